@@ -1,0 +1,288 @@
+"""
+``mi-diffind``: render, compare, inspect, fit.
+
+Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import time
+from pathlib import Path
+
+from . import __version__, runtime
+from .files import OutputError, write_json, writable_folder
+from .fitting import SCHEDULES, FittingError
+from .lookup import STORAGES
+from .tables import TableError
+
+
+class UsageError(Exception):
+    """Bad input that the argument parser cannot see."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    arguments = _parser().parse_args(argv)
+    from .scenes import SceneError  # imports Mitsuba
+
+    try:
+        if arguments.json is not None:
+            writable_folder(Path(arguments.json).parent)
+        result = arguments.run(arguments)
+        if arguments.json is not None:
+            write_json(arguments.json, result)
+        return 0
+    except (UsageError, OutputError, TableError, FittingError, SceneError) as e:
+        print(f"mi-diffind: error: {e}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("mi-diffind: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mi-diffind", description="Learned lookup tables for Mitsuba 3: differentiable indirection."
+    )
+    parser.add_argument("--version", action="version", version=f"mi-diffind {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, run, help: str):
+        sub = commands.add_parser(name, help=help, description=help)
+        sub.set_defaults(run=run)
+        sub.add_argument("--json", metavar="FILE", help="also write what is printed to FILE")
+        return sub
+
+    def scene_options(sub, rendering: bool = True):
+        sub.add_argument("--variant", help="Mitsuba variant (default: cuda_ad_rgb with a GPU, else llvm_ad_rgb)")
+        sub.add_argument(
+            "-D", dest="defines", action="append", default=[], metavar="NAME=VALUE", help="set a <default> of the scene"
+        )
+        if rendering:
+            sub.add_argument("--spp", type=_positive, help="samples per pixel (default: the scene's)")
+            sub.add_argument("--seed", type=_natural, default=0, help="seed of the random numbers (default: 0)")
+
+    sub = command("render", _render, "render a scene that names learned plugins")
+    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument("-o", "--output", metavar="FILE", help="image, .exr or .png (default: SCENE.exr)")
+    scene_options(sub)
+
+    sub = command("compare", _compare, "render a scene as written and with exact plugins, and show the difference")
+    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument("--out", default="out", metavar="DIR", help="folder for pictures (default: out)")
+    sub.add_argument("--passes", type=_positive, default=5, help="passes to split the samples into (default: 5)")
+    scene_options(sub)
+
+    sub = command("inspect", _inspect, "say what is in a table file, or which learned plugins a scene uses")
+    sub.add_argument("file", metavar="FILE.npz|SCENE.xml")
+    scene_options(sub, rendering=False)
+
+    sub = command("fit", _fit, "train tables")
+    sub.add_argument("task", choices=["disney"])
+    sub.add_argument("-o", "--output", required=True, metavar="FILE.npz", help="table file to write")
+    sub.add_argument("--storage", choices=STORAGES, default="float32", help="storage form (default: float32)")
+    sub.add_argument("--backend", choices=["llvm", "cuda"], help="where to train (default: the GPU if there is one)")
+    sub.add_argument("--steps", type=_positive, help="optimisation steps")
+    sub.add_argument("--batch", type=_positive, help="samples a step")
+    sub.add_argument("--lr", type=float, help="Adam's learning rate")
+    sub.add_argument("--schedule", choices=SCHEDULES, help="course of the learning rate")
+    sub.add_argument("--seed", type=_natural, help="seed of the random numbers")
+    sub.add_argument("--checkpoint", metavar="FILE", help="keep the state of the training in FILE")
+    sub.add_argument("--resume", action="store_true", help="go on from --checkpoint")
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = _natural(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _natural(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number ≥ 0")
+    return value
+
+
+def _set_variant(name: str | None) -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    if name is None:
+        name = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
+    if name not in mi.variants():
+        raise UsageError(f'the variant "{name}" does not exist; available are {", ".join(mi.variants())}')
+    if name.startswith("llvm") and runtime.llvm_problem():
+        raise UsageError(runtime.llvm_problem())
+    try:
+        mi.set_variant(name)
+    except ImportError as e:
+        raise UsageError(f'the variant "{name}" cannot run here: {e}') from None
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+def _defines(arguments) -> dict[str, str]:
+    result = {}
+    for text in arguments.defines:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise UsageError(f'-D {text}: expected NAME=VALUE, as in "-D width=320"')
+        result[name] = value
+    return result
+
+
+def _render(arguments) -> dict:
+    from tqdm import tqdm
+
+    output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
+    if output.suffix.lower() not in (".exr", ".png"):
+        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are .exr and .png')
+    writable_folder(output.parent)
+    _set_variant(arguments.variant)
+    import mitsuba as mi
+
+    from . import compare, scenes
+
+    defines = _defines(arguments)
+    start = time.perf_counter()
+    learned = scenes.learned_plugins(arguments.scene, **defines)
+    scene = scenes.load(arguments.scene, **defines)
+    loaded = time.perf_counter()
+    spp = arguments.spp or scene.sensors()[0].sampler().sample_count()
+    passes = max(1, spp // 16)
+    with tqdm(total=passes, desc="render", unit="pass", disable=None) as bar:
+        image, _ = scenes.render(scene, spp, arguments.seed, passes, lambda _: bar.update(1))
+    rendered = time.perf_counter()
+    compare.write_image(output, image)
+    print(f"{output}: {image.shape[1]} x {image.shape[0]}, {spp} spp, {rendered - loaded:.1f} s in {mi.variant()}")
+    return {
+        "scene": arguments.scene,
+        "output": str(output),
+        "variant": mi.variant(),
+        "width": image.shape[1],
+        "height": image.shape[0],
+        "spp": spp,
+        "seed": arguments.seed,
+        "seconds_load": loaded - start,
+        "seconds_render": rendered - loaded,
+        "learned_plugins": learned,
+        "table_bytes": compare.table_bytes(arguments.scene, learned),
+    }
+
+
+def _compare(arguments) -> dict:
+    writable_folder(arguments.out, create=True)
+    _set_variant(arguments.variant)
+    from . import compare
+
+    comparison = compare.compare(
+        arguments.scene, arguments.spp, arguments.seed, arguments.passes, **_defines(arguments)
+    )
+    paths = compare.write(comparison, arguments.out)
+    print("\n".join(compare.summary(comparison.figures)))
+    print(f"picture     {paths['figure']}")
+    return {**comparison.figures, "files": paths}
+
+
+def _inspect(arguments) -> dict:
+    if Path(arguments.file).suffix.lower() == ".xml":
+        return _inspect_scene(arguments)
+    from .tables import load_table
+
+    table = load_table(arguments.file)
+    print(f"{arguments.file}: tables for the task \"{table.task}\", {table.nbytes:,} bytes as {table.storage}")
+    arrays = {}
+    for name, array in table.arrays.items():
+        values = table.values(name)
+        arrays[name] = {
+            "resolution": list(array.shape[:-1]),
+            "channels": array.shape[-1],
+            "bytes": array.nbytes,
+            "min": float(values.min()),
+            "max": float(values.max()),
+        }
+        size = " x ".join(map(str, array.shape[:-1]))
+        print(
+            f"  {name:22} {size:>9}, {array.shape[-1]} channels, {array.nbytes:6,} bytes, "
+            f"values {values.min():.4g} to {values.max():.4g}"
+        )
+    for title, content in (("trained with", {**table.settings, "seed": table.seed}), ("measured", table.quality)):
+        print(f"  {title}: " + ", ".join(f"{k} {v}" for k, v in content.items()))
+    return {
+        "file": arguments.file,
+        "task": table.task,
+        "storage": table.storage,
+        "bytes": table.nbytes,
+        "arrays": arrays,
+        "settings": table.settings,
+        "seed": table.seed,
+        "quality": table.quality,
+    }
+
+
+def _inspect_scene(arguments) -> dict:
+    _set_variant(arguments.variant)
+    from . import compare, scenes
+
+    learned = scenes.learned_plugins(arguments.file, **_defines(arguments))
+    tables = compare.tables_of(arguments.file, learned)
+    total = sum(t.nbytes for t in tables.values())
+    print(f"{arguments.file}: {len(learned)} learned material(s), {total:,} bytes of tables in {len(tables)} file(s)")
+    for entry in learned:
+        given = ", ".join(
+            f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in entry["parameters"].items()
+        )
+        print(f"  {entry['id']} ({entry['plugin']}): {given or 'defaults'}")
+    return {
+        "file": arguments.file,
+        "learned_plugins": learned,
+        "table_bytes": total,
+        "tables": [{"file": f, "storage": s, "bytes": t.nbytes} for (f, s), t in tables.items()],
+    }
+
+
+def _fit(arguments) -> dict:
+    output = Path(arguments.output)
+    if output.suffix.lower() != ".npz":
+        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed is .npz')
+    writable_folder(output.parent)
+    from .tables import save_table
+    from .tasks.disney.training import DEFAULT_SETTINGS, fit_disney
+
+    given = {k: getattr(arguments, k) for k in ("steps", "batch", "lr", "schedule", "seed")}
+    settings = dataclasses.replace(DEFAULT_SETTINGS, **{k: v for k, v in given.items() if v is not None})
+    try:
+        table, result = fit_disney(
+            settings, arguments.backend, arguments.storage, arguments.checkpoint, arguments.resume
+        )
+    except RuntimeError as e:
+        raise FittingError(str(e)) from e
+    save_table(output, table)
+    quality = ", ".join(f"{k} {v}" for k, v in table.quality.items())
+    state = f"interrupted at step {result.steps}, kept" if result.interrupted else "best"
+    print(f"{output}: {table.nbytes:,} bytes as {table.storage}; {state} step {result.step}; {quality}")
+    if result.interrupted:
+        raise KeyboardInterrupt
+    return {
+        "output": str(output),
+        "bytes": table.nbytes,
+        "storage": table.storage,
+        "settings": table.settings,
+        "quality": table.quality,
+        "step": result.step,
+        "seconds": result.seconds,
+        "restarts": result.restarts,
+        "history": result.history,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,173 @@
+"""
+A scene as written beside the same scene with every learned plugin replaced by its exact counterpart: what the
+approximation costs in accuracy, and what it takes or saves in time.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from . import metrics, scenes
+from .files import replacing, writable_folder
+
+
+@dataclass
+class Comparison:
+    """Both images (linear, ``(height, width, 3)``) and what was measured (see :func:`compare`)."""
+
+    written: np.ndarray
+    exact: np.ndarray
+    figures: dict
+
+
+def compare(
+    path: str | os.PathLike,
+    spp: int | None = None,
+    seed: int = 0,
+    passes: int = 5,
+    progress: bool = True,
+    **defines: str,
+) -> Comparison:
+    """
+    Render ``path`` as written and exact, in turn, pass by pass, with the same random numbers.
+
+    Figures: ``psnr_db``, ``flip``, ``mae`` of the image as written against the exact one; the median seconds of a pass
+    of each; ``time_ratio`` (written over exact: median, minimum and maximum over the passes but the first, which
+    compiles); ``learned_plugins`` and the ``table_bytes`` of each distinct table they read.
+    """
+    learned = scenes.learned_plugins(path, **defines)
+    loaded = {"written": scenes.load(path, **defines), "exact": scenes.load(path, exact=True, **defines)}
+    spp = spp or loaded["written"].sensors()[0].sampler().sample_count()
+    passes = max(1, min(passes, spp))
+    images, seconds = {}, {name: [] for name in loaded}
+    with tqdm(total=2 * passes, desc="render", unit="pass", disable=None if progress else True) as bar:
+        for i in range(passes):
+            n = (i + 1) * spp // passes - i * spp // passes
+            for name in loaded if i % 2 == 0 else reversed(loaded):
+                image, took = scenes.render(loaded[name], n, seed * passes + i)
+                images[name] = images.get(name, 0) + image.astype(np.float64) * (n / spp)
+                seconds[name] += took
+                bar.update(1)
+
+    written, exact = (images[name][..., :3].astype(np.float32) for name in ("written", "exact"))
+    if written.shape[-1] == 1:
+        written, exact = np.repeat(written, 3, -1), np.repeat(exact, 3, -1)
+    timed = slice(1, None) if passes > 1 else slice(None)
+    ratios = [w / e for w, e in zip(seconds["written"][timed], seconds["exact"][timed], strict=True)]
+    figures = {
+        "scene": str(path),
+        "variant": mi.variant(),
+        "spp": spp,
+        "seed": seed,
+        "width": written.shape[1],
+        "height": written.shape[0],
+        **metrics.compare(exact, written),
+        "seconds_per_pass": {name: statistics.median(seconds[name][timed]) for name in loaded},
+        "seconds_first_pass": {name: seconds[name][0] for name in loaded},
+        "time_ratio": {"median": statistics.median(ratios), "min": min(ratios), "max": max(ratios)},
+        "passes": passes,
+        "learned_plugins": len(learned),
+        "table_bytes": table_bytes(path, learned),
+    }
+    return Comparison(written, exact, figures)
+
+
+def table_bytes(scene: str | os.PathLike, learned: list[dict]) -> int:
+    """Bytes of all distinct tables that the learned plugins of a scene read, in their storage forms."""
+    return sum(table.nbytes for table in tables_of(scene, learned).values())
+
+
+def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, str], object]:
+    """The distinct tables of a scene's learned plugins: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`."""
+    from .tasks.disney.arrays import load_disney_table
+    from .tasks.disney.library import SHIPPED
+
+    found = {}
+    for entry in learned:
+        name, storage = entry.get("filename", ""), entry.get("storage", "float32")
+        file = SHIPPED if not name else Path(scene).resolve().parent / name
+        if (str(file), storage) not in found:
+            found[str(file), storage] = load_disney_table(file).to(storage)
+    return found
+
+
+def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
+    """
+    Write ``comparison.png`` and the EXRs ``written.exr``, ``exact.exr``, ``error.exr`` (absolute difference) into
+    ``folder``, which is made if its parent exists. Returns the paths. Raises :class:`OutputError`.
+    """
+    folder = writable_folder(folder, create=True)
+    images = {
+        "written": comparison.written,
+        "exact": comparison.exact,
+        "error": np.abs(comparison.written - comparison.exact),
+    }
+    paths = {}
+    for name, image in images.items():
+        paths[name] = str(folder / f"{name}.exr")
+        write_image(paths[name], image)
+    paths["figure"] = str(folder / "comparison.png")
+    figure(comparison, paths["figure"])
+    return paths
+
+
+def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
+    """Write a linear image: ``.exr`` as 32-bit floats, ``.png`` or ``.jpg`` as displayed."""
+    with replacing(path) as temporary:
+        bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
+        if Path(path).suffix.lower() == ".exr":
+            bitmap.write(str(temporary))
+        else:
+            mi.util.write_bitmap(str(temporary), bitmap, write_async=False)
+
+
+def figure(comparison: Comparison, path: str | os.PathLike) -> None:
+    """One picture to judge at a glance: as written, exact, error map with a colour bar, numbers."""
+    from matplotlib.figure import Figure
+
+    f = comparison.figures
+    error = np.abs(comparison.written - comparison.exact).mean(axis=-1)
+    height, width = error.shape
+    sheet = Figure(figsize=(14, 14 * height / width + 1.0), dpi=110, layout="constrained")
+    axes = sheet.subplots(2, 2)
+    for ax, image, title in (
+        (axes[0, 0], comparison.written, "as written (learned tables)"),
+        (axes[0, 1], comparison.exact, "exact"),
+    ):
+        ax.imshow(metrics.srgb(image), interpolation="nearest")
+        ax.set_title(title)
+    top = max(float(np.quantile(error, 0.995)), 1e-6)
+    shown = axes[1, 0].imshow(error, cmap="magma", vmin=0, vmax=top, interpolation="nearest")
+    axes[1, 0].set_title("absolute difference, mean of the channels (linear)")
+    sheet.colorbar(shown, ax=axes[1, 0], extend="max", shrink=0.9)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    axes[1, 1].text(
+        0.02, 0.95, "\n".join(summary(f)), va="top", family="monospace", fontsize=12, transform=axes[1, 1].transAxes
+    )
+    with replacing(path) as temporary:
+        sheet.savefig(temporary, format=Path(path).suffix[1:])
+
+
+def summary(f: dict) -> list[str]:
+    """The figures as lines of text."""
+    ratio, seconds = f["time_ratio"], f["seconds_per_pass"]
+    return [
+        f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {f['spp']} spp",
+        f"variant     {f['variant']}",
+        f"learned     {f['learned_plugins']} materials, {f['table_bytes']:,} bytes of tables",
+        "",
+        f"PSNR        {f['psnr_db']:.2f} dB   (linear, clipped to [0, 1])",
+        f"FLIP        {f['flip']:.4f}     (0 = equal to the eye)",
+        f"MAE         {f['mae']:.5f}",
+        "",
+        f"time        {seconds['written']:.2f} s a pass, exact {seconds['exact']:.2f} s",
+        f"ratio       {ratio['median']:.2f}  ({ratio['min']:.2f} to {ratio['max']:.2f}, {f['passes']} passes)",
+    ]

@@ -1,0 +1,65 @@
+"""Writing files so that nothing half-written stays behind."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+from pathlib import Path
+
+
+class OutputError(OSError):
+    """An output file or folder cannot be written; the message is one sentence that names it."""
+
+
+def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
+    """
+    The folder ``path``, made if ``create``. Raises :class:`OutputError` if it does not exist or cannot be written.
+
+    Called before long work starts, so that a typing error costs seconds, not the result.
+    """
+    path = Path(path)
+    try:
+        if create:
+            path.mkdir(parents=True, exist_ok=True)
+        if not path.is_dir():
+            kind = "is not a folder" if path.exists() else "does not exist"
+            raise OutputError(f'output folder "{path}" {kind}')
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OutputError:
+        raise
+    except OSError as e:
+        raise OutputError(f'output folder "{path}" cannot be written: {e.strerror or e}') from None
+    return path
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike):
+    """
+    Yield the path of a temporary file beside ``path`` (with the same extension); rename it to ``path`` on success,
+    remove it on failure. Raises :class:`OutputError` if the folder cannot be written.
+    """
+    path = Path(path)
+    writable_folder(path.parent)
+    if path.is_dir():
+        raise OutputError(f'output file "{path}" is a folder')
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    try:
+        yield Path(name)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(name, 0o666 & ~umask)
+        os.replace(name, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        raise
+
+
+def write_json(path: str | os.PathLike, content) -> None:
+    """Write ``content`` as indented JSON, in one piece."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

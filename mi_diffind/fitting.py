@@ -1,0 +1,347 @@
+"""
+The training loop, one for all tasks: Adam on random batches, with schedules, checkpoints and guards.
+
+A task describes itself as a :class:`Problem`; :func:`fit` does the rest. Everything random is drawn from
+``(seed, step)``, so that a run is repeatable and an interrupted one continues exactly where it stopped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import drjit as dr
+import numpy as np
+from drjit.opt import Adam
+from tqdm import tqdm
+
+from .files import replacing, writable_folder
+
+SCHEDULES = ("constant", "cosine", "plateau")
+LOSSES = ("mae", "mse")
+
+
+class FittingError(RuntimeError):
+    """A training cannot go on; the message is one sentence."""
+
+
+class Problem(Protocol):
+    """What a task has to provide to be trained."""
+
+    #: The trainable module (``drjit.nn.Module``), allocated.
+    net: object
+
+    #: Weight of each named target in the loss; a missing name counts 1.
+    weights: dict[str, float]
+
+    def batch(self, rng, size: int):
+        """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
+
+    def predict(self, net, inputs) -> dict[str, list]:
+        """What the tables say for ``inputs``, in the form of the targets."""
+
+    def quality(self, net) -> dict[str, float]:
+        """Measured quality on held-out data; the first entry decides which state is the best (higher is better)."""
+
+
+@dataclass
+class FitSettings:
+    """
+    How to train. ``lr`` is Adam's learning rate, ``schedule`` its course: ``"constant"``, ``"cosine"`` (to zero) or
+    ``"plateau"`` (halved when the loss has not improved for a tenth of the steps). ``quality_every`` and
+    ``check_every`` are numbers of steps between measurements and between looks at the loss.
+    """
+
+    steps: int = 2000
+    batch: int = 65536
+    lr: float = 1e-3
+    schedule: str = "cosine"
+    loss: str = "mae"
+    seed: int = 0
+    quality_every: int = 200
+    check_every: int = 20
+
+    def __post_init__(self):
+        for name, low in (("steps", 1), ("batch", 1), ("quality_every", 1), ("check_every", 1), ("seed", 0)):
+            if getattr(self, name) < low:
+                raise FittingError(f"{name}: found {getattr(self, name)}, at least {low} is needed")
+        if not (math.isfinite(self.lr) and self.lr > 0):
+            raise FittingError(f"lr: found {self.lr}, a positive number is needed")
+        if self.schedule not in SCHEDULES:
+            raise FittingError(f'schedule: found "{self.schedule}", allowed are {SCHEDULES}')
+        if self.loss not in LOSSES:
+            raise FittingError(f'loss: found "{self.loss}", allowed are {LOSSES}')
+
+
+@dataclass
+class FitResult:
+    """The best state that was seen: its quality, the step it was reached at, and how the run went."""
+
+    quality: dict[str, float]
+    step: int
+    steps: int
+    seconds: float
+    interrupted: bool
+    restarts: int
+    history: list[dict] = field(default_factory=list)
+
+
+@dataclass
+class _State:
+    """
+    Everything that a training consists of: tables and, for each, Adam's step count and moments. Dr.Jit arrays (never
+    written in place, so a snapshot costs nothing) or, from a checkpoint, NumPy arrays.
+    """
+
+    step: int
+    lr_scale: float
+    parameters: dict
+    moments: dict[str, tuple]
+
+
+def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, progress=True, log=None) -> FitResult:
+    """
+    Train ``problem.net`` in place and leave the best state found in it.
+
+    ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
+    read first (it must belong to the same settings). Ctrl-C ends the training after the current step and keeps the
+    best state so far. If the loss or a parameter becomes NaN, or the loss explodes, the last good state is restored
+    and the learning rate halved; ``log`` (default: print to stderr) is told so in one sentence.
+
+    Raises :class:`FittingError` if the training diverges again and again, or the checkpoint does not fit.
+    """
+    net = problem.net
+    if checkpoint is not None:
+        writable_folder(Path(checkpoint).parent)
+    trainer, plateau = _Trainer(problem, settings), _Plateau(settings)
+    best, best_quality, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
+    if resume:
+        if checkpoint is None:
+            raise FittingError("resuming needs the checkpoint file to resume from")
+        state, extra = _load_checkpoint(checkpoint, settings, trainer)
+        trainer.restore(state)
+        best, best_quality, best_step = extra["best"], extra["best_quality"], extra["best_step"]
+        history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
+        plateau.restore(extra["plateau"])
+
+    start = time.perf_counter() - spent
+    good, reference = trainer.snapshot(), None
+    bar = tqdm(total=settings.steps, initial=trainer.step, disable=None if progress else True, unit="step")
+    log = log or (lambda message: tqdm.write(message, file=sys.stderr))
+    interrupted = False
+
+    def measure(loss):
+        nonlocal best, best_quality, best_step
+        quality = {k: float(v) for k, v in problem.quality(net).items()}
+        name, value = next(iter(quality.items()))
+        history.append({"step": trainer.step, "loss": loss, **quality})
+        if best is None or value > next(iter(best_quality.values())):
+            best, best_quality, best_step = trainer.snapshot().parameters, quality, trainer.step
+        bar.set_postfix({"loss": f"{loss:.3g}", name: f"{value:.2f}"})
+
+    with _interruptible() as stop, bar:
+        while trainer.step < settings.steps and not stop.is_set():
+            loss = trainer.take_step(plateau.factor)
+            bar.update(1)
+            last = trainer.step == settings.steps
+            if trainer.step % settings.check_every and trainer.step % settings.quality_every and not last:
+                continue
+            value = float(loss[0])
+            if _diverged(value, reference) or not trainer.finite():
+                restarts += 1
+                if restarts > 8:
+                    raise FittingError(
+                        f"the training diverged {restarts} times (last at step {trainer.step}, loss {value:g}): "
+                        f"lower the learning rate, {settings.lr:g}"
+                    )
+                log(
+                    f"step {trainer.step}: the loss is {value:g}; restored step {good.step} "
+                    f"with half the learning rate ({settings.lr * good.lr_scale / 2:g})"
+                )
+                good.lr_scale /= 2
+                trainer.restore(good)
+                bar.n = trainer.step
+                continue
+            reference = value if reference is None else 0.5 * (reference + value)
+            plateau.update(trainer.step, value)
+            good = trainer.snapshot()
+            if trainer.step % settings.quality_every == 0 or last:
+                measure(value)
+                if checkpoint is not None:
+                    extra = {
+                        "best": best, "best_quality": best_quality, "best_step": best_step, "history": history,
+                        "restarts": restarts, "seconds": time.perf_counter() - start, "plateau": plateau.state(),
+                    }  # fmt: skip
+                    _save_checkpoint(checkpoint, settings, good, extra)
+        if stop.is_set() and trainer.step < settings.steps:
+            interrupted = True
+            if best is None and trainer.finite():
+                measure(float("nan"))
+
+    if best is None:
+        raise FittingError("the training was stopped before its first measurement: there is nothing to keep")
+    trainer.load_parameters(best)
+    return FitResult(
+        best_quality, best_step, trainer.step, time.perf_counter() - start, interrupted, restarts, history
+    )
+
+
+def _diverged(value: float, reference: float | None) -> bool:
+    return not math.isfinite(value) or (reference is not None and value > 10 * reference + 1e-6)
+
+
+class _Plateau:
+    """Halve the learning rate when the loss has not improved for a tenth of the steps (``schedule="plateau"``)."""
+
+    def __init__(self, settings: FitSettings):
+        self.active = settings.schedule == "plateau"
+        self.patience = max(settings.check_every, settings.steps // 10)
+        self.factor, self.best, self.since = 1.0, math.inf, 0
+
+    def update(self, step: int, loss: float) -> None:
+        if not self.active:
+            return
+        if loss < 0.999 * self.best:
+            self.best, self.since = loss, step
+        elif step - self.since >= self.patience:
+            self.factor, self.since = self.factor / 2, step
+
+    def state(self) -> list:
+        return [self.factor, self.best if math.isfinite(self.best) else None, self.since]
+
+    def restore(self, state: list) -> None:
+        self.factor, best, self.since = state
+        self.best = math.inf if best is None else best
+
+
+class _Trainer:
+    """The optimiser and its module; the only place that touches Adam's internals."""
+
+    def __init__(self, problem: Problem, settings: FitSettings):
+        self.problem, self.settings = problem, settings
+        self.step, self.lr_scale = 0, 1.0
+        self.optimizer = Adam(lr=settings.lr)
+        self.optimizer.update(problem.net)
+        self.module = sys.modules[type(next(iter(self.optimizer.values()))).__module__]
+
+    def learning_rate(self, plateau: float) -> float:
+        rate = self.settings.lr * self.lr_scale
+        if self.settings.schedule == "cosine":
+            rate *= 0.5 * (1 + math.cos(math.pi * self.step / self.settings.steps))
+        return rate * plateau
+
+    def take_step(self, plateau: float = 1.0):
+        net, settings = self.problem.net, self.settings
+        # A number that changes with the step must not be part of the kernel, or each step would compile anew:
+        # the seed is opaque, and Adam makes a learning rate opaque if it is a Python float set parameter by parameter.
+        seed = dr.opaque(self.module.UInt64, (settings.seed << 32) + self.step)
+        rng = dr.rng(seed=seed)
+        net.update(self.optimizer)
+        inputs, targets = self.problem.batch(rng, settings.batch)
+        outputs = self.problem.predict(net, inputs)
+        loss = 0
+        for name, target in targets.items():
+            errors = [o - t for o, t in zip(outputs[name], target, strict=True)]
+            errors = [dr.abs(e) if settings.loss == "mae" else dr.square(e) for e in errors]
+            weight = self.problem.weights.get(name, 1.0) / (len(errors) * settings.batch)
+            loss += weight * dr.sum(sum(errors[1:], errors[0]))
+        dr.backward(loss)
+        rate = self.learning_rate(plateau)
+        self.optimizer.set_learning_rate({name: rate for name in self.optimizer})
+        self.optimizer.step()
+        net.update(self.optimizer)
+        self.step += 1
+        loss = dr.detach(loss)
+        dr.schedule(loss)
+        return loss
+
+    def finite(self) -> bool:
+        return all(bool(dr.all(dr.isfinite(v.array), axis=None)) for v in self.optimizer.values())
+
+    def snapshot(self) -> _State:
+        parameters, moments = {}, {}
+        for key, (value, _, _, (t, m, v, _)) in self.optimizer.state.items():
+            parameters[key], moments[key] = dr.detach(value), (t, m, v)
+        return _State(self.step, self.lr_scale, parameters, moments)
+
+    def restore(self, state: _State) -> None:
+        self.step, self.lr_scale = state.step, state.lr_scale
+        for key, (value, promoted, lr, (t, m, v, v_max)) in list(self.optimizer.state.items()):
+            t_new, m_new, v_new = state.moments[key]
+            new = type(value)(state.parameters[key])
+            dr.make_opaque(new)
+            dr.enable_grad(new)
+            self.optimizer.state[key] = (
+                new, promoted, lr, (type(t)(t_new), type(m)(m_new), type(v)(v_new), v_max)
+            )  # fmt: skip
+        self.problem.net.update(self.optimizer)
+
+    def load_parameters(self, parameters: dict) -> None:
+        for key, value in parameters.items():
+            self.problem.net[key] = type(self.optimizer[key])(value)
+
+
+def _save_checkpoint(path, settings: FitSettings, state: _State, extra: dict) -> None:
+    arrays = {}
+    for key, value in state.parameters.items():
+        t, m, v = state.moments[key]
+        arrays |= {f"value/{key}": value.numpy(), f"m/{key}": m.numpy(), f"v/{key}": v.numpy()}
+        arrays |= {f"t/{key}": np.int64(t[0]), f"best/{key}": np.asarray(extra["best"][key])}
+    meta = {k: v for k, v in extra.items() if k != "best"}
+    meta |= {"step": state.step, "lr_scale": state.lr_scale, "settings": asdict(settings)}
+    arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, **arrays)
+
+
+def _load_checkpoint(path, settings: FitSettings, trainer: _Trainer) -> tuple[_State, dict]:
+    if not os.path.exists(path):
+        raise FittingError(f'the checkpoint "{path}" does not exist, there is nothing to resume')
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {k: data[k] for k in data.files}
+        meta = json.loads(arrays["meta"].tobytes())
+        keys = list(trainer.optimizer)
+        state = _State(
+            meta["step"], meta["lr_scale"], {k: arrays[f"value/{k}"] for k in keys},
+            {k: (int(arrays[f"t/{k}"]), arrays[f"m/{k}"], arrays[f"v/{k}"]) for k in keys},
+        )  # fmt: skip
+        best = {k: arrays[f"best/{k}"] for k in keys}
+    except Exception as e:  # zipfile, json and numpy each have their own for a damaged file
+        raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({type(e).__name__}: {e})') from None
+    for key in keys:
+        if state.parameters[key].shape != trainer.optimizer[key].shape:
+            raise FittingError(f'the checkpoint "{path}" holds other table sizes ("{key}")')
+    if meta["settings"] != asdict(settings):
+        changed = [k for k, v in asdict(settings).items() if meta["settings"].get(k) != v]
+        raise FittingError(f'the checkpoint "{path}" was made with other settings ({", ".join(changed)})')
+    return state, {**meta, "best": best}
+
+
+@contextlib.contextmanager
+def _interruptible():
+    """An event that Ctrl-C sets; a second Ctrl-C raises ``KeyboardInterrupt`` as usual."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def handler(signum, frame):
+        stop.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,302 @@
+"""
+What has to be right before a plugin can run: LLVM, and the registration of the plugins.
+
+**LLVM.** On a CPU, Dr.Jit compiles through LLVM, which it looks for the moment ``drjit`` is imported. Dr.Jit 1.5
+accepts LLVM 15 to 18, but the first kernel with a minimum or maximum then aborts the whole process (``Cannot
+select: fminimum``), which no ``try`` can catch. :func:`select_llvm` therefore chooses the library before that:
+
+1. ``DRJIT_LIBLLVM_PATH``, if the user has set it;
+2. the library that pip installed (``karellen-llvm-core``);
+3. the system's, if it is new enough.
+
+If ``drjit`` was imported first and has picked an unusable version, the choice is made again, as long as no kernel has
+run and no scene object exists. If no usable library exists, the LLVM backend is switched off, so that
+``mi.set_variant("llvm_…")`` raises instead of aborting later; CUDA variants are not concerned.
+
+**Plugins.** Mitsuba's classes differ from variant to variant (``mi.BSDF`` is another class in each), so the plugins
+are defined anew for each variant when it is set: :func:`register_plugins` subscribes to that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import glob
+import importlib.metadata
+import os
+import re
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+ENV = "DRJIT_LIBLLVM_PATH"
+
+#: The oldest LLVM whose code generator knows every instruction that Dr.Jit 1.5 emits.
+MIN_LLVM = 19
+
+_SYSTEM_PATTERNS = (
+    "/usr/lib/*-linux-gnu/libLLVM*.so*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+    "/usr/lib64/llvm*/lib*/libLLVM*.so*",
+    "/usr/lib/libLLVM*.so*",
+    "/usr/local/lib/libLLVM*.so*",
+)
+
+_ADVICE = "install one without root by 'pip install karellen-llvm-core' or point DRJIT_LIBLLVM_PATH to one"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """
+    The outcome of the search for LLVM.
+
+    ``path`` is the library to use, or ``None`` to leave the search to Dr.Jit (platforms that we do not search);
+    ``origin`` says where it came from; ``problem`` is a sentence for the user if no library is usable.
+    """
+
+    path: str | None
+    origin: str
+    problem: str | None = None
+
+
+def library_version(path: str) -> int | None:
+    """
+    The major version of the LLVM library at ``path``: 15 if it is older than 16 (when ``LLVMGetVersion`` came),
+    ``None`` if it is no loadable LLVM library at all.
+    """
+    try:
+        library = ctypes.CDLL(path)  # RTLD_LOCAL: Dr.Jit's own search does not see it
+    except OSError:
+        return None
+    if not hasattr(library, "LLVMDisposeMessage"):
+        return None
+    if not hasattr(library, "LLVMGetVersion"):
+        return 15
+    version = [ctypes.c_uint() for _ in range(3)]
+    library.LLVMGetVersion(*map(ctypes.byref, version))
+    return version[0].value
+
+
+def pip_libraries() -> list[str]:
+    """Paths of the LLVM libraries that pip installed into this environment, newest first."""
+    found = []
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        files = importlib.metadata.distribution("karellen-llvm-core").files or ()
+        found += [str(Path(f.locate()).resolve()) for f in files if _named_version(f.name) is not None]
+    found += glob.glob(os.path.join(sys.prefix, "lib", "libLLVM*.so*"))
+    return _newest_first(found)
+
+
+def system_libraries(patterns=_SYSTEM_PATTERNS) -> list[str]:
+    """Paths of the LLVM libraries that the operating system has, newest first."""
+    return _newest_first(path for pattern in patterns for path in glob.glob(pattern))
+
+
+def _named_version(name: str) -> int | None:
+    match = re.fullmatch(r"libLLVM(?:-(\d+))?[\d.]*\.so(?:\.(\d+))?[\d.]*", name)
+    return int(match[1] or match[2] or 0) if match else None
+
+
+def _newest_first(paths) -> list[str]:
+    usable = {p for p in paths if _named_version(os.path.basename(p)) is not None and os.path.exists(p)}
+    return sorted(usable, key=lambda p: (_named_version(os.path.basename(p)), p), reverse=True)
+
+
+def choose_llvm(
+    environ=os.environ, pip=pip_libraries, system=system_libraries, version=library_version
+) -> Choice:
+    """
+    Choose the LLVM library: an explicit setting wins, then pip's, then the system's. Changes nothing.
+
+    The arguments exist for tests: the environment, the two searches and the function that reads a version.
+    """
+    explicit = environ.get(ENV)
+    if explicit:
+        found = version(explicit)
+        if found is None:
+            problem = f"{ENV}={explicit} is not a loadable LLVM library: correct it, unset it, or {_ADVICE}."
+        elif found < MIN_LLVM:
+            problem = (
+                f"{ENV}={explicit} is LLVM {found if found > 15 else '15 or older'}, with which Dr.Jit aborts: "
+                f"version {MIN_LLVM} or newer is needed, so unset it, or {_ADVICE}."
+            )
+        else:
+            problem = None
+        return Choice(explicit, ENV, problem)
+
+    if not sys.platform.startswith("linux"):
+        return Choice(None, "Dr.Jit's own search")
+
+    too_old = []
+    for origin, paths in (("pip", pip()), ("system", system())):
+        for path in paths:
+            found = version(path)
+            if found is not None and found >= MIN_LLVM:
+                return Choice(path, origin)
+            too_old.append(path)
+    seen = f" (found only {too_old[0]}, which is too old)" if too_old else ""
+    return Choice(
+        None, "none", f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}."
+    )
+
+
+_problem: str | None = None
+
+
+def llvm_problem() -> str | None:
+    """The sentence that says why LLVM variants cannot run here, or ``None`` if they can."""
+    return _problem
+
+
+def select_llvm() -> Choice:
+    """
+    Make Dr.Jit use the library that :func:`choose_llvm` names. Called by ``import mi_diffind``.
+
+    Raises ``ImportError`` with one sentence if Dr.Jit already runs kernels on, or holds objects of, an LLVM that
+    would abort. Warns (``RuntimeWarning``) and switches the LLVM backend off if there is no usable library.
+    """
+    global _problem
+    if "drjit" in sys.modules:
+        running = sys.modules["drjit"].detail.llvm_version()
+        if running[0] >= MIN_LLVM:
+            return Choice(os.environ.get(ENV), "already running")
+    choice = choose_llvm()
+    _problem = choice.problem
+
+    if "drjit" not in sys.modules:
+        if choice.problem is None:
+            if choice.path is not None:
+                os.environ[ENV] = choice.path
+            import drjit
+
+            running = drjit.detail.llvm_version()  # waits for the asynchronous start
+            if 0 <= running[0] < MIN_LLVM:  # only where the search was left to Dr.Jit
+                _problem = f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
+                _restart_llvm(None)
+        else:
+            with _hidden_llvm():
+                import drjit
+
+                drjit.detail.llvm_version()
+    elif choice.problem is None and choice.path is not None:
+        _restart_llvm(choice.path)
+    elif running[0] >= 0:
+        _problem = _problem or f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
+        _restart_llvm(None)
+
+    if _problem:
+        warnings.warn(f"LLVM variants are switched off: {_problem}", RuntimeWarning, stacklevel=4)
+    return choice
+
+
+@contextlib.contextmanager
+def _hidden_llvm():
+    """Make Dr.Jit's search for LLVM fail while the context is open: an inactive backend raises, an old one aborts."""
+    before = os.environ.get(ENV)
+    os.environ[ENV] = "(switched off by mi_diffind: no usable LLVM)"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[ENV]
+        else:
+            os.environ[ENV] = before
+
+
+def _restart_llvm(path: str | None) -> None:
+    """
+    Stop Dr.Jit's LLVM backend and start it again with the library at ``path`` (``None``: leave it off).
+
+    Dr.Jit has no Python function for this; its library exports the C++ functions ``jit_shutdown(int)`` and
+    ``jit_init(uint32_t)``. Variables survive the restart, registered scene objects and kernels do not.
+    """
+    import drjit
+
+    version = drjit.detail.llvm_version()
+    active = version[0] >= 0
+    too_late = (
+        f"Dr.Jit already uses LLVM {version[0]}, with which it aborts, and {{}}: import mi_diffind before loading "
+        f"a scene or computing anything" + (f", or set {ENV}={path} beforehand." if path else f"; {_ADVICE}.")
+    )
+    try:
+        core = ctypes.CDLL(_core_library())
+        shutdown, init = core["_Z12jit_shutdowni"], core["_Z8jit_initj"]
+        launch_stats, id_bound = core["_Z16jit_launch_statsPmS_S_"], core["_Z21jit_registry_id_boundPKcS0_"]
+    except (OSError, AttributeError):
+        if not active:
+            return
+        raise ImportError(too_late.format("this version of it cannot be restarted")) from None
+
+    if active:
+        launches = [ctypes.c_size_t() for _ in range(3)]
+        launch_stats(*map(ctypes.byref, launches))
+        if launches[0].value:
+            raise ImportError(too_late.format("has run kernels on it"))
+        id_bound.argtypes, id_bound.restype = [ctypes.c_char_p] * 2, ctypes.c_uint32
+        if "mitsuba" in sys.modules:
+            for variant in sys.modules["mitsuba"].variants():
+                for domain in (b"Texture", b"BSDF", b"Shape", b"Emitter", b"Sensor", b"Scene", b"Sampler", b"Film"):
+                    if variant.startswith("llvm") and id_bound(variant.encode(), domain):
+                        raise ImportError(too_late.format("holds scene objects"))
+
+    shutdown(0)
+    with contextlib.nullcontext() if path else _hidden_llvm():
+        if path:
+            os.environ[ENV] = path
+        init(1 << 2)  # JitBackend::LLVM
+    init(1 << 1)  # JitBackend::CUDA
+
+
+def _core_library() -> str:
+    import drjit
+
+    name = {"linux": "libdrjit-core.so", "darwin": "libdrjit-core.dylib"}.get(sys.platform, "drjit-core.dll")
+    return os.path.join(os.path.dirname(drjit.__file__), name)
+
+
+@functools.lru_cache(maxsize=1)
+def _on_variant_change():
+    # One function object for the whole process: Mitsuba keeps the callbacks in a set.
+    def callback(old: str | None, new: str) -> None:
+        from . import plugins
+
+        plugins.register(new)
+
+    return callback
+
+
+def register_plugins() -> None:
+    """Register the plugins with the variant that is set, if any, and with every one that will be set."""
+    import mitsuba as mi
+
+    callback = _on_variant_change()
+    mi.detail.add_variant_callback(callback)
+    if mi.variant() is not None:
+        callback(None, mi.variant())
+
+
+def array_module(backend: str | None = None):
+    """
+    The module of differentiable Dr.Jit types to compute with outside of Mitsuba: ``drjit.llvm.ad`` or
+    ``drjit.cuda.ad``. ``backend`` is ``"llvm"``, ``"cuda"``, or ``None`` for the GPU if there is one.
+
+    Raises ``RuntimeError`` with one sentence if that backend cannot run here.
+    """
+    import drjit as dr
+
+    has_cuda = dr.has_backend(dr.JitBackend.CUDA)
+    backend = backend or ("cuda" if has_cuda else "llvm")
+    if backend == "cuda":
+        if not has_cuda:
+            raise RuntimeError('the backend "cuda" needs an NVIDIA GPU and its driver, and none was found')
+        import drjit.cuda.ad as module
+    elif backend == "llvm":
+        if not dr.has_backend(dr.JitBackend.LLVM):
+            raise RuntimeError(llvm_problem() or f"Dr.Jit could not start its LLVM backend: {_ADVICE}.")
+        import drjit.llvm.ad as module
+    else:
+        raise RuntimeError(f'the backend "{backend}" is unknown, allowed are "llvm" and "cuda"')
+    return module

@@ -1,0 +1,168 @@
+"""
+Scene files: load them, render them, swap every learned plugin for its exact counterpart.
+
+Everything here runs in the variant that is set.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from . import plugins
+
+
+class SceneError(RuntimeError):
+    """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
+
+
+def load(path: str | os.PathLike, exact: bool = False, **defines: str):
+    """
+    Load a scene as ``mi.load_file`` does; with ``exact``, every learned plugin is replaced by its exact counterpart.
+
+    ``defines`` replace the scene's ``<default>`` values. Raises :class:`SceneError`.
+    """
+    with _scene_errors(path), _resolving(path):
+        config = mi.parser.ParserConfig(mi.variant())
+        state = _parse(config, path, defines)
+        if exact:
+            swap_exact(state)
+        mi.parser.transform_all(config, state)
+        loaded = mi.parser.instantiate(config, state)
+        if not isinstance(loaded, mi.Scene):
+            raise RuntimeError(f"{path}: holds a {type(loaded).__name__}, a scene is expected")
+        return loaded
+
+
+def swap_exact(state) -> int:
+    """Replace learned plugins in a parsed scene (``mi.parser.ParserState``) by exact ones; returns how many."""
+    count = 0
+    for node in state.nodes:
+        props = node.props
+        counterpart = plugins.EXACT_COUNTERPARTS.get(props.plugin_name())
+        if counterpart is not None:
+            name, learned_only = counterpart
+            props.set_plugin_name(name)
+            for key in learned_only:
+                if key in props:
+                    del props[key]
+            count += 1
+    return count
+
+
+def learned_plugins(path: str | os.PathLike, **defines: str) -> list[dict]:
+    """
+    The learned plugins that a scene file names: ``plugin``, ``id``, ``parameters`` (constants as numbers, textures as
+    ``"texture"``), ``filename`` and ``storage`` of its tables. Raises :class:`SceneError`.
+    """
+    found = []
+    with _scene_errors(path), _resolving(path):
+        state = _parse(mi.parser.ParserConfig(mi.variant()), path, defines)
+        for node in state.nodes:
+            props = node.props
+            if props.plugin_name() not in plugins.EXACT_COUNTERPARTS:
+                continue
+            _, learned_only = plugins.EXACT_COUNTERPARTS[props.plugin_name()]
+            constants = {k: _constant(props, k) for k in props if k not in learned_only}
+            found.append({
+                "plugin": props.plugin_name(),
+                "id": props.id(),
+                "parameters": constants,
+                **{k: str(props[k]) for k in learned_only if k in props},
+            })  # fmt: skip
+    return found
+
+
+def render(
+    scene, spp: int | None = None, seed: int = 0, passes: int = 1, on_pass: Callable[[float], None] | None = None
+) -> tuple[np.ndarray, list[float]]:
+    """
+    Render in ``passes`` of about ``spp / passes`` samples each and average them.
+
+    Returns the linear image ``(height, width, channels)``, float32, and the seconds that each pass took (the first
+    includes compilation). ``on_pass(seconds)`` is called after each. The same arguments give the same image.
+    """
+    image, seconds = None, []
+    for n, done, pass_image in _passes(scene, spp, seed, passes, seconds):
+        image = pass_image * n if image is None else image + pass_image * n
+        total = done
+        if on_pass is not None:
+            on_pass(seconds[-1])
+    return (image / total).astype(np.float32), seconds
+
+
+def _passes(scene, spp, seed, passes, seconds) -> Iterator[tuple[int, int, np.ndarray]]:
+    spp = spp or scene.sensors()[0].sampler().sample_count()
+    passes = max(1, min(passes, spp))
+    done = 0
+    for i in range(passes):
+        n = (i + 1) * spp // passes - i * spp // passes
+        start = time.perf_counter()
+        with _scene_errors(None):
+            image = mi.render(scene, spp=n, seed=((seed << 16) + i) % 2**32).numpy()
+        seconds.append(time.perf_counter() - start)
+        done += n
+        yield n, done, image.astype(np.float64)
+
+
+def _parse(config, path, defines: dict[str, str]):
+    if not Path(path).is_file():
+        raise RuntimeError(f"{path}: no such scene file")
+    return mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in defines.items()})
+
+
+def _constant(props, key: str):
+    kind = props.type(key)
+    if kind in (mi.Properties.Type.Float, mi.Properties.Type.Integer):
+        return float(props[key])
+    return "texture" if kind == mi.Properties.Type.Reference else str(props[key])
+
+
+@contextlib.contextmanager
+def _resolving(path):
+    """Look for relative file names beside the scene, as ``mi.load_file`` does."""
+    before = mi.file_resolver()
+    resolver = mi.FileResolver(before)
+    resolver.prepend(str(Path(path).resolve().parent))
+    mi.set_file_resolver(resolver)
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(before)
+
+
+@contextlib.contextmanager
+def _scene_errors(path):
+    """Turn Mitsuba's nested messages into one sentence."""
+    try:
+        yield
+    except SceneError:
+        raise
+    except (RuntimeError, TypeError, ValueError, OSError) as e:
+        message = one_sentence(e)
+        if path is not None and str(path) not in message:
+            message = f"{path}: {message}"
+        raise SceneError(message) from e
+
+
+def one_sentence(error: BaseException) -> str:
+    """
+    What went wrong, without the layers around it: Mitsuba prefixes source lines, embeds Python tracebacks, and hides
+    the cause of an error at render time behind ``drjit.custom(...) error``.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    text = re.sub(r"\[[\w.]+:\d+\] ", "", str(error)).strip()
+    head, traceback, tail = text.partition("Traceback (most recent call last):")
+    if traceback:
+        last = [line for line in tail.splitlines() if re.match(r"[\w.]+: ", line)][-1]
+        location = re.sub(r"failed to instantiate.*", "", head.strip())
+        text = location + last.split(": ", 1)[1]
+    return " ".join(text.split())

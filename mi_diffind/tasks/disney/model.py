@@ -1,0 +1,217 @@
+"""
+The reference: Burley, *Physically Based Shading at Disney*, 2012.
+
+All functions work on Dr.Jit arrays of one width, in the local frame with the normal (0, 0, 1), for unit directions
+``wi`` (towards the viewer) and ``wo`` (towards the light) with positive cosines ``wi.z`` and ``wo.z``; what a caller
+does with other directions is up to him, nothing becomes NaN. Values include the cosine ``wo.z``, as in Mitsuba.
+
+The colour is affine in the tint ``albedo / luminance(albedo)``: ``f = tint · x + y``. So the model only ever produces
+two scalars for each lobe (:func:`compose`), made of a few factors (:class:`Factors`), and tables need to replace
+nothing but the factors.
+
+Two choices where descriptions of the model differ: the specular reflectance at normal incidence is
+``0.08 · specular`` (Burley; the paper's own evaluation uses 0.1), and the clearcoat's masking term is *not* divided
+by ``4 (n·l)(n·v)``, as in Mitsuba's ``principled``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import drjit as dr
+
+from ...lookup import clamp
+
+#: Smallest GGX roughness α, as in Mitsuba's ``principled``.
+ALPHA_MIN = 1e-3
+
+#: Reflectance at normal incidence for ``specular = 1``.
+SPECULAR_SCALE = 0.08
+
+#: The clearcoat's fixed values: strength, Schlick's reflectance at normal incidence, α of its masking term.
+COAT_STRENGTH, COAT_F0, COAT_MASKING_ALPHA = 0.25, 0.04, 0.25
+
+#: The lobes, in the order of a BSDF's components.
+LOBES = ("diffuse", "specular", "clearcoat")
+
+#: Added to squared lengths before dividing: far below what directions produce, far above the smallest float.
+TINY = 1e-30
+
+
+@dataclass
+class Material:
+    """The ten artist parameters, in [0, 1] each (``specular`` up to 3 for high indices of refraction)."""
+
+    metallic: Any
+    roughness: Any
+    anisotropic: Any
+    specular: Any
+    spec_tint: Any
+    sheen: Any
+    sheen_tint: Any
+    flatness: Any
+    clearcoat: Any
+    clearcoat_gloss: Any
+
+
+PARAMETERS = tuple(f.name for f in fields(Material))
+
+
+@dataclass
+class Factors:
+    """
+    What depends on the directions, each a scalar array. ``c = wo.z``, ``s = (1 − l·h)^5``, ``m`` = metallic.
+
+    ``specular``: D · G · c / (4 (n·l)(n·v)); ``metal_base``: m (1 − s); ``base``: (1 − m)(1 − s);
+    ``sheen``: (1 − m) s c; ``grazing``: s; ``diffuse``: base diffuse · c; ``flat``: subsurface approximation · c;
+    ``clearcoat``: GTR1 · G · F · c without its strength.
+    """
+
+    specular: Any
+    metal_base: Any
+    base: Any
+    sheen: Any
+    grazing: Any
+    diffuse: Any
+    flat: Any
+    clearcoat: Any
+
+
+@dataclass
+class Geometry:
+    """Unnormalised half vector ``h = wi + wo``, its squared length, and the cosine between it and ``wo``."""
+
+    h: Any
+    h2: Any
+    cos_d: Any
+
+
+def geometry(wi, wo) -> Geometry:
+    """For unit vectors, ``l·h = |wi + wo| / 2``: no normalisation, and no 0/0 where the directions are opposite."""
+    h = wi + wo
+    h2 = dr.squared_norm(h)
+    return Geometry(h, h2, dr.minimum(0.5 * dr.sqrt(h2 + TINY), 1))
+
+
+def schlick(cosine):
+    """(1 − cos)^5."""
+    m = 1 - cosine
+    m2 = m * m
+    return m2 * m2 * m
+
+
+def roughness_to_alpha(roughness, anisotropic):
+    """``(α_x, α_y)``: roughness² over and times the aspect √(1 − 0.9 anisotropic), at least :data:`ALPHA_MIN`."""
+    aspect = dr.sqrt(1 - 0.9 * anisotropic)
+    alpha = dr.square(roughness)
+    return dr.maximum(alpha / aspect, ALPHA_MIN), dr.maximum(alpha * aspect, ALPHA_MIN)
+
+
+def masking_denominator(w, ax, ay):
+    """
+    ``d(w) = c + √(c² + α_x² x² + α_y² y²)`` with ``c = w.z``: Smith's masking is ``G₁ = 2c / d``, and
+    ``G / (4 (n·l)(n·v)) = 1 / (d(wi) d(wo))`` is finite at the horizon, where ``d ≥ min(α_x, α_y)``.
+    """
+    return w.z + dr.sqrt(dr.square(w.z) + dr.square(ax * w.x) + dr.square(ay * w.y))
+
+
+def ggx(g: Geometry, ax, ay):
+    """Anisotropic GTR2 (GGX) for a half vector that need not be normalised."""
+    stretched = dr.square(g.h.x / ax) + dr.square(g.h.y / ay) + dr.square(g.h.z)
+    return dr.square(g.h2 / (stretched + TINY)) / (dr.pi * ax * ay)
+
+
+def coat_alpha(gloss):
+    """α of the clearcoat: mix(0.1, 0.001, gloss)."""
+    return 0.1 + (0.001 - 0.1) * gloss
+
+
+def gtr1(g: Geometry, alpha):
+    """
+    GTR1 with the denominator written as ``sin² + α² cos²``: the published form ``1 + (α² − 1) cos²`` cancels near the
+    peak, to zero or below it.
+    """
+    a2 = dr.square(alpha)
+    denominator = dr.square(g.h.x) + dr.square(g.h.y) + a2 * dr.square(g.h.z)
+    return (a2 - 1) / (dr.pi * dr.log(a2)) * g.h2 / (denominator + TINY)
+
+
+def coat_masking(cosine):
+    """Smith's G₁ for the clearcoat's fixed α."""
+    a2 = COAT_MASKING_ALPHA**2
+    return 2 * cosine / (cosine + dr.sqrt(a2 + (1 - a2) * dr.square(cosine)))
+
+
+def diffuse_factors(roughness, cos_d, fresnel_sum, fresnel_product, cos_ratio, cos_o):
+    """
+    Burley's base diffuse and the Hanrahan–Krueger-inspired subsurface approximation, times ``cos_o``, from
+    ``F_L + F_V``, ``F_L F_V`` and ``cos_o / (cos_i + cos_o)``.
+    """
+    f90 = 2 * roughness * dr.square(cos_d)
+    k = f90 - 0.5
+    diffuse = dr.fma(k, fresnel_sum + k * fresnel_product, 1) * cos_o
+    k = 0.5 * f90 - 1
+    fss = dr.fma(k, fresnel_sum + k * fresnel_product, 1)
+    flat = 1.25 * (fss * (cos_ratio - 0.5 * cos_o) + 0.5 * cos_o)
+    return diffuse, flat
+
+
+def exact_factors(material: Material, wi, wo) -> Factors:
+    """The factors, straight from the formulas."""
+    g = geometry(wi, wo)
+    ax, ay = roughness_to_alpha(material.roughness, material.anisotropic)
+    s = schlick(g.cos_d)
+    fl, fv = schlick(wo.z), schlick(wi.z)
+    diffuse, flat = diffuse_factors(
+        material.roughness, g.cos_d, fl + fv, fl * fv, wo.z / (wi.z + wo.z + TINY), wo.z
+    )
+    specular = ggx(g, ax, ay) * wo.z / (masking_denominator(wi, ax, ay) * masking_denominator(wo, ax, ay))
+    coat_fresnel = COAT_F0 + (1 - COAT_F0) * s
+    return Factors(
+        specular=specular,
+        metal_base=material.metallic * (1 - s),
+        base=(1 - material.metallic) * (1 - s),
+        sheen=(1 - material.metallic) * s * wo.z,
+        grazing=s,
+        diffuse=diffuse,
+        flat=flat,
+        clearcoat=gtr1(g, coat_alpha(material.clearcoat_gloss))
+        * coat_masking(wi.z) * coat_masking(wo.z) * coat_fresnel * wo.z,
+    )  # fmt: skip
+
+
+def compose(material: Material, luminance, f: Factors) -> dict[str, tuple]:
+    """
+    For each lobe the pair ``(x, y)`` of ``f = tint · x + y``; ``luminance`` is that of the albedo.
+
+    All are non-negative if the factors are.
+    """
+    m, one = material, 1
+    f0 = SPECULAR_SCALE * m.specular
+    sheen = m.sheen * f.sheen
+    return {
+        "diffuse": (
+            (one - m.metallic) * luminance * dr.inv_pi * dr.fma(m.flatness, f.flat - f.diffuse, f.diffuse)
+            + sheen * m.sheen_tint,
+            sheen * (one - m.sheen_tint),
+        ),
+        "specular": (
+            f.specular * (luminance * f.metal_base + f0 * m.spec_tint * f.base),
+            f.specular * (f0 * (one - m.spec_tint) * f.base + f.grazing),
+        ),
+        "clearcoat": (0, COAT_STRENGTH * m.clearcoat * f.clearcoat),
+    }
+
+
+def tint(albedo, luminance):
+    """``albedo / luminance``, and 1 for black, which has no hue."""
+    visible = luminance > 1e-6
+    return dr.select(visible, albedo / dr.select(visible, luminance, 1), 1)
+
+
+def sanitize(material: Material, specular_max: float = 3.0) -> Material:
+    """Every parameter limited to its range, NaN to 0: textures and optimisers overshoot."""
+    return Material(
+        **{n: clamp(getattr(material, n), 0.0, specular_max if n == "specular" else 1.0) for n in PARAMETERS}
+    )

@@ -1,0 +1,386 @@
+from __future__ import annotations  # Delayed parsing of type annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_diffind.tasks.disney import model, sampling
+from mi_diffind.tasks.disney.model import LOBES, PARAMETERS, Material
+
+_DIFFERENTIABLE = mi.ParamFlags.Differentiable
+_DISCONTINUOUS = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
+
+#: Largest index of refraction whose reflectance the model is asked to express (``specular`` = 3.1).
+ETA_MAX = 3.0
+
+
+class Disney(mi.BSDF):
+    r"""
+    .. _bsdf-disney:
+
+    Disney BRDF (:monosp:`disney`)
+    ------------------------------
+
+    .. pluginparameters::
+
+     * - base_color
+       - |spectrum| or |texture|
+       - The albedo of the material. (Default: 0.5)
+       - |exposed|, |differentiable|
+
+     * - roughness
+       - |float| or |texture|
+       - Roughness of the diffuse and of the specular lobe; GGX :math:`\alpha = \mathrm{roughness}^2`, at least
+         :math:`10^{-3}`. (Default: 0.5)
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - anisotropic
+       - |float| or |texture|
+       - Stretches the highlight along the tangent. (Default: 0.0)
+       - |exposed|, |differentiable|
+
+     * - metallic
+       - |float| or |texture|
+       - Blends from a dielectric with diffuse reflection to a metal coloured by the albedo. (Default: 0.0)
+       - |exposed|, |differentiable|
+
+     * - specular
+       - |float| or |texture|
+       - Reflectance of the dielectric at normal incidence, as a fraction of 0.08. (Default: 0.5)
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - eta
+       - |float| or |texture|
+       - The same as a relative index of refraction in [1, 3], instead of ``specular``: reflectance
+         :math:`((\eta - 1)/(\eta + 1))^2`.
+       - |exposed|, |differentiable|, |discontinuous|
+
+     * - spec_tint
+       - |float| or |texture|
+       - Tints the dielectric's specular reflection with the albedo's hue. (Default: 0.0)
+       - |exposed|, |differentiable|
+
+     * - sheen
+       - |float| or |texture|
+       - An additional grazing reflection, for cloth. (Default: 0.0)
+       - |exposed|, |differentiable|
+
+     * - sheen_tint
+       - |float| or |texture|
+       - Tints the sheen with the albedo's hue. (Default: 0.0)
+       - |exposed|, |differentiable|
+
+     * - flatness
+       - |float| or |texture|
+       - Blends the diffuse lobe to an approximation of subsurface scattering. Also accepted as ``subsurface``.
+         (Default: 0.0)
+       - |exposed|, |differentiable|
+
+     * - clearcoat
+       - |float| or |texture|
+       - Strength of a second, colourless specular lobe. (Default: 0.0)
+       - |exposed|, |differentiable|
+
+     * - clearcoat_gloss
+       - |float| or |texture|
+       - Its glossiness, from satin to gloss. (Default: 0.0)
+       - |exposed|, |differentiable|
+
+     * - spec_trans
+       - |float|
+       - Accepted if 0, for the sake of scenes written for :monosp:`principled`: the model has no transmission.
+         (Default: 0.0)
+       - --
+
+     * - diffuse_reflectance_sampling_rate, main_specular_sampling_rate, clearcoat_sampling_rate
+       - |float|
+       - Factors on the share of samples that each lobe gets. (Default: 1.0)
+       - |exposed|
+
+    The reflection model of *Physically Based Shading at Disney* (Burley 2012), evaluated from its formulas. It is the
+    exact counterpart of :ref:`neural_disney <bsdf-neural_disney>` and has the same parameters, whose names and
+    meaning follow Mitsuba's :monosp:`principled`: changing ``type`` is all it takes. All are in [0, 1]: constants
+    outside are refused, textures are clamped. Differences to ``principled``: Schlick's Fresnel term in place of the
+    dielectric one, and no transmission.
+
+    It reflects on the front side only; put it into a :monosp:`twosided` for both. Components: 0 diffuse and sheen,
+    1 specular, 2 clearcoat.
+
+    Values and gradients are finite for every input: grazing directions, roughness 0, black albedo. Sampling is
+    detached: gradients flow through the value of a sample, not through its position or density, which keeps them
+    unbiased where the choice of a lobe depends on a parameter.
+
+    .. tabs::
+        .. code-tab:: xml
+            :name: disney
+
+            <bsdf type="disney">
+                <rgb name="base_color" value="0.8, 0.2, 0.1"/>
+                <float name="roughness" value="0.3"/>
+                <float name="clearcoat" value="1.0"/>
+                <float name="clearcoat_gloss" value="0.9"/>
+            </bsdf>
+
+        .. code-tab:: python
+
+            'type': 'disney',
+            'base_color': {
+                'type': 'rgb',
+                'value': [0.8, 0.2, 0.1]
+            },
+            'roughness': 0.3,
+            'clearcoat': 1.0,
+            'clearcoat_gloss': 0.9
+    """
+
+    #: Parameter → default, in the order of the manual page.
+    DEFAULTS = {  # noqa: RUF012
+        "roughness": 0.5,
+        "anisotropic": 0.0,
+        "metallic": 0.0,
+        "spec_tint": 0.0,
+        "sheen": 0.0,
+        "sheen_tint": 0.0,
+        "flatness": 0.0,
+        "clearcoat": 0.0,
+        "clearcoat_gloss": 0.0,
+    }
+
+    RATES = {  # noqa: RUF012
+        "diffuse": "diffuse_reflectance_sampling_rate",
+        "specular": "main_specular_sampling_rate",
+        "clearcoat": "clearcoat_sampling_rate",
+    }
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+
+        if props.has_property("subsurface"):
+            if props.has_property("flatness"):
+                raise RuntimeError('"flatness" and "subsurface" are two names of one parameter, give only one')
+            aliases = {"flatness": "subsurface"}
+        else:
+            aliases = {}
+
+        self.base_color = props.get_texture("base_color", 0.5)
+        _check_range("base_color", self.base_color, 0, 1)
+        self.scalars = {}
+        for name, default in self.DEFAULTS.items():
+            given = aliases.get(name, name)
+            self.scalars[name] = props.get_texture(given, default)
+            _check_range(given, self.scalars[name], 0, 1)
+
+        # As in `principled`, a constant is exposed under its own name and not as a texture's value
+        if props.has_property("eta") and props.has_property("specular"):
+            raise RuntimeError('"eta" and "specular" are two ways to say one thing, give only one')
+        self.reflectance_name = "eta" if props.has_property("eta") else "specular"
+        low, high = (1, ETA_MAX) if self.reflectance_name == "eta" else (0, 1)
+        name = self.reflectance_name
+        if not props.has_property(name) or props.type(name) in (mi.Properties.Type.Float, mi.Properties.Type.Integer):
+            value = float(props.get(name, 0.5))
+            if not low <= value <= high:
+                raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is [{low}, {high}]')
+            self.reflectance = mi.Float(value)
+            dr.make_opaque(self.reflectance)
+        else:
+            self.reflectance = props.get_texture(name)
+            _check_range(name, self.reflectance, low, high)
+
+        if props.has_property("spec_trans"):
+            transmission = props.get_texture("spec_trans", 0.0)
+            if _bounds(transmission)[1] > 0:
+                raise RuntimeError(
+                    'parameter "spec_trans": found a value above 0, but this model has no transmission; '
+                    'use Mitsuba\'s "principled" for it'
+                )
+
+        self.rates = {}
+        for lobe, name in self.RATES.items():
+            rate = float(props.get(name, 1.0))
+            if not 0 <= rate < float("inf"):
+                raise RuntimeError(f'parameter "{name}": found {rate:g}, a number ≥ 0 is needed')
+            self.rates[lobe] = mi.Float(rate)
+            dr.make_opaque(self.rates[lobe])
+
+        front = mi.BSDFFlags.FrontSide
+        if any(t.is_spatially_varying() for t in self._textures().values()):
+            front = front | mi.BSDFFlags.SpatiallyVarying
+        glossy = mi.BSDFFlags.GlossyReflection | front
+        anisotropic = glossy | mi.BSDFFlags.Anisotropic
+        is_anisotropic = _bounds(self.scalars["anisotropic"])[1] > 0
+        self.m_components = [
+            mi.BSDFFlags.DiffuseReflection | front,
+            anisotropic if is_anisotropic else glossy,
+            glossy,
+        ]
+        self.m_flags = self.m_components[0] | self.m_components[1] | self.m_components[2]
+
+    # -- what the learned plugin replaces ---------------------------------------------------------------------------
+
+    def factors(self, material: Material, wi: mi.Vector3f, wo: mi.Vector3f, active: mi.Bool) -> model.Factors:
+        """The factors of the BRDF that depend on the directions."""
+        return model.exact_factors(material, wi, wo)
+
+    # -- parameters -------------------------------------------------------------------------------------------------
+
+    def _textures(self) -> dict[str, mi.Texture]:
+        textures = {"base_color": self.base_color, **self.scalars}
+        if isinstance(self.reflectance, mi.Texture):
+            textures[self.reflectance_name] = self.reflectance
+        return textures
+
+    def traverse(self, cb: mi.TraversalCallback):
+        cb.put("base_color", self.base_color, _DIFFERENTIABLE)
+        for name, texture in self.scalars.items():
+            cb.put(name, texture, _DISCONTINUOUS if name == "roughness" else _DIFFERENTIABLE)
+        cb.put(self.reflectance_name, self.reflectance, _DISCONTINUOUS)
+        for lobe, name in self.RATES.items():
+            cb.put(name, self.rates[lobe], mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys: list[str] = ()):
+        # A number assigned from Python is a literal, which would become part of the kernel and recompile it
+        if not isinstance(self.reflectance, mi.Texture):
+            dr.make_opaque(self.reflectance)
+        dr.make_opaque(self.rates)
+
+    def _material(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Material:
+        values = {name: texture.eval_1(si, active) for name, texture in self.scalars.items()}
+        texture = isinstance(self.reflectance, mi.Texture)
+        specular = self.reflectance.eval_1(si, active) if texture else self.reflectance
+        if self.reflectance_name == "eta":
+            specular = dr.square((specular - 1) / (specular + 1)) / model.SPECULAR_SCALE
+        return model.sanitize(Material(specular=specular, **values), dr.square((ETA_MAX - 1) / (ETA_MAX + 1)) / 0.08)
+
+    def _albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool):
+        """The albedo in [0, 1] (NaN → 0) and its luminance."""
+        albedo = mi.UnpolarizedSpectrum(model.clamp(self.base_color.eval(si, active), 0.0, 1.0))
+        if mi.is_monochromatic:
+            return albedo, albedo[0]
+        if mi.is_rgb:
+            return albedo, mi.luminance(albedo)
+        # A mean over the sampled wavelengths, weighted by the luminous efficiency: 1 for a white albedo whatever they
+        # are (Mitsuba's `luminance` alone varies with them)
+        one = mi.UnpolarizedSpectrum(1)
+        weight = mi.luminance(one, si.wavelengths) + 1e-6
+        return albedo, (mi.luminance(albedo, si.wavelengths) + 1e-6 * dr.mean(albedo)) / weight
+
+    # -- evaluation -------------------------------------------------------------------------------------------------
+
+    def _rates(self, ctx: mi.BSDFContext) -> dict[str, mi.Float]:
+        """The sampling rates of the lobes that the context asks for; the others are missing."""
+        flags = (mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.GlossyReflection)
+        return {
+            lobe: self.rates[lobe]
+            for component, (lobe, flag) in enumerate(zip(LOBES, flags, strict=True))
+            if ctx.is_enabled(flag, component)
+        }
+
+    def _prepare(self, si, wo, active):
+        """Directions that are safe to compute with in every lane, and the lanes whose result counts."""
+        active = active & (si.wi.z > 0) & (wo.z > 0)
+        up = mi.Vector3f(0, 0, 1)
+        return dr.select(active, si.wi, up), dr.select(active, wo, up), active
+
+    def _value(self, lobes, material, albedo, luminance, wi, wo, active):
+        parts = model.compose(material, luminance, self.factors(material, wi, wo, active))
+        x = sum(parts[lobe][0] for lobe in lobes)
+        y = sum(parts[lobe][1] for lobe in lobes)
+        value = mi.UnpolarizedSpectrum(model.tint(albedo, luminance) * x + y)
+        return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
+
+    def _density(self, rates, material, luminance, wi, wo, active):
+        # Detached, see the manual page
+        with dr.suspend_grad():
+            every = {lobe: rates.get(lobe, mi.Float(0)) for lobe in LOBES}
+            probabilities = sampling.lobe_probabilities(material, luminance, wi.z, every)
+            pdf = sampling.density(material, probabilities, wi, wo)
+            return dr.detach(dr.select(active, pdf, 0))
+
+    def eval(self, ctx, si, wo, active=True):
+        wi, wo, active = self._prepare(si, wo, active)
+        return self._value(self._rates(ctx), self._material(si, active), *self._albedo(si, active), wi, wo, active)
+
+    def pdf(self, ctx, si, wo, active=True):
+        wi, wo, active = self._prepare(si, wo, active)
+        _, luminance = self._albedo(si, active)
+        return self._density(self._rates(ctx), self._material(si, active), luminance, wi, wo, active)
+
+    def eval_pdf(self, ctx, si, wo, active=True):
+        wi, wo, active = self._prepare(si, wo, active)
+        return self._eval_pdf(self._rates(ctx), self._material(si, active), *self._albedo(si, active), wi, wo, active)
+
+    def _eval_pdf(self, rates, material, albedo, luminance, wi, wo, active):
+        value = self._value(rates, material, albedo, luminance, wi, wo, active)
+        return value, self._density(rates, material, luminance, wi, wo, active)
+
+    def sample(self, ctx, si, sample1, sample2, active=True):
+        rates = self._rates(ctx)
+        active = active & (si.wi.z > 0)
+        wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
+        material = self._material(si, active)
+        albedo, luminance = self._albedo(si, active)
+
+        bs = dr.zeros(mi.BSDFSample3f)
+        with dr.suspend_grad():
+            every = {lobe: rates.get(lobe, mi.Float(0)) for lobe in LOBES}
+            p = sampling.lobe_probabilities(material, luminance, wi.z, every)
+            is_diffuse = sample1 < p["diffuse"]
+            is_coat = ~is_diffuse & (sample1 < p["diffuse"] + p["clearcoat"])
+
+            ax, ay = model.roughness_to_alpha(material.roughness, material.anisotropic)
+            ggx = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, ax, ay, True)
+            half, _ = ggx.sample(wi, sample2)
+            coat_half = mi.Normal3f(*sampling.sample_gtr1(material.clearcoat_gloss, sample2))
+            wo = mi.reflect(wi, dr.select(is_coat, coat_half, half))
+            wo = dr.detach(dr.select(is_diffuse, mi.warp.square_to_cosine_hemisphere(sample2), wo))
+
+        bs.wo = wo
+        bs.eta = 1.0
+        bs.sampled_component = dr.select(is_diffuse, mi.UInt32(0), dr.select(is_coat, mi.UInt32(2), mi.UInt32(1)))
+        bs.sampled_type = dr.select(
+            is_diffuse, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+        )
+
+        active &= wo.z > 0
+        safe = dr.select(active, wo, mi.Vector3f(0, 0, 1))
+        value, bs.pdf = self._eval_pdf(rates, material, albedo, luminance, wi, safe, active)
+        active &= bs.pdf > 0
+        return bs, dr.select(active, value / dr.select(active, bs.pdf, 1), 0)
+
+    def eval_diffuse_reflectance(self, si, active=True):
+        return mi.depolarizer(mi.Spectrum(self.base_color.eval(si, active)))
+
+    def to_string(self):
+        lines = [f"  {name} = {_indent(texture)}," for name, texture in self._textures().items()]
+        if not isinstance(self.reflectance, mi.Texture):
+            lines.append(f"  {self.reflectance_name} = {self.reflectance},")
+        return f"{type(self).__name__}[\n" + "\n".join(lines) + "\n]"
+
+
+def _indent(value) -> str:
+    return str(value).replace("\n", "\n  ")
+
+
+def _bounds(texture: mi.Texture) -> tuple[float, float]:
+    """
+    Smallest and largest value: of a constant number exactly; of anything else 0 and the largest value it knows of
+    (Mitsuba itself refuses colours outside [0, 1], and what a texture has outside is clamped when it is read).
+    """
+    params = mi.traverse(texture)
+    if "value" in params and isinstance(params["value"], mi.Float):
+        value = params["value"].numpy()
+        return float(value.min()), float(value.max())
+    try:
+        return 0.0, float(texture.max())
+    except Exception:  # `max` is optional for textures
+        return 0.0, 1.0
+
+
+def _check_range(name: str, texture: mi.Texture, low: float, high: float) -> None:
+    if texture.is_spatially_varying():
+        return
+    for value in _bounds(texture):
+        if not low <= value <= high:  # NaN, too
+            raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is [{low}, {high}]')
+
+
+mi.register_bsdf("disney", lambda props: Disney(props))
