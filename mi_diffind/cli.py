@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from . import __version__, runtime
-from .files import OutputError, write_json, writable_folder
+from .files import OutputError, writable_file, writable_folder, write_json
 from .fitting import SCHEDULES, FittingError
 from .lookup import STORAGES
 from .tables import TableError
@@ -30,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
 
     try:
         if arguments.json is not None:
-            writable_folder(Path(arguments.json).parent)
+            writable_file(arguments.json)
         result = arguments.run(arguments)
         if arguments.json is not None:
             write_json(arguments.json, result)
@@ -59,7 +59,12 @@ def _parser() -> argparse.ArgumentParser:
     def scene_options(sub, rendering: bool = True):
         sub.add_argument("--variant", help="Mitsuba variant (default: cuda_ad_rgb with a GPU, else llvm_ad_rgb)")
         sub.add_argument(
-            "-D", dest="defines", action="append", default=[], metavar="NAME=VALUE", help="set a <default> of the scene"
+            "-D",
+            dest="defines",
+            action="append",
+            default=[],
+            metavar="NAME=VALUE",
+            help="set a <default> of the scene",
         )
         if rendering:
             sub.add_argument("--spp", type=_positive, help="samples per pixel (default: the scene's)")
@@ -90,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--lr", type=float, help="Adam's learning rate")
     sub.add_argument("--schedule", choices=SCHEDULES, help="course of the learning rate")
     sub.add_argument("--seed", type=_natural, help="seed of the random numbers")
+    sub.add_argument("--all-cores", action="store_true", help="faster, but not the same bytes each time")
     sub.add_argument("--checkpoint", metavar="FILE", help="keep the state of the training in FILE")
     sub.add_argument("--resume", action="store_true", help="go on from --checkpoint")
     return parser
@@ -145,7 +151,7 @@ def _render(arguments) -> dict:
     output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
     if output.suffix.lower() not in (".exr", ".png"):
         raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are .exr and .png')
-    writable_folder(output.parent)
+    writable_file(output)
     _set_variant(arguments.variant)
     import mitsuba as mi
 
@@ -198,7 +204,7 @@ def _inspect(arguments) -> dict:
     from .tables import load_table
 
     table = load_table(arguments.file)
-    print(f"{arguments.file}: tables for the task \"{table.task}\", {table.nbytes:,} bytes as {table.storage}")
+    print(f'{arguments.file}: tables for the task "{table.task}", {table.nbytes:,} bytes as {table.storage}')
     arrays = {}
     for name, array in table.arrays.items():
         values = table.values(name)
@@ -214,7 +220,10 @@ def _inspect(arguments) -> dict:
             f"  {name:22} {size:>9}, {array.shape[-1]} channels, {array.nbytes:6,} bytes, "
             f"values {values.min():.4g} to {values.max():.4g}"
         )
-    for title, content in (("trained with", {**table.settings, "seed": table.seed}), ("measured", table.quality)):
+    for title, content in (
+        ("trained with", {**table.settings, "seed": table.seed}),
+        ("measured", table.quality),
+    ):
         print(f"  {title}: " + ", ".join(f"{k} {v}" for k, v in content.items()))
     return {
         "file": arguments.file,
@@ -237,9 +246,7 @@ def _inspect_scene(arguments) -> dict:
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned material(s), {total:,} bytes of tables in {len(tables)} file(s)")
     for entry in learned:
-        given = ", ".join(
-            f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in entry["parameters"].items()
-        )
+        given = ", ".join(f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in entry["parameters"].items())
         print(f"  {entry['id']} ({entry['plugin']}): {given or 'defaults'}")
     return {
         "file": arguments.file,
@@ -253,12 +260,13 @@ def _fit(arguments) -> dict:
     output = Path(arguments.output)
     if output.suffix.lower() != ".npz":
         raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed is .npz')
-    writable_folder(output.parent)
+    writable_file(output)
     from .tables import save_table
     from .tasks.disney.training import DEFAULT_SETTINGS, fit_disney
 
     given = {k: getattr(arguments, k) for k in ("steps", "batch", "lr", "schedule", "seed")}
-    settings = dataclasses.replace(DEFAULT_SETTINGS, **{k: v for k, v in given.items() if v is not None})
+    given = {k: v for k, v in given.items() if v is not None}
+    settings = dataclasses.replace(DEFAULT_SETTINGS, deterministic=not arguments.all_cores, **given)
     try:
         table, result = fit_disney(
             settings, arguments.backend, arguments.storage, arguments.checkpoint, arguments.resume

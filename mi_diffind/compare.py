@@ -150,7 +150,13 @@ def figure(comparison: Comparison, path: str | os.PathLike) -> None:
     for ax in axes.flat:
         ax.set_axis_off()
     axes[1, 1].text(
-        0.02, 0.95, "\n".join(summary(f)), va="top", family="monospace", fontsize=12, transform=axes[1, 1].transAxes
+        0.02,
+        0.95,
+        "\n".join(summary(f)),
+        va="top",
+        family="monospace",
+        fontsize=12,
+        transform=axes[1, 1].transAxes,
     )
     with replacing(path) as temporary:
         sheet.savefig(temporary, format=Path(path).suffix[1:])

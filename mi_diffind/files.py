@@ -15,14 +15,14 @@ class OutputError(OSError):
 
 def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
     """
-    The folder ``path``, made if ``create``. Raises :class:`OutputError` if it does not exist or cannot be written.
+    The folder ``path``, made if ``create`` and its parent exists. Raises :class:`OutputError` if it does not exist or cannot be written.
 
     Called before long work starts, so that a typing error costs seconds, not the result.
     """
     path = Path(path)
     try:
-        if create:
-            path.mkdir(parents=True, exist_ok=True)
+        if create and path.parent.is_dir() and not path.exists():
+            path.mkdir()
         if not path.is_dir():
             kind = "is not a folder" if path.exists() else "does not exist"
             raise OutputError(f'output folder "{path}" {kind}')
@@ -35,16 +35,22 @@ def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
     return path
 
 
+def writable_file(path: str | os.PathLike) -> Path:
+    """The file ``path``, new or to be replaced. Raises :class:`OutputError` if its folder cannot be written."""
+    path = Path(path)
+    writable_folder(path.parent)
+    if path.is_dir():
+        raise OutputError(f'output file "{path}" is a folder')
+    return path
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike):
     """
     Yield the path of a temporary file beside ``path`` (with the same extension); rename it to ``path`` on success,
     remove it on failure. Raises :class:`OutputError` if the folder cannot be written.
     """
-    path = Path(path)
-    writable_folder(path.parent)
-    if path.is_dir():
-        raise OutputError(f'output file "{path}" is a folder')
+    path = writable_file(path)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.close(handle)
     try:

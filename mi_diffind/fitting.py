@@ -16,7 +16,6 @@ import sys
 import threading
 import time
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Protocol
 
 import drjit as dr
@@ -24,7 +23,7 @@ import numpy as np
 from drjit.opt import Adam
 from tqdm import tqdm
 
-from .files import replacing, writable_folder
+from .files import replacing, writable_file
 
 SCHEDULES = ("constant", "cosine", "plateau")
 LOSSES = ("mae", "mse")
@@ -59,6 +58,10 @@ class FitSettings:
     How to train. ``lr`` is Adam's learning rate, ``schedule`` its course: ``"constant"``, ``"cosine"`` (to zero) or
     ``"plateau"`` (halved when the loss has not improved for a tenth of the steps). ``quality_every`` and
     ``check_every`` are numbers of steps between measurements and between looks at the loss.
+
+    With ``deterministic``, the same settings give the same bytes: the LLVM backend then trains on one core, since
+    the sums that several make together depend on who comes first (in their last digits). No effect on CUDA, where
+    sums are made by atomics.
     """
 
     steps: int = 2000
@@ -69,6 +72,7 @@ class FitSettings:
     seed: int = 0
     quality_every: int = 200
     check_every: int = 20
+    deterministic: bool = True
 
     def __post_init__(self):
         for name, low in (("steps", 1), ("batch", 1), ("quality_every", 1), ("check_every", 1), ("seed", 0)):
@@ -121,9 +125,10 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
     """
     net = problem.net
     if checkpoint is not None:
-        writable_folder(Path(checkpoint).parent)
+        writable_file(checkpoint)
     trainer, plateau = _Trainer(problem, settings), _Plateau(settings)
     best, best_quality, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
+    reference = None  # a running mean of the loss; from the first step on, lest an explosion right after it sets it
     if resume:
         if checkpoint is None:
             raise FittingError("resuming needs the checkpoint file to resume from")
@@ -131,10 +136,11 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
         trainer.restore(state)
         best, best_quality, best_step = extra["best"], extra["best_quality"], extra["best_step"]
         history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
+        reference = extra["reference"]
         plateau.restore(extra["plateau"])
 
     start = time.perf_counter() - spent
-    good, reference = trainer.snapshot(), None
+    good = trainer.snapshot()
     bar = tqdm(total=settings.steps, initial=trainer.step, disable=None if progress else True, unit="step")
     log = log or (lambda message: tqdm.write(message, file=sys.stderr))
     interrupted = False
@@ -148,12 +154,14 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
             best, best_quality, best_step = trainer.snapshot().parameters, quality, trainer.step
         bar.set_postfix({"loss": f"{loss:.3g}", name: f"{value:.2f}"})
 
-    with _interruptible() as stop, bar:
+    with _interruptible() as stop, _cores(settings.deterministic), bar:
         while trainer.step < settings.steps and not stop.is_set():
+            before = trainer.snapshot()
             loss = trainer.take_step(plateau.factor)
             bar.update(1)
             last = trainer.step == settings.steps
-            if trainer.step % settings.check_every and trainer.step % settings.quality_every and not last:
+            due = trainer.step % settings.check_every == 0 or trainer.step % settings.quality_every == 0
+            if not (due or last or reference is None):
                 continue
             value = float(loss[0])
             if _diverged(value, reference) or not trainer.finite():
@@ -173,15 +181,16 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
                 continue
             reference = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
-            good = trainer.snapshot()
+            good = before  # not the state after this step: nobody has seen its loss yet
             if trainer.step % settings.quality_every == 0 or last:
                 measure(value)
                 if checkpoint is not None:
                     extra = {
                         "best": best, "best_quality": best_quality, "best_step": best_step, "history": history,
                         "restarts": restarts, "seconds": time.perf_counter() - start, "plateau": plateau.state(),
+                        "reference": reference,
                     }  # fmt: skip
-                    _save_checkpoint(checkpoint, settings, good, extra)
+                    _save_checkpoint(checkpoint, settings, trainer.snapshot(), extra)
         if stop.is_set() and trainer.step < settings.steps:
             interrupted = True
             if best is None and trainer.finite():
@@ -190,9 +199,7 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
     if best is None:
         raise FittingError("the training was stopped before its first measurement: there is nothing to keep")
     trainer.load_parameters(best)
-    return FitResult(
-        best_quality, best_step, trainer.step, time.perf_counter() - start, interrupted, restarts, history
-    )
+    return FitResult(best_quality, best_step, trainer.step, time.perf_counter() - start, interrupted, restarts, history)
 
 
 def _diverged(value: float, reference: float | None) -> bool:
@@ -325,6 +332,17 @@ def _load_checkpoint(path, settings: FitSettings, trainer: _Trainer) -> tuple[_S
         changed = [k for k, v in asdict(settings).items() if meta["settings"].get(k) != v]
         raise FittingError(f'the checkpoint "{path}" was made with other settings ({", ".join(changed)})')
     return state, {**meta, "best": best}
+
+
+@contextlib.contextmanager
+def _cores(deterministic: bool):
+    before = dr.thread_count()
+    if deterministic:
+        dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
 
 
 @contextlib.contextmanager

@@ -78,7 +78,7 @@ class DifferentiableArray(nn.Module):
     }
 
     def __init__(self, resolution=(2,), channels=1, init="constant", value=None, fold=False, border="clamp"):
-        resolution = (resolution,) if isinstance(resolution, int) else tuple(int(n) for n in resolution)
+        resolution = tuple(int(n) for n in np.atleast_1d(resolution))
         border = (border,) * len(resolution) if isinstance(border, str) else tuple(border)
         if not 1 <= len(resolution) <= 4 or min(resolution) < 1:
             raise ValueError(f"resolution: found {resolution}, allowed are 1 to 4 dimensions of at least 1 entry each")
@@ -101,6 +101,10 @@ class DifferentiableArray(nn.Module):
         self.init = init
         random = isinstance(init, str) and init == "random"
         self.value = value if value is not None else (0.0, 1.0) if random else 0.5
+        if random and np.shape(self.value) != (2,):
+            raise ValueError(f'value: found {value}, init="random" needs a pair (low, high)')
+        if isinstance(init, str) and init == "constant" and np.shape(self.value) not in ((), (1,), (self.channels,)):
+            raise ValueError(f"value: found {value}, one number or {self.channels} are needed, one a channel")
         self.data = None
 
     # -- allocation and storage forms -------------------------------------------------------------------------------
@@ -121,8 +125,13 @@ class DifferentiableArray(nn.Module):
             drawn = rng.random(_module(dtype).Float, int(np.prod(shape)))
             values = low + (high - low) * drawn.numpy().reshape(shape)
         result = self._like()
+        result.storage = "float16" if dr.is_half_v(dtype) else "float32"
         result.data = _tensor(dtype, values, self.resolution, self.channels)
         return result, self.channels
+
+    def _require_entries(self) -> None:
+        if self.data is None:
+            raise RuntimeError("this DifferentiableArray has no entries yet: call .alloc(tensor type) first")
 
     def _like(self) -> DifferentiableArray:
         """A copy that shares everything but the cache of parameter names."""
@@ -150,6 +159,10 @@ class DifferentiableArray(nn.Module):
         With ``storage="uint8"``, ``quantization = (scale, offset)`` says that ``values`` are already bytes.
         """
         values = np.asarray(values)
+        if storage not in lookup.STORAGES:
+            raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
+        if values.ndim < 2:
+            raise ValueError(f"values: found shape {values.shape}, the last axis has to be the channels")
         result = cls(values.shape[:-1], values.shape[-1], "constant", None, fold, border)
         result.storage = storage
         if storage == "uint8":
@@ -167,6 +180,7 @@ class DifferentiableArray(nn.Module):
 
     def numpy(self) -> np.ndarray:
         """The entries as they are interpolated (after the fold, dequantised), float32, ``(N_1, …, N_d, channels)``."""
+        self._require_entries()
         if self.storage == "uint8":
             codes = self.codes().astype(np.float64)
             return (np.asarray(self.offset) + np.asarray(self.scale) * codes).astype(np.float32)
@@ -201,14 +215,20 @@ class DifferentiableArray(nn.Module):
 
     def __call__(self, x, active=True):
         """Read at ``x`` (see the class). ``active`` masks lanes that must not access memory; they return 0."""
-        if self.data is None:
-            raise RuntimeError("this DifferentiableArray has no entries yet: call .alloc(tensor type) first")
-        coordinates, is_coopvec = _coordinates(x)
+        self._require_entries()
+        coordinates, is_coopvec = _coordinates(x, _module(self.data).Float)
         if len(coordinates) != self.dims:
             raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(coordinates)} coordinate(s)")
         if self.storage == "uint8":
             values = lookup.read_packed(
-                self.data, self.scale, self.offset, self.resolution, self.channels, coordinates, self.border, active
+                self.data,
+                self.scale,
+                self.offset,
+                self.resolution,
+                self.channels,
+                coordinates,
+                self.border,
+                active,
             )
         else:
             expected = (*self.resolution, lookup.padded_channels(self.channels))
@@ -256,11 +276,17 @@ class Indirection(nn.Module):
         self.inputs = tuple(tuple(int(i) for i in group) for group in inputs)
         if [len(group) for group in self.inputs] != [p.dims for p in self.primary]:
             raise ValueError(f"inputs: found {self.inputs}, but the primaries have {[p.dims for p in self.primary]}")
+        if min(i for group in self.inputs for i in group) < 0:
+            raise ValueError(f"inputs: found {self.inputs}, an index is at least 0")
+
+    @property
+    def dims(self) -> int:
+        """Number of inputs."""
+        return 1 + max(i for group in self.inputs for i in group)
 
     def _alloc(self, dtype, size=-1, rng=None):
-        expected = 1 + max(i for group in self.inputs for i in group)
-        if size not in (-1, expected):
-            raise ValueError(f"an indirection of {expected} input(s) was given {size}")
+        if size not in (-1, self.dims):
+            raise ValueError(f"an indirection of {self.dims} input(s) was given {size}")
         primary = [p._alloc(dtype, p.dims, rng)[0] for p in self.primary]
         cascaded, channels = self.cascaded._alloc(dtype, self.cascaded.dims, rng)
         return Indirection(primary, cascaded, self.inputs), channels
@@ -277,6 +303,8 @@ class Indirection(nn.Module):
     def pointer(self, x, active=True) -> list:
         """The coordinate at which the cascaded array is read for the inputs ``x``."""
         x, _ = _coordinates(x)
+        if len(x) != self.dims:
+            raise ValueError(f"an indirection of {self.dims} input(s) was read at {len(x)} coordinate(s)")
         result = []
         for array, group in zip(self.primary, self.inputs, strict=True):
             result += array([x[i] for i in group], active)
@@ -315,12 +343,14 @@ def _tensor(dtype, values: np.ndarray, resolution, channels: int):
     return dtype(stored)
 
 
-def _coordinates(x):
-    """A list of single-precision arrays from whatever the caller passed, and whether it was a cooperative vector."""
-    if isinstance(x, nn.CoopVec):
-        return list(x), True
-    if isinstance(x, (list, tuple)):
-        return list(x), False
-    if dr.depth_v(x) == 1:
-        return [x], False
-    return list(x), False
+def _coordinates(x, default=None):
+    """
+    A list of single-precision arrays from whatever the caller passed, and whether it was a cooperative vector.
+    Numbers become arrays like the others, or like ``default``.
+    """
+    is_coopvec = isinstance(x, nn.CoopVec)
+    if not is_coopvec and not isinstance(x, (list, tuple)) and dr.depth_v(x) <= 1:
+        x = [x]
+    x = list(x)
+    Float = next((dr.float32_array_t(type(v)) for v in x if dr.is_jit_v(v)), default)
+    return [v if Float is None or type(v) is Float else Float(v) for v in x], is_coopvec

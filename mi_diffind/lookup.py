@@ -132,7 +132,14 @@ def read_float(data, resolution: Sequence[int], channels: int, x: Sequence, bord
 
 
 def read_packed(
-    words, scale, offset, resolution: Sequence[int], channels: int, x: Sequence, border: Sequence[str], active=True
+    words,
+    scale,
+    offset,
+    resolution: Sequence[int],
+    channels: int,
+    x: Sequence,
+    border: Sequence[str],
+    active=True,
 ):
     """
     Read a table of bytes packed in ``UInt32`` words (:func:`pack`). Channel ``k`` of the result is
@@ -179,7 +186,9 @@ def read_packed(
             index = lower if index is None else dr.fma(index, n, lower)
         terms.append((weight, fetch(index)))
     sums = terms[0][1] if terms[0][0] is None else _weighted_sum(terms)
-    return [dr.fma(s - 1, 256 * scale[k], offset[k]) for k, s in enumerate(sums)]
+    values = [dr.fma(s - 1, 256 * scale[k], offset[k]) for k, s in enumerate(sums)]
+    # A masked gather gives the byte 0, which means `offset`, not 0.
+    return values if active is True else [dr.select(active, v, 0) for v in values]
 
 
 def quantize(values, channels: int):
@@ -192,6 +201,8 @@ def quantize(values, channels: int):
     import numpy as np
 
     flat = np.asarray(values, dtype=np.float64).reshape(-1, channels)
+    if not np.isfinite(flat).all():
+        raise ValueError("entries that are NaN or infinite cannot be stored as bytes")
     offset = flat.min(axis=0)
     scale = (flat.max(axis=0) - offset) / 255
     codes = np.rint((flat - offset) / np.where(scale > 0, scale, 1))

@@ -105,9 +105,7 @@ def _newest_first(paths) -> list[str]:
     return sorted(usable, key=lambda p: (_named_version(os.path.basename(p)), p), reverse=True)
 
 
-def choose_llvm(
-    environ=os.environ, pip=pip_libraries, system=system_libraries, version=library_version
-) -> Choice:
+def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, version=library_version) -> Choice:
     """
     Choose the LLVM library: an explicit setting wins, then pip's, then the system's. Changes nothing.
 
@@ -139,7 +137,9 @@ def choose_llvm(
             too_old.append(path)
     seen = f" (found only {too_old[0]}, which is too old)" if too_old else ""
     return Choice(
-        None, "none", f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}."
+        None,
+        "none",
+        f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}.",
     )
 
 
@@ -238,7 +238,16 @@ def _restart_llvm(path: str | None) -> None:
         id_bound.argtypes, id_bound.restype = [ctypes.c_char_p] * 2, ctypes.c_uint32
         if "mitsuba" in sys.modules:
             for variant in sys.modules["mitsuba"].variants():
-                for domain in (b"Texture", b"BSDF", b"Shape", b"Emitter", b"Sensor", b"Scene", b"Sampler", b"Film"):
+                for domain in (
+                    b"Texture",
+                    b"BSDF",
+                    b"Shape",
+                    b"Emitter",
+                    b"Sensor",
+                    b"Scene",
+                    b"Sampler",
+                    b"Film",
+                ):
                     if variant.startswith("llvm") and id_bound(variant.encode(), domain):
                         raise ImportError(too_late.format("holds scene objects"))
 

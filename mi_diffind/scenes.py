@@ -81,7 +81,11 @@ def learned_plugins(path: str | os.PathLike, **defines: str) -> list[dict]:
 
 
 def render(
-    scene, spp: int | None = None, seed: int = 0, passes: int = 1, on_pass: Callable[[float], None] | None = None
+    scene,
+    spp: int | None = None,
+    seed: int = 0,
+    passes: int = 1,
+    on_pass: Callable[[float], None] | None = None,
 ) -> tuple[np.ndarray, list[float]]:
     """
     Render in ``passes`` of about ``spp / passes`` samples each and average them.
@@ -119,10 +123,12 @@ def _parse(config, path, defines: dict[str, str]):
 
 
 def _constant(props, key: str):
-    kind = props.type(key)
-    if kind in (mi.Properties.Type.Float, mi.Properties.Type.Integer):
+    kind, types = props.type(key), mi.Properties.Type
+    if kind in (types.Float, types.Integer):
         return float(props[key])
-    return "texture" if kind == mi.Properties.Type.Reference else str(props[key])
+    if kind == types.Color:
+        return [float(v) for v in props[key]]
+    return "texture" if kind in (types.Reference, types.ResolvedReference) else str(props[key])
 
 
 @contextlib.contextmanager

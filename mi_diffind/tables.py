@@ -13,6 +13,7 @@ import io
 import json
 import math
 import os
+import textwrap
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,7 +77,14 @@ class Table:
             else:
                 arrays[name] = values.astype(_DTYPES[storage])
         return Table(
-            self.task, arrays, storage, self.borders, quantization, self.settings, self.seed, dict(self.quality)
+            self.task,
+            arrays,
+            storage,
+            self.borders,
+            quantization,
+            self.settings,
+            self.seed,
+            dict(self.quality),
         )
 
     def values(self, name: str) -> np.ndarray:
@@ -95,16 +103,20 @@ def save_table(path: str | os.PathLike, table: Table) -> None:
         raise TableError(f'{path}: storage "{table.storage}" is unknown, allowed are {STORAGES}')
     described = {}
     for name, array in table.arrays.items():
+        if name == "meta" or not name.isprintable():
+            raise TableError(f"{path}: an array cannot be called {name!r}")
         if array.dtype != dtype:
-            raise TableError(f'{path}: array "{name}" has the type {array.dtype}, storage "{table.storage}" needs {dtype}')
+            raise TableError(
+                f'{path}: array "{name}" has the type {array.dtype}, storage "{table.storage}" needs {dtype}'
+            )
         if dtype.kind == "f" and not np.isfinite(array).all():
             raise TableError(f'{path}: array "{name}" contains NaN or infinity')
-        described[name] = {
-            "shape": list(array.shape),
-            "border": list(table.borders.get(name, ("clamp",) * (array.ndim - 1))),
-        }
+        border = tuple(table.borders.get(name, ("clamp",) * (array.ndim - 1)))
+        _check_shape(path, name, array.shape, border)
+        described[name] = {"shape": list(array.shape), "border": list(border)}
         if table.storage == "uint8":
-            scale, offset = table.quantization[name]
+            scale, offset = table.quantization.get(name, ((), ()))
+            _check_affine(path, name, array.shape, scale, offset)
             described[name] |= {"scale": list(scale), "offset": list(offset)}
     meta = {
         "format_version": FORMAT_VERSION,
@@ -115,7 +127,10 @@ def save_table(path: str | os.PathLike, table: Table) -> None:
         "seed": table.seed,
         "quality": table.quality,
     }
-    text = np.frombuffer(json.dumps(meta, indent=1, allow_nan=False).encode(), dtype=np.uint8)
+    try:
+        text = np.frombuffer(json.dumps(meta, indent=1, allow_nan=False).encode(), dtype=np.uint8)
+    except (ValueError, TypeError) as e:
+        raise TableError(f"{path}: its settings, seed or quality cannot be written ({_reason(e)})") from None
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, array in {"meta": text, **table.arrays}.items():
             buffer = io.BytesIO()
@@ -142,17 +157,24 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
     except IsADirectoryError:
         raise TableError(f"{path}: is a folder, a table file (.npz) is expected") from None
     except zipfile.BadZipFile as e:
-        raise TableError(f"{path}: not a table file (.npz), or a truncated one ({e})") from None
-    except (OSError, EOFError, zipfile.LargeZipFile, NotImplementedError, RuntimeError) as e:
-        raise TableError(f"{path}: cannot be read ({e})") from None
+        raise TableError(f"{path}: not a table file (.npz), or a truncated one ({_reason(e)})") from None
+    except TableError:
+        raise
+    except Exception as e:  # zipfile, zlib, lzma and numpy each have their own for a damaged file
+        raise TableError(f"{path}: cannot be read ({_reason(e)})") from None
+
+
+def _reason(e: Exception) -> str:
+    """What ``e`` says, on one line and no longer than one."""
+    return textwrap.shorten(str(e), 100, placeholder="…") or type(e).__name__
 
 
 def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
     members = {}
     total = 0
     for info in archive.infolist():
-        if not info.filename.endswith(".npy"):
-            raise TableError(f'{path}: contains "{info.filename}", which is not an array')
+        if not info.filename.endswith(".npy") or not info.filename.isprintable():
+            raise TableError(f"{path}: contains {info.filename!r}, which is not an array")
         if info.filename[:-4] in members:
             raise TableError(f'{path}: contains the array "{info.filename[:-4]}" twice')
         members[info.filename[:-4]] = info
@@ -168,6 +190,8 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
         version, stored_task, storage = meta["format_version"], meta["task"], meta["storage"]
         described = {name: entry for name, entry in meta["arrays"].items()}
         settings, seed, quality = meta["settings"], meta["seed"], meta["quality"]
+        if not isinstance(settings, dict) or not isinstance(quality, dict):
+            raise TypeError("the settings and the quality have to be objects")
     except (ValueError, TypeError, KeyError, AttributeError) as e:
         raise TableError(f'{path}: its "meta" array is damaged ({type(e).__name__}: {e})') from None
     if version != FORMAT_VERSION:
@@ -190,19 +214,17 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
             shape = tuple(int(n) for n in entry["shape"])
             border = tuple(entry["border"])
             affine = [tuple(float(v) for v in entry[k]) for k in ("scale", "offset")] if storage == "uint8" else None
-        except (ValueError, TypeError, KeyError) as e:
-            raise TableError(f'{path}: the description of array "{name}" is damaged ({type(e).__name__}: {e})') from None
+        except (ValueError, TypeError, KeyError, OverflowError) as e:
+            raise TableError(
+                f'{path}: the description of array "{name}" is damaged ({type(e).__name__}: {e})'
+            ) from None
         wanted = shapes[name] if shapes is not None else shape
         if len(shape) != len(wanted) or any(w is not None and s != w for s, w in zip(shape, wanted, strict=True)):
             raise TableError(f'{path}: array "{name}" has the shape {shape}, expected {tuple(wanted)}')
-        if not 2 <= len(shape) <= 5 or min(shape) < 1:
-            raise TableError(f'{path}: array "{name}" has the shape {shape}, expected 1 to 4 dimensions and channels')
-        if len(border) != len(shape) - 1 or any(b not in BORDERS for b in border):
-            raise TableError(f'{path}: array "{name}" has the borders {border}, allowed are {BORDERS} for each axis')
+        _check_shape(path, name, shape, border)
         array = _array(archive, members[name], path, name, _DTYPES[storage], shape)
         if affine is not None:
-            if any(len(v) != shape[-1] or not all(map(math.isfinite, v)) for v in affine):
-                raise TableError(f'{path}: array "{name}" needs a finite scale and offset for each channel')
+            _check_affine(path, name, shape, *affine)
             table.quantization[name] = (affine[0], affine[1])
         elif not np.isfinite(array).all():
             raise TableError(f'{path}: array "{name}" contains NaN or infinity')
@@ -211,15 +233,30 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
     return table
 
 
+def _check_shape(path, name: str, shape: tuple, border: tuple) -> None:
+    if not 2 <= len(shape) <= 5 or min(shape) < 1:
+        raise TableError(f'{path}: array "{name}" has the shape {shape}, expected 1 to 4 dimensions and channels')
+    if len(border) != len(shape) - 1 or any(b not in BORDERS for b in border):
+        raise TableError(f'{path}: array "{name}" has the borders {border}, allowed are {BORDERS} for each axis')
+
+
+def _check_affine(path, name: str, shape: tuple, scale: tuple, offset: tuple) -> None:
+    if any(len(v) != shape[-1] or not all(map(math.isfinite, v)) for v in (scale, offset)):
+        raise TableError(f'{path}: array "{name}" needs a finite scale and offset for each channel')
+
+
 def _array(archive, info, path, name: str, dtype: np.dtype, shape: tuple | None) -> np.ndarray:
     """One member of the archive; its header is checked against the claimed size before anything is allocated."""
     with archive.open(info) as stream:
         try:
             version = np.lib.format.read_magic(stream)
-            reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+            reader = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version]
             found_shape, fortran, found_dtype = reader(stream)
         except (ValueError, KeyError) as e:
-            raise TableError(f'{path}: array "{name}" has a damaged header ({e})') from None
+            raise TableError(f'{path}: array "{name}" has a damaged header ({_reason(e)})') from None
         if found_dtype != dtype:
             raise TableError(f'{path}: array "{name}" has the type {found_dtype}, expected {dtype}')
         if fortran or (shape is not None and found_shape != shape):

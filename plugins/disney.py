@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.tasks.disney import model, sampling
-from mi_diffind.tasks.disney.model import LOBES, PARAMETERS, Material
+from mi_diffind.tasks.disney.model import LOBES, Material
 
 _DIFFERENTIABLE = mi.ParamFlags.Differentiable
 _DISCONTINUOUS = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
@@ -154,8 +154,8 @@ class Disney(mi.BSDF):
     def __init__(self, props: mi.Properties):
         super().__init__(props)
 
-        if props.has_property("subsurface"):
-            if props.has_property("flatness"):
+        if "subsurface" in props:
+            if "flatness" in props:
                 raise RuntimeError('"flatness" and "subsurface" are two names of one parameter, give only one')
             aliases = {"flatness": "subsurface"}
         else:
@@ -170,12 +170,12 @@ class Disney(mi.BSDF):
             _check_range(given, self.scalars[name], 0, 1)
 
         # As in `principled`, a constant is exposed under its own name and not as a texture's value
-        if props.has_property("eta") and props.has_property("specular"):
+        if "eta" in props and "specular" in props:
             raise RuntimeError('"eta" and "specular" are two ways to say one thing, give only one')
-        self.reflectance_name = "eta" if props.has_property("eta") else "specular"
+        self.reflectance_name = "eta" if "eta" in props else "specular"
         low, high = (1, ETA_MAX) if self.reflectance_name == "eta" else (0, 1)
         name = self.reflectance_name
-        if not props.has_property(name) or props.type(name) in (mi.Properties.Type.Float, mi.Properties.Type.Integer):
+        if name not in props or props.type(name) in (mi.Properties.Type.Float, mi.Properties.Type.Integer):
             value = float(props.get(name, 0.5))
             if not low <= value <= high:
                 raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is [{low}, {high}]')
@@ -185,7 +185,7 @@ class Disney(mi.BSDF):
             self.reflectance = props.get_texture(name)
             _check_range(name, self.reflectance, low, high)
 
-        if props.has_property("spec_trans"):
+        if "spec_trans" in props:
             transmission = props.get_texture("spec_trans", 0.0)
             if _bounds(transmission)[1] > 0:
                 raise RuntimeError(
@@ -383,4 +383,5 @@ def _check_range(name: str, texture: mi.Texture, low: float, high: float) -> Non
             raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is [{low}, {high}]')
 
 
-mi.register_bsdf("disney", lambda props: Disney(props))
+# The class itself, not a function that looks it up: this module is executed again for the next variant
+mi.register_bsdf("disney", Disney)

@@ -91,4 +91,4 @@ class NeuralDisney(Disney):
         return super().to_string()[:-1] + tables + "]"
 
 
-mi.register_bsdf("neural_disney", lambda props: NeuralDisney(props))
+mi.register_bsdf("neural_disney", NeuralDisney)

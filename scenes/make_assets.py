@@ -357,9 +357,7 @@ def probe(name, folder):
 
 def main():
     """Parses the command line and makes what its inputs allow."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suzi", help="models/suzi.glb.js of npm's @pmndrs/assets")
     parser.add_argument("--probes", help="folder with interior.exr and forest.exr of blender-data")
     args = parser.parse_args()

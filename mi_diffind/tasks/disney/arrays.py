@@ -123,9 +123,7 @@ class DisneyArrays(nn.Module):
         specular = dr.square(g.h2 / (quadric * root + TINY)) * wo.z
 
         fresnel_sum, fresnel_product, cos_ratio, coat_masking = self.diffuse([wo.z, wi.z], active)
-        diffuse, flat = diffuse_factors(
-            material.roughness, g.cos_d, fresnel_sum, fresnel_product, cos_ratio, wo.z
-        )
+        diffuse, flat = diffuse_factors(material.roughness, g.cos_d, fresnel_sum, fresnel_product, cos_ratio, wo.z)
         metal_base, base, coat_fresnel, sheen = self.fresnel([g.cos_d, material.metallic], active)
 
         k0, k1 = self.coat_coefficients(material.clearcoat_gloss, active)
@@ -137,8 +135,8 @@ class DisneyArrays(nn.Module):
             base=dr.maximum(base, 0),
             sheen=dr.maximum(sheen, 0) * wo.z,
             grazing=dr.maximum((coat_fresnel - COAT_F0) / (1 - COAT_F0), 0),
-            diffuse=dr.maximum(diffuse, 0),
-            flat=dr.maximum(flat, 0),
+            diffuse=diffuse,
+            flat=flat,
             clearcoat=dr.maximum(coat * coat_masking * coat_fresnel, 0) * wo.z,
         )
 

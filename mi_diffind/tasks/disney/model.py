@@ -35,8 +35,9 @@ COAT_STRENGTH, COAT_F0, COAT_MASKING_ALPHA = 0.25, 0.04, 0.25
 #: The lobes, in the order of a BSDF's components.
 LOBES = ("diffuse", "specular", "clearcoat")
 
-#: Added to squared lengths before dividing: far below what directions produce, far above the smallest float.
-TINY = 1e-30
+#: Added to squared lengths before dividing: below what directions 1e-6 rad from opposite produce, yet large enough for
+#: its inverse square, which derivatives contain, to be a float.
+TINY = 1e-18
 
 
 @dataclass
@@ -95,8 +96,8 @@ def geometry(wi, wo) -> Geometry:
 
 
 def schlick(cosine):
-    """(1 − cos)^5."""
-    m = 1 - cosine
+    """(1 − cos)^5, and 0 for a cosine that rounding has made larger than 1."""
+    m = dr.maximum(1 - cosine, 0)
     m2 = m * m
     return m2 * m2 * m
 
@@ -154,7 +155,7 @@ def diffuse_factors(roughness, cos_d, fresnel_sum, fresnel_product, cos_ratio, c
     k = 0.5 * f90 - 1
     fss = dr.fma(k, fresnel_sum + k * fresnel_product, 1)
     flat = 1.25 * (fss * (cos_ratio - 0.5 * cos_o) + 0.5 * cos_o)
-    return diffuse, flat
+    return dr.maximum(diffuse, 0), dr.maximum(flat, 0)  # against rounding, and approximate arguments
 
 
 def exact_factors(material: Material, wi, wo) -> Factors:
@@ -163,9 +164,7 @@ def exact_factors(material: Material, wi, wo) -> Factors:
     ax, ay = roughness_to_alpha(material.roughness, material.anisotropic)
     s = schlick(g.cos_d)
     fl, fv = schlick(wo.z), schlick(wi.z)
-    diffuse, flat = diffuse_factors(
-        material.roughness, g.cos_d, fl + fv, fl * fv, wo.z / (wi.z + wo.z + TINY), wo.z
-    )
+    diffuse, flat = diffuse_factors(material.roughness, g.cos_d, fl + fv, fl * fv, wo.z / (wi.z + wo.z + TINY), wo.z)
     specular = ggx(g, ax, ay) * wo.z / (masking_denominator(wi, ax, ay) * masking_denominator(wo, ax, ay))
     coat_fresnel = COAT_F0 + (1 - COAT_F0) * s
     return Factors(
@@ -192,7 +191,7 @@ def compose(material: Material, luminance, f: Factors) -> dict[str, tuple]:
     sheen = m.sheen * f.sheen
     return {
         "diffuse": (
-            (one - m.metallic) * luminance * dr.inv_pi * dr.fma(m.flatness, f.flat - f.diffuse, f.diffuse)
+            (one - m.metallic) * luminance * dr.inv_pi * (f.diffuse * (one - m.flatness) + f.flat * m.flatness)
             + sheen * m.sheen_tint,
             sheen * (one - m.sheen_tint),
         ),

@@ -25,7 +25,7 @@ from .model import COAT_F0, PARAMETERS, Material, compose, exact_factors
 EXPONENTIAL_RATE = 3.0
 
 #: The settings that made the shipped tables.
-DEFAULT_SETTINGS = FitSettings(steps=3000, batch=65536, lr=3e-3, schedule="cosine", seed=1, quality_every=250)
+DEFAULT_SETTINGS = FitSettings(steps=2000, batch=65536, lr=3e-3, schedule="cosine", seed=1, quality_every=200)
 
 #: Luminance weights of linear sRGB, as ``mi.luminance``.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
@@ -76,7 +76,12 @@ def targets(m: Material, wi, wo) -> dict[str, list]:
             wo.z / (wi.z + wo.z + model.TINY),
             model.coat_masking(wi.z) * model.coat_masking(wo.z),
         ],
-        "fresnel": [m.metallic * (1 - s), (1 - m.metallic) * (1 - s), COAT_F0 + (1 - COAT_F0) * s, (1 - m.metallic) * s],
+        "fresnel": [
+            m.metallic * (1 - s),
+            (1 - m.metallic) * (1 - s),
+            COAT_F0 + (1 - COAT_F0) * s,
+            (1 - m.metallic) * s,
+        ],
         "coat": [dr.log(1 / k), dr.log(a2 / k)],
     }
 

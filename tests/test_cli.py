@@ -1,0 +1,255 @@
+"""The command line: what it writes, what it says, and how it refuses."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_diffind.cli import main
+
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
+SMALL = ["-D", "width=48", "-D", "height=28", "--spp", "4"]
+
+
+def scene_file(tmp_path, bsdf='<bsdf type="neural_disney"/>'):
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>'
+        '<sensor type="perspective"><sampler type="independent"><integer name="sample_count" value="2"/></sampler>'
+        '<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film></sensor>'
+        f'<shape type="sphere"><transform name="to_world"><translate z="4"/></transform>{bsdf}</shape></scene>'
+    )
+    return str(path)
+
+
+def refused(capsys, *arguments):
+    """Run a command that must fail with exit code 2 and one sentence; returns it."""
+    capsys.readouterr()
+    assert main(list(arguments)) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    lines = [line for line in lines if line.startswith("mi-diffind: error: ")]
+    assert len(lines) == 1, lines
+    assert "Traceback" not in lines[0] and "[parser.cpp" not in lines[0]
+    return lines[0]
+
+
+def test_render(tmp_path, capsys):
+    import mitsuba as mi
+
+    out, report = tmp_path / "image.exr", tmp_path / "report.json"
+    assert main(["render", str(SCENES / "still_life.xml"), "-o", str(out), "--json", str(report), *SMALL]) == 0
+    assert str(out) in capsys.readouterr().out
+    image = np.array(mi.Bitmap(str(out)))
+    assert image.shape == (28, 48, 3) and np.isfinite(image).all() and image.mean() > 0.01
+    found = json.loads(report.read_text())
+    assert found["spp"] == 4 and found["width"] == 48 and found["variant"].endswith("_ad_rgb")
+    assert len(found["learned_plugins"]) == 9 and found["table_bytes"] == 12480 and found["seconds_render"] > 0
+    assert sorted(os.listdir(tmp_path)) == ["image.exr", "report.json"]  # nothing temporary stays
+    assert main(["render", str(SCENES / "still_life.xml"), "-o", str(tmp_path / "image.png"), *SMALL]) == 0
+    assert np.array(mi.Bitmap(str(tmp_path / "image.png"))).shape == (28, 48, 3)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
+def test_render_in_other_variants(tmp_path, variant):
+    out = tmp_path / "image.exr"
+    assert main(["render", str(SCENES / "still_life.xml"), "-o", str(out), "--variant", variant, *SMALL]) == 0
+    assert out.stat().st_size > 1000
+
+
+def test_compare(tmp_path, capsys):
+    import mitsuba as mi
+
+    out, report = tmp_path / "pictures", tmp_path / "report.json"
+    arguments = ["compare", str(SCENES / "materials.xml"), "--out", str(out), "--json", str(report), *SMALL]
+    assert main([*arguments, "--passes", "2"]) == 0
+    text = capsys.readouterr().out
+    assert "PSNR" in text and "FLIP" in text and "ratio" in text
+    assert sorted(os.listdir(out)) == ["comparison.png", "error.exr", "exact.exr", "written.exr"]
+    found = json.loads(report.read_text())
+    written, exact, error = (np.array(mi.Bitmap(found["files"][k])) for k in ("written", "exact", "error"))
+    assert np.allclose(np.abs(written - exact), error, atol=1e-5)
+    mse = np.mean((np.clip(written, 0, 1) - np.clip(exact, 0, 1)) ** 2)
+    assert found["psnr_db"] == pytest.approx(-10 * np.log10(mse), abs=0.01)
+    assert found["time_ratio"]["min"] <= found["time_ratio"]["median"] <= found["time_ratio"]["max"]
+    assert {"flip", "mae", "seconds_per_pass", "learned_plugins", "table_bytes"} <= set(found)
+
+
+def test_inspect_tables(tmp_path, capsys):
+    from mi_diffind.tasks.disney.library import SHIPPED
+
+    report = tmp_path / "report.json"
+    assert main(["inspect", str(SHIPPED), "--json", str(report)]) == 0
+    text = capsys.readouterr().out
+    assert "12,480 bytes" in text and "masking" in text and "psnr_db" in text
+    found = json.loads(report.read_text())
+    assert found["task"] == "disney" and found["arrays"]["ggx"]["channels"] == 3
+    assert sum(a["bytes"] for a in found["arrays"].values()) == found["bytes"]
+
+
+def test_inspect_scene(capsys):
+    assert main(["inspect", str(SCENES / "still_life.xml")]) == 0
+    text = capsys.readouterr().out
+    assert "9 learned material(s), 12,480 bytes" in text
+    assert "wood (neural_disney): base_color texture, roughness texture" in text
+
+
+def test_fit(tmp_path, capsys):
+    out, report = tmp_path / "own.npz", tmp_path / "report.json"
+    arguments = [
+        "fit",
+        "disney",
+        "--steps",
+        "20",
+        "--batch",
+        "4096",
+        "--storage",
+        "float16",
+        "--backend",
+        "llvm",
+    ]
+    assert main([*arguments, "-o", str(out), "--json", str(report)]) == 0
+    found = json.loads(report.read_text())
+    assert found["bytes"] == 6240 and found["quality"]["psnr_db"] > 30 and found["settings"]["steps"] == 20
+    again = tmp_path / "again.npz"
+    assert main([*arguments, "-o", str(again)]) == 0
+    assert out.read_bytes() == again.read_bytes()
+    own = scene_file(tmp_path, '<bsdf type="neural_disney"><string name="filename" value="own.npz"/></bsdf>')
+    assert main(["render", own, "-o", str(tmp_path / "image.exr")]) == 0
+
+
+def test_fit_is_interrupted_and_resumed(tmp_path):
+    """Ctrl-C keeps the best so far and the checkpoint; resuming ends at the same bytes as an undisturbed run."""
+    command = [sys.executable, "-m", "mi_diffind.cli", "fit", "disney", "--steps", "1000", "--batch", "2048"]
+    checkpoint, out = tmp_path / "state.npz", tmp_path / "own.npz"
+    options = ["--backend", "llvm", "-o", str(out), "--checkpoint", str(checkpoint)]
+    process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    for _ in range(600):
+        if checkpoint.exists() or process.poll() is not None:
+            break
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert "interrupted at step" in stdout and out.exists()
+    early = out.read_bytes()
+    subprocess.run([*command, *options, "--resume"], check=True, capture_output=True)
+    assert out.read_bytes() != early
+    undisturbed = tmp_path / "undisturbed.npz"
+    subprocess.run([*command, "--backend", "llvm", "-o", str(undisturbed)], check=True, capture_output=True)
+    assert out.read_bytes() == undisturbed.read_bytes()
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------
+
+
+def test_missing_files(tmp_path, capsys):
+    assert "nowhere.xml: no such scene file" in refused(capsys, "render", "nowhere.xml")
+    assert "nowhere.xml: no such scene file" in refused(capsys, "compare", "nowhere.xml", "--out", str(tmp_path / "o"))
+    assert "nowhere.xml: no such scene file" in refused(capsys, "inspect", "nowhere.xml")
+    assert "nowhere.npz: no such file" in refused(capsys, "inspect", "nowhere.npz")
+
+
+@pytest.mark.parametrize(
+    "bsdf, sentence",
+    [
+        (
+            '<bsdf type="neural_disney"><float name="roughness" value="1.5"/></bsdf>',
+            "found 1.5, allowed is [0, 1]",
+        ),
+        ('<bsdf type="neural_disney"><float name="roughnes" value="0.5"/></bsdf>', '"roughnes"'),
+        ('<bsdf type="neural_disney"><float name="spec_trans" value="0.5"/></bsdf>', "no transmission"),
+        (
+            '<bsdf type="neural_disney"><string name="filename" value="no.npz"/></bsdf>',
+            "no.npz: no such file",
+        ),
+        (
+            '<bsdf type="neural_disney"><string name="filename" value="scene.xml"/></bsdf>',
+            "scene.xml: not a table file",
+        ),
+        ('<bsdf type="neural_disneyy"/>', "neural_disneyy"),
+        ("<bsdf", "scene.xml"),
+    ],
+)
+def test_bad_scenes(tmp_path, capsys, bsdf, sentence):
+    path, out = scene_file(tmp_path, bsdf), tmp_path / "image.exr"
+    message = refused(capsys, "render", path, "-o", str(out))
+    assert sentence in message and "scene.xml" in message
+    assert not out.exists()
+
+
+def test_bad_options(tmp_path, capsys):
+    path = scene_file(tmp_path)
+    assert 'the variant "llvm_rgb" does not exist; available are' in refused(
+        capsys, "render", path, "--variant", "llvm_rgb"
+    )
+    assert 'does not run in the variant "scalar_rgb"; use one of' in refused(
+        capsys, "render", path, "--variant", "scalar_rgb"
+    )
+    assert "expected NAME=VALUE" in refused(capsys, "render", path, "-D", "width")
+    assert "nothing" in refused(capsys, "render", path, "-D", "nothing=1")
+    assert "allowed are .exr and .png" in refused(capsys, "render", path, "-o", str(tmp_path / "image.tiff"))
+    assert "allowed is .npz" in refused(capsys, "fit", "disney", "-o", str(tmp_path / "t.bin"))
+    assert "lr: found -1" in refused(capsys, "fit", "disney", "-o", str(tmp_path / "t.npz"), "--lr", "-1")
+    assert "there is nothing to resume" in refused(
+        capsys,
+        "fit",
+        "disney",
+        "-o",
+        str(tmp_path / "t.npz"),
+        "--resume",
+        "--checkpoint",
+        str(tmp_path / "c.npz"),
+    )
+    for arguments in (["render", path, "--spp", "0"], ["fit", "nothing", "-o", "t.npz"], ["nothing"], []):
+        with pytest.raises(SystemExit) as caught:
+            main(arguments)
+        assert caught.value.code == 2
+
+
+def test_not_a_scene(tmp_path, capsys):
+    path = tmp_path / "bsdf.xml"
+    path.write_text('<bsdf version="3.0.0" type="neural_disney"/>')
+    assert "a scene is expected" in refused(capsys, "render", str(path), "-o", str(tmp_path / "image.exr"))
+
+
+def test_bad_output_folders(tmp_path, capsys):
+    """Said before anything is rendered or trained."""
+    path, missing = scene_file(tmp_path), tmp_path / "missing"
+    for arguments in (
+        ["render", path, "-o", str(missing / "image.exr")],
+        ["fit", "disney", "-o", str(missing / "own.npz")],
+        ["render", path, "-o", str(tmp_path / "image.exr"), "--json", str(missing / "report.json")],
+        ["fit", "disney", "-o", str(tmp_path / "own.npz"), "--checkpoint", str(missing / "state.npz")],
+    ):
+        assert f'output folder "{missing}" does not exist' in refused(capsys, *arguments)
+    assert f'output folder "{missing / "deeper"}"' in refused(capsys, "compare", path, "--out", str(missing / "deeper"))
+    assert not missing.exists()
+    assert "is not a folder" in refused(capsys, "render", path, "-o", f"{path}/image.exr")
+    assert "is a folder" in refused(capsys, "fit", "disney", "-o", _folder(tmp_path / "own.npz"))
+
+
+def _folder(path):
+    path.mkdir()
+    return str(path)
+
+
+def test_read_only_output_folder(tmp_path, capsys):
+    path = scene_file(tmp_path)
+    if os.geteuid() == 0:  # root writes everywhere but into the kernel's own file systems
+        folder = Path("/proc/self/task")
+    else:
+        folder = tmp_path / "locked"
+        folder.mkdir(mode=0o555)
+    for arguments in (
+        ["render", path, "-o", str(folder / "image.exr")],
+        ["compare", path, "--out", str(folder)],
+        ["compare", path, "--out", str(folder / "new")],
+        ["fit", "disney", "-o", str(folder / "own.npz")],
+    ):
+        assert "cannot be written" in refused(capsys, *arguments)

@@ -1,0 +1,91 @@
+"""The scenes of the repository, and swapping learned plugins for exact ones."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_diffind import metrics
+
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
+SMALL = {"width": 96, "height": 56}
+
+
+@pytest.mark.parametrize("name", ["materials", "still_life"])
+def test_scene_as_written_and_exact(mi_rgb, name):
+    """The bound on the approximation: measured at full size 44 to 46 dB for both scenes (README)."""
+    from mi_diffind import compare
+
+    result = compare.compare(SCENES / f"{name}.xml", spp=32, passes=2, progress=False, **SMALL)
+    assert np.isfinite(result.written).all() and result.written.min() >= 0
+    assert result.written.std() > 0.05
+    assert not np.array_equal(result.written, result.exact)
+    assert result.figures["psnr_db"] > 38
+    assert result.figures["flip"] < 0.03
+    assert result.figures["learned_plugins"] == (60 if name == "materials" else 9)
+    assert result.figures["table_bytes"] == 12480
+
+
+@pytest.mark.parametrize("name", ["materials", "still_life"])
+def test_exact_scene_names_no_learned_plugin(mi_rgb, name):
+    from mi_diffind import scenes
+
+    exact = scenes.load(SCENES / f"{name}.xml", exact=True, **SMALL)
+    assert "NeuralDisney" not in str(exact) and "Disney[" in str(exact)
+    written = scenes.load(SCENES / f"{name}.xml", **SMALL)
+    assert "NeuralDisney" in str(written)
+
+
+def test_materials_cover_the_ten_parameters(mi_rgb):
+    from mi_diffind import scenes
+    from mi_diffind.tasks.disney.model import PARAMETERS
+
+    learned = scenes.learned_plugins(SCENES / "materials.xml")
+    for name in PARAMETERS:
+        row = [e["parameters"][name] for e in learned if e["id"].rpartition("_")[0] == name]
+        assert np.allclose(sorted(row), np.linspace(0, 1, 6), atol=1e-3), name
+
+
+def test_materials_are_what_their_script_writes(tmp_path):
+    """Both files of the pair are in the repository: they must not drift apart."""
+    text = (SCENES / "materials.xml").read_bytes()
+    (tmp_path / "scenes").mkdir()
+    copy = tmp_path / "scenes" / "make_materials.py"
+    copy.write_text((SCENES / "make_materials.py").read_text())
+    subprocess.run([sys.executable, str(copy)], check=True, cwd=tmp_path)
+    assert (tmp_path / "scenes" / "materials.xml").read_bytes() == text
+
+
+def test_same_arguments_same_image(mi_rgb):
+    from mi_diffind import scenes
+
+    scene = scenes.load(SCENES / "still_life.xml", **SMALL)
+    first, second = (scenes.render(scene, 4, seed=5, passes=2)[0] for _ in range(2))
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, scenes.render(scene, 4, seed=6, passes=2)[0])
+
+
+def test_passes_add_up_to_the_samples(mi_rgb):
+    """An average of passes of unequal size is the average of the samples."""
+    from mi_diffind import scenes
+
+    scene = scenes.load(SCENES / "still_life.xml", **SMALL)
+    image, seconds = scenes.render(scene, 7, passes=3)
+    assert len(seconds) == 3
+    converged, _ = scenes.render(scene, 64)
+    assert abs(image.mean() / converged.mean() - 1) < 0.1
+
+
+def test_metrics():
+    rng = np.random.default_rng(0)
+    a = rng.random((32, 48, 3)).astype(np.float32)
+    assert metrics.psnr(a, a) == np.inf and metrics.flip(a, a) == 0 and metrics.mae(a, a) == 0
+    b = np.clip(a + 0.1, 0, 1)
+    assert metrics.psnr(a, b) == pytest.approx(-10 * np.log10(np.mean((a - b) ** 2)), rel=1e-5)
+    assert metrics.psnr(a, np.where(a > 0.5, a + 7, a)) < 40  # clipped, yet seen
+    assert metrics.psnr(np.full_like(a, 3), np.full_like(a, 9)) == np.inf  # both white
+    assert 0.01 < metrics.flip(a, b) < 1
+    grey = np.full((4, 4, 3), 0.2140, np.float32)
+    assert np.allclose(metrics.srgb(grey), 0.5, atol=1e-3)
