@@ -15,7 +15,8 @@ class OutputError(OSError):
 
 def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
     """
-    The folder ``path``, made if ``create`` and its parent exists. Raises :class:`OutputError` if it does not exist or cannot be written.
+    The folder ``path``, made if ``create`` and its parent exists. Raises :class:`OutputError` if it does not exist or
+    cannot be written.
 
     Called before long work starts, so that a typing error costs seconds, not the result.
     """

@@ -323,13 +323,17 @@ def _load_checkpoint(path, settings: FitSettings, trainer: _Trainer) -> tuple[_S
             {k: (int(arrays[f"t/{k}"]), arrays[f"m/{k}"], arrays[f"v/{k}"]) for k in keys},
         )  # fmt: skip
         best = {k: arrays[f"best/{k}"] for k in keys}
+        for key in ("best_quality", "best_step", "history", "restarts", "seconds", "plateau", "reference"):
+            meta[key]  # a KeyError here, not later
+        stored_settings = dict(meta["settings"])
     except Exception as e:  # zipfile, json and numpy each have their own for a damaged file
         raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({type(e).__name__}: {e})') from None
     for key in keys:
-        if state.parameters[key].shape != trainer.optimizer[key].shape:
+        stored = (state.parameters[key], *state.moments[key][1:], best[key])
+        if any(a.shape != trainer.optimizer[key].shape for a in stored):
             raise FittingError(f'the checkpoint "{path}" holds other table sizes ("{key}")')
-    if meta["settings"] != asdict(settings):
-        changed = [k for k, v in asdict(settings).items() if meta["settings"].get(k) != v]
+    if stored_settings != asdict(settings):
+        changed = [k for k, v in asdict(settings).items() if stored_settings.get(k) != v]
         raise FittingError(f'the checkpoint "{path}" was made with other settings ({", ".join(changed)})')
     return state, {**meta, "best": best}
 

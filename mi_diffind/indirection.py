@@ -234,8 +234,16 @@ class DifferentiableArray(nn.Module):
             expected = (*self.resolution, lookup.padded_channels(self.channels))
             if self.data.shape != expected:
                 raise ValueError(f'"data" has the shape {self.data.shape}, expected {expected}')
-            entries = fold(self.data.array) if self.folded else self.data.array
-            values = lookup.read_float(entries, self.resolution, self.channels, coordinates, self.border, active)
+            # Folding the whole table once is cheaper, but a loop or call that is being recorded can only gather from
+            # (and send gradients to) what exists already.
+            entries, transform = self.data.array, None
+            if self.folded and dr.flag(dr.JitFlag.SymbolicScope):
+                transform = fold
+            elif self.folded:
+                entries = fold(entries)
+            values = lookup.read_float(
+                entries, self.resolution, self.channels, coordinates, self.border, active, transform
+            )
         return nn.CoopVec(*values) if is_coopvec else values
 
 
@@ -320,7 +328,7 @@ class Indirection(nn.Module):
 
 
 def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.ndarray:
-    """Entries that equal their own position: shape ``(N_1, …, N_d, channels)``, channel ``k`` along axis ``k mod d``."""
+    """Entries equal to their own position, ``(N_1, …, N_d, channels)``; channel ``k`` runs along axis ``k mod d``."""
     grids = np.meshgrid(
         *[
             np.arange(n, dtype=np.float32) / max(1, n if b == "repeat" else n - 1)
@@ -338,6 +346,7 @@ def _module(array):
 
 def _tensor(dtype, values: np.ndarray, resolution, channels: int):
     half = dr.is_half_v(dtype)
+    dtype = _module(dtype).TensorXf16 if half else _module(dtype).TensorXf  # never double, also in such variants
     stored = np.zeros((*resolution, lookup.padded_channels(channels)), np.float16 if half else np.float32)
     stored[..., :channels] = values
     return dtype(stored)

@@ -102,13 +102,15 @@ def _weighted_sum(terms):
     return total
 
 
-def read_float(data, resolution: Sequence[int], channels: int, x: Sequence, border: Sequence[str], active=True):
+def read_float(
+    data, resolution: Sequence[int], channels: int, x: Sequence, border: Sequence[str], active=True, transform=None
+):
     """
     Read a table of 16- or 32-bit floats.
 
     ``data`` is the flat array of shape ``(N_1·…·N_d·padded_channels(channels),)``, ``x`` the ``d`` coordinates.
     Returns a list of ``channels`` arrays of the coordinates' (single precision) type. Differentiable with respect to
-    ``data`` and ``x``.
+    ``data`` and ``x``. ``transform`` is applied to each entry that was fetched.
     """
     Float = type(x[0])
     stored = padded_channels(channels)
@@ -120,12 +122,14 @@ def read_float(data, resolution: Sequence[int], channels: int, x: Sequence, bord
 
     def fetch(index):
         if Packet is None:
-            return [Float(dr.gather(type(data), data, index, active))]
-        values = []
-        for group in range(groups):
-            where = index if groups == 1 else dr.fma(index, groups, group)
-            values += [Float(v) for v in dr.gather(Packet, data, where, active)]
-        return values[:channels]
+            values = [Float(dr.gather(type(data), data, index, active))]
+        else:
+            values = []
+            for group in range(groups):
+                where = index if groups == 1 else dr.fma(index, groups, group)
+                values += [Float(v) for v in dr.gather(Packet, data, where, active)]
+            values = values[:channels]
+        return values if transform is None else [transform(v) for v in values]
 
     axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
     return _weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))

@@ -97,7 +97,7 @@ class Table:
 
 
 def save_table(path: str | os.PathLike, table: Table) -> None:
-    """Write ``table`` to ``path`` through a temporary file. Raises :class:`TableError` if it is not writable as such."""
+    """Write ``table`` to ``path`` through a temporary file. Raises :class:`TableError` if it is inconsistent."""
     dtype = _DTYPES.get(table.storage)
     if dtype is None:
         raise TableError(f'{path}: storage "{table.storage}" is unknown, allowed are {STORAGES}')

@@ -145,7 +145,10 @@ def test_table_factors_are_finite_and_non_negative_everywhere(rng):
     cosines = np.concatenate([[0, 1e-38, 1e-20, 1e-8, 1e-4, 0.5, 1], rng.random(50)])
     z = np.array(np.meshgrid(cosines, cosines)).reshape(2, -1)
     phi = 2 * np.pi * rng.random(z.shape)
-    wi, wo = (np.stack([np.sqrt(1 - c * c) * np.cos(p), np.sqrt(1 - c * c) * np.sin(p), c]) for c, p in zip(z, phi))
+    wi, wo = (
+        np.stack([np.sqrt(1 - c * c) * np.cos(p), np.sqrt(1 - c * c) * np.sin(p), c])
+        for c, p in zip(z, phi, strict=True)
+    )
     values = rng.integers(0, 2, (len(PARAMETERS), z.shape[1])).astype(np.float32)
     material = Material(**{k: ad.Float(v) for k, v in zip(PARAMETERS, values, strict=True)})
     wi, wo = ad.Array3f(wi.astype("f4")), ad.Array3f(wo.astype("f4"))

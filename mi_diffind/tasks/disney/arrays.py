@@ -79,7 +79,7 @@ class DisneyArrays(nn.Module):
 
     @classmethod
     def from_table(cls, table: Table, dtype, storage: str = "float32") -> DisneyArrays:
-        """Allocate from a :class:`Table` that :func:`load_disney_table` has checked, in another storage form if asked."""
+        """Allocate from a :class:`Table` that :func:`load_disney_table` has checked, in the given storage form."""
         return cls(
             {name: DifferentiableArray.from_numpy(table.values(name), dtype, storage=storage) for name in SHAPES}
         )

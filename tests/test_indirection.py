@@ -1,0 +1,512 @@
+"""The modules: construction, initialisation, fold, composition, and behaviour as ``drjit.nn`` modules."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit import nn
+from drjit.opt import Adam
+from scipy.ndimage import map_coordinates
+
+from mi_diffind import DifferentiableArray, Indirection, fold, lookup
+from mi_diffind.indirection import ramp
+from mi_diffind.runtime import array_module
+
+BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
+BELOW_ONE = np.float32(1) - np.float32(2**-23)
+
+
+@pytest.fixture(params=BACKENDS)
+def ad(request):
+    return array_module(request.param)
+
+
+def interpolate(table, x):
+    """Values of a clamped table, ``(samples, channels)``: SciPy's first-order spline, in float64."""
+    table = np.asarray(table, np.float64)
+    position = [np.clip(x[:, k], 0, 1) * (n - 1) for k, n in enumerate(table.shape[:-1])]
+    channels = [map_coordinates(table[..., c], position, order=1, mode="nearest") for c in range(table.shape[-1])]
+    return np.stack(channels, axis=-1)
+
+
+def triangle(x):
+    """The triangle wave of period 2 in float64, without its hair's breadth below 1."""
+    return 1 - np.abs(1 - np.mod(np.asarray(x, np.float64), 2))
+
+
+def read(module, ad, x):
+    values = module([ad.Float(np.ascontiguousarray(v, np.float32)) for v in x.T])
+    dr.eval(values)
+    return np.stack([np.broadcast_to(v.numpy(), len(x)) for v in values], axis=-1)
+
+
+def uniform(seed, samples, dims):
+    return np.random.default_rng(seed).uniform(0, 1, (samples, dims)).astype(np.float32)
+
+
+def pair(ad, seed=0, primary=(5, 6), cascaded=(4, 5), channels=3):
+    """An allocated indirection with random entries: those of the primary need folding."""
+    rng = np.random.default_rng(seed)
+    p = rng.uniform(-2, 3, (*primary, len(cascaded)))
+    c = rng.uniform(0.5, 1.5, (*cascaded, channels))
+    net = Indirection(
+        DifferentiableArray(primary, len(cascaded), p, fold=True), DifferentiableArray(cascaded, channels, c)
+    )
+    return net.alloc(ad.TensorXf)
+
+
+# -- fold ---------------------------------------------------------------------------------------------------------------
+
+
+def test_fold_values(ad):
+    x = np.concatenate([np.linspace(-7, 7, 4001), np.arange(-9, 10), np.random.default_rng(0).normal(0, 50, 4000)])
+    x = x.astype(np.float32)
+    y = fold(ad.Float(x)).numpy()
+    np.testing.assert_allclose(y, triangle(x), atol=1.5e-7)
+    np.testing.assert_array_equal(fold(ad.Float([0.0, 1.0, 2.0, -1.0])).numpy(), [0, BELOW_ONE, 0, BELOW_ONE])
+    inside = np.random.default_rng(1).uniform(0, 1, 1000).astype(np.float32)
+    np.testing.assert_array_equal(fold(ad.Float(inside)).numpy(), inside)
+
+
+def test_fold_is_periodic_and_even(ad):
+    x = np.random.default_rng(2).uniform(-1, 1, 1000).astype(np.float32)
+    for period in (2, -2, 4, -6, 100):
+        np.testing.assert_allclose(fold(ad.Float(x) + period).numpy(), fold(ad.Float(x)).numpy(), atol=1e-5)
+    np.testing.assert_allclose(fold(-ad.Float(x)).numpy(), fold(ad.Float(x)).numpy(), atol=2e-7)
+
+
+def test_fold_never_reaches_one(ad):
+    """Around every odd number, and for any finite bit pattern: at least 0 and below 1."""
+    odd = np.arange(-99, 100, 2).astype(np.float32)
+    bits = np.random.default_rng(3).integers(0, 2**32, 200_000, dtype=np.uint32).view(np.float32)
+    near = [odd, np.nextafter(odd, np.float32(1e9)), np.nextafter(odd, np.float32(-1e9)), bits[np.isfinite(bits)]]
+    y = fold(ad.Float(np.concatenate(near))).numpy()
+    assert y.min() >= 0 and y.max() < 1
+
+
+def test_fold_slope(ad):
+    x = ad.Float([0.0, 0.3, 0.999, 1.0, 1.3, 1.999, 2.0, 2.5, 3.5, -0.5, -1.5, 1.0 - 2**-24])
+    dr.enable_grad(x)
+    dr.backward(fold(x))
+    np.testing.assert_array_equal(x.grad.numpy(), [1, 1, 1, -1, -1, -1, 1, 1, -1, -1, 1, 1])
+
+
+# -- initialisation -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("border", lookup.BORDERS)
+@pytest.mark.parametrize("resolution", [(7,), (3, 5), (4, 1, 3), (2, 3, 2, 4)])
+def test_ramp(ad, resolution, border):
+    """Each entry is its own position; more channels than axes start over."""
+    dims = len(resolution)
+    channels = dims + 2
+    array = DifferentiableArray(resolution, channels, "ramp", border=border).alloc(ad.TensorXf)
+    entries = array.numpy()
+    for index in np.ndindex(*resolution):
+        for k in range(channels):
+            n = resolution[k % dims]
+            expected = index[k % dims] / (n if border == "repeat" else max(1, n - 1))
+            assert entries[(*index, k)] == np.float32(expected)
+    if border == "clamp":  # it reads as the identity, except along a single entry
+        x = uniform(0, 100, dims)
+        for k, n in enumerate(resolution):
+            np.testing.assert_allclose(read(array, ad, x)[:, k], x[:, k] if n > 1 else 0, atol=2e-7)
+
+
+def test_constant(ad):
+    assert (DifferentiableArray((3, 4), 3).alloc(ad.TensorXf).numpy() == 0.5).all()
+    array = DifferentiableArray((3, 4), 3, "constant", (0.5, 0.5, 1)).alloc(ad.TensorXf)
+    np.testing.assert_array_equal(array.numpy(), np.broadcast_to(np.float32([0.5, 0.5, 1]), (3, 4, 3)))
+
+
+def test_given_entries(ad):
+    entries = np.random.default_rng(4).normal(size=(3, 4, 5)).astype(np.float32)
+    for given in (entries, ad.TensorXf(entries), entries.astype(np.float64)):
+        np.testing.assert_array_equal(DifferentiableArray((3, 4), 5, given).alloc(ad.TensorXf).numpy(), entries)
+
+
+def test_random_is_seeded(ad):
+    """The same generator gives the same entries, another seed others, and no two arrays of a pair are alike."""
+    array = DifferentiableArray((8, 8), 3, "random", (-2, 1))
+    first = array.alloc(ad.TensorXf).numpy()
+    np.testing.assert_array_equal(array.alloc(ad.TensorXf).numpy(), first)
+    same, other = (array.alloc(ad.TensorXf, rng=dr.rng(seed=s)).numpy() for s in (5, 6))
+    np.testing.assert_array_equal(array.alloc(ad.TensorXf, rng=dr.rng(seed=5)).numpy(), same)
+    assert not np.array_equal(same, other) and not np.array_equal(same, first)
+    assert first.min() >= -2 and first.max() < 1 and first.std() > 0.5 and len(np.unique(first)) == first.size
+    net = Indirection(
+        [DifferentiableArray((4,), 1, "random"), DifferentiableArray((4,), 1, "random")],
+        DifferentiableArray((4, 4), 1, "random"),
+    ).alloc(ad.TensorXf)
+    a, b, c = (net[key].numpy().ravel()[:4].tolist() for key in net)
+    assert a != b != c != a
+
+
+def test_half_precision_allocation(ad):
+    array = DifferentiableArray((3, 3), 3, "ramp").alloc(ad.TensorXf16)
+    assert array.storage == "float16" and array.nbytes == 2 * 27
+    assert DifferentiableArray((3, 3), 3).alloc(ad.TensorXf).nbytes == 4 * 27
+    double = DifferentiableArray((3, 3), 3, "ramp").alloc(ad.TensorXf64)  # what ``mi.TensorXf`` is in double variants
+    np.testing.assert_allclose(read(double, ad, uniform(0, 9, 2))[:, :2], uniform(0, 9, 2), atol=2e-7)
+
+
+# -- one array read with another ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dims", [1, 2, 3, 4])
+def test_ramp_and_grid_are_an_ordinary_lookup(ad, dims):
+    """
+    With a ramp as the primary array, an indirection is the cascaded array read directly: bit by bit where no rounding
+    is possible (dyadic coordinates and positions), to the last digits elsewhere.
+    """
+    rng = np.random.default_rng(dims)
+    grid = rng.integers(0, 256, (5, 3, 9, 5)[:dims] + (3,)).astype(np.float32)
+    primary = DifferentiableArray((9, 5, 5, 3)[:dims], dims, "ramp", fold=True)
+    net = Indirection(primary, DifferentiableArray(grid.shape[:-1], 3, grid)).alloc(ad.TensorXf)
+    # The ramp's last entry is a hair below 1, so its last cell is left out of the exact comparison.
+    last = np.array([(n - 2) / (n - 1) for n in primary.resolution])
+    dyadic = (np.floor(rng.uniform(0, 1, (200, dims)) * last * 64) / 64).astype(np.float32)
+    np.testing.assert_array_equal(read(net, ad, dyadic), read(net.cascaded, ad, dyadic))
+    anywhere = rng.uniform(-0.2, 1.2, (200, dims)).astype(np.float32)
+    np.testing.assert_allclose(read(net, ad, anywhere), interpolate(grid, anywhere), atol=255 * 1e-5)
+    constant = Indirection(primary, DifferentiableArray(grid.shape[:-1], 3)).alloc(ad.TensorXf)
+    np.testing.assert_allclose(read(constant, ad, anywhere), 0.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_values(ad, storage):
+    net = pair(ad)
+    x = uniform(1, 300, 2)
+    before = net.numpy() if hasattr(net, "numpy") else [net.primary[0].numpy(), net.cascaded.numpy()]
+    np.testing.assert_allclose(before[0], triangle(net["primary.0.data"].numpy()[..., :2]), atol=3e-7)
+    if storage != "float32":
+        net = net.to(storage)
+    p, c = net.primary[0].numpy(), net.cascaded.numpy()
+    assert net.nbytes == {"float32": 4, "float16": 2, "uint8": 1}[storage] * (p.size + c.size)
+    assert p.min() >= 0 and p.max() <= 1
+    np.testing.assert_allclose(p, before[0], atol={"float32": 0, "float16": 3e-4, "uint8": 0.502 / 255}[storage])
+    np.testing.assert_allclose(np.stack([v.numpy() for v in net.pointer([ad.Float(v) for v in x.T.copy()])], 1),
+                               interpolate(p, x), rtol=1e-5, atol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(read(net, ad, x), interpolate(c, interpolate(p, x)), rtol=1e-5)
+
+
+def test_storage_can_differ(ad):
+    net = pair(ad).to("uint8", "float16")
+    assert net.primary[0].storage == "uint8" and net.cascaded.storage == "float16"
+    back = net.to("float32")
+    x = uniform(2, 100, 2)
+    np.testing.assert_allclose(read(back, ad, x), read(net, ad, x), rtol=1e-5)
+
+
+def test_gradients_equal_central_differences(ad):
+    """Through both arrays and the fold, with respect to all entries and to the inputs."""
+    net = pair(ad, seed=3, primary=(3, 4), cascaded=(3, 4), channels=2)
+    p, c = net["primary.0.data"].numpy()[..., :2].astype(np.float64), net.cascaded.numpy().astype(np.float64)
+
+    def value(p, c, x):
+        return interpolate(c, interpolate(triangle(p), x)).sum()
+
+    # Points whose pointers stay away from the edges of the cascaded array's cells, where slopes jump.
+    x = uniform(4, 200, 2)
+    position = interpolate(triangle(p), x) * (np.array([3, 4]) - 1)
+    own = x * (np.array([3, 4]) - 1)
+    away = [np.abs(v - np.rint(v)).min(axis=1) > 0.02 for v in (position, own)]
+    x = x[away[0] & away[1]][:40]
+    assert len(x) == 40
+
+    point = [ad.Float(v) for v in x.T.copy()]
+    dr.enable_grad(net["primary.0.data"], net["cascaded.data"], *point)
+    dr.backward(sum(net(point)))
+    h = 1e-5
+    for key, table in (("primary.0.data", p), ("cascaded.data", c)):
+        found = net[key].grad.numpy()[..., : table.shape[-1]]
+        for index in np.ndindex(*table.shape):
+            step = np.zeros_like(table)
+            step[index] = h
+            plus, minus = [(p + s, c) if table is p else (p, c + s) for s in (step, -step)]
+            assert found[index] == pytest.approx((value(*plus, x) - value(*minus, x)) / (2 * h), rel=1e-3, abs=2e-4)
+    for k, v in enumerate(point):
+        step = h * np.eye(2)[k]
+        for sample in range(len(x)):
+            row = x[sample : sample + 1].astype(np.float64)
+            expected = (value(p, c, row + step) - value(p, c, row - step)) / (2 * h)
+            assert v.grad.numpy()[sample] == pytest.approx(expected, rel=1e-3, abs=2e-4)
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_several_primaries(ad, storage):
+    """Outputs are concatenated in the order of the primaries; ``inputs`` says who reads what."""
+    rng = np.random.default_rng(5)
+    tables = [rng.uniform(0, 1, s) for s in ((4, 5, 2), (6, 1), (3, 3, 1))]
+    grid = rng.uniform(0.5, 1.5, (3, 4, 3, 5, 4))
+    groups = ((2, 0), (1,), (0, 1))
+    net = Indirection(
+        [DifferentiableArray(t.shape[:-1], t.shape[-1], t, fold=True) for t in tables],
+        DifferentiableArray(grid.shape[:-1], 4, grid),
+        groups,
+    ).alloc(ad.TensorXf)
+    assert list(net) == ["primary.0.data", "primary.1.data", "primary.2.data", "cascaded.data"]
+    net = net if storage == "float32" else net.to(storage)
+    x = uniform(6, 200, 3)
+    pointers = [interpolate(p.numpy(), x[:, list(g)]) for p, g in zip(net.primary, groups, strict=True)]
+    expected = interpolate(net.cascaded.numpy(), np.concatenate(pointers, axis=1))
+    np.testing.assert_allclose(read(net, ad, x), expected, rtol=1e-5)
+
+
+def test_inputs_default_to_consecutive_ones():
+    arrays = [DifferentiableArray((4, 4), 3), DifferentiableArray(4, 1)]
+    assert Indirection(arrays, DifferentiableArray((2,) * 4)).inputs == ((0, 1), (2,))
+    assert Indirection(arrays[1], DifferentiableArray(4)).inputs == ((0,),)
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_masked_lanes_are_zero(ad, storage):
+    net = pair(ad)
+    net = net if storage == "float32" else net.to(storage)
+    x = [ad.Float([0.2, 0.4]), ad.Float([0.7, 0.1])]
+    values = net(x, active=ad.Bool([True, False]))
+    assert all(v.numpy()[0] == w.numpy()[0] and v.numpy()[1] == 0 for v, w in zip(values, net(x), strict=True))
+
+
+# -- what coordinates can be --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_forms_of_the_coordinate(ad, storage):
+    """Lists, tuples, vectors, numbers and other precisions mean the same; results are single precision."""
+    net = pair(ad)
+    net = net if storage == "float32" else net.to(storage)
+    expected = [v.numpy()[0] for v in net([ad.Float(0.25), ad.Float(0.5)])]
+    forms = (
+        (ad.Float(0.25), ad.Float(0.5)), ad.Array2f(0.25, 0.5), [0.25, ad.Float(0.5)], [ad.Float(0.25), 0.5],
+        [0.25, 0.5], [ad.Float16(0.25), ad.Float16(0.5)], [ad.Float64(0.25), ad.Float64(0.5)],
+    )  # fmt: skip
+    for x in forms:
+        values = net(x)
+        assert isinstance(values, list) and all(type(v) is ad.Float for v in values)
+        np.testing.assert_array_equal([v.numpy()[0] for v in values], expected)
+    line = DifferentiableArray(3, 2, "ramp").alloc(ad.TensorXf).to(storage)
+    for x in (ad.Float(0.25), [ad.Float(0.25)], 0.25):
+        assert [round(float(v.numpy()[0]), 2) for v in line(x)] == [0.25, 0.25]
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_cooperative_vectors(ad, storage):
+    """A cooperative vector in, a cooperative vector out, with gradients."""
+    net = pair(ad)
+    net = net if storage == "float32" else net.to(storage)
+    x = [ad.Float([0.2, 0.4]), ad.Float([0.7, 0.1])]
+    for module in (net, net.cascaded):
+        out = module(nn.CoopVec(*x))
+        assert isinstance(out, nn.CoopVec) and len(out) == 3
+        for v, w in zip(list(out), module(x), strict=True):
+            np.testing.assert_array_equal(v.numpy(), w.numpy())
+    dr.enable_grad(x)
+    dr.backward(sum(list(net(nn.CoopVec(*x)))))
+    through, _ = [v.grad.numpy() for v in x], dr.clear_grad(x)
+    dr.backward(sum(net(x)))
+    for a, b in zip(through, x, strict=True):
+        np.testing.assert_array_equal(a, b.grad.numpy())
+
+
+def test_composes_with_other_modules(ad):
+    net = nn.Sequential(
+        DifferentiableArray((4, 4), 3, "random", fold=True), nn.ReLU(), DifferentiableArray((3, 3, 3), 2, "random")
+    )
+    net = net.alloc(ad.TensorXf, 2)
+    assert list(net) == ["layers.0.data", "layers.2.data"]
+    x = uniform(0, 50, 2)
+    out = net(nn.CoopVec(*(ad.Float(v) for v in x.T.copy())))
+    expected = interpolate(net.layers[2].numpy(), interpolate(net.layers[0].numpy(), x))
+    np.testing.assert_allclose(np.stack([v.numpy() for v in out], axis=1), expected, rtol=1e-5)
+    with pytest.raises(ValueError, match="was given 3 input"):
+        net.alloc(ad.TensorXf, 3)
+
+
+# -- behaviour as modules -----------------------------------------------------------------------------------------------
+
+
+def test_parameter_names_and_optimiser(ad):
+    net = pair(ad)
+    assert list(net) == ["primary.0.data", "cascaded.data"]
+    assert list(net.cascaded) == ["data"]
+    optimizer = Adam(lr=0.01)
+    optimizer.update(net)
+    assert set(optimizer) == set(net)
+    point = [ad.Float(v) for v in uniform(7, 4096, 2).T.copy()]
+    losses, start = [], {k: net[k].numpy() for k in net}
+    for _ in range(30):
+        net.update(optimizer)
+        loss = dr.mean(sum(dr.square(v - 0.3 * k) for k, v in enumerate(net(point))))
+        dr.backward(loss)
+        optimizer.step()
+        losses.append(float(loss[0]))
+    net.update(optimizer)
+    assert losses[-1] < 0.75 * losses[0]
+    for key in net:
+        assert not np.array_equal(net[key].numpy(), start[key])
+        np.testing.assert_array_equal(net[key].numpy(), optimizer[key].numpy())
+    assert not net["cascaded.data"].numpy()[..., 3:].any()  # padding stays what it was
+
+
+def test_a_table_of_the_wrong_shape_is_refused(ad):
+    array = pair(ad).cascaded
+    array.data = ad.TensorXf(np.zeros((4, 5, 3), np.float32))
+    with pytest.raises(ValueError, match=r'"data" has the shape \(4, 5, 3\), expected \(4, 5, 4\)'):
+        array([ad.Float(0), ad.Float(0)])
+
+
+def test_copies_are_independent(ad):
+    net = pair(ad)
+    copy = net.to("float32")
+    copy["cascaded.data"] = copy["cascaded.data"] * 0
+    assert net.cascaded.numpy().any() and not copy.cascaded.numpy().any()
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_pytree(ad, storage):
+    """Traversed by Dr.Jit: evaluation, gradients on and off, frozen functions."""
+    net = pair(ad)
+    net = net if storage == "float32" else net.to(storage)
+    dr.schedule(net)
+    dr.make_opaque(net)
+    dr.eval(net)
+    dr.enable_grad(net)
+    assert dr.grad_enabled(net.cascaded.data) == (storage != "uint8")
+    dr.disable_grad(net)
+    frozen = dr.freeze(lambda net, x: net(x))
+    for seed in (0, 1):
+        x = [ad.Float(v) for v in uniform(seed, 64, 2).T.copy()]
+        for v, w in zip(frozen(net, x), net(x), strict=True):
+            np.testing.assert_allclose(v.numpy(), w.numpy(), rtol=1e-6)
+    assert frozen.n_recordings == 1
+    assert "Indirection(DifferentiableArray(5x6" in repr(net) and storage in repr(net)
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+@pytest.mark.parametrize("mode", ["symbolic", "evaluated"])
+@pytest.mark.parametrize("as_state", [False, True])
+def test_in_a_loop(ad, storage, mode, as_state):
+    """Reading inside a recorded loop, with the net as a loop variable or from outside."""
+    net = pair(ad)
+    net = net if storage == "float32" else net.to(storage)
+    x = [ad.Float(v) for v in uniform(8, 16, 2).T.copy()]
+    expected = sum(net([x[0] * (i / 4), x[1]])[1] for i in range(4)).numpy()
+
+    @dr.syntax
+    def with_state(net, x, i, total, mode):  # ``dr.syntax`` sees no closure
+        while dr.hint(i < 4, mode=mode):
+            total += net([x[0] * (type(total)(i) / 4), x[1]])[1]
+            i += 1
+        return total
+
+    if as_state:
+        found = with_state(net, x, ad.UInt(0), dr.zeros(ad.Float, 16), mode)
+    else:
+        _, found = dr.while_loop(
+            (ad.UInt(0), dr.zeros(ad.Float, 16)),
+            lambda i, total: i < 4,
+            lambda i, total: (i + 1, total + net([x[0] * (ad.Float(i) / 4), x[1]])[1]),
+            mode=mode,
+        )
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["symbolic", "evaluated"])
+def test_in_an_indirect_call(ad, mode):
+    """Inside ``dr.switch`` (as in a BSDF that Mitsuba calls), with gradients to both tables and to the inputs."""
+    net = pair(ad)
+    other = net.to("uint8")
+    x = [ad.Float(v) for v in uniform(9, 40, 2).T.copy()]
+    which = dr.arange(ad.UInt, 40) % 2
+
+    def gradients(function):
+        dr.enable_grad(net["primary.0.data"], net["cascaded.data"], *x)
+        dr.backward(function())
+        arrays = (net["primary.0.data"], net["cascaded.data"], *x)
+        result, _ = [a.grad.numpy() for a in arrays], dr.disable_grad(arrays)
+        return result
+
+    calls = [lambda a, b: net([a, b])[1], lambda a, b: other([a, b])[1]]
+    expected = gradients(lambda: dr.select(which == 0, net(x)[1], other(x)[1]))
+    with dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, mode == "symbolic"):
+        np.testing.assert_allclose(
+            dr.switch(which, calls, *x).numpy(), dr.select(which == 0, net(x)[1], other(x)[1]).numpy(), rtol=1e-6
+        )
+        found = gradients(lambda: dr.switch(which, calls, *x))
+    for a, b in zip(found, expected, strict=True):
+        assert b.any()
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+# -- mistakes -----------------------------------------------------------------------------------------------------------
+
+MISTAKES = {
+    "no dimension": (lambda: DifferentiableArray(()), "1 to 4 dimensions"),
+    "five dimensions": (lambda: DifferentiableArray((2,) * 5), "1 to 4 dimensions"),
+    "no entries": (lambda: DifferentiableArray((4, 0)), "at least 1 entry"),
+    "negative entries": (lambda: DifferentiableArray(-3), "at least 1 entry"),
+    "no channel": (lambda: DifferentiableArray(4, 0), "channels: found 0"),
+    "unknown border": (lambda: DifferentiableArray(4, border="mirror"), "mirror"),
+    "too few borders": (lambda: DifferentiableArray((4, 4), border=("clamp",)), "one for each axis"),
+    "unknown initialisation": (lambda: DifferentiableArray(4, init="noise"), '"noise"'),
+    "wrong shape": (lambda: DifferentiableArray((4, 4), 2, np.zeros((4, 4))), r"expected \(4, 4, 2\)"),
+    "not a range": (lambda: DifferentiableArray(4, 1, "random", 0.5), "pair"),
+    "values for other channels": (lambda: DifferentiableArray(4, 3, value=(1, 2)), "one a channel"),
+    "pointer too short": (
+        lambda: Indirection(DifferentiableArray((4, 4), 2), DifferentiableArray((4, 4, 4))),
+        "2 channel.* 3 dimension",
+    ),
+    "pointer too long": (lambda: Indirection(DifferentiableArray(4, 2), DifferentiableArray(4)), "2 channel"),
+    "no primary": (lambda: Indirection([], DifferentiableArray(4)), "0 channel"),
+    "inputs do not fit": (
+        lambda: Indirection(DifferentiableArray((4, 4), 2), DifferentiableArray((4, 4)), [(0,)]),
+        "inputs: found",
+    ),
+    "negative input": (
+        lambda: Indirection(DifferentiableArray((4, 4), 2), DifferentiableArray((4, 4)), [(-1, 0)]),
+        "at least 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_impossible_settings(name):
+    make, message = MISTAKES[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_numpy_integers_are_integers():
+    array = DifferentiableArray(np.int64(4), np.int32(2))
+    assert array.resolution == (4,) and array.channels == 2
+    assert DifferentiableArray(np.array([4, 5])).resolution == (4, 5)
+
+
+def test_mistakes_when_reading(ad):
+    net = pair(ad)
+    x = ad.Float(0.5)
+    for wrong in ([x], [x] * 3):
+        with pytest.raises(ValueError, match=rf"2 input.* {len(wrong)} coordinate"):
+            net(wrong)
+        with pytest.raises(ValueError, match=rf"2 dimension.* {len(wrong)} coordinate"):
+            net.cascaded(wrong)
+    empty = DifferentiableArray((4, 4))
+    for use in (lambda: empty([x, x]), empty.numpy, lambda: empty.to("uint8")):
+        with pytest.raises(RuntimeError, match="alloc"):
+            use()
+    with pytest.raises(ValueError, match="uint4"):
+        net.to("uint4")
+    with pytest.raises(ValueError, match="float64"):
+        DifferentiableArray.from_numpy(np.zeros((3, 1)), ad.TensorXf, storage="float64")
+    with pytest.raises(ValueError, match="channels"):
+        DifferentiableArray.from_numpy(np.zeros(3), ad.TensorXf)
+    with pytest.raises(ValueError, match="float32"):
+        net.cascaded.codes()
+    with pytest.raises(ValueError, match="2 input"):
+        net.alloc(ad.TensorXf, 3)
+
+
+def test_ramp_function():
+    np.testing.assert_array_equal(ramp((3,), 1, ("clamp",))[:, 0], [0, 0.5, 1])
+    np.testing.assert_array_equal(ramp((4,), 1, ("repeat",))[:, 0], [0, 0.25, 0.5, 0.75])

@@ -1,0 +1,392 @@
+"""
+Multilinear reads against an independent interpolation: SciPy's, in float64, one channel block at a time.
+
+SciPy knows neither of our borders, so the reference does by hand what they mean: a clamped axis has its entries at
+``i / (N − 1)`` and the coordinate is clipped, a repeating one at ``i / N`` with the first entry appended once more.
+"""
+
+import drjit as dr
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+
+from mi_diffind import DifferentiableArray, lookup
+from mi_diffind.runtime import array_module
+
+BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
+CHANNELS = (1, 2, 3, 4, 7, 12)
+RESOLUTION = (5, 4, 6, 3)
+DENORMAL = 1e-45
+BELOW_ONE = float(np.nextafter(np.float32(1), np.float32(0)))
+ABOVE_ONE = float(np.nextafter(np.float32(1), np.float32(2)))
+SPECIAL = (
+    0.0, -0.0, 1.0, BELOW_ONE, ABOVE_ONE, DENORMAL, -DENORMAL, 1e-38, -1e-38, -1e-9, 0.5, 2.0, -1.0,
+    -5.3, 7.25, 1e9, -1e9, 3.4e38, -3.4e38, np.inf, -np.inf, np.nan,
+)  # fmt: skip
+
+
+@pytest.fixture(params=BACKENDS)
+def ad(request):
+    return array_module(request.param)
+
+
+def borders(dims):
+    """Both borders everywhere, and mixed ones."""
+    alternating = [("clamp", "repeat")[k % 2] for k in range(dims)]
+    choices = {("clamp",) * dims, ("repeat",) * dims, tuple(alternating), tuple(reversed(alternating))}
+    return sorted(choices)
+
+
+def entries(rng, resolution, channels):
+    """Random entries in [0.5, 1.5]: away from zero, so that a relative error means something for each value."""
+    return rng.uniform(0.5, 1.5, (*resolution, channels)).astype(np.float32)
+
+
+def normalised(x, border):
+    """The coordinate that the documentation says is read, in float64."""
+    x = np.asarray(x, np.float64)
+    if border == "clamp":
+        return np.where(np.isnan(x), 0.0, np.clip(x, 0, 1))
+    return np.where(np.isfinite(x), np.mod(np.where(np.isfinite(x), x, 0), 1), 0.0)
+
+
+def reference(table, x, border):
+    """The interpolated values, shape ``(samples, channels)``; ``x`` has the shape ``(samples, dims)``."""
+    table = np.asarray(table, np.float64)
+    points, grid = [], []
+    for axis, kind in enumerate(border):
+        n = table.shape[axis]
+        points.append(normalised(x[:, axis], kind))
+        if kind == "repeat" or n == 1:
+            table = np.concatenate([table, np.take(table, [0], axis)], axis)
+        grid.append(np.linspace(0, 1, table.shape[axis]))
+    return RegularGridInterpolator(grid, table)(np.stack(points, axis=-1))
+
+
+def read(array, ad, x, **kwargs):
+    x = np.asarray(x, np.float32)
+    values = array([ad.Float(x[:, k].copy()) for k in range(x.shape[1])], **kwargs)
+    dr.eval(values)  # one kernel, not one a channel
+    return np.stack([np.broadcast_to(v.numpy(), len(x)) for v in values], axis=-1)
+
+
+def inside(rng, samples, resolution, border):
+    """Random coordinates well inside a cell each (periods away, if the border allows it), where slopes exist."""
+    columns = []
+    for n, kind in zip(resolution, border, strict=True):
+        cells = n if kind == "repeat" else max(1, n - 1)
+        x = (rng.integers(cells, size=samples) + rng.uniform(0.05, 0.95, samples)) / cells
+        columns.append(x + (rng.integers(-2, 3, samples) if kind == "repeat" else 0))
+    return np.stack(columns, axis=-1).astype(np.float32)
+
+
+# -- values -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+@pytest.mark.parametrize("channels", CHANNELS)
+@pytest.mark.parametrize("dims", [1, 2, 3, 4])
+def test_values_equal_scipy(ad, dims, channels, storage):
+    """Each storage form interpolates what it holds to 1e-5, inside and outside [0, 1], with all borders."""
+    rng = np.random.default_rng(100 * dims + channels)
+    resolution = RESOLUTION[:dims]
+    table = entries(rng, resolution, channels)
+    x = rng.uniform(-1.2, 2.2, (300, dims)).astype(np.float32)
+    x[:200] = np.mod(x[:200], 1)
+    # Kernels with many half-precision gathers take long to compile: one border each, in turn.
+    chosen = borders(dims)[channels % len(borders(dims)) :][:1] if storage == "float16" else borders(dims)
+    for border in chosen:
+        array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, storage)
+        values, held = read(array, ad, x), array.numpy()
+        assert values.shape == (300, channels)
+        np.testing.assert_allclose(values, reference(held, x, border), rtol=1e-5, atol=0)
+        if storage == "uint8":
+            half_step = (table.max(axis=tuple(range(dims))) - table.min(axis=tuple(range(dims)))) / 255 / 2
+            assert (np.abs(values - reference(table, x, border)) <= half_step * 1.001 + 1e-6).all()
+            assert (np.abs(held - table) <= half_step * 1.001).all()
+        elif storage == "float16":
+            np.testing.assert_array_equal(held, table.astype(np.float16).astype(np.float32))
+        else:
+            np.testing.assert_array_equal(held, table)
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+@pytest.mark.parametrize("channels", [1, 2, 3])
+@pytest.mark.parametrize("resolution", [(1,), (1, 3), (3, 1), (1, 1), (2, 1, 3), (1, 4, 1), (1, 2, 1, 2), (2, 2)])
+def test_one_entry_along_an_axis(ad, resolution, channels, storage):
+    """A single entry is constant along its axis, and has no slope."""
+    rng = np.random.default_rng(7)
+    x = rng.uniform(-0.5, 1.5, (100, len(resolution))).astype(np.float32)
+    for border in borders(len(resolution)):
+        table = entries(rng, resolution, channels)
+        array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, storage)
+        np.testing.assert_allclose(read(array, ad, x), reference(array.numpy(), x, border), rtol=1e-5)
+        point = [ad.Float(x[:, k].copy()) for k in range(len(resolution))]
+        dr.enable_grad(point)
+        dr.backward(sum(array(point)), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        for n, v in zip(resolution, point, strict=True):
+            assert n > 1 or not v.grad.numpy().any()
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+@pytest.mark.parametrize("border", lookup.BORDERS)
+@pytest.mark.parametrize("channels", [1, 2, 3])
+@pytest.mark.parametrize("dims", [1, 2, 4])
+def test_special_coordinates(ad, dims, channels, border, storage):
+    """Exact ends, neighbours of the ends, NaN, infinities, denormals, far away: each along each axis."""
+    rng = np.random.default_rng(dims)
+    table = entries(rng, RESOLUTION[:dims], channels)
+    array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, storage)
+    x = rng.uniform(0, 1, (dims * len(SPECIAL), dims)).astype(np.float32)
+    for axis in range(dims):
+        x[axis * len(SPECIAL) : (axis + 1) * len(SPECIAL), axis] = SPECIAL
+    x = np.concatenate([x, np.repeat(np.float32(SPECIAL)[:, None], dims, axis=1)])
+    values = read(array, ad, x)
+    np.testing.assert_allclose(values, reference(array.numpy(), x, (border,) * dims), rtol=1e-5)
+
+
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+@pytest.mark.parametrize("dims", [1, 2, 3, 4])
+def test_ends_are_stored_values(ad, dims, storage):
+    """At exactly 0 and exactly 1, what is read are the corner entries, bit by bit; beyond them as well."""
+    table = entries(np.random.default_rng(3), RESOLUTION[:dims], 3)
+    array = DifferentiableArray.from_numpy(table, ad.TensorXf, "clamp", storage)
+    held = array.numpy()
+    for value, index in ((0.0, 0), (-0.0, 0), (-3.0, 0), (-np.inf, 0), (np.nan, 0), (1.0, -1), (9.0, -1), (np.inf, -1)):
+        np.testing.assert_array_equal(read(array, ad, [[value] * dims])[0], held[(index,) * dims], str(value))
+    wrapped = DifferentiableArray.from_numpy(table, ad.TensorXf, "repeat", storage)
+    for value in (0.0, -0.0, 1.0, -4.0, np.nan, np.inf, -np.inf, 1e30):
+        np.testing.assert_array_equal(read(wrapped, ad, [[value] * dims])[0], held[(0,) * dims], str(value))
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+@pytest.mark.parametrize("border", lookup.BORDERS)
+def test_no_bit_pattern_leads_outside_the_table(ad, border, storage):
+    """Any 32 bits as a coordinate: the weights sum to one over entries of the table."""
+    bits = np.random.default_rng(5).integers(0, 2**32, (20000, 3), dtype=np.uint32)
+    x = bits.view(np.float32)
+    for resolution, channels in (((3, 2, 5), 1), ((2, 3, 2), 3)):
+        table = np.full((*resolution, channels), 3.0, np.float32)
+        table[0] = 2.0
+        array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, storage)
+        values = read(array, ad, x)
+        assert np.isfinite(values).all()
+        assert values.min() >= 2 - 1e-6 and values.max() <= 3 + 1e-6
+
+
+@pytest.mark.parametrize("border", lookup.BORDERS)
+def test_neighbouring_cells_meet(ad, border):
+    """Reading just left and just right of every entry gives that entry: no cell is off by one."""
+    n = 9
+    table = entries(np.random.default_rng(9), (n,), 3)
+    array = DifferentiableArray.from_numpy(table, ad.TensorXf, border)
+    x = (np.arange(n) / (n if border == "repeat" else n - 1)).astype(np.float32)
+    for direction in (-1, 1):
+        around = np.nextafter(x, np.float32(direction * 10))[:, None]
+        np.testing.assert_allclose(read(array, ad, around), table, atol=5e-6)
+
+
+def test_large_tables(ad):
+    """The position inside a table of 512 entries a side still has the resolution that single precision allows."""
+    rng = np.random.default_rng(11)
+    table = entries(rng, (512, 512), 4)
+    x = rng.uniform(0, 1, (5000, 2)).astype(np.float32)
+    values = read(DifferentiableArray.from_numpy(table, ad.TensorXf), ad, x)
+    expected = reference(table, x, ("clamp", "clamp"))
+    # A coordinate of 24 bits times 511: the weight is known to 2^-16, at worst.
+    assert np.abs(values - expected).max() <= 2 * 2.0**-16
+    assert np.sqrt(np.mean((values - expected) ** 2)) <= 1e-5
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+@pytest.mark.parametrize("channels", CHANNELS)
+def test_masked_lanes_are_zero(ad, channels, storage):
+    """Masked lanes return 0, whatever byte 0 means, and their coordinate does not matter."""
+    rng = np.random.default_rng(1)
+    array = DifferentiableArray.from_numpy(entries(rng, (4, 3), channels), ad.TensorXf, storage=storage)
+    x = rng.uniform(0, 1, (64, 2)).astype(np.float32)
+    mask = rng.integers(0, 2, 64).astype(bool)
+    everything = read(array, ad, x)
+    x[~mask] = np.nan
+    np.testing.assert_array_equal(read(array, ad, x, active=ad.Bool(mask)), np.where(mask[:, None], everything, 0))
+
+
+def test_masked_lanes_leave_no_gradient(ad):
+    array = DifferentiableArray.from_numpy(entries(np.random.default_rng(1), (4,), 3), ad.TensorXf)
+    dr.enable_grad(array.data)
+    x = ad.Float([0.1, 0.9])
+    dr.enable_grad(x)
+    dr.backward(sum(array(x, active=ad.Bool([True, False]))))
+    gradient = array.data.grad.numpy()
+    assert gradient[:2, :3].all() and not gradient[2:].any()
+    assert x.grad.numpy()[0] != 0 and x.grad.numpy()[1] == 0
+
+
+# -- gradients ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", CHANNELS)
+@pytest.mark.parametrize("dims", [1, 2, 3, 4])
+def test_gradients_equal_central_differences(ad, dims, channels):
+    """With respect to the entries and to the coordinate, against differences of the float64 reference."""
+    rng = np.random.default_rng(10 * dims + channels)
+    resolution = (4, 3, 3, 2)[:dims]
+    table = entries(rng, resolution, channels)
+    weight = rng.uniform(-1, 1, channels)
+    for border in borders(dims) if channels <= 4 else borders(dims)[-1:]:
+        x = inside(rng, 100, resolution, border)
+        array = DifferentiableArray.from_numpy(table, ad.TensorXf, border)
+        point = [ad.Float(x[:, k].copy()) for k in range(dims)]
+        dr.enable_grad(array.data, *point)
+        dr.backward(sum(float(w) * v for w, v in zip(weight, array(point), strict=True)))
+        dr.eval(array.data.grad, [v.grad for v in point])  # one kernel
+
+        # The reference is linear in the entries: its central difference is exact for any step. All at once: the
+        # table whose channels are the unit vectors gives each entry's influence on each sample.
+        count = int(np.prod(resolution))
+        units = np.eye(count).reshape(*resolution, count)
+        step = 0.5
+        influence = (reference(units * step, x, border) - reference(-units * step, x, border)).sum(axis=0) / (2 * step)
+        expected = influence.reshape(*resolution, 1) * weight
+        np.testing.assert_allclose(array.data.grad.numpy()[..., :channels], expected, rtol=1e-5, atol=1e-5)
+
+        for k, v in enumerate(point):
+            h = np.zeros(dims)
+            h[k] = 1e-5
+            x64 = x.astype(np.float64)
+            slope = (reference(table, x64 + h, border) - reference(table, x64 - h, border)) @ weight / 2e-5
+            np.testing.assert_allclose(v.grad.numpy(), slope, rtol=1e-4, atol=1e-5 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
+@pytest.mark.parametrize("dims", [1, 2, 3])
+def test_packed_reads_are_differentiable_in_the_coordinate(ad, dims, channels):
+    rng = np.random.default_rng(dims)
+    border = borders(dims)[-1]
+    array = DifferentiableArray.from_numpy(entries(rng, RESOLUTION[:dims], channels), ad.TensorXf, border, "uint8")
+    x = inside(rng, 100, RESOLUTION[:dims], border)
+    point = [ad.Float(x[:, k].copy()) for k in range(dims)]
+    dr.enable_grad(point)
+    dr.backward(sum(array(point)))
+    for k, v in enumerate(point):
+        h = 1e-5 * np.eye(dims)[k]
+        held = array.numpy()
+        slope = (reference(held, x + h, border) - reference(held, x - h, border)).sum(axis=1) / 2e-5
+        np.testing.assert_allclose(v.grad.numpy(), slope, rtol=1e-3, atol=1e-4 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_slope_at_the_ends(ad, storage):
+    """That of the first and last cell at exactly 0 and 1, of the cell that is read otherwise, none beyond a clamp."""
+    table = np.array([[1.0], [3.0], [4.0], [0.0]], np.float32)
+    x = (0.0, -0.0, 1.0, BELOW_ONE, 0.5, -DENORMAL, -0.01, ABOVE_ONE, 1.01, np.inf, -np.inf, np.nan)
+    clamped = [6, 6, -12, -12, 3, 0, 0, 0, 0, 0, 0, 0]
+    around = [8, 8, 8, 4, -16, 4, 4, 8, 8, 0, 0, 0]
+    for border, expected in (("clamp", clamped), ("repeat", around)):
+        array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, storage)
+        point = ad.Float(np.float32(x))
+        dr.enable_grad(point)
+        dr.backward(array(point)[0])
+        found = point.grad.numpy()
+        held = array.numpy()[:, 0] - table[:, 0]
+        np.testing.assert_allclose(found, expected, atol=1e-3 + 8 * np.abs(held).max(), err_msg=border)
+        assert (found[np.equal(expected, 0)] == 0).all()
+
+
+def test_entries_get_the_gradient_of_reads_outside(ad):
+    """Beyond a clamped border, the end entry is what is read and what is trained."""
+    array = DifferentiableArray.from_numpy(np.zeros((3, 1), np.float32), ad.TensorXf)
+    dr.enable_grad(array.data)
+    dr.backward(array(ad.Float([-2.0, np.nan, 1.0, 5.0, np.inf]))[0])
+    np.testing.assert_array_equal(array.data.grad.numpy()[:, 0], [2, 0, 3])
+
+
+# -- storage ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", [3, 5, 7, 11])
+@pytest.mark.parametrize("fold", [False, True])
+def test_padding_has_no_influence_and_no_gradient(ad, channels, fold):
+    rng = np.random.default_rng(channels)
+    table = entries(rng, (4, 3), channels)
+    clean = DifferentiableArray.from_numpy(table, ad.TensorXf, fold=fold)
+    dirty = DifferentiableArray.from_numpy(table, ad.TensorXf, fold=fold)
+    stored = dirty.data.numpy()
+    assert stored.shape == (4, 3, lookup.padded_channels(channels)) and stored.shape[-1] % 4 == 0
+    stored[..., channels:] = np.nan
+    stored[0, 0, channels:] = 3e38
+    dirty.data = ad.TensorXf(stored)
+    x = rng.uniform(0, 1, (50, 2)).astype(np.float32)
+    np.testing.assert_array_equal(read(dirty, ad, x), read(clean, ad, x))
+    np.testing.assert_array_equal(dirty.numpy(), clean.numpy())
+    for array in (clean, dirty):
+        dr.enable_grad(array.data)
+        dr.backward(sum(array([ad.Float(x[:, 0].copy()), ad.Float(x[:, 1].copy())])))
+        gradient = array.data.grad.numpy()
+        assert gradient[..., :channels].all() and not gradient[..., channels:].any()
+
+
+@pytest.mark.parametrize("channels", CHANNELS)
+@pytest.mark.parametrize("dims", [1, 2, 3, 4])
+def test_bytes_survive_packing(ad, dims, channels):
+    """What is packed is what ``codes`` gives back, and the extreme bytes mean the extreme values exactly."""
+    rng = np.random.default_rng(dims)
+    codes = rng.integers(0, 256, (*RESOLUTION[:dims], channels)).astype(np.uint8)
+    scale, offset = rng.uniform(0.1, 1, channels), rng.uniform(-1, 1, channels)
+    array = DifferentiableArray.from_numpy(codes, ad.TensorXf, "clamp", "uint8", quantization=(scale, offset))
+    np.testing.assert_array_equal(array.codes(), codes)
+    np.testing.assert_allclose(array.numpy(), offset + scale * codes, rtol=1e-6)
+    assert array.nbytes == codes.nbytes
+
+    table = entries(rng, RESOLUTION[:dims], channels)
+    found, scale, offset = lookup.quantize(table, channels)
+    flat, back = table.reshape(-1, channels), (offset + scale * found).reshape(-1, channels).astype(np.float32)
+    np.testing.assert_array_equal(back.min(axis=0), flat.min(axis=0))
+    np.testing.assert_array_equal(back.max(axis=0), flat.max(axis=0))
+
+
+def test_quantising_a_constant_and_refusing_nan(ad):
+    constant = np.full((3, 3, 2), 0.3, np.float32)
+    array = DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")
+    np.testing.assert_array_equal(read(array, ad, [[0.2, 0.7]]), np.float32([[0.3, 0.3]]))
+    for bad in (np.nan, np.inf):
+        constant[1, 1, 1] = bad
+        with pytest.raises(ValueError, match="NaN or infinite"):
+            DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")
+
+
+def test_gathers():
+    """The documented number of memory accesses: few channels share a word between corners."""
+    assert lookup.gathers((8, 8), 1, "uint8") == 1
+    assert lookup.gathers((8, 8), 2, "uint8") == 2
+    assert lookup.gathers((8, 8), 4, "uint8") == 4
+    assert lookup.gathers((8,) * 4, 1, "uint8") == 4
+    assert lookup.gathers((8,) * 4, 7, "uint8") == 32
+    assert lookup.gathers((8, 8), 1, "float32") == 4
+    assert lookup.gathers((8, 8), 4, "float32") == 4
+    assert lookup.gathers((8, 8), 7, "float16") == 8
+
+
+def test_gathers_that_the_kernel_makes():
+    """The kernel really contains as many gathers as :func:`mi_diffind.lookup.gathers` says for bytes."""
+    ad = array_module("llvm")
+    for resolution, channels in (((5, 7), 1), ((5, 7), 2), ((5, 7), 3), ((3, 4, 5), 1), ((3, 4, 5), 7)):
+        table = entries(np.random.default_rng(0), resolution, channels)
+        array = DifferentiableArray.from_numpy(table, ad.TensorXf, storage="uint8")
+        x = [dr.linspace(ad.Float, 0, 1, 123) for _ in resolution]
+        dr.eval(x)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(array(x))
+            code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
+        calls = [line for line in code.splitlines() if "call" in line and "gather" in line]
+        assert len(calls) == lookup.gathers(resolution, channels, "uint8")
+
+
+def test_clamp_keeps_the_gradient_at_its_bounds(ad):
+    x = ad.Float([0.0, 1.0, 0.5, -0.1, 1.1, np.nan])
+    dr.enable_grad(x)
+    y = lookup.clamp(x, 0.0, 1.0)
+    dr.backward(y)
+    np.testing.assert_array_equal(y.numpy(), np.float32([0, 1, 0.5, 0, 1, 0]))
+    np.testing.assert_array_equal(x.grad.numpy(), [1, 1, 1, 0, 0, 0])
