@@ -6,7 +6,13 @@ Learned lookup tables that a renderer trusts: differentiable indirection for Mit
 first, and makes sure that Dr.Jit runs on an LLVM that does not abort (:mod:`mi_diffind.runtime`).
 """
 
+from pathlib import Path as _Path
+
 from . import runtime as _runtime
+
+_here = _Path(__file__).resolve().parent
+if not (_here / "plugins").is_dir():  # a checkout has the folder `plugins` beside this one, an installation inside
+    __path__.append(str(_here.parent))
 
 _runtime.select_llvm()  # before Dr.Jit starts
 

@@ -42,6 +42,10 @@ class Problem(Protocol):
     #: Weight of each named target in the loss; a missing name counts 1.
     weights: dict[str, float]
 
+    #: Optional: states whose quality (first entry) differs by less than this count as equally good, and the later one
+    #: is kept. (Default: 0)
+    tolerance: float
+
     def batch(self, rng, size: int):
         """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
 
@@ -150,7 +154,8 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
         quality = {k: float(v) for k, v in problem.quality(net).items()}
         name, value = next(iter(quality.items()))
         history.append({"step": trainer.step, "loss": loss, **quality})
-        if best is None or value > next(iter(best_quality.values())):
+        top = max((h[name] for h in history if math.isfinite(h[name])), default=value)
+        if best is None or value >= top - getattr(problem, "tolerance", 0.0):
             best, best_quality, best_step = trainer.snapshot().parameters, quality, trainer.step
         bar.set_postfix({"loss": f"{loss:.3g}", name: f"{value:.2f}"})
 
@@ -272,7 +277,11 @@ class _Trainer:
         return loss
 
     def finite(self) -> bool:
-        return all(bool(dr.all(dr.isfinite(v.array), axis=None)) for v in self.optimizer.values())
+        """Whether all entries are finite, and Adam's moments: an infinite one would stop its entry for good."""
+        arrays = []
+        for value, _, _, (_, m, v, _) in self.optimizer.state.values():
+            arrays += [value.array, m.array, v.array]
+        return all(bool(dr.all(dr.isfinite(a), axis=None)) for a in arrays)
 
     def snapshot(self) -> _State:
         parameters, moments = {}, {}
@@ -329,8 +338,9 @@ def _load_checkpoint(path, settings: FitSettings, trainer: _Trainer) -> tuple[_S
     except Exception as e:  # zipfile, json and numpy each have their own for a damaged file
         raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({type(e).__name__}: {e})') from None
     for key in keys:
-        stored = (state.parameters[key], *state.moments[key][1:], best[key])
-        if any(a.shape != trainer.optimizer[key].shape for a in stored):
+        shape = trainer.optimizer[key].shape
+        moments_fit = all(m.shape == (math.prod(shape),) for m in state.moments[key][1:])  # Adam keeps them flat
+        if state.parameters[key].shape != shape or best[key].shape != shape or not moments_fit:
             raise FittingError(f'the checkpoint "{path}" holds other table sizes ("{key}")')
     if stored_settings != asdict(settings):
         changed = [k for k, v in asdict(settings).items() if stored_settings.get(k) != v]

@@ -16,6 +16,7 @@ import numpy as np
 from drjit import nn
 
 from . import lookup
+from .runtime import llvm_problem
 
 __all__ = ["DifferentiableArray", "Indirection", "fold"]
 
@@ -171,6 +172,7 @@ class DifferentiableArray(nn.Module):
             else:
                 codes, (scale, offset) = values, quantization
             result.scale, result.offset = tuple(map(float, scale)), tuple(map(float, offset))
+            _require_backend(dtype)
             UInt32 = _module(dtype).UInt32
             result.data = UInt32(lookup.pack(codes, result.border))
         else:
@@ -344,7 +346,14 @@ def _module(array):
     return sys.modules[(array if isinstance(array, type) else type(array)).__module__]
 
 
+def _require_backend(dtype) -> None:
+    # Without LLVM, Dr.Jit takes the whole process down when it makes an array from NumPy's (SIGFPE).
+    if not dr.has_backend(dr.backend_v(dtype)):
+        raise RuntimeError(llvm_problem() or f"the Dr.Jit backend of {dtype.__module__} cannot run here")
+
+
 def _tensor(dtype, values: np.ndarray, resolution, channels: int):
+    _require_backend(dtype)
     half = dr.is_half_v(dtype)
     dtype = _module(dtype).TensorXf16 if half else _module(dtype).TensorXf  # never double, also in such variants
     stored = np.zeros((*resolution, lookup.padded_channels(channels)), np.float16 if half else np.float32)

@@ -269,7 +269,7 @@ class Disney(mi.BSDF):
         """The sampling rates of the lobes that the context asks for; the others are missing."""
         flags = (mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.GlossyReflection)
         return {
-            lobe: self.rates[lobe]
+            lobe: model.clamp(self.rates[lobe], 0.0, 1e6)
             for component, (lobe, flag) in enumerate(zip(LOBES, flags, strict=True))
             if ctx.is_enabled(flag, component)
         }
@@ -281,10 +281,8 @@ class Disney(mi.BSDF):
         return dr.select(active, si.wi, up), dr.select(active, wo, up), active
 
     def _value(self, lobes, material, albedo, luminance, wi, wo, active):
-        parts = model.compose(material, luminance, self.factors(material, wi, wo, active))
-        x = sum(parts[lobe][0] for lobe in lobes)
-        y = sum(parts[lobe][1] for lobe in lobes)
-        value = mi.UnpolarizedSpectrum(model.tint(albedo, luminance) * x + y)
+        parts = model.compose(material, self.factors(material, wi, wo, active))
+        value = mi.UnpolarizedSpectrum(model.colour([parts[lobe] for lobe in lobes], albedo, luminance))
         return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
 
     def _density(self, rates, material, luminance, wi, wo, active):
@@ -340,7 +338,7 @@ class Disney(mi.BSDF):
             is_diffuse, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
         )
 
-        active &= wo.z > 0
+        active &= dr.isfinite(wo.z) & (wo.z > 0)
         safe = dr.select(active, wo, mi.Vector3f(0, 0, 1))
         value, bs.pdf = self._eval_pdf(rates, material, albedo, luminance, wi, safe, active)
         active &= bs.pdf > 0

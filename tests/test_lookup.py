@@ -80,7 +80,7 @@ def inside(rng, samples, resolution, border):
     return np.stack(columns, axis=-1).astype(np.float32)
 
 
-# -- values -------------------------------------------------------------------------------------------------------------
+# -- values ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -222,7 +222,7 @@ def test_masked_lanes_leave_no_gradient(ad):
     assert x.grad.numpy()[0] != 0 and x.grad.numpy()[1] == 0
 
 
-# -- gradients ----------------------------------------------------------------------------------------------------------
+# -- gradients ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("channels", CHANNELS)
@@ -301,7 +301,7 @@ def test_entries_get_the_gradient_of_reads_outside(ad):
     np.testing.assert_array_equal(array.data.grad.numpy()[:, 0], [2, 0, 3])
 
 
-# -- storage ------------------------------------------------------------------------------------------------------------
+# -- storage -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("channels", [3, 5, 7, 11])

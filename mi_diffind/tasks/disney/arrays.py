@@ -1,8 +1,8 @@
 """
 The Disney BRDF as tables: the layout of the paper's Table 1, with a small encoder before it.
 
-The *encoder* is two 1D primary arrays, which map roughness and anisotropy to coordinates; it depends on the material
-only. The *decoder* is five cascaded arrays, the same for every material:
+The *encoder* is two 1D primary arrays, which map roughness (warped, see :func:`warp_roughness`) and anisotropy to
+coordinates; it depends on the material only. The *decoder* is five cascaded arrays, the same for every material:
 
 ============ ========= ======== ================================ ===================================================
 array        size      channels read at                          holds
@@ -20,6 +20,8 @@ quantity in a form that cannot blow up: denominators are sums of positive terms,
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import numpy as np
 from drjit import nn
@@ -27,7 +29,7 @@ from drjit import nn
 from ...indirection import DifferentiableArray
 from ...lookup import clamp
 from ...tables import Table, TableError, load_table
-from .model import ALPHA_MIN, COAT_F0, TINY, Factors, Material, diffuse_factors, geometry
+from .model import ALPHA_MIN, COAT_F0, TINY, Factors, Material, diffuse_factors, geometry, positive
 
 #: Sizes: name → (shape with channels last).
 SHAPES = {
@@ -97,7 +99,7 @@ class DisneyArrays(nn.Module):
     def encode(self, material: Material, active=True):
         """The latent coordinates of (roughness, anisotropic). Depends on the material only."""
         return (
-            self.encoder_roughness([material.roughness], active)[0],
+            self.encoder_roughness([warp_roughness(material.roughness)], active)[0],
             self.encoder_anisotropic([material.anisotropic], active)[0],
         )
 
@@ -131,14 +133,25 @@ class DisneyArrays(nn.Module):
         coat = g.h2 / (k0 * sine2 + k1 * dr.square(g.h.z) + TINY)
         return Factors(
             specular=specular,
-            metal_base=dr.maximum(metal_base, 0),
-            base=dr.maximum(base, 0),
-            sheen=dr.maximum(sheen, 0) * wo.z,
-            grazing=dr.maximum((coat_fresnel - COAT_F0) / (1 - COAT_F0), 0),
+            metal_base=positive(metal_base),
+            base=positive(base),
+            sheen=positive(sheen) * wo.z,
+            grazing=positive((coat_fresnel - COAT_F0) / (1 - COAT_F0)),
             diffuse=diffuse,
             flat=flat,
-            clearcoat=dr.maximum(coat * coat_masking * coat_fresnel, 0) * wo.z,
+            clearcoat=positive(coat * coat_masking * coat_fresnel) * wo.z,
         )
+
+
+def warp_roughness(roughness):
+    """
+    The coordinate of a roughness in the encoder: ``√(r + c)``, brought to [0, 1].
+
+    GGX coefficients span decades where roughness is low; the eight entries of the encoder lie closer together there
+    (0, 0.04, 0.12, 0.23, …). With ``c = 0.01`` the slope at roughness 0 stays finite.
+    """
+    c = 0.01
+    return (dr.sqrt(roughness + c) - math.sqrt(c)) / (math.sqrt(1 + c) - math.sqrt(c))
 
 
 def load_disney_table(path) -> Table:
@@ -160,6 +173,8 @@ def initial_entries(name: str) -> np.ndarray:
     shape = SHAPES[name]
     axes = [np.linspace(0, 1, n) for n in shape[:-1]]
     u, v = (*np.meshgrid(*axes, indexing="ij"), None)[:2]
+    if name in ("ggx", "masking"):  # read at the encoded roughness, to begin with the warped one
+        u = (u * (math.sqrt(1.01) - 0.1) + 0.1) ** 2 - 0.01
     if name == "ggx":
         aspect = np.sqrt(1 - 0.9 * v)
         ax, ay = np.maximum(u**2 / aspect, ALPHA_MIN), np.maximum(u**2 * aspect, ALPHA_MIN)

@@ -5,9 +5,10 @@ All functions work on Dr.Jit arrays of one width, in the local frame with the no
 ``wi`` (towards the viewer) and ``wo`` (towards the light) with positive cosines ``wi.z`` and ``wo.z``; what a caller
 does with other directions is up to him, nothing becomes NaN. Values include the cosine ``wo.z``, as in Mitsuba.
 
-The colour is affine in the tint ``albedo / luminance(albedo)``: ``f = tint · x + y``. So the model only ever produces
-two scalars for each lobe (:func:`compose`), made of a few factors (:class:`Factors`), and tables need to replace
-nothing but the factors.
+The colour is affine in the albedo and in its tint, ``albedo / luminance(albedo)``: ``f = albedo · a + tint · x + y``.
+(The paper writes ``tint · x + y`` with ``a · luminance`` inside ``x``; apart, the derivative with respect to a black
+albedo is right.) So the model only ever produces three scalars for each lobe (:func:`compose`), made of a few factors
+(:class:`Factors`), and tables need to replace nothing but the factors.
 
 Two choices where descriptions of the model differ: the specular reflectance at normal incidence is
 ``0.08 · specular`` (Burley; the paper's own evaluation uses 0.1), and the clearcoat's masking term is *not* divided
@@ -95,6 +96,11 @@ def geometry(wi, wo) -> Geometry:
     return Geometry(h, h2, dr.minimum(0.5 * dr.sqrt(h2 + TINY), 1))
 
 
+def positive(x):
+    """``max(x, 0)``, and 0 for NaN."""
+    return dr.select(x > 0, x, 0)
+
+
 def schlick(cosine):
     """(1 − cos)^5, and 0 for a cosine that rounding has made larger than 1."""
     m = dr.maximum(1 - cosine, 0)
@@ -155,7 +161,7 @@ def diffuse_factors(roughness, cos_d, fresnel_sum, fresnel_product, cos_ratio, c
     k = 0.5 * f90 - 1
     fss = dr.fma(k, fresnel_sum + k * fresnel_product, 1)
     flat = 1.25 * (fss * (cos_ratio - 0.5 * cos_o) + 0.5 * cos_o)
-    return dr.maximum(diffuse, 0), dr.maximum(flat, 0)  # against rounding, and approximate arguments
+    return positive(diffuse), positive(flat)  # against rounding, and approximate arguments
 
 
 def exact_factors(material: Material, wi, wo) -> Factors:
@@ -180,33 +186,37 @@ def exact_factors(material: Material, wi, wo) -> Factors:
     )  # fmt: skip
 
 
-def compose(material: Material, luminance, f: Factors) -> dict[str, tuple]:
+def compose(material: Material, f: Factors) -> dict[str, tuple]:
     """
-    For each lobe the pair ``(x, y)`` of ``f = tint · x + y``; ``luminance`` is that of the albedo.
-
-    All are non-negative if the factors are.
+    For each lobe the scalars ``(a, x, y)`` of ``f = albedo · a + tint · x + y``, non-negative if the factors are.
     """
-    m, one = material, 1
+    m = material
     f0 = SPECULAR_SCALE * m.specular
     sheen = m.sheen * f.sheen
     return {
         "diffuse": (
-            (one - m.metallic) * luminance * dr.inv_pi * (f.diffuse * (one - m.flatness) + f.flat * m.flatness)
-            + sheen * m.sheen_tint,
-            sheen * (one - m.sheen_tint),
+            (1 - m.metallic) * dr.inv_pi * (f.diffuse * (1 - m.flatness) + f.flat * m.flatness),
+            sheen * m.sheen_tint,
+            sheen * (1 - m.sheen_tint),
         ),
         "specular": (
-            f.specular * (luminance * f.metal_base + f0 * m.spec_tint * f.base),
-            f.specular * (f0 * (one - m.spec_tint) * f.base + f.grazing),
+            f.specular * f.metal_base,
+            f.specular * f0 * m.spec_tint * f.base,
+            f.specular * (f0 * (1 - m.spec_tint) * f.base + f.grazing),
         ),
-        "clearcoat": (0, COAT_STRENGTH * m.clearcoat * f.clearcoat),
+        "clearcoat": (0, 0, COAT_STRENGTH * m.clearcoat * f.clearcoat),
     }
 
 
+def colour(lobes, albedo, luminance):
+    """``albedo · a + tint · x + y``, summed over ``lobes``, an iterable of such triples."""
+    a, x, y = (sum(parts) for parts in zip(*lobes, strict=True))
+    return albedo * a + tint(albedo, luminance) * x + y
+
+
 def tint(albedo, luminance):
-    """``albedo / luminance``, and 1 for black, which has no hue."""
-    visible = luminance > 1e-6
-    return dr.select(visible, albedo / dr.select(visible, luminance, 1), 1)
+    """``albedo / luminance``, turning into 1 for black, which has no hue; its slope stays below 10⁵."""
+    return (albedo + 1e-5) / (luminance + 1e-5)
 
 
 def sanitize(material: Material, specular_max: float = 3.0) -> Material:

@@ -55,7 +55,8 @@ def density(m: Material, probabilities: dict, wi, wo):
 def sample_gtr1(gloss, sample):
     """A half vector with density ``GTR1(h) · h.z`` (Burley 2012, appendix B.2); ``sample`` uniform in [0, 1)²."""
     a2 = dr.square(model.coat_alpha(gloss))
-    cos2 = (1 - dr.power(a2, 1 - sample.y)) / (1 - a2)
-    cos, sin = dr.sqrt(dr.clip(cos2, 0, 1)), dr.sqrt(dr.clip(1 - cos2, 0, 1))
+    # The published form gives cos², from which sin² = 1 − cos² would cancel next to the peak
+    sin2 = dr.clip(a2 * (dr.exp(-sample.y * dr.log(a2)) - 1) / (1 - a2), 0, 1)
+    sin, cos = dr.sqrt(sin2), dr.sqrt(1 - sin2)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * sample.x)
     return cos_phi * sin, sin_phi * sin, cos

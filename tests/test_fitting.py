@@ -1,0 +1,505 @@
+"""The training loop, on problems of a few entries: repeatable, resumable, interruptible, and hard to derail."""
+
+import math
+import os
+import signal
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_diffind import DifferentiableArray, Indirection, fitting
+from mi_diffind.files import OutputError
+from mi_diffind.fitting import FitSettings, FittingError, fit
+from mi_diffind.runtime import array_module
+
+BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
+
+
+@pytest.fixture(params=BACKENDS)
+def ad(request):
+    return array_module(request.param)
+
+
+class Curve:
+    """Fit ``0.5 + 0.3 sin(6x)`` by an indirection; ``at`` maps numbers of calls to something to do in that batch."""
+
+    def __init__(self, ad, at=None):
+        self.ad, self.at, self.calls = ad, at or {}, 0
+        self.weights = {"y": 1.0}
+        primary = DifferentiableArray(16, 1, "ramp", fold=True)
+        self.net = Indirection(primary, DifferentiableArray(8, 1)).alloc(ad.TensorXf)
+
+    def target(self, x):
+        return 0.5 + 0.3 * dr.sin(6 * x)
+
+    def batch(self, rng, size):
+        self.calls += 1
+        x = rng.random(self.ad.Float, size)
+        y = self.target(x)
+        action = self.at.get(self.calls)
+        return [x], {"y": [y if action is None else action(y)]}
+
+    def predict(self, net, inputs):
+        return {"y": net(inputs)}
+
+    def quality(self, net):
+        x = dr.linspace(self.ad.Float, 0, 1, 500)
+        error = dr.mean(dr.square(net([x])[0] - self.target(x)))
+        return {"psnr_db": float(-10 * math.log10(error[0])), "calls": self.calls}
+
+
+def settings(**changes):
+    return FitSettings(**{"steps": 60, "batch": 512, "lr": 1e-2, "quality_every": 20, "check_every": 5, **changes})
+
+
+def contents(problem):
+    return {key: problem.net[key].numpy().tobytes() for key in problem.net}
+
+
+def run(problem, *args, **kwargs):
+    messages = []
+    result = fit(problem, *args, progress=False, log=messages.append, **kwargs)
+    return result, messages
+
+
+def nan(y):
+    return y * math.nan
+
+
+def interrupt(y):
+    os.kill(os.getpid(), signal.SIGINT)
+    return y
+
+
+# -- results ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loss", fitting.LOSSES)
+def test_converges(ad, loss):
+    problem = Curve(ad)
+    before = problem.quality(problem.net)["psnr_db"]
+    result, messages = run(problem, settings(steps=300, loss=loss, quality_every=50))
+    assert before < 15 and result.quality["psnr_db"] > 35
+    assert problem.quality(problem.net)["psnr_db"] == result.quality["psnr_db"]
+    assert (result.steps, result.interrupted, result.restarts, messages) == (300, False, 0, [])
+    assert [entry["step"] for entry in result.history] == [50, 100, 150, 200, 250, 300]
+    assert result.history[-1]["loss"] < 0.1 * 0.2 and result.seconds > 0
+
+
+def test_several_targets_and_weights(ad):
+    """Each target counts by its weight, 1 if it has none; 0 means that it is not trained."""
+
+    class Two(Curve):
+        def __init__(self, ad, weights):
+            super().__init__(ad)
+            self.weights = weights
+            self.net = DifferentiableArray(4, 2).alloc(ad.TensorXf)
+
+        def batch(self, rng, size):
+            x = rng.random(self.ad.Float, size)
+            return [x], {"a": [self.ad.Float(1)], "b": [self.ad.Float(2)]}
+
+        def predict(self, net, inputs):
+            a, b = net(inputs)
+            return {"a": [a], "b": [b]}
+
+        def quality(self, net):
+            return {"q": 1.0}
+
+    first = {}
+    for name, weights in {"plain": {}, "a": {"b": 0.0}, "heavy": {"a": 3.0}}.items():
+        problem = Two(ad, weights)
+        first[name] = run(problem, settings(steps=1))[0].history[0]["loss"]
+        if name == "a":
+            entries = problem.net.numpy()
+            assert (entries[:, 0] > 0.5).all() and (entries[:, 1] == 0.5).all()
+    assert first["plain"] == pytest.approx(0.5 + 1.5)
+    assert first["a"] == pytest.approx(0.5)
+    assert first["heavy"] == pytest.approx(3 * 0.5 + 1.5)
+
+
+def test_the_best_state_is_kept(ad):
+    """When later measurements are worse, the tables are those of the best one."""
+
+    class Spoiled(Curve):
+        def quality(self, net):
+            self.states = [*getattr(self, "states", []), contents(self)]
+            return {"psnr_db": [1.0, 5.0, 3.0][len(self.states) - 1]}
+
+    problem = Spoiled(ad)
+    result, _ = run(problem, settings())
+    assert result.step == 40 and result.quality == {"psnr_db": 5.0} and result.steps == 60
+    assert contents(problem) == problem.states[1] != problem.states[2]
+
+
+# -- repeatability ----------------------------------------------------------------------------------------------------
+
+
+def test_same_seed_same_bytes(ad):
+    if ad.Float is not array_module("llvm").Float:
+        pytest.skip("sums on CUDA are made by atomics, in any order")
+    results = []
+    for seed in (3, 3, 4):
+        problem = Curve(ad)
+        # More than one packet of work, so that several cores would take part if they were allowed to.
+        result, _ = run(problem, settings(seed=seed, steps=25, batch=50_000))
+        results.append((contents(problem), result.quality, [h["loss"] for h in result.history]))
+    assert results[0] == results[1]
+    assert results[0][0] != results[2][0]
+
+
+def test_the_number_of_threads_is_restored(ad):
+    before = dr.thread_count()
+    seen = []
+    problem = Curve(ad, {3: lambda y: seen.append(dr.thread_count()) or y})
+    run(problem, settings(steps=5))
+    assert seen == [1] and dr.thread_count() == before
+    run(Curve(ad, {3: lambda y: seen.append(dr.thread_count()) or y}), settings(steps=5, deterministic=False))
+    assert seen == [1, before] and dr.thread_count() == before
+    with pytest.raises(ZeroDivisionError):
+        run(Curve(ad, {3: lambda y: 1 / 0}), settings(steps=5))
+    assert dr.thread_count() == before
+
+
+@pytest.mark.parametrize("schedule", fitting.SCHEDULES)
+def test_resumed_equals_uninterrupted(ad, tmp_path, schedule):
+    """Stopped by Ctrl-C between two checkpoints, or by a crash: the continued run is the same, bit by bit."""
+    if ad.Float is not array_module("llvm").Float:
+        pytest.skip("sums on CUDA are made by atomics, in any order")
+    chosen = settings(schedule=schedule, steps=70, lr=0.05)
+    whole = Curve(ad)
+    expected, _ = run(whole, chosen)
+
+    def crash(y):
+        raise ZeroDivisionError
+
+    for kind, action in {"interrupt": interrupt, "crash": crash}.items():
+        path = tmp_path / f"{kind}.npz"
+        stopped = Curve(ad, {47: action})
+        if kind == "crash":
+            with pytest.raises(ZeroDivisionError):
+                run(stopped, chosen, checkpoint=path)
+        else:
+            result, _ = run(stopped, chosen, checkpoint=path)
+            assert result.interrupted and result.steps == 47
+        continued = Curve(ad)
+        result, _ = run(continued, chosen, checkpoint=path, resume=True)
+        assert continued.calls == 30  # from step 40
+        assert contents(continued) == contents(whole)
+        assert (result.step, result.steps, result.restarts) == (expected.step, 70, 0)
+        assert [h["loss"] for h in result.history] == [h["loss"] for h in expected.history]
+        assert os.listdir(tmp_path).count(path.name) == 1
+    assert len(os.listdir(tmp_path)) == 2  # nothing temporary
+
+
+def test_resuming_a_finished_run_gives_its_result(ad, tmp_path):
+    first, second = Curve(ad), Curve(ad)
+    expected, _ = run(first, settings(), checkpoint=tmp_path / "c.npz")
+    result, _ = run(second, settings(), checkpoint=tmp_path / "c.npz", resume=True)
+    assert second.calls == 0 and contents(second) == contents(first) and result.step == expected.step
+
+
+# -- Ctrl-C -----------------------------------------------------------------------------------------------------------
+
+
+def test_interrupt_keeps_the_best_state(ad):
+    problem = Curve(ad, {50: interrupt})
+    before = signal.getsignal(signal.SIGINT)
+    result, _ = run(problem, settings())
+    assert result.interrupted and result.steps == 50 and result.step == 40
+    assert signal.getsignal(signal.SIGINT) is before
+    whole = Curve(ad)
+    run(whole, settings(steps=60))
+    assert problem.quality(problem.net)["psnr_db"] == result.quality["psnr_db"] == result.history[-1]["psnr_db"]
+    assert contents(problem) != contents(whole)
+
+
+def test_interrupt_before_the_first_measurement(ad):
+    """What has been reached by then is measured and kept."""
+    problem = Curve(ad, {7: interrupt})
+    start = contents(problem)
+    result, _ = run(problem, settings())
+    assert result.interrupted and result.steps == result.step == 7 and contents(problem) != start
+    assert problem.quality(problem.net)["psnr_db"] == result.quality["psnr_db"]
+
+
+def test_second_interrupt_is_a_real_one(ad):
+    before = signal.getsignal(signal.SIGINT)
+    problem = Curve(ad, {7: lambda y: interrupt(interrupt(y))})
+    with pytest.raises(KeyboardInterrupt):
+        run(problem, settings())
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_works_in_another_thread(ad):
+    """Signals belong to the main thread; training elsewhere does without."""
+    import threading
+
+    results = []
+    thread = threading.Thread(target=lambda: results.append(run(Curve(ad), settings(steps=10))))
+    thread.start()
+    thread.join()
+    assert results[0][0].steps == 10
+
+
+# -- divergence -------------------------------------------------------------------------------------------------------
+
+
+def test_nan_restores_the_last_good_state(ad):
+    """NaN targets for three steps: back to a state whose loss was seen, at half the rate, and a sentence about it."""
+    problem = Curve(ad, dict.fromkeys((33, 34, 35), nan))
+    result, messages = run(problem, settings(steps=300, quality_every=50))
+    assert result.restarts == 1 and result.steps == 300 and result.quality["psnr_db"] > 35
+    assert messages == ["step 35: the loss is nan; restored step 29 with half the learning rate (0.005)"]
+    assert all(math.isfinite(h["loss"]) for h in result.history)
+    assert problem.calls == 300 + 35 - 29
+
+
+def test_damage_between_two_looks_is_noticed(ad):
+    """
+    The bad step is over when the loss is looked at, and the loss is small again; but Adam's second moments have become
+    infinite, and with them no entry would ever move again.
+    """
+    problem = Curve(ad, {32: lambda y: y + 1e30})
+    result, messages = run(problem, settings(loss="mse"))
+    assert result.restarts == 1 and messages[0].startswith("step 35: ") and "restored step 29" in messages[0]
+    assert all(np.isfinite(problem.net[key].numpy()).all() for key in problem.net)
+
+
+def test_nan_between_two_looks_does_no_harm(ad):
+    problem = Curve(ad, {32: nan})
+    run(problem, settings())
+    assert all(np.isfinite(problem.net[key].numpy()).all() for key in problem.net)
+
+
+def test_nan_in_the_last_step_is_noticed(ad):
+    problem = Curve(ad, {60: nan})
+    result, messages = run(problem, settings())
+    assert result.restarts == 1 and "step 60" in messages[0] and result.steps == 60
+
+
+def test_explosion_is_noticed(ad):
+    """A loss that jumps by more than an order of magnitude counts as divergence as well."""
+    problem = Curve(ad, {35: lambda y: y + 1e6})
+    result, messages = run(problem, settings())
+    assert result.restarts == 1 and "half the learning rate" in messages[0] and result.steps == 60
+
+
+@pytest.mark.parametrize("check_every", [1, 20])
+def test_an_absurd_learning_rate_is_halved_until_it_works(ad, check_every):
+    """The state to go back to is one whose loss was seen, not the one after the step that ruined it."""
+    problem = Curve(ad)
+    problem.net = DifferentiableArray(16, 1).alloc(ad.TensorXf)
+    result, messages = run(problem, settings(lr=100.0, steps=300, check_every=check_every))
+    assert 3 <= result.restarts <= 8 and len(messages) == result.restarts
+    assert "restored step 0 with half the learning rate (50)" in messages[0]
+    assert "(25)" in messages[1] and "(12.5)" in messages[2]
+    assert result.quality["psnr_db"] > 30
+
+
+def test_diverging_again_and_again_is_an_error(ad):
+    class Hopeless(Curve):
+        def target(self, x):
+            return x * math.nan
+
+    problem, messages = Hopeless(ad), []
+    with pytest.raises(FittingError, match=r"diverged 9 times .*lower the learning rate, 0\.01") as caught:
+        fit(problem, settings(), progress=False, log=messages.append)
+    assert "\n" not in str(caught.value) and len(messages) == 8
+    assert [f"({0.01 / 2**k:g})" in m for k, m in enumerate(messages, 1)] == [True] * 8
+    with pytest.raises(FittingError, match="diverged 9 times"):
+        run(Curve(ad), settings(lr=1e38))
+
+
+def test_the_guard_survives_resuming(ad, tmp_path):
+    """The halved rate and the number of restarts are part of the checkpoint."""
+    path = tmp_path / "c.npz"
+    run(Curve(ad, {35: nan, 57: interrupt}), settings(steps=80), checkpoint=path)
+    result, messages = run(Curve(ad, {15: nan}), settings(steps=80), checkpoint=path, resume=True)
+    assert result.restarts == 2 and "(0.0025)" in messages[0]
+
+
+def test_messages_go_to_stderr(ad, capsys):
+    fit(Curve(ad, {35: nan}), settings(), progress=False)
+    assert "half the learning rate" in capsys.readouterr().err
+
+
+def test_progress_bar(ad, capsys):
+    fit(Curve(ad), settings(), progress=True)
+    captured = capsys.readouterr()
+    assert captured.out == ""  # results belong to stdout, progress does not
+
+
+# -- schedules --------------------------------------------------------------------------------------------------------
+
+
+def rates(ad, **changes):
+    """
+    The learning rate of every step, measured: with a gradient that never changes, each step of Adam is as long as the
+    learning rate says.
+    """
+
+    class Far(Curve):
+        def __init__(self, ad):
+            super().__init__(ad)
+            self.net = DifferentiableArray(1, 1, value=0.0).alloc(ad.TensorXf)
+            self.positions = []
+
+        def batch(self, rng, size):
+            self.positions.append(float(self.net.numpy().ravel()[0]))
+            return [self.ad.Float(0.5)], {"y": [self.ad.Float(1000.0)]}
+
+        def quality(self, net):
+            self.positions.append(float(net.numpy().ravel()[0]))
+            return {"q": 0.0}
+
+    problem = Far(ad)
+    run(problem, settings(batch=1, lr=1e-2, quality_every=10**6, **changes))
+    return np.diff(problem.positions)
+
+
+def test_constant_schedule(ad):
+    np.testing.assert_allclose(rates(ad, schedule="constant", steps=40), np.full(40, 1e-2), rtol=1e-3)
+
+
+def test_cosine_schedule(ad):
+    expected = 1e-2 * 0.5 * (1 + np.cos(np.pi * np.arange(40) / 40))
+    np.testing.assert_allclose(rates(ad, schedule="cosine", steps=40), expected, rtol=1e-2, atol=1e-6)
+
+
+def test_plateau_schedule(ad):
+    """This loss hardly improves: the rate halves each time a tenth of the steps has passed."""
+    found = rates(ad, schedule="plateau", steps=100, check_every=1) / 1e-2
+    halvings = np.rint(np.log2(1 / found)).astype(int)
+    np.testing.assert_allclose(found, 0.5**halvings, rtol=2e-3)
+    assert halvings[0] == 0 and halvings[-1] in (8, 9, 10)
+    assert set(np.diff(halvings)) == {0, 1} and np.diff(np.flatnonzero(np.diff(halvings))).tolist() == [10] * 8
+
+
+def test_plateau_leaves_an_improving_loss_alone(ad):
+    problem = Curve(ad)
+    problem.net = DifferentiableArray(16, 1, value=50.0).alloc(ad.TensorXf)
+    result, _ = run(problem, settings(schedule="plateau", lr=0.1, steps=100))
+    losses = [h["loss"] for h in result.history]
+    assert losses[0] - losses[-1] == pytest.approx(0.1 * 80, rel=0.05)  # 80 steps at the full rate
+
+
+# -- cost -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("schedule", fitting.SCHEDULES)
+def test_no_compilation_after_the_first_steps(ad, schedule):
+    """
+    A step that changes a literal would compile a new kernel each time. The cache on disk could hide that, so distinct
+    kernels are counted.
+    """
+    seen, growth = set(), []
+
+    class Counting(Curve):
+        def batch(self, rng, size):
+            seen.update(k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
+            growth.append(len(seen))
+            return super().batch(rng, size)
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        run(Counting(ad, {35: nan}), settings(steps=80, schedule=schedule))
+    assert growth[5] >= 1
+    # Measurements (step 20) and the restart (step 35) have kernels of their own, later steps have none.
+    assert growth[-1] == growth[44] and growth[19] == growth[11] and growth[-1] <= growth[11] + 6
+    assert len(growth) > 80
+
+
+# -- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"steps": 0}, "steps: found 0"), ({"batch": 0}, "batch: found 0"), ({"batch": -5}, "batch: found -5"),
+        ({"lr": 0.0}, "lr: found 0"), ({"lr": -1.0}, "lr: found -1"), ({"lr": math.nan}, "lr: found nan"),
+        ({"lr": math.inf}, "lr: found inf"), ({"schedule": "step"}, '"step", allowed are'),
+        ({"loss": "huber"}, '"huber", allowed are'), ({"seed": -1}, "seed: found -1"),
+        ({"quality_every": 0}, "quality_every"), ({"check_every": 0}, "check_every"),
+    ],
+)  # fmt: skip
+def test_bad_settings(change, match):
+    with pytest.raises(FittingError, match=match) as caught:
+        settings(**change)
+    assert "\n" not in str(caught.value)
+
+
+def test_checkpoint_in_a_folder_that_does_not_exist(ad, tmp_path):
+    """Noticed before the training, not after it."""
+    problem = Curve(ad)
+    with pytest.raises(OutputError, match="does not exist"):
+        run(problem, settings(), checkpoint=tmp_path / "nowhere" / "c.npz")
+    assert problem.calls == 0
+
+
+def test_resuming_needs_a_checkpoint(ad, tmp_path):
+    with pytest.raises(FittingError, match="needs the checkpoint"):
+        run(Curve(ad), settings(), resume=True)
+    with pytest.raises(FittingError, match="does not exist, there is nothing to resume"):
+        run(Curve(ad), settings(), checkpoint=tmp_path / "c.npz", resume=True)
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    path = tmp_path / "c.npz"
+    run(Curve(array_module("llvm")), settings(steps=20), checkpoint=path)
+    return path
+
+
+def not_resumable(path, match, problem=None, **changes):
+    problem = problem or Curve(array_module("llvm"))
+    start = contents(problem)
+    with pytest.raises((FittingError, OutputError), match=match) as caught:
+        run(problem, settings(**{"steps": 20, **changes}), checkpoint=path, resume=True)
+    message = str(caught.value)
+    assert str(path) in message and "\n" not in message
+    assert contents(problem) == start
+
+
+def test_damaged_checkpoint(checkpoint):
+    content = checkpoint.read_bytes()
+    for damaged in (b"", b"hello", content[:100], content[:-30], content[:500] + content[520:]):
+        checkpoint.write_bytes(damaged)
+        not_resumable(checkpoint, "is damaged or of another task")
+    folder = checkpoint.parent / "folder.npz"
+    folder.mkdir()
+    not_resumable(folder, "folder")
+
+
+def test_checkpoint_without_something(checkpoint):
+    with np.load(checkpoint) as data:
+        arrays = dict(data)
+    for name in arrays:
+        np.savez(checkpoint, **{k: v for k, v in arrays.items() if k != name})
+        not_resumable(checkpoint, "is damaged or of another task")
+    import json
+
+    meta = json.loads(arrays["meta"].tobytes())
+    for key in meta:
+        text = json.dumps({k: v for k, v in meta.items() if k != key}).encode()
+        np.savez(checkpoint, **{**arrays, "meta": np.frombuffer(text, np.uint8)})
+        not_resumable(checkpoint, "is damaged or of another task")
+    for name in arrays:
+        if name.startswith(("value/", "m/", "v/", "best/")):
+            np.savez(checkpoint, **{**arrays, name: np.zeros((3, 1), np.float32)})
+            not_resumable(checkpoint, "other table sizes")
+
+
+def test_checkpoint_of_another_run(checkpoint):
+    not_resumable(checkpoint, r"other settings \(lr\)", lr=0.5)
+    not_resumable(checkpoint, r"other settings \(batch, seed\)", batch=7, seed=1)
+    ad = array_module("llvm")
+    larger = Curve(ad)
+    larger.net = Indirection(DifferentiableArray(32, 1, "ramp", fold=True), DifferentiableArray(8, 1)).alloc(
+        ad.TensorXf
+    )
+    not_resumable(checkpoint, r"other table sizes \(\"primary\.0\.data\"\)", larger)
+    other = Curve(ad)
+    other.net = DifferentiableArray(16, 1).alloc(ad.TensorXf)
+    not_resumable(checkpoint, "damaged or of another task", other)

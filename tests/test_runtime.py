@@ -1,0 +1,362 @@
+"""
+The choice of LLVM: as a function, and in fresh processes, where a wrong one would abort (which no ``try`` can catch, so
+only a process of its own can show that it does not happen).
+"""
+
+import glob
+import os
+import subprocess
+import sys
+
+import drjit as dr
+import pytest
+
+from mi_diffind import runtime
+from mi_diffind.runtime import ENV, MIN_LLVM, choose_llvm, library_version, system_libraries
+
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="LLVM is searched for on Linux only")
+
+VERSIONS = {"/new": 20, "/newer": 21, "/minimum": MIN_LLVM, "/old": 18, "/ancient": 15, "/broken": None}
+
+#: Uses a minimum and a maximum, on which an old LLVM aborts.
+KERNEL = """
+import drjit as dr, drjit.llvm.ad as ad
+x = dr.arange(ad.Float, 3)
+x = dr.minimum(x, 1) + dr.maximum(x, 1)
+assert x.numpy().tolist() == [1, 2, 3], x
+"""
+
+RENDER = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+scene = mi.load_dict({
+    "type": "scene", "integrator": {"type": "direct"}, "emitter": {"type": "constant"},
+    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+    "shape": {"type": "sphere", "center": [0, 0, 5], "bsdf": {"type": "neural_disney"}},
+})
+import numpy as np
+image = np.array(mi.render(scene, spp=1))
+assert image.shape == (4, 4, 3) and np.isfinite(image).all() and image.max() > 0
+"""
+
+PRINT_VERSION = "import drjit as dr; print('LLVM', dr.detail.llvm_version()[0])\n"
+
+
+def choose(environ=None, pip=(), system=()):
+    return choose_llvm(environ or {}, lambda: list(pip), lambda: list(system), VERSIONS.get)
+
+
+# -- the choice --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", ["/new", "/minimum"])
+def test_explicit_setting_wins(path):
+    choice = choose({ENV: path}, pip=["/newer"], system=["/newer"])
+    assert (choice.path, choice.origin, choice.problem) == (path, ENV, None)
+
+
+@linux
+def test_order_of_the_search():
+    assert choose(pip=["/new"], system=["/newer"]).path == "/new"
+    assert choose(pip=["/new"], system=["/newer"]).origin == "pip"
+    assert choose(pip=["/newer", "/new"]).path == "/newer"
+    assert choose(pip=["/broken", "/old", "/new"]).path == "/new"
+    choice = choose(system=["/old", "/minimum"])
+    assert (choice.path, choice.origin, choice.problem) == ("/minimum", "system", None)
+    assert choose({ENV: ""}, pip=["/new"]).path == "/new"  # set to nothing is not set
+
+
+@linux
+@pytest.mark.parametrize(("system", "mentioned"), [([], "none was found"), (["/old", "/ancient"], "/old")])
+def test_nothing_usable_says_what_to_install(system, mentioned):
+    choice = choose(system=system)
+    assert choice.path is None
+    assert mentioned in choice.problem and "pip install karellen-llvm-core" in choice.problem
+    assert f"LLVM {MIN_LLVM} or newer" in choice.problem and ENV in choice.problem
+    one_sentence(choice.problem)
+
+
+@pytest.mark.parametrize(
+    ("path", "mentioned"),
+    [
+        ("/old", "LLVM 18"),
+        ("/ancient", "15 or older"),
+        ("/broken", "not a loadable"),
+        ("/no/such/file", "not a loadable"),
+    ],
+)
+def test_an_unusable_explicit_setting_is_refused(path, mentioned):
+    """Not silently replaced by another: the user said so."""
+    problem = choose({ENV: path}, pip=["/new"], system=["/new"]).problem
+    assert mentioned in problem and path in problem and "pip install karellen-llvm-core" in problem
+    one_sentence(problem)
+
+
+def test_elsewhere_the_search_is_left_to_drjit(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "darwin")
+    choice = choose(pip=["/new"])
+    assert choice.path is None and choice.problem is None
+    assert choose({ENV: "/old"}).problem is not None
+
+
+def one_sentence(text):
+    assert text.endswith(".") and ". " not in text and "\n" not in text
+
+
+def test_names_of_libraries(tmp_path):
+    """Which files count as LLVM, and which is the newest: the number in the name, wherever it stands."""
+    names = {
+        "libLLVM-15.so": 15, "libLLVM-15.so.1": 15, "libLLVM.so.20.1": 20, "libLLVM-9.so": 9, "libLLVM.so.19.1": 19,
+        "libLLVM.so": 0, "libLLVM-14.0.6.so.1": 14, "libLLVM.so.23": 23,
+    }  # fmt: skip
+    others = ("libLLVMSupport.a", "libLLVM-C.so.20", "libLLVM-18.so.bak", "libclang.so.20", "libLLVMCore.so")
+    for name in (*names, *others):
+        (tmp_path / name).write_text("")
+    (tmp_path / "libLLVM.so.99").symlink_to(tmp_path / "missing")
+    found = [os.path.basename(p) for p in system_libraries([str(tmp_path / "*")])]
+    assert set(found) == set(names)
+    assert [names[n] for n in found] == sorted(names.values(), reverse=True)
+    assert system_libraries([str(tmp_path / "nothing*")]) == []
+    assert all(runtime._named_version(name) == version for name, version in names.items())
+
+
+def test_version_of_a_library(tmp_path):
+    fake = tmp_path / "libLLVM.so.20"
+    fake.write_text("not a library")
+    assert library_version(str(fake)) is None
+    assert library_version(str(tmp_path / "missing.so")) is None
+    assert library_version(str(tmp_path)) is None
+    assert library_version("libc.so.6") is None  # a library, but another one
+
+
+@linux
+def test_version_of_the_library_in_use():
+    usable = [p for p in [*runtime.pip_libraries(), *system_libraries()] if (library_version(p) or 0) >= MIN_LLVM]
+    if not usable:
+        pytest.skip("no LLVM to look at")
+    assert runtime._named_version(os.path.basename(usable[0])) in (0, library_version(usable[0]))
+    assert dr.detail.llvm_version()[0] >= MIN_LLVM
+
+
+def test_array_module():
+    with pytest.raises(RuntimeError, match="metal"):
+        runtime.array_module("metal")
+    assert runtime.array_module("llvm").__name__ == "drjit.llvm.ad"
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        assert runtime.array_module() is runtime.array_module("llvm")
+        with pytest.raises(RuntimeError, match="NVIDIA"):
+            runtime.array_module("cuda")
+
+
+# -- in fresh processes ------------------------------------------------------------------------------------------------
+
+
+def python(code, setting=None, **extra):
+    """Run ``code``; never accept that the process was killed by a signal."""
+    environ = {k: v for k, v in os.environ.items() if k != ENV} | extra
+    if setting is not None:
+        environ[ENV] = setting
+    done = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True, timeout=300)
+    assert done.returncode >= 0, f"killed by signal {-done.returncode}:\n{done.stderr}"
+    return done
+
+
+def succeeds(code, setting=None, **extra):
+    done = python(code, setting, **extra)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def old_library(*versions):
+    """An LLVM of one of the given versions on this machine, or skip."""
+    for version in versions:
+        for pattern in (f"/usr/lib/*-linux-gnu/libLLVM-{version}.so*", f"/usr/lib/llvm-{version}/lib/libLLVM*.so*"):
+            for path in sorted(glob.glob(pattern)):
+                if (library_version(path) or MIN_LLVM) < MIN_LLVM:
+                    return path
+    pytest.skip(f"no LLVM {' or '.join(map(str, versions))} on this machine")
+
+
+@pytest.fixture
+def aborting():
+    """An old LLVM that Dr.Jit loads all the same, and with which it would abort."""
+    return old_library(15, 16, 17, 18)
+
+
+@pytest.mark.parametrize(
+    "imports",
+    ["import mi_diffind", "import mitsuba, mi_diffind", "import drjit, mi_diffind",
+     "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import mi_diffind",
+     "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.set_variant('llvm_ad_spectral'); import mi_diffind"],
+    ids=["alone", "after mitsuba", "after drjit", "after a variant", "after two variants"],
+)  # fmt: skip
+def test_any_order_of_imports(imports):
+    done = succeeds(f"{imports}\n{KERNEL}{RENDER}{PRINT_VERSION}")
+    assert int(done.stdout.split()[-1]) >= MIN_LLVM
+    assert "RuntimeWarning" not in done.stderr
+
+
+def test_the_old_library_would_abort(aborting):
+    """That these tests test something: without this package, this kernel takes the process down."""
+    environ = {**os.environ, ENV: aborting}
+    done = subprocess.run([sys.executable, "-c", KERNEL], env=environ, capture_output=True, text=True, timeout=300)
+    assert done.returncode != 0
+
+
+@pytest.mark.parametrize("first", ["", "import drjit; ", "import mitsuba; "])
+@pytest.mark.parametrize("which", ["missing", "damaged", "14", "aborting"])
+def test_an_unusable_explicit_library_never_aborts(which, first, tmp_path, request):
+    """A warning that says what to do, an exception where LLVM is then used, no abort; the setting is left alone."""
+    if which == "aborting":
+        path = request.getfixturevalue("aborting")
+    elif which == "14":
+        path = old_library(14)
+    else:
+        path = str(tmp_path / "libLLVM.so.20")
+        if which == "damaged":
+            (tmp_path / "libLLVM.so.20").write_text("not a library")
+    code = f"""
+{first}import mi_diffind, mitsuba as mi, os, numpy, drjit.llvm.ad
+assert os.environ["{ENV}"] == {path!r}
+assert "karellen" in mi_diffind.runtime.llvm_problem()
+mi.set_variant("scalar_rgb")
+print("went on")
+try:
+    {KERNEL.strip().replace(chr(10), chr(10) + "    ")}
+except Exception as e:
+    print("refused:", str(e)[:200])
+else:
+    print("computed")
+for name, use in {{
+    "array_module": lambda: mi_diffind.runtime.array_module("llvm"),
+    "alloc": lambda: mi_diffind.DifferentiableArray((4, 4), 3).alloc(drjit.llvm.ad.TensorXf),
+    "from_numpy": lambda: mi_diffind.DifferentiableArray.from_numpy(
+        numpy.zeros((4, 1)), drjit.llvm.ad.TensorXf, storage="uint8"),
+}}.items():
+    try:
+        use()
+    except RuntimeError as e:
+        print(f"{{name}}: {{e}}")
+try:
+    mi.set_variant("llvm_ad_rgb")
+except ImportError as e:
+    print("set_variant:", e)
+"""
+    done = succeeds(code, path)
+    warnings = [line for line in done.stderr.splitlines() if "RuntimeWarning" in line]
+    assert len(warnings) == 1 and path in warnings[0] and "pip install karellen-llvm-core" in warnings[0]
+    assert "went on" in done.stdout and "refused:" in done.stdout and "computed" not in done.stdout
+    lines = done.stdout.splitlines()
+    for name in ("array_module", "alloc", "from_numpy"):
+        assert any(line.startswith(f"{name}: ") and path in line for line in lines)
+    assert "set_variant: " in done.stdout
+
+
+def test_an_unusable_library_behind_a_variant_that_is_set(aborting):
+    """Mitsuba has begun to use a library that would abort, and there is no other: exceptions from then on."""
+    code = f"""
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import mi_diffind
+for make in (lambda: {{"type": "neural_disney"}}, mi.cornell_box, lambda: {{"type": "scene"}}):
+    try:
+        mi.load_dict(make())
+    except Exception as e:
+        print("refused")
+try:
+    {KERNEL.strip().replace(chr(10), chr(10) + "    ")}
+except Exception as e:
+    print("refused")
+"""
+    done = succeeds(code, aborting)
+    assert done.stdout.split() == ["refused"] * 4 and done.stderr.count("RuntimeWarning") == 1
+
+
+def test_rendering_with_an_unusable_library_is_an_exception(tmp_path):
+    done = python(f"import mi_diffind\n{RENDER}", str(tmp_path / "none.so"))
+    assert done.returncode == 1 and "karellen-llvm-core" in done.stderr
+
+
+@pytest.mark.parametrize("imported", ["drjit", "mitsuba"])
+def test_too_late_after_a_kernel(aborting, imported):
+    """
+    A kernel has run on an old LLVM (one that it can compile), and its code cannot be taken back: importing says so,
+    as an exception.
+    """
+    code = f"import {imported}\nimport drjit as dr, drjit.llvm as ll\n"
+    code += "assert (dr.arange(ll.Float, 3) + 1).numpy().tolist() == [1, 2, 3]\nprint('ran')\nimport mi_diffind\n"
+    # Without a setting, Dr.Jit would have to find the old library by itself: the setting is removed after its start.
+    code = "import os, drjit; drjit.detail.llvm_version(); " + f"del os.environ['{ENV}']\n" + code
+    done = python(code, aborting)
+    assert "ran" in done.stdout and done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("ImportError: ") and "has run kernels on it" in last and "import mi_diffind before" in last
+
+
+def test_too_late_with_scene_objects(aborting):
+    code = f"""
+import os, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import drjit; drjit.detail.llvm_version(); del os.environ["{ENV}"]
+bsdf = mi.load_dict({{"type": "diffuse"}})
+import mi_diffind
+"""
+    done = python(code, aborting)
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith("ImportError: ")
+
+
+@pytest.mark.parametrize("first", ["drjit", "mitsuba"])
+def test_an_old_library_that_drjit_found_is_replaced(aborting, first):
+    """As on Debian 12: Dr.Jit, imported first, has taken the system's LLVM 15; it is replaced before anything runs."""
+    code = f"import {first}, drjit, os\nprint('first', drjit.detail.llvm_version()[0])\ndel os.environ['{ENV}']\n"
+    done = succeeds(f"{code}import mi_diffind\n{KERNEL}{RENDER}{PRINT_VERSION}", aborting)
+    lines = done.stdout.split()
+    assert int(lines[1]) < MIN_LLVM <= int(lines[-1])
+
+
+def test_variables_survive_the_replacement(aborting):
+    """Arrays made (not computed) on the old LLVM keep their values."""
+    code = f"""
+import drjit as dr, drjit.llvm as ll, os
+a = ll.Float([1, 2, 3])
+assert dr.detail.llvm_version()[0] < {MIN_LLVM}
+del os.environ["{ENV}"]
+import mi_diffind
+assert dr.detail.llvm_version()[0] >= {MIN_LLVM}
+assert dr.minimum(a, 2).numpy().tolist() == [1, 2, 2]
+"""
+    succeeds(code, aborting)
+
+
+@pytest.mark.parametrize("first", ["", "import drjit", "import mitsuba"])
+def test_a_machine_without_any_usable_library(aborting, first):
+    """No setting, nothing from pip, an old one in the system: a warning, no abort, other variants work."""
+    # The searches are replaced before the package is initialised: its runtime module is loaded on its own first.
+    code = f"""
+import sys, types
+{first}
+package = types.ModuleType("mi_diffind")
+package.__path__ = [{os.path.dirname(runtime.__file__)!r}]
+sys.modules["mi_diffind"] = package
+import mi_diffind.runtime as runtime
+runtime.choose_llvm.__defaults__ = ({{}}, lambda: [], lambda: [{aborting!r}], runtime.library_version)
+del sys.modules["mi_diffind"]
+
+import mi_diffind, mitsuba as mi
+assert {aborting!r} in runtime.llvm_problem()
+mi.set_variant("scalar_rgb")
+try:
+    {KERNEL.strip().replace(chr(10), chr(10) + "    ")}
+except RuntimeError as e:
+    print("refused")
+"""
+    done = succeeds(code)
+    assert done.stdout.split() == ["refused"]
+    assert done.stderr.count("RuntimeWarning") == 1 and "pip install karellen-llvm-core" in done.stderr
+
+
+def test_plugins_register_for_variants_set_later():
+    succeeds(
+        f"import mi_diffind, mitsuba as mi\nmi.set_variant('scalar_rgb')\nmi.set_variant('llvm_ad_mono')\n{RENDER}"
+    )

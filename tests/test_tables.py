@@ -1,0 +1,576 @@
+"""Table files: exact round trips, nothing half-written, and one sentence for every way a file can be wrong."""
+
+import io
+import json
+import os
+import random
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+from mi_diffind import TableError, load_table, lookup, save_table, tables
+from mi_diffind.files import OutputError
+from mi_diffind.tables import Table
+
+SHAPES = {"primary.0.data": (4, 5, 2), "cascaded": (3, 3, 7)}
+
+
+def example(storage="float32", seed=0) -> Table:
+    rng = np.random.default_rng(seed)
+    arrays = {name: rng.normal(0, 1, shape).astype(np.float32) for name, shape in SHAPES.items()}
+    arrays["cascaded"][0, 0, :4] = [0.0, -0.0, 1e-45, -3e38] if storage == "float32" else [0.0, -0.0, 6e-8, -6e4]
+    table = Table(
+        "a task", arrays, "float32", {"cascaded": ("clamp", "repeat")}, {}, {"lr": 1e-3, "name": "α β"}, 7,
+        {"psnr_db": 33.25},
+    )  # fmt: skip
+    return table.to(storage)
+
+
+def parts(path):
+    """The members of an archive: name → bytes."""
+    with zipfile.ZipFile(path) as archive:
+        return {info.filename: archive.read(info) for info in archive.infolist()}
+
+
+def rebuild(path, members):
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items() if isinstance(members, dict) else members:
+            archive.writestr(name, content)
+
+
+def npy(array, **kwargs):
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.asarray(array), **kwargs)
+    return buffer.getvalue()
+
+
+def change_meta(path, change):
+    """Rewrite the file with another description: ``change`` edits it in place, or returns the text to store."""
+    members = parts(path)
+    meta = json.loads(np.load(io.BytesIO(members["meta.npy"])).tobytes())
+    text = change(meta)
+    text = text if isinstance(text, bytes) else json.dumps(meta).encode()
+    members["meta.npy"] = npy(np.frombuffer(text, np.uint8))
+    rebuild(path, members)
+
+
+def refused(path, match=None, **kwargs):
+    """The file is refused with one sentence that starts with its name."""
+    with pytest.raises(TableError, match=match) as caught:
+        load_table(path, **kwargs)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    assert len(message) < len(str(path)) + 250
+    return message
+
+
+@pytest.fixture(params=lookup.STORAGES)
+def saved(request, tmp_path):
+    path = tmp_path / "tables.npz"
+    save_table(path, example(request.param))
+    return path
+
+
+@pytest.fixture
+def plain(tmp_path):
+    path = tmp_path / "tables.npz"
+    save_table(path, example())
+    return path
+
+
+# -- round trip --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_round_trip_is_exact(tmp_path, storage):
+    table, path = example(storage), tmp_path / "tables.npz"
+    save_table(path, table)
+    loaded = load_table(path, task="a task", shapes=SHAPES)
+    assert (loaded.task, loaded.storage, loaded.settings, loaded.seed, loaded.quality) == (
+        "a task", storage, {"lr": 1e-3, "name": "α β"}, 7, {"psnr_db": 33.25},
+    )  # fmt: skip
+    assert list(loaded.arrays) == list(table.arrays)
+    for name, array in table.arrays.items():
+        assert loaded.arrays[name].dtype == array.dtype and loaded.arrays[name].shape == array.shape
+        assert loaded.arrays[name].tobytes() == array.tobytes()
+        np.testing.assert_array_equal(loaded.values(name), table.values(name))
+    assert loaded.borders == {"primary.0.data": ("clamp", "clamp"), "cascaded": ("clamp", "repeat")}
+    assert loaded.quantization == table.quantization and bool(loaded.quantization) == (storage == "uint8")
+    assert loaded.nbytes == sum(a.nbytes for a in table.arrays.values())
+    again = tmp_path / "again.npz"
+    save_table(again, loaded)
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_numpy_reads_it(saved):
+    """The format promises that ``numpy.load`` is enough, without pickle."""
+    with np.load(saved, allow_pickle=False) as data:
+        assert set(data.files) == {"meta", *SHAPES}
+        assert json.loads(data["meta"].tobytes())["format_version"] == tables.FORMAT_VERSION
+        assert data["cascaded"].shape == SHAPES["cascaded"]
+
+
+def test_same_content_gives_the_same_bytes(tmp_path, monkeypatch):
+    import time
+
+    files = []
+    for k, now in enumerate((1e9, 1.5e9)):
+        monkeypatch.setattr(time, "time", lambda now=now: now)
+        monkeypatch.setattr(time, "localtime", lambda *a, now=now: time.gmtime(now))
+        files.append(tmp_path / f"{k}.npz")
+        save_table(files[-1], example())
+    assert files[0].read_bytes() == files[1].read_bytes()
+    save_table(files[1], example(seed=1))
+    assert files[0].read_bytes() != files[1].read_bytes()
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_conversion(storage):
+    """Each storage form is as close as it can be, and going there twice changes nothing."""
+    rng = np.random.default_rng(1)
+    table = Table("t", {"a": rng.uniform(-1, 2, (6, 5, 3)).astype(np.float32)}, quality={"psnr_db": 1.0})
+    converted = table.to(storage)
+    assert converted.storage == storage and converted.quality == table.quality and converted.to(storage) is converted
+    tolerance = {"float32": 0, "float16": 2 * 2.0**-11, "uint8": 3 / 255 / 2 * 1.001}[storage]
+    assert np.abs(converted.values("a") - table.values("a")).max() <= tolerance
+    np.testing.assert_array_equal(converted.to("float32").to(storage).values("a"), converted.values("a"))
+    assert table.nbytes == {"float32": 1, "float16": 2, "uint8": 4}[storage] * converted.nbytes
+    with pytest.raises(ValueError, match="int4"):
+        table.to("int4")
+
+
+def test_columns_in_fortran_order_and_views(tmp_path):
+    table = example()
+    values = table.arrays["cascaded"]
+    table.arrays["cascaded"] = np.asfortranarray(values)
+    save_table(tmp_path / "f.npz", table)
+    np.testing.assert_array_equal(load_table(tmp_path / "f.npz").arrays["cascaded"], values)
+
+
+# -- writing -----------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_stays_behind_when_writing_fails(tmp_path, monkeypatch):
+    """An old file survives a failure in the middle, and no temporary one is left."""
+    path = tmp_path / "tables.npz"
+    save_table(path, example(seed=1))
+    before = path.read_bytes()
+
+    original, calls = zipfile.ZipFile.writestr, []
+
+    def failing(self, *args, **kwargs):
+        calls.append(os.listdir(tmp_path))
+        if len(calls) == 2:
+            raise OSError(28, "No space left on device")
+        return original(self, *args, **kwargs)
+
+    monkeypatch.setattr(zipfile.ZipFile, "writestr", failing)
+    with pytest.raises(OSError, match="No space left"):
+        save_table(path, example())
+    assert os.listdir(tmp_path) == ["tables.npz"] and path.read_bytes() == before
+    assert len(calls[0]) == 2  # it was written beside the old one, not over it
+
+    calls.clear()
+    with pytest.raises(OSError, match="No space left"):
+        save_table(tmp_path / "new.npz", example())
+    assert os.listdir(tmp_path) == ["tables.npz"]
+
+
+def test_an_interrupted_rename_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "tables.npz"
+    save_table(path, example(seed=1))
+    before = path.read_bytes()
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        save_table(path, example())
+    assert os.listdir(tmp_path) == ["tables.npz"] and path.read_bytes() == before
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    with pytest.raises(OutputError, match="does not exist"):
+        save_table(tmp_path / "nowhere" / "t.npz", example())
+    with pytest.raises(OutputError, match="is a folder"):
+        save_table(tmp_path, example())
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="not a folder"):
+        save_table(tmp_path / "file" / "t.npz", example())
+
+
+def _with(**changes):
+    table = example(changes.pop("storage", "float32"))
+    for key, value in changes.items():
+        setattr(table, key, value)
+    return table
+
+
+UNWRITABLE = {
+    "unknown storage": (lambda: _with(storage="float32") and Table("t", {}, "float64"), '"float64"'),
+    "wrong type": (lambda: _with(arrays={"a": np.zeros((3, 1))}), "float64"),
+    "NaN": (lambda: _with(arrays={"a": np.full((3, 1), np.nan, np.float32)}), "NaN or infinity"),
+    "infinity": (lambda: _with(arrays={"a": np.full((3, 1), np.inf, np.float32)}), "NaN or infinity"),
+    "called meta": (lambda: _with(arrays={"meta": np.zeros((3, 1), np.float32)}), "meta"),
+    "no channels": (lambda: _with(arrays={"a": np.zeros(3, np.float32)}), r"shape \(3,\)"),
+    "unknown border": (lambda: _with(borders={"cascaded": ("clamp", "mirror")}), "mirror"),
+    "too few borders": (lambda: _with(borders={"cascaded": ("clamp",)}), "borders"),
+    "NaN quality": (lambda: _with(quality={"psnr_db": float("nan")}), "cannot be written"),
+    "odd settings": (lambda: _with(settings={"x": object()}), "cannot be written"),
+    "no affine map": (lambda: _with(storage="uint8", quantization={}), "scale and offset"),
+    "short affine map": (
+        lambda: _with(storage="uint8", quantization=dict.fromkeys(SHAPES, ((1.0,), (0.0,)))),
+        "scale and offset",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", UNWRITABLE)
+def test_unwritable_tables_are_refused(tmp_path, fault):
+    """What could not be loaded again is not written either."""
+    make, match = UNWRITABLE[fault]
+    with pytest.raises(TableError, match=match) as caught:
+        save_table(tmp_path / "t.npz", make())
+    assert "t.npz" in str(caught.value) and "\n" not in str(caught.value)
+    assert not os.listdir(tmp_path)
+
+
+# -- reading: the archive ----------------------------------------------------------------------------------------------
+
+
+def test_no_such_file(tmp_path):
+    refused(tmp_path / "none.npz", "no such file")
+
+
+def test_a_folder(tmp_path):
+    refused(tmp_path, "is a folder")
+
+
+def test_a_file_inside_a_file(tmp_path):
+    (tmp_path / "file").write_text("")
+    refused(tmp_path / "file" / "t.npz", "cannot be read")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"PK", b"PK\x03\x04" + bytes(100), npy(np.zeros(3)), bytes(70000)])
+def test_not_an_archive(tmp_path, content):
+    path = tmp_path / "t.npz"
+    path.write_bytes(content)
+    refused(path, "not a table file")
+
+
+def test_truncated_anywhere(saved):
+    content = saved.read_bytes()
+    for length in [*range(0, len(content), 37), len(content) - 1]:
+        saved.write_bytes(content[:length])
+        refused(saved, "truncated")
+
+
+def test_a_hole_in_the_middle(saved):
+    content = saved.read_bytes()
+    for cut in (100, 500, len(content) // 2):
+        saved.write_bytes(content[:cut] + content[cut + 10 :])
+        refused(saved)
+
+
+def test_random_damage_is_refused_or_harmless(saved):
+    """Flipped bytes: either the file is refused with a sentence, or what is read is what was written."""
+    content, original = saved.read_bytes(), load_table(saved)
+    randomness = random.Random(0)
+    outcomes = {True: 0, False: 0}
+    for _ in range(600):
+        damaged = bytearray(content)
+        for _ in range(randomness.choice([1, 1, 3])):
+            damaged[randomness.randrange(len(content))] = randomness.randrange(256)
+        saved.write_bytes(damaged)
+        try:
+            loaded = load_table(saved)
+        except TableError as e:
+            outcomes[False] += 1
+            assert str(e).startswith(str(saved)) and str(e).isprintable()
+        else:
+            outcomes[True] += 1
+            for name, array in original.arrays.items():
+                assert loaded.arrays[name].tobytes() == array.tobytes()
+            assert (loaded.task, loaded.quantization, loaded.borders) == (
+                original.task, original.quantization, original.borders,
+            )  # fmt: skip
+    assert outcomes[False] > 300
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_damage_in_a_compressed_stream(plain, method):
+    """Every decompressor has its own exceptions."""
+    members = parts(plain)
+    with zipfile.ZipFile(plain, "w", method) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+        offset = archive.getinfo("cascaded.npy").header_offset + 30 + len("cascaded.npy")
+        size = archive.getinfo("cascaded.npy").compress_size
+    load_table(plain)
+    content = plain.read_bytes()
+    for position in range(offset + 9, offset + size - 4, 7):  # LZMA starts with its version
+        damaged = bytearray(content)
+        damaged[position : position + 4] = b"\xff\x00\xff\x55"
+        plain.write_bytes(damaged)
+        refused(plain)
+
+
+def test_an_entry_that_is_no_array(plain):
+    rebuild(plain, {**parts(plain), "readme.txt": b"hello"})
+    refused(plain, r"readme\.txt.*not an array")
+    rebuild(plain, {**parts(plain), "a\nb.npy": b"hello"})
+    refused(plain, "not an array")
+
+
+def test_an_array_twice(plain):
+    members = list(parts(plain).items())
+    with pytest.warns(UserWarning, match="Duplicate"):
+        rebuild(plain, [*members, members[-1]])
+    refused(plain, "twice")
+
+
+def test_an_encrypted_file(plain):
+    content = bytearray(plain.read_bytes())
+    for signature, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        position = content.find(signature)
+        while position >= 0:
+            content[position + flags] |= 1
+            position = content.find(signature, position + 1)
+    plain.write_bytes(content)
+    refused(plain, "encrypted")
+
+
+# -- reading: sizes ----------------------------------------------------------------------------------------------------
+
+
+def header(shape, descr="<f4", length=None):
+    """The start of an ``.npy`` file that claims the given shape and holds nothing."""
+    text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    text += b" " * (length or 0)
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+def limited(path, match, **kwargs):
+    """Refused, without a byte more than a few megabytes allocated on the way."""
+    tracemalloc.start()
+    try:
+        refused(path, match, **kwargs)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 8e6
+
+
+def test_a_header_that_claims_a_huge_shape(plain):
+    """Also when the description agrees with it."""
+    shape = (60000, 60000, 7)
+    members = parts(plain)
+    members["cascaded.npy"] = header(shape) + bytes(63 * 4)
+    rebuild(plain, members)
+    limited(plain, "cascaded.*expected")
+    change_meta(plain, lambda meta: meta["arrays"]["cascaded"].update(shape=shape))
+    limited(plain, "claims 100,800,000,000 bytes but the file holds")
+    change_meta(plain, lambda meta: meta["arrays"]["cascaded"].update(shape=(2**63, 2**63, 7)))
+    limited(plain, "expected")
+
+
+def test_an_archive_that_claims_a_huge_content(plain):
+    """Central directory and local header both say so."""
+    content = bytearray(plain.read_bytes())
+    for signature, field in ((b"PK\x01\x02", 24), (b"PK\x03\x04", 22)):
+        position = content.rfind(signature)
+        content[position + field : position + field + 4] = (2**32 - 2).to_bytes(4, "little")
+    plain.write_bytes(content)
+    limited(plain, r"claims 4,29\d,\d{3},\d{3} bytes of content, at most 1,073,741,824")
+
+
+def test_a_compression_bomb(plain):
+    members = parts(plain)
+    with zipfile.ZipFile(plain, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+        with archive.open("bomb.npy", "w", force_zip64=True) as stream:
+            block = bytes(2**20)
+            for _ in range(1025):
+                stream.write(block)
+    limited(plain, "claims 1,07.* bytes of content")
+
+
+def test_a_header_that_is_too_long(plain):
+    members = parts(plain)
+    members["cascaded.npy"] = header((3, 3, 7), length=20000) + bytes(63 * 4)
+    rebuild(plain, members)
+    refused(plain, '"cascaded" has a damaged header')
+
+
+@pytest.mark.parametrize("shape", [(-3, -3, 7), (3, 3, 7, 0), (0, 3, 7)])
+def test_odd_shapes(plain, shape):
+    members = parts(plain)
+    members["cascaded.npy"] = header(shape) + bytes(63 * 4)
+    rebuild(plain, members)
+    refused(plain, "cascaded")
+    change_meta(plain, lambda meta: meta["arrays"]["cascaded"].update(shape=shape))
+    refused(plain, "cascaded")
+
+
+# -- reading: the arrays -----------------------------------------------------------------------------------------------
+
+
+def test_unknown_version(saved):
+    for version in (0, 2, "1", None, [1]):
+        change_meta(saved, lambda meta, version=version: meta.update(format_version=version))
+        refused(saved, "format version .*, this package reads version 1")
+
+
+def test_missing_array(saved):
+    members = parts(saved)
+    rebuild(saved, {k: v for k, v in members.items() if k != "cascaded.npy"})
+    refused(saved, '"cascaded" is missing')
+    refused(saved, '"cascaded" is missing', shapes=SHAPES)
+    rebuild(saved, {k: v for k, v in members.items() if k != "meta.npy"})
+    refused(saved, '"meta"')
+
+
+def test_additional_array(saved):
+    rebuild(saved, {**parts(saved), "more.npy": npy(np.zeros((3, 1), np.float32))})
+    refused(saved, 'unexpected array "more"')
+    refused(saved, 'unexpected array "more"', shapes=SHAPES)
+
+
+def test_arrays_other_than_expected(saved):
+    only = {"cascaded": SHAPES["cascaded"]}
+    refused(saved, r'unexpected array "primary\.0\.data"', shapes=only)
+    refused(saved, '"third" is missing', shapes={**SHAPES, "third": (3, 1)})
+    change_meta(saved, lambda meta: meta["arrays"].pop("cascaded"))
+    refused(saved, "cascaded", shapes=SHAPES)
+    refused(saved, "cascaded")
+
+
+def test_wrong_shape(saved):
+    refused(saved, r"shape \(3, 3, 7\), expected \(3, 4, 7\)", shapes={**SHAPES, "cascaded": (3, 4, 7)})
+    refused(saved, "expected", shapes={**SHAPES, "cascaded": (3, 3, 7, 1)})
+    assert load_table(saved, shapes={**SHAPES, "cascaded": (None, None, 7)}).task == "a task"
+    change_meta(saved, lambda meta: meta["arrays"]["cascaded"].update(shape=[3, 7, 3]))
+    refused(saved, "cascaded")  # what is described is not what is stored
+    refused(saved, "cascaded", shapes={**SHAPES, "cascaded": (3, 7, 3)})
+
+
+def test_fortran_order(plain):
+    members = parts(plain)
+    members["cascaded.npy"] = npy(np.asfortranarray(np.zeros((3, 3, 7), np.float32)))
+    rebuild(plain, members)
+    refused(plain, "cascaded")
+
+
+@pytest.mark.parametrize("dtype", ["<f8", ">f4", "<i4", "u1", "<f2", "S4", "<M8[s]"])
+def test_wrong_type(plain, dtype):
+    members = parts(plain)
+    members["cascaded.npy"] = npy(np.zeros((3, 3, 7), dtype))
+    rebuild(plain, members)
+    refused(plain, 'array "cascaded" has the type .*, expected float32')
+
+
+def test_pickled_objects(plain, tmp_path):
+    """An object array would run code when unpickled; it is refused by its type alone."""
+
+    class Evil:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "pwned"),)
+
+    members = parts(plain)
+    for name in ("cascaded.npy", "meta.npy"):
+        evil = npy(np.full((3, 3, 7), Evil(), object), allow_pickle=True)
+        rebuild(plain, {**members, name: evil})
+        refused(plain, "has the type object")
+    assert not (tmp_path / "pwned").exists()
+
+
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_not_finite(tmp_path, storage, value):
+    path = tmp_path / "t.npz"
+    table = example(storage)
+    save_table(path, table)
+    broken = table.arrays["cascaded"].copy()
+    broken[1, 2, 3] = value
+    rebuild(path, {**parts(path), "cascaded.npy": npy(broken)})
+    refused(path, '"cascaded" contains NaN or infinity')
+
+
+def test_too_little_or_too_much_data(plain):
+    members = parts(plain)
+    for content in (members["cascaded.npy"][:-4], members["cascaded.npy"] + b"more", members["cascaded.npy"][:20]):
+        rebuild(plain, {**members, "cascaded.npy": content})
+        refused(plain, "cascaded")
+
+
+@pytest.mark.parametrize("bad", [b"", b"hello", b"\x93NUMPY\x09\x00", b"\x93NUMPY\x01\x00\x05\x00{'a'}"])
+def test_damaged_header(plain, bad):
+    rebuild(plain, {**parts(plain), "cascaded.npy": bad})
+    refused(plain, '"cascaded" has a damaged header')
+
+
+# -- reading: the description ------------------------------------------------------------------------------------------
+
+
+def test_wrong_task(saved):
+    refused(saved, 'holds tables for the task "a task", expected "another"', task="another")
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[]", b"1", b"{}", b"\xff\xfe\xfd", b"null", b"[" * 100_000, b"1" * 5000])
+def test_damaged_description(plain, text):
+    change_meta(plain, lambda meta: text)
+    refused(plain)
+
+
+@pytest.mark.parametrize("key", ["format_version", "task", "storage", "arrays", "settings", "seed", "quality"])
+def test_incomplete_description(plain, key):
+    change_meta(plain, lambda meta: meta.pop(key) and None)
+    refused(plain, f"damaged.*{key}")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("arrays", [1]), ("arrays", None), ("settings", 3), ("quality", "good"), ("storage", "float64"), ("storage", [])],
+)
+def test_mistyped_description(plain, key, value):
+    change_meta(plain, lambda meta: meta.update({key: value}))
+    refused(plain, "damaged|storage form")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shape": None}, {"shape": "abc"}, {"shape": [float("inf"), 3, 7]}, {"shape": [float("nan"), 3, 7]},
+        {"shape": [21]}, {"shape": []}, {"shape": [3, 3]}, {"border": None}, {"border": ["clamp"]},
+        {"border": ["clamp", "mirror"]}, {"border": "clamp"}, {"border": [[], {}]},
+    ],
+)  # fmt: skip
+def test_damaged_array_description(plain, change):
+    change_meta(plain, lambda meta: meta["arrays"]["cascaded"].update(change))
+    refused(plain, "cascaded")
+
+
+@pytest.mark.parametrize("key", ["scale", "offset"])
+@pytest.mark.parametrize(
+    "value", [None, [], [1.0] * 6, [1.0] * 8, [float("nan")] * 7, [float("inf")] * 7, ["a"] * 7, [10**400] * 7, 3]
+)
+def test_damaged_affine_map(tmp_path, key, value):
+    """The affine map of bytes needs one finite number a channel."""
+    path = tmp_path / "t.npz"
+    save_table(path, example("uint8"))
+    change_meta(path, lambda meta: meta["arrays"]["cascaded"].update({key: value}))
+    refused(path, "cascaded")
+    change_meta(path, lambda meta: meta["arrays"]["cascaded"].pop(key) and None)
+    refused(path, "cascaded")
+
+
+def test_shipped_tables_load():
+    folder = os.path.join(os.path.dirname(tables.__file__), "data")
+    shipped = [name for name in os.listdir(folder) if name.endswith(".npz")]
+    assert shipped
+    for name in shipped:
+        assert load_table(os.path.join(folder, name)).arrays
