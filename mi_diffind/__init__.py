@@ -16,10 +16,11 @@ if not (_here / "plugins").is_dir():  # a checkout has the folder `plugins` besi
 
 _runtime.select_llvm()  # before Dr.Jit starts
 
+from . import plugins as _plugins  # noqa: E402
 from .indirection import DifferentiableArray, Indirection, fold  # noqa: E402
 from .tables import TableError, load_table, save_table  # noqa: E402
 
-_runtime.register_plugins()
+_plugins.install()
 
 __version__ = "0.1.0"
 

@@ -277,11 +277,7 @@ class _Trainer:
         return loss
 
     def finite(self) -> bool:
-        """Whether all entries are finite, and Adam's moments: an infinite one would stop its entry for good."""
-        arrays = []
-        for value, _, _, (_, m, v, _) in self.optimizer.state.values():
-            arrays += [value.array, m.array, v.array]
-        return all(bool(dr.all(dr.isfinite(a), axis=None)) for a in arrays)
+        return all(bool(dr.all(dr.isfinite(v.array), axis=None)) for v in self.optimizer.values())
 
     def snapshot(self) -> _State:
         parameters, moments = {}, {}

@@ -8,6 +8,7 @@ optimiser, ``net.update(opt)`` takes them back, and ``nn.Sequential``, hash grid
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 
@@ -356,9 +357,23 @@ def _tensor(dtype, values: np.ndarray, resolution, channels: int):
     _require_backend(dtype)
     half = dr.is_half_v(dtype)
     dtype = _module(dtype).TensorXf16 if half else _module(dtype).TensorXf  # never double, also in such variants
-    stored = np.zeros((*resolution, lookup.padded_channels(channels)), np.float16 if half else np.float32)
+    shape = (*resolution, lookup.padded_channels(channels))
+    stored = _aligned(shape, np.float16 if half else np.float32)
     stored[..., :channels] = values
+    stored[..., channels:] = 0
     return dtype(stored)
+
+
+def _aligned(shape, dtype) -> np.ndarray:
+    """
+    An uninitialised array that starts at a multiple of 64 bytes. On the CPU, Dr.Jit uses NumPy's memory as it is, and
+    from memory that is aligned less it gathers number by number instead of packet by packet: half the speed in single
+    precision, a fifth in half precision.
+    """
+    count, size = math.prod(shape), np.dtype(dtype).itemsize
+    memory = np.empty(count * size + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    return memory[start : start + count * size].view(dtype).reshape(shape)
 
 
 def _coordinates(x, default=None):

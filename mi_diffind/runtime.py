@@ -1,7 +1,7 @@
 """
-What has to be right before a plugin can run: LLVM, and the registration of the plugins.
+What has to be right before anything can run: LLVM.
 
-**LLVM.** On a CPU, Dr.Jit compiles through LLVM, which it looks for the moment ``drjit`` is imported. Dr.Jit 1.5
+On a CPU, Dr.Jit compiles through LLVM, which it looks for the moment ``drjit`` is imported. Dr.Jit 1.5
 accepts LLVM 15 to 18, but the first kernel with a minimum or maximum then aborts the whole process (``Cannot
 select: fminimum``), which no ``try`` can catch. :func:`select_llvm` therefore chooses the library before that:
 
@@ -12,16 +12,12 @@ select: fminimum``), which no ``try`` can catch. :func:`select_llvm` therefore c
 If ``drjit`` was imported first and has picked an unusable version, the choice is made again, as long as no kernel has
 run and no scene object exists. If no usable library exists, the LLVM backend is switched off, so that
 ``mi.set_variant("llvm_…")`` raises instead of aborting later; CUDA variants are not concerned.
-
-**Plugins.** Mitsuba's classes differ from variant to variant (``mi.BSDF`` is another class in each), so the plugins
-are defined anew for each variant when it is set: :func:`register_plugins` subscribes to that.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import functools
 import glob
 import importlib.metadata
 import os
@@ -264,27 +260,6 @@ def _core_library() -> str:
 
     name = {"linux": "libdrjit-core.so", "darwin": "libdrjit-core.dylib"}.get(sys.platform, "drjit-core.dll")
     return os.path.join(os.path.dirname(drjit.__file__), name)
-
-
-@functools.lru_cache(maxsize=1)
-def _on_variant_change():
-    # One function object for the whole process: Mitsuba keeps the callbacks in a set.
-    def callback(old: str | None, new: str) -> None:
-        from . import plugins
-
-        plugins.register(new)
-
-    return callback
-
-
-def register_plugins() -> None:
-    """Register the plugins with the variant that is set, if any, and with every one that will be set."""
-    import mitsuba as mi
-
-    callback = _on_variant_change()
-    mi.detail.add_variant_callback(callback)
-    if mi.variant() is not None:
-        callback(None, mi.variant())
 
 
 def array_module(backend: str | None = None):

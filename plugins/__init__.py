@@ -1,8 +1,9 @@
 """
 Mitsuba plugins, one a file. ``import mi_diffind`` registers them; nothing here needs to be imported by hand.
 
-A plugin's module defines its class for the variant that is set, as Mitsuba's own Python plugins do, and is therefore
-executed once for each variant (:func:`register`).
+Mitsuba's classes differ from variant to variant (``mi.BSDF`` is another class in each). A plugin's module therefore
+defines its class for the variant that is set, as Mitsuba's own Python plugins do, and is executed once for each variant
+(:func:`register`), now or when the variant is set (:func:`install`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,19 @@ _registered: set[str] = set()
 def supported(variant: str) -> bool:
     """Can the plugins run in this variant? Python plugins need a vectorised (JIT) one with derivatives."""
     return "_ad_" in variant and not variant.endswith("_double")
+
+
+def install() -> None:
+    """Register the plugins with the variant that is set, if any, and with every one that will be set."""
+    import mitsuba as mi
+
+    mi.detail.add_variant_callback(_on_variant_change)  # a set: the second time changes nothing
+    if mi.variant() is not None:
+        register(mi.variant())
+
+
+def _on_variant_change(old: str | None, new: str) -> None:
+    register(new)
 
 
 def register(variant: str) -> None:

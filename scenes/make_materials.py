@@ -73,7 +73,7 @@ HEADER = """\
             <integer name="height" value="$height"/>
             <string name="pixel_format" value="rgb"/>
             <string name="component_format" value="float32"/>
-            <rfilter type="gaussian"/>
+            <rfilter type="box"/>
         </film>
     </sensor>
 

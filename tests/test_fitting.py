@@ -257,10 +257,7 @@ def test_nan_restores_the_last_good_state(ad):
 
 
 def test_damage_between_two_looks_is_noticed(ad):
-    """
-    The bad step is over when the loss is looked at, and the loss is small again; but Adam's second moments have become
-    infinite, and with them no entry would ever move again.
-    """
+    """The bad step is over when the loss is looked at; but its gradient overflowed, and the tables are lost."""
     problem = Curve(ad, {32: lambda y: y + 1e30})
     result, messages = run(problem, settings(loss="mse"))
     assert result.restarts == 1 and messages[0].startswith("step 35: ") and "restored step 29" in messages[0]
@@ -277,6 +274,24 @@ def test_nan_in_the_last_step_is_noticed(ad):
     problem = Curve(ad, {60: nan})
     result, messages = run(problem, settings())
     assert result.restarts == 1 and "step 60" in messages[0] and result.steps == 60
+
+
+def test_entries_lost_in_a_step_whose_loss_was_fine(ad, monkeypatch):
+    """The loss is that of the state before the step: what the last step did shows in the entries only."""
+    original, spoiled = fitting._Trainer.take_step, []
+
+    def take_step(self, plateau=1.0):
+        loss = original(self, plateau)
+        if self.step == 60 and not spoiled:
+            spoiled.append(True)
+            self.optimizer["cascaded.data"] = self.optimizer["cascaded.data"] * math.nan
+        return loss
+
+    monkeypatch.setattr(fitting._Trainer, "take_step", take_step)
+    problem = Curve(ad)
+    result, messages = run(problem, settings())
+    assert spoiled and result.restarts == 1 and messages[0].startswith("step 60: ")
+    assert all(np.isfinite(problem.net[key].numpy()).all() for key in problem.net)
 
 
 def test_explosion_is_noticed(ad):

@@ -345,6 +345,18 @@ def test_bytes_survive_packing(ad, dims, channels):
     np.testing.assert_array_equal(back.max(axis=0), flat.max(axis=0))
 
 
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+def test_entries_are_aligned(storage):
+    """From memory aligned to less than 64 bytes, reads on the CPU are two to five times slower."""
+    ad = array_module("llvm")
+    for size in range(2, 12):
+        table = np.zeros((size, 3), np.float32)
+        array = DifferentiableArray.from_numpy(table, ad.TensorXf, storage=storage)
+        fresh = DifferentiableArray(size, 3, "ramp").alloc(ad.TensorXf)
+        for data in (array.data, fresh.data):
+            assert dr.detach(data).numpy().ctypes.data % 64 == 0  # on the CPU, this is the memory itself
+
+
 def test_quantising_a_constant_and_refusing_nan(ad):
     constant = np.full((3, 3, 2), 0.3, np.float32)
     array = DifferentiableArray.from_numpy(constant, ad.TensorXf, storage="uint8")

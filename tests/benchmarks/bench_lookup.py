@@ -37,13 +37,13 @@ BAR = 0.7
 
 def coordinates(ad, dims: int, count: int, coherent: bool):
     """Uniform coordinates in random order, or those of a smooth walk: neighbours in the same cell or the next."""
-    rng = np.random.default_rng(0)
+    # Computed by Dr.Jit: memory that comes from NumPy is aligned by chance, and kernels differ with that.
+    rng = dr.rng(seed=0)
     if coherent:
-        t = np.linspace(0, 1, count)
-        columns = [0.5 + 0.5 * np.sin(2 * np.pi * (7 * k + 3) * t + k) for k in range(dims)]
+        t = dr.linspace(ad.Float, 0, 1, count)
+        result = [0.5 + 0.5 * dr.sin(dr.two_pi * (7 * k + 3) * t + k) for k in range(dims)]
     else:
-        columns = [rng.random(count) for _ in range(dims)]
-    result = [ad.Float(c.astype(np.float32)) + 0 for c in columns]  # + 0: memory of Dr.Jit's own, hence aligned
+        result = [rng.random(ad.Float, count) for _ in range(dims)]
     dr.make_opaque(result)
     return result
 
