@@ -135,16 +135,16 @@ def figure(comparison: Comparison, path: str | os.PathLike) -> None:
     f = comparison.figures
     error = np.abs(comparison.written - comparison.exact).mean(axis=-1)
     height, width = error.shape
-    sheet = Figure(figsize=(14, 14 * height / width + 1.0), dpi=110, layout="constrained")
+    sheet = Figure(figsize=(14, 14 * height / width + 0.7), dpi=110, layout="constrained")
     axes = sheet.subplots(2, 2)
     for ax, image, title in (
         (axes[0, 0], comparison.written, "as written (learned tables)"),
         (axes[0, 1], comparison.exact, "exact"),
     ):
-        ax.imshow(metrics.srgb(image), interpolation="nearest")
+        ax.imshow(metrics.srgb(image))
         ax.set_title(title)
     top = max(float(np.quantile(error, 0.995)), 1e-6)
-    shown = axes[1, 0].imshow(error, cmap="magma", vmin=0, vmax=top, interpolation="nearest")
+    shown = axes[1, 0].imshow(error, cmap="magma", vmin=0, vmax=top)
     axes[1, 0].set_title("absolute difference, mean of the channels (linear)")
     sheet.colorbar(shown, ax=axes[1, 0], extend="max", shrink=0.9)
     for ax in axes.flat:

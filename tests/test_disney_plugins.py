@@ -333,16 +333,14 @@ def test_aliases_and_indices_of_refraction(mi_rgb, rng):
 
 
 def test_parameters_may_be_colours(mi_any, rng):
-    """As for ``principled``: a scalar parameter given as ``rgb`` reads as Mitsuba's ``eval_1`` says (its luminance)."""
+    """A scalar parameter given as a colour reads as its mean, as Mitsuba's ``eval_1`` says."""
     mi = mi_any
-    grey = {"type": "rgb", "value": [0.3, 0.3, 0.3]}
-    if mi.is_spectral:
-        with_color = mi.load_dict({"type": "disney", "base_color": grey, "roughness": 0.3})
-    else:
-        with_color = mi.load_dict({"type": "disney", "base_color": grey, "roughness": grey})
-    plain = mi.load_dict({"type": "disney", "base_color": grey, "roughness": 0.3})
+    color, grey = {"type": "rgb", "value": [0.6, 0.3, 0.2]}, {"type": "rgb", "value": [0.3, 0.3, 0.3]}
+    names = ("roughness", "specular", "clearcoat")
+    with_colors = mi.load_dict({"type": "disney", "base_color": color, **{k: grey for k in names}})
+    plain = mi.load_dict({"type": "disney", "base_color": color, **{k: 0.3 for k in names}})
     si, wo = interactions(mi, directions(mi, rng, 100)), directions(mi, rng, 100)
-    a, b = (x.eval(mi.BSDFContext(), si, wo).numpy() for x in (with_color, plain))
+    a, b = (x.eval(mi.BSDFContext(), si, wo).numpy() for x in (with_colors, plain))
     assert np.allclose(a, b, rtol=1e-4)
 
 
