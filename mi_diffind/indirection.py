@@ -175,7 +175,10 @@ class DifferentiableArray(nn.Module):
             result.scale, result.offset = tuple(map(float, scale)), tuple(map(float, offset))
             _require_backend(dtype)
             UInt32 = _module(dtype).UInt32
-            result.data = UInt32(lookup.pack(codes, result.border))
+            packed = lookup.pack(codes, result.border)
+            words = _aligned(packed.shape, np.uint32)
+            words[...] = packed
+            result.data = UInt32(words)
         else:
             tensor = _module(dtype).TensorXf16 if storage == "float16" else _module(dtype).TensorXf
             result.data = _tensor(tensor, values, result.resolution, result.channels)
@@ -195,8 +198,7 @@ class DifferentiableArray(nn.Module):
         """The bytes of an array in ``"uint8"`` storage, shape ``(N_1, …, N_d, channels)``."""
         if self.storage != "uint8":
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
-        words = self.data.numpy().astype("<u4").view(np.uint8)
-        return words.reshape(*self.resolution, -1)[..., : self.channels].copy()
+        return lookup.unpack(self.data.numpy(), self.resolution, self.channels)
 
     # -- properties -------------------------------------------------------------------------------------------------
 

@@ -46,19 +46,33 @@ def padded_channels(channels: int) -> int:
     return channels if channels <= 2 else 4 * math.ceil(channels / 4)
 
 
-def corner_bits(dims: int, channels: int) -> int:
+#: A packed table may hold each entry several times, so that one gather brings several corners of a cell, as long as it
+#: stays below this size, in bytes: about what the cache of one core holds.
+WIDE_BYTES = 2**20
+
+
+def packed_layout(resolution: Sequence[int], channels: int) -> tuple[int, int, int]:
     """
-    How many trailing axes have both their corners inside one packed ``UInt32``: the largest ``k`` with
-    ``channels · 2^k ≤ 4``. A one-channel bilinear read (k = 2) needs a single gather.
+    How a table of bytes is packed: ``(inner, stride, words)``.
+
+    A texel stores the ``2^inner`` corners of a cell along the last ``inner`` axes, each in ``stride`` bytes, in
+    ``words`` words of 32 bits. One word may hold what fits (a one-channel bilinear read is a single gather), and up to
+    four words if the table stays below :data:`WIDE_BYTES`.
     """
-    return min(dims, {1: 2, 2: 1}.get(channels, 0))
+    stride = channels if channels <= 2 else 4 * math.ceil(channels / 4)
+    for inner in range(len(resolution), 0, -1):
+        words = math.ceil(stride * 2**inner / 4)
+        if words == 1 or (words in (2, 4) and math.prod(resolution) * 4 * words <= WIDE_BYTES):
+            return inner, stride, words
+    return 0, stride, math.ceil(stride / 4)
 
 
 def gathers(resolution: Sequence[int], channels: int, storage: str) -> int:
     """Number of gather instructions that one read takes."""
     dims = len(resolution)
     if storage == "uint8":
-        return 2 ** (dims - corner_bits(dims, channels)) * math.ceil(channels / 4)
+        inner, _, words = packed_layout(resolution, channels)
+        return 2 ** (dims - inner) * (1 if words <= 2 else math.ceil(words / 4) if words % 4 == 0 else words)
     return 2**dims * max(1, padded_channels(channels) // 4)
 
 
@@ -149,48 +163,61 @@ def read_packed(
     Read a table of bytes packed in ``UInt32`` words (:func:`pack`). Channel ``k`` of the result is
     ``offset[k] + scale[k] · (interpolated byte)``. Differentiable with respect to ``x`` only.
 
-    A byte becomes a float by a bit trick: placed in the mantissa of a number in [1, 2) it reads ``1 + byte/256``, and
-    since the weights of a read sum to one, the ones are subtracted once at the end.
+    Two bytes of a word lie where a float has its mantissa, and rotated by half a word so do the other two. Under the
+    exponent of 1, they read ``1 + byte/256`` and ``1 + byte/65536`` without any conversion; since the weights of a
+    read sum to one, the ones are subtracted once at the end. What the latter loses by that, at most 1/64 of a step in
+    1D and 2D, grows with the number of corners: from 3D on those bytes are converted instead.
     """
     Float = type(x[0])
-    dims = len(resolution)
-    inner = corner_bits(dims, channels)
-    per_texel = math.ceil(channels / 4)
+    UInt32, Int32 = type(words), dr.int32_array_t(type(words))
+    module = sys.modules[Float.__module__]
+    inner, stride, per_texel = packed_layout(resolution, channels)
     axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
+    outer = len(resolution) - inner
+    packet = per_texel if per_texel in (1, 2) else 4 if per_texel % 4 == 0 else 1
+    groups = per_texel // packet
 
-    # Axes whose corners share a word contribute their lower index only; their weights select bytes of the word.
-    outer = dims - inner
-    merged = [(a if k < outer else (a[0], a[0], a[2])) for k, a in enumerate(axes)]
-    byte_weights = [None]
+    convert = len(resolution) > 2
+
+    inner_weights = [None]
     for _, _, w in axes[outer:]:
-        byte_weights = [v if b is None else b * v for b in byte_weights for v in (1 - w, w)]
+        inner_weights = [v if b is None else b * v for b in inner_weights for v in (1 - w, w)]
 
-    def mantissa(word, byte: int):
-        shift = 15 - 8 * byte
-        moved = word << shift if shift >= 0 else word >> -shift
-        return dr.reinterpret_array(Float, (moved & 0x7F8000) | 0x3F800000)
+    def fetch(index) -> list:
+        """All words of a texel, each also rotated."""
+        found = []
+        for group in range(groups):
+            where = index if groups == 1 else dr.fma(index, groups, group)
+            if packet == 1:
+                found.append(dr.gather(UInt32, words, where, active))
+            else:
+                found += list(dr.gather(getattr(module, f"Array{packet}u"), words, where, active))
+        return [(w, (w << 16) | (w >> 16)) for w in found]
 
-    def fetch(index):
-        values = []
-        for group in range(per_texel):
-            where = index if per_texel == 1 else dr.fma(index, per_texel, group)
-            word = dr.gather(type(words), words, where, active)
-            for channel in range(4 * group, min(channels, 4 * group + 4)):
-                if inner == 0:
-                    values.append(mantissa(word, channel - 4 * group))
-                else:
-                    corners = [mantissa(word, corner * channels + channel) for corner in range(2**inner)]
-                    values.append(_weighted_sum(zip(byte_weights, ([c] for c in corners), strict=True))[0])
-        return values
+    def byte(found, position: int):
+        word = found[position // 4][position % 4 // 2]
+        if position % 2 and channels == 1:  # the corners of one channel are summed, so all have to be of one kind
+            word = word << 8
+        elif position % 2:
+            low = word & 0x7F80
+            return Float(Int32(low)) if convert else dr.reinterpret_array(Float, low | 0x3F800000)
+        return dr.reinterpret_array(Float, (word & 0x7F8000) | 0x3F800000)
 
-    outer_corners = _corners(axes[:outer], resolution[:outer]) if outer else [(None, None)]
     terms = []
-    for index, weight in outer_corners:
-        for (lower, _, _), n in zip(merged[outer:], resolution[outer:], strict=True):
+    for index, weight in _corners(axes[:outer], resolution[:outer]) if outer else [(None, None)]:
+        # Axes whose corners share a texel contribute their lower index only
+        for (lower, _, _), n in zip(axes[outer:], resolution[outer:], strict=True):
             index = lower if index is None else dr.fma(index, n, lower)
-        terms.append((weight, fetch(index)))
+        found = fetch(index)
+        corners = [[byte(found, k * stride + channel) for channel in range(channels)] for k in range(2**inner)]
+        terms.append((weight, corners[0] if inner == 0 else _weighted_sum(zip(inner_weights, corners, strict=True))))
     sums = terms[0][1] if terms[0][0] is None else _weighted_sum(terms)
-    values = [dr.fma(s - 1, 256 * scale[k], offset[k]) for k, s in enumerate(sums)]
+    values = []
+    for k, s in enumerate(sums):
+        if k % 2 and convert:
+            values.append(dr.fma(s, scale[k] / 128, offset[k]))
+        else:
+            values.append(dr.fma(s - 1, (65536 if k % 2 else 256) * scale[k], offset[k]))
     # A masked gather gives the byte 0, which means `offset`, not 0.
     return values if active is True else [dr.select(active, v, 0) for v in values]
 
@@ -216,21 +243,34 @@ def quantize(values, channels: int):
 def pack(codes, border: Sequence[str]):
     """
     The words that :func:`read_packed` reads, from a NumPy ``uint8`` array of shape ``(N_1, …, N_d, c)``: a flat
-    ``uint32`` array, little end first, channels (and shared corners, last axis fastest) in ascending bytes.
+    ``uint32`` array in the layout of :func:`packed_layout`, the last axis fastest. See :func:`unpack` for the bits.
     """
     import numpy as np
 
     codes = np.asarray(codes, dtype=np.uint8)
     *resolution, channels = codes.shape
-    dims = len(resolution)
-    inner = corner_bits(dims, channels)
-    parts = [codes]
-    for axis in range(dims - inner, dims):
+    inner, stride, words = packed_layout(resolution, channels)
+    padding = [(0, 0)] * len(resolution)
+    parts = [np.pad(codes, [*padding, (0, stride - channels)])]
+    for axis in range(len(resolution) - inner, len(resolution)):
         n = resolution[axis]
         following = np.arange(1, n + 1)
         following = following % n if border[axis] == "repeat" else np.minimum(following, n - 1)
         parts = [q for p in parts for q in (p, np.take(p, following, axis=axis))]
     joined = np.concatenate(parts, axis=-1)
-    missing = -joined.shape[-1] % 4
-    joined = np.concatenate([joined, np.zeros((*resolution, missing), np.uint8)], axis=-1)
-    return np.ascontiguousarray(joined).view("<u4").astype(np.uint32).reshape(-1)
+    joined = np.pad(joined, [*padding, (0, 4 * words - joined.shape[-1])]).reshape(-1, 4).astype(np.uint32)
+    upper, lower = joined[:, 0] << 15 | joined[:, 1] << 7, joined[:, 2] << 15 | joined[:, 3] << 7
+    return upper | lower >> 16 | lower << 16
+
+
+def unpack(words, resolution: Sequence[int], channels: int):
+    """
+    The bytes of a packed table, ``(N_1, …, N_d, channels)``: byte 0 of a word lies in bits 15 to 22, byte 1 in bits 7
+    to 14, and bytes 2 and 3 there once the word is rotated by 16.
+    """
+    import numpy as np
+
+    words = np.asarray(words, dtype=np.uint32)
+    rotated = words << 16 | words >> 16
+    found = np.stack([words >> 15, words >> 7, rotated >> 15, rotated >> 7], axis=-1) & 0xFF
+    return found.astype(np.uint8).reshape(*resolution, -1)[..., :channels].copy()

@@ -174,6 +174,8 @@ def test_ramp_and_grid_are_an_ordinary_lookup(ad, dims):
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_values(ad, storage):
+    # Packed 2D reads: 1/64 of a step (tests/test_lookup.py), times the slope of the cascaded array
+    atol = 5e-4 if storage == "uint8" else 0
     net = pair(ad)
     x = uniform(1, 300, 2)
     before = net.primary[0].numpy()
@@ -185,8 +187,8 @@ def test_values(ad, storage):
     assert p.min() >= 0 and p.max() <= 1
     np.testing.assert_allclose(p, before, atol={"float32": 0, "float16": 3e-4, "uint8": 0.502 / 255}[storage])
     np.testing.assert_allclose(np.stack([v.numpy() for v in net.pointer([ad.Float(v) for v in x.T.copy()])], 1),
-                               interpolate(p, x), rtol=1e-5, atol=1e-6)  # fmt: skip
-    np.testing.assert_allclose(read(net, ad, x), interpolate(c, interpolate(p, x)), rtol=1e-5)
+                               interpolate(p, x), rtol=1e-5, atol=1e-6 if atol == 0 else 1 / 255 / 64)  # fmt: skip
+    np.testing.assert_allclose(read(net, ad, x), interpolate(c, interpolate(p, x)), rtol=1e-5, atol=atol)
 
 
 def test_storage_can_differ(ad):
@@ -194,7 +196,7 @@ def test_storage_can_differ(ad):
     assert net.primary[0].storage == "uint8" and net.cascaded.storage == "float16"
     back = net.to("float32")
     x = uniform(2, 100, 2)
-    np.testing.assert_allclose(read(back, ad, x), read(net, ad, x), rtol=1e-5)
+    np.testing.assert_allclose(read(back, ad, x), read(net, ad, x), rtol=1e-5, atol=5e-4)
 
 
 def test_gradients_equal_central_differences(ad):
@@ -249,7 +251,7 @@ def test_several_primaries(ad, storage):
     x = uniform(6, 200, 3)
     pointers = [interpolate(p.numpy(), x[:, list(g)]) for p, g in zip(net.primary, groups, strict=True)]
     expected = interpolate(net.cascaded.numpy(), np.concatenate(pointers, axis=1))
-    np.testing.assert_allclose(read(net, ad, x), expected, rtol=1e-5)
+    np.testing.assert_allclose(read(net, ad, x), expected, rtol=1e-5, atol=5e-4 if storage == "uint8" else 0)
 
 
 def test_inputs_default_to_consecutive_ones():

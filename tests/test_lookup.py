@@ -70,6 +70,16 @@ def read(array, ad, x, **kwargs):
     return np.stack([np.broadcast_to(v.numpy(), len(x)) for v in values], axis=-1)
 
 
+def assert_interpolated(array, values, x, border):
+    """
+    ``values`` are what the reference makes of the entries that ``array`` holds, to a relative error of 1e-5; packed
+    reads in 1D and 2D, whose bytes have only 7 bits below them, may be off by 1/64 of a quantisation step more.
+    """
+    slack = np.asarray(array.scale) / 64 if array.storage == "uint8" and array.dims <= 2 else 0
+    expected = reference(array.numpy(), x, border)
+    assert (np.abs(values - expected) <= 1e-5 * np.abs(expected) + slack).all()
+
+
 def inside(rng, samples, resolution, border):
     """Random coordinates well inside a cell each (periods away, if the border allows it), where slopes exist."""
     columns = []
@@ -99,7 +109,7 @@ def test_values_equal_scipy(ad, dims, channels, storage):
         array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, storage)
         values, held = read(array, ad, x), array.numpy()
         assert values.shape == (300, channels)
-        np.testing.assert_allclose(values, reference(held, x, border), rtol=1e-5, atol=0)
+        assert_interpolated(array, values, x, border)
         if storage == "uint8":
             half_step = (table.max(axis=tuple(range(dims))) - table.min(axis=tuple(range(dims)))) / 255 / 2
             assert (np.abs(values - reference(table, x, border)) <= half_step * 1.001 + 1e-6).all()
@@ -120,7 +130,7 @@ def test_one_entry_along_an_axis(ad, resolution, channels, storage):
     for border in borders(len(resolution)):
         table = entries(rng, resolution, channels)
         array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, storage)
-        np.testing.assert_allclose(read(array, ad, x), reference(array.numpy(), x, border), rtol=1e-5)
+        assert_interpolated(array, read(array, ad, x), x, border)
         point = [ad.Float(x[:, k].copy()) for k in range(len(resolution))]
         dr.enable_grad(point)
         dr.backward(sum(array(point)), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
@@ -142,7 +152,7 @@ def test_special_coordinates(ad, dims, channels, border, storage):
         x[axis * len(SPECIAL) : (axis + 1) * len(SPECIAL), axis] = SPECIAL
     x = np.concatenate([x, np.repeat(np.float32(SPECIAL)[:, None], dims, axis=1)])
     values = read(array, ad, x)
-    np.testing.assert_allclose(values, reference(array.numpy(), x, (border,) * dims), rtol=1e-5)
+    assert_interpolated(array, values, x, (border,) * dims)
 
 
 @pytest.mark.parametrize("storage", ["float32", "float16"])
@@ -368,21 +378,33 @@ def test_quantising_a_constant_and_refusing_nan(ad):
 
 
 def test_gathers():
-    """The documented number of memory accesses: few channels share a word between corners."""
+    """The number of memory accesses: the corners of a cell share a texel where that keeps the table small."""
     assert lookup.gathers((8, 8), 1, "uint8") == 1
-    assert lookup.gathers((8, 8), 2, "uint8") == 2
-    assert lookup.gathers((8, 8), 4, "uint8") == 4
-    assert lookup.gathers((8,) * 4, 1, "uint8") == 4
-    assert lookup.gathers((8,) * 4, 7, "uint8") == 32
+    assert lookup.gathers((8, 8), 4, "uint8") == 1
+    assert lookup.gathers((1000, 1000), 1, "uint8") == 1
+    assert lookup.gathers((1000, 1000), 2, "uint8") == 2
+    assert lookup.gathers((1000, 1000), 4, "uint8") == 4
+    assert lookup.gathers((8,) * 4, 1, "uint8") == 1
+    assert lookup.gathers((8,) * 4, 7, "uint8") == 8
+    assert lookup.gathers((8,) * 4, 12, "uint8") == 48
     assert lookup.gathers((8, 8), 1, "float32") == 4
     assert lookup.gathers((8, 8), 4, "float32") == 4
     assert lookup.gathers((8, 8), 7, "float16") == 8
 
 
 def test_gathers_that_the_kernel_makes():
-    """The kernel really contains as many gathers as :func:`mi_diffind.lookup.gathers` says for bytes."""
+    """
+    The kernel really contains as many gathers as :func:`mi_diffind.lookup.gathers` says for bytes: Dr.Jit reads packets
+    at once only from aligned memory.
+    """
     ad = array_module("llvm")
-    for resolution, channels in (((5, 7), 1), ((5, 7), 2), ((5, 7), 3), ((3, 4, 5), 1), ((3, 4, 5), 7)):
+    large = (600, 600)
+    for resolution, channels in (
+        *(((5, 7), c) for c in (1, 2, 3, 5, 12, 16)),
+        *((large, c) for c in (1, 2, 3, 5)),
+        ((3, 4, 5), 1),
+        ((3, 4, 5), 7),
+    ):
         table = entries(np.random.default_rng(0), resolution, channels)
         array = DifferentiableArray.from_numpy(table, ad.TensorXf, storage="uint8")
         x = [dr.linspace(ad.Float, 0, 1, 123) for _ in resolution]
@@ -392,7 +414,7 @@ def test_gathers_that_the_kernel_makes():
             dr.eval(array(x))
             code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
         calls = [line for line in code.splitlines() if "call" in line and "gather" in line]
-        assert len(calls) == lookup.gathers(resolution, channels, "uint8")
+        assert len(calls) == lookup.gathers(resolution, channels, "uint8"), (resolution, channels)
 
 
 def test_clamp_keeps_the_gradient_at_its_bounds(ad):
