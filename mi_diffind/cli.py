@@ -83,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command("inspect", _inspect, "say what is in a table file, or which learned plugins a scene uses")
     sub.add_argument("file", metavar="FILE.npz|SCENE.xml")
+    sub.add_argument("--measure", action="store_true", help="measure the accuracy of tables in each storage form")
     scene_options(sub, rendering=False)
 
     sub = command("fit", _fit, "train tables")
@@ -225,6 +226,7 @@ def _inspect(arguments) -> dict:
         ("measured", table.quality),
     ):
         print(f"  {title}: " + ", ".join(f"{k} {v}" for k, v in content.items()))
+    measured = _measure(arguments.file, table) if arguments.measure else None
     return {
         "file": arguments.file,
         "task": table.task,
@@ -234,7 +236,29 @@ def _inspect(arguments) -> dict:
         "settings": table.settings,
         "seed": table.seed,
         "quality": table.quality,
+        **({"measured": measured} if measured else {}),
     }
+
+
+def _measure(file: str, table) -> dict:
+    """Accuracy over random directions and materials, for each storage form and distribution of the materials."""
+    from .tasks.disney.arrays import TASK, DisneyArrays, load_disney_table
+    from .tasks.disney.training import measure
+
+    if table.task != TASK:
+        raise UsageError(f'{file}: holds tables for the task "{table.task}", which cannot be measured')
+    table, types, result = load_disney_table(file), runtime.array_module(), {}
+    for storage in STORAGES:
+        form = table.to(storage)
+        net = DisneyArrays.from_table(table, types.TensorXf, storage)
+        result[storage] = {"bytes": form.nbytes}
+        for distribution in ("training", "uniform"):
+            result[storage][distribution] = found = measure(net, types, distribution=distribution)
+            print(
+                f"  {storage:8} {form.nbytes:6,} bytes, {distribution:8} materials: "
+                f"BRDF x cosine {found['psnr_db']:.2f} dB, BRDF {found['psnr_brdf_db']:.2f} dB"
+            )
+    return result
 
 
 def _inspect_scene(arguments) -> dict:

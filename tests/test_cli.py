@@ -92,6 +92,19 @@ def test_inspect_tables(tmp_path, capsys):
     assert sum(a["bytes"] for a in found["arrays"].values()) == found["bytes"]
 
 
+def test_inspect_measures(tmp_path, capsys):
+    from mi_diffind.tasks.disney.library import SHIPPED
+
+    report = tmp_path / "report.json"
+    assert main(["inspect", str(SHIPPED), "--measure", "--json", str(report)]) == 0
+    assert "uint8     3,120 bytes" in capsys.readouterr().out
+    measured = json.loads(report.read_text())["measured"]
+    for storage, size in (("float32", 12480), ("float16", 6240), ("uint8", 3120)):
+        assert measured[storage]["bytes"] == size
+        assert measured[storage]["training"]["psnr_db"] > measured[storage]["uniform"]["psnr_db"] > 33
+        assert measured[storage]["training"]["psnr_brdf_db"] > 33
+
+
 def test_inspect_scene(capsys):
     assert main(["inspect", str(SCENES / "still_life.xml")]) == 0
     text = capsys.readouterr().out
