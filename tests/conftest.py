@@ -1,5 +1,7 @@
 """Fixtures shared by all tests: Mitsuba variants and seeded generators."""
 
+import gc
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -35,3 +37,19 @@ def mi_any(request):
 @pytest.fixture
 def rng():
     return np.random.default_rng(20231212)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def collect_garbage():
+    """Scenes and optimisers die with their module, not at some point of a later test."""
+    yield
+    gc.collect()
+
+
+@pytest.fixture
+def no_garbage_collection():
+    """For frozen functions: Dr.Jit aborts if the collector frees its arrays while it records one."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()

@@ -365,7 +365,7 @@ def test_copies_are_independent(ad):
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
-def test_pytree(ad, storage):
+def test_pytree(ad, storage, no_garbage_collection):
     """Traversed by Dr.Jit: evaluation, gradients on and off, frozen functions."""
     net = pair(ad)
     net = net if storage == "float32" else net.to(storage)
