@@ -15,6 +15,7 @@ from pathlib import Path
 from . import __version__, runtime
 from .files import OutputError, writable_file, writable_folder, write_json
 from .fitting import SCHEDULES, FittingError
+from .interrupt import interruptible
 from .lookup import STORAGES
 from .tables import TableError
 
@@ -34,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
         result = arguments.run(arguments)
         if arguments.json is not None:
             write_json(arguments.json, result)
-        return 0
+        return 130 if result.get("interrupted") else 0
     except (UsageError, OutputError, TableError, FittingError, SceneError) as e:
         print(f"mi-diffind: error: {e}", file=sys.stderr)
         return 2
@@ -165,18 +166,22 @@ def _render(arguments) -> dict:
     loaded = time.perf_counter()
     spp = arguments.spp or scene.sensors()[0].sampler().sample_count()
     passes = max(1, spp // 16)
-    with tqdm(total=passes, desc="render", unit="pass", disable=None) as bar:
-        image, _ = scenes.render(scene, spp, arguments.seed, passes, lambda _: bar.update(1))
+    with interruptible() as stop, tqdm(total=passes, desc="render", unit="pass", disable=None) as bar:
+        image, seconds = scenes.render(scene, spp, arguments.seed, passes, bar.update, stop)
     rendered = time.perf_counter()
     compare.write_image(output, image)
-    print(f"{output}: {image.shape[1]} x {image.shape[0]}, {spp} spp, {rendered - loaded:.1f} s in {mi.variant()}")
+    done = len(seconds) * spp // passes
+    kept = f"interrupted, kept {done} of {spp}" if done < spp else f"{spp}"
+    size = f"{image.shape[1]} x {image.shape[0]}"
+    print(f"{output}: {size}, {kept} spp, {rendered - loaded:.1f} s in {mi.variant()}")
     return {
+        "interrupted": done < spp,
         "scene": arguments.scene,
         "output": str(output),
         "variant": mi.variant(),
         "width": image.shape[1],
         "height": image.shape[0],
-        "spp": spp,
+        "spp": done,
         "seed": arguments.seed,
         "seconds_load": loaded - start,
         "seconds_render": rendered - loaded,
@@ -195,6 +200,8 @@ def _compare(arguments) -> dict:
     )
     paths = compare.write(comparison, arguments.out)
     print("\n".join(compare.summary(comparison.figures)))
+    if comparison.figures["interrupted"]:
+        print("interrupted; this is what there was")
     print(f"picture     {paths['figure']}")
     return {**comparison.figures, "files": paths}
 
@@ -301,9 +308,8 @@ def _fit(arguments) -> dict:
     quality = ", ".join(f"{k} {v}" for k, v in table.quality.items())
     state = f"interrupted at step {result.steps}, kept" if result.interrupted else "best"
     print(f"{output}: {table.nbytes:,} bytes as {table.storage}; {state} step {result.step}; {quality}")
-    if result.interrupted:
-        raise KeyboardInterrupt
     return {
+        "interrupted": result.interrupted,
         "output": str(output),
         "bytes": table.nbytes,
         "storage": table.storage,

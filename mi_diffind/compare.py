@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from . import metrics, scenes
 from .files import replacing, writable_folder
+from .interrupt import interruptible
 
 
 @dataclass
@@ -40,23 +41,29 @@ def compare(
 
     Figures: ``psnr_db``, ``flip``, ``mae`` of the image as written against the exact one; the median seconds of a pass
     of each; ``time_ratio`` (written over exact: median, minimum and maximum over the passes but the first, which
-    compiles); ``learned_plugins`` and the ``table_bytes`` of each distinct table they read.
+    compiles); ``learned_plugins`` and the ``table_bytes`` of each distinct table they read. Ctrl-C ends it after the
+    current pair of passes; ``spp`` and ``passes`` then say how many there were, and ``interrupted`` is true.
     """
     learned = scenes.learned_plugins(path, **defines)
     loaded = {"written": scenes.load(path, **defines), "exact": scenes.load(path, exact=True, **defines)}
     spp = spp or loaded["written"].sensors()[0].sampler().sample_count()
     passes = max(1, min(passes, spp))
-    images, seconds = {}, {name: [] for name in loaded}
-    with tqdm(total=2 * passes, desc="render", unit="pass", disable=None if progress else True) as bar:
+    images, seconds, done = {}, {name: [] for name in loaded}, 0
+    bar = tqdm(total=2 * passes, desc="render", unit="pass", disable=None if progress else True)
+    with interruptible() as stop, bar:
         for i in range(passes):
-            n = (i + 1) * spp // passes - i * spp // passes
+            n = (i + 1) * spp // passes - done
             for name in loaded if i % 2 == 0 else reversed(loaded):
                 image, took = scenes.render(loaded[name], n, seed * passes + i)
-                images[name] = images.get(name, 0) + image.astype(np.float64) * (n / spp)
+                images[name] = images.get(name, 0) + n * image.astype(np.float64)
                 seconds[name] += took
                 bar.update(1)
+            done += n
+            if stop.is_set():
+                break
 
-    written, exact = (images[name][..., :3].astype(np.float32) for name in ("written", "exact"))
+    interrupted, spp, passes = done < spp, done, len(seconds["exact"])
+    written, exact = ((images[name][..., :3] / spp).astype(np.float32) for name in ("written", "exact"))
     if written.shape[-1] == 1:
         written, exact = np.repeat(written, 3, -1), np.repeat(exact, 3, -1)
     timed = slice(1, None) if passes > 1 else slice(None)
@@ -73,6 +80,7 @@ def compare(
         "seconds_first_pass": {name: seconds[name][0] for name in loaded},
         "time_ratio": {"median": statistics.median(ratios), "min": min(ratios), "max": max(ratios)},
         "passes": passes,
+        "interrupted": interrupted,
         "learned_plugins": len(learned),
         "table_bytes": table_bytes(path, learned),
     }

@@ -11,9 +11,7 @@ import contextlib
 import json
 import math
 import os
-import signal
 import sys
-import threading
 import time
 from dataclasses import asdict, dataclass, field
 from typing import Protocol
@@ -24,6 +22,7 @@ from drjit.opt import Adam
 from tqdm import tqdm
 
 from .files import replacing, writable_file
+from .interrupt import interruptible
 
 SCHEDULES = ("constant", "cosine", "plateau")
 LOSSES = ("mae", "mse")
@@ -159,7 +158,7 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
             best, best_quality, best_step = trainer.snapshot().parameters, quality, trainer.step
         bar.set_postfix({"loss": f"{loss:.3g}", name: f"{value:.2f}"})
 
-    with _interruptible() as stop, _cores(settings.deterministic), bar:
+    with interruptible() as stop, _cores(settings.deterministic), bar:
         while trainer.step < settings.steps and not stop.is_set():
             before = trainer.snapshot()
             loss = trainer.take_step(plateau.factor)
@@ -353,23 +352,3 @@ def _cores(deterministic: bool):
         yield
     finally:
         dr.set_thread_count(before)
-
-
-@contextlib.contextmanager
-def _interruptible():
-    """An event that Ctrl-C sets; a second Ctrl-C raises ``KeyboardInterrupt`` as usual."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def handler(signum, frame):
-        stop.set()
-        signal.signal(signal.SIGINT, before)
-
-    signal.signal(signal.SIGINT, handler)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
@@ -85,35 +86,32 @@ def render(
     spp: int | None = None,
     seed: int = 0,
     passes: int = 1,
-    on_pass: Callable[[float], None] | None = None,
+    on_pass: Callable[[], object] | None = None,
+    stop: threading.Event | None = None,
 ) -> tuple[np.ndarray, list[float]]:
     """
     Render in ``passes`` of about ``spp / passes`` samples each and average them.
 
     Returns the linear image ``(height, width, channels)``, float32, and the seconds that each pass took (the first
-    includes compilation). ``on_pass(seconds)`` is called after each. The same arguments give the same image.
+    includes compilation). ``on_pass()`` is called after each; once ``stop`` is set, the pass that is running is the
+    last, and the image is the average of those done, ``len(seconds) · spp // passes`` samples. The same arguments give
+    the same image, if the film's filter is a box (other filters add up samples of neighbouring pixels in any order).
     """
-    image, seconds = None, []
-    for n, done, pass_image in _passes(scene, spp, seed, passes, seconds):
-        image = pass_image * n if image is None else image + pass_image * n
-        total = done
-        if on_pass is not None:
-            on_pass(seconds[-1])
-    return (image / total).astype(np.float32), seconds
-
-
-def _passes(scene, spp, seed, passes, seconds) -> Iterator[tuple[int, int, np.ndarray]]:
     spp = spp or scene.sensors()[0].sampler().sample_count()
     passes = max(1, min(passes, spp))
-    done = 0
+    image, seconds, done = 0, [], 0
     for i in range(passes):
-        n = (i + 1) * spp // passes - i * spp // passes
+        n = (i + 1) * spp // passes - done
         start = time.perf_counter()
         with _scene_errors(None):
-            image = mi.render(scene, spp=n, seed=((seed << 16) + i) % 2**32).numpy()
+            image = image + n * mi.render(scene, spp=n, seed=((seed << 16) + i) % 2**32).numpy().astype(np.float64)
         seconds.append(time.perf_counter() - start)
         done += n
-        yield n, done, image.astype(np.float64)
+        if on_pass is not None:
+            on_pass()
+        if stop is not None and stop.is_set():
+            break
+    return (image / done).astype(np.float32), seconds
 
 
 def _parse(config, path, defines: dict[str, str]):

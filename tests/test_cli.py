@@ -158,6 +158,48 @@ def test_fit_is_interrupted_and_resumed(tmp_path):
     assert out.read_bytes() == undisturbed.read_bytes()
 
 
+def interrupted(*arguments) -> subprocess.CompletedProcess:
+    """Run a command that sends itself SIGINT while it renders its second pass."""
+    code = SIGINT_IN_THE_SECOND_PASS + "\nfrom mi_diffind.cli import main\nsys.exit(main())"
+    return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=120)
+
+
+SIGINT_IN_THE_SECOND_PASS = """
+import os, signal, sys, mi_diffind.scenes as scenes
+count = [0]
+original = scenes.mi.render
+def render(*args, **kwargs):
+    count[0] += 1
+    if count[0] == 2:
+        os.kill(os.getpid(), signal.SIGINT)
+    return original(*args, **kwargs)
+class Mi:
+    def __getattr__(self, name):
+        return render if name == "render" else getattr(module, name)
+module = scenes.mi
+scenes.mi = Mi()
+"""
+
+
+def test_interrupted_renders_keep_what_they_have(tmp_path):
+    import mitsuba as mi
+
+    out, report = tmp_path / "image.exr", tmp_path / "report.json"
+    scene = str(SCENES / "still_life.xml")
+    size = ["-D", "width=48", "-D", "height=28"]
+    done = interrupted("render", scene, "-o", str(out), "--json", str(report), "--spp", "96", *size)
+    assert done.returncode == 130, done.stderr
+    assert "interrupted, kept 32 of 96 spp" in done.stdout
+    assert json.loads(report.read_text())["spp"] == 32
+    assert np.array(mi.Bitmap(str(out))).mean() > 0.01
+
+    folder = tmp_path / "pictures"
+    done = interrupted("compare", scene, "--out", str(folder), "--spp", "20", *size)
+    assert done.returncode == 130, done.stderr
+    assert "4 spp" in done.stdout and "interrupted; this is what there was" in done.stdout
+    assert (folder / "comparison.png").exists()
+
+
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 
