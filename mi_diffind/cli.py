@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import sys
 import time
 from pathlib import Path
@@ -18,6 +19,7 @@ from .fitting import SCHEDULES, FittingError
 from .interrupt import interruptible
 from .lookup import STORAGES
 from .tables import TableError
+from .tasks.disney.training import DEFAULT_SETTINGS
 
 
 class UsageError(Exception):
@@ -42,6 +44,9 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("mi-diffind: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # the reader of a pipe has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -92,14 +97,15 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("-o", "--output", required=True, metavar="FILE.npz", help="table file to write")
     sub.add_argument("--storage", choices=STORAGES, default="float32", help="storage form (default: float32)")
     sub.add_argument("--backend", choices=["llvm", "cuda"], help="where to train (default: the GPU if there is one)")
-    sub.add_argument("--steps", type=_positive, help="optimisation steps")
-    sub.add_argument("--batch", type=_positive, help="samples a step")
-    sub.add_argument("--lr", type=float, help="Adam's learning rate")
-    sub.add_argument("--schedule", choices=SCHEDULES, help="course of the learning rate")
-    sub.add_argument("--seed", type=_natural, help="seed of the random numbers")
+    default = DEFAULT_SETTINGS
+    sub.add_argument("--steps", type=_positive, help=f"optimisation steps (default: {default.steps})")
+    sub.add_argument("--batch", type=_positive, help=f"samples a step (default: {default.batch})")
+    sub.add_argument("--lr", type=float, help=f"Adam's learning rate (default: {default.lr})")
+    sub.add_argument("--schedule", choices=SCHEDULES, help=f"of the learning rate (default: {default.schedule})")
+    sub.add_argument("--seed", type=_natural, help=f"seed of the random numbers (default: {default.seed})")
     sub.add_argument("--all-cores", action="store_true", help="faster, but not the same bytes each time")
     sub.add_argument("--checkpoint", metavar="FILE", help="keep the state of the training in FILE")
-    sub.add_argument("--resume", action="store_true", help="go on from --checkpoint")
+    sub.add_argument("--resume", action="store_true", help="go on from --checkpoint, with the same settings")
     return parser
 
 
@@ -130,6 +136,8 @@ def _set_variant(name: str | None) -> None:
         raise UsageError(f'the variant "{name}" does not exist; available are {", ".join(mi.variants())}')
     if name.startswith("llvm") and runtime.llvm_problem():
         raise UsageError(runtime.llvm_problem())
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise UsageError(f'the variant "{name}" needs an NVIDIA GPU and its driver, and none was found')
     try:
         mi.set_variant(name)
     except ImportError as e:
@@ -147,9 +155,16 @@ def _defines(arguments) -> dict[str, str]:
     return result
 
 
+def _scene(arguments) -> str:
+    if not Path(arguments.scene).is_file():
+        raise UsageError(f"{arguments.scene}: no such scene file")
+    return arguments.scene
+
+
 def _render(arguments) -> dict:
     from tqdm import tqdm
 
+    _scene(arguments)
     output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
     if output.suffix.lower() not in (".exr", ".png"):
         raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are .exr and .png')
@@ -191,6 +206,7 @@ def _render(arguments) -> dict:
 
 
 def _compare(arguments) -> dict:
+    _scene(arguments)
     writable_folder(arguments.out, create=True)
     _set_variant(arguments.variant)
     from . import compare
@@ -200,15 +216,17 @@ def _compare(arguments) -> dict:
     )
     paths = compare.write(comparison, arguments.out)
     print("\n".join(compare.summary(comparison.figures)))
-    if comparison.figures["interrupted"]:
-        print("interrupted; this is what there was")
     print(f"picture     {paths['figure']}")
     return {**comparison.figures, "files": paths}
 
 
 def _inspect(arguments) -> dict:
     if Path(arguments.file).suffix.lower() == ".xml":
+        if arguments.measure:
+            raise UsageError(f"{arguments.file}: --measure needs a table file (.npz)")
         return _inspect_scene(arguments)
+    if arguments.variant or arguments.defines:
+        raise UsageError(f"{arguments.file}: --variant and -D need a scene file (.xml)")
     from .tables import load_table
 
     table = load_table(arguments.file)
@@ -278,7 +296,7 @@ def _inspect_scene(arguments) -> dict:
     print(f"{arguments.file}: {len(learned)} learned material(s), {total:,} bytes of tables in {len(tables)} file(s)")
     for entry in learned:
         given = ", ".join(f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in entry["parameters"].items())
-        print(f"  {entry['id']} ({entry['plugin']}): {given or 'defaults'}")
+        print(f"  {entry['id'] or '(no id)'} ({entry['plugin']}): {given or 'defaults'}")
     return {
         "file": arguments.file,
         "learned_plugins": learned,
@@ -291,9 +309,11 @@ def _fit(arguments) -> dict:
     output = Path(arguments.output)
     if output.suffix.lower() != ".npz":
         raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed is .npz')
+    if arguments.checkpoint is not None and Path(arguments.checkpoint).resolve() == output.resolve():
+        raise UsageError(f'"{output}" cannot be the output and the checkpoint')
     writable_file(output)
     from .tables import save_table
-    from .tasks.disney.training import DEFAULT_SETTINGS, fit_disney
+    from .tasks.disney.training import fit_disney
 
     given = {k: getattr(arguments, k) for k in ("steps", "batch", "lr", "schedule", "seed")}
     given = {k: v for k, v in given.items() if v is not None}

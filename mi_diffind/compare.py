@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from . import metrics, scenes
+from . import metrics, plugins, scenes
 from .files import replacing, writable_folder
 from .interrupt import interruptible
 
@@ -43,8 +43,13 @@ def compare(
     of each; ``time_ratio`` (written over exact: median, minimum and maximum over the passes but the first, which
     compiles); ``learned_plugins`` and the ``table_bytes`` of each distinct table they read. Ctrl-C ends it after the
     current pair of passes; ``spp`` and ``passes`` then say how many there were, and ``interrupted`` is true.
+
+    Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no learned plugin.
     """
     learned = scenes.learned_plugins(path, **defines)
+    if not learned:
+        names = ", ".join(plugins.EXACT_COUNTERPARTS)
+        raise scenes.SceneError(f"{path}: names no learned plugin ({names}), so there is nothing to compare")
     loaded = {"written": scenes.load(path, **defines), "exact": scenes.load(path, exact=True, **defines)}
     spp = spp or loaded["written"].sensors()[0].sampler().sample_count()
     passes = max(1, min(passes, spp))
@@ -62,7 +67,7 @@ def compare(
             if stop.is_set():
                 break
 
-    interrupted, spp, passes = done < spp, done, len(seconds["exact"])
+    requested, spp, passes = spp, done, len(seconds["exact"])
     written, exact = ((images[name][..., :3] / spp).astype(np.float32) for name in ("written", "exact"))
     if written.shape[-1] == 1:
         written, exact = np.repeat(written, 3, -1), np.repeat(exact, 3, -1)
@@ -80,7 +85,8 @@ def compare(
         "seconds_first_pass": {name: seconds[name][0] for name in loaded},
         "time_ratio": {"median": statistics.median(ratios), "min": min(ratios), "max": max(ratios)},
         "passes": passes,
-        "interrupted": interrupted,
+        "interrupted": done < requested,
+        "spp_requested": requested,
         "learned_plugins": len(learned),
         "table_bytes": table_bytes(path, learned),
     }
@@ -99,10 +105,11 @@ def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, 
 
     found = {}
     for entry in learned:
-        name, storage = entry.get("filename", ""), entry.get("storage", "float32")
+        name, storage = entry.get("filename", ""), entry.get("storage", "")
         file = SHIPPED if not name else Path(scene).resolve().parent / name
         if (str(file), storage) not in found:
-            found[str(file), storage] = load_disney_table(file).to(storage)
+            table = load_disney_table(file)
+            found[str(file), storage] = table.to(storage or table.storage)
     return found
 
 
@@ -173,10 +180,12 @@ def figure(comparison: Comparison, path: str | os.PathLike) -> None:
 def summary(f: dict) -> list[str]:
     """The figures as lines of text."""
     ratio, seconds = f["time_ratio"], f["seconds_per_pass"]
+    materials = "1 material" if f["learned_plugins"] == 1 else f"{f['learned_plugins']} materials"
+    spp = f"{f['spp']} of {f['spp_requested']} spp (interrupted)" if f["interrupted"] else f"{f['spp']} spp"
     return [
-        f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {f['spp']} spp",
+        f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {spp}",
         f"variant     {f['variant']}",
-        f"learned     {f['learned_plugins']} materials, {f['table_bytes']:,} bytes of tables",
+        f"learned     {materials}, {f['table_bytes']:,} bytes of tables",
         "",
         f"PSNR        {f['psnr_db']:.2f} dB   (linear, clipped to [0, 1])",
         f"FLIP        {f['flip']:.4f}     (0 = equal to the eye)",

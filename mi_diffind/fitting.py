@@ -129,12 +129,14 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
     net = problem.net
     if checkpoint is not None:
         writable_file(checkpoint)
+        if os.path.exists(checkpoint) and not resume and not _is_checkpoint(checkpoint):
+            raise FittingError(f'the checkpoint "{checkpoint}" would replace a file that is not one')
     trainer, plateau = _Trainer(problem, settings), _Plateau(settings)
     best, best_quality, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
     reference = None  # a running mean of the loss; from the first step on, lest an explosion right after it sets it
     if resume:
         if checkpoint is None:
-            raise FittingError("resuming needs the checkpoint file to resume from")
+            raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
         state, extra = _load_checkpoint(checkpoint, settings, trainer)
         trainer.restore(state)
         best, best_quality, best_step = extra["best"], extra["best_quality"], extra["best_step"]
@@ -312,6 +314,14 @@ def _save_checkpoint(path, settings: FitSettings, state: _State, extra: dict) ->
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, **arrays)
+
+
+def _is_checkpoint(path) -> bool:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return "lr_scale" in json.loads(data["meta"].tobytes())
+    except Exception:  # zipfile, json and numpy each have their own for another kind of file
+        return False
 
 
 def _load_checkpoint(path, settings: FitSettings, trainer: _Trainer) -> tuple[_State, dict]:

@@ -60,7 +60,8 @@ class DifferentiableArray(nn.Module):
 
     There is one trainable parameter, ``data``, a tensor of shape ``(N_1, …, N_d, padded)``, where ``padded`` is
     ``channels`` rounded up to 1, 2 or a multiple of 4: padding makes gathers and scatters packets, 2.7 times faster in
-    training. Padding entries have no influence. :meth:`numpy` returns the entries without it.
+    training. Padding entries have no influence. :meth:`numpy` returns the entries without it, and ``data`` may be set
+    to a tensor without it, which is read channel by channel.
 
     :meth:`to` converts to another storage form: ``"float32"`` for training, ``"float16"`` for storing, ``"uint8"``
     (packed in ``UInt32``) for inference. Raises ``ValueError`` for impossible settings.
@@ -202,6 +203,12 @@ class DifferentiableArray(nn.Module):
 
     # -- properties -------------------------------------------------------------------------------------------------
 
+    def check_shape(self) -> None:
+        """Raise ``ValueError`` if ``data`` is a tensor of any shape but the two that can be read."""
+        expected = (*self.resolution, self.channels)
+        if self.data.shape not in (expected, (*self.resolution, lookup.padded_channels(self.channels))):
+            raise ValueError(f'"data" has the shape {self.data.shape}, expected {expected}')
+
     @property
     def dims(self) -> int:
         """Number of input dimensions."""
@@ -236,9 +243,7 @@ class DifferentiableArray(nn.Module):
                 active,
             )
         else:
-            expected = (*self.resolution, lookup.padded_channels(self.channels))
-            if self.data.shape != expected:
-                raise ValueError(f'"data" has the shape {self.data.shape}, expected {expected}')
+            self.check_shape()
             # Folding the whole table once is cheaper, but a loop or call that is being recorded can only gather from
             # (and send gradients to) what exists already.
             entries, transform = self.data.array, None
@@ -247,7 +252,14 @@ class DifferentiableArray(nn.Module):
             elif self.folded:
                 entries = fold(entries)
             values = lookup.read_float(
-                entries, self.resolution, self.channels, coordinates, self.border, active, transform
+                entries,
+                self.resolution,
+                self.channels,
+                coordinates,
+                self.border,
+                active,
+                transform,
+                self.data.shape[-1],
             )
         return nn.CoopVec(*values) if is_coopvec else values
 

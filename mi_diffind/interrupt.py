@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
 
 
@@ -22,6 +23,7 @@ def interruptible():
 
     def handler(signum, frame):
         stop.set()
+        print("stopping after this step; Ctrl-C again aborts", file=sys.stderr)
         signal.signal(signal.SIGINT, before)
 
     signal.signal(signal.SIGINT, handler)

@@ -117,32 +117,38 @@ def _weighted_sum(terms):
 
 
 def read_float(
-    data, resolution: Sequence[int], channels: int, x: Sequence, border: Sequence[str], active=True, transform=None
+    data,
+    resolution: Sequence[int],
+    channels: int,
+    x: Sequence,
+    border: Sequence[str],
+    active=True,
+    transform=None,
+    stored: int | None = None,
 ):
     """
     Read a table of 16- or 32-bit floats.
 
-    ``data`` is the flat array of shape ``(N_1·…·N_d·padded_channels(channels),)``, ``x`` the ``d`` coordinates.
-    Returns a list of ``channels`` arrays of the coordinates' (single precision) type. Differentiable with respect to
-    ``data`` and ``x``. ``transform`` is applied to each entry that was fetched.
+    ``data`` is the flat array of shape ``(N_1·…·N_d·stored,)``, where ``stored`` is ``padded_channels(channels)``
+    unless given, ``x`` the ``d`` coordinates. Returns a list of ``channels`` arrays of the coordinates' (single
+    precision) type. Differentiable with respect to ``data`` and ``x``. ``transform`` is applied to each entry that was
+    fetched.
     """
     Float = type(x[0])
-    stored = padded_channels(channels)
-    packet = min(stored, 4)
+    stored = stored or padded_channels(channels)
+    packet = next(p for p in (4, 2, 1) if stored % p == 0)
     groups = stored // packet
     module = sys.modules[Float.__module__]
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
     Packet = None if packet == 1 else getattr(module, f"Array{packet}{suffix}")
 
     def fetch(index):
-        if Packet is None:
-            values = [Float(dr.gather(type(data), data, index, active))]
-        else:
-            values = []
-            for group in range(groups):
-                where = index if groups == 1 else dr.fma(index, groups, group)
-                values += [Float(v) for v in dr.gather(Packet, data, where, active)]
-            values = values[:channels]
+        values = []
+        for group in range(groups):
+            where = index if groups == 1 else dr.fma(index, groups, group)
+            found = dr.gather(Packet or type(data), data, where, active)
+            values += [Float(v) for v in (found if Packet else [found])]
+        values = values[:channels]
         return values if transform is None else [transform(v) for v in values]
 
     axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]

@@ -42,6 +42,7 @@ _SYSTEM_PATTERNS = (
 )
 
 _ADVICE = "install one without root by 'pip install karellen-llvm-core' or point DRJIT_LIBLLVM_PATH to one"
+_CORRECT = "correct the path, or unset the variable to use the one of 'pip install karellen-llvm-core'"
 
 
 @dataclass(frozen=True)
@@ -111,11 +112,11 @@ def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, 
     if explicit:
         found = version(explicit)
         if found is None:
-            problem = f"{ENV}={explicit} is not a loadable LLVM library: correct it, unset it, or {_ADVICE}."
+            problem = f"{ENV}={explicit} is not a loadable LLVM library: {_CORRECT}."
         elif found < MIN_LLVM:
             problem = (
                 f"{ENV}={explicit} is LLVM {found if found > 15 else '15 or older'}, with which Dr.Jit aborts: "
-                f"version {MIN_LLVM} or newer is needed, so unset it, or {_ADVICE}."
+                f"version {MIN_LLVM} or newer is needed: {_CORRECT}."
             )
         else:
             problem = None

@@ -187,6 +187,10 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
     raw = _array(archive, members.pop("meta"), path, "meta", np.dtype("u1"), None)
     try:
         meta = json.loads(raw.tobytes())
+        if "lr_scale" in meta:
+            raise TableError(
+                f"{path}: is the checkpoint of a training, the table file is what it writes at its end (-o)"
+            )
         version, stored_task, storage = meta["format_version"], meta["task"], meta["storage"]
         described = {name: entry for name, entry in meta["arrays"].items()}
         settings, seed, quality = meta["settings"], meta["seed"], meta["quality"]

@@ -100,7 +100,7 @@ class Disney(mi.BSDF):
     exact counterpart of :ref:`neural_disney <bsdf-neural_disney>` and has the same parameters, whose names and
     meaning follow Mitsuba's :monosp:`principled`: changing ``type`` is all it takes. All are in [0, 1]: constants
     outside are refused, textures are clamped. Differences to ``principled``: Schlick's Fresnel term in place of the
-    dielectric one, and no transmission.
+    dielectric one, no transmission, and ``eta`` between 1 and 3.
 
     It reflects on the front side only; put it into a :monosp:`twosided` for both. Components: 0 diffuse and sheen,
     1 specular, 2 clearcoat.

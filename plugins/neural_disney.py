@@ -25,13 +25,14 @@ class NeuralDisney(Disney):
      * - storage
        - |string|
        - Storage form of the tables: ``float32``, ``float16`` or ``uint8``. The tables are exposed as parameters only
-         in the first. (Default: ``float32``)
+         in the first. (Default: the file's own, ``float32`` for those that ship)
        - --
 
      * - tables.ggx, tables.masking, tables.diffuse, tables.fresnel, tables.coat, tables.encoder_roughness,
          tables.encoder_anisotropic
        - |tensor|
-       - The entries of the tables.
+       - The entries of the tables, in the file's shapes, or with channels padded to 1, 2 or a multiple of 4, as they
+         are to begin with (``tables.ggx``: 16 × 16 × 4, the last unused).
        - |exposed|, |differentiable|
 
      * - base_color, roughness, anisotropic, metallic, specular, eta, spec_tint, sheen, sheen_tint, flatness,
@@ -74,7 +75,7 @@ class NeuralDisney(Disney):
         filename = str(props.get("filename", ""))
         if filename:
             filename = str(mi.file_resolver().resolve(filename))
-        self.arrays = load_arrays(filename, mi.TensorXf, str(props.get("storage", "float32")))
+        self.arrays = load_arrays(filename, mi.TensorXf, str(props.get("storage", "")))
 
     def factors(self, material, wi, wo, active):
         return self.arrays.factors(material, wi, wo, active)
@@ -85,6 +86,16 @@ class NeuralDisney(Disney):
             array = getattr(self.arrays, name)
             if array.storage == "float32":
                 cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str] = ()):
+        super().parameters_changed(keys)
+        for name in SHAPES:
+            array = getattr(self.arrays, name)
+            if array.storage == "float32":
+                try:
+                    array.check_shape()
+                except ValueError as e:
+                    raise RuntimeError(f'parameter "tables.{name}": {e}') from None
 
     def to_string(self):
         tables = f"  tables = {self.arrays.nbytes} bytes as {self.arrays.ggx.storage},\n"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import BACKENDS
 
 from mi_diffind.cli import main
 
@@ -196,7 +197,7 @@ def test_interrupted_renders_keep_what_they_have(tmp_path):
     folder = tmp_path / "pictures"
     done = interrupted("compare", scene, "--out", str(folder), "--spp", "20", *size)
     assert done.returncode == 130, done.stderr
-    assert "4 spp" in done.stdout and "interrupted; this is what there was" in done.stdout
+    assert "4 of 20 spp (interrupted)" in done.stdout
     assert (folder / "comparison.png").exists()
 
 
@@ -206,6 +207,7 @@ def test_interrupted_renders_keep_what_they_have(tmp_path):
 def test_missing_files(tmp_path, capsys):
     assert "nowhere.xml: no such scene file" in refused(capsys, "render", "nowhere.xml")
     assert "nowhere.xml: no such scene file" in refused(capsys, "compare", "nowhere.xml", "--out", str(tmp_path / "o"))
+    assert not (tmp_path / "o").exists()
     assert "nowhere.xml: no such scene file" in refused(capsys, "inspect", "nowhere.xml")
     assert "nowhere.npz: no such file" in refused(capsys, "inspect", "nowhere.npz")
 
@@ -267,7 +269,41 @@ def test_bad_options(tmp_path, capsys):
         assert caught.value.code == 2
 
 
+def test_checkpoints_replace_nothing_else(tmp_path, capsys):
+    from mi_diffind.tasks.disney.library import SHIPPED
+
+    table, checkpoint = tmp_path / "table.npz", tmp_path / "state.npz"
+    table.write_bytes(SHIPPED.read_bytes())
+    fit = ["fit", "disney", "--steps", "4", "--batch", "64", "--backend", "llvm", "-o", str(tmp_path / "own.npz")]
+    assert "would replace a file that is not one" in refused(capsys, *fit, "--checkpoint", str(table))
+    assert table.read_bytes() == SHIPPED.read_bytes()
+    assert "cannot be the output and the checkpoint" in refused(capsys, *fit, "--checkpoint", str(tmp_path / "own.npz"))
+    for _ in range(2):  # its own checkpoint may be replaced
+        assert main([*fit, "--checkpoint", str(checkpoint)]) == 0
+    assert "is the checkpoint of a training" in refused(capsys, "inspect", str(checkpoint))
+    assert "--checkpoint FILE" in refused(capsys, *fit, "--resume")
+
+
+def test_nothing_to_compare(tmp_path, capsys):
+    path, out = scene_file(tmp_path, '<bsdf type="diffuse"/>'), tmp_path / "pictures"
+    assert "names no learned plugin" in refused(capsys, "compare", path, "--out", str(out))
+    assert main(["render", path, "-o", str(tmp_path / "image.exr")]) == 0
+
+
+def test_options_for_the_other_kind_of_file(tmp_path, capsys):
+    from mi_diffind.tasks.disney.library import SHIPPED
+
+    assert "--measure needs a table file" in refused(capsys, "inspect", scene_file(tmp_path), "--measure")
+    assert "need a scene file" in refused(capsys, "inspect", str(SHIPPED), "-D", "a=1")
+
+
+@pytest.mark.skipif("cuda" in "".join(BACKENDS), reason="this machine has a GPU")
+def test_variant_without_its_device(tmp_path, capsys):
+    assert "needs an NVIDIA GPU" in refused(capsys, "render", scene_file(tmp_path), "--variant", "cuda_ad_rgb")
+
+
 def test_not_a_scene(tmp_path, capsys):
+    assert "no such scene file" in refused(capsys, "render", ".")
     path = tmp_path / "bsdf.xml"
     path.write_text('<bsdf version="3.0.0" type="neural_disney"/>')
     assert "a scene is expected" in refused(capsys, "render", str(path), "-o", str(tmp_path / "image.exr"))

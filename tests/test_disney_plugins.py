@@ -289,6 +289,41 @@ def test_assigning_tables_changes_one_instance_only(mi_rgb, rng):
     assert np.array_equal(second.eval(mi.BSDFContext(), si, wo).numpy(), before)
 
 
+def test_tables_of_the_file_can_be_assigned(mi_rgb, rng):
+    """Entries may have the file's shape as well as the padded one; any other is refused in a sentence."""
+    from mi_diffind.tables import load_table
+    from mi_diffind.tasks.disney.library import SHIPPED
+
+    mi = mi_rgb
+    bsdf = mi.load_dict({"type": "neural_disney", **RICH})
+    si, wo = interactions(mi, directions(mi, rng, 1000)), directions(mi, rng, 1000)
+    before = bsdf.eval(mi.BSDFContext(), si, wo).numpy()
+    params, table = mi.traverse(bsdf), load_table(SHIPPED)
+    for name in ("ggx", "masking", "coat"):
+        params[f"tables.{name}"] = mi.TensorXf(table.values(name))
+    params.update()
+    assert np.array_equal(bsdf.eval(mi.BSDFContext(), si, wo).numpy(), before)
+    params["tables.ggx"] = mi.TensorXf(table.values("ggx") + 0.1)  # once more: the parameter is still the table
+    params.update()
+    assert not np.allclose(bsdf.eval(mi.BSDFContext(), si, wo).numpy(), before)
+    params["tables.ggx"] = mi.TensorXf(np.zeros((4, 4, 3), np.float32))
+    with pytest.raises(RuntimeError, match=r'"tables.ggx": "data" has the shape \(4, 4, 3\), expected \(16, 16, 3\)'):
+        params.update()
+    params["tables.ggx"] = mi.TensorXf(table.values("ggx"))
+    params.update()
+
+
+def test_a_file_is_read_in_its_own_form(mi_rgb, tmp_path):
+    from mi_diffind.tables import save_table
+    from mi_diffind.tasks.disney.arrays import load_disney_table
+    from mi_diffind.tasks.disney.library import SHIPPED
+
+    save_table(tmp_path / "own.npz", load_disney_table(SHIPPED).to("uint8"))
+    own = {"type": "neural_disney", "filename": str(tmp_path / "own.npz")}
+    assert "tables = 3120 bytes as uint8" in str(mi_rgb.load_dict(own))
+    assert "tables = 12480 bytes as float32" in str(mi_rgb.load_dict({**own, "storage": "float32"}))
+
+
 # -- parameters --------------------------------------------------------------------------------------------------------
 
 

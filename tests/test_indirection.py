@@ -352,9 +352,30 @@ def test_parameter_names_and_optimiser(ad):
 
 def test_a_table_of_the_wrong_shape_is_refused(ad):
     array = pair(ad).cascaded
-    array.data = ad.TensorXf(np.zeros((4, 5, 3), np.float32))
-    with pytest.raises(ValueError, match=r'"data" has the shape \(4, 5, 3\), expected \(4, 5, 4\)'):
-        array([ad.Float(0), ad.Float(0)])
+    for shape in ((4, 5, 2), (5, 4, 3), (4, 5), (60,)):
+        array.data = ad.TensorXf(np.zeros(shape, np.float32))
+        with pytest.raises(ValueError, match=r'"data" has the shape .*, expected \(4, 5, 3\)'):
+            array([ad.Float(0), ad.Float(0)])
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 5, 6, 7])
+def test_entries_without_padding(ad, channels):
+    """A tensor of the logical shape reads, and gets gradients, as the padded one does."""
+    table = np.random.default_rng(channels).uniform(0, 1, (4, 5, channels)).astype(np.float32)
+    padded = DifferentiableArray.from_numpy(table, ad.TensorXf)
+    plain = DifferentiableArray.from_numpy(table, ad.TensorXf)
+    plain.data = ad.TensorXf(table)
+    x = [ad.Float(v) for v in uniform(3, 100, 2).T.copy()]
+    np.testing.assert_array_equal(plain.numpy(), padded.numpy())
+    gradients = []
+    for array in (padded, plain):
+        dr.enable_grad(array.data)
+        values = array(x)
+        gradients.append(values)
+        dr.backward(sum(v * (k + 1) for k, v in enumerate(values)))
+    for a, b in zip(*gradients, strict=True):
+        np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-6)
+    np.testing.assert_allclose(plain.data.grad.numpy(), padded.data.grad.numpy()[..., :channels], rtol=1e-5)
 
 
 def test_copies_are_independent(ad):

@@ -13,14 +13,15 @@ from .arrays import DisneyArrays, load_disney_table
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "disney.npz"
 
 
-def load_arrays(filename: str | os.PathLike, dtype, storage: str = "float32") -> DisneyArrays:
+def load_arrays(filename: str | os.PathLike, dtype, storage: str = "") -> DisneyArrays:
     """
-    Tables allocated for the tensor type ``dtype`` in the given storage form; ``filename`` "" means the shipped ones.
+    Tables allocated for the tensor type ``dtype`` in the given storage form, "" meaning the file's own; ``filename`` ""
+    means the shipped ones.
 
     A file is read and checked once, and what is returned shares its memory (Dr.Jit arrays are never written in
     place), yet assigning to one copy does not change another. Raises :class:`TableError` or ``ValueError``.
     """
-    if storage not in STORAGES:
+    if storage and storage not in STORAGES:
         raise ValueError(f'parameter "storage": found "{storage}", allowed are {", ".join(STORAGES)}')
     path = Path(filename) if str(filename) else SHIPPED
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
@@ -34,4 +35,5 @@ def load_arrays(filename: str | os.PathLike, dtype, storage: str = "float32") ->
 
 @functools.lru_cache(maxsize=64)
 def _load(path: Path, stamp: int, dtype, storage: str) -> DisneyArrays:
-    return DisneyArrays.from_table(load_disney_table(path), dtype, storage)
+    table = load_disney_table(path)
+    return DisneyArrays.from_table(table, dtype, storage or table.storage)
