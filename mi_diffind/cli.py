@@ -17,7 +17,7 @@ from . import __version__, runtime
 from .files import OutputError, writable_file, writable_folder, write_json
 from .fitting import SCHEDULES, FittingError
 from .interrupt import interruptible
-from .lookup import STORAGES
+from .lookup import STORAGES, gathers
 from .tables import TableError
 from .tasks.disney.training import DEFAULT_SETTINGS
 
@@ -238,12 +238,14 @@ def _inspect(arguments) -> dict:
             "resolution": list(array.shape[:-1]),
             "channels": array.shape[-1],
             "bytes": array.nbytes,
+            "gathers_per_read": gathers(array.shape[:-1], array.shape[-1], table.storage),
             "min": float(values.min()),
             "max": float(values.max()),
         }
         size = " x ".join(map(str, array.shape[:-1]))
         print(
             f"  {name:22} {size:>9}, {array.shape[-1]} channels, {array.nbytes:6,} bytes, "
+            f"{arrays[name]['gathers_per_read']} gathers a read, "
             f"values {values.min():.4g} to {values.max():.4g}"
         )
     for title, content in (
