@@ -278,11 +278,11 @@ def _measure(file: str, table) -> dict:
     for storage in STORAGES:
         form = table.to(storage)
         net = DisneyArrays.from_table(table, types.TensorXf, storage)
-        result[storage] = {"bytes": form.nbytes}
+        result[storage] = {"bytes": form.nbytes, "memory_bytes": net.memory_nbytes}
         for distribution in ("training", "uniform"):
             result[storage][distribution] = found = measure(net, types, distribution=distribution)
             print(
-                f"  {storage:8} {form.nbytes:6,} bytes, {distribution:8} materials: "
+                f"  {storage:8} {form.nbytes:6,} bytes ({net.memory_nbytes:,} in memory), {distribution:8} materials: "
                 f"BRDF x cosine {found['psnr_db']:.2f} dB, BRDF {found['psnr_brdf_db']:.2f} dB"
             )
     return result

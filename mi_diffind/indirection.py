@@ -219,6 +219,15 @@ class DifferentiableArray(nn.Module):
         """Bytes of the entries in their storage form, without padding: what a file has to hold."""
         return int(np.prod(self.resolution)) * self.channels * {"float32": 4, "float16": 2, "uint8": 1}[self.storage]
 
+    @property
+    def memory_nbytes(self) -> int:
+        """
+        Bytes in memory: with padded channels, and with the entries that packed tables repeat so that one gather brings
+        several corners (:func:`mi_diffind.lookup.packed_layout`).
+        """
+        self._require_entries()
+        return dr.width(self.data) * (2 if self.storage == "float16" else 4)
+
     def __repr__(self) -> str:
         size = "x".join(map(str, self.resolution))
         return f"DifferentiableArray({size}, channels={self.channels}, storage={self.storage}, fold={self.folded})"

@@ -98,10 +98,10 @@ def test_inspect_measures(tmp_path, capsys):
 
     report = tmp_path / "report.json"
     assert main(["inspect", str(SHIPPED), "--measure", "--json", str(report)]) == 0
-    assert "uint8     3,120 bytes" in capsys.readouterr().out
+    assert "uint8     3,120 bytes (" in capsys.readouterr().out
     measured = json.loads(report.read_text())["measured"]
     for storage, size in (("float32", 12480), ("float16", 6240), ("uint8", 3120)):
-        assert measured[storage]["bytes"] == size
+        assert measured[storage]["bytes"] == size <= measured[storage]["memory_bytes"] < 20_000
         assert measured[storage]["training"]["psnr_db"] > measured[storage]["uniform"]["psnr_db"] > 33
         assert measured[storage]["training"]["psnr_brdf_db"] > 33
 

@@ -96,6 +96,11 @@ class DisneyArrays(nn.Module):
         """Bytes of all entries in their storage form."""
         return sum(getattr(self, name).nbytes for name in SHAPES)
 
+    @property
+    def memory_nbytes(self) -> int:
+        """Bytes in memory, with padding and repeated entries."""
+        return sum(getattr(self, name).memory_nbytes for name in SHAPES)
+
     def encode(self, material: Material, active=True):
         """The latent coordinates of (roughness, anisotropic). Depends on the material only."""
         return (
