@@ -155,16 +155,16 @@ def _defines(arguments) -> dict[str, str]:
     return result
 
 
-def _scene(arguments) -> str:
+def _require_scene(arguments) -> None:
+    """Before an output folder is made."""
     if not Path(arguments.scene).is_file():
         raise UsageError(f"{arguments.scene}: no such scene file")
-    return arguments.scene
 
 
 def _render(arguments) -> dict:
     from tqdm import tqdm
 
-    _scene(arguments)
+    _require_scene(arguments)
     output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
     if output.suffix.lower() not in (".exr", ".png"):
         raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are .exr and .png')
@@ -172,7 +172,7 @@ def _render(arguments) -> dict:
     _set_variant(arguments.variant)
     import mitsuba as mi
 
-    from . import compare, scenes
+    from . import scenes
 
     defines = _defines(arguments)
     start = time.perf_counter()
@@ -184,7 +184,7 @@ def _render(arguments) -> dict:
     with interruptible() as stop, tqdm(total=passes, desc="render", unit="pass", disable=None) as bar:
         image, seconds = scenes.render(scene, spp, arguments.seed, passes, bar.update, stop)
     rendered = time.perf_counter()
-    compare.write_image(output, image)
+    scenes.write_image(output, image)
     done = len(seconds) * spp // passes
     kept = f"interrupted, kept {done} of {spp}" if done < spp else f"{spp}"
     size = f"{image.shape[1]} x {image.shape[0]}"
@@ -201,12 +201,12 @@ def _render(arguments) -> dict:
         "seconds_load": loaded - start,
         "seconds_render": rendered - loaded,
         "learned_plugins": learned,
-        "table_bytes": compare.table_bytes(arguments.scene, learned),
+        "table_bytes": scenes.table_bytes(arguments.scene, learned),
     }
 
 
 def _compare(arguments) -> dict:
-    _scene(arguments)
+    _require_scene(arguments)
     writable_folder(arguments.out, create=True)
     _set_variant(arguments.variant)
     from . import compare
@@ -290,10 +290,10 @@ def _measure(file: str, table) -> dict:
 
 def _inspect_scene(arguments) -> dict:
     _set_variant(arguments.variant)
-    from . import compare, scenes
+    from . import scenes
 
     learned = scenes.learned_plugins(arguments.file, **_defines(arguments))
-    tables = compare.tables_of(arguments.file, learned)
+    tables = scenes.tables_of(arguments.file, learned)
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned material(s), {total:,} bytes of tables in {len(tables)} file(s)")
     for entry in learned:

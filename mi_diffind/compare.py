@@ -88,29 +88,9 @@ def compare(
         "interrupted": done < requested,
         "spp_requested": requested,
         "learned_plugins": len(learned),
-        "table_bytes": table_bytes(path, learned),
+        "table_bytes": scenes.table_bytes(path, learned),
     }
     return Comparison(written, exact, figures)
-
-
-def table_bytes(scene: str | os.PathLike, learned: list[dict]) -> int:
-    """Bytes of all distinct tables that the learned plugins of a scene read, in their storage forms."""
-    return sum(table.nbytes for table in tables_of(scene, learned).values())
-
-
-def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, str], object]:
-    """The distinct tables of a scene's learned plugins: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`."""
-    from .tasks.disney.arrays import load_disney_table
-    from .tasks.disney.library import SHIPPED
-
-    found = {}
-    for entry in learned:
-        name, storage = entry.get("filename", ""), entry.get("storage", "")
-        file = SHIPPED if not name else Path(scene).resolve().parent / name
-        if (str(file), storage) not in found:
-            table = load_disney_table(file)
-            found[str(file), storage] = table.to(storage or table.storage)
-    return found
 
 
 def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
@@ -127,20 +107,10 @@ def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
     paths = {}
     for name, image in images.items():
         paths[name] = str(folder / f"{name}.exr")
-        write_image(paths[name], image)
+        scenes.write_image(paths[name], image)
     paths["figure"] = str(folder / "comparison.png")
     figure(comparison, paths["figure"])
     return paths
-
-
-def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write a linear image: ``.exr`` as 32-bit floats, ``.png`` or ``.jpg`` as displayed."""
-    with replacing(path) as temporary:
-        bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
-        if Path(path).suffix.lower() == ".exr":
-            bitmap.write(str(temporary))
-        else:
-            mi.util.write_bitmap(str(temporary), bitmap, write_async=False)
 
 
 def figure(comparison: Comparison, path: str | os.PathLike) -> None:

@@ -59,7 +59,7 @@ def packed_layout(resolution: Sequence[int], channels: int) -> tuple[int, int, i
     ``words`` words of 32 bits. One word may hold what fits (a one-channel bilinear read is a single gather), and up to
     four words if the table stays below :data:`WIDE_BYTES`.
     """
-    stride = channels if channels <= 2 else 4 * math.ceil(channels / 4)
+    stride = padded_channels(channels)
     for inner in range(len(resolution), 0, -1):
         words = math.ceil(stride * 2**inner / 4)
         if words == 1 or (words in (2, 4) and math.prod(resolution) * 4 * words <= WIDE_BYTES):
@@ -67,13 +67,19 @@ def packed_layout(resolution: Sequence[int], channels: int) -> tuple[int, int, i
     return 0, stride, math.ceil(stride / 4)
 
 
+def _packet(count: int) -> int:
+    """How many of ``count`` consecutive values one gather fetches."""
+    return next(p for p in (4, 2, 1) if count % p == 0)
+
+
 def gathers(resolution: Sequence[int], channels: int, storage: str) -> int:
     """Number of gather instructions that one read takes."""
     dims = len(resolution)
     if storage == "uint8":
         inner, _, words = packed_layout(resolution, channels)
-        return 2 ** (dims - inner) * (1 if words <= 2 else math.ceil(words / 4) if words % 4 == 0 else words)
-    return 2**dims * max(1, padded_channels(channels) // 4)
+        return 2 ** (dims - inner) * (words // _packet(words))
+    stored = padded_channels(channels)
+    return 2**dims * (stored // _packet(stored))
 
 
 def _axis(x, n: int, border: str):
@@ -136,7 +142,7 @@ def read_float(
     """
     Float = type(x[0])
     stored = stored or padded_channels(channels)
-    packet = next(p for p in (4, 2, 1) if stored % p == 0)
+    packet = _packet(stored)
     groups = stored // packet
     module = sys.modules[Float.__module__]
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
@@ -180,7 +186,7 @@ def read_packed(
     inner, stride, per_texel = packed_layout(resolution, channels)
     axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
     outer = len(resolution) - inner
-    packet = per_texel if per_texel in (1, 2) else 4 if per_texel % 4 == 0 else 1
+    packet = _packet(per_texel)
     groups = per_texel // packet
 
     convert = len(resolution) > 2

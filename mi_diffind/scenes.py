@@ -1,5 +1,5 @@
 """
-Scene files: load them, render them, swap every learned plugin for its exact counterpart.
+Scene files: load them, render them, say which tables they read, swap every learned plugin for its exact counterpart.
 
 Everything here runs in the variant that is set.
 """
@@ -18,6 +18,9 @@ import mitsuba as mi
 import numpy as np
 
 from . import plugins
+from .files import replacing
+from .tasks.disney.arrays import load_disney_table
+from .tasks.disney.library import SHIPPED
 
 
 class SceneError(RuntimeError):
@@ -81,6 +84,23 @@ def learned_plugins(path: str | os.PathLike, **defines: str) -> list[dict]:
     return found
 
 
+def table_bytes(scene: str | os.PathLike, learned: list[dict]) -> int:
+    """Bytes of all distinct tables that the learned plugins of a scene read, in their storage forms."""
+    return sum(table.nbytes for table in tables_of(scene, learned).values())
+
+
+def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, str], object]:
+    """The distinct tables of a scene's learned plugins: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`."""
+    found = {}
+    for entry in learned:
+        name, storage = entry.get("filename", ""), entry.get("storage", "")
+        file = SHIPPED if not name else Path(scene).resolve().parent / name
+        if (str(file), storage) not in found:
+            table = load_disney_table(file)
+            found[str(file), storage] = table.to(storage or table.storage)
+    return found
+
+
 def render(
     scene,
     spp: int | None = None,
@@ -112,6 +132,16 @@ def render(
         if stop is not None and stop.is_set():
             break
     return (image / done).astype(np.float32), seconds
+
+
+def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
+    """Write a linear image: ``.exr`` as 32-bit floats, ``.png`` or ``.jpg`` as displayed."""
+    with replacing(path) as temporary:
+        bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
+        if Path(path).suffix.lower() == ".exr":
+            bitmap.write(str(temporary))
+        else:
+            mi.util.write_bitmap(str(temporary), bitmap, write_async=False)
 
 
 def _parse(config, path, defines: dict[str, str]):

@@ -247,8 +247,8 @@ class Disney(mi.BSDF):
         texture = isinstance(self.reflectance, mi.Texture)
         specular = self.reflectance.eval_1(si, active) if texture else self.reflectance
         if self.reflectance_name == "eta":
-            specular = dr.square((specular - 1) / (specular + 1)) / model.SPECULAR_SCALE
-        return model.sanitize(Material(specular=specular, **values), dr.square((ETA_MAX - 1) / (ETA_MAX + 1)) / 0.08)
+            specular = model.specular_from_eta(specular)
+        return model.sanitize(Material(specular=specular, **values), model.specular_from_eta(ETA_MAX))
 
     def _albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool):
         """The albedo in [0, 1] (NaN → 0) and its luminance."""

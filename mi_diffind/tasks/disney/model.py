@@ -43,7 +43,7 @@ TINY = 1e-18
 
 @dataclass
 class Material:
-    """The ten artist parameters, in [0, 1] each (``specular`` up to 3 for high indices of refraction)."""
+    """The ten artist parameters, in [0, 1] each (``specular`` may be higher, for high indices of refraction)."""
 
     metallic: Any
     roughness: Any
@@ -219,7 +219,12 @@ def tint(albedo, luminance):
     return (albedo + 1e-5) / (luminance + 1e-5)
 
 
-def sanitize(material: Material, specular_max: float = 3.0) -> Material:
+def specular_from_eta(eta):
+    """``specular`` of a relative index of refraction: reflectance ((η − 1)/(η + 1))² in units of 0.08."""
+    return dr.square((eta - 1) / (eta + 1)) / SPECULAR_SCALE
+
+
+def sanitize(material: Material, specular_max: float = 1.0) -> Material:
     """Every parameter limited to its range, NaN to 0: textures and optimisers overshoot."""
     return Material(
         **{n: clamp(getattr(material, n), 0.0, specular_max if n == "specular" else 1.0) for n in PARAMETERS}
