@@ -15,7 +15,7 @@ import sys
 MODULES = ("disney", "neural_disney")
 
 #: For each learned plugin: its exact counterpart and the parameters that only the learned one has.
-EXACT_COUNTERPARTS = {"neural_disney": ("disney", ("filename", "storage"))}
+EXACT_COUNTERPARTS = {"neural_disney": ("disney", ("quality", "effects", "filename", "storage"))}
 
 _registered: set[str] = set()
 

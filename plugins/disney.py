@@ -4,7 +4,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.tasks.disney import model, sampling
-from mi_diffind.tasks.disney.model import LOBES, Material
+from mi_diffind.tasks.disney.decoder import Decoder
+from mi_diffind.tasks.disney.effects import Effects
+from mi_diffind.tasks.disney.model import LOBES, PARAMETERS
 
 _DIFFERENTIABLE = mi.ParamFlags.Differentiable
 _DISCONTINUOUS = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
@@ -214,12 +216,6 @@ class Disney(mi.BSDF):
         ]
         self.m_flags = self.m_components[0] | self.m_components[1] | self.m_components[2]
 
-    # -- what the learned plugin replaces ---------------------------------------------------------------------------
-
-    def factors(self, material: Material, wi: mi.Vector3f, wo: mi.Vector3f, active: mi.Bool) -> model.Factors:
-        """The factors of the BRDF that depend on the directions."""
-        return model.exact_factors(material, wi, wo)
-
     # -- parameters -------------------------------------------------------------------------------------------------
 
     def _textures(self) -> dict[str, mi.Texture]:
@@ -242,26 +238,17 @@ class Disney(mi.BSDF):
             dr.make_opaque(self.reflectance)
         dr.make_opaque(self.rates)
 
-    def _material(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Material:
-        values = {name: texture.eval_1(si, active) for name, texture in self.scalars.items()}
+    def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool):
+        """A parameter at ``si``, limited to its range (NaN → 0): textures and optimisers overshoot."""
+        if name == "base_color":
+            return mi.UnpolarizedSpectrum(model.clamp(self.base_color.eval(si, active), 0.0, 1.0))
+        if name != "specular":
+            return model.clamp(self.scalars[name].eval_1(si, active), 0.0, 1.0)
         texture = isinstance(self.reflectance, mi.Texture)
-        specular = self.reflectance.eval_1(si, active) if texture else self.reflectance
+        value = self.reflectance.eval_1(si, active) if texture else self.reflectance
         if self.reflectance_name == "eta":
-            specular = model.specular_from_eta(specular)
-        return model.sanitize(Material(specular=specular, **values), model.specular_from_eta(ETA_MAX))
-
-    def _albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool):
-        """The albedo in [0, 1] (NaN → 0) and its luminance."""
-        albedo = mi.UnpolarizedSpectrum(model.clamp(self.base_color.eval(si, active), 0.0, 1.0))
-        if mi.is_monochromatic:
-            return albedo, albedo[0]
-        if mi.is_rgb:
-            return albedo, mi.luminance(albedo)
-        # A mean over the sampled wavelengths, weighted by the luminous efficiency: 1 for a white albedo whatever they
-        # are (Mitsuba's `luminance` alone varies with them)
-        one = mi.UnpolarizedSpectrum(1)
-        weight = mi.luminance(one, si.wavelengths) + 1e-6
-        return albedo, (mi.luminance(albedo, si.wavelengths) + 1e-6 * dr.mean(albedo)) / weight
+            value = model.specular_from_eta(value)
+        return model.clamp(value, 0.0, model.specular_from_eta(ETA_MAX))
 
     # -- evaluation -------------------------------------------------------------------------------------------------
 
@@ -280,67 +267,101 @@ class Disney(mi.BSDF):
         up = mi.Vector3f(0, 0, 1)
         return dr.select(active, si.wi, up), dr.select(active, wo, up), active
 
-    def _value(self, lobes, material, albedo, luminance, wi, wo, active):
-        parts = model.compose(material, self.factors(material, wi, wo, active))
-        value = mi.UnpolarizedSpectrum(model.colour([parts[lobe] for lobe in lobes], albedo, luminance))
+    # The three methods below are what :class:`NeuralDisney` replaces
+
+    def _effects(self) -> Effects:
+        """The parts of the model in use."""
+        return Effects()
+
+    def _surface(self, si, active, effects: Effects, value: bool = True, density: bool = True):
+        """
+        The material at ``si``: its parameters, and the coefficients that values and densities need. All of it is
+        evaluated here, not when it is first used, which may be where derivatives are suspended.
+        """
+        parameters = Parameters(self, si, active)
+        if value:
+            for name in ("albedo", "luminance", *PARAMETERS):
+                getattr(parameters, name)
+        groups = sampling.required(effects) if density else ()
+        return parameters, {name: _ANALYTIC.coefficients(name, parameters, effects) for name in groups}
+
+    def _reflected(self, parameters, coefficients, effects: Effects, lobes, wi, wo, active):
+        """BRDF · cosine of the lobes named in ``lobes``, a colour or a number."""
+        parts = model.compose(parameters, model.exact_factors(parameters, wi, wo), lobes)
+        return model.colour(parts.values(), parameters.albedo, parameters.luminance)
+
+    def _value(self, surface, effects, lobes, wi, wo, active):
+        value = mi.UnpolarizedSpectrum(self._reflected(*surface, effects, lobes, wi, wo, active))
         return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
 
-    def _density(self, rates, material, luminance, wi, wo, active):
+    def _density(self, surface, effects, rates, wi, wo, active):
         # Detached, see the manual page
         with dr.suspend_grad():
-            every = {lobe: rates.get(lobe, mi.Float(0)) for lobe in LOBES}
-            probabilities = sampling.lobe_probabilities(material, luminance, wi.z, every)
-            pdf = sampling.density(material, probabilities, wi, wo)
-            return dr.detach(dr.select(active, pdf, 0))
+            probabilities = sampling.lobe_probabilities(surface[1], effects, wi.z, rates)
+            pdf = sampling.density(surface[1], effects, probabilities, wi, wo)
+            return dr.detach(dr.select(active, mi.Float(pdf), 0))
 
     def eval(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(si, wo, active)
-        return self._value(self._rates(ctx), self._material(si, active), *self._albedo(si, active), wi, wo, active)
+        effects = self._effects()
+        surface = self._surface(si, active, effects, density=False)
+        return self._value(surface, effects, tuple(self._rates(ctx)), wi, wo, active)
 
     def pdf(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(si, wo, active)
-        _, luminance = self._albedo(si, active)
-        return self._density(self._rates(ctx), self._material(si, active), luminance, wi, wo, active)
+        effects = self._effects()
+        surface = self._surface(si, active, effects, value=False)
+        return self._density(surface, effects, self._rates(ctx), wi, wo, active)
 
     def eval_pdf(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(si, wo, active)
-        return self._eval_pdf(self._rates(ctx), self._material(si, active), *self._albedo(si, active), wi, wo, active)
+        effects = self._effects()
+        surface = self._surface(si, active, effects)
+        return self._eval_pdf(surface, effects, self._rates(ctx), wi, wo, active)
 
-    def _eval_pdf(self, rates, material, albedo, luminance, wi, wo, active):
-        value = self._value(rates, material, albedo, luminance, wi, wo, active)
-        return value, self._density(rates, material, luminance, wi, wo, active)
+    def _eval_pdf(self, surface, effects, rates, wi, wo, active):
+        value = self._value(surface, effects, tuple(rates), wi, wo, active)
+        return value, self._density(surface, effects, rates, wi, wo, active)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         rates = self._rates(ctx)
         active = active & (si.wi.z > 0)
         wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
-        material = self._material(si, active)
-        albedo, luminance = self._albedo(si, active)
+        effects = self._effects()
+        surface = self._surface(si, active, effects)
+        c = surface[1]
 
         bs = dr.zeros(mi.BSDFSample3f)
         with dr.suspend_grad():
-            every = {lobe: rates.get(lobe, mi.Float(0)) for lobe in LOBES}
-            p = sampling.lobe_probabilities(material, luminance, wi.z, every)
-            is_diffuse = sample1 < p["diffuse"]
-            is_coat = ~is_diffuse & (sample1 < p["diffuse"] + p["clearcoat"])
-
-            ax, ay = model.roughness_to_alpha(material.roughness, material.anisotropic)
-            ggx = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, ax, ay, True)
-            half, _ = ggx.sample(wi, sample2)
-            coat_half = mi.Normal3f(*sampling.sample_gtr1(material.clearcoat_gloss, sample2))
-            wo = mi.reflect(wi, dr.select(is_coat, coat_half, half))
-            wo = dr.detach(dr.select(is_diffuse, mi.warp.square_to_cosine_hemisphere(sample2), wo))
+            # The specular lobe is what remains: it is also what a context without any lobe "samples", with density 0
+            p = sampling.lobe_probabilities(c, effects, wi.z, rates)
+            half, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, *c["ggx"]["alpha"], True).sample(wi, sample2)
+            component = mi.UInt32(1)
+            threshold = mi.Float(0)
+            if "diffuse" in p:
+                threshold = p["diffuse"]
+                is_diffuse = sample1 < threshold
+                component = dr.select(is_diffuse, 0, component)
+            if "clearcoat" in p:
+                is_coat = (sample1 >= threshold) & (sample1 < threshold + p["clearcoat"])
+                component = dr.select(is_coat, 2, component)
+                coat_half = mi.Normal3f(*sampling.sample_gtr1(c["coat"]["a2"], c["coat"]["log"], sample2))
+                half = dr.select(is_coat, coat_half, half)
+            wo = mi.reflect(wi, half)
+            if "diffuse" in p:
+                wo = dr.select(is_diffuse, mi.warp.square_to_cosine_hemisphere(sample2), wo)
+            wo = dr.detach(wo)
 
         bs.wo = wo
         bs.eta = 1.0
-        bs.sampled_component = dr.select(is_diffuse, mi.UInt32(0), dr.select(is_coat, mi.UInt32(2), mi.UInt32(1)))
+        bs.sampled_component = component
         bs.sampled_type = dr.select(
-            is_diffuse, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+            component == 0, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
         )
 
         active &= dr.isfinite(wo.z) & (wo.z > 0)
         safe = dr.select(active, wo, mi.Vector3f(0, 0, 1))
-        value, bs.pdf = self._eval_pdf(rates, material, albedo, luminance, wi, safe, active)
+        value, bs.pdf = self._eval_pdf(surface, effects, rates, wi, safe, active)
         active &= bs.pdf > 0
         return bs, dr.select(active, value / dr.select(active, bs.pdf, 1), 0)
 
@@ -352,6 +373,42 @@ class Disney(mi.BSDF):
         if not isinstance(self.reflectance, mi.Texture):
             lines.append(f"  {self.reflectance_name} = {self.reflectance},")
         return f"{type(self).__name__}[\n" + "\n".join(lines) + "\n]"
+
+
+#: What sampling and densities are computed from, in every form of the model.
+_ANALYTIC = Decoder()
+
+
+class Parameters:
+    """
+    A material's parameters at a surface interaction: ``roughness``, …, ``specular``, and ``albedo``, ``luminance``. Each
+    is read when it is first asked for, so one that nobody asks for is not read.
+    """
+
+    def __init__(self, bsdf: Disney, si: mi.SurfaceInteraction3f, active: mi.Bool):
+        self._bsdf, self._si, self._active = bsdf, si, active
+
+    def __getattr__(self, name: str):
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name == "luminance":
+            value = luminance(self.albedo, self._si)
+        else:
+            value = self._bsdf._read("base_color" if name == "albedo" else name, self._si, self._active)
+        setattr(self, name, value)
+        return value
+
+
+def luminance(albedo, si: mi.SurfaceInteraction3f):
+    """The luminance of an albedo, 1 for a white one."""
+    if mi.is_monochromatic:
+        return albedo[0]
+    if mi.is_rgb:
+        return mi.luminance(albedo)
+    # A mean over the sampled wavelengths, weighted by the luminous efficiency: 1 for a white albedo whatever they
+    # are (Mitsuba's `luminance` alone varies with them)
+    weight = mi.luminance(mi.UnpolarizedSpectrum(1), si.wavelengths) + 1e-6
+    return (mi.luminance(albedo, si.wavelengths) + 1e-6 * dr.mean(albedo)) / weight
 
 
 def _indent(value) -> str:

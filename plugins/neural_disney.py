@@ -1,11 +1,16 @@
 from __future__ import annotations  # Delayed parsing of type annotations
 
+import dataclasses
+
+import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.tasks.disney.arrays import SHAPES
-from mi_diffind.tasks.disney.library import load_arrays
+from mi_diffind.tasks.disney import sampling
+from mi_diffind.tasks.disney.effects import Effects, Known, find_effects
+from mi_diffind.tasks.disney.library import load_decoder
 
-from .disney import Disney
+from . import knowledge
+from .disney import Disney, Parameters
 
 
 class NeuralDisney(Disney):
@@ -17,9 +22,23 @@ class NeuralDisney(Disney):
 
     .. pluginparameters::
 
+     * - quality
+       - |string|
+       - ``fast``: arithmetic wherever it takes less time than a table on a CPU, which on those we measured is
+         everywhere; ``tables``: every factor is read from tables of together 3 KB, in a factorisation that stays
+         accurate at the horizon; ``paper``: the layout of the paper's Table 1, for comparison. (Default: that of the
+         file, if ``filename`` is given, else ``fast``)
+       - --
+
+     * - effects
+       - |string|
+       - ``used``: only the parts of the model that the material makes use of are traced, read and sampled; ``all``: all
+         of them. (Default: ``used``)
+       - --
+
      * - filename
        - |string|
-       - Tables of one's own, as written by ``mi-diffind fit disney``. (Default: the tables that ship with the package)
+       - Tables of one's own, as written by ``mi-diffind fit disney``. (Default: those that ship with the package)
        - --
 
      * - storage
@@ -28,11 +47,11 @@ class NeuralDisney(Disney):
          in the first. (Default: the file's own, ``float32`` for those that ship)
        - --
 
-     * - tables.ggx, tables.masking, tables.diffuse, tables.fresnel, tables.coat, tables.encoder_roughness,
-         tables.encoder_anisotropic
+     * - tables.alpha, tables.masking, tables.cosine, tables.coat, tables.encoder_roughness,
+         tables.encoder_anisotropic; or tables.ggx, tables.masking, tables.diffuse, tables.fresnel, … (``paper``)
        - |tensor|
        - The entries of the tables, in the file's shapes, or with channels padded to 1, 2 or a multiple of 4, as they
-         are to begin with (``tables.ggx``: 16 × 16 × 4, the last unused).
+         are to begin with.
        - |exposed|, |differentiable|
 
      * - base_color, roughness, anisotropic, metallic, specular, eta, spec_tint, sheen, sheen_tint, flatness,
@@ -42,10 +61,16 @@ class NeuralDisney(Disney):
        - |exposed|, |differentiable|
 
     The Disney BRDF by *differentiable indirection* (Datta et al., *Efficient Graphics Representation with
-    Differentiable Indirection*, SIGGRAPH Asia 2023): a small encoder turns the material into coordinates, and five
-    learned tables of together 12 KB, the layout of the paper's Table 1, replace the arithmetic of its lobes. The exact
-    counterpart is :ref:`disney <bsdf-disney>`, from which this plugin differs in nothing but the value: sampling and
-    densities are analytic, so they stay normalised although the tables are approximate.
+    Differentiable Indirection*, SIGGRAPH Asia 2023): a small encoder turns the material into coordinates, and learned
+    tables replace the arithmetic of its lobes, as far as they earn their place. The exact counterpart is
+    :ref:`disney <bsdf-disney>`, from which this plugin differs in nothing but the value: sampling and densities are
+    analytic, so they stay normalised although tables are approximate.
+
+    **Only the effects in use.** A part of the model that the parameters make zero (``clearcoat`` 0, ``metallic`` 1, a
+    black texture, the tint of a grey albedo, …) is neither traced nor read nor sampled. What is in use is found when the
+    scene is loaded and again when parameters change; parameters with gradients enabled always count as in use, and so
+    does a texture whose bounds are not known (constants and bitmaps are). ``mi-diffind inspect SCENE.xml`` lists what was
+    left out, and why. Whatever depends on constant parameters alone is evaluated once, not for each sample.
 
     .. tabs::
         .. code-tab:: xml
@@ -75,31 +100,140 @@ class NeuralDisney(Disney):
         filename = str(props.get("filename", ""))
         if filename:
             filename = str(mi.file_resolver().resolve(filename))
-        self.arrays = load_arrays(filename, mi.TensorXf, str(props.get("storage", "")))
+        quality, storage = (str(props.get(name, "")) for name in ("quality", "storage"))
+        self.decoder = load_decoder(filename, mi.TensorXf, storage, quality)
+        self.effects = str(props.get("effects", "used"))
+        if self.effects not in ("used", "all"):
+            raise RuntimeError(f'parameter "effects": found "{self.effects}", allowed are used, all')
 
-    def factors(self, material, wi, wo, active):
-        return self.arrays.factors(material, wi, wo, active)
+        #: For each parameter: the arrays that it was when it was last looked at, and what was found.
+        self._looked_at: dict[str, tuple[list, Known]] = {}
+        #: Coefficients that depend on constants alone, evaluated; the effects that they are for.
+        self._constant: dict[str, dict] = {}
+        self._constant_for: tuple | None = None
+        self._prepare_constants()
+
+    # -- effects in use, and what is evaluated once -------------------------------------------------------------------
+
+    def _parameter(self, name: str):
+        """The texture or number behind a parameter of the model."""
+        if name == "base_color":
+            return self.base_color
+        return self.reflectance if name == "specular" else self.scalars[name]
+
+    def _optimised(self, name: str) -> bool:
+        return any(knowledge.has_gradient(v) for v in knowledge.values(self._parameter(name)))
+
+    def _look(self) -> None:
+        """Find out what is not known yet about parameters, or not any more."""
+        for name in ("base_color", *self.scalars, "specular"):
+            arrays = knowledge.values(self._parameter(name))
+            before = self._looked_at.get(name)
+            if before is not None and [*map(knowledge.identity, before[0])] == [*map(knowledge.identity, arrays)]:
+                continue
+            if dr.flag(dr.JitFlag.FreezingScope) or any(map(knowledge.has_gradient, arrays)):
+                self._looked_at.pop(name, None)  # values cannot be looked at, or need not
+            else:
+                # Detached copies keep the arrays alive, so that no other one gets their index
+                self._looked_at[name] = ([dr.detach(v) for v in arrays], knowledge.bounds(self._parameter(name), name == "base_color"))
+
+    def _known(self) -> dict[str, Known]:
+        known = {name: found for name, (_, found) in self._looked_at.items()}
+        for name in ("base_color", *self.scalars, "specular"):
+            if self._optimised(name):
+                known[name] = Known(optimised=True)
+        return known
+
+    def _effects(self) -> Effects:
+        return find_effects(self._known())[0] if self.effects == "used" else Effects()
+
+    def _prepare_constants(self) -> None:
+        """Evaluate every group of coefficients that depends on constants alone."""
+        self._look()
+        effects = self._effects()
+        constant = {
+            name
+            for name in ("base_color", *self.scalars, "specular")
+            if not (isinstance(self._parameter(name), mi.Texture) and self._parameter(name).is_spatially_varying())
+            and not (name == "base_color" and mi.is_spectral)
+            and not self._optimised(name)
+        }
+        groups = {*self.decoder.required(effects), *sampling.required(effects)}
+        groups = sorted(group for group in groups if constant.issuperset(self.decoder.groups[group]))
+        parameters = Parameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
+        with dr.suspend_grad():
+            self._constant = {group: self.decoder.coefficients(group, parameters, effects) for group in groups}
+        dr.make_opaque(self._constant)
+        self._constant_for = effects
+
+    def _surface(self, si, active, effects, value=True, density=True):
+        parameters = Parameters(self, si, active)
+        groups = dict.fromkeys(
+            (*(self.decoder.required(effects) if value else ()), *(sampling.required(effects) if density else ()))
+        )
+        coefficients = {}
+        for group in groups:
+            found = self._constant.get(group) if effects == self._constant_for else None
+            # Gradients may have been enabled since
+            if found is None or any(self._optimised(name) for name in self.decoder.groups[group]):
+                found = self.decoder.coefficients(group, parameters, effects)
+            coefficients[group] = found
+        return parameters, coefficients
+
+    def _reflected(self, parameters, coefficients, effects, lobes, wi, wo, active):
+        return self.decoder.value(coefficients, effects, lobes, parameters, wi, wo, active)
+
+    def _rates(self, ctx):
+        lobes = self._effects().lobes
+        return {lobe: rate for lobe, rate in super()._rates(ctx).items() if lobe in lobes}
+
+    # -- parameters -------------------------------------------------------------------------------------------------
+
+    def _tables(self) -> dict:
+        """The tables that are exposed."""
+        arrays = self.decoder.arrays
+        if arrays is None:
+            return {}
+        tables = {name: getattr(arrays, name) for name in arrays.SHAPES}
+        return {name: array for name, array in tables.items() if array.storage == "float32"}
 
     def traverse(self, cb: mi.TraversalCallback):
         super().traverse(cb)
-        for name in SHAPES:
-            array = getattr(self.arrays, name)
-            if array.storage == "float32":
-                cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
+        for name, array in self._tables().items():
+            cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str] = ()):
         super().parameters_changed(keys)
-        for name in SHAPES:
-            array = getattr(self.arrays, name)
-            if array.storage == "float32":
-                try:
-                    array.check_shape()
-                except ValueError as e:
-                    raise RuntimeError(f'parameter "tables.{name}": {e}') from None
+        for name, array in self._tables().items():
+            try:
+                array.check_shape()
+            except ValueError as e:
+                raise RuntimeError(f'parameter "tables.{name}": {e}') from None
+        self._prepare_constants()
+
+    def report(self) -> dict:
+        """
+        What this instance does: ``quality``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
+        ``evaluated_once`` (groups of coefficients), ``storage`` and ``table_bytes``.
+        """
+        effects = self._effects()
+        reasons = find_effects(self._known())[1] if self.effects == "used" else {}
+        arrays = self.decoder.arrays
+        return {
+            "quality": "fast" if arrays is None else arrays.QUALITY,
+            "effects_in_use": list(effects.names),
+            "effects_left_out": reasons,
+            "evaluated_once": sorted(self._constant),
+            "storage": None if arrays is None else next(iter(arrays.SHAPES)) and getattr(arrays, next(iter(arrays.SHAPES))).storage,
+            "table_bytes": 0 if arrays is None else arrays.nbytes,
+        }
 
     def to_string(self):
-        tables = f"  tables = {self.arrays.nbytes} bytes as {self.arrays.ggx.storage},\n"
-        return super().to_string()[:-1] + tables + "]"
+        report = self.report()
+        tables = f", {report['table_bytes']} bytes as {report['storage']}" if report["storage"] else ""
+        effects = ", ".join(report["effects_in_use"])
+        added = f"  quality = {report['quality']}{tables},\n  effects = {effects},\n"
+        return super().to_string()[:-1] + added + "]"
 
 
 mi.register_bsdf("neural_disney", NeuralDisney)

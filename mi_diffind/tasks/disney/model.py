@@ -150,12 +150,12 @@ def coat_masking(cosine):
     return 2 * cosine / (cosine + dr.sqrt(a2 + (1 - a2) * dr.square(cosine)))
 
 
-def diffuse_factors(roughness, cos_d, fresnel_sum, fresnel_product, cos_ratio, cos_o):
+def diffuse_factors(roughness, cos_d2, fresnel_sum, fresnel_product, cos_ratio, cos_o):
     """
     Burley's base diffuse and the Hanrahan–Krueger-inspired subsurface approximation, times ``cos_o``, from
-    ``F_L + F_V``, ``F_L F_V`` and ``cos_o / (cos_i + cos_o)``.
+    ``(l·h)²``, ``F_L + F_V``, ``F_L F_V`` and ``cos_o / (cos_i + cos_o)``.
     """
-    f90 = 2 * roughness * dr.square(cos_d)
+    f90 = 2 * roughness * cos_d2
     k = f90 - 0.5
     diffuse = dr.fma(k, fresnel_sum + k * fresnel_product, 1) * cos_o
     k = 0.5 * f90 - 1
@@ -170,7 +170,8 @@ def exact_factors(material: Material, wi, wo) -> Factors:
     ax, ay = roughness_to_alpha(material.roughness, material.anisotropic)
     s = schlick(g.cos_d)
     fl, fv = schlick(wo.z), schlick(wi.z)
-    diffuse, flat = diffuse_factors(material.roughness, g.cos_d, fl + fv, fl * fv, wo.z / (wi.z + wo.z + TINY), wo.z)
+    ratio = wo.z / (wi.z + wo.z + TINY)
+    diffuse, flat = diffuse_factors(material.roughness, dr.square(g.cos_d), fl + fv, fl * fv, ratio, wo.z)
     specular = ggx(g, ax, ay) * wo.z / (masking_denominator(wi, ax, ay) * masking_denominator(wo, ax, ay))
     coat_fresnel = COAT_F0 + (1 - COAT_F0) * s
     return Factors(
@@ -186,31 +187,37 @@ def exact_factors(material: Material, wi, wo) -> Factors:
     )  # fmt: skip
 
 
-def compose(material: Material, f: Factors) -> dict[str, tuple]:
+def compose(material: Material, f: Factors, lobes=LOBES) -> dict[str, tuple]:
     """
     For each lobe the scalars ``(a, x, y)`` of ``f = albedo · a + tint · x + y``, non-negative if the factors are.
     """
     m = material
-    f0 = SPECULAR_SCALE * m.specular
-    sheen = m.sheen * f.sheen
-    return {
-        "diffuse": (
+    parts = {}
+    if "diffuse" in lobes:
+        sheen = m.sheen * f.sheen
+        parts["diffuse"] = (
             (1 - m.metallic) * dr.inv_pi * (f.diffuse * (1 - m.flatness) + f.flat * m.flatness),
             sheen * m.sheen_tint,
             sheen * (1 - m.sheen_tint),
-        ),
-        "specular": (
+        )
+    if "specular" in lobes:
+        f0 = SPECULAR_SCALE * m.specular
+        parts["specular"] = (
             f.specular * f.metal_base,
             f.specular * f0 * m.spec_tint * f.base,
             f.specular * (f0 * (1 - m.spec_tint) * f.base + f.grazing),
-        ),
-        "clearcoat": (0, 0, COAT_STRENGTH * m.clearcoat * f.clearcoat),
-    }
+        )
+    if "clearcoat" in lobes:
+        parts["clearcoat"] = (0, 0, COAT_STRENGTH * m.clearcoat * f.clearcoat)
+    return parts
 
 
 def colour(lobes, albedo, luminance):
     """``albedo · a + tint · x + y``, summed over ``lobes``, an iterable of such triples."""
-    a, x, y = (sum(parts) for parts in zip(*lobes, strict=True))
+    total = [0, 0, 0]
+    for lobe in lobes:
+        total = [a + b for a, b in zip(total, lobe, strict=True)]
+    a, x, y = total
     return albedo * a + tint(albedo, luminance) * x + y
 
 

@@ -1,62 +1,83 @@
 """
 Importance sampling of the Disney BRDF: which lobe, and with which density.
 
-The density has to be normalised exactly even where the tables are approximate, so it is always computed from the
-analytic distributions: a cosine for diffuse and sheen, visible normals (Heitz 2018) for the specular lobe, GTR1 half
-vectors for the clearcoat. Written with :func:`.model.masking_denominator`, the density of visible normals mapped to
-directions is just ``D / (2 d(wi))``: no cosine is divided by.
+The density has to be normalised exactly even where tables are approximate, so it is always computed from the analytic
+distributions: a cosine for diffuse and sheen, visible normals (Heitz 2018) for the specular lobe, GTR1 half vectors for
+the clearcoat. Written with :func:`.model.masking_denominator`, the density of visible normals mapped to directions is
+just ``D / (2 d(wi))``: no cosine is divided by.
 
-Same frame and conventions as :mod:`.model`.
+Same frame and conventions as :mod:`.model`; ``c`` are coefficients of :class:`.decoder.Decoder` (``ggx``, ``coat`` and
+``shares``), ``e`` the effects in use.
 """
 
 from __future__ import annotations
 
 import drjit as dr
 
-from . import model
-from .model import COAT_F0, LOBES, SPECULAR_SCALE, TINY, Material
+from .decoder import coat_quadric, masking, quadric
+from .effects import Effects
+from .model import COAT_F0, TINY, geometry, schlick
+
+#: Groups of coefficients that densities need, and whether they do with the effects ``e``.
+REQUIRED = {"ggx": lambda e: True, "coat": lambda e: e.clearcoat, "shares": lambda e: len(e.lobes) > 1}
 
 #: Share that a lobe gets however little energy is estimated for it, so that no lobe is left to another's sampling.
 FLOOR = 0.02
 
 
-def lobe_probabilities(m: Material, luminance, cos_i, rates: dict[str, float]) -> dict:
+def required(e: Effects) -> tuple[str, ...]:
+    """The groups of coefficients that densities need when the effects ``e`` are in use."""
+    return tuple(name for name, applies in REQUIRED.items() if applies(e))
+
+
+def lobe_probabilities(c: dict, e: Effects, cos_i, rates: dict) -> dict:
     """
     The probability of sampling each lobe, proportional to an estimate of its albedo for the direction ``wi``.
 
-    ``rates`` multiplies each lobe's share; 0 turns a lobe off. The specular lobe is never without a chance unless it
-    is turned off; if all are, every probability is 0.
+    ``rates`` maps lobes to factors on their shares; a lobe that it lacks is turned off. The specular lobe is never
+    without a chance unless it is turned off; if all are, there is none.
     """
-    s = model.schlick(cos_i)
-    f0 = luminance * m.metallic + (1 - m.metallic) * SPECULAR_SCALE * m.specular
-    share = {
-        "diffuse": (1 - m.metallic) * (luminance + m.sheen * (0.05 + 0.4 * s)),
-        "specular": FLOOR + f0 + (1 - f0) * s,
-        "clearcoat": m.clearcoat * (FLOOR + (COAT_F0 + (1 - COAT_F0) * s) * (0.1 + 0.9 * dr.square(cos_i))),
-    }
-    share = {name: rates[name] * dr.maximum(share[name], 0) for name in LOBES}
+    lobes = [lobe for lobe in e.lobes if lobe in rates]
+    if len(e.lobes) == 1:
+        return {lobe: dr.select(rates[lobe] > 0, type(cos_i)(1), 0) for lobe in lobes}
+    shares, s = c["shares"], schlick(cos_i)
+    share = {}
+    for lobe in lobes:
+        if lobe == "diffuse":
+            energy = shares["diffuse"]
+            if e.sheen:
+                energy = dr.fma(shares["sheen"], 0.05 + 0.4 * s, energy)
+        elif lobe == "specular":
+            energy = FLOOR + shares["f0"] + (1 - shares["f0"]) * s
+        else:
+            energy = shares["clearcoat"] * (FLOOR + (COAT_F0 + (1 - COAT_F0) * s) * (0.1 + 0.9 * dr.square(cos_i)))
+        share[lobe] = rates[lobe] * dr.maximum(energy, 0)
     norm = dr.rcp(dr.maximum(sum(share.values()), TINY))
-    return {name: share[name] * norm for name in LOBES}
+    return {lobe: share[lobe] * norm for lobe in lobes}
 
 
-def density(m: Material, probabilities: dict, wi, wo):
+def density(c: dict, e: Effects, probabilities: dict, wi, wo):
     """Density of ``wo`` per solid angle when lobes are chosen with ``probabilities``."""
-    g = model.geometry(wi, wo)
-    ax, ay = model.roughness_to_alpha(m.roughness, m.anisotropic)
-    specular = model.ggx(g, ax, ay) / (2 * model.masking_denominator(wi, ax, ay))
-    coat = model.gtr1(g, model.coat_alpha(m.clearcoat_gloss)) * g.h.z / (2 * g.h2 + TINY)
-    return (
-        probabilities["diffuse"] * wo.z * dr.inv_pi
-        + probabilities["specular"] * specular
-        + probabilities["clearcoat"] * coat
-    )
+    g = geometry(wi, wo)
+    pdf = 0
+    if "diffuse" in probabilities:
+        pdf = probabilities["diffuse"] * (wo.z * dr.inv_pi)
+    if "specular" in probabilities:
+        d = dr.square(g.h2 / (quadric(c["ggx"]["q"], g) + TINY))
+        pdf = probabilities["specular"] * d / (2 * masking(c["ggx"]["alpha2"], wi)) + pdf
+    if "clearcoat" in probabilities:
+        coat = c["coat"]["norm"] * g.h.z / (2 * coat_quadric(c["coat"]["a2"], g))
+        pdf = probabilities["clearcoat"] * coat + pdf
+    return pdf
 
 
-def sample_gtr1(gloss, sample):
-    """A half vector with density ``GTR1(h) · h.z`` (Burley 2012, appendix B.2); ``sample`` uniform in [0, 1)²."""
-    a2 = dr.square(model.coat_alpha(gloss))
+def sample_gtr1(a2, log_a2, sample):
+    """
+    A half vector with density ``GTR1(h) · h.z`` (Burley 2012, appendix B.2), from α² and its logarithm; ``sample``
+    uniform in [0, 1)².
+    """
     # The published form gives cos², from which sin² = 1 − cos² would cancel next to the peak
-    sin2 = dr.clip(a2 * (dr.exp(-sample.y * dr.log(a2)) - 1) / (1 - a2), 0, 1)
+    sin2 = dr.clip(a2 * (dr.exp(-sample.y * log_a2) - 1) / (1 - a2), 0, 1)
     sin, cos = dr.sqrt(sin2), dr.sqrt(1 - sin2)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * sample.x)
     return cos_phi * sin, sin_phi * sin, cos

@@ -9,8 +9,9 @@ metallic and roughness exponential-like (many low values), the rest uniform.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 
@@ -18,8 +19,11 @@ from ...fitting import FitResult, FitSettings, fit
 from ...runtime import array_module
 from ...tables import Table
 from . import model
-from .arrays import DisneyArrays
-from .model import COAT_F0, PARAMETERS, Material, compose, exact_factors
+from .arrays import Arrays
+from .decoder import Decoder
+from .effects import Effects
+from .library import LAYOUTS, decoder_of
+from .model import PARAMETERS, Material, compose, exact_factors
 
 #: Rate of the exponential-like distribution on [0, 1]: half of the samples lie below 0.21.
 EXPONENTIAL_RATE = 3.0
@@ -58,79 +62,59 @@ def random_directions(rng, types, size: int):
     return uniform_hemisphere(types, u[0], u[1]), uniform_hemisphere(types, u[2], u[3])
 
 
-def targets(m: Material, wi, wo) -> dict[str, list]:
-    """What each array should hold for these samples, straight from the formulas."""
-    g = model.geometry(wi, wo)
-    ax, ay = model.roughness_to_alpha(m.roughness, m.anisotropic)
-    norm = dr.sqrt(dr.pi * ax * ay)
-    root = dr.sqrt(model.masking_denominator(wi, ax, ay) * model.masking_denominator(wo, ax, ay))
-    s, fl, fv = model.schlick(g.cos_d), model.schlick(wo.z), model.schlick(wi.z)
-    a2 = dr.square(model.coat_alpha(m.clearcoat_gloss))
-    k = (a2 - 1) / (dr.pi * dr.log(a2))
-    return {
-        "ggx": [dr.log(norm / dr.square(ax)), dr.log(norm / dr.square(ay)), dr.log(norm)],
-        "masking": [dr.log(root)],
-        "diffuse": [
-            fl + fv,
-            fl * fv,
-            wo.z / (wi.z + wo.z + model.TINY),
-            model.coat_masking(wi.z) * model.coat_masking(wo.z),
-        ],
-        "fresnel": [
-            m.metallic * (1 - s),
-            (1 - m.metallic) * (1 - s),
-            COAT_F0 + (1 - COAT_F0) * s,
-            (1 - m.metallic) * s,
-        ],
-        "coat": [dr.log(1 / k), dr.log(a2 / k)],
-    }
+@dataclass
+class Shaded(Material):
+    """A material with its ``albedo``, a colour, and the albedo's ``luminance``."""
+
+    albedo: Any
+    luminance: Any
+
+    @classmethod
+    def of(cls, material: Material, albedo) -> Shaded:
+        luminance = sum(w * c for w, c in zip(LUMINANCE, albedo, strict=True))
+        return cls(**{n: getattr(material, n) for n in PARAMETERS}, albedo=albedo, luminance=luminance)
 
 
-def shade(net: DisneyArrays | None, m: Material, albedo, wi, wo):
-    """BRDF · cosine in RGB, from the tables, or exact if ``net`` is ``None``."""
-    luminance = sum(w * c for w, c in zip(LUMINANCE, albedo, strict=True))
-    factors = exact_factors(m, wi, wo) if net is None else net.factors(m, wi, wo)
-    return model.colour(compose(m, factors).values(), albedo, luminance)
+def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects = Effects()):  # noqa: B008
+    """BRDF · cosine in RGB: from ``decoder``, or straight from the formulas if it is ``None``."""
+    p = Shaded.of(m, albedo)
+    if decoder is None:
+        return model.colour(compose(p, exact_factors(p, wi, wo)).values(), albedo, p.luminance)
+    c = {group: decoder.coefficients(group, p, effects) for group in decoder.required(effects)}
+    return decoder.value(c, effects, effects.lobes, p, wi, wo)
 
 
 class DisneyProblem:
     """
-    The training problem of :mod:`mi_diffind.fitting`. ``quality_samples`` random directions and materials, seeded and
-    held out, measure ``psnr_db``: PSNR of BRDF · cosine, clipped to [0, 1], against the analytic model.
+    The training problem of :mod:`mi_diffind.fitting` for the layout of a quality level. ``quality_samples`` random
+    directions and materials, seeded and held out, measure ``psnr_db``: PSNR of BRDF · cosine, clipped to [0, 1],
+    against the analytic model.
     """
 
-    weights = {"ggx": 1.0, "masking": 1.0, "diffuse": 1.0, "fresnel": 1.0, "coat": 1.0}  # noqa: RUF012
+    weights: dict[str, float] = {}  # noqa: RUF012
 
     #: dB. The peak of a smooth surface gains long after the mean over random directions has settled.
     tolerance = 0.2
 
-    def __init__(self, backend: str | None = None, quality_samples: int = 2**18):
+    def __init__(self, backend: str | None = None, quality: str = "tables", quality_samples: int = 2**18):
         self.types = array_module(backend)
-        self.net = DisneyArrays().alloc(self.types.TensorXf)
+        self.net = LAYOUTS[quality]().alloc(self.types.TensorXf)
         self.quality_samples = quality_samples
 
     def batch(self, rng, size: int):
         m, (wi, wo) = random_materials(rng, self.types, size), random_directions(rng, self.types, size)
-        return (m, wi, wo), targets(m, wi, wo)
+        uniform = [rng.random(self.types.Float, size) for _ in range(2)]
+        return (m, wi, wo, uniform), self.net.targets(m, wi, wo, uniform)
 
-    def predict(self, net: DisneyArrays, inputs) -> dict[str, list]:
-        m, wi, wo = inputs
-        latent = net.encode(m)
-        root = net.masking_root(latent[0], wi.z * wo.z)
-        return {
-            "ggx": net.ggx(latent),
-            "masking": [dr.log(root)],
-            "diffuse": net.diffuse([wo.z, wi.z]),
-            "fresnel": net.fresnel([model.geometry(wi, wo).cos_d, m.metallic]),
-            "coat": net.coat([m.clearcoat_gloss]),
-        }
+    def predict(self, net: Arrays, inputs) -> dict[str, list]:
+        return net.predict(*inputs)
 
-    def quality(self, net: DisneyArrays) -> dict[str, float]:
-        return measure(net, self.types, self.quality_samples)
+    def quality(self, net: Arrays) -> dict[str, float]:
+        return measure(decoder_of(net), self.types, self.quality_samples)
 
 
 def measure(
-    net: DisneyArrays, types, samples: int = 10**6, distribution: str = "training", seed: int = 2023
+    decoder: Decoder, types, samples: int = 10**6, distribution: str = "training", seed: int = 2023
 ) -> dict[str, float]:
     """
     Accuracy of the tables over random directions (uniform over the hemisphere) and materials: ``psnr_db`` of values
@@ -139,7 +123,7 @@ def measure(
     rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
     m, (wi, wo) = random_materials(rng, types, samples, distribution), random_directions(rng, types, samples)
     albedo = types.Array3f([rng.random(types.Float, samples) for _ in range(3)])
-    truth, found = shade(None, m, albedo, wi, wo), shade(net, m, albedo, wi, wo)
+    truth, found = shade(None, m, albedo, wi, wo), shade(decoder, m, albedo, wi, wo)
 
     def clipped_mse(a, b):
         difference = dr.clip(a, 0, 1) - dr.clip(b, 0, 1)
@@ -157,15 +141,19 @@ def measure(
 def fit_disney(
     settings: FitSettings = DEFAULT_SETTINGS,
     backend: str | None = None,
+    quality: str = "tables",
     storage: str = "float32",
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: bool = True,
 ) -> tuple[Table, FitResult]:
-    """Train the tables and return them with their quality (measured in the storage form) and the run's record."""
-    problem = DisneyProblem(backend)
+    """
+    Train the tables of a quality level and return them with their accuracy (measured in the storage form) and the run's
+    record.
+    """
+    problem = DisneyProblem(backend, quality)
     result = fit(problem, settings, checkpoint, resume, progress)
     table = problem.net.to_table(storage, settings=asdict(settings), seed=settings.seed)
-    stored = DisneyArrays.from_table(table, problem.types.TensorXf)
-    table.quality = {k: round(v, 4) for k, v in measure(stored, problem.types).items()}
+    stored = type(problem.net).from_table(table, problem.types.TensorXf)
+    table.quality = {k: round(v, 4) for k, v in measure(decoder_of(stored), problem.types).items()}
     return table, result

@@ -1,0 +1,239 @@
+"""
+The Disney BRDF evaluated in two steps: coefficients that depend on the material alone, and what depends on directions.
+
+:class:`Decoder` is the model of :mod:`.model` rearranged for speed, with the same values up to rounding. Only the parts
+in use (:class:`.effects.Effects`) are computed. Coefficients come in groups (:data:`GROUPS`), each of which depends on a
+few parameters: where these are constant, a caller evaluates the group once and not for each sample.
+
+Learned forms replace some of its methods by reads (:class:`.factored.FactoredDecoder`) or all of it
+(:class:`.paper.PaperDecoder`). Sampling and densities (:mod:`.sampling`) always use the analytic coefficients.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+
+from . import model
+from .effects import Effects
+from .model import COAT_F0, COAT_STRENGTH, SPECULAR_SCALE, TINY, diffuse_factors, geometry, schlick
+
+#: Groups of coefficients → the parameters that they are computed from.
+GROUPS = {  
+    "ggx": ("roughness", "anisotropic"),
+    "diffuse": ("base_color", "metallic"),
+    "retro": ("roughness",),
+    "flatness": ("flatness",),
+    "sheen": ("base_color", "metallic", "sheen", "sheen_tint"),
+    "f0": ("base_color", "metallic", "specular", "spec_tint"),
+    "coat": ("clearcoat", "clearcoat_gloss"),
+    "shares": ("base_color", "metallic", "specular", "sheen", "clearcoat"),
+}
+
+
+class Decoder:
+    """
+    The analytic form.
+
+    ``p`` in what follows is any object with the parameters as attributes, sanitised (:func:`.model.sanitize`), and with
+    ``albedo`` (a colour) and ``luminance``. ``c`` maps the names of groups to coefficients.
+    """
+
+    #: Groups → parameters. A learned form may have more.
+    groups = GROUPS
+
+    #: The tables that are read.
+    arrays = None
+
+    def required(self, e: Effects) -> tuple[str, ...]:
+        """The groups that values need when the effects ``e`` are in use."""
+        needed = {
+            "ggx": True,
+            "diffuse": e.diffuse or e.subsurface,
+            "retro": e.diffuse or e.subsurface,
+            "flatness": e.diffuse and e.subsurface,
+            "sheen": e.sheen,
+            "f0": e.metal or e.dielectric,
+            "coat": e.clearcoat,
+        }
+        return tuple(name for name, applies in needed.items() if applies)
+
+    def coefficients(self, group: str, p: Any, e: Effects) -> dict:
+        """The coefficients of one group."""
+        return getattr(self, f"_{group}")(p, e)
+
+    # -- the material -----------------------------------------------------------------------------------------------
+
+    def _ggx(self, p, e: Effects) -> dict:
+        """See :func:`ggx_coefficients`."""
+        if not e.anisotropic:
+            return ggx_coefficients(dr.maximum(dr.square(p.roughness), model.ALPHA_MIN))
+        return ggx_coefficients(*model.roughness_to_alpha(p.roughness, p.anisotropic))
+
+    def _diffuse(self, p, e: Effects) -> dict:
+        albedo = p.albedo * dr.inv_pi
+        return {"albedo": albedo * (1 - p.metallic) if e.metal else albedo}
+
+    def _retro(self, p, e: Effects) -> dict:
+        return {"roughness": p.roughness}
+
+    def _flatness(self, p, e: Effects) -> dict:
+        return {"flatness": p.flatness}
+
+    def _sheen(self, p, e: Effects) -> dict:
+        strength = p.sheen * (1 - p.metallic) if e.metal else p.sheen
+        return {"colour": strength * _mix_tint(p, p.sheen_tint) if e.sheen_tint else strength}
+
+    def _f0(self, p, e: Effects) -> dict:
+        f0 = 0
+        if e.dielectric:
+            f0 = SPECULAR_SCALE * p.specular
+            f0 = f0 * (1 - p.metallic) if e.metal else f0
+            f0 = f0 * _mix_tint(p, p.spec_tint) if e.spec_tint else f0
+        if e.metal:
+            f0 = p.albedo * p.metallic + f0
+        return {"f0": f0}
+
+    def _coat(self, p, e: Effects) -> dict:
+        """``GTR1 = scale |h|² / (sin² + α² cos²)``, the scale with the lobe's strength; ``log`` is for sampling."""
+        a2 = dr.square(model.coat_alpha(p.clearcoat_gloss))
+        log = dr.log(a2)
+        norm = (a2 - 1) / (dr.pi * log)
+        return {"a2": a2, "log": log, "norm": norm, "scale": COAT_STRENGTH * p.clearcoat * norm}
+
+    def _shares(self, p, e: Effects) -> dict:
+        """What :func:`.sampling.lobe_probabilities` needs: how much energy a lobe has, for any direction."""
+        shares = {}
+        dielectric = (1 - p.metallic) if e.metal else 1
+        if "diffuse" in e.lobes:
+            shares["diffuse"] = dielectric * p.luminance
+            if e.sheen:
+                shares["sheen"] = dielectric * p.sheen
+        f0 = 0
+        if e.dielectric:
+            f0 = dielectric * (SPECULAR_SCALE * p.specular)
+        if e.metal:
+            f0 = p.luminance * p.metallic + f0
+        shares["f0"] = f0
+        if e.clearcoat:
+            shares["clearcoat"] = p.clearcoat
+        return shares
+
+    # -- directions -------------------------------------------------------------------------------------------------
+
+    def value(self, c: dict, e: Effects, lobes, p, wi, wo, active=True):
+        """
+        BRDF · ``wo.z`` of the lobes named in ``lobes``: a colour, or a number where it has no hue. ``p`` is not used
+        here, but by forms that read tables at parameters.
+        """
+        g = geometry(wi, wo)
+        total = 0
+        if e.sheen or "specular" in lobes or "clearcoat" in lobes:
+            s = self.fresnel(g.cos_d, active)
+        if "diffuse" in lobes:
+            if e.diffuse or e.subsurface:
+                total = c["diffuse"]["albedo"] * self.diffuse(c, e, g, wi, wo, active)
+            if e.sheen:
+                total = c["sheen"]["colour"] * (s * wo.z) + total
+        if "specular" in lobes:
+            colour = dr.fma(c["f0"]["f0"], 1 - s, s) if "f0" in c else s
+            total = colour * self.specular(c, e, g, wi, wo, active) + total
+        if "clearcoat" in lobes and e.clearcoat:
+            total = self.clearcoat(c, e, g, s, wi, wo, active) + total
+        return total
+
+    def diffuse(self, c, e: Effects, g, wi, wo, active):
+        """Base diffuse and subsurface approximation, mixed by flatness, times ``π wo.z``."""
+        fl, fv = self.fresnel(wo.z, active), self.fresnel(wi.z, active)
+        # (l·h)² = |h|²/4 without a root; the ratio is only needed for subsurface scattering
+        ratio = wo.z / (wi.z + wo.z + TINY) if e.subsurface else 0
+        base, flat = diffuse_factors(c["retro"]["roughness"], 0.25 * g.h2, fl + fv, fl * fv, ratio, wo.z)
+        if not e.subsurface:
+            return base
+        return dr.lerp(base, flat, c["flatness"]["flatness"]) if e.diffuse else flat
+
+    def specular(self, c, e: Effects, g, wi, wo, active):
+        """``D G wo.z / (4 (n·l)(n·v))``."""
+        return (
+            dr.square(g.h2 / (quadric(self.ggx(c)["q"], g) + TINY))
+            * wo.z
+            / (self.masking(c, wi, active) * self.masking(c, wo, active))
+        )
+
+    def clearcoat(self, c, e: Effects, g, s, wi, wo, active):
+        """The clearcoat lobe with its strength, times ``wo.z``."""
+        masked, denominator = self.coat_masking(wi.z, wo.z, active)
+        fresnel = dr.fma(1 - COAT_F0, s, COAT_F0)
+        coat = self.coat(c)
+        return coat["scale"] * g.h2 * fresnel * wo.z * masked / (coat_quadric(coat["a2"], g) * denominator)
+
+    # -- what tables may replace ------------------------------------------------------------------------------------
+
+    def ggx(self, c):
+        """The specular lobe's coefficients, see :func:`ggx_coefficients`."""
+        return c["ggx"]
+
+    def coat(self, c):
+        """``a2`` and ``scale`` of the clearcoat's GTR1."""
+        return c["coat"]
+
+    def fresnel(self, cosine, active=True):
+        """Schlick's ``(1 − cosine)^5``."""
+        return schlick(cosine)
+
+    def masking(self, c, w, active=True):
+        """:func:`.model.masking_denominator` of one direction."""
+        return masking(self.ggx(c)["alpha2"], w)
+
+    def coat_masking(self, cos_i, cos_o, active=True):
+        """Numerator and denominator of Smith's masking of the clearcoat for both directions."""
+        return 4 * cos_i * cos_o, coat_masking_denominator(cos_i) * coat_masking_denominator(cos_o)
+
+
+def ggx_coefficients(ax, ay=None) -> dict:
+    """
+    α, its square for masking, and ``q`` with ``D = (|h|² / Σ q_k h_k²)²``: a sum of positive terms, in which nothing
+    cancels at the peak and nothing overflows at roughness 0. Without ``ay``, those of an isotropic distribution.
+    """
+    if ay is None:
+        root = math.sqrt(math.pi)
+        return {"alpha": (ax, ax), "alpha2": (dr.square(ax),), "q": (root / ax, root * ax)}
+    norm = dr.sqrt(dr.pi * ax * ay)
+    ax2, ay2 = dr.square(ax), dr.square(ay)
+    return {"alpha": (ax, ay), "alpha2": (ax2, ay2), "q": (norm / ax2, norm / ay2, norm)}
+
+
+def quadric(q, g):
+    """``Σ q_k h_k²``, with two coefficients for the isotropic form."""
+    if len(q) == 2:
+        return dr.fma(q[0], dr.square(g.h.x) + dr.square(g.h.y), q[1] * dr.square(g.h.z))
+    return dr.fma(q[0], dr.square(g.h.x), dr.fma(q[1], dr.square(g.h.y), q[2] * dr.square(g.h.z)))
+
+
+def stretched(alpha2, w):
+    """``α_x² x² + α_y² y²`` of a direction, from α² once or for each axis."""
+    if len(alpha2) == 1:
+        return alpha2[0] * (dr.square(w.x) + dr.square(w.y))
+    return dr.fma(alpha2[0], dr.square(w.x), alpha2[1] * dr.square(w.y))
+
+
+def masking(alpha2, w):
+    """:func:`.model.masking_denominator` from α², once or for each axis."""
+    return w.z + dr.sqrt(dr.fma(w.z, w.z, stretched(alpha2, w)))
+
+
+def coat_quadric(a2, g):
+    """``sin² + α² cos²`` of the half vector, times its squared length."""
+    return dr.fma(a2, dr.square(g.h.z), dr.square(g.h.x) + dr.square(g.h.y)) + TINY
+
+
+def coat_masking_denominator(cosine):
+    """``c + √(α² + (1 − α²) c²)``: the clearcoat's G₁ is ``2c`` over it."""
+    a2 = model.COAT_MASKING_ALPHA**2
+    return cosine + dr.sqrt(dr.fma(1 - a2, dr.square(cosine), a2))
+
+
+def _mix_tint(p, amount):
+    return dr.fma(amount, model.tint(p.albedo, p.luminance) - 1, 1)

@@ -1,0 +1,96 @@
+"""
+Which parts of the Disney BRDF a material makes use of, found from what is known about its parameters before anything
+is rendered. What is not in use need not be traced, read or sampled; that this changes nothing is a property of the
+model: each part below has a factor that is exactly 0 for every value the parameter can take.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from .model import PARAMETERS
+
+
+@dataclass(frozen=True)
+class Known:
+    """
+    What is known about a parameter: its values lie in ``[low, high]``; ``optimised`` says that a derivative with
+    respect to it is asked for, and that it may take any value. ``grey``: its channels are equal, if it is a colour.
+    """
+
+    low: float = 0.0
+    high: float = 1.0
+    optimised: bool = False
+    grey: bool = False
+
+    def is_always(self, value: float) -> bool:
+        """Is the parameter this constant, and meant to stay so?"""
+        return self.low == self.high == value and not self.optimised
+
+
+@dataclass(frozen=True)
+class Effects:
+    """
+    The parts of the model in use.
+
+    ``diffuse``: Burley's base diffuse; ``subsurface``: its Hanrahan–Krueger-like alternative; ``sheen``, and
+    ``sheen_tint``, its tint; ``metal``: reflection coloured by the albedo; ``dielectric``: colourless reflection at
+    normal incidence, and ``spec_tint``, its tint; ``anisotropic``: a stretched highlight; ``clearcoat``.
+
+    The specular lobe's reflection towards grazing angles (Schlick's ``(1 − l·h)^5``) is always in use.
+    """
+
+    diffuse: bool = True
+    subsurface: bool = True
+    sheen: bool = True
+    sheen_tint: bool = True
+    metal: bool = True
+    dielectric: bool = True
+    spec_tint: bool = True
+    anisotropic: bool = True
+    clearcoat: bool = True
+
+    @property
+    def lobes(self) -> tuple[str, ...]:
+        """The lobes (components of the BSDF) in use, in the order of :data:`.model.LOBES`."""
+        diffuse = ("diffuse",) if self.diffuse or self.subsurface or self.sheen else ()
+        return (*diffuse, "specular", *(("clearcoat",) if self.clearcoat else ()))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the parts in use."""
+        return tuple(f.name for f in fields(self) if getattr(self, f.name))
+
+
+def find_effects(known: dict[str, Known]) -> tuple[Effects, dict[str, str]]:
+    """
+    The effects in use, and for each of the others the reason why it is not, in words.
+
+    ``known`` maps ``base_color`` and the names of :data:`.model.PARAMETERS` to what is known; a missing one may be
+    anything. Parameters that are being optimised keep their effect, and its derivative, whatever their value.
+    """
+    k = {name: known.get(name, Known()) for name in ("base_color", *PARAMETERS)}
+    reasons: dict[str, str] = {}
+
+    def unless(effect: str, *causes: tuple[bool, str]) -> None:
+        for applies, reason in causes:
+            if applies:
+                reasons.setdefault(effect, reason)
+
+    all_metal = (k["metallic"].is_always(1), "metallic is 1")
+    black = (k["base_color"].is_always(0), "base_color is black")
+    grey = (k["base_color"].grey and not k["base_color"].optimised, "base_color has no hue")
+
+    def zero(name: str) -> tuple[bool, str]:
+        return k[name].is_always(0), f"{name} is 0"
+
+    unless("diffuse", all_metal, black, (k["flatness"].is_always(1), "flatness is 1"))
+    unless("subsurface", zero("flatness"), all_metal, black)
+    unless("sheen", zero("sheen"), all_metal)
+    unless("metal", zero("metallic"))
+    unless("dielectric", zero("specular"), all_metal)
+    unless("anisotropic", zero("anisotropic"))
+    unless("clearcoat", zero("clearcoat"))
+    unless("sheen_tint", zero("sheen_tint"), ("sheen" in reasons, "no sheen to tint"), grey)
+    unless("spec_tint", zero("spec_tint"), ("dielectric" in reasons, "no dielectric reflection to tint"), grey)
+    return Effects(**{f.name: f.name not in reasons for f in fields(Effects)}), reasons
