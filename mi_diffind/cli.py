@@ -1,5 +1,5 @@
 """
-``mi-diffind``: render, compare, inspect, fit.
+``mi-diffind``: render, compare, regress, inspect, fit, tradeoff.
 
 Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
 """
@@ -7,6 +7,7 @@ Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import os
 import sys
@@ -37,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
         result = arguments.run(arguments)
         if arguments.json is not None:
             write_json(arguments.json, result)
-        return 130 if result.get("interrupted") else 0
+        return 130 if result.get("interrupted") else 1 if result.get("failed") else 0
     except (UsageError, OutputError, TableError, FittingError, SceneError) as e:
         print(f"mi-diffind: error: {e}", file=sys.stderr)
         return 2
@@ -79,6 +80,20 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("render", _render, "render a scene that names learned plugins")
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("-o", "--output", metavar="FILE", help="image, .exr or .png (default: SCENE.exr)")
+    sub.add_argument(
+        "--depth",
+        type=_depth,
+        default="scene",
+        metavar="auto|N|scene",
+        help="longest path, counted as max_depth: the scene's (default), N, or measured: where a probe finds the rest "
+        "below a tolerance",
+    )
+    sub.add_argument(
+        "--depth-tolerance",
+        type=_fraction,
+        metavar="T",
+        help="part of the scattered light that --depth auto may leave out (default: 0.005)",
+    )
     scene_options(sub)
 
     sub = command("compare", _compare, "render a scene as written and with exact plugins, and show the difference")
@@ -87,14 +102,32 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--passes", type=_positive, default=5, help="passes to split the samples into (default: 5)")
     scene_options(sub)
 
+    sub = command("regress", _regress, "check that scenes render as their stored references do")
+    sub.add_argument("scenes", nargs="+", metavar="SCENE.xml")
+    sub.add_argument("--update", action="store_true", help="render the references again and store them")
+    sub.add_argument(
+        "--references", metavar="DIR", help='folder of the references (default: "references" by the scene)'
+    )
+    sub.add_argument("--out", default="out", metavar="DIR", help="folder for what a failed check saw (default: out)")
+    sub.add_argument("--spp", type=_positive, help="samples per pixel of a check (default: the reference's)")
+    sub.add_argument("--seed", type=_natural, help="seed of the random numbers (default: 0; --update: the reference's)")
+    scene_options(sub, rendering=False)
+
     sub = command("inspect", _inspect, "say what is in a table file, or which learned plugins a scene uses")
     sub.add_argument("file", metavar="FILE.npz|SCENE.xml")
     sub.add_argument("--measure", action="store_true", help="measure the accuracy of tables in each storage form")
     scene_options(sub, rendering=False)
 
+    sub = command("tradeoff", _tradeoff, "measure time against accuracy of all forms of a task")
+    sub.add_argument("task", choices=["disney"])
+    sub.add_argument("--out", default="out", metavar="DIR", help="folder for table and plot (default: out)")
+    sub.add_argument("--quick", action="store_true", help="smoke run: less of everything, times not to be quoted")
+    sub.add_argument("--variant", help="Mitsuba variant (default: cuda_ad_rgb with a GPU, else llvm_ad_rgb)")
+
     sub = command("fit", _fit, "train tables")
     sub.add_argument("task", choices=["disney"])
     sub.add_argument("-o", "--output", required=True, metavar="FILE.npz", help="table file to write")
+    sub.add_argument("--quality", choices=["tables", "paper"], default="tables", help="layout (default: tables)")
     sub.add_argument("--storage", choices=STORAGES, default="float32", help="storage form (default: float32)")
     sub.add_argument("--backend", choices=["llvm", "cuda"], help="where to train (default: the GPU if there is one)")
     default = DEFAULT_SETTINGS
@@ -123,6 +156,25 @@ def _natural(text: str) -> int:
         value = -1
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is not a whole number ≥ 0")
+    return value
+
+
+def _depth(text: str) -> int | str:
+    if text in ("auto", "scene"):
+        return text
+    try:
+        return _positive(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"found {text}, allowed are auto, scene and whole numbers ≥ 1") from None
+
+
+def _fraction(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1:
+        raise argparse.ArgumentTypeError(f"found {text}, allowed is more than 0 and less than 1")
     return value
 
 
@@ -155,19 +207,21 @@ def _defines(arguments) -> dict[str, str]:
     return result
 
 
-def _require_scene(arguments) -> None:
+def _require_scene(path: str) -> None:
     """Before an output folder is made."""
-    if not Path(arguments.scene).is_file():
-        raise UsageError(f"{arguments.scene}: no such scene file")
+    if not Path(path).is_file():
+        raise UsageError(f"{path}: no such scene file")
 
 
 def _render(arguments) -> dict:
     from tqdm import tqdm
 
-    _require_scene(arguments)
+    _require_scene(arguments.scene)
     output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
     if output.suffix.lower() not in (".exr", ".png"):
         raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are .exr and .png')
+    if arguments.depth_tolerance is not None and arguments.depth != "auto":
+        raise UsageError("--depth-tolerance needs --depth auto")
     writable_file(output)
     _set_variant(arguments.variant)
     import mitsuba as mi
@@ -175,9 +229,11 @@ def _render(arguments) -> dict:
     from . import scenes
 
     defines = _defines(arguments)
+    depth = _choose_depth(arguments, defines)
     start = time.perf_counter()
-    learned = scenes.learned_plugins(arguments.scene, **defines)
-    scene = scenes.load(arguments.scene, **defines)
+    learned = scenes.learned_plugins(arguments.scene, defines=defines)
+    changed = depth["chosen"] != depth["scene"]
+    scene = scenes.load(arguments.scene, longest_path=depth["chosen"] if changed else None, defines=defines)
     loaded = time.perf_counter()
     spp = arguments.spp or scene.sensors()[0].sampler().sample_count()
     passes = max(1, spp // 16)
@@ -198,26 +254,87 @@ def _render(arguments) -> dict:
         "height": image.shape[0],
         "spp": done,
         "seed": arguments.seed,
+        "depth": depth,
         "seconds_load": loaded - start,
         "seconds_render": rendered - loaded,
         "learned_plugins": learned,
+        "learned_materials": scenes.reports(scene),
         "table_bytes": scenes.table_bytes(arguments.scene, learned),
     }
 
 
+def _choose_depth(arguments, defines: dict[str, str]) -> dict:
+    """The depth to render to, and why; what was not measured is None."""
+    from . import scenes, transport
+
+    if arguments.depth == "auto":
+        tolerance = arguments.depth_tolerance or transport.TOLERANCE
+        found = transport.auto_depth(arguments.scene, tolerance, arguments.seed, defines=defines)
+        print("\n".join(transport.summary(found)))
+        return {"requested": "auto", **found}
+    own = None
+    with contextlib.suppress(scenes.SceneError):  # no integrator with a depth: fine, unless one is asked for
+        own = scenes.integrator_of(arguments.scene, defines=defines)[1]
+    chosen = own if arguments.depth == "scene" else arguments.depth
+    unknown = ("tolerance", "shares", "left_out", "left_out_in_a_tile", "probe_seconds")
+    return {"requested": arguments.depth, "chosen": chosen, "scene": own, **dict.fromkeys(unknown)}
+
+
 def _compare(arguments) -> dict:
-    _require_scene(arguments)
+    _require_scene(arguments.scene)
     writable_folder(arguments.out, create=True)
     _set_variant(arguments.variant)
     from . import compare
 
     comparison = compare.compare(
-        arguments.scene, arguments.spp, arguments.seed, arguments.passes, **_defines(arguments)
+        arguments.scene, arguments.spp, arguments.seed, arguments.passes, defines=_defines(arguments)
     )
     paths = compare.write(comparison, arguments.out)
     print("\n".join(compare.summary(comparison.figures)))
     print(f"picture     {paths['figure']}")
     return {**comparison.figures, "files": paths}
+
+
+def _regress(arguments) -> dict:
+    for path in arguments.scenes:
+        _require_scene(path)
+    stems = [Path(path).stem for path in arguments.scenes]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise UsageError(f'{len(stems)} scenes, and more than one is called "{stem}": check them one at a time')
+    _set_variant(arguments.variant)
+    from . import regress
+
+    defines, results = _defines(arguments), []
+    options = {"spp": arguments.spp, "seed": arguments.seed, "defines": defines}
+    if arguments.update:
+        for path in arguments.scenes:
+            results.append(regress.update_reference(path, arguments.references, **options))
+            if results[-1]["interrupted"]:
+                break
+            print(
+                "{reference}: {width} x {height}, {spp} spp, {bytes:,} bytes; unchanged, {failing_pixels} of its pixels "
+                "fail at {budget} spp".format(**results[-1])
+            )
+    else:
+        out = Path(arguments.out)
+        writable_folder(out if out.exists() else out.parent)
+        options["seed"] = arguments.seed or 0
+        for path in arguments.scenes:  # before the first is rendered
+            regress.read_reference(path, arguments.references)
+        try:
+            for path in arguments.scenes:
+                results.append(regress.regress(path, arguments.references, out, **options))
+                if results[-1]["interrupted"]:
+                    break
+        finally:
+            if results:
+                print("\n".join(regress.summary(results)))
+    return {
+        "interrupted": results[-1]["interrupted"],
+        "failed": sum(r.get("passed") is False for r in results),
+        "scenes": results,
+    }
 
 
 def _inspect(arguments) -> dict:
@@ -269,18 +386,19 @@ def _inspect(arguments) -> dict:
 
 def _measure(file: str, table) -> dict:
     """Accuracy over random directions and materials, for each storage form and distribution of the materials."""
-    from .tasks.disney.arrays import TASK, DisneyArrays, load_disney_table
+    from .tasks.disney.arrays import TASK
+    from .tasks.disney.library import decoder_of, load_disney_table
     from .tasks.disney.training import measure
 
     if table.task != TASK:
         raise UsageError(f'{file}: holds tables for the task "{table.task}", which cannot be measured')
-    table, types, result = load_disney_table(file), runtime.array_module(), {}
+    (table, layout), types, result = load_disney_table(file), runtime.array_module(), {}
     for storage in STORAGES:
         form = table.to(storage)
-        net = DisneyArrays.from_table(table, types.TensorXf, storage)
+        net = layout.from_table(table, types.TensorXf, storage)
         result[storage] = {"bytes": form.nbytes, "memory_bytes": net.memory_nbytes}
         for distribution in ("training", "uniform"):
-            result[storage][distribution] = found = measure(net, types, distribution=distribution)
+            result[storage][distribution] = found = measure(decoder_of(net), types, distribution=distribution)
             print(
                 f"  {storage:8} {form.nbytes:6,} bytes ({net.memory_nbytes:,} in memory), {distribution:8} materials: "
                 f"BRDF x cosine {found['psnr_db']:.2f} dB, BRDF {found['psnr_brdf_db']:.2f} dB"
@@ -290,21 +408,59 @@ def _measure(file: str, table) -> dict:
 
 def _inspect_scene(arguments) -> dict:
     _set_variant(arguments.variant)
-    from . import scenes
+    from . import operations, scenes
 
-    learned = scenes.learned_plugins(arguments.file, **_defines(arguments))
+    defines = _defines(arguments)
+    learned = scenes.learned_plugins(arguments.file, defines=defines)
     tables = scenes.tables_of(arguments.file, learned)
+    materials = []
+    for material in scenes.learned_materials(scenes.load(arguments.file, defines=defines)):
+        counts = {m: n.asdict() for m, n in operations.bsdf_operations(material).items()}
+        materials.append({"id": material.id(), **material.report(), "operations": counts})
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned material(s), {total:,} bytes of tables in {len(tables)} file(s)")
-    for entry in learned:
-        given = ", ".join(f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in entry["parameters"].items())
-        print(f"  {entry['id'] or '(no id)'} ({entry['plugin']}): {given or 'defaults'}")
+    given = {entry["id"]: entry["parameters"] for entry in learned}
+    for material in materials:
+        parameters = given.get(material["id"]) or {}
+        parameters = ", ".join(f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in parameters.items())
+        stored = f", {material['table_bytes']:,} bytes as {material['storage']}" if material["storage"] else ""
+        print(f"  {material['id'] or '(no id)'}: {parameters or 'defaults'}")
+        print(f"    quality   {material['quality']}{stored}")
+        print(f"    in use    {', '.join(material['effects_in_use']) or 'grazing reflection only'}")
+        left_out = ", ".join(f"{k} ({v})" for k, v in material["effects_left_out"].items())
+        print(f"    left out  {left_out or 'nothing'}")
+        for method, n in material["operations"].items():
+            print(
+                f"    {method:9} {n['gathers']} reads of {n['bytes_gathered']} bytes, {n['flops']} flops "
+                f"({n['add']} add, {n['mul']} mul, {n['div']} div, {n['sqrt']} sqrt), {n['instructions']} instructions"
+            )
     return {
         "file": arguments.file,
         "learned_plugins": learned,
+        "learned_materials": materials,
         "table_bytes": total,
         "tables": [{"file": f, "storage": s, "bytes": t.nbytes} for (f, s), t in tables.items()],
     }
+
+
+def _tradeoff(arguments) -> dict:
+    writable_folder(arguments.out, create=True)
+    _set_variant(arguments.variant)
+    import importlib
+
+    import mitsuba as mi
+
+    from . import plugins, tradeoff
+
+    if not plugins.supported(mi.variant()):
+        usable = ", ".join(v for v in mi.variants() if plugins.supported(v))
+        raise UsageError(f'the plugins do not run in the variant "{mi.variant()}"; use one of {usable}')
+    study = importlib.import_module(f".tradeoffs.{arguments.task}", __package__).study(arguments.quick)
+    result = tradeoff.measure(study, tradeoff.Settings.choose(mi.variant(), arguments.quick), arguments.out)
+    paths = tradeoff.write(result, arguments.out)
+    print("\n".join(tradeoff.summary(result)))
+    print("\nwritten     " + ", ".join(paths.values()))
+    return {**tradeoff.finite(result), "files": paths}
 
 
 def _fit(arguments) -> dict:
@@ -322,7 +478,12 @@ def _fit(arguments) -> dict:
     settings = dataclasses.replace(DEFAULT_SETTINGS, deterministic=not arguments.all_cores, **given)
     try:
         table, result = fit_disney(
-            settings, arguments.backend, arguments.storage, arguments.checkpoint, arguments.resume
+            settings,
+            arguments.backend,
+            arguments.quality,
+            arguments.storage,
+            arguments.checkpoint,
+            arguments.resume,
         )
     except RuntimeError as e:
         raise FittingError(str(e)) from e

@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from . import metrics, plugins, scenes
-from .files import replacing, writable_folder
+from . import metrics, plugins, scenes, sheet
+from .files import writable_folder
 from .interrupt import interruptible
 
 
@@ -34,7 +34,7 @@ def compare(
     seed: int = 0,
     passes: int = 5,
     progress: bool = True,
-    **defines: str,
+    defines: dict[str, str] | None = None,
 ) -> Comparison:
     """
     Render ``path`` as written and exact, in turn, pass by pass, with the same random numbers.
@@ -46,11 +46,11 @@ def compare(
 
     Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no learned plugin.
     """
-    learned = scenes.learned_plugins(path, **defines)
+    learned = scenes.learned_plugins(path, defines=defines)
     if not learned:
         names = ", ".join(plugins.EXACT_COUNTERPARTS)
         raise scenes.SceneError(f"{path}: names no learned plugin ({names}), so there is nothing to compare")
-    loaded = {"written": scenes.load(path, **defines), "exact": scenes.load(path, exact=True, **defines)}
+    loaded = {"written": scenes.load(path, defines=defines), "exact": scenes.load(path, exact=True, defines=defines)}
     spp = spp or loaded["written"].sensors()[0].sampler().sample_count()
     passes = max(1, min(passes, spp))
     images, seconds, done = {}, {name: [] for name in loaded}, 0
@@ -115,36 +115,16 @@ def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
 
 def figure(comparison: Comparison, path: str | os.PathLike) -> None:
     """One picture to judge at a glance: as written, exact, error map with a colour bar, numbers."""
-    from matplotlib.figure import Figure
-
-    f = comparison.figures
     error = np.abs(comparison.written - comparison.exact).mean(axis=-1)
-    height, width = error.shape
-    sheet = Figure(figsize=(14, 14 * height / width + 0.7), dpi=110, layout="constrained")
-    axes = sheet.subplots(2, 2)
-    for ax, image, title in (
-        (axes[0, 0], comparison.written, "as written (learned tables)"),
-        (axes[0, 1], comparison.exact, "exact"),
-    ):
-        ax.imshow(metrics.srgb(image))
-        ax.set_title(title)
     top = max(float(np.quantile(error, 0.995)), 1e-6)
-    shown = axes[1, 0].imshow(error, cmap="magma", vmin=0, vmax=top)
-    axes[1, 0].set_title("absolute difference, mean of the channels (linear)")
-    sheet.colorbar(shown, ax=axes[1, 0], extend="max", shrink=0.9)
-    for ax in axes.flat:
-        ax.set_axis_off()
-    axes[1, 1].text(
-        0.02,
-        0.95,
-        "\n".join(summary(f)),
-        va="top",
-        family="monospace",
-        fontsize=12,
-        transform=axes[1, 1].transAxes,
-    )
-    with replacing(path) as temporary:
-        sheet.savefig(temporary, format=Path(path).suffix[1:])
+    title = "absolute difference, mean of the channels (linear)"
+    cells = [
+        sheet.picture("as written (learned tables)", comparison.written),
+        sheet.picture("exact", comparison.exact),
+        sheet.colour_map(title, error, "max", cmap="magma", vmin=0, vmax=top),
+        sheet.text(summary(comparison.figures)),
+    ]
+    sheet.write(path, cells, 2, error.shape)
 
 
 def summary(f: dict) -> list[str]:

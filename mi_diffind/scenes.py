@@ -19,25 +19,38 @@ import numpy as np
 
 from . import plugins
 from .files import replacing
-from .tasks.disney.arrays import load_disney_table
-from .tasks.disney.library import SHIPPED
+from .tasks.disney.library import load_disney_table, table_file
+
+#: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
+MAX_DEPTHS = {
+    **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer"), -1),
+    **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
+}
 
 
 class SceneError(RuntimeError):
     """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
 
 
-def load(path: str | os.PathLike, exact: bool = False, **defines: str):
+def load(
+    path: str | os.PathLike,
+    exact: bool = False,
+    longest_path: int | None = None,
+    defines: dict[str, str] | None = None,
+):
     """
     Load a scene as ``mi.load_file`` does; with ``exact``, every learned plugin is replaced by its exact counterpart.
 
-    ``defines`` replace the scene's ``<default>`` values. Raises :class:`SceneError`.
+    ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
+    infinite), and ``defines`` (name → value) the scene's ``<default>`` values. Raises :class:`SceneError`.
     """
-    with _scene_errors(path), _resolving(path):
+    with scene_errors(path), _resolving(path):
         config = mi.parser.ParserConfig(mi.variant())
         state = _parse(config, path, defines)
         if exact:
             swap_exact(state)
+        if longest_path is not None:
+            _path_integrator(state)["max_depth"] = longest_path
         mi.parser.transform_all(config, state)
         loaded = mi.parser.instantiate(config, state)
         if not isinstance(loaded, mi.Scene):
@@ -61,13 +74,25 @@ def swap_exact(state) -> int:
     return count
 
 
-def learned_plugins(path: str | os.PathLike, **defines: str) -> list[dict]:
+def integrator_of(path: str | os.PathLike, defines: dict[str, str] | None = None) -> tuple[str, int]:
+    """
+    The integrator that follows the scene's paths (others, like ``aov``, may contain it) and its ``max_depth``.
+
+    Raises :class:`SceneError`, also if there is none of :data:`MAX_DEPTHS`, or more than one.
+    """
+    with scene_errors(path), _resolving(path):
+        props = _path_integrator(_parse(mi.parser.ParserConfig(mi.variant()), path, defines))
+        name = props.plugin_name()
+        return name, int(props.get("max_depth", MAX_DEPTHS[name]))
+
+
+def learned_plugins(path: str | os.PathLike, defines: dict[str, str] | None = None) -> list[dict]:
     """
     The learned plugins that a scene file names: ``plugin``, ``id``, ``parameters`` (constants as numbers, textures as
     ``"texture"``), ``filename`` and ``storage`` of its tables. Raises :class:`SceneError`.
     """
     found = []
-    with _scene_errors(path), _resolving(path):
+    with scene_errors(path), _resolving(path):
         state = _parse(mi.parser.ParserConfig(mi.variant()), path, defines)
         for node in state.nodes:
             props = node.props
@@ -84,6 +109,23 @@ def learned_plugins(path: str | os.PathLike, **defines: str) -> list[dict]:
     return found
 
 
+def learned_materials(scene) -> list:
+    """The instances of learned BSDFs in a loaded scene, wherever they hide (in a ``twosided``, a ``bumpmap``, …)."""
+    found = {}
+    for _, _, node, *_ in mi.traverse(scene).properties.values():
+        if isinstance(node, mi.BSDF) and hasattr(node, "report"):
+            found[id(node)] = node
+    return list(found.values())
+
+
+def reports(scene) -> list[dict]:
+    """
+    For each learned material of a loaded scene, what it does: its ``id``, ``quality``, ``effects_in_use``,
+    ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage`` and ``table_bytes``.
+    """
+    return [{"id": material.id(), **material.report()} for material in learned_materials(scene)]
+
+
 def table_bytes(scene: str | os.PathLike, learned: list[dict]) -> int:
     """Bytes of all distinct tables that the learned plugins of a scene read, in their storage forms."""
     return sum(table.nbytes for table in tables_of(scene, learned).values())
@@ -94,9 +136,9 @@ def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, 
     found = {}
     for entry in learned:
         name, storage = entry.get("filename", ""), entry.get("storage", "")
-        file = SHIPPED if not name else Path(scene).resolve().parent / name
-        if (str(file), storage) not in found:
-            table = load_disney_table(file)
+        file = table_file(name and Path(scene).resolve().parent / name, entry.get("quality", ""))
+        if file is not None and (str(file), storage) not in found:
+            table, _ = load_disney_table(file)
             found[str(file), storage] = table.to(storage or table.storage)
     return found
 
@@ -123,8 +165,7 @@ def render(
     for i in range(passes):
         n = (i + 1) * spp // passes - done
         start = time.perf_counter()
-        with _scene_errors(None):
-            image = image + n * mi.render(scene, spp=n, seed=((seed << 16) + i) % 2**32).numpy().astype(np.float64)
+        image = image + n * render_pass(scene, n, (seed << 16) + i)
         seconds.append(time.perf_counter() - start)
         done += n
         if on_pass is not None:
@@ -132,6 +173,12 @@ def render(
         if stop is not None and stop.is_set():
             break
     return (image / done).astype(np.float32), seconds
+
+
+def render_pass(scene, spp: int, seed: int) -> np.ndarray:
+    """One pass, ``(height, width, channels)``, float64; ``seed`` is Mitsuba's own, modulo 2³². Raises SceneError."""
+    with scene_errors(None):
+        return mi.render(scene, spp=spp, seed=seed % 2**32).numpy().astype(np.float64)
 
 
 def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
@@ -144,10 +191,19 @@ def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
             mi.util.write_bitmap(str(temporary), bitmap, write_async=False)
 
 
-def _parse(config, path, defines: dict[str, str]):
+def _parse(config, path, defines: dict[str, str] | None):
     if not Path(path).is_file():
         raise RuntimeError(f"{path}: no such scene file")
-    return mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in defines.items()})
+    return mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in (defines or {}).items()})
+
+
+def _path_integrator(state):
+    integrators = [node.props for node in state.nodes if node.type == mi.ObjectType.Integrator]
+    found = [props for props in integrators if props.plugin_name() in MAX_DEPTHS]
+    if len(found) != 1:
+        names = ", ".join(props.plugin_name() for props in integrators) or "none"
+        raise RuntimeError(f"a depth needs one integrator of {', '.join(MAX_DEPTHS)}; found {names}")
+    return found[0]
 
 
 def _constant(props, key: str):
@@ -173,7 +229,7 @@ def _resolving(path):
 
 
 @contextlib.contextmanager
-def _scene_errors(path):
+def scene_errors(path):
     """Turn Mitsuba's nested messages into one sentence."""
     try:
         yield

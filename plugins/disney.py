@@ -252,13 +252,13 @@ class Disney(mi.BSDF):
 
     # -- evaluation -------------------------------------------------------------------------------------------------
 
-    def _rates(self, ctx: mi.BSDFContext) -> dict[str, mi.Float]:
-        """The sampling rates of the lobes that the context asks for; the others are missing."""
+    def _rates(self, ctx: mi.BSDFContext, effects: Effects) -> dict[str, mi.Float]:
+        """The sampling rates of the lobes that are in use and that the context asks for; the others are missing."""
         flags = (mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.GlossyReflection)
         return {
             lobe: model.clamp(self.rates[lobe], 0.0, 1e6)
             for component, (lobe, flag) in enumerate(zip(LOBES, flags, strict=True))
-            if ctx.is_enabled(flag, component)
+            if lobe in effects.lobes and ctx.is_enabled(flag, component)
         }
 
     def _prepare(self, si, wo, active):
@@ -305,29 +305,29 @@ class Disney(mi.BSDF):
         wi, wo, active = self._prepare(si, wo, active)
         effects = self._effects()
         surface = self._surface(si, active, effects, density=False)
-        return self._value(surface, effects, tuple(self._rates(ctx)), wi, wo, active)
+        return self._value(surface, effects, tuple(self._rates(ctx, effects)), wi, wo, active)
 
     def pdf(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(si, wo, active)
         effects = self._effects()
         surface = self._surface(si, active, effects, value=False)
-        return self._density(surface, effects, self._rates(ctx), wi, wo, active)
+        return self._density(surface, effects, self._rates(ctx, effects), wi, wo, active)
 
     def eval_pdf(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(si, wo, active)
         effects = self._effects()
         surface = self._surface(si, active, effects)
-        return self._eval_pdf(surface, effects, self._rates(ctx), wi, wo, active)
+        return self._eval_pdf(surface, effects, self._rates(ctx, effects), wi, wo, active)
 
     def _eval_pdf(self, surface, effects, rates, wi, wo, active):
         value = self._value(surface, effects, tuple(rates), wi, wo, active)
         return value, self._density(surface, effects, rates, wi, wo, active)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
-        rates = self._rates(ctx)
+        effects = self._effects()
+        rates = self._rates(ctx, effects)
         active = active & (si.wi.z > 0)
         wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
-        effects = self._effects()
         surface = self._surface(si, active, effects)
         c = surface[1]
 
@@ -381,8 +381,8 @@ _ANALYTIC = Decoder()
 
 class Parameters:
     """
-    A material's parameters at a surface interaction: ``roughness``, …, ``specular``, and ``albedo``, ``luminance``. Each
-    is read when it is first asked for, so one that nobody asks for is not read.
+    A material's parameters at a surface interaction: ``roughness``, …, ``specular``, and ``albedo``, ``luminance``.
+    Each is read when it is first asked for, so one that nobody asks for is not read.
     """
 
     def __init__(self, bsdf: Disney, si: mi.SurfaceInteraction3f, active: mi.Bool):

@@ -13,16 +13,58 @@ from mi_diffind.tasks.disney.effects import Known
 _WAVELENGTHS = [360.0 + 10 * i for i in range(48)]
 
 
-def values(texture) -> list:
-    """The arrays that a texture (or number) consists of, children included."""
-    if not isinstance(texture, mi.Object):
-        return [texture]
-    parameters = mi.traverse(texture)
-    return [v for v in (parameters[key] for key in parameters.keys()) if isinstance(v, dr.ArrayBase)]
+class Watched:
+    """
+    A parameter of a BSDF, a texture or a number, and what is known about it. ``constant``: it is the same everywhere (a
+    colour in spectral variants is not: it varies with the wavelengths).
+    """
+
+    def __init__(self, texture, colour: bool = False):
+        self.texture, self.colour = texture, colour
+        self.constant = not texture.is_spatially_varying() and not (colour and mi.is_spectral)
+        self._parameters = mi.traverse(texture)
+        self._arrays, self._found = None, Known()
+
+    def _values(self) -> list:
+        """The arrays that the texture consists of at present, children included."""
+        values = (self._parameters[key] for key in self._parameters.keys())
+        return [v for v in values if isinstance(v, dr.ArrayBase)]
+
+    def optimised(self) -> bool:
+        """Is a derivative with respect to it asked for? Also where derivatives are suspended at the moment."""
+        return any(map(has_gradient, self._values()))
+
+    def look(self) -> None:
+        """Find out its bounds, if they are not known or it is not what it was."""
+        values = self._values()
+        if dr.flag(dr.JitFlag.FreezingScope) or any(map(has_gradient, values)):
+            self._arrays, self._found = None, Known()  # values cannot be looked at, or need not
+        elif self._arrays is None or [*map(_identity, self._arrays)] != [*map(_identity, values)]:
+            # The copies keep the arrays alive, so that no other one gets their index
+            self._arrays, self._found = [dr.detach(v) for v in values], bounds(self.texture, self.colour)
+
+    def known(self) -> Known:
+        """What was found when it was last looked at; anything is possible if it is being optimised."""
+        return Known(optimised=True) if self.optimised() else self._found
+
+
+class WatchedNumber(Watched):
+    """A number that is a member of the BSDF itself: ``read`` returns it."""
+
+    def __init__(self, read):
+        self.texture, self.colour, self.constant, self._read = None, False, True, read
+        self._arrays, self._found = None, Known()
+
+    def _values(self) -> list:
+        return [self._read()]
+
+    def look(self) -> None:
+        self.texture = self._read()
+        super().look()
 
 
 def has_gradient(value) -> bool:
-    """Is a derivative with respect to this array asked for? Also where derivatives are suspended at the moment."""
+    """Is a derivative with respect to this array asked for?"""
     if dr.is_tensor_v(value):
         return value.array.index_ad != 0
     if dr.depth_v(value) > 1:
@@ -30,12 +72,12 @@ def has_gradient(value) -> bool:
     return dr.is_diff_v(value) and value.index_ad != 0
 
 
-def identity(value) -> tuple:
+def _identity(value) -> tuple:
     """What tells an array from another one that took its place."""
     if dr.is_tensor_v(value):
-        return identity(value.array)
+        return _identity(value.array)
     if dr.depth_v(value) > 1:
-        return tuple(i for v in value for i in identity(v))
+        return tuple(i for v in value for i in _identity(v))
     return (value.index,) if dr.is_jit_v(value) else (value,)
 
 

@@ -1,16 +1,16 @@
 from __future__ import annotations  # Delayed parsing of type annotations
 
-import dataclasses
-
 import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.tasks.disney import sampling
-from mi_diffind.tasks.disney.effects import Effects, Known, find_effects
+from mi_diffind.tasks.disney.decoder import GROUPS
+from mi_diffind.tasks.disney.effects import Effects, find_effects
 from mi_diffind.tasks.disney.library import load_decoder
 
 from . import knowledge
 from .disney import Disney, Parameters
+from .knowledge import Watched, WatchedNumber
 
 
 class NeuralDisney(Disney):
@@ -67,10 +67,10 @@ class NeuralDisney(Disney):
     analytic, so they stay normalised although tables are approximate.
 
     **Only the effects in use.** A part of the model that the parameters make zero (``clearcoat`` 0, ``metallic`` 1, a
-    black texture, the tint of a grey albedo, …) is neither traced nor read nor sampled. What is in use is found when the
-    scene is loaded and again when parameters change; parameters with gradients enabled always count as in use, and so
-    does a texture whose bounds are not known (constants and bitmaps are). ``mi-diffind inspect SCENE.xml`` lists what was
-    left out, and why. Whatever depends on constant parameters alone is evaluated once, not for each sample.
+    black texture, the tint of a grey albedo, …) is neither traced nor read nor sampled. What is in use is found when
+    the scene is loaded and again when parameters change; parameters with gradients enabled always count as in use, and
+    so does a texture whose bounds are not known (constants and bitmaps are). ``mi-diffind inspect SCENE.xml`` lists what
+    was left out, and why. Whatever depends on constant parameters alone is evaluated once, not for each sample.
 
     .. tabs::
         .. code-tab:: xml
@@ -106,86 +106,66 @@ class NeuralDisney(Disney):
         if self.effects not in ("used", "all"):
             raise RuntimeError(f'parameter "effects": found "{self.effects}", allowed are used, all')
 
-        #: For each parameter: the arrays that it was when it was last looked at, and what was found.
-        self._looked_at: dict[str, tuple[list, Known]] = {}
-        #: Coefficients that depend on constants alone, evaluated; the effects that they are for.
+        #: What is known about the parameters of the model.
+        self._watched = {
+            "base_color": Watched(self.base_color, colour=True),
+            **{name: Watched(texture) for name, texture in self.scalars.items()},
+            "specular": (
+                Watched(self.reflectance)
+                if isinstance(self.reflectance, mi.Texture)
+                else WatchedNumber(lambda: self.reflectance)
+            ),
+        }
+        #: Coefficients that depend on constants alone, evaluated, and the effects that they are for.
         self._constant: dict[str, dict] = {}
-        self._constant_for: tuple | None = None
+        self._constant_for: Effects | None = None
         self._prepare_constants()
 
     # -- effects in use, and what is evaluated once -------------------------------------------------------------------
 
-    def _parameter(self, name: str):
-        """The texture or number behind a parameter of the model."""
-        if name == "base_color":
-            return self.base_color
-        return self.reflectance if name == "specular" else self.scalars[name]
-
-    def _optimised(self, name: str) -> bool:
-        return any(knowledge.has_gradient(v) for v in knowledge.values(self._parameter(name)))
-
-    def _look(self) -> None:
-        """Find out what is not known yet about parameters, or not any more."""
-        for name in ("base_color", *self.scalars, "specular"):
-            arrays = knowledge.values(self._parameter(name))
-            before = self._looked_at.get(name)
-            if before is not None and [*map(knowledge.identity, before[0])] == [*map(knowledge.identity, arrays)]:
-                continue
-            if dr.flag(dr.JitFlag.FreezingScope) or any(map(knowledge.has_gradient, arrays)):
-                self._looked_at.pop(name, None)  # values cannot be looked at, or need not
-            else:
-                # Detached copies keep the arrays alive, so that no other one gets their index
-                self._looked_at[name] = ([dr.detach(v) for v in arrays], knowledge.bounds(self._parameter(name), name == "base_color"))
-
-    def _known(self) -> dict[str, Known]:
-        known = {name: found for name, (_, found) in self._looked_at.items()}
-        for name in ("base_color", *self.scalars, "specular"):
-            if self._optimised(name):
-                known[name] = Known(optimised=True)
-        return known
-
     def _effects(self) -> Effects:
-        return find_effects(self._known())[0] if self.effects == "used" else Effects()
+        if self.effects == "all":
+            return Effects()
+        return find_effects({name: watched.known() for name, watched in self._watched.items()})[0]
+
+    def _is_constant(self, group: str) -> bool:
+        """Does a group of coefficients depend on constants alone, none of which is being optimised?"""
+        watched = [self._watched[name] for name in self.decoder.groups[group]]
+        if not all(w.constant and not w.optimised() for w in watched):
+            return False
+        reads_tables = group not in GROUPS
+        return not (reads_tables and any(knowledge.has_gradient(a.data) for a in self._tables().values()))
 
     def _prepare_constants(self) -> None:
-        """Evaluate every group of coefficients that depends on constants alone."""
-        self._look()
+        """Look at the parameters, and evaluate every group of coefficients that depends on constants alone."""
+        for watched in self._watched.values():
+            watched.look()
         effects = self._effects()
-        constant = {
-            name
-            for name in ("base_color", *self.scalars, "specular")
-            if not (isinstance(self._parameter(name), mi.Texture) and self._parameter(name).is_spatially_varying())
-            and not (name == "base_color" and mi.is_spectral)
-            and not self._optimised(name)
-        }
-        groups = {*self.decoder.required(effects), *sampling.required(effects)}
-        groups = sorted(group for group in groups if constant.issuperset(self.decoder.groups[group]))
+        groups = sorted({*self.decoder.required(effects), *sampling.required(effects)})
         parameters = Parameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
         with dr.suspend_grad():
-            self._constant = {group: self.decoder.coefficients(group, parameters, effects) for group in groups}
+            self._constant = {
+                group: self.decoder.coefficients(group, parameters, effects)
+                for group in groups
+                if self._is_constant(group)
+            }
         dr.make_opaque(self._constant)
         self._constant_for = effects
 
     def _surface(self, si, active, effects, value=True, density=True):
         parameters = Parameters(self, si, active)
-        groups = dict.fromkeys(
-            (*(self.decoder.required(effects) if value else ()), *(sampling.required(effects) if density else ()))
-        )
+        groups = (*(self.decoder.required(effects) if value else ()), *(sampling.required(effects) if density else ()))
+        usable = self._constant if effects == self._constant_for else {}
         coefficients = {}
-        for group in groups:
-            found = self._constant.get(group) if effects == self._constant_for else None
-            # Gradients may have been enabled since
-            if found is None or any(self._optimised(name) for name in self.decoder.groups[group]):
-                found = self.decoder.coefficients(group, parameters, effects)
-            coefficients[group] = found
+        for group in dict.fromkeys(groups):
+            if group in usable and self._is_constant(group):  # gradients may have been enabled since
+                coefficients[group] = usable[group]
+            else:
+                coefficients[group] = self.decoder.coefficients(group, parameters, effects)
         return parameters, coefficients
 
     def _reflected(self, parameters, coefficients, effects, lobes, wi, wo, active):
         return self.decoder.value(coefficients, effects, lobes, parameters, wi, wo, active)
-
-    def _rates(self, ctx):
-        lobes = self._effects().lobes
-        return {lobe: rate for lobe, rate in super()._rates(ctx).items() if lobe in lobes}
 
     # -- parameters -------------------------------------------------------------------------------------------------
 
@@ -216,15 +196,16 @@ class NeuralDisney(Disney):
         What this instance does: ``quality``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
         ``evaluated_once`` (groups of coefficients), ``storage`` and ``table_bytes``.
         """
-        effects = self._effects()
-        reasons = find_effects(self._known())[1] if self.effects == "used" else {}
+        effects, reasons = find_effects({name: watched.known() for name, watched in self._watched.items()})
+        if self.effects == "all":
+            effects, reasons = Effects(), {}
         arrays = self.decoder.arrays
         return {
             "quality": "fast" if arrays is None else arrays.QUALITY,
             "effects_in_use": list(effects.names),
             "effects_left_out": reasons,
             "evaluated_once": sorted(self._constant),
-            "storage": None if arrays is None else next(iter(arrays.SHAPES)) and getattr(arrays, next(iter(arrays.SHAPES))).storage,
+            "storage": None if arrays is None else arrays.storage,
             "table_bytes": 0 if arrays is None else arrays.nbytes,
         }
 

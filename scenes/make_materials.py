@@ -54,6 +54,8 @@ HEADER = """\
     <default name="width" value="960"/>
     <default name="height" value="552"/>
     <default name="max_depth" value="5"/>
+    <default name="quality" value="tables"/>
+    <default name="effects" value="used"/>
 
     <integrator type="path">
         <integer name="max_depth" value="$max_depth"/>
@@ -139,6 +141,8 @@ SPHERE = """
             <translate x="{x:.3f}" y="0.5" z="{z:.3f}"/>
         </transform>
         <bsdf type="neural_disney" id="{name}_{column}">
+            <string name="quality" value="$quality"/>
+            <string name="effects" value="$effects"/>
             <rgb name="base_color" value="{color}"/>
 {parameters}
         </bsdf>

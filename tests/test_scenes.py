@@ -18,23 +18,23 @@ def test_scene_as_written_and_exact(mi_rgb, name):
     """The bound on the approximation: measured at full size 44 to 46 dB for both scenes (README)."""
     from mi_diffind import compare
 
-    result = compare.compare(SCENES / f"{name}.xml", spp=32, passes=2, progress=False, **SMALL)
+    result = compare.compare(SCENES / f"{name}.xml", spp=32, passes=2, progress=False, defines=SMALL)
     assert np.isfinite(result.written).all() and result.written.min() >= 0
     assert result.written.std() > 0.05
     assert not np.array_equal(result.written, result.exact)
     assert result.figures["psnr_db"] > 38
     assert result.figures["flip"] < 0.03
     assert result.figures["learned_plugins"] == (60 if name == "materials" else 9)
-    assert result.figures["table_bytes"] == 12480
+    assert result.figures["table_bytes"] == 3072
 
 
 @pytest.mark.parametrize("name", ["materials", "still_life"])
 def test_exact_scene_names_no_learned_plugin(mi_rgb, name):
     from mi_diffind import scenes
 
-    exact = scenes.load(SCENES / f"{name}.xml", exact=True, **SMALL)
+    exact = scenes.load(SCENES / f"{name}.xml", exact=True, defines=SMALL)
     assert "NeuralDisney" not in str(exact) and "Disney[" in str(exact)
-    written = scenes.load(SCENES / f"{name}.xml", **SMALL)
+    written = scenes.load(SCENES / f"{name}.xml", defines=SMALL)
     assert "NeuralDisney" in str(written)
 
 
@@ -61,7 +61,7 @@ def test_materials_are_what_their_script_writes(tmp_path):
 def test_same_arguments_same_image(mi_rgb):
     from mi_diffind import scenes
 
-    scene = scenes.load(SCENES / "still_life.xml", **SMALL)
+    scene = scenes.load(SCENES / "still_life.xml", defines=SMALL)
     first, second = (scenes.render(scene, 4, seed=5, passes=2)[0] for _ in range(2))
     assert np.array_equal(first, second)
     assert not np.array_equal(first, scenes.render(scene, 4, seed=6, passes=2)[0])
@@ -71,7 +71,7 @@ def test_passes_add_up_to_the_samples(mi_rgb):
     """An average of passes of unequal size is the average of the samples."""
     from mi_diffind import scenes
 
-    scene = scenes.load(SCENES / "still_life.xml", **SMALL)
+    scene = scenes.load(SCENES / "still_life.xml", defines=SMALL)
     image, seconds = scenes.render(scene, 7, passes=3)
     assert len(seconds) == 3
     converged, _ = scenes.render(scene, 64)

@@ -76,6 +76,11 @@ class Arrays(nn.Module):
         return Table(TASK, arrays, "float32", **about).to(storage)
 
     @property
+    def storage(self) -> str:
+        """The storage form of the entries."""
+        return getattr(self, next(iter(self.SHAPES))).storage
+
+    @property
     def nbytes(self) -> int:
         """Bytes of all entries in their storage form."""
         return sum(getattr(self, name).nbytes for name in self.SHAPES)

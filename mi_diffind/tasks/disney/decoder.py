@@ -2,8 +2,8 @@
 The Disney BRDF evaluated in two steps: coefficients that depend on the material alone, and what depends on directions.
 
 :class:`Decoder` is the model of :mod:`.model` rearranged for speed, with the same values up to rounding. Only the parts
-in use (:class:`.effects.Effects`) are computed. Coefficients come in groups (:data:`GROUPS`), each of which depends on a
-few parameters: where these are constant, a caller evaluates the group once and not for each sample.
+in use (:class:`.effects.Effects`) are computed. Coefficients come in groups (:data:`GROUPS`), each of which depends on
+a few parameters: where these are constant, a caller evaluates the group once and not for each sample.
 
 Learned forms replace some of its methods by reads (:class:`.factored.FactoredDecoder`) or all of it
 (:class:`.paper.PaperDecoder`). Sampling and densities (:mod:`.sampling`) always use the analytic coefficients.
@@ -21,7 +21,7 @@ from .effects import Effects
 from .model import COAT_F0, COAT_STRENGTH, SPECULAR_SCALE, TINY, diffuse_factors, geometry, schlick
 
 #: Groups of coefficients → the parameters that they are computed from.
-GROUPS = {  
+GROUPS = {
     "ggx": ("roughness", "anisotropic"),
     "diffuse": ("base_color", "metallic"),
     "retro": ("roughness",),

@@ -64,7 +64,7 @@ def load_arrays(filename: str | os.PathLike, dtype, storage: str = "", quality: 
     path = table_file(filename, quality)
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
     original = _load(path, stamp, dtype, storage)
-    if quality and original.QUALITY != quality:
+    if quality not in ("", original.QUALITY):
         raise TableError(f'{path}: holds tables of the quality "{original.QUALITY}", "{quality}" was asked for')
     arrays = {}
     for name in original.SHAPES:

@@ -153,7 +153,8 @@ def fit_disney(
     """
     problem = DisneyProblem(backend, quality)
     result = fit(problem, settings, checkpoint, resume, progress)
-    table = problem.net.to_table(storage, settings=asdict(settings), seed=settings.seed)
+    about = {**asdict(settings), "quality": quality}
+    table = problem.net.to_table(storage, settings=about, seed=settings.seed)
     stored = type(problem.net).from_table(table, problem.types.TensorXf)
     table.quality = {k: round(v, 4) for k, v in measure(decoder_of(stored), problem.types).items()}
     return table, result
