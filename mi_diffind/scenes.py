@@ -65,6 +65,10 @@ def swap_exact(state) -> int:
         props = node.props
         counterpart = plugins.EXACT_COUNTERPARTS.get(props.plugin_name())
         if counterpart is not None:
+            if "latents" in props:
+                raise RuntimeError(
+                    f'"{props.id()}" has its parameters encoded (latents); its exact counterpart needs the originals'
+                )
             name, learned_only = counterpart
             props.set_plugin_name(name)
             for key in learned_only:

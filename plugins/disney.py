@@ -203,12 +203,17 @@ class Disney(mi.BSDF):
             self.rates[lobe] = mi.Float(rate)
             dr.make_opaque(self.rates[lobe])
 
+        self._set_flags(
+            any(t.is_spatially_varying() for t in self._textures().values()),
+            _bounds(self.scalars["anisotropic"])[1] > 0,
+        )
+
+    def _set_flags(self, varies: bool, is_anisotropic: bool) -> None:
         front = mi.BSDFFlags.FrontSide
-        if any(t.is_spatially_varying() for t in self._textures().values()):
+        if varies:
             front = front | mi.BSDFFlags.SpatiallyVarying
         glossy = mi.BSDFFlags.GlossyReflection | front
         anisotropic = glossy | mi.BSDFFlags.Anisotropic
-        is_anisotropic = _bounds(self.scalars["anisotropic"])[1] > 0
         self.m_components = [
             mi.BSDFFlags.DiffuseReflection | front,
             anisotropic if is_anisotropic else glossy,
@@ -228,7 +233,8 @@ class Disney(mi.BSDF):
         cb.put("base_color", self.base_color, _DIFFERENTIABLE)
         for name, texture in self.scalars.items():
             cb.put(name, texture, _DISCONTINUOUS if name == "roughness" else _DIFFERENTIABLE)
-        cb.put(self.reflectance_name, self.reflectance, _DISCONTINUOUS)
+        if self.reflectance is not None:
+            cb.put(self.reflectance_name, self.reflectance, _DISCONTINUOUS)
         for lobe, name in self.RATES.items():
             cb.put(name, self.rates[lobe], mi.ParamFlags.NonDifferentiable)
 
@@ -238,8 +244,11 @@ class Disney(mi.BSDF):
             dr.make_opaque(self.reflectance)
         dr.make_opaque(self.rates)
 
-    def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool):
-        """A parameter at ``si``, limited to its range (NaN → 0): textures and optimisers overshoot."""
+    def _read(self, name: str, parameters: Parameters, si: mi.SurfaceInteraction3f, active: mi.Bool):
+        """
+        A parameter at ``si``, limited to its range (NaN → 0): textures and optimisers overshoot. ``parameters`` asks,
+        and may be asked for others.
+        """
         if name == "base_color":
             return mi.UnpolarizedSpectrum(model.clamp(self.base_color.eval(si, active), 0.0, 1.0))
         if name != "specular":
@@ -394,7 +403,7 @@ class Parameters:
         if name == "luminance":
             value = luminance(self.albedo, self._si)
         else:
-            value = self._bsdf._read("base_color" if name == "albedo" else name, self._si, self._active)
+            value = self._bsdf._read("base_color" if name == "albedo" else name, self, self._si, self._active)
         setattr(self, name, value)
         return value
 

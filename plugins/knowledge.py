@@ -49,18 +49,21 @@ class Watched:
 
 
 class WatchedNumber(Watched):
-    """A number that is a member of the BSDF itself: ``read`` returns it."""
+    """A number that is a parameter of the BSDF itself (which is assigned to in place)."""
 
-    def __init__(self, read):
-        self.texture, self.colour, self.constant, self._read = None, False, True, read
+    def __init__(self, number):
+        self.texture, self.colour, self.constant = number, False, True
         self._arrays, self._found = None, Known()
 
     def _values(self) -> list:
-        return [self._read()]
+        return [self.texture]
+
+
+class WatchedChannel(Watched):
+    """A channel of a texture, about whose values nothing is known."""
 
     def look(self) -> None:
-        self.texture = self._read()
-        super().look()
+        pass
 
 
 def has_gradient(value) -> bool:

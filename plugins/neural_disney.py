@@ -1,16 +1,18 @@
 from __future__ import annotations  # Delayed parsing of type annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.tasks.disney import sampling
-from mi_diffind.tasks.disney.decoder import GROUPS
+from mi_diffind.tasks.disney import model, sampling
+from mi_diffind.tasks.disney.decoder import GROUPS, Decoder
 from mi_diffind.tasks.disney.effects import Effects, find_effects
 from mi_diffind.tasks.disney.library import load_decoder
 
 from . import knowledge
 from .disney import Disney, Parameters
-from .knowledge import Watched, WatchedNumber
+from .knowledge import Watched, WatchedChannel, WatchedNumber
 
 
 class NeuralDisney(Disney):
@@ -47,6 +49,19 @@ class NeuralDisney(Disney):
          in the first. (Default: the file's own, ``float32`` for those that ship)
        - --
 
+     * - latents
+       - |string|
+       - Names of parameters (``roughness``, ``metallic``, …; not ``base_color``) that are stored three to a texture, in
+         this order, in ``latents_0``, ``latents_1``, …, as written by ``mi-diffind encode``. Of them, roughness and
+         anisotropic are *encoded*: they hold the encoder's coordinates for this quality, which the decoder reads
+         directly. (Default: none)
+       - --
+
+     * - latents_0, latents_1, latents_2, latents_3
+       - |texture|
+       - Textures of three channels each, with values in [0, 1]; of one channel if it holds the last parameter alone.
+       - |exposed|, |differentiable|
+
      * - tables.alpha, tables.masking, tables.cosine, tables.coat, tables.encoder_roughness,
          tables.encoder_anisotropic; or tables.ggx, tables.masking, tables.diffuse, tables.fresnel, … (``paper``)
        - |tensor|
@@ -69,8 +84,8 @@ class NeuralDisney(Disney):
     **Only the effects in use.** A part of the model that the parameters make zero (``clearcoat`` 0, ``metallic`` 1, a
     black texture, the tint of a grey albedo, …) is neither traced nor read nor sampled. What is in use is found when
     the scene is loaded and again when parameters change; parameters with gradients enabled always count as in use, and
-    so does a texture whose bounds are not known (constants and bitmaps are). ``mi-diffind inspect SCENE.xml`` lists what
-    was left out, and why. Whatever depends on constant parameters alone is evaluated once, not for each sample.
+    so does a texture whose bounds are not known (constants and bitmaps are). ``mi-diffind inspect SCENE.xml`` lists
+    what was left out, and why. Whatever depends on constant parameters alone is evaluated once, not for each sample.
 
     .. tabs::
         .. code-tab:: xml
@@ -106,20 +121,78 @@ class NeuralDisney(Disney):
         if self.effects not in ("used", "all"):
             raise RuntimeError(f'parameter "effects": found "{self.effects}", allowed are used, all')
 
+        #: Textures of several parameters each, and for each of these its texture and channel.
+        self.latents: list[mi.Texture] = []
+        self._latent_channels: dict[str, tuple[int, int]] = {}
+        self._take_latents(props)
+
         #: What is known about the parameters of the model.
         self._watched = {
             "base_color": Watched(self.base_color, colour=True),
             **{name: Watched(texture) for name, texture in self.scalars.items()},
-            "specular": (
-                Watched(self.reflectance)
-                if isinstance(self.reflectance, mi.Texture)
-                else WatchedNumber(lambda: self.reflectance)
-            ),
+            **{name: WatchedChannel(self.latents[i]) for name, (i, _) in self._latent_channels.items()},
         }
+        if "specular" not in self._watched:
+            number = not isinstance(self.reflectance, mi.Texture)
+            self._watched["specular"] = (WatchedNumber if number else Watched)(self.reflectance)
         #: Coefficients that depend on constants alone, evaluated, and the effects that they are for.
         self._constant: dict[str, dict] = {}
         self._constant_for: Effects | None = None
         self._prepare_constants()
+
+    def _take_latents(self, props: mi.Properties) -> None:
+        names = str(props.get("latents", "")).split()
+        for i in range(math.ceil(len(names) / 3)):
+            self.latents.append(props.get_texture(f"latents_{i}"))
+        for i, name in enumerate(names):
+            allowed = (*self.DEFAULTS, "specular")
+            if name not in allowed or name in names[:i]:
+                fault = "twice" if name in names[:i] else f"allowed are {', '.join(allowed)}"
+                raise RuntimeError(f'parameter "latents": found "{name}", {fault}')
+            for alias in (name, {"flatness": "subsurface", "specular": "eta"}.get(name, name)):
+                if alias in props:
+                    raise RuntimeError(f'parameter "{alias}": is given by "latents", too')
+            self._latent_channels[name] = divmod(i, 3)
+            if name == "specular":
+                self.reflectance = None
+            else:
+                del self.scalars[name]
+        if names:
+            anisotropic = self.scalars.get("anisotropic")
+            self._set_flags(True, anisotropic is None or not knowledge.bounds(anisotropic).is_always(0))
+
+    def _read(self, name, parameters, si, active):
+        if name == "latent":
+            return self._read_latent(parameters, si, active)
+        if name.startswith("latents_"):
+            i = int(name[len("latents_") :])
+            if len(self._latent_channels) == 3 * i + 1:  # the only one in its texture
+                return (self.latents[i].eval_1(si, active),)
+            return self.latents[i].eval_3(si, active)
+        if name in ("roughness", "anisotropic") and parameters.latent is not None:
+            roughness, anisotropic = self.decoder.decode(parameters.latent, active)
+            return roughness if name == "roughness" else anisotropic
+        if name in self._latent_channels:
+            return self._channel(name, parameters)
+        return super()._read(name, parameters, si, active)
+
+    def _channel(self, name, parameters):
+        texture, channel = self._latent_channels[name]
+        return model.clamp(getattr(parameters, f"latents_{texture}")[channel], 0.0, 1.0)
+
+    def _read_latent(self, parameters, si, active):
+        """The encoded roughness and anisotropy, if at least one of them is stored encoded."""
+        if not {"roughness", "anisotropic"} & set(self._latent_channels):
+            return None
+        return tuple(
+            self._channel(name, parameters)
+            if name in self._latent_channels
+            else encode(super(NeuralDisney, self)._read(name, parameters, si, active), active)
+            for name, encode in (
+                ("roughness", self.decoder.encode_roughness),
+                ("anisotropic", self.decoder.encode_anisotropic),
+            )
+        )
 
     # -- effects in use, and what is evaluated once -------------------------------------------------------------------
 
@@ -179,6 +252,8 @@ class NeuralDisney(Disney):
 
     def traverse(self, cb: mi.TraversalCallback):
         super().traverse(cb)
+        for i, texture in enumerate(self.latents):
+            cb.put(f"latents_{i}", texture, mi.ParamFlags.Differentiable)
         for name, array in self._tables().items():
             cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
 
@@ -190,6 +265,35 @@ class NeuralDisney(Disney):
             except ValueError as e:
                 raise RuntimeError(f'parameter "tables.{name}": {e}') from None
         self._prepare_constants()
+
+    def textured(self) -> list[str]:
+        """The parameters that are textures and have an effect at present."""
+        effects, analytic = self._effects(), Decoder()
+        parameters = Parameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
+        for group in (*analytic.required(effects), *sampling.required(effects)):
+            analytic.coefficients(group, parameters, effects)
+        read = {"base_color" if name == "albedo" else name for name in vars(parameters)}
+        return [name for name, watched in self._watched.items() if name in read and not watched.constant]
+
+    def parameter(self, name: str):
+        """The texture (or number) of a parameter."""
+        return self._watched[name].texture
+
+    def constants(self) -> dict:
+        """The parameters that are the same everywhere: name → number, or three of them for ``base_color``."""
+        parameters = Parameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
+        found = {}
+        for name, watched in self._watched.items():
+            if watched.constant:
+                value = dr.detach(getattr(parameters, "albedo" if name == "base_color" else name))
+                found[name] = [float(v) for v in value.numpy().ravel()] if name == "base_color" else float(value[0])
+        return found
+
+    def encoded(self, name: str, si: mi.SurfaceInteraction3f):
+        """A parameter at ``si``, as ``latents`` hold it."""
+        value = getattr(Parameters(self, si, True), name)
+        encode = {"roughness": self.decoder.encode_roughness, "anisotropic": self.decoder.encode_anisotropic}.get(name)
+        return value if encode is None else encode(value)
 
     def report(self) -> dict:
         """

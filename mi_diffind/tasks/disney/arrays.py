@@ -8,14 +8,12 @@ and knows its training: targets, predictions, and where to start from. Its decod
 
 from __future__ import annotations
 
-import math
-
-import drjit as dr
 import numpy as np
 from drjit import nn
 
 from ...indirection import DifferentiableArray
 from ...tables import Table
+from .decoder import warp_roughness
 
 TASK = "disney"
 
@@ -90,6 +88,27 @@ class Arrays(nn.Module):
         """Bytes in memory, with padding and repeated entries."""
         return sum(getattr(self, name).memory_nbytes for name in self.SHAPES)
 
+    def encode(self, material, active=True):
+        """
+        The latent coordinates of (roughness, anisotropic), or ``material.latent`` if it has them already. Depends on
+        the material only.
+        """
+        latent = getattr(material, "latent", None)
+        if latent is not None:
+            return latent
+        return (
+            self.encode_roughness(material.roughness, active),
+            self.encode_anisotropic(material.anisotropic, active),
+        )
+
+    def encode_roughness(self, roughness, active=True):
+        """The coordinate of a roughness, in [0, 1]."""
+        return sum(self.encoder_roughness([warp_roughness(roughness)], active))
+
+    def encode_anisotropic(self, anisotropic, active=True):
+        """The coordinate of an anisotropy, in [0, 1]."""
+        return sum(self.encoder_anisotropic([anisotropic], active))
+
     # -- training ---------------------------------------------------------------------------------------------------
 
     @classmethod
@@ -103,19 +122,3 @@ class Arrays(nn.Module):
     def predict(self, m, wi, wo, uniform) -> dict[str, list]:
         """What they give, in the form of the targets."""
         raise NotImplementedError
-
-
-def warp_roughness(roughness):
-    """
-    The coordinate of a roughness in the encoder: ``√(r + c)``, brought to [0, 1].
-
-    GGX coefficients span decades where roughness is low; the eight entries of the encoder lie closer together there
-    (0, 0.04, 0.12, 0.23, …). With ``c = 0.01`` the slope at roughness 0 stays finite.
-    """
-    c = 0.01
-    return (dr.sqrt(roughness + c) - math.sqrt(c)) / (math.sqrt(1 + c) - math.sqrt(c))
-
-
-def unwarp_roughness(u: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`warp_roughness`, for NumPy."""
-    return np.maximum((u * (math.sqrt(1.01) - 0.1) + 0.1) ** 2 - 0.01, 0)

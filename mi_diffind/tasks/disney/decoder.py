@@ -64,6 +64,20 @@ class Decoder:
         """The coefficients of one group."""
         return getattr(self, f"_{group}")(p, e)
 
+    # -- the encoded roughness and anisotropy, as a texture may hold them ----------------------------------------------
+
+    def encode_roughness(self, roughness, active=True):
+        """The coordinate of a roughness, in [0, 1]: warped, so that bytes are finer where it is low."""
+        return warp_roughness(roughness)
+
+    def encode_anisotropic(self, anisotropic, active=True):
+        """The coordinate of an anisotropy, in [0, 1]."""
+        return anisotropic
+
+    def decode(self, latent, active=True) -> tuple:
+        """The roughness and anisotropy of a pair of coordinates."""
+        return model.clamp(unwarp_roughness(latent[0]), 0.0, 1.0), latent[1]
+
     # -- the material -----------------------------------------------------------------------------------------------
 
     def _ggx(self, p, e: Effects) -> dict:
@@ -233,6 +247,31 @@ def coat_masking_denominator(cosine):
     """``c + √(α² + (1 − α²) c²)``: the clearcoat's G₁ is ``2c`` over it."""
     a2 = model.COAT_MASKING_ALPHA**2
     return cosine + dr.sqrt(dr.fma(1 - a2, dr.square(cosine), a2))
+
+
+def warp_roughness(roughness):
+    """
+    The coordinate of a roughness in the encoder: ``√(r + c)``, brought to [0, 1].
+
+    GGX coefficients span decades where roughness is low; the eight entries of the encoder lie closer together there
+    (0, 0.04, 0.12, 0.23, …). With ``c = 0.01`` the slope at roughness 0 stays finite.
+    """
+    return (dr.sqrt(roughness + _WARP) - math.sqrt(_WARP)) / (math.sqrt(1 + _WARP) - math.sqrt(_WARP))
+
+
+def unwarp_roughness(u):
+    """The inverse of :func:`warp_roughness`, up to a rounding that may leave it below 0."""
+    root = u * (math.sqrt(1 + _WARP) - math.sqrt(_WARP)) + math.sqrt(_WARP)
+    return root * root - _WARP
+
+
+_WARP = 0.01
+
+
+def alpha_to_roughness(ax, ay) -> tuple:
+    """The roughness and anisotropy in [0, 1] whose α these are, the inverse of :func:`.model.roughness_to_alpha`."""
+    roughness = dr.sqrt(dr.sqrt(ax * ay))
+    return model.clamp(roughness, 0.0, 1.0), model.clamp((1 - ay / ax) / 0.9, 0.0, 1.0)
 
 
 def _mix_tint(p, amount):

@@ -20,14 +20,20 @@ layout lacks.
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import numpy as np
 
 from ...lookup import clamp, quantize
 from ...tables import Table
 from . import decoder, model
-from .arrays import Arrays, unwarp_roughness, warp_roughness
+from .arrays import Arrays
 from .model import ALPHA_MIN, TINY, positive
+
+
+#: Limits of ``ln α``: those of a roughness of 0, and of 1 with anisotropy 1.
+LOG_ALPHA = (math.log(ALPHA_MIN), 1.2)
 
 
 class FactoredArrays(Arrays):
@@ -57,15 +63,9 @@ class FactoredArrays(Arrays):
     #: exponential follows, and 8 bits for 8 units of a logarithm are errors of 1.6%.
     SPLIT = ("encoder_roughness", "encoder_anisotropic", "alpha")
 
-    def encode(self, material, active=True):
-        """The latent coordinates of (roughness, anisotropic). Depends on the material only."""
-        roughness = self.encoder_roughness([warp_roughness(material.roughness)], active)
-        anisotropic = self.encoder_anisotropic([material.anisotropic], active)
-        return sum(roughness), sum(anisotropic)
-
-    def log_alpha(self, material, active=True) -> list:
-        """``ln α_x`` and ``ln α_y``. Depends on the material only."""
-        x, y, rest_x, rest_y = self.alpha(self.encode(material, active), active)
+    def log_alpha(self, latent, active=True) -> list:
+        """``ln α_x`` and ``ln α_y`` of the encoded roughness and anisotropy. Depends on the material only."""
+        x, y, rest_x, rest_y = self.alpha(latent, active)
         return [x + rest_x, y + rest_y]
 
     def to_table(self, storage: str = "float32", **about) -> Table:
@@ -101,7 +101,7 @@ class FactoredArrays(Arrays):
     def predict(self, m, wi, wo, uniform) -> dict[str, list]:
         u, v = uniform
         return {
-            "alpha": self.log_alpha(m),
+            "alpha": self.log_alpha(self.encode(m)),
             "masking": self.masking([u]),
             "cosine": self.cosine([v]),
             "coat": self.coat([m.clearcoat_gloss]),
@@ -113,7 +113,7 @@ class FactoredArrays(Arrays):
         if name.startswith("encoder"):
             entries = [u, np.zeros_like(u)]
         elif name == "alpha":
-            u = unwarp_roughness(u)
+            u = np.maximum(decoder.unwarp_roughness(u), 0)
             aspect = np.sqrt(1 - 0.9 * v)
             entries = [np.log(np.maximum(a, ALPHA_MIN)) for a in (u**2 / aspect, u**2 * aspect)]
             entries += [np.zeros_like(u)] * 2
@@ -145,6 +145,18 @@ class FactoredDecoder(decoder.Decoder):
     def __init__(self, arrays: FactoredArrays, read=FACTORS):
         self.arrays, self.read = arrays, tuple(read)
 
+    def encode_roughness(self, roughness, active=True):
+        return self.arrays.encode_roughness(roughness, active)
+
+    def encode_anisotropic(self, anisotropic, active=True):
+        return self.arrays.encode_anisotropic(anisotropic, active)
+
+    def decode(self, latent, active=True):
+        return decoder.alpha_to_roughness(*self._alpha(latent, active))
+
+    def _alpha(self, latent, active=True):
+        return [dr.exp(clamp(v, *LOG_ALPHA)) for v in self.arrays.log_alpha(latent, active)]
+
     def required(self, e):
         instead = {"ggx": "read_ggx" if "alpha" in self.read else "ggx", "coat": "read_coat"}
         if "coat" not in self.read:
@@ -152,8 +164,7 @@ class FactoredDecoder(decoder.Decoder):
         return tuple(instead.get(name, name) for name in super().required(e))
 
     def _read_ggx(self, p, e):
-        limits = self.arrays.RANGES["alpha"]
-        ax, ay = (dr.exp(clamp(v, *limits)) for v in self.arrays.log_alpha(p))
+        ax, ay = self._alpha(self.arrays.encode(p))
         return decoder.ggx_coefficients(*((ax, ay) if e.anisotropic else (ax,)))
 
     def _read_coat(self, p, e):

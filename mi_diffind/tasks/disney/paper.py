@@ -1,7 +1,7 @@
 """
 ``quality="paper"``: the layout of the paper's Table 1, with a small encoder before it.
 
-The *encoder* is two 1D primary arrays, which map roughness (warped, see :func:`.arrays.warp_roughness`) and anisotropy
+The *encoder* is two 1D primary arrays, which map roughness (warped, see :func:`.decoder.warp_roughness`) and anisotropy
 to coordinates; it depends on the material only. The *decoder* is five cascaded arrays, the same for every material:
 
 ============ ========= ======== ================================ ===================================================
@@ -27,7 +27,7 @@ import numpy as np
 
 from ...lookup import clamp
 from . import decoder, model
-from .arrays import Arrays, unwarp_roughness, warp_roughness
+from .arrays import Arrays
 from .model import ALPHA_MIN, COAT_F0, LOBES, TINY, Factors, compose, diffuse_factors, geometry, positive
 
 
@@ -55,13 +55,6 @@ class PaperArrays(Arrays):
         "fresnel": (0.0, 1.0),
         "coat": (-16.0, 8.0),
     }
-
-    def encode(self, material, active=True):
-        """The latent coordinates of (roughness, anisotropic). Depends on the material only."""
-        return (
-            self.encoder_roughness([warp_roughness(material.roughness)], active)[0],
-            self.encoder_anisotropic([material.anisotropic], active)[0],
-        )
 
     def ggx_coefficients(self, latent, active=True) -> list:
         """``q`` with ``D = 1 / (q_x h_x² + q_y h_y² + q_z h_z²)²`` for a unit half vector. Material only."""
@@ -170,7 +163,7 @@ class PaperArrays(Arrays):
         if name.startswith("encoder"):
             return u[..., None]
         if name in ("ggx", "masking"):  # read at the encoded roughness, to begin with the warped one
-            u = unwarp_roughness(u)
+            u = np.maximum(decoder.unwarp_roughness(u), 0)
         if name == "ggx":
             aspect = np.sqrt(1 - 0.9 * v)
             ax, ay = np.maximum(u**2 / aspect, ALPHA_MIN), np.maximum(u**2 * aspect, ALPHA_MIN)
@@ -204,6 +197,16 @@ class PaperDecoder(decoder.Decoder):
 
     def __init__(self, arrays: PaperArrays):
         self.arrays = arrays
+
+    def encode_roughness(self, roughness, active=True):
+        return self.arrays.encode_roughness(roughness, active)
+
+    def encode_anisotropic(self, anisotropic, active=True):
+        return self.arrays.encode_anisotropic(anisotropic, active)
+
+    def decode(self, latent, active=True):
+        qx, qy, qz = self.arrays.ggx_coefficients(latent, active)
+        return decoder.alpha_to_roughness(dr.sqrt(qz / qx), dr.sqrt(qz / qy))
 
     def required(self, e):
         return ("encoded", "encoded_coat") if e.clearcoat else ("encoded",)
