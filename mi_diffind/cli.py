@@ -124,6 +124,16 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--quick", action="store_true", help="smoke run: less of everything, times not to be quoted")
     sub.add_argument("--variant", help="Mitsuba variant (default: cuda_ad_rgb with a GPU, else llvm_ad_rgb)")
 
+    sub = command("encode", _encode, "turn the parameter textures of a material into latent textures")
+    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument("--material", required=True, metavar="ID", help="id of the material")
+    sub.add_argument("-o", "--output", required=True, metavar="DIR", help="folder for textures and material.xml")
+    sub.add_argument(
+        "--storage", choices=["uint8", "float16"], default="uint8", help="PNG or EXR (default: uint8, PNG)"
+    )
+    sub.add_argument("--resolution", type=_positive, help="side in texels (default: that of the largest texture)")
+    scene_options(sub, rendering=False)
+
     sub = command("fit", _fit, "train tables")
     sub.add_argument("task", choices=["disney"])
     sub.add_argument("-o", "--output", required=True, metavar="FILE.npz", help="table file to write")
@@ -258,7 +268,7 @@ def _render(arguments) -> dict:
         "seconds_load": loaded - start,
         "seconds_render": rendered - loaded,
         "learned_plugins": learned,
-        "learned_materials": scenes.reports(scene),
+        "learned_materials": scenes.reports(scene) if arguments.json is not None else [],
         "table_bytes": scenes.table_bytes(arguments.scene, learned),
     }
 
@@ -312,10 +322,9 @@ def _regress(arguments) -> dict:
             results.append(regress.update_reference(path, arguments.references, **options))
             if results[-1]["interrupted"]:
                 break
-            print(
-                "{reference}: {width} x {height}, {spp} spp, {bytes:,} bytes; unchanged, {failing_pixels} of its pixels "
-                "fail at {budget} spp".format(**results[-1])
-            )
+            text = "{reference}: {width} x {height}, {spp} spp, {bytes:,} bytes; "
+            text += "failing pixels in a check at {budget} spp: {failing_pixels}"
+            print(text.format(**results[-1]))
     else:
         out = Path(arguments.out)
         writable_folder(out if out.exists() else out.parent)
@@ -408,15 +417,12 @@ def _measure(file: str, table) -> dict:
 
 def _inspect_scene(arguments) -> dict:
     _set_variant(arguments.variant)
-    from . import operations, scenes
+    from . import scenes
 
     defines = _defines(arguments)
     learned = scenes.learned_plugins(arguments.file, defines=defines)
     tables = scenes.tables_of(arguments.file, learned)
-    materials = []
-    for material in scenes.learned_materials(scenes.load(arguments.file, defines=defines)):
-        counts = {m: n.asdict() for m, n in operations.bsdf_operations(material).items()}
-        materials.append({"id": material.id(), **material.report(), "operations": counts})
+    materials = scenes.reports(scenes.load(arguments.file, defines=defines))
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned material(s), {total:,} bytes of tables in {len(tables)} file(s)")
     given = {entry["id"]: entry["parameters"] for entry in learned}
@@ -461,6 +467,34 @@ def _tradeoff(arguments) -> dict:
     print("\n".join(tradeoff.summary(result)))
     print("\nwritten     " + ", ".join(paths.values()))
     return {**tradeoff.finite(result), "files": paths}
+
+
+def _encode(arguments) -> dict:
+    _require_scene(arguments.scene)
+    writable_folder(Path(arguments.output).parent)
+    _set_variant(arguments.variant)
+    from .encode import encode
+
+    found = encode(
+        arguments.scene,
+        arguments.material,
+        arguments.output,
+        arguments.storage,
+        arguments.resolution,
+        _defines(arguments),
+    )
+    layout = [found["layout"][i : i + 3] for i in range(0, len(found["layout"]), 3)]
+    print(f"{found['files'][0]}: {found['width']} x {found['height']}, quality {found['quality']}")
+    for i, names in enumerate(layout):
+        print(f"  latents_{i}   {', '.join(names)}")
+    if found["base_color"]:
+        print("  base_color  albedo")
+    ratio = found["time_ratio"]
+    print(
+        f"  {found['bytes']:,} bytes ({found['bytes_before']:,} before), PSNR {found['psnr_db']:.2f} dB, time of an eval "
+        f"{ratio['median']:.2f} of that before ({ratio['q1']:.2f} to {ratio['q3']:.2f})"
+    )
+    return found
 
 
 def _fit(arguments) -> dict:

@@ -19,6 +19,7 @@ import numpy as np
 
 from . import plugins
 from .files import replacing
+from .operations import bsdf_operations
 from .tasks.disney.library import load_disney_table, table_file
 
 #: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
@@ -125,9 +126,17 @@ def learned_materials(scene) -> list:
 def reports(scene) -> list[dict]:
     """
     For each learned material of a loaded scene, what it does: its ``id``, ``quality``, ``effects_in_use``,
-    ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage`` and ``table_bytes``.
+    ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage`` and ``table_bytes``, and the ``operations``
+    of ``eval``, ``pdf`` and ``sample`` (:class:`~mi_diffind.operations.Operations`, by name).
     """
-    return [{"id": material.id(), **material.report()} for material in learned_materials(scene)]
+    return [
+        {
+            "id": material.id(),
+            **material.report(),
+            "operations": {method: n.asdict() for method, n in bsdf_operations(material).items()},
+        }
+        for material in learned_materials(scene)
+    ]
 
 
 def table_bytes(scene: str | os.PathLike, learned: list[dict]) -> int:

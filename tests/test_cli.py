@@ -72,6 +72,7 @@ def test_compare(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "PSNR" in text and "FLIP" in text and "ratio" in text
     assert sorted(os.listdir(out)) == ["comparison.png", "error.exr", "exact.exr", "written.exr"]
+    assert np.array(mi.Bitmap(str(out / "comparison.png"))).std() > 20  # not blank
     found = json.loads(report.read_text())
     written, exact, error = (np.array(mi.Bitmap(found["files"][k])) for k in ("written", "exact", "error"))
     assert np.allclose(np.abs(written - exact), error, atol=1e-5)
