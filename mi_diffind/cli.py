@@ -491,8 +491,8 @@ def _encode(arguments) -> dict:
         print("  base_color  albedo")
     ratio = found["time_ratio"]
     print(
-        f"  {found['bytes']:,} bytes ({found['bytes_before']:,} before), PSNR {found['psnr_db']:.2f} dB, time of an eval "
-        f"{ratio['median']:.2f} of that before ({ratio['q1']:.2f} to {ratio['q3']:.2f})"
+        f"  {found['bytes']:,} bytes ({found['bytes_before']:,} before), PSNR {found['psnr_db']:.2f} dB, "
+        f"time of an eval {ratio['median']:.2f} of that before ({ratio['q1']:.2f} to {ratio['q3']:.2f})"
     )
     return found
 

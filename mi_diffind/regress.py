@@ -122,7 +122,9 @@ def render_with_variance(
     stop: threading.Event | None = None,
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """
-    Render ``passes`` (at least 2) independent images of ``spp / passes`` samples a pixel, rounded up.
+    Render ``passes`` (at least 2) independent images of ``spp / passes`` samples a pixel, rounded up to a power of two:
+    then no pixel is shared by two threads, which would add up its samples in any order, and the same arguments give the
+    same bits.
 
     Returns their mean and the variance of one sample (that of the passes, times the samples of a pass), both
     ``(height, width, channels)``, float32, with 3 channels or 1, and the samples per pixel that were taken.
@@ -135,7 +137,7 @@ def render_with_variance(
     """
     if passes < 2:
         raise ValueError(f"passes: found {passes}, at least 2 are needed")
-    n = -(-spp // passes)
+    n = 1 << (-(-spp // passes) - 1).bit_length()
     mean, squares, done = 0.0, 0.0, 0
     for i in range(passes):
         image = _colour(scenes.render_pass(scene, n, (seed << 16) + _REFERENCE_SEEDS + i))

@@ -170,7 +170,8 @@ def render(
     Returns the linear image ``(height, width, channels)``, float32, and the seconds that each pass took (the first
     includes compilation). ``on_pass()`` is called after each; once ``stop`` is set, the pass that is running is the
     last, and the image is the average of those done, ``len(seconds) · spp // passes`` samples. The same arguments give
-    the same image, if the film's filter is a box (other filters add up samples of neighbouring pixels in any order).
+    the same image, if the film's filter is a box (other filters add up samples of neighbouring pixels in any order) and
+    the samples of a pass are a power of two (else the last bit of a few pixels varies).
     """
     spp = spp or scene.sensors()[0].sampler().sample_count()
     passes = max(1, min(passes, spp))

@@ -111,7 +111,7 @@ def test_gradients_against_finite_differences(rng, decoder):
 @pytest.mark.parametrize("quality", list(SHIPPED))
 def test_shipped_tables_keep_their_promises(quality):
     table, layout = load_disney_table(SHIPPED[quality])
-    assert layout.QUALITY == quality
+    assert quality == layout.QUALITY
     assert all(array.shape == layout.SHAPES[name] for name, array in table.arrays.items())
     assert table.nbytes <= 12_500
     if quality == "paper":

@@ -31,7 +31,6 @@ from . import decoder, model
 from .arrays import Arrays
 from .model import ALPHA_MIN, TINY, positive
 
-
 #: Limits of ``ln α``: those of a roughness of 0, and of 1 with anisotropy 1.
 LOG_ALPHA = (math.log(ALPHA_MIN), 1.2)
 

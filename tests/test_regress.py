@@ -1,0 +1,374 @@
+"""Checks against stored references: the statistics, what they let pass and catch, the files, and the command."""
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import _set
+from test_cli import refused
+
+from mi_diffind.cli import main
+
+TESTS = Path(__file__).resolve().parent
+SCENES = TESTS.parent / "scenes"
+STORED = [SCENES / "materials.xml", SCENES / "still_life.xml", TESTS / "lamp.xml"]
+
+
+@pytest.fixture
+def regress(mi_rgb):
+    from mi_diffind import regress
+
+    return regress
+
+
+def scene_file(tmp_path, name="scene", roughness=0.5):
+    path = tmp_path / f"{name}.xml"
+    path.write_text(
+        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/><default name="width" value="16"/>'
+        '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="$width"/>'
+        '<integer name="height" value="12"/><rfilter type="box"/><string name="pixel_format" value="rgb"/></film>'
+        '</sensor><shape type="sphere"><transform name="to_world"><translate z="4"/></transform>'
+        f'<bsdf type="neural_disney"><float name="roughness" value="{roughness}"/></bsdf></shape></scene>'
+    )
+    return str(path)
+
+
+def noise(rng, variance, spp):
+    """What ``spp`` samples of zero mean average to, if they are normally distributed."""
+    return rng.standard_normal(variance.shape) * np.sqrt(variance / spp)
+
+
+# -- the statistics ----------------------------------------------------------------------------------------------------
+
+
+def test_p_values_are_those_of_scipy(regress, rng):
+    from scipy.stats import norm
+
+    reference, variance = rng.random((9, 7, 3)), 10 ** rng.uniform(-6, 0, (9, 7, 3))
+    deviation = np.sqrt(np.maximum(variance, 1e-4) * (1 / 40 + 1 / 160))
+    image = reference + deviation * rng.normal(0, 2, reference.shape)
+    test = regress.z_test(image, reference, variance, 40, 160)
+    expected = 2 * norm.sf(np.abs(image - reference) / deviation)
+    assert np.allclose(test.p_values, expected, rtol=1e-5, atol=0)
+    assert test.alpha == pytest.approx(1 - 0.99 ** (1 / 63), rel=1e-9)
+    failing = (expected <= test.alpha).any(axis=-1)
+    assert 0 < failing.sum() < 63 and np.array_equal(test.failing, failing)
+    assert test.fraction == pytest.approx(1 - failing.mean())
+    exact = regress.z_test(image, reference, variance, 40)  # a reference free of noise
+    deviation = np.sqrt(np.maximum(variance, 1e-4) / 40)
+    assert np.allclose(exact.p_values, 2 * norm.sf(np.abs(image - reference) / deviation), rtol=1e-5)
+
+
+def test_p_values_are_uniform_if_nothing_changed(regress, rng):
+    """Both the image and the reference are noisy, the reference as much as the image."""
+    from scipy.stats import kstest
+
+    variance = 10 ** rng.uniform(-3, 1, (60, 80, 3))
+    truth = rng.random(variance.shape)
+    image, reference = truth + noise(rng, variance, 16), truth + noise(rng, variance, 16)
+    assert kstest(regress.z_test(image, reference, variance, 16, 16).p_values.ravel(), "uniform").pvalue > 0.01
+    assert kstest(regress.z_test(image, reference, variance, 16).p_values.ravel(), "uniform").pvalue < 1e-9
+
+
+def test_one_image_in_a_hundred_has_a_failing_pixel(regress, rng):
+    """What Šidák's correction promises, for one channel."""
+    variance = np.ones((10, 12, 1))
+    failing = [regress.z_test(noise(rng, variance, 4), 0 * variance, variance, 4).failing.any() for _ in range(3000)]
+    assert 15 <= sum(failing) <= 48  # 30 expected, three standard deviations
+
+
+def test_a_quarter_of_a_percent_may_fail(regress):
+    """Two pixels of 800 may, three may not; a pixel fails with any of its channels, and if one is not finite."""
+    reference, variance = np.full((20, 40, 3), 0.5), np.full((20, 40, 3), 0.04)
+    for wrong in (1.0, np.nan, np.inf, -np.inf):
+        image = reference.copy()
+        image[3, 4:6, 1] = wrong
+        test = regress.z_test(image, reference, variance, 64, 1024)
+        assert test.passed and test.failing.sum() == 2 and test.failing[3, 4]
+        image[19, 39, 2] = wrong
+        test = regress.z_test(image, reference, variance, 64, 1024)
+        assert not test.passed and test.failing.sum() == 3
+    with pytest.raises(ValueError, match="shapes differ"):
+        regress.z_test(reference, reference[:1], variance, 64)
+
+
+def test_changes_above_the_noise_are_caught(regress, rng):
+    """A hundredth of the pixels, changed by eight standard deviations of the mean; not if changed by one."""
+    variance = np.full((60, 80, 3), 0.25)
+    for deviations, passes in ((1, True), (8, False)):
+        image = noise(rng, variance, 100)
+        image[:6, :8] += deviations * 0.5 / 10
+        assert regress.z_test(image, 0 * variance, variance, 100, 1600).passed == passes
+
+
+def test_small_variances_are_raised_to_the_floor(regress):
+    """Without noise, differences of 0.01 / sqrt(spp) times the quantile (here 4.4) pass."""
+    zero = np.zeros((30, 40, 3))
+    assert regress.z_test(zero + 4.2 * 0.01 / 10, zero, zero, 100).passed
+    assert not regress.z_test(zero + 4.6 * 0.01 / 10, zero, zero, 100).passed
+
+
+def test_mean_and_variance_of_passes(regress, rng, monkeypatch):
+    """Of noise with a known variance of a sample, whatever the number of samples in a pass; alpha is left out."""
+    truth, variance = rng.random((40, 50, 4)), 10 ** rng.uniform(-3, 1, (40, 50, 4))
+    taken = []
+
+    def render_pass(scene, spp, seed):
+        taken.append((spp, seed))
+        return truth + noise(rng, variance, spp)
+
+    monkeypatch.setattr(regress.scenes, "render_pass", render_pass)
+    for spp, in_a_pass in ((1, 1), (128, 1), (129, 2), (3808, 32), (6800, 64)):  # powers of two: see below
+        taken.clear()
+        mean, found, done = regress.render_with_variance(None, spp, seed=3)
+        assert {n for n, _ in taken} == {in_a_pass} and done == 128 * in_a_pass >= spp
+        assert mean.shape == found.shape == (40, 50, 3)
+        ratio = found / variance[..., :3]
+        assert abs(ratio.mean() - 1) < 0.02 and ratio.std() == pytest.approx(np.sqrt(2 / 127), rel=0.1)
+        z = (mean - truth[..., :3]) / np.sqrt(variance[..., :3] / done)
+        assert abs(z.mean()) < 0.1 and z.std() == pytest.approx(1, rel=0.05)
+        seeds = {seed for _, seed in taken}
+        assert len(seeds) == 128
+        taken.clear()
+        regress.scenes.render(None, 4000, seed=3, passes=100)
+        assert seeds.isdisjoint(seed for _, seed in taken)  # a check never sees the samples of its reference
+    with pytest.raises(ValueError, match="at least 2"):
+        regress.render_with_variance(None, 16, passes=1)
+
+
+# -- the repository's scenes -------------------------------------------------------------------------------------------
+
+
+def test_passes_of_references_repeat_to_the_last_bit(regress):
+    """Passes of 30 or 54 samples do not on several cores: threads share pixels, and add up in any order."""
+    scene = regress.scenes.load(TESTS / "lamp.xml")
+    for spp in (32, 64):
+        assert len({regress.scenes.render_pass(scene, spp, 7).tobytes() for _ in range(6)}) == 1
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono"])
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
+def test_scene_renders_as_its_reference(path, variant):
+    """If a change is meant, render the references again: scenes/README.md says how."""
+    _set(variant)
+    from mi_diffind import regress
+
+    result = regress.regress(path, progress=False)
+    assert result["passed"], result
+    assert result["reference_spp"] >= 16 * result["spp"] and result["spp"] > 200
+
+
+def test_references_are_small():
+    files = [f for folder in (SCENES, TESTS) for f in (folder / "references").iterdir()]
+    assert len(files) == 3 * len(STORED) and sum(f.stat().st_size for f in files) < 2_000_000
+
+
+def test_a_broken_table_entry_is_caught(regress, tmp_path, capsys, monkeypatch):
+    """Of a table of the paper's layout, the entry that matters most for the image is changed by 10%; no other."""
+    import drjit as dr
+    import mitsuba as mi
+
+    original = regress.scenes.load
+
+    def broken(path, **defines):
+        scene = original(path, **defines)
+        params = mi.traverse(scene)
+        keys = [k for k in params.keys() if k.endswith("tables.masking") and params[k].shape[0] == 16]
+        assert len(keys) == 2  # the two materials in that quality
+        params = mi.traverse(scene)  # anew: what has been read counts as changed
+        params.keep(keys)
+        for key in keys:
+            dr.enable_grad(params[key])
+        params.update()
+        dr.backward(dr.sum(mi.render(scene, params, spp=4), axis=None))
+        slope = sum(np.abs(params[key].grad.numpy()) for key in keys)
+        for key in keys:
+            table = params[key].numpy()
+            table.flat[slope.argmax()] *= 1.1
+            params[key] = mi.TensorXf(table)
+        params.update()
+        return scene
+
+    out, report = tmp_path / "out", tmp_path / "report.json"
+    arguments = ["regress", str(TESTS / "lamp.xml"), "--out", str(out), "--json", str(report)]
+    assert main(arguments) == 0 and not out.exists()
+    assert "passed" in capsys.readouterr().out
+    monkeypatch.setattr(regress.scenes, "load", broken)
+    assert main(arguments) == 1
+    text = capsys.readouterr().out
+    assert "FAILED" in text and str(out / "lamp.llvm_ad_rgb.png") in text
+    found = json.loads(report.read_text())
+    result = found["scenes"][0]
+    assert found["failed"] == 1 and result["passed"] is False
+    assert result["fraction"] == pytest.approx(1 - result["failing_pixels"] / (result["width"] * result["height"]))
+    assert len(result["files"]) == 5 and {Path(f).name for f in result["files"].values()} == set(os.listdir(out))
+    image, reference, error, p = (
+        np.array(mi.Bitmap(result["files"][k])) for k in ("image", "reference", "error", "p_value")
+    )
+    assert np.array_equal(np.abs(image - reference), error)
+    assert (p <= result["alpha"]).any(axis=-1).sum() == result["failing_pixels"] > 0.0025 * p[..., 0].size
+    assert np.array(mi.Bitmap(result["files"]["figure"])).std() > 20  # not blank
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def test_update_stores_what_a_check_needs(tmp_path, capsys):
+    import OpenEXR
+
+    path, report = scene_file(tmp_path), tmp_path / "report.json"
+    update = ["regress", path, "--update", "--json", str(report)]
+    assert main([*update, "--spp", "20", "--seed", "7", "-D", "width=10"]) == 0
+    assert "10 x 12, 512 spp" in capsys.readouterr().out  # 128 passes of 4, more than 16 · 20
+    folder = tmp_path / "references"
+    assert os.listdir(folder) == ["scene.llvm_ad_rgb.exr"]
+    with OpenEXR.File(str(folder / "scene.llvm_ad_rgb.exr"), separate_channels=True) as file:
+        about = json.loads(file.header()["mi_diffind"])
+        channels = {k: v.pixels.copy() for k, v in file.channels().items()}
+    assert sorted(channels) == ["B", "G", "R", "variance.B", "variance.G", "variance.R"]
+    assert all(c.shape == (12, 10) and c.dtype == np.float32 for c in channels.values())
+    versions = about.pop("versions")
+    assert set(versions) == {"mi_diffind", "mitsuba"}
+    expected = {"scene": "scene", "variant": "llvm_ad_rgb", "defines": {"width": "10"}, "budget": 20, "spp": 512}
+    assert about == {**expected, "seed": 7}
+
+    first = (folder / "scene.llvm_ad_rgb.exr").read_bytes()
+    assert main(update) == 0  # the same size, samples and seed again
+    assert (folder / "scene.llvm_ad_rgb.exr").read_bytes() == first
+    assert main([*update, "--seed", "8"]) == 0
+    assert (folder / "scene.llvm_ad_rgb.exr").read_bytes() != first
+    assert main(["regress", path, "--json", str(report)]) == 0
+    result = json.loads(report.read_text())["scenes"][0]
+    assert (result["width"], result["height"], result["spp"], result["reference_spp"]) == (10, 12, 20, 512)
+    assert main(["regress", path, "--spp", "30", "--seed", "5", "--json", str(report)]) == 0
+    result = json.loads(report.read_text())["scenes"][0]
+    assert result["spp"] == 30 and result["seed"] == 5
+
+
+def test_every_scene_is_checked(tmp_path, capsys):
+    """One that fails does not hide the next; mono has one channel; --references names another folder."""
+    paths = [scene_file(tmp_path, name) for name in ("first", "second", "third")]
+    options = ["--references", str(tmp_path / "kept"), "--out", str(tmp_path / "out"), "--variant", "llvm_ad_mono"]
+    assert main(["regress", *paths, *options, "--update", "--spp", "64"]) == 0
+    assert len(os.listdir(tmp_path / "kept")) == 3 and not (tmp_path / "references").exists()
+    scene_file(tmp_path, "second", roughness=0.1)
+    capsys.readouterr()
+    assert main(["regress", *paths, *options]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines if "pixels" in line] == [
+        ["passed", "first"],
+        ["FAILED", "second"],
+        ["passed", "third"],
+    ]
+    assert len(os.listdir(tmp_path / "out")) == 5
+
+
+def test_an_update_that_does_not_end_changes_nothing(regress, tmp_path, capsys, monkeypatch):
+    import OpenEXR
+
+    path = scene_file(tmp_path)
+    assert main(["regress", path, "--update", "--spp", "8"]) == 0
+    file = tmp_path / "references" / "scene.llvm_ad_rgb.exr"
+    before = file.read_bytes()
+
+    def write(self, name):
+        Path(name).write_bytes(b"half")
+        raise RuntimeError("disk full")
+
+    class Failing(OpenEXR.File):
+        pass
+
+    Failing.write = write
+    with monkeypatch.context() as patch:
+        patch.setattr(OpenEXR, "File", Failing)
+        assert "cannot be written: disk full" in refused(capsys, "regress", path, "--update", "--seed", "1")
+    assert file.read_bytes() == before and os.listdir(file.parent) == [file.name]
+
+    original = regress.scenes.render_pass
+
+    def interrupting(scene, spp, seed):
+        os.kill(os.getpid(), signal.SIGINT)
+        return original(scene, spp, seed)
+
+    monkeypatch.setattr(regress.scenes, "render_pass", interrupting)
+    report = tmp_path / "report.json"
+    assert main(["regress", path, "--update", "--seed", "1", "--json", str(report)]) == 130
+    assert json.loads(report.read_text())["interrupted"]
+    assert file.read_bytes() == before and os.listdir(file.parent) == [file.name]
+    capsys.readouterr()
+    assert main(["regress", path, "--json", str(report)]) == 130
+    assert "interrupted" in capsys.readouterr().out
+    assert json.loads(report.read_text())["scenes"][0]["passed"] is None
+
+
+def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path, capsys, monkeypatch):
+    """Rare bright paths: one pixel in a hundred is struck in a pass, few of them in both renders."""
+
+    def fireflies(scene, spp, seed):
+        return 0.5 + 100 * (rng.random((12, 16, 3)) < 1e-5 * spp)
+
+    monkeypatch.setattr(regress.scenes, "render_pass", fireflies)
+    path = scene_file(tmp_path)
+    assert "although nothing has changed" in refused(capsys, "regress", path, "--update", "--spp", "1000")
+    monkeypatch.setattr(regress.scenes, "render_pass", lambda *_: np.full((12, 16, 3), np.nan))
+    assert "192 pixel(s) are not finite" in refused(capsys, "regress", path, "--update", "--spp", "10")
+    assert not list((tmp_path / "references").iterdir())
+
+
+def test_references_serve_both_backends(regress, tmp_path, monkeypatch):
+    path = scene_file(tmp_path)
+    regress.update_reference(path, spp=8, progress=False)
+    stored = regress.read_reference(path)
+    monkeypatch.setattr(regress.mi, "variant", lambda: "cuda_ad_rgb")
+    assert np.array_equal(regress.read_reference(path).image, stored.image)
+    monkeypatch.setattr(regress.mi, "variant", lambda: "llvm_ad_spectral")
+    with pytest.raises(regress.BadReference, match=r'no reference ".*scene.llvm_ad_spectral.exr"; run'):
+        regress.read_reference(path)
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------
+
+
+def test_bad_references(regress, tmp_path, capsys):
+    path, other = scene_file(tmp_path), scene_file(tmp_path, "other")
+    out = ["--out", str(tmp_path / "out")]
+    assert "with --update to make it" in refused(capsys, "regress", path, *out)
+    assert main(["regress", path, "--update", "--spp", "8"]) == 0
+    # The missing one is found before the first scene is rendered
+    assert "other.xml: has no reference" in refused(capsys, "regress", path, other, *out)
+    assert "passed" not in capsys.readouterr().out
+    message = refused(capsys, "regress", path, "-D", "width=20", *out)
+    assert "renders 20 x 12 pixels, its reference has 16 x 12 of 3 channel(s)" in message
+
+    file = tmp_path / "references" / "scene.llvm_ad_rgb.exr"
+    content = file.read_bytes()
+    file.with_name("other.llvm_ad_rgb.exr").write_bytes(content)
+    assert 'is the reference of the scene "scene"' in refused(capsys, "regress", other, *out)
+    for damaged in (b"", b"no image", content[:300], content[: len(content) // 2]):
+        file.write_bytes(damaged)
+        assert "cannot be read as an EXR image" in refused(capsys, "regress", path, *out)
+        assert "remove it" in refused(capsys, "regress", path, "--update")
+    regress.scenes.write_image(file, np.zeros((12, 16, 3)))
+    assert "is an EXR image, but no reference" in refused(capsys, "regress", path, *out)
+    about = {"scene": "scene", "variant": "llvm_ad_rgb", "defines": {}, "budget": 8, "spp": 128, "seed": 0}
+    picture = np.zeros((12, 16, 3), np.float32)
+    for image, wrong in ((picture, {"budget": 0}), (picture, {"spp": "many"}), (picture + np.nan, {})):
+        regress._write(file, regress.Reference(image, picture, {**about, **wrong}))
+        assert "is a damaged reference" in refused(capsys, "regress", path, *out)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_options(tmp_path, capsys):
+    path = scene_file(tmp_path)
+    assert "nowhere.xml: no such scene file" in refused(capsys, "regress", path, "nowhere.xml", "--update")
+    assert 'more than one is called "scene"' in refused(capsys, "regress", path, path)
+    assert "does not exist" in refused(capsys, "regress", path, "--out", str(tmp_path / "no" / "out"))
+    assert "is not a folder" in refused(capsys, "regress", path, "--out", path)
+    assert "does not exist" in refused(capsys, "regress", path, "--update", "--references", str(tmp_path / "no" / "r"))
+    assert "expected NAME=VALUE" in refused(capsys, "regress", path, "--update", "-D", "width")
+    with pytest.raises(SystemExit) as caught:
+        main(["regress"])
+    assert caught.value.code == 2
