@@ -184,10 +184,11 @@ class NeuralDisney(Disney):
         """The encoded roughness and anisotropy, if at least one of them is stored encoded."""
         if not {"roughness", "anisotropic"} & set(self._latent_channels):
             return None
+        read = super()._read  # not by the name of the class, which means another one once the variant has changed
         return tuple(
             self._channel(name, parameters)
             if name in self._latent_channels
-            else encode(super(NeuralDisney, self)._read(name, parameters, si, active), active)
+            else encode(read(name, parameters, si, active), active)
             for name, encode in (
                 ("roughness", self.decoder.encode_roughness),
                 ("anisotropic", self.decoder.encode_anisotropic),

@@ -104,6 +104,21 @@ def test_bytes_are_spaced_for_the_decoder(mi_rgb, rng, tmp_path):
     assert error < 0.5 * np.abs(raw - roughness.numpy()).mean()
 
 
+def test_encoded_materials_outlive_a_change_of_variant(mi_rgb, rng, tmp_path):
+    """The module is executed again for each variant: a class must not look itself up by its name."""
+    from mi_diffind.encode import encode
+
+    mi = mi_rgb
+    variant = mi.variant()
+    encode(write_scene(tmp_path, rng, ("roughness",)), "m", tmp_path / "out")
+    bsdf = mi.load_file(str(tmp_path / "out" / "material.xml"))
+    mi.set_variant(variant.replace("rgb", "mono"))
+    mi.set_variant(variant)
+    si = dr.zeros(mi.SurfaceInteraction3f, 10)
+    si.wi = mi.Vector3f(0, 0, 1)
+    assert np.isfinite(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0.6, 0.8)).numpy()).all()
+
+
 def test_only_what_has_an_effect_is_stored(mi_rgb, rng, tmp_path):
     from mi_diffind.encode import encode
 
