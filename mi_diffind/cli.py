@@ -140,10 +140,10 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--quality", choices=["tables", "paper"], default="tables", help="layout (default: tables)")
     sub.add_argument("--storage", choices=STORAGES, default="float32", help="storage form (default: float32)")
     sub.add_argument("--backend", choices=["llvm", "cuda"], help="where to train (default: the GPU if there is one)")
-    default = DEFAULT_SETTINGS
+    default = DEFAULT_SETTINGS["tables"]
     sub.add_argument("--steps", type=_positive, help=f"optimisation steps (default: {default.steps})")
     sub.add_argument("--batch", type=_positive, help=f"samples a step (default: {default.batch})")
-    sub.add_argument("--lr", type=float, help=f"Adam's learning rate (default: {default.lr})")
+    sub.add_argument("--lr", type=float, help="Adam's learning rate (default: the task's)")
     sub.add_argument("--schedule", choices=SCHEDULES, help=f"of the learning rate (default: {default.schedule})")
     sub.add_argument("--seed", type=_natural, help=f"seed of the random numbers (default: {default.seed})")
     sub.add_argument("--all-cores", action="store_true", help="faster, but not the same bytes each time")
@@ -509,7 +509,7 @@ def _fit(arguments) -> dict:
 
     given = {k: getattr(arguments, k) for k in ("steps", "batch", "lr", "schedule", "seed")}
     given = {k: v for k, v in given.items() if v is not None}
-    settings = dataclasses.replace(DEFAULT_SETTINGS, deterministic=not arguments.all_cores, **given)
+    settings = dataclasses.replace(DEFAULT_SETTINGS[arguments.quality], deterministic=not arguments.all_cores, **given)
     try:
         table, result = fit_disney(
             settings,

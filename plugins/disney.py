@@ -100,7 +100,7 @@ class Disney(mi.BSDF):
 
     The reflection model of *Physically Based Shading at Disney* (Burley 2012), evaluated from its formulas. It is the
     exact counterpart of :ref:`neural_disney <bsdf-neural_disney>` and has the same parameters, whose names and
-    meaning follow Mitsuba's :monosp:`principled`: changing ``type`` is all it takes. All are in [0, 1]: constants
+    meaning follow Mitsuba's :monosp:`principled`: changing ``type`` is all it takes. All are in [0, 1]: numbers
     outside are refused, textures are clamped. Differences to ``principled``: Schlick's Fresnel term in place of the
     dielectric one, no transmission, and ``eta`` between 1 and 3.
 
@@ -163,13 +163,14 @@ class Disney(mi.BSDF):
         else:
             aliases = {}
 
+        # Only numbers are checked: to look into a texture, a constructor would have to wait for a kernel
         self.base_color = props.get_texture("base_color", 0.5)
-        _check_range("base_color", self.base_color, 0, 1)
+        _check_range(props, "base_color", 0, 1)
         self.scalars = {}
         for name, default in self.DEFAULTS.items():
             given = aliases.get(name, name)
             self.scalars[name] = props.get_texture(given, default)
-            _check_range(given, self.scalars[name], 0, 1)
+            _check_range(props, given, 0, 1)
 
         # As in `principled`, a constant is exposed under its own name and not as a texture's value
         if "eta" in props and "specular" in props:
@@ -177,21 +178,19 @@ class Disney(mi.BSDF):
         self.reflectance_name = "eta" if "eta" in props else "specular"
         low, high = (1, ETA_MAX) if self.reflectance_name == "eta" else (0, 1)
         name = self.reflectance_name
-        if name not in props or props.type(name) in (mi.Properties.Type.Float, mi.Properties.Type.Integer):
-            value = float(props.get(name, 0.5))
-            if not low <= value <= high:
-                raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is [{low}, {high}]')
-            self.reflectance = mi.Float(value)
+        _check_range(props, name, low, high)
+        if name not in props or _is_number(props, name):
+            self.reflectance = mi.Float(float(props.get(name, 0.5)))
             dr.make_opaque(self.reflectance)
         else:
             self.reflectance = props.get_texture(name)
-            _check_range(name, self.reflectance, low, high)
 
         if "spec_trans" in props:
-            transmission = props.get_texture("spec_trans", 0.0)
-            if _bounds(transmission)[1] > 0:
+            found = f"{float(props['spec_trans']):g}" if _is_number(props, "spec_trans") else "a texture"
+            props.get_texture("spec_trans", 0.0)
+            if found != "0":
                 raise RuntimeError(
-                    'parameter "spec_trans": found a value above 0, but this model has no transmission; '
+                    f'parameter "spec_trans": found {found}, but this model has no transmission, only 0 is allowed; '
                     'use Mitsuba\'s "principled" for it'
                 )
 
@@ -203,10 +202,9 @@ class Disney(mi.BSDF):
             self.rates[lobe] = mi.Float(rate)
             dr.make_opaque(self.rates[lobe])
 
-        self._set_flags(
-            any(t.is_spatially_varying() for t in self._textures().values()),
-            _bounds(self.scalars["anisotropic"])[1] > 0,
-        )
+        number = "anisotropic" not in props or _is_number(props, "anisotropic")
+        self._is_anisotropic = not number or float(props.get("anisotropic", 0.0)) > 0
+        self._set_flags(any(t.is_spatially_varying() for t in self._textures().values()), self._is_anisotropic)
 
     def _set_flags(self, varies: bool, is_anisotropic: bool) -> None:
         front = mi.BSDFFlags.FrontSide
@@ -424,25 +422,13 @@ def _indent(value) -> str:
     return str(value).replace("\n", "\n  ")
 
 
-def _bounds(texture: mi.Texture) -> tuple[float, float]:
-    """
-    Smallest and largest value: of a constant number exactly; of anything else 0 and the largest value it knows of
-    (Mitsuba itself refuses colours outside [0, 1], and what a texture has outside is clamped when it is read).
-    """
-    params = mi.traverse(texture)
-    if "value" in params and isinstance(params["value"], mi.Float):
-        value = params["value"].numpy()
-        return float(value.min()), float(value.max())
-    try:
-        return 0.0, float(texture.max())
-    except Exception:  # `max` is optional for textures
-        return 0.0, 1.0
+def _is_number(props: mi.Properties, name: str) -> bool:
+    return props.type(name) in (mi.Properties.Type.Float, mi.Properties.Type.Integer)
 
 
-def _check_range(name: str, texture: mi.Texture, low: float, high: float) -> None:
-    if texture.is_spatially_varying():
-        return
-    for value in _bounds(texture):
+def _check_range(props: mi.Properties, name: str, low: float, high: float) -> None:
+    if name in props and _is_number(props, name):
+        value = float(props[name])
         if not low <= value <= high:  # NaN, too
             raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is [{low}, {high}]')
 

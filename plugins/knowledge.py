@@ -3,30 +3,66 @@
 from __future__ import annotations
 
 import math
+import threading
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.tasks.disney.effects import Known
 
-#: Wavelengths at which constant spectra are looked at, in nm: visible light in steps of 10.
-_WAVELENGTHS = [360.0 + 10 * i for i in range(48)]
+_waiting = threading.local()
+
+
+def when_outermost(work) -> None:
+    """
+    Do ``work``, which may wait for a kernel, now; or, if this thread is waiting in other such work already, after that.
+
+    Mitsuba loads scenes in several threads, and one that waits for a kernel takes up the next task, which may construct
+    the next material: without this, constructors would nest without bounds.
+    """
+    queue = getattr(_waiting, "queue", None)
+    if queue is not None:
+        queue.append(work)
+        return
+    _waiting.queue = [work]
+    try:
+        while _waiting.queue:
+            _waiting.queue.pop(0)()
+    finally:
+        _waiting.queue = None
+
+
+#: Textures whose values are those of their parameters, wherever they are read. Others may call themselves constant and
+#: not be, as ``mesh_attribute`` does.
+_CONSTANTS = ("UniformSpectrum", "SRGBReflectanceSpectrum")
+_BITMAPS = "BitmapTextureImpl"
+
+
+def _kind(texture) -> str:
+    """Mitsuba's name of a texture's class; nothing for one written in Python, which may be of any name."""
+    return texture.class_name() if type(texture).__module__.startswith("mitsuba") else ""
 
 
 class Watched:
     """
     A parameter of a BSDF, a texture or a number, and what is known about it. ``constant``: it is the same everywhere (a
-    colour in spectral variants is not: it varies with the wavelengths).
+    colour in spectral variants is not: it varies with the wavelengths). ``is_eta``: it stands for the reflectance that
+    belongs to it.
     """
 
-    def __init__(self, texture, colour: bool = False):
-        self.texture, self.colour = texture, colour
-        self.constant = not texture.is_spatially_varying() and not (colour and mi.is_spectral)
-        self._parameters = mi.traverse(texture)
+    def __init__(self, texture, colour: bool = False, is_eta: bool = False):
+        self.texture, self.colour, self.is_eta = texture, colour, is_eta
+        if isinstance(texture, dr.ArrayBase):  # a parameter of the BSDF itself, assigned to in place
+            self.constant, self._parameters = True, None
+        else:
+            self.constant = _kind(texture) in _CONSTANTS and not (colour and mi.is_spectral)
+            self._parameters = mi.traverse(texture)
         self._arrays, self._found = None, Known()
 
     def _values(self) -> list:
         """The arrays that the texture consists of at present, children included."""
+        if self._parameters is None:
+            return [self.texture]
         values = (self._parameters[key] for key in self._parameters.keys())
         return [v for v in values if isinstance(v, dr.ArrayBase)]
 
@@ -34,33 +70,42 @@ class Watched:
         """Is a derivative with respect to it asked for? Also where derivatives are suspended at the moment."""
         return any(map(has_gradient, self._values()))
 
+    def changed(self) -> bool:
+        """Is it not what it was when it was last looked at? A texture may be updated without anybody being told."""
+        if self._arrays is None:
+            return True
+        return [*map(_identity, self._arrays)] != [*map(_identity, self._values())]
+
     def look(self) -> None:
         """Find out its bounds, if they are not known or it is not what it was."""
-        values = self._values()
-        if dr.flag(dr.JitFlag.FreezingScope) or any(map(has_gradient, values)):
+        if dr.flag(dr.JitFlag.FreezingScope) or self.optimised():
             self._arrays, self._found = None, Known()  # values cannot be looked at, or need not
-        elif self._arrays is None or [*map(_identity, self._arrays)] != [*map(_identity, values)]:
+        elif self.changed():
             # The copies keep the arrays alive, so that no other one gets their index
-            self._arrays, self._found = [dr.detach(v) for v in values], bounds(self.texture, self.colour)
+            self._arrays, self._found = [dr.detach(v) for v in self._values()], self._bounds()
+
+    def _bounds(self) -> Known:
+        found = bounds(self.texture, self.colour)
+        if self.is_eta:  # 1 reflects nothing
+            return Known(0, 0) if found.is_always(1) else Known(0, math.inf)
+        return found
 
     def known(self) -> Known:
-        """What was found when it was last looked at; anything is possible if it is being optimised."""
-        return Known(optimised=True) if self.optimised() else self._found
-
-
-class WatchedNumber(Watched):
-    """A number that is a parameter of the BSDF itself (which is assigned to in place)."""
-
-    def __init__(self, number):
-        self.texture, self.colour, self.constant = number, False, True
-        self._arrays, self._found = None, Known()
-
-    def _values(self) -> list:
-        return [self.texture]
+        """What was found when it was last looked at; anything is possible if it has changed, or is being optimised."""
+        if self.optimised():
+            return Known(optimised=True)
+        return Known() if self.changed() else self._found
 
 
 class WatchedChannel(Watched):
     """A channel of a texture, about whose values nothing is known."""
+
+    def __init__(self, texture):
+        super().__init__(texture)
+        self.constant = False
+
+    def changed(self) -> bool:
+        return False
 
     def look(self) -> None:
         pass
@@ -87,24 +132,20 @@ def _identity(value) -> tuple:
 def bounds(texture, colour: bool = False) -> Known:
     """
     Bounds of what ``texture`` (or a number) gives: of its ``eval`` if ``colour``, else of its ``eval_1``. Constants and
-    bitmaps are known, whatever their filter; anything else may have any value in [0, 1].
+    bitmaps are known, whatever their filter; anything else may have any value.
     """
-    if not isinstance(texture, mi.Object):
+    if isinstance(texture, dr.ArrayBase):
         return _of([texture])
-    if not texture.is_spatially_varying():
+    kind = _kind(texture)
+    if kind in _CONSTANTS and mi.is_spectral and colour:
+        # Smooth, and coefficients of a sigmoid: neither black nor without hue, unless it is uniform
+        return _of([mi.traverse(texture)["value"]]) if kind == "UniformSpectrum" else Known()
+    if kind in _CONSTANTS:
         si = dr.zeros(mi.SurfaceInteraction3f)
-        if not colour:
-            return _of([texture.eval_1(si)])
-        if mi.is_spectral:
-            found = []
-            for i in range(0, len(_WAVELENGTHS), 4):
-                si.wavelengths = mi.UnpolarizedSpectrum(_WAVELENGTHS[i : i + 4])
-                found += list(texture.eval(si))
-            return _of(found)
-        return _of(list(texture.eval(si)))
-    data = mi.traverse(texture).get("data")
-    if data is None or not dr.is_tensor_v(data) or data.ndim != 3:
+        return _of(list(texture.eval(si)) if colour else [texture.eval_1(si)])
+    if not kind.startswith(_BITMAPS):
         return Known()
+    data = mi.traverse(texture)["data"]
     channels = data.shape[-1]
     if mi.is_spectral and channels > 1:
         return Known()  # coefficients of spectra

@@ -12,7 +12,7 @@ from mi_diffind.tasks.disney.library import load_decoder
 
 from . import knowledge
 from .disney import Disney, Parameters
-from .knowledge import Watched, WatchedChannel, WatchedNumber
+from .knowledge import Watched, WatchedChannel, when_outermost
 
 
 class NeuralDisney(Disney):
@@ -133,12 +133,11 @@ class NeuralDisney(Disney):
             **{name: WatchedChannel(self.latents[i]) for name, (i, _) in self._latent_channels.items()},
         }
         if "specular" not in self._watched:
-            number = not isinstance(self.reflectance, mi.Texture)
-            self._watched["specular"] = (WatchedNumber if number else Watched)(self.reflectance)
+            self._watched["specular"] = Watched(self.reflectance, is_eta=self.reflectance_name == "eta")
         #: Coefficients that depend on constants alone, evaluated, and the effects that they are for.
         self._constant: dict[str, dict] = {}
         self._constant_for: Effects | None = None
-        self._prepare_constants()
+        when_outermost(self._prepare_constants)
 
     def _take_latents(self, props: mi.Properties) -> None:
         names = str(props.get("latents", "")).split()
@@ -159,7 +158,7 @@ class NeuralDisney(Disney):
                 del self.scalars[name]
         if names:
             anisotropic = self.scalars.get("anisotropic")
-            self._set_flags(True, anisotropic is None or not knowledge.bounds(anisotropic).is_always(0))
+            self._set_flags(True, self._is_anisotropic or anisotropic is None)
 
     def _read(self, name, parameters, si, active):
         if name == "latent":
@@ -200,12 +199,14 @@ class NeuralDisney(Disney):
     def _effects(self) -> Effects:
         if self.effects == "all":
             return Effects()
+        if not dr.flag(dr.JitFlag.SymbolicScope) and any(watched.changed() for watched in self._watched.values()):
+            self._prepare_constants()  # a texture was updated, and we were not told
         return find_effects({name: watched.known() for name, watched in self._watched.items()})[0]
 
     def _is_constant(self, group: str) -> bool:
-        """Does a group of coefficients depend on constants alone, none of which is being optimised?"""
+        """Does a group of coefficients depend on constants alone, none of which is being optimised or has changed?"""
         watched = [self._watched[name] for name in self.decoder.groups[group]]
-        if not all(w.constant and not w.optimised() for w in watched):
+        if not all(w.constant and not w.optimised() and not w.changed() for w in watched):
             return False
         reads_tables = group not in GROUPS
         return not (reads_tables and any(knowledge.has_gradient(a.data) for a in self._tables().values()))
@@ -214,7 +215,9 @@ class NeuralDisney(Disney):
         """Look at the parameters, and evaluate every group of coefficients that depends on constants alone."""
         for watched in self._watched.values():
             watched.look()
-        effects = self._effects()
+        effects = find_effects({name: watched.known() for name, watched in self._watched.items()})[0]
+        if self.effects == "all":
+            effects = Effects()
         groups = sorted({*self.decoder.required(effects), *sampling.required(effects)})
         parameters = Parameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
         with dr.suspend_grad():
@@ -223,6 +226,8 @@ class NeuralDisney(Disney):
                 for group in groups
                 if self._is_constant(group)
             }
+        # A frozen function is recorded anew when the arrays that it finds here are others
+        self._constant["effects"] = {name: mi.Float(0) for name in effects.names}
         dr.make_opaque(self._constant)
         self._constant_for = effects
 
@@ -232,7 +237,8 @@ class NeuralDisney(Disney):
         usable = self._constant if effects == self._constant_for else {}
         coefficients = {}
         for group in dict.fromkeys(groups):
-            if group in usable and self._is_constant(group):  # gradients may have been enabled since
+            # Gradients may have been enabled, and textures updated, since
+            if group in usable and self._is_constant(group):
                 coefficients[group] = usable[group]
             else:
                 coefficients[group] = self.decoder.coefficients(group, parameters, effects)
@@ -309,7 +315,7 @@ class NeuralDisney(Disney):
             "quality": "fast" if arrays is None else arrays.QUALITY,
             "effects_in_use": list(effects.names),
             "effects_left_out": reasons,
-            "evaluated_once": sorted(self._constant),
+            "evaluated_once": sorted(group for group in self._constant if group != "effects"),
             "storage": None if arrays is None else arrays.storage,
             "table_bytes": 0 if arrays is None else arrays.nbytes,
         }

@@ -53,7 +53,7 @@ def test_decode_inverts_encode(rng, quality):
     decoder = load_decoder("", ad.TensorXf, "", quality)
     roughness, anisotropic = (ad.Float(rng.random(10_000).astype("f4")) for _ in range(2))
     latent = decoder.encode_roughness(roughness), decoder.encode_anisotropic(anisotropic)
-    assert all(v.numpy().min() >= 0 and v.numpy().max() <= 1 for v in latent)
+    assert all(v.numpy().min() >= -1e-3 and v.numpy().max() <= 1.001 for v in latent)
     found = decoder.decode(latent)
     visible = roughness.numpy() > 0.05  # below, α has a floor
     for a, b, tolerance in zip(found, (roughness, anisotropic), (0.005, 0.05), strict=True):

@@ -25,7 +25,7 @@ def test_scene_as_written_and_exact(mi_rgb, name):
     assert result.figures["psnr_db"] > 38
     assert result.figures["flip"] < 0.03
     assert result.figures["learned_plugins"] == (60 if name == "materials" else 9)
-    assert result.figures["table_bytes"] == 3072
+    assert result.figures["table_bytes"] == 2048
 
 
 @pytest.mark.parametrize("name", ["materials", "still_life"])

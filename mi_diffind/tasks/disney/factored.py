@@ -4,12 +4,17 @@
 =============== ========= ======== =============================== ===================================================
 array           size      channels read at                         holds
 =============== ========= ======== =============================== ===================================================
-``encoder_…``   8         2        warped roughness; anisotropy    a coordinate in ``alpha``, and its rest
-``alpha``       16 × 8    4        encoded roughness, anisotropy   ln α_x, ln α_y of GGX, and the rest of each
+``encoder_…``   8         2        warped roughness; anisotropy    coordinates in the two that follow, with rests
+``alpha``       64        2        encoded roughness               ln √(α_x α_y) of GGX, and its rest
+``aspect``      32        2        encoded anisotropy              ln √(α_y / α_x), and its rest
 ``masking``     32        1        c / (c + t)                     d / (c + t)
 ``cosine``      64        2        a cosine                        (1 − c)^2.5, Schlick's root; coat's G₁
-``coat``        32        2        clearcoat gloss                 ln of the coefficients of GTR1's denominator
+``coat``        32        4        clearcoat gloss                 α and normalisation of GTR1, and their rests
 =============== ========= ======== =============================== ===================================================
+
+The *rest* is what rounding to bytes has left of a value whose exponential or small square is taken: both together are
+as good as 16 bits. The floor on α is applied after reading, since its kink would not fit into a table; both logarithms
+then depend on one parameter each, and an isotropic material need not read the second.
 
 Masking is tabulated for each direction, with the cosine already divided out: ``d = c + √(c² + t²)``, where ``c`` is the
 direction's cosine and ``t = √(α_x² x² + α_y² y²)`` its tangent, stretched by the roughness. ``d`` is homogeneous, so
@@ -20,8 +25,6 @@ layout lacks.
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import numpy as np
 
@@ -31,8 +34,12 @@ from . import decoder, model
 from .arrays import Arrays
 from .model import ALPHA_MIN, TINY, positive
 
-#: Limits of ``ln α``: those of a roughness of 0, and of 1 with anisotropy 1.
-LOG_ALPHA = (math.log(ALPHA_MIN), 1.2)
+#: Where the tabulated α ends: below the floor that is applied to it, so that the kink is not in the table.
+LOWEST_ALPHA = 0.2 * ALPHA_MIN
+
+
+#: Limits of what is read, whatever is in the tables: roughness and anisotropy between 0 and 1, and a little more.
+LOG_ALPHA, LOG_ASPECT = (-12.0, 0.1), (-1.2, 0.0)
 
 
 class FactoredArrays(Arrays):
@@ -43,29 +50,31 @@ class FactoredArrays(Arrays):
     SHAPES = {  # noqa: RUF012
         "encoder_roughness": (8, 2),
         "encoder_anisotropic": (8, 2),
-        "alpha": (16, 8, 4),
+        "alpha": (64, 2),
+        "aspect": (32, 2),
         "masking": (32, 1),
         "cosine": (64, 2),
-        "coat": (32, 2),
+        "coat": (32, 4),
     }
 
     RANGES = {  # noqa: RUF012
         "encoder_roughness": (-0.1, 1.0),
         "encoder_anisotropic": (-0.1, 1.0),
-        "alpha": (-7.5, 2.0),
+        "alpha": (-12.0, 2.0),
+        "aspect": (-2.0, 0.5),
         "masking": (0.5, 4.0),
         "cosine": (0.0, 2.0),
-        "coat": (-16.0, 8.0),
+        "coat": (-0.05, 0.2),
     }
 
     #: Tables whose second half of channels is what rounding the first half to bytes has left, to be added to it: an
     #: exponential follows, and 8 bits for 8 units of a logarithm are errors of 1.6%.
-    SPLIT = ("encoder_roughness", "encoder_anisotropic", "alpha")
+    SPLIT = ("encoder_roughness", "encoder_anisotropic", "alpha", "aspect", "coat")
 
-    def log_alpha(self, latent, active=True) -> list:
-        """``ln α_x`` and ``ln α_y`` of the encoded roughness and anisotropy. Depends on the material only."""
-        x, y, rest_x, rest_y = self.alpha(latent, active)
-        return [x + rest_x, y + rest_y]
+    def coat_values(self, gloss, active=True) -> list:
+        """α of the clearcoat's GTR1, and its normalisation. Depends on the material only."""
+        alpha, norm, rest_alpha, rest_norm = self.coat([gloss], active)
+        return [alpha + rest_alpha, norm + rest_norm]
 
     def to_table(self, storage: str = "float32", **about) -> Table:
         table = super().to_table("float32", **about)
@@ -73,6 +82,8 @@ class FactoredArrays(Arrays):
             values = table.arrays[name]
             half = values.shape[-1] // 2
             total = values[..., :half] + values[..., half:]
+            if name in ("encoder_anisotropic", "aspect"):
+                total[0] = 0  # an anisotropy of 0 is none, to the last bit: it may be left out
             codes, scale, offset = quantize(total, half)
             coarse = np.asarray(offset) + np.asarray(scale) * codes.astype(np.float64)
             table.arrays[name] = np.concatenate([coarse, total - coarse], axis=-1).astype(np.float32)
@@ -86,44 +97,44 @@ class FactoredArrays(Arrays):
         Tables of one coordinate are trained at uniform ones: those of random directions would hardly ever lie near the
         horizon, where errors matter as much.
         """
-        ax, ay = model.roughness_to_alpha(m.roughness, m.anisotropic)
         u, v = uniform
-        a2 = dr.square(model.coat_alpha(m.clearcoat_gloss))
-        k = (a2 - 1) / (dr.pi * dr.log(a2))
+        alpha = model.coat_alpha(m.clearcoat_gloss)
         return {
-            "alpha": [dr.log(ax), dr.log(ay)],
+            "alpha": [dr.log(dr.maximum(dr.square(m.roughness), LOWEST_ALPHA))],
+            "aspect": [0.5 * dr.log(1 - 0.9 * m.anisotropic)],
             "masking": [u + dr.sqrt(dr.square(u) + dr.square(1 - u))],
             "cosine": [dr.sqrt(model.schlick(v)), model.coat_masking(v)],
-            "coat": [dr.log(1 / k), dr.log(a2 / k)],
+            "coat": [alpha, (dr.square(alpha) - 1) / (2 * dr.pi * dr.log(alpha))],
         }
 
     def predict(self, m, wi, wo, uniform) -> dict[str, list]:
         u, v = uniform
+        roughness, anisotropic = self.encode(m)
         return {
-            "alpha": self.log_alpha(self.encode(m)),
+            "alpha": [sum(self.alpha([roughness]))],
+            "aspect": [sum(self.aspect([anisotropic]))],
             "masking": self.masking([u]),
             "cosine": self.cosine([v]),
-            "coat": self.coat([m.clearcoat_gloss]),
+            "coat": self.coat_values(m.clearcoat_gloss),
         }
 
     @classmethod
     def initial(cls, name: str) -> np.ndarray:
-        u, v = (*cls.axes(name), None)[:2]
+        (u,) = cls.axes(name)
         if name.startswith("encoder"):
             entries = [u, np.zeros_like(u)]
         elif name == "alpha":
-            u = np.maximum(decoder.unwarp_roughness(u), 0)
-            aspect = np.sqrt(1 - 0.9 * v)
-            entries = [np.log(np.maximum(a, ALPHA_MIN)) for a in (u**2 / aspect, u**2 * aspect)]
-            entries += [np.zeros_like(u)] * 2
+            alpha = np.maximum(decoder.unwarp_roughness(u), 0) ** 2
+            entries = [np.log(np.maximum(alpha, LOWEST_ALPHA)), np.zeros_like(u)]
+        elif name == "aspect":
+            entries = [0.5 * np.log(1 - 0.9 * u), np.zeros_like(u)]
         elif name == "masking":
             entries = [u + np.sqrt(u**2 + (1 - u) ** 2)]
         elif name == "cosine":
             entries = [(1 - u) ** 2.5, 2 * u / (u + np.sqrt(0.0625 + 0.9375 * u**2))]
         else:
-            a2 = (0.1 - 0.099 * u) ** 2
-            k = (a2 - 1) / (np.pi * np.log(a2))
-            entries = [np.log(1 / k), np.log(a2 / k)]
+            alpha = 0.1 - 0.099 * u
+            entries = [alpha, (alpha**2 - 1) / (2 * np.pi * np.log(alpha)), np.zeros_like(u), np.zeros_like(u)]
         return np.stack(entries, axis=-1)
 
 
@@ -151,10 +162,15 @@ class FactoredDecoder(decoder.Decoder):
         return self.arrays.encode_anisotropic(anisotropic, active)
 
     def decode(self, latent, active=True):
-        return decoder.alpha_to_roughness(*self._alpha(latent, active))
+        return decoder.alpha_to_roughness(*self._alpha(latent, True, active))
 
-    def _alpha(self, latent, active=True):
-        return [dr.exp(clamp(v, *LOG_ALPHA)) for v in self.arrays.log_alpha(latent, active)]
+    def _alpha(self, latent, anisotropic: bool, active=True) -> list:
+        """α_x and α_y of the encoded roughness and anisotropy, or one number for an isotropic material."""
+        mean = clamp(sum(self.arrays.alpha([latent[0]], active)), *LOG_ALPHA)
+        if not anisotropic:
+            return [dr.maximum(dr.exp(mean), ALPHA_MIN)]
+        aspect = clamp(sum(self.arrays.aspect([latent[1]], active)), *LOG_ASPECT)
+        return [dr.maximum(dr.exp(v), ALPHA_MIN) for v in (mean - aspect, mean + aspect)]
 
     def required(self, e):
         instead = {"ggx": "read_ggx" if "alpha" in self.read else "ggx", "coat": "read_coat"}
@@ -163,13 +179,14 @@ class FactoredDecoder(decoder.Decoder):
         return tuple(instead.get(name, name) for name in super().required(e))
 
     def _read_ggx(self, p, e):
-        ax, ay = self._alpha(self.arrays.encode(p))
-        return decoder.ggx_coefficients(*((ax, ay) if e.anisotropic else (ax,)))
+        return decoder.ggx_coefficients(*self._alpha(self.arrays.encode(p), e.anisotropic))
 
     def _read_coat(self, p, e):
-        limits = self.arrays.RANGES["coat"]
-        k0, k1 = (dr.exp(clamp(v, *limits)) for v in self.arrays.coat([p.clearcoat_gloss]))
-        return {"a2": k1 / k0, "scale": model.COAT_STRENGTH * p.clearcoat / k0}
+        alpha, norm = self.arrays.coat_values(p.clearcoat_gloss)
+        return {
+            "a2": dr.square(clamp(alpha, 1e-4, 0.2)),
+            "scale": model.COAT_STRENGTH * p.clearcoat * clamp(norm, 0.0, 0.2),
+        }
 
     def ggx(self, c):
         return c["read_ggx"] if "alpha" in self.read else super().ggx(c)
