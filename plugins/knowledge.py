@@ -27,6 +27,8 @@ def when_outermost(work) -> None:
     _waiting.queue = [work]
     try:
         while _waiting.queue:
+            # What was computed for other materials in the meantime came before, as far as Dr.Jit is concerned
+            dr.detail.new_scope(dr.backend_v(mi.Float))
             _waiting.queue.pop(0)()
     finally:
         _waiting.queue = None
