@@ -27,7 +27,7 @@ class NeuralDisney(Disney):
      * - quality
        - |string|
        - ``fast``: arithmetic wherever it takes less time than a table on a CPU, which on those we measured is
-         everywhere; ``tables``: every factor is read from tables of together 3 KB, in a factorisation that stays
+         everywhere; ``tables``: every factor is read from tables of together 2 KB, in a factorisation that stays
          accurate at the horizon; ``paper``: the layout of the paper's Table 1, for comparison. (Default: that of the
          file, if ``filename`` is given, else ``fast``)
        - --
