@@ -224,7 +224,15 @@ def test_interrupt_before_the_first_measurement(ad):
     assert problem.quality(problem.net)["psnr_db"] == result.quality["psnr_db"]
 
 
-def test_second_interrupt_is_a_real_one(ad):
+@pytest.fixture
+def usual_interrupts():
+    """A shell starts background jobs with Ctrl-C ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_second_interrupt_is_a_real_one(ad, usual_interrupts):
     before = signal.getsignal(signal.SIGINT)
     problem = Curve(ad, {7: lambda y: interrupt(interrupt(y))})
     with pytest.raises(KeyboardInterrupt):
