@@ -199,7 +199,8 @@ class NeuralDisney(Disney):
     def _effects(self) -> Effects:
         if self.effects == "all":
             return Effects()
-        if not dr.flag(dr.JitFlag.SymbolicScope) and any(watched.changed() for watched in self._watched.values()):
+        watched = self._watched.values()
+        if not dr.flag(dr.JitFlag.SymbolicScope) and any(w.changed() and not w.optimised() for w in watched):
             self._prepare_constants()  # a texture was updated, and we were not told
         return find_effects({name: watched.known() for name, watched in self._watched.items()})[0]
 
