@@ -201,6 +201,30 @@ class DifferentiableArray(nn.Module):
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
         return lookup.unpack(self.data.numpy(), self.resolution, self.channels)
 
+    def at(self, x) -> DifferentiableArray:
+        """
+        The array of one dimension less that remains where the *last* coordinate is ``x``, a number in an array of size
+        1: ``array.at(x)([a]) == array([a, x])`` up to rounding. In single precision, its entries folded already;
+        differentiable with respect to the entries and to ``x``. Raises ``ValueError`` for an array of one dimension.
+        """
+        if self.dims < 2:
+            raise ValueError("an array of 1 dimension has no coordinate to fix but its only one")
+        module, (*resolution, _) = _module(self.data), self.resolution
+        index = dr.arange(module.UInt32, math.prod(resolution))
+        positions = []
+        for n, border in reversed(list(zip(resolution, self.border, strict=False))):
+            positions.insert(0, module.Float(index % n) / max(1, n if border == "repeat" else n - 1))
+            index = index // n
+        values = self([*positions, x])
+        stored = lookup.padded_channels(self.channels)
+        flat = dr.zeros(module.Float, math.prod(resolution) * stored)
+        index = dr.arange(module.UInt32, math.prod(resolution)) * stored
+        for k, value in enumerate(values):
+            dr.scatter(flat, value, index + k)
+        result = DifferentiableArray(resolution, self.channels, border=self.border[:-1])
+        result.data = module.TensorXf(flat, (*resolution, stored))
+        return result
+
     # -- properties -------------------------------------------------------------------------------------------------
 
     def check_shape(self) -> None:

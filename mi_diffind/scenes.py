@@ -20,12 +20,19 @@ import numpy as np
 from . import plugins
 from .files import replacing
 from .operations import bsdf_operations
-from .tasks.disney.library import load_disney_table, table_file
+from .tasks import ggx
+from .tasks.disney import library as disney
 
 #: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
 MAX_DEPTHS = {
     **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer"), -1),
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
+}
+
+#: For each learned plugin: which file it reads, by file name and quality, and how to read it.
+_TABLES = {
+    "neural_disney": (disney.table_file, disney.load_disney_table),
+    "neural_ggx": (ggx.table_file, ggx.load_ggx_table),
 }
 
 
@@ -70,11 +77,12 @@ def swap_exact(state) -> int:
                 raise RuntimeError(
                     f'"{props.id()}" has its parameters encoded (latents); its exact counterpart needs the originals'
                 )
-            name, learned_only = counterpart
-            props.set_plugin_name(name)
-            for key in learned_only:
+            props.set_plugin_name(counterpart.name)
+            for key in counterpart.learned_only:
                 if key in props:
                     del props[key]
+            for key, value in counterpart.given.items():
+                props[key] = value
             count += 1
     return count
 
@@ -103,7 +111,7 @@ def learned_plugins(path: str | os.PathLike, defines: dict[str, str] | None = No
             props = node.props
             if props.plugin_name() not in plugins.EXACT_COUNTERPARTS:
                 continue
-            _, learned_only = plugins.EXACT_COUNTERPARTS[props.plugin_name()]
+            learned_only = plugins.EXACT_COUNTERPARTS[props.plugin_name()].learned_only
             constants = {k: _constant(props, k) for k in props if k not in learned_only}
             found.append({
                 "plugin": props.plugin_name(),
@@ -149,9 +157,10 @@ def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, 
     found = {}
     for entry in learned:
         name, storage = entry.get("filename", ""), entry.get("storage", "")
+        table_file, load_table = _TABLES[entry["plugin"]]
         file = table_file(name and Path(scene).resolve().parent / name, entry.get("quality", ""))
         if file is not None and (str(file), storage) not in found:
-            table, _ = load_disney_table(file)
+            table, _ = load_table(file)
             found[str(file), storage] = table.to(storage or table.storage)
     return found
 

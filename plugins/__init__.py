@@ -10,12 +10,29 @@ from __future__ import annotations
 
 import importlib
 import sys
+from dataclasses import dataclass, field
 
 #: Modules of this package that define a plugin, in an order in which each follows those that it builds upon.
-MODULES = ("disney", "neural_disney")
+MODULES = ("disney", "neural_disney", "neural_ggx")
 
-#: For each learned plugin: its exact counterpart and the parameters that only the learned one has.
-EXACT_COUNTERPARTS = {"neural_disney": ("disney", ("quality", "effects", "filename", "storage"))}
+
+@dataclass(frozen=True)
+class Counterpart:
+    """
+    What is exact where a learned plugin is not: the ``name`` of a plugin that takes the same parameters but those of
+    ``learned_only``, and needs those of ``given`` in addition.
+    """
+
+    name: str
+    learned_only: tuple[str, ...]
+    given: dict[str, str] = field(default_factory=dict)
+
+
+#: The exact counterpart of each learned plugin.
+EXACT_COUNTERPARTS = {
+    "neural_disney": Counterpart("disney", ("quality", "effects", "filename", "storage")),
+    "neural_ggx": Counterpart("roughconductor", ("quality", "filename", "storage"), {"distribution": "ggx"}),
+}
 
 _registered: set[str] = set()
 
