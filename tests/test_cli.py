@@ -147,6 +147,28 @@ def test_fit(tmp_path, capsys):
     assert main(["render", own, "-o", str(tmp_path / "image.exr")]) == 0
 
 
+def test_fit_ggx(tmp_path, capsys):
+    from mi_diffind.tables import load_table
+
+    out, report = tmp_path / "own.npz", tmp_path / "report.json"
+    arguments = ["fit", "ggx", "--steps", "40", "--batch", "4096", "--backend", "llvm"]
+    assert main([*arguments, "-o", str(out), "--json", str(report)]) == 0
+    table, found = load_table(out), json.loads(report.read_text())
+    assert table.task == "ggx" and table.storage == "float32"
+    assert table.arrays["primary"].shape == (16, 16, 2) and table.arrays["cascaded"].shape == (8, 8, 1)
+    assert found["bytes"] == 4 * (16 * 16 * 2 + 8 * 8) and found["settings"]["quality"] == "tables"
+    assert found["settings"]["schedule"] == "cosine"
+    own = ["--quality", "paper", "--primary", "12", "--cascaded", "6", "--storage", "float16", "--lr", "0.002"]
+    assert main([*arguments, *own, "-o", str(out)]) == 0
+    table = load_table(out)
+    assert table.arrays["primary"].shape == (12, 12, 2) and table.arrays["cascaded"].shape == (6, 6, 1)
+    assert table.storage == "float16" and table.settings["lr"] == 0.002 and table.settings["quality"] == "paper"
+    assert table.settings["schedule"] == "constant"  # of the level that was asked for
+    capsys.readouterr()
+    assert main(["inspect", str(out)]) == 0
+    assert 'tables for the task "ggx", 648 bytes as float16' in capsys.readouterr().out
+
+
 def test_fit_is_interrupted_and_resumed(tmp_path):
     """Ctrl-C keeps the best so far and the checkpoint; resuming ends at the same bytes as an undisturbed run."""
     command = [sys.executable, "-m", "mi_diffind.cli", "fit", "disney", "--steps", "1000", "--batch", "2048"]
@@ -211,12 +233,95 @@ def test_interrupted_renders_keep_what_they_have(tmp_path):
     assert (folder / "comparison.png").exists()
 
 
+VERBS = ("render", "compare", "regress", "inspect", "tradeoff", "encode", "fit")
+TASKS = {"fit": ("disney", "ggx"), "tradeoff": ("disney", "ggx", "scene")}
+
+HELP = """
+import contextlib, io, json, sys
+from mi_diffind.cli import main
+
+texts = []
+for arguments in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        try:
+            main([*arguments, "--help"])
+        except SystemExit as e:
+            assert e.code == 0, arguments
+    texts.append(text.getvalue())
+import mitsuba
+
+print(json.dumps({"texts": texts, "modules": sorted(sys.modules), "variant": mitsuba.variant()}))
+"""
+
+
+def test_help_is_fast():
+    """Of each verb and task: before anything of Mitsuba is loaded but its core, which ``import mi_diffind`` needs."""
+    commands = [[], *([verb] for verb in VERBS), *([verb, task] for verb, tasks in TASKS.items() for task in tasks)]
+    done = subprocess.run(
+        [sys.executable, "-c", HELP, json.dumps(commands)], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    for command, text in zip(commands, found["texts"], strict=True):
+        assert text.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
+    assert all(f"\n    {verb} " in found["texts"][0] for verb in VERBS)
+    assert found["variant"] is None
+    slow = {"matplotlib", "OpenEXR", "trimesh", "mi_diffind.scenes", "mi_diffind.tradeoff", "mi_diffind.budget"}
+    slow |= {"mi_diffind.compare", "mi_diffind.regress", "mi_diffind.transport", "mi_diffind.encode"}
+    assert not slow & set(found["modules"])
+    assert not [name for name in found["modules"] if name.startswith("mi_diffind.tradeoffs.")]
+    text = dict(zip(map(tuple, commands), found["texts"], strict=True))
+    assert "--primary" in text["fit", "ggx"] and "--primary" not in text["fit", "disney"]  # those of the task only
+    assert "-D NAME" in text["tradeoff", "scene"] and "-D NAME" not in text["tradeoff", "disney"]
+
+
+def test_json_before_or_after_the_task(tmp_path):
+    fit = ["--steps", "2", "--batch", "64", "--backend", "llvm", "-o", str(tmp_path / "own.npz")]
+    for name, before in (("before.json", True), ("after.json", False)):
+        option = ["--json", str(tmp_path / name)]
+        assert main(["fit", *(option if before else ()), "disney", *fit, *(() if before else option)]) == 0
+        assert json.loads((tmp_path / name).read_text())["bytes"] == 2048
+
+
+def test_tradeoff_of_a_scene(tmp_path, capsys):
+    out, report = tmp_path / "out", tmp_path / "report.json"
+    arguments = ["tradeoff", "scene", str(SCENES / "materials.xml"), "--quick", "--out", str(out)]
+    assert main([*arguments, "--json", str(report), "--seed", "3", *SMALL]) == 0
+    text, found = capsys.readouterr().out, json.loads(report.read_text())
+    assert "materials.xml, 48 x 28" in text and "bias" in text and found["verdict"] in text
+    files = [str(out / f"tradeoff.{kind}") for kind in ("csv", "json", "png")]
+    assert text.endswith("\nwritten     " + ", ".join(files) + "\n")
+    assert list(found.pop("files").values()) == files and sorted(map(str, out.iterdir())) == files
+    assert json.loads((out / "tradeoff.json").read_text()) == found
+    assert found["counts"][-1] == 4 and found["seed"] == 3 and found["defines"] == {"width": "48", "height": "28"}
+    assert found["settings"]["quick"] and not found["interrupted"]
+
+
+def test_tradeoff_of_a_scene_is_interrupted(tmp_path, capsys, monkeypatch, mi_rgb):
+    from mi_diffind import budget
+
+    monkeypatch.setattr(budget, "measure", lambda *arguments: {"interrupted": True})
+    monkeypatch.setattr(budget, "write", lambda result, folder: {"csv": f"{folder}/a.csv", "json": f"{folder}/a.json"})
+    monkeypatch.setattr(budget, "summary", lambda result: ["first", "second"])
+    assert main(["tradeoff", "scene", scene_file(tmp_path), "--out", str(tmp_path)]) == 130
+    assert capsys.readouterr().out == f"first\nsecond\n\nwritten     {tmp_path}/a.csv, {tmp_path}/a.json\n"
+
+
+def test_the_command_names_every_study():
+    from mi_diffind.commands.tradeoff import STUDIES
+    from mi_diffind.tradeoffs import TASKS
+
+    assert set(STUDIES) == set(TASKS)
+
+
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 
 def test_missing_files(tmp_path, capsys):
     assert "nowhere.xml: no such scene file" in refused(capsys, "render", "nowhere.xml")
     assert "nowhere.xml: no such scene file" in refused(capsys, "compare", "nowhere.xml", "--out", str(tmp_path / "o"))
+    scene = ["tradeoff", "scene", "nowhere.xml", "--out", str(tmp_path / "o")]
+    assert "nowhere.xml: no such scene file" in refused(capsys, *scene)
     assert not (tmp_path / "o").exists()
     assert "nowhere.xml: no such scene file" in refused(capsys, "inspect", "nowhere.xml")
     assert "nowhere.npz: no such file" in refused(capsys, "inspect", "nowhere.npz")
@@ -273,10 +378,34 @@ def test_bad_options(tmp_path, capsys):
         "--checkpoint",
         str(tmp_path / "c.npz"),
     )
-    for arguments in (["render", path, "--spp", "0"], ["fit", "nothing", "-o", "t.npz"], ["nothing"], []):
+    for arguments in (["render", path, "--spp", "0"], ["nothing"], []):
         with pytest.raises(SystemExit) as caught:
             main(arguments)
         assert caught.value.code == 2
+
+
+def test_bad_tasks(capsys):
+    for arguments, sentence in (
+        (["fit", "nothing", "-o", "t.npz"], "mi-diffind fit: error: argument TASK: invalid choice: 'nothing'"),
+        (["tradeoff", "nothing"], "mi-diffind tradeoff: error: argument TASK: invalid choice: 'nothing'"),
+        (["fit"], "mi-diffind fit: error: the following arguments are required: TASK"),
+        (["fit", "disney", "-o", "t.npz", "--primary", "8"], "unrecognized arguments: --primary 8"),
+        (["tradeoff", "scene"], "mi-diffind tradeoff scene: error: the following arguments are required: SCENE.xml"),
+    ):
+        with pytest.raises(SystemExit) as caught:
+            main(arguments)
+        assert caught.value.code == 2 and sentence in capsys.readouterr().err
+
+
+def test_bad_sizes(tmp_path, capsys):
+    fit = ["fit", "ggx", "--steps", "2", "-o", str(tmp_path / "own.npz")]
+    assert "primary: found 1, allowed are 2 to 4096" in refused(capsys, *fit, "--primary", "1")
+    assert "cascaded: found 5000, allowed are 2 to 4096" in refused(capsys, *fit, "--cascaded", "5000")
+    for value in ("0", "-3", "many"):
+        with pytest.raises(SystemExit) as caught:
+            main([*fit, f"--primary={value}"])
+        assert caught.value.code == 2 and "mi-diffind fit ggx: error: argument --primary" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == []
 
 
 def test_checkpoints_replace_nothing_else(tmp_path, capsys):

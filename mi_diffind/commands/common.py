@@ -1,0 +1,125 @@
+"""What verbs share: kinds of arguments, options that several have, checks before the work starts."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .. import runtime
+
+
+class UsageError(Exception):
+    """Bad input that the argument parser cannot see."""
+
+
+# -- parsers ----------------------------------------------------------------------------------------------------------
+
+
+def verb(commands, name: str, run, help: str) -> argparse.ArgumentParser:
+    """The parser of a new verb among ``commands``; what ``run(arguments)`` returns is what ``--json`` writes."""
+    sub = commands.add_parser(name, help=help, description=help)
+    sub.set_defaults(run=run)
+    _json_option(sub, None)
+    return sub
+
+
+def tasks_of(sub: argparse.ArgumentParser):
+    """The subparsers of a verb that has another parser for each task, for :func:`task`; the choice is ``.task``."""
+    return sub.add_subparsers(dest="task", required=True, metavar="TASK")
+
+
+def task(tasks, name: str, help: str) -> argparse.ArgumentParser:
+    """The parser of a new task among ``tasks``."""
+    sub = tasks.add_parser(name, help=help, description=help)
+    _json_option(sub, argparse.SUPPRESS)  # a default would replace what was given before the task
+    return sub
+
+
+def _json_option(sub: argparse.ArgumentParser, default: str | None) -> None:
+    sub.add_argument("--json", metavar="FILE", default=default, help="also write what is printed to FILE")
+
+
+def variant_option(sub: argparse.ArgumentParser) -> None:
+    """``--variant``, for :func:`set_variant`."""
+    sub.add_argument("--variant", help="Mitsuba variant (default: cuda_ad_rgb with a GPU, else llvm_ad_rgb)")
+
+
+def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
+    """``--variant``, ``-D`` (for :func:`defines_of`) and, with ``rendering``, ``--spp`` and ``--seed``."""
+    variant_option(sub)
+    sub.add_argument(
+        "-D",
+        dest="defines",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="set a <default> of the scene",
+    )
+    if rendering:
+        sub.add_argument("--spp", type=positive, help="samples per pixel (default: the scene's)")
+        sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
+
+
+# -- kinds of arguments -----------------------------------------------------------------------------------------------
+
+
+def positive(text: str) -> int:
+    """A whole number ≥ 1. Raises ``ArgumentTypeError``."""
+    value = natural(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def natural(text: str) -> int:
+    """A whole number ≥ 0. Raises ``ArgumentTypeError``."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number ≥ 0")
+    return value
+
+
+# -- before the work starts -------------------------------------------------------------------------------------------
+
+
+def set_variant(name: str | None) -> None:
+    """
+    Set the Mitsuba variant ``name``, or, if it is ``None``, the RGB variant for the GPU if there is one, else for the
+    CPU. Raises :class:`UsageError` if it cannot run here.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if name is None:
+        name = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
+    if name not in mi.variants():
+        raise UsageError(f'the variant "{name}" does not exist; available are {", ".join(mi.variants())}')
+    if name.startswith("llvm") and runtime.llvm_problem():
+        raise UsageError(runtime.llvm_problem())
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise UsageError(f'the variant "{name}" needs an NVIDIA GPU and its driver, and none was found')
+    try:
+        mi.set_variant(name)
+    except ImportError as e:
+        raise UsageError(f'the variant "{name}" cannot run here: {e}') from None
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+def defines_of(arguments) -> dict[str, str]:
+    """What ``-D`` sets: name → value. Raises :class:`UsageError`."""
+    result = {}
+    for text in arguments.defines:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise UsageError(f'-D {text}: expected NAME=VALUE, as in "-D width=320"')
+        result[name] = value
+    return result
+
+
+def require_scene(path: str) -> None:
+    """Raise :class:`UsageError` if there is no file ``path``: before an output folder is made for it."""
+    if not Path(path).is_file():
+        raise UsageError(f"{path}: no such scene file")

@@ -1,0 +1,34 @@
+"""``mi-diffind compare``: a scene as written and with exact plugins, side by side."""
+
+from __future__ import annotations
+
+from ..files import writable_folder
+from .common import defines_of, positive, require_scene, scene_options, set_variant, verb
+
+
+def add(commands) -> None:
+    """Add the verb and its options to ``commands``, the subparsers of the command line."""
+    sub = verb(commands, "compare", run, "render a scene as written and with exact plugins, and show the difference")
+    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument("--out", default="out", metavar="DIR", help="folder for pictures (default: out)")
+    sub.add_argument("--passes", type=positive, default=5, help="passes to split the samples into (default: 5)")
+    scene_options(sub)
+
+
+def run(arguments) -> dict:
+    """
+    Render the scene twice and write the pictures. Returns the figures and the ``files``. Raises
+    :class:`~mi_diffind.commands.common.UsageError`, and as :mod:`mi_diffind.compare` does.
+    """
+    require_scene(arguments.scene)
+    writable_folder(arguments.out, create=True)
+    set_variant(arguments.variant)
+    from .. import compare
+
+    comparison = compare.compare(
+        arguments.scene, arguments.spp, arguments.seed, arguments.passes, defines=defines_of(arguments)
+    )
+    paths = compare.write(comparison, arguments.out)
+    print("\n".join(compare.summary(comparison.figures)))
+    print(f"picture     {paths['figure']}")
+    return {**comparison.figures, "files": paths}

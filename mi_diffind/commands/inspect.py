@@ -1,0 +1,151 @@
+"""``mi-diffind inspect``: what is in a table file, or which learned plugins a scene uses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .. import runtime
+from ..lookup import STORAGES, gathers
+from ..tasks import ggx
+from ..tasks.disney import arrays as disney_arrays
+from ..tasks.disney.library import decoder_of, load_disney_table
+from ..tasks.disney.training import measure
+from .common import UsageError, defines_of, scene_options, set_variant, verb
+
+
+def add(commands) -> None:
+    """Add the verb and its options to ``commands``, the subparsers of the command line."""
+    sub = verb(commands, "inspect", run, "say what is in a table file, or which learned plugins a scene uses")
+    sub.add_argument("file", metavar="FILE.npz|SCENE.xml")
+    sub.add_argument("--measure", action="store_true", help="measure the accuracy of tables in each storage form")
+    scene_options(sub, rendering=False)
+
+
+def run(arguments) -> dict:
+    """
+    Print what the file holds and return it. Raises :class:`UsageError`, and
+    :class:`~mi_diffind.tables.TableError` or :class:`~mi_diffind.scenes.SceneError` for a file that cannot be read.
+    """
+    if Path(arguments.file).suffix.lower() == ".xml":
+        if arguments.measure:
+            raise UsageError(f"{arguments.file}: --measure needs a table file (.npz)")
+        return _inspect_scene(arguments)
+    if arguments.variant or arguments.defines:
+        raise UsageError(f"{arguments.file}: --variant and -D need a scene file (.xml)")
+    from ..tables import load_table
+
+    table = load_table(arguments.file)
+    print(f'{arguments.file}: tables for the task "{table.task}", {table.nbytes:,} bytes as {table.storage}')
+    arrays = {}
+    for name, array in table.arrays.items():
+        values = table.values(name)
+        arrays[name] = {
+            "resolution": list(array.shape[:-1]),
+            "channels": array.shape[-1],
+            "bytes": array.nbytes,
+            "gathers_per_read": gathers(array.shape[:-1], array.shape[-1], table.storage),
+            "min": float(values.min()),
+            "max": float(values.max()),
+        }
+        size = " x ".join(map(str, array.shape[:-1]))
+        print(
+            f"  {name:22} {size:>9}, {array.shape[-1]} channels, {array.nbytes:6,} bytes, "
+            f"{arrays[name]['gathers_per_read']} gathers a read, "
+            f"values {values.min():.4g} to {values.max():.4g}"
+        )
+    for title, content in (
+        ("trained with", {**table.settings, "seed": table.seed}),
+        ("measured", table.quality),
+    ):
+        print(f"  {title}: " + ", ".join(f"{k} {v}" for k, v in content.items()))
+    measured = _measure(arguments.file, table) if arguments.measure else None
+    return {
+        "file": arguments.file,
+        "task": table.task,
+        "storage": table.storage,
+        "bytes": table.nbytes,
+        "arrays": arrays,
+        "settings": table.settings,
+        "seed": table.seed,
+        "quality": table.quality,
+        **({"measured": measured} if measured else {}),
+    }
+
+
+def _measure(file: str, table) -> dict:
+    """Accuracy of tables in each storage form, printed and returned."""
+    measures = {disney_arrays.TASK: _measure_disney, ggx.TASK: _measure_ggx}
+    if table.task not in measures:
+        raise UsageError(f'{file}: holds tables for the task "{table.task}", which cannot be measured')
+    return measures[table.task](file)
+
+
+def _measure_disney(file: str) -> dict:
+    """Over random directions and materials, for each distribution of the materials."""
+    (table, layout), types, result = load_disney_table(file), runtime.array_module(), {}
+    for storage in STORAGES:
+        form = table.to(storage)
+        net = layout.from_table(table, types.TensorXf, storage)
+        result[storage] = {"bytes": form.nbytes, "memory_bytes": net.memory_nbytes}
+        for distribution in ("training", "uniform"):
+            result[storage][distribution] = found = measure(decoder_of(net), types, distribution=distribution)
+            print(
+                f"  {storage:8} {form.nbytes:6,} bytes ({net.memory_nbytes:,} in memory), {distribution:8} materials: "
+                f"BRDF x cosine {found['psnr_db']:.2f} dB, BRDF {found['psnr_brdf_db']:.2f} dB"
+            )
+    return result
+
+
+def _measure_ggx(file: str) -> dict:
+    """On the bounded range, and at the peak by bands of roughness."""
+    (table, encoding), types, result = ggx.load_ggx_table(file), runtime.array_module(), {}
+    for storage in STORAGES:
+        net = ggx.to_indirection(table, types.TensorXf, storage)
+        found = ggx.measure(ggx.LearnedGGX(net, encoding), types)
+        memory = sum(array.memory_nbytes for array in (*net.primary, net.cascaded))
+        result[storage] = {"bytes": net.nbytes, "memory_bytes": memory, **found}
+        print(
+            f"  {storage:8} {net.nbytes:6,} bytes ({memory:,} in memory): D clipped to [0, 1] "
+            f"{found['psnr_db']:.2f} dB, mean absolute error {found['mae']:.2g}"
+        )
+        for low, high in ggx.BANDS:
+            name = f"{low:g}_{high:g}"
+            print(
+                f"           roughness {low:g} to {high:g}: relative error at the normal at most "
+                f"{found[f'peak_error_{name}']:.2%}, in the lobe {found[f'lobe_error_{name}']:.2%} (99th percentile)"
+            )
+    return result
+
+
+def _inspect_scene(arguments) -> dict:
+    set_variant(arguments.variant)
+    from .. import scenes
+
+    defines = defines_of(arguments)
+    learned = scenes.learned_plugins(arguments.file, defines=defines)
+    tables = scenes.tables_of(arguments.file, learned)
+    materials = scenes.reports(scenes.load(arguments.file, defines=defines))
+    total = sum(t.nbytes for t in tables.values())
+    print(f"{arguments.file}: {len(learned)} learned material(s), {total:,} bytes of tables in {len(tables)} file(s)")
+    given = {entry["id"]: entry["parameters"] for entry in learned}
+    for material in materials:
+        parameters = given.get(material["id"]) or {}
+        parameters = ", ".join(f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in parameters.items())
+        stored = f", {material['table_bytes']:,} bytes as {material['storage']}" if material["storage"] else ""
+        print(f"  {material['id'] or '(no id)'}: {parameters or 'defaults'}")
+        print(f"    quality   {material['quality']}{stored}")
+        print(f"    in use    {', '.join(material['effects_in_use']) or 'grazing reflection only'}")
+        left_out = ", ".join(f"{k} ({v})" for k, v in material["effects_left_out"].items())
+        print(f"    left out  {left_out or 'nothing'}")
+        for method, n in material["operations"].items():
+            print(
+                f"    {method:9} {n['gathers']} reads of {n['bytes_gathered']} bytes, {n['flops']} flops "
+                f"({n['add']} add, {n['mul']} mul, {n['div']} div, {n['sqrt']} sqrt), {n['instructions']} instructions"
+            )
+    return {
+        "file": arguments.file,
+        "learned_plugins": learned,
+        "learned_materials": materials,
+        "table_bytes": total,
+        "tables": [{"file": f, "storage": s, "bytes": t.nbytes} for (f, s), t in tables.items()],
+    }

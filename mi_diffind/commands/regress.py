@@ -1,0 +1,67 @@
+"""``mi-diffind regress``: do scenes still render as their stored references do?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..files import writable_folder
+from .common import UsageError, defines_of, natural, positive, require_scene, scene_options, set_variant, verb
+
+
+def add(commands) -> None:
+    """Add the verb and its options to ``commands``, the subparsers of the command line."""
+    sub = verb(commands, "regress", run, "check that scenes render as their stored references do")
+    sub.add_argument("scenes", nargs="+", metavar="SCENE.xml")
+    sub.add_argument("--update", action="store_true", help="render the references again and store them")
+    sub.add_argument(
+        "--references", metavar="DIR", help='folder of the references (default: "references" by the scene)'
+    )
+    sub.add_argument("--out", default="out", metavar="DIR", help="folder for what a failed check saw (default: out)")
+    sub.add_argument("--spp", type=positive, help="samples per pixel of a check (default: the reference's)")
+    sub.add_argument("--seed", type=natural, help="seed of the random numbers (default: 0; --update: the reference's)")
+    scene_options(sub, rendering=False)
+
+
+def run(arguments) -> dict:
+    """
+    Check each scene, or store its reference again. Returns the result of each in ``scenes`` and how many ``failed``.
+    Raises :class:`UsageError`, and as :mod:`mi_diffind.regress` does.
+    """
+    for path in arguments.scenes:
+        require_scene(path)
+    stems = [Path(path).stem for path in arguments.scenes]
+    for stem in stems:
+        if stems.count(stem) > 1:
+            raise UsageError(f'{len(stems)} scenes, and more than one is called "{stem}": check them one at a time')
+    set_variant(arguments.variant)
+    from .. import regress
+
+    defines, results = defines_of(arguments), []
+    options = {"spp": arguments.spp, "seed": arguments.seed, "defines": defines}
+    if arguments.update:
+        for path in arguments.scenes:
+            results.append(regress.update_reference(path, arguments.references, **options))
+            if results[-1]["interrupted"]:
+                break
+            text = "{reference}: {width} x {height}, {spp} spp, {bytes:,} bytes; "
+            text += "failing pixels in a check at {budget} spp: {failing_pixels}"
+            print(text.format(**results[-1]))
+    else:
+        out = Path(arguments.out)
+        writable_folder(out if out.exists() else out.parent)
+        options["seed"] = arguments.seed or 0
+        for path in arguments.scenes:  # before the first is rendered
+            regress.read_reference(path, arguments.references)
+        try:
+            for path in arguments.scenes:
+                results.append(regress.regress(path, arguments.references, out, **options))
+                if results[-1]["interrupted"]:
+                    break
+        finally:
+            if results:
+                print("\n".join(regress.summary(results)))
+    return {
+        "interrupted": results[-1]["interrupted"],
+        "failed": sum(r.get("passed") is False for r in results),
+        "scenes": results,
+    }

@@ -1,0 +1,124 @@
+"""``mi-diffind render``: a scene that names learned plugins, as an image."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import time
+from pathlib import Path
+
+from ..files import writable_file
+from ..interrupt import interruptible
+from .common import UsageError, defines_of, positive, require_scene, scene_options, set_variant, verb
+
+
+def add(commands) -> None:
+    """Add the verb and its options to ``commands``, the subparsers of the command line."""
+    sub = verb(commands, "render", run, "render a scene that names learned plugins")
+    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument("-o", "--output", metavar="FILE", help="image, .exr or .png (default: SCENE.exr)")
+    sub.add_argument(
+        "--depth",
+        type=_depth,
+        default="scene",
+        metavar="auto|N|scene",
+        help="longest path, counted as max_depth: the scene's (default), N, or measured: where a probe finds the rest "
+        "below a tolerance",
+    )
+    sub.add_argument(
+        "--depth-tolerance",
+        type=_fraction,
+        metavar="T",
+        help="part of the scattered light that --depth auto may leave out (default: 0.005)",
+    )
+    scene_options(sub)
+
+
+def run(arguments) -> dict:
+    """
+    Render the scene and write the image. Returns what is printed, which learned plugins the scene names and how long it
+    took; after Ctrl-C of the passes that are done. Raises :class:`UsageError`, and as :mod:`mi_diffind.scenes` does.
+    """
+    from tqdm import tqdm
+
+    require_scene(arguments.scene)
+    output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
+    if output.suffix.lower() not in (".exr", ".png"):
+        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are .exr and .png')
+    if arguments.depth_tolerance is not None and arguments.depth != "auto":
+        raise UsageError("--depth-tolerance needs --depth auto")
+    writable_file(output)
+    set_variant(arguments.variant)
+    import mitsuba as mi
+
+    from .. import scenes
+
+    defines = defines_of(arguments)
+    depth = _choose_depth(arguments, defines)
+    start = time.perf_counter()
+    learned = scenes.learned_plugins(arguments.scene, defines=defines)
+    changed = depth["chosen"] != depth["scene"]
+    scene = scenes.load(arguments.scene, longest_path=depth["chosen"] if changed else None, defines=defines)
+    loaded = time.perf_counter()
+    spp = arguments.spp or scene.sensors()[0].sampler().sample_count()
+    passes = max(1, spp // 16)
+    with interruptible() as stop, tqdm(total=passes, desc="render", unit="pass", disable=None) as bar:
+        image, seconds = scenes.render(scene, spp, arguments.seed, passes, bar.update, stop)
+    rendered = time.perf_counter()
+    scenes.write_image(output, image)
+    done = len(seconds) * spp // passes
+    kept = f"interrupted, kept {done} of {spp}" if done < spp else f"{spp}"
+    size = f"{image.shape[1]} x {image.shape[0]}"
+    print(f"{output}: {size}, {kept} spp, {rendered - loaded:.1f} s in {mi.variant()}")
+    return {
+        "interrupted": done < spp,
+        "scene": arguments.scene,
+        "output": str(output),
+        "variant": mi.variant(),
+        "width": image.shape[1],
+        "height": image.shape[0],
+        "spp": done,
+        "seed": arguments.seed,
+        "depth": depth,
+        "seconds_load": loaded - start,
+        "seconds_render": rendered - loaded,
+        "learned_plugins": learned,
+        "learned_materials": scenes.reports(scene) if arguments.json is not None else [],
+        "table_bytes": scenes.table_bytes(arguments.scene, learned),
+    }
+
+
+def _choose_depth(arguments, defines: dict[str, str]) -> dict:
+    """The depth to render to, and why; what was not measured is None."""
+    from .. import scenes, transport
+
+    if arguments.depth == "auto":
+        tolerance = arguments.depth_tolerance or transport.TOLERANCE
+        found = transport.auto_depth(arguments.scene, tolerance, arguments.seed, defines=defines)
+        print("\n".join(transport.summary(found)))
+        return {"requested": "auto", **found}
+    own = None
+    with contextlib.suppress(scenes.SceneError):  # no integrator with a depth: fine, unless one is asked for
+        own = scenes.integrator_of(arguments.scene, defines=defines)[1]
+    chosen = own if arguments.depth == "scene" else arguments.depth
+    unknown = ("tolerance", "shares", "left_out", "left_out_in_a_tile", "probe_seconds")
+    return {"requested": arguments.depth, "chosen": chosen, "scene": own, **dict.fromkeys(unknown)}
+
+
+def _depth(text: str) -> int | str:
+    if text in ("auto", "scene"):
+        return text
+    try:
+        return positive(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"found {text}, allowed are auto, scene and whole numbers ≥ 1") from None
+
+
+def _fraction(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1:
+        raise argparse.ArgumentTypeError(f"found {text}, allowed is more than 0 and less than 1")
+    return value

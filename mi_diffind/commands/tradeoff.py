@@ -1,0 +1,93 @@
+"""``mi-diffind tradeoff``: time against accuracy, of all forms of a task or of a scene."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+
+from ..files import writable_folder
+from .common import (
+    UsageError,
+    defines_of,
+    natural,
+    positive,
+    require_scene,
+    scene_options,
+    set_variant,
+    task,
+    tasks_of,
+    variant_option,
+    verb,
+)
+
+#: Tasks with a study in :mod:`mi_diffind.tradeoffs`.
+STUDIES = {
+    "disney": "all forms of the Disney BRDF",
+    "ggx": "all forms of the GGX distribution",
+}
+
+
+def add(commands) -> None:
+    """Add the verb, its tasks and their options to ``commands``, the subparsers of the command line."""
+    tasks = tasks_of(
+        verb(commands, "tradeoff", run, "measure time against accuracy, of all forms of a task or of a scene")
+    )
+    for name, about in STUDIES.items():
+        sub = task(tasks, name, f"measure time against accuracy of {about}")
+        _add_common(sub)
+        variant_option(sub)
+    sub = task(tasks, "scene", "measure time against accuracy of a scene, learned and exact, at several sample counts")
+    sub.add_argument("scene", metavar="SCENE.xml")
+    _add_common(sub)
+    scene_options(sub, rendering=False)
+    sub.add_argument("--spp", type=positive, help="most samples per pixel (default: the scene's; --quick: at most 4)")
+    sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
+
+
+def _add_common(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--out", default="out", metavar="DIR", help="folder for table and plot (default: out)")
+    sub.add_argument("--quick", action="store_true", help="smoke run: less of everything, times not to be quoted")
+
+
+def run(arguments) -> dict:
+    """
+    Measure and write table and plot. Returns the result with its ``files``; after Ctrl-C, what there is up to then.
+    Raises :class:`UsageError`, :class:`~mi_diffind.files.OutputError`, and
+    :class:`~mi_diffind.scenes.SceneError`.
+    """
+    if arguments.task == "scene":
+        require_scene(arguments.scene)
+    writable_folder(arguments.out, create=True)
+    set_variant(arguments.variant)
+    import mitsuba as mi
+
+    from .. import plugins
+
+    if not plugins.supported(mi.variant()):
+        usable = ", ".join(v for v in mi.variants() if plugins.supported(v))
+        raise UsageError(f'the plugins do not run in the variant "{mi.variant()}"; use one of {usable}')
+    return _scene(arguments) if arguments.task == "scene" else _study(arguments)
+
+
+def _study(arguments) -> dict:
+    import mitsuba as mi
+
+    from .. import tradeoff
+
+    study = importlib.import_module(f"..tradeoffs.{arguments.task}", __package__).study(arguments.quick)
+    result = tradeoff.measure(study, tradeoff.Settings.choose(mi.variant(), arguments.quick), arguments.out)
+    paths = tradeoff.write(result, arguments.out)
+    print("\n".join(tradeoff.summary(result)))
+    print("\nwritten     " + ", ".join(paths.values()))
+    return {**tradeoff.finite(result), "files": paths}
+
+
+def _scene(arguments) -> dict:
+    from .. import budget
+
+    settings = budget.Settings.choose(arguments.quick, arguments.spp)
+    result = budget.measure(arguments.scene, settings, arguments.out, arguments.seed, defines_of(arguments))
+    paths = budget.write(result, arguments.out)
+    print("\n".join(budget.summary(result)))
+    print("\nwritten     " + ", ".join(paths.values()))
+    return {**result, "files": paths}
