@@ -45,6 +45,9 @@ class Problem(Protocol):
     #: is kept. (Default: 0)
     tolerance: float
 
+    #: Optional: what the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
+    about: dict
+
     def batch(self, rng, size: int):
         """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
 
@@ -115,14 +118,17 @@ class _State:
     moments: dict[str, tuple]
 
 
-def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, progress=True, log=None) -> FitResult:
+def fit(
+    problem: Problem, settings: FitSettings, checkpoint=None, resume=False, progress=True, log=None, title=None
+) -> FitResult:
     """
     Train ``problem.net`` in place and leave the best state found in it.
 
     ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
-    read first (it must belong to the same settings). Ctrl-C ends the training after the current step and keeps the
-    best state so far. If the loss or a parameter becomes NaN, or the loss explodes, the last good state is restored
-    and the learning rate halved; ``log`` (default: print to stderr) is told so in one sentence.
+    read first (it must belong to the same settings). ``title`` stands before the progress bar. Ctrl-C ends the training
+    after the current step and keeps the best state so far. If the loss or a parameter becomes NaN, or the loss
+    explodes, the last good state is restored and the learning rate halved; ``log`` (default: print to stderr) is told
+    so in one sentence.
 
     Raises :class:`FittingError` if the training diverges again and again, or the checkpoint does not fit.
     """
@@ -137,7 +143,7 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
     if resume:
         if checkpoint is None:
             raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
-        state, extra = _load_checkpoint(checkpoint, settings, trainer)
+        state, extra = _load_checkpoint(checkpoint, _all_settings(problem, settings), trainer)
         trainer.restore(state)
         best, best_quality, best_step = extra["best"], extra["best_quality"], extra["best_step"]
         history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
@@ -146,7 +152,7 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
 
     start = time.perf_counter() - spent
     good = trainer.snapshot()
-    bar = tqdm(total=settings.steps, initial=trainer.step, disable=None if progress else True, unit="step")
+    bar = tqdm(total=settings.steps, initial=trainer.step, desc=title, disable=None if progress else True, unit="step")
     log = log or (lambda message: tqdm.write(message, file=sys.stderr))
     interrupted = False
 
@@ -196,7 +202,7 @@ def fit(problem: Problem, settings: FitSettings, checkpoint=None, resume=False, 
                         "restarts": restarts, "seconds": time.perf_counter() - start, "plateau": plateau.state(),
                         "reference": reference,
                     }  # fmt: skip
-                    _save_checkpoint(checkpoint, settings, trainer.snapshot(), extra)
+                    _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), extra)
         if stop.is_set() and trainer.step < settings.steps:
             interrupted = True
             if best is None and trainer.finite():
@@ -303,14 +309,19 @@ class _Trainer:
             self.problem.net[key] = type(self.optimizer[key])(value)
 
 
-def _save_checkpoint(path, settings: FitSettings, state: _State, extra: dict) -> None:
+def _all_settings(problem: Problem, settings: FitSettings) -> dict:
+    """What a checkpoint has to agree in."""
+    return {**asdict(settings), **json.loads(json.dumps(getattr(problem, "about", {})))}
+
+
+def _save_checkpoint(path, settings: dict, state: _State, extra: dict) -> None:
     arrays = {}
     for key, value in state.parameters.items():
         t, m, v = state.moments[key]
         arrays |= {f"value/{key}": value.numpy(), f"m/{key}": m.numpy(), f"v/{key}": v.numpy()}
         arrays |= {f"t/{key}": np.int64(t[0]), f"best/{key}": np.asarray(extra["best"][key])}
     meta = {k: v for k, v in extra.items() if k != "best"}
-    meta |= {"step": state.step, "lr_scale": state.lr_scale, "settings": asdict(settings)}
+    meta |= {"step": state.step, "lr_scale": state.lr_scale, "settings": settings}
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, **arrays)
@@ -324,7 +335,7 @@ def _is_checkpoint(path) -> bool:
         return False
 
 
-def _load_checkpoint(path, settings: FitSettings, trainer: _Trainer) -> tuple[_State, dict]:
+def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, dict]:
     if not os.path.exists(path):
         raise FittingError(f'the checkpoint "{path}" does not exist, there is nothing to resume')
     try:
@@ -347,8 +358,8 @@ def _load_checkpoint(path, settings: FitSettings, trainer: _Trainer) -> tuple[_S
         moments_fit = all(m.shape == (math.prod(shape),) for m in state.moments[key][1:])  # Adam keeps them flat
         if state.parameters[key].shape != shape or best[key].shape != shape or not moments_fit:
             raise FittingError(f'the checkpoint "{path}" holds other table sizes ("{key}")')
-    if stored_settings != asdict(settings):
-        changed = [k for k, v in asdict(settings).items() if stored_settings.get(k) != v]
+    if stored_settings != settings:
+        changed = [k for k in {**settings, **stored_settings} if stored_settings.get(k) != settings.get(k)]
         raise FittingError(f'the checkpoint "{path}" was made with other settings ({", ".join(changed)})')
     return state, {**meta, "best": best}
 

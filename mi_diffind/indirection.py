@@ -227,6 +227,14 @@ class DifferentiableArray(nn.Module):
 
     # -- properties -------------------------------------------------------------------------------------------------
 
+    @property
+    def is_pointer(self) -> bool:
+        """Are all entries bytes that stand for numbers in [0, 1], so that whatever is read is a coordinate?"""
+        if self.storage != "uint8":
+            return False
+        pairs = list(zip(self.scale, self.offset, strict=True))
+        return all(offset >= 0 and scale >= 0 and offset + 255 * scale <= 1 for scale, offset in pairs)
+
     def check_shape(self) -> None:
         """Raise ``ValueError`` if ``data`` is a tensor of any shape but the two that can be read."""
         expected = (*self.resolution, self.channels)
@@ -258,8 +266,11 @@ class DifferentiableArray(nn.Module):
 
     # -- reading ----------------------------------------------------------------------------------------------------
 
-    def __call__(self, x, active=True):
-        """Read at ``x`` (see the class). ``active`` masks lanes that must not access memory; they return 0."""
+    def __call__(self, x, active=True, inside=False):
+        """
+        Read at ``x`` (see the class). ``active`` masks lanes that must not access memory; they return 0. ``inside``:
+        all coordinates are known to lie in [0, 1], as those that bytes hold may be.
+        """
         self._require_entries()
         coordinates, is_coopvec = _coordinates(x, _module(self.data).Float)
         if len(coordinates) != self.dims:
@@ -274,6 +285,7 @@ class DifferentiableArray(nn.Module):
                 coordinates,
                 self.border,
                 active,
+                inside,
             )
         else:
             self.check_shape()
@@ -370,7 +382,8 @@ class Indirection(nn.Module):
 
     def __call__(self, x, active=True):
         """Read at the inputs ``x``; returns a list of channels, or a ``nn.CoopVec`` if given one."""
-        values = self.cascaded(self.pointer(x, active), active)
+        inside = all(p.is_pointer for p in self.primary)
+        values = self.cascaded(self.pointer(x, active), active, inside)
         return nn.CoopVec(*values) if isinstance(x, nn.CoopVec) else values
 
     def __repr__(self) -> str:

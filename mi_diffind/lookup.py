@@ -82,8 +82,10 @@ def gathers(resolution: Sequence[int], channels: int, storage: str) -> int:
     return 2**dims * (stored // _packet(stored))
 
 
-def _axis(x, n: int, border: str):
-    """Cell index, next index and weight of the next one along an axis with ``n`` entries."""
+def _axis(x, n: int, border: str, inside: bool = False):
+    """
+    Cell index, next index and weight of the next one along an axis with ``n`` entries; ``inside``: x is in [0, 1].
+    """
     UInt32 = dr.uint32_array_t(type(x))
     if n == 1:
         zero = UInt32(0)
@@ -93,7 +95,7 @@ def _axis(x, n: int, border: str):
         lower = dr.minimum(UInt32(position), n - 1)
         upper = dr.select(lower == n - 1, 0, lower + 1)
     else:
-        position = clamp(x, 0.0, 1.0) * (n - 1)
+        position = (x if inside else clamp(x, 0.0, 1.0)) * (n - 1)
         lower = dr.minimum(UInt32(position), n - 2)
         upper = lower + 1
     return lower, upper, position - type(x)(lower)
@@ -170,10 +172,12 @@ def read_packed(
     x: Sequence,
     border: Sequence[str],
     active=True,
+    inside: bool = False,
 ):
     """
     Read a table of bytes packed in ``UInt32`` words (:func:`pack`). Channel ``k`` of the result is
-    ``offset[k] + scale[k] · (interpolated byte)``. Differentiable with respect to ``x`` only.
+    ``offset[k] + scale[k] · (interpolated byte)``. Differentiable with respect to ``x`` only. ``inside``: all
+    coordinates are known to lie in [0, 1], which saves looking.
 
     Two bytes of a word lie where a float has its mantissa, and rotated by half a word so do the other two. Under the
     exponent of 1, they read ``1 + byte/256`` and ``1 + byte/65536`` without any conversion; since the weights of a
@@ -184,16 +188,12 @@ def read_packed(
     UInt32, Int32 = type(words), dr.int32_array_t(type(words))
     module = sys.modules[Float.__module__]
     inner, stride, per_texel = packed_layout(resolution, channels)
-    axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
+    axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
     outer = len(resolution) - inner
     packet = _packet(per_texel)
     groups = per_texel // packet
 
     convert = len(resolution) > 2
-
-    inner_weights = [None]
-    for _, _, w in axes[outer:]:
-        inner_weights = [v if b is None else b * v for b in inner_weights for v in (1 - w, w)]
 
     def fetch(index) -> list:
         """All words of a texel, each also rotated."""
@@ -222,14 +222,16 @@ def read_packed(
             index = lower if index is None else dr.fma(index, n, lower)
         found = fetch(index)
         corners = [[byte(found, k * stride + channel) for channel in range(channels)] for k in range(2**inner)]
-        terms.append((weight, corners[0] if inner == 0 else _weighted_sum(zip(inner_weights, corners, strict=True))))
+        for _, _, w in reversed(axes[outer:]):
+            pairs = zip(corners[::2], corners[1::2], strict=True)
+            corners = [[dr.fma(w, b - a, a) for a, b in zip(*pair, strict=True)] for pair in pairs]
+        terms.append((weight, corners[0]))
     sums = terms[0][1] if terms[0][0] is None else _weighted_sum(terms)
     values = []
     for k, s in enumerate(sums):
-        if k % 2 and convert:
-            values.append(dr.fma(s, scale[k] / 128, offset[k]))
-        else:
-            values.append(dr.fma(s - 1, (65536 if k % 2 else 256) * scale[k], offset[k]))
+        step = scale[k] / 128 if k % 2 and convert else (65536 if k % 2 else 256) * scale[k]
+        ones = 0 if k % 2 and convert else step
+        values.append(dr.fma(s, step, offset[k] - ones))
     # A masked gather gives the byte 0, which means `offset`, not 0.
     return values if active is True else [dr.select(active, v, 0) for v in values]
 

@@ -265,6 +265,7 @@ class GGXProblem:
     def __init__(self, net, types, quality: str = "tables", encoding: Encoding | None = None):
         self.net, self.types, self.samples = net, types, quality
         self.encoding = encoding or ENCODINGS[quality]
+        self.about = {"samples": quality, **asdict(self.encoding)}
 
     def batch(self, rng, size: int):
         cos, sin2, alpha = draw(rng, self.types, size, self.samples)
@@ -299,7 +300,7 @@ def fit_ggx(
     net = indirection(primary, cascaded).alloc(types.TensorXf)
     result = fit(GGXProblem(net, types, quality), settings, checkpoint, resume, progress)
     encoding = ENCODINGS[quality]
-    about = {**asdict(settings), "quality": quality, **asdict(encoding), "seconds": round(result.seconds, 1)}
+    about = {**asdict(settings), "quality": quality, **asdict(encoding)}
     arrays = {"primary": net.primary[0], "cascaded": net.cascaded}
     table = Table(
         TASK,
