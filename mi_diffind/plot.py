@@ -63,8 +63,8 @@ def write(path: str | os.PathLike, title: str, panels: Sequence[Panel], y_label:
 
 def draw(title: str, panels: Sequence[Panel], y_label: str, caption: str):
     """
-    A Matplotlib figure with up to two panels a row, and with time on a logarithmic axis (accuracies in dB are
-    logarithms already).
+    A Matplotlib figure with up to two panels a row, and with time or bytes on a logarithmic axis (accuracies in dB are
+    logarithms already). If there are several representations, a legend names them.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -74,16 +74,27 @@ def draw(title: str, panels: Sequence[Panel], y_label: str, caption: str):
     width = 6.4 * columns
     text = "\n".join(textwrap.wrap(caption, int(19 * width)))
     below = 0.17 * (text.count("\n") + 1) + 0.15
-    sheet = Figure(figsize=(width, 4.6 * rows + 0.4 + below), dpi=200, layout="constrained")
-    canvas = FigureCanvasAgg(sheet)
-    height = sheet.get_figheight()
-    sheet.get_layout_engine().set(rect=(0, below / height, 1, 1 - below / height), w_pad=0.08, h_pad=0.08)
-    sheet.suptitle(title, fontsize=12, fontweight="bold")
-    sheet.text(0.012, 0.06 / height, text, fontsize=7.5, va="bottom", ha="left", color="0.25")
     styles = {}
     for panel in panels:
         for point in panel.points:
             styles.setdefault(point.representation, STYLES[len(styles) % len(STYLES)])
+    above = 0.55 if len(styles) > 1 else 0.3
+    sheet = Figure(figsize=(width, 4.6 * rows + above + below), dpi=200, layout="constrained")
+    canvas = FigureCanvasAgg(sheet)
+    height = sheet.get_figheight()
+    sheet.get_layout_engine().set(rect=(0, below / height, 1, 1 - (above + below) / height), w_pad=0.08, h_pad=0.08)
+    sheet.text(0.5, 1 - 0.08 / height, title, fontsize=12, fontweight="bold", ha="center", va="top")
+    sheet.text(0.012, 0.06 / height, text, fontsize=7.5, va="bottom", ha="left", color="0.25")
+    if len(styles) > 1:
+        from matplotlib.lines import Line2D
+
+        shown = [
+            Line2D([], [], color=colour, marker=marker, linestyle="none", markersize=6.5, label=name)
+            for name, (colour, marker) in styles.items()
+        ]
+        legend = sheet.legend(handles=shown, loc="upper center", bbox_to_anchor=(0.5, 1 - 0.24 / height),
+                              ncols=len(shown), fontsize=8.5, frameon=False)  # fmt: skip
+        legend.set_in_layout(False)
     accuracies = [x.accuracy for p in panels for x in p.points]
     drawn = []
     for k, panel in enumerate(panels):
@@ -99,6 +110,47 @@ def draw(title: str, panels: Sequence[Panel], y_label: str, caption: str):
     return sheet
 
 
+def write_courses(path: str | os.PathLike, title: str, trainings: dict[str, dict], caption: str) -> None:
+    """
+    The courses of trainings (records of :class:`~mi_diffind.convergence.Training`): PSNR over steps, one panel each,
+    every run a line, from the shortest (light) to the longest (dark); what has not converged is marked.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(5, len(trainings))
+    rows = -(-len(trainings) // columns)
+    width = 2.6 * columns
+    about = "PSNR in dB over training steps; each line is a run of its own, twice as long as that before."
+    text = "\n".join(textwrap.wrap(f"{about} {caption}", int(19 * width)))
+    below = 0.17 * (text.count("\n") + 1) + 0.15
+    sheet = Figure(figsize=(width, 1.9 * rows + 0.4 + below), dpi=160, layout="constrained")
+    FigureCanvasAgg(sheet)
+    height = sheet.get_figheight()
+    sheet.get_layout_engine().set(rect=(0, below / height, 1, 1 - below / height))
+    sheet.suptitle(title, fontsize=12, fontweight="bold")
+    sheet.text(0.012, 0.06 / height, text, fontsize=7.5, va="bottom", ha="left", color="0.25")
+    for k, (name, record) in enumerate(trainings.items()):
+        axes = sheet.add_subplot(rows, columns, k + 1)
+        runs = record["runs"]
+        for i, run in enumerate(runs):
+            shade = str(0.75 * (1 - (i + 1) / len(runs)))
+            axes.plot(run["curve_steps"], run["curve_psnr_db"], color=shade, linewidth=1.1)
+        gain = "" if record["gain_db"] is None else f", last doubling {record['gain_db']:+.1f} dB"
+        state = "converged" if record["converged"] else "NOT converged"
+        axes.set_title(f"{name}: {record['psnr_db']:.1f} dB\n{state}{gain}", fontsize=7.5,
+                       color="0.1" if record["converged"] else "#b2182b")  # fmt: skip
+        axes.set_xscale("log")
+        top = max(v for run in runs for v in run["curve_psnr_db"])
+        axes.set_ylim(top - 20, top + 2)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.xaxis.set_minor_formatter(lambda value, _: "")
+        axes.tick_params(labelsize=6.5)
+        axes.grid(color="0.92", linewidth=0.5)
+    with replacing(path) as temporary:
+        sheet.savefig(temporary, format=Path(path).suffix[1:])
+
+
 def _draw(axes, panel: Panel, styles: dict, accuracies: list):
     """All but the labels; returns the points on the front by time."""
     axes.set_xscale("log")
@@ -110,10 +162,12 @@ def _draw(axes, panel: Panel, styles: dict, accuracies: list):
     margin = max(0.08 * (top - bottom), 2)
     axes.set_ylim(bottom - 1.2 * margin, top + 2.2 * margin)
     decades = math.log10(high / low)
-    fine = (1, 2, 5) if decades > 1.1 else (1, 1.5, 2, 3, 4, 5, 7) if decades > 0.6 else (1, *np.arange(1.2, 9.8, 0.4))
+    fine = (1, *np.arange(1.2, 9.8, 0.4))
+    for limit, ticks in ((0.6, (1, 1.5, 2, 3, 4, 5, 7)), (1.1, (1, 2, 5)), (3, (1,))):
+        fine = ticks if decades > limit else fine
     ticks = [m * 10.0**e for e in range(-4, 7) for m in fine]
     axes.set_xticks([t for t in ticks if low <= t <= high])
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}" if value >= 1000 else f"{value:g}")
     axes.xaxis.set_minor_formatter(lambda value, _: "")
     axes.tick_params(labelsize=8)
     axes.grid(which="major", color="0.9", linewidth=0.6)

@@ -38,6 +38,7 @@ import numpy as np
 from tqdm import tqdm
 
 from . import plot
+from .convergence import Training, folder_for
 from .files import replacing, writable_folder, write_json
 from .interrupt import interruptible
 from .operations import Operations, count
@@ -103,6 +104,9 @@ class Candidate:
     is_reference: bool = False
     in_passes: bool = True
     note: str = ""
+    label: str = ""
+    training: str = ""
+    operations: Callable[[str], Operations] | None = None
 
 
 @dataclass
@@ -110,13 +114,18 @@ class Case:
     """
     A situation. ``queries(lanes)`` maps the name of each query to the names of all candidates and :data:`FLOOR`, and
     these to functions; ``passes()``, if there are any, maps candidates (those with ``in_passes``) to functions of the
-    number of the pass, which do one pass of a whole job. Both are called when they are needed.
+    number of the pass, which do one pass of a whole job. Both are called when they are needed. ``candidates`` are the
+    names of those that take part (default: all), ``query_names`` those of its queries (default: the study's);
+    ``in_picture``: it has a panel.
     """
 
     name: str
     queries: Callable[[int], dict[str, dict[str, Query]]]
     passes: Callable[[], dict[str, Callable[[int], object]]] | None = None
     about: dict = field(default_factory=dict)
+    candidates: tuple[str, ...] | None = None
+    query_names: tuple[str, ...] | None = None
+    in_picture: bool = True
 
 
 @dataclass
@@ -127,6 +136,8 @@ class Study:
     ``accuracy`` names the error that pictures show and the Pareto front is made with, one that is larger for better
     candidates, as a PSNR is. ``ratios`` are pairs of candidates. ``fingerprint`` tells whether what is measured is
     still the same. ``conclusions(result)`` are lines to print below the tables, ``about`` what to keep with them.
+    ``trainings`` are done first, unless their results are at hand, made by the same ``training_fingerprint``;
+    ``bytes_in_picture``: accuracy is also drawn against bytes.
     """
 
     task: str
@@ -141,6 +152,18 @@ class Study:
     variant: str = ""
     about: dict = field(default_factory=dict)
     conclusions: Callable[[dict], list[str]] = lambda result: []
+    trainings: list[Training] = field(default_factory=list)
+    training_fingerprint: str = ""
+    bytes_in_picture: bool = False
+
+    def names(self, case: Case, in_passes: bool = False) -> list[str]:
+        """The candidates that take part in a case."""
+        found = [c for c in self.candidates if case.candidates is None or c.name in case.candidates]
+        return [c.name for c in found if c.in_passes or not in_passes]
+
+    def queries_of(self, case: Case) -> tuple[str, ...]:
+        """The queries of a case."""
+        return case.query_names or self.queries
 
 
 # -- measuring --------------------------------------------------------------------------------------------------------
@@ -254,7 +277,7 @@ class _Stopped(Exception):
 class _Run:
     """The state of a run, kept in a file if there is a folder: what has been measured, under a key."""
 
-    SECTIONS = ("errors", "operations", "queries", "passes")
+    SECTIONS = ("trainings", "errors", "operations", "queries", "passes")
 
     def __init__(self, key: dict, folder: Path | None, task: str):
         self.key = json.loads(json.dumps(key))
@@ -304,23 +327,23 @@ def measure(study: Study, settings: Settings, folder: str | os.PathLike | None =
         print(f"going on from {run.path}", file=sys.stderr)
     if progress and run.discarded:
         print(f"{run.path} is of other settings, versions or sources: starting anew", file=sys.stderr)
-    interrupted = False
-    names = [c.name for c in study.candidates]
-    in_passes = [c.name for c in study.candidates if c.in_passes]
-    kernels = len(study.queries) * (len(names) + 1)
+    interrupted = not _train(study, run, folder, progress)
     units = sum(c.errors is not None for c in study.candidates)
     for case in study.cases:
-        units += kernels * (1 + settings.rounds)
-        units += len(in_passes) * (1 + settings.passes) if case.passes is not None else 0
-    bar = tqdm(total=units, desc="measure", unit="step", smoothing=0.02, disable=None if progress else True)
+        units += len(study.queries_of(case)) * (len(study.names(case)) + 1) * (1 + settings.rounds)
+        units += len(study.names(case, True)) * (1 + settings.passes) if case.passes is not None else 0
+    hidden = True if interrupted or not progress else None
+    bar = tqdm(total=units, desc="measure", unit="step", smoothing=0.02, disable=hidden)
     with interruptible() as stop, bar:
         steps = _Steps(study, settings, run, bar, stop)
         try:
+            if interrupted:
+                raise _Stopped
             steps.errors()
             for case in study.cases:
-                steps.queries(case, names)
+                steps.queries(case)
                 if case.passes is not None:
-                    steps.passes(case, in_passes)
+                    steps.passes(case)
         except _Stopped:
             interrupted = True
         finally:
@@ -336,11 +359,27 @@ def measure(study: Study, settings: Settings, folder: str | os.PathLike | None =
         "settings": asdict(settings),
         "accuracy": study.accuracy,
         "accuracy_label": study.accuracy_label,
+        "bytes_in_picture": study.bytes_in_picture,
         "about": study.about,
         **result,
     }
     result["conclusions"] = study.conclusions(result)
     return result
+
+
+def _train(study: Study, run: _Run, folder: Path | None, progress: bool) -> bool:
+    """Do the trainings, each in its own progress bar; false if there was a Ctrl-C."""
+    models = None
+    if folder is not None and study.trainings:
+        models = folder_for(folder, study.task, study.training_fingerprint)
+    for i, training in enumerate(study.trainings):
+        if progress:
+            print(f"training {i + 1} of {len(study.trainings)}: {training.name}", file=sys.stderr)
+        record = training.run(models, progress)
+        if record is None:
+            return False
+        run.data["trainings"][training.name] = record
+    return True
 
 
 class _Steps:
@@ -364,20 +403,23 @@ class _Steps:
                 self.run.save(5)
             self._tick()
 
-    def queries(self, case: Case, names: list[str]) -> None:
+    def queries(self, case: Case) -> None:
         """Count, which compiles, then time in rounds."""
+        names, queries = self.study.names(case), self.study.queries_of(case)
+        own = {c.name: c.operations for c in self.study.candidates}
         operations = self.run.data["operations"].setdefault(case.name, {})
         times = self.run.data["queries"].setdefault(case.name, [])
-        kernels = len(self.study.queries) * (len(names) + 1)
+        kernels = len(queries) * (len(names) + 1)
         if len(times) >= self.settings.rounds:
             self.bar.update(kernels * (1 + self.settings.rounds))
             return
         functions = case.queries(self.settings.lanes)
-        flat = {(q, c): functions[q][c] for q in self.study.queries for c in (FLOOR, *names)}
+        flat = {(q, c): functions[q][c] for q in queries for c in (FLOOR, *names)}
         for (query, name), function in flat.items():
             counted = operations.setdefault(query, {})
             if name not in counted:
-                counted[name] = count_query(function).asdict()
+                found = count_query(function)
+                counted[name] = (own[name](query) if own.get(name) else found).asdict()
             self._tick()
         self.bar.update(kernels * len(times))
         while len(times) < self.settings.rounds:
@@ -390,7 +432,8 @@ class _Steps:
             times.append(found)
             self.run.save(5)
 
-    def passes(self, case: Case, names: list[str]) -> None:
+    def passes(self, case: Case) -> None:
+        names = self.study.names(case, True)
         times = self.run.data["passes"].setdefault(case.name, [])
         if len(times) >= self.settings.passes:
             self.bar.update(len(names) * (1 + self.settings.passes))
@@ -420,13 +463,17 @@ def _pass_seconds(function: Callable[[int], object], number: int) -> dict[str, f
 
 
 def _assemble(study: Study, settings: Settings, data: dict) -> dict:
-    candidates = {}
+    candidates, trainings = {}, data["trainings"]
     for c in study.candidates:
+        trained = trainings.get(c.training, {})
         candidates[c.name] = {
             "representation": c.representation,
             "setting": c.setting,
+            "label": c.label or c.name,
             "bytes": c.bytes,
-            "training_seconds": c.training_seconds,
+            "training": c.training,
+            "training_seconds": trained.get("seconds") if c.training else c.training_seconds,
+            "converged": trained.get("converged") if c.training else None,
             "is_truth": c.is_truth,
             "is_reference": c.is_reference,
             "note": c.note,
@@ -437,8 +484,8 @@ def _assemble(study: Study, settings: Settings, data: dict) -> dict:
         rounds, passes = data["queries"].get(case.name, []), data["passes"].get(case.name, [])
         if not rounds:
             continue
-        found = {"about": case.about, "queries": {}, "passes": {}, "ratios": {}}
-        for query in study.queries:
+        found = {"about": case.about, "in_picture": case.in_picture, "queries": {}, "passes": {}, "ratios": {}}
+        for query in study.queries_of(case):
             seconds = {name: [r[query][name] for r in rounds] for name in rounds[0][query]}
             ns = {name: [t * 1e9 / settings.lanes for t in times] for name, times in seconds.items()}
             floor = spread(ns.pop(FLOOR))["median"]
@@ -453,7 +500,7 @@ def _assemble(study: Study, settings: Settings, data: dict) -> dict:
             found["passes"][kind] = {name: _timing(times) for name, times in ms.items()}
             found["ratios"][kind] = _ratios(study.ratios, ms, 0.0)
         cases[case.name] = found
-    return {"candidates": candidates, "cases": cases}
+    return {"candidates": candidates, "cases": cases, "trainings": trainings}
 
 
 def _timing(values: list[float], floor: float = 0.0) -> dict:
@@ -473,7 +520,7 @@ def _mark_front(timings: dict, candidates: dict, accuracy: str) -> None:
     competing = {
         name: (math.log(max(timings[name]["time"], 1e-6)), -c["errors"][accuracy])
         for name, c in candidates.items()
-        if accuracy in c["errors"] and not c["is_reference"] and not c["is_truth"]
+        if name in timings and accuracy in c["errors"] and not c["is_reference"] and not c["is_truth"]
     }
     front = dict(zip(competing, pareto(list(competing.values()), (math.log(SAME_TIME), 0)), strict=True))
     for name in timings:
@@ -518,6 +565,7 @@ COLUMNS = (
     "instructions",
     "bytes",
     "training_seconds",
+    "converged",
     "on_front",
     "note",
 )
@@ -539,7 +587,8 @@ def rows(result: dict) -> list[dict]:
                     "case": case,
                     "query": query,
                     "candidate": name,
-                    **{k: c[k] for k in ("representation", "setting", "bytes", "training_seconds", "note")},
+                    **{k: c[k] for k in ("representation", "setting", "bytes", "note")},
+                    **{k: c[k] for k in ("training_seconds", "converged")},
                     "unit": "ms a pass" if whole else "ns",
                     "time": t["time"],
                     "time_q1": t["q1"],
@@ -559,8 +608,8 @@ def rows(result: dict) -> list[dict]:
 def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
     """
     Write ``tradeoff.csv`` (see :func:`rows`), ``tradeoff.json`` (``result``) and, if there is anything to draw,
-    ``tradeoff.png`` into ``folder``; of a run that is complete, nothing else stays there. Returns the paths. Raises
-    :class:`~mi_diffind.files.OutputError`.
+    ``tradeoff.png`` and, if something was trained, ``training.png`` into ``folder``; of a run that is complete, nothing
+    else stays there but trained models. Returns the paths. Raises :class:`~mi_diffind.files.OutputError`.
     """
     folder = writable_folder(folder, create=True)
     paths = {kind: str(folder / f"tradeoff.{kind}") for kind in ("csv", "json", "png")}
@@ -577,6 +626,9 @@ def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
         figure(result, paths["png"])
     else:
         del paths["png"]
+    if result["trainings"]:
+        paths["training"] = str(folder / "training.png")
+        plot.write_courses(paths["training"], f"{result['title']}: training", result["trainings"], _machine(result))
     if not result["interrupted"]:
         (folder / PARTIAL.format(result["task"])).unlink(missing_ok=True)
     return paths
@@ -593,15 +645,22 @@ def finite(value):
 
 def caption(result: dict) -> str:
     """What the figures were measured on and how, as one paragraph."""
-    m, s = result["machine"], result["settings"]
-    device = m["gpu"] if m["variant"].startswith("cuda") else f"{m['cpu']} ({m['instructions']}), {m['cores']} cores"
-    llvm = f", LLVM {m['llvm']}" if m["llvm"] else ""
+    s = result["settings"]
     state = " Interrupted: fewer rounds than asked for." if result["interrupted"] else ""
     quick = " A smoke run (--quick): times are not to be quoted." if s["quick"] else ""
     return (
-        f"{device}; {m['variant']}, Mitsuba {m['mitsuba']}, Dr.Jit {m['drjit']}{llvm}, mi_diffind {m['mi-diffind']}; "
-        f"{result['date']}. Medians and quartiles of {s['rounds']} interleaved rounds of {s['lanes']:,} lanes on all "
+        f"{_machine(result)} Medians and quartiles of {s['rounds']} interleaved rounds of {s['lanes']:,} lanes on all "
         f"cores, input and output (the floor) subtracted; errors from {s['samples']:,} samples.{quick}{state}"
+    )
+
+
+def _machine(result: dict) -> str:
+    m = result["machine"]
+    device = m["gpu"] if m["variant"].startswith("cuda") else f"{m['cpu']} ({m['instructions']}), {m['cores']} cores"
+    llvm = f", LLVM {m['llvm']}" if m["llvm"] else ""
+    return (
+        f"{device}; {m['variant']}, Mitsuba {m['mitsuba']}, Dr.Jit {m['drjit']}{llvm}, mi_diffind {m['mi-diffind']}; "
+        f"{result['date']}."
     )
 
 
@@ -612,21 +671,40 @@ def figure(result: dict, path: str | os.PathLike) -> None:
     """
     panels = []
     for case, measured in result["cases"].items():
+        if not measured["in_picture"]:
+            continue
         query, timings = next(iter(measured["queries"].items()))
-        points, lines = [], []
+        points, lines, sizes = [], [], []
         for name, t in timings.items():
             c = result["candidates"][name]
-            if t["time"] <= 0:
-                continue
+            shown = result["accuracy"] in c["errors"]
+            if shown and not (c["is_truth"] or c["is_reference"]) and c["bytes"] > 0:
+                sizes.append((name, c))
             if c["is_truth"] or c["is_reference"]:
-                lines.append(plot.Line(name, t["time"], c["is_truth"]))
-            elif result["accuracy"] in c["errors"]:
+                least = HIDDEN * t["floor"]
+                label = c["label"] if t["time"] >= least else f"{c['label']}, below {least:.2g} ns"
+                lines.append(plot.Line(label, max(t["time"], least), c["is_truth"]))
+            elif shown and t["time"] > 0:
                 points.append(
-                    plot.Point(name, t["time"], t["q1"], t["q3"], c["errors"][result["accuracy"]],
+                    plot.Point(c["label"], t["time"], t["q1"], t["q3"], c["errors"][result["accuracy"]],
                                c["representation"], bool(t["on_front"]))
                 )  # fmt: skip
         panels.append(plot.Panel(case, f"time of one {query}, ns", points, lines))
+        if result["bytes_in_picture"]:
+            panels.append(plot.Panel(case, "bytes", _by_bytes(sizes, result["accuracy"]), []))
     plot.write(path, result["title"], panels, result["accuracy_label"], caption(result))
+
+
+def _by_bytes(candidates: list[tuple[str, dict]], accuracy: str) -> list[plot.Point]:
+    """Accuracy against bytes, of what differs in either only: two forms of one thing are one point."""
+    points = {}
+    for _, c in candidates:
+        points.setdefault((c["bytes"], c["training"] or c["errors"][accuracy]), c)
+    front = pareto([(math.log(c["bytes"]), -c["errors"][accuracy]) for c in points.values()])
+    return [
+        plot.Point(c["label"], *[c["bytes"]] * 3, c["errors"][accuracy], c["representation"], on_front)
+        for c, on_front in zip(points.values(), front, strict=True)
+    ]
 
 
 def summary(result: dict) -> list[str]:
@@ -639,8 +717,10 @@ def summary(result: dict) -> list[str]:
         lines += ["", f"{case}: ns each, floor subtracted ({floors}); ± half the interquartile range"]
         header = "".join(f"{q:>16}" for q in queries)
         header += f"{'flops':>8}{'reads':>7}" + (f"{'ms ' + PASS:>18}" if measured["passes"] else "")
-        lines.append(f"  {'':{width}}{header}{'accuracy':>13}")
+        lines.append(f"  {'':{width}}{header}{'bytes':>12}{'accuracy':>11}")
         for name, c in result["candidates"].items():
+            if name not in measured["queries"][queries[0]]:
+                continue
             cells = "".join(f"{_cell(measured['queries'][q][name]):>16}" for q in queries)
             operations = measured["queries"][queries[0]][name]["operations"]
             cells += f"{operations['flops']:>8}{operations['gathers']:>7}"
@@ -650,7 +730,8 @@ def summary(result: dict) -> list[str]:
             accuracy = c["errors"].get(result["accuracy"])
             shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
             front = " *" if measured["queries"][queries[0]][name]["on_front"] else ""
-            lines.append(f"  {name:{width}}{cells}{shown:>13}{front}")
+            doubt = " not converged" if c["converged"] is False else ""
+            lines.append(f"  {name:{width}}{cells}{c['bytes']:>12,}{shown:>11}{front}{doubt}")
     if lines:
         lines.append(
             f"  (* on the Pareto front of accuracy and {queries[0]}; flops and reads are those of {queries[0]})"

@@ -4,4 +4,4 @@ this package lies above them.
 """
 
 #: Tasks with a study: ``mi_diffind.tradeoffs.NAME.study(quick)``, to be called with a Mitsuba variant set.
-TASKS = ("disney",)
+TASKS = ("disney", "ggx")
