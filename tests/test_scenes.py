@@ -48,14 +48,15 @@ def test_materials_cover_the_ten_parameters(mi_rgb):
         assert np.allclose(sorted(row), np.linspace(0, 1, 6), atol=1e-3), name
 
 
-def test_materials_are_what_their_script_writes(tmp_path):
-    """Both files of the pair are in the repository: they must not drift apart."""
-    text = (SCENES / "materials.xml").read_bytes()
+@pytest.mark.parametrize("name", ["materials", "metals"])
+def test_scenes_are_what_their_scripts_write(tmp_path, name):
+    """Both files of a pair are in the repository: they must not drift apart."""
+    text = (SCENES / f"{name}.xml").read_bytes()
     (tmp_path / "scenes").mkdir()
-    copy = tmp_path / "scenes" / "make_materials.py"
-    copy.write_text((SCENES / "make_materials.py").read_text())
+    copy = tmp_path / "scenes" / f"make_{name}.py"
+    copy.write_text((SCENES / f"make_{name}.py").read_text())
     subprocess.run([sys.executable, str(copy)], check=True, cwd=tmp_path)
-    assert (tmp_path / "scenes" / "materials.xml").read_bytes() == text
+    assert (tmp_path / "scenes" / f"{name}.xml").read_bytes() == text
 
 
 def test_same_arguments_same_image(mi_rgb):
