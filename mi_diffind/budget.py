@@ -64,7 +64,8 @@ from . import budget_plot, metrics, plugins, scenes
 from .budget_plot import about, duration, percent
 from .files import replacing, writable_folder, write_json
 from .interrupt import interruptible
-from .tradeoff import fingerprint, finite, machine, spread
+from .report import finite, machine_line
+from .tradeoff import fingerprint, machine, spread
 
 #: Added to the square of the brightness in the denominator of the error: linear values, 1 is white.
 EPSILON = 0.01
@@ -468,18 +469,10 @@ def _errors(image: np.ndarray, truth: np.ndarray, weights: np.ndarray, truth_noi
 
 def _files(scene_path, learned: list[dict], defines: dict[str, str]) -> set[str]:
     """All files on which a render depends: the scene, what it includes and names, its tables, and this package."""
-    package, folder = Path(__file__).resolve().parent, Path(scene_path).resolve().parent
+    package = Path(__file__).resolve().parent
     found = {*package.rglob("*.py"), *Path(plugins.__file__).resolve().parent.glob("*.py")}
     found |= {Path(file) for file, _ in scenes.tables_of(scene_path, learned)}
-    with scenes.scene_errors(scene_path), scenes._resolving(scene_path):
-        state = scenes._parse(mi.parser.ParserConfig(mi.variant()), scene_path, defines)
-    found |= {Path(str(file)) for file in state.files}
-    for node in state.nodes:
-        strings = (node.props[k] for k in node.props if node.props.type(k) == mi.Properties.Type.String)
-        for path in (folder / text for text in strings if text):
-            with contextlib.suppress(OSError, ValueError):  # any text may be asked for, and few are names of files
-                if path.is_file():
-                    found.add(path)
+    found |= set(scenes.files_of(scene_path, defines))
     return {str(path.resolve()) for path in found}
 
 
@@ -678,9 +671,7 @@ def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
 
 def caption(result: dict) -> str:
     """What the figures were measured on and how, as one paragraph."""
-    m, reference = result["machine"], result["reference"]
-    device = m["gpu"] if m["variant"].startswith("cuda") else f"{m['cpu']} ({m['instructions']}), {m['cores']} cores"
-    llvm = f", LLVM {m['llvm']}" if m["llvm"] else ""
+    reference = result["reference"]
     defines = "".join(f", {k}={v}" for k, v in result["defines"].items())
     quick = " A smoke run (--quick): times are not to be quoted." if result["settings"]["quick"] else ""
     state = " Interrupted: fewer images than asked for." if result["interrupted"] else ""
@@ -689,8 +680,7 @@ def caption(result: dict) -> str:
         f"{Path(result['scene']).name}{defines}, {result['width']} × {result['height']}, {_list(result['counts'])} "
         f"samples per pixel (spp). Relative RMS error against {reference['spp']} spp of the exact scene, whose own "
         f"noise, {percent(reference['noise_rmse'])}, is subtracted. Medians and quartiles of {_images(result)} of "
-        f"different seeds; seconds of the kernels of a whole render. {device}; {m['variant']}, Mitsuba {m['mitsuba']}, "
-        f"Dr.Jit {m['drjit']}{llvm}, mi_diffind {m['mi-diffind']}; {result['date']}.{bad}{quick}{state}"
+        f"different seeds; seconds of the kernels of a whole render. {machine_line(result)}{bad}{quick}{state}"
     )
 
 

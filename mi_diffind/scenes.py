@@ -214,6 +214,21 @@ def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
             mi.util.write_bitmap(str(temporary), bitmap, write_async=False)
 
 
+def files_of(path: str | os.PathLike, defines: dict[str, str] | None = None) -> list[Path]:
+    """The files that a scene consists of: itself, what it includes and what it names. Raises :class:`SceneError`."""
+    folder = Path(path).resolve().parent
+    with scene_errors(path), _resolving(path):
+        state = _parse(mi.parser.ParserConfig(mi.variant()), path, defines)
+    found = [Path(str(file)).resolve() for file in state.files]
+    for node in state.nodes:
+        texts = (node.props[k] for k in node.props if node.props.type(k) == mi.Properties.Type.String)
+        for file in (folder / text for text in texts if text):
+            with contextlib.suppress(OSError, ValueError):  # any text may be asked for, and few are names of files
+                if file.is_file():
+                    found.append(file.resolve())
+    return list(dict.fromkeys(found))
+
+
 def _parse(config, path, defines: dict[str, str] | None):
     if not Path(path).is_file():
         raise RuntimeError(f"{path}: no such scene file")

@@ -1,4 +1,4 @@
-"""Write metals.xml: rough conductors from nearly smooth to fully rough, one metal a row. ``python scenes/make_metals.py``"""
+"""Write metals.xml: rough conductors, a metal a row, from nearly smooth to fully rough."""
 
 from pathlib import Path
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from conftest import BACKENDS
 
-from mi_diffind import plot, tradeoff
+from mi_diffind import plot, report, tradeoff
 from mi_diffind.cli import main
 from mi_diffind.operations import Operations
 from mi_diffind.runtime import array_module
@@ -157,7 +157,7 @@ def test_everything_is_measured_in_turn(tmp_path):
     # A different random number in each pass, the same for all candidates
     assert [e[3] for e in log if e[0] == "pass" and e[2] == "slow"] == [0, 1, 2, 3]
     assert os.listdir(tmp_path) == ["tradeoff_small.partial.json"]  # until it is written
-    tradeoff.write(result, tmp_path)
+    report.write(result, tmp_path)
     assert sorted(os.listdir(tmp_path)) == ["tradeoff.csv", "tradeoff.json", "tradeoff.png"]
 
 
@@ -211,11 +211,11 @@ def test_numbers_from_known_times(monkeypatch):
 
 def test_files(tmp_path):
     result = measure(small_study(Log()), SETTINGS, progress=False)
-    paths = tradeoff.write(result, tmp_path / "out")
+    paths = report.write(result, tmp_path / "out")
     assert sorted(os.listdir(tmp_path / "out")) == ["tradeoff.csv", "tradeoff.json", "tradeoff.png"]
     with open(paths["csv"], encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
-    assert list(table[0]) == [*tradeoff.COLUMNS, "db", "samples"]
+    assert list(table[0]) == [*report.COLUMNS, "db", "samples"]
     assert len(table) == 2 * 2 * 3 + 2 * 2  # queries, and passes of one case, kernels and with tracing
     first = table[0]
     assert (first["task"], first["case"], first["query"], first["candidate"]) == ("small", "first", "eval", "slow")
@@ -223,14 +223,14 @@ def test_files(tmp_path):
     assert (first["add"], first["sqrt"], first["reads"], first["flops"]) == ("1", "1", "0", "6")
     whole = next(row for row in table if row["query"] == "render")
     assert whole["unit"] == "ms a pass" and whole["floor"] == whole["flops"] == ""
-    assert json.loads(Path(paths["json"]).read_text(encoding="utf-8")) == tradeoff.finite(result)
+    assert json.loads(Path(paths["json"]).read_text(encoding="utf-8")) == report.finite(result)
     assert Path(paths["png"]).read_bytes()[:4] == b"\x89PNG"
-    text = "\n".join(tradeoff.summary(result))
+    text = "\n".join(report.summary(result))
     assert "2 cases done" in text and "slow / good" in text and "exact: the truth" in text and "20.0 dB" in text
 
 
 def test_json_has_no_nan():
-    tree = tradeoff.finite({"a": math.nan, "b": [1.5, -math.inf], "c": ("x", None, True)})
+    tree = report.finite({"a": math.nan, "b": [1.5, -math.inf], "c": ("x", None, True)})
     assert tree == {"a": None, "b": [1.5, None], "c": ["x", None, True]}
 
 
@@ -257,8 +257,8 @@ def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, 
         assert result["cases"]["first"]["queries"]["eval"]["slow"]["rounds"] == SETTINGS.rounds
     if where == "rounds":  # one round and a part of the next: the part does not count
         assert result["cases"]["first"]["queries"]["pdf"]["good"]["rounds"] == 2
-    assert len(tradeoff.summary(result)) > 1
-    tradeoff.write(result, tmp_path)  # with whatever there is
+    assert len(report.summary(result)) > 1
+    report.write(result, tmp_path)  # with whatever there is
 
     again = Log()
     finished = measure(small_study(again), SETTINGS, tmp_path, progress=False)
@@ -269,7 +269,7 @@ def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, 
     for case in finished["cases"].values():
         assert all(t["rounds"] == SETTINGS.rounds for q in case["queries"].values() for t in q.values())
         assert all(t["rounds"] == SETTINGS.passes for q in case["passes"].values() for t in q.values())
-    tradeoff.write(finished, tmp_path)
+    report.write(finished, tmp_path)
     assert not list(tmp_path.glob("*.partial.json"))
 
 
@@ -357,19 +357,19 @@ def test_a_picture_of_little(tmp_path):
 def disney(tmp_path_factory):
     """Folder and result of a smoke run."""
     folder = tmp_path_factory.mktemp("disney") / "out"
-    report = folder.parent / "report.json"
-    code = main(["tradeoff", "disney", "--quick", "--out", str(folder), "--json", str(report)])
+    found = folder.parent / "report.json"
+    code = main(["tradeoff", "disney", "--quick", "--out", str(folder), "--json", str(found)])
     assert code == 0
-    return folder, json.loads(report.read_text(encoding="utf-8"))
+    return folder, json.loads(found.read_text(encoding="utf-8"))
 
 
 def test_quick_run_writes_what_it_promises(disney):
-    folder, report = disney
+    folder, found = disney
     assert sorted(os.listdir(folder)) == ["tradeoff.csv", "tradeoff.json", "tradeoff.png"]
     with open(folder / "tradeoff.csv", encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
     errors = ["mae_training", "mae_uniform", "psnr_db_training", "psnr_db_uniform"]
-    assert list(table[0]) == [*tradeoff.COLUMNS, *errors]
+    assert list(table[0]) == [*report.COLUMNS, *errors]
     names = {row["candidate"] for row in table}
     stored = {f"{q}{s}" for q in ("tables", "paper") for s in ("", ", float16", ", uint8")}
     single = {f"only {factor} read" for factor in ("alpha", "masking", "cosine", "coat")}
@@ -380,26 +380,26 @@ def test_quick_run_writes_what_it_promises(disney):
         assert float(row["time_with_floor"]) > 0 and int(row["rounds"]) >= 2
         assert (row["psnr_db_training"] == "") == (row["candidate"] in ("principled", "disney"))
     written = json.loads((folder / "tradeoff.json").read_text(encoding="utf-8"))
-    assert report.pop("files") == {k: str(folder / f"tradeoff.{k}") for k in ("csv", "json", "png")}
-    assert written == report and not report["interrupted"]
-    assert {"cpu", "cores", "variant", "mitsuba", "drjit", "mi-diffind"} <= set(report["machine"])
+    assert found.pop("files") == {k: str(folder / f"tradeoff.{k}") for k in ("csv", "json", "png")}
+    assert written == found and not found["interrupted"]
+    assert {"cpu", "cores", "variant", "mitsuba", "drjit", "mi-diffind"} <= set(found["machine"])
     assert (folder / "tradeoff.png").stat().st_size > 50_000
 
 
 def test_candidates_are_what_they_are_called(disney):
     """Accuracies, reads and operations tell one from another: a wrong decoder or storage would show."""
-    _, report = disney
-    accuracy = {name: c["errors"].get("psnr_db_training") for name, c in report["candidates"].items()}
+    _, found = disney
+    accuracy = {name: c["errors"].get("psnr_db_training") for name, c in found["candidates"].items()}
     assert accuracy["fast"] > 100
     single = [accuracy[f"only {factor} read"] for factor in ("masking", "cosine", "coat")]
     assert accuracy["paper"] < accuracy["tables"] < min(single)
     assert abs(accuracy["only alpha read"] - accuracy["tables"]) < 3  # the table that limits the others
     assert accuracy["tables, uint8"] < accuracy["tables"]
-    bytes_of = {name: c["bytes"] for name, c in report["candidates"].items()}
+    bytes_of = {name: c["bytes"] for name, c in found["candidates"].items()}
     for quality in ("tables", "paper"):
         assert bytes_of[quality] == 2 * bytes_of[f"{quality}, float16"] == 4 * bytes_of[f"{quality}, uint8"] > 0
     assert bytes_of["fast"] == bytes_of["disney"] == bytes_of["principled"] == 0
-    constant, textured = report["cases"].values()
+    constant, textured = found["cases"].values()
     for query in ("eval", "sample"):
         reads = {name: t["operations"]["gathers"] for name, t in constant["queries"][query].items()}
         assert reads["fast"] == reads["disney"] == reads["principled"] == 0
@@ -432,11 +432,11 @@ def test_textured_materials(mi_rgb):
 
 
 def test_conclusions(disney):
-    _, report = disney
-    text = "\n".join(report["conclusions"])
+    _, found = disney
+    text = "\n".join(found["conclusions"])
     assert "exact, the paper's" in text and "bar, all lobes: principled / fast ≥ 1.5" in text
     assert "of the forms that read a table, the fastest" in text
-    paper = report["about"]["paper_operations"]
+    paper = found["about"]["paper_operations"]
     assert paper["exact, the paper's"]["flops"] == 92 + 150 + 2 * 17 + 4 * 5 + 4
     assert paper["tables, the paper's"]["flops"] == 11 + 26 + 4 and paper["tables, the paper's"]["gathers"] == 5
 
@@ -506,8 +506,8 @@ def test_some_cases_have_fewer_candidates_and_other_queries(tmp_path):
     assert list(result["cases"]["second"]["queries"]) == ["pdf"]
     assert list(result["cases"]["second"]["queries"]["pdf"]) == ["good", "exact"]
     assert list(result["cases"]["first"]["queries"]["eval"]) == ["slow", "good", "exact"]
-    tradeoff.write(result, tmp_path)
-    text = "\n".join(tradeoff.summary(result)).split("second")[1]
+    report.write(result, tmp_path)
+    text = "\n".join(report.summary(result)).split("second")[1]
     assert "good" in text and "slow  " not in text.split("ratios")[0]
 
 
@@ -543,15 +543,15 @@ def test_trainings_come_first_and_can_be_interrupted(tmp_path):
     study.candidates[0] = replace(study.candidates[0], training="model", label="s")
     result = measure(study, SETTINGS, tmp_path, progress=False)
     assert result["interrupted"] and log == [("train", "model")] and not result["cases"]
-    tradeoff.write(result, tmp_path)
+    report.write(result, tmp_path)
     result = measure(study, SETTINGS, tmp_path, progress=False)
     assert not result["interrupted"] and log[1:3] == [("train", "model"), ("errors", "slow")]
     slow = result["candidates"]["slow"]
     assert (slow["training_seconds"], slow["converged"], slow["label"]) == (3.0, False, "s")
     assert result["candidates"]["good"]["converged"] is None
-    paths = tradeoff.write(result, tmp_path)
+    paths = report.write(result, tmp_path)
     assert Path(paths["training"]).stat().st_size > 10_000
-    assert "not converged" in "\n".join(tradeoff.summary(result))
+    assert "not converged" in "\n".join(report.summary(result))
 
 
 @pytest.mark.parametrize(

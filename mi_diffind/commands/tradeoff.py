@@ -72,14 +72,14 @@ def run(arguments) -> dict:
 def _study(arguments) -> dict:
     import mitsuba as mi
 
-    from .. import tradeoff
+    from .. import report, tradeoff
 
     study = importlib.import_module(f"..tradeoffs.{arguments.task}", __package__).study(arguments.quick)
     result = tradeoff.measure(study, tradeoff.Settings.choose(mi.variant(), arguments.quick), arguments.out)
-    paths = tradeoff.write(result, arguments.out)
-    print("\n".join(tradeoff.summary(result)))
+    paths = report.write(result, arguments.out)
+    print("\n".join(report.summary(result)))
     print("\nwritten     " + ", ".join(paths.values()))
-    return {**tradeoff.finite(result), "files": paths}
+    return {**report.finite(result), "files": paths}
 
 
 def _scene(arguments) -> dict:

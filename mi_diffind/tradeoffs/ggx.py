@@ -273,7 +273,7 @@ def _add_formula(made: _Made) -> None:
 
 
 def _conductors(made: _Made) -> list[Case]:
-    """``neural_ggx`` with the tables that ship, and ``roughconductor``: copper of constant and of textured roughness."""
+    """``neural_ggx`` with the tables that ship, and ``roughconductor``, of constant and of textured roughness."""
     plugins = {"roughconductor": {"type": "roughconductor", "distribution": "ggx"}}
     made.candidates.append(Candidate("roughconductor", "Mitsuba", is_truth=True, in_passes=False))
     table, encoding = ggx.load_ggx_table(ggx.SHIPPED["tables"])
