@@ -1,8 +1,8 @@
 """
 The training loop, one for all tasks: Adam on random batches, with schedules, checkpoints and guards.
 
-A task describes itself as a :class:`Problem`; :func:`fit` does the rest. Everything random is drawn from
-``(seed, step)``, so that a run is repeatable and an interrupted one continues exactly where it stopped.
+A task describes itself as a :class:`Problem`; :func:`fit` does the rest. Everything random is drawn from the seed, the
+step and the number of restarts, so that a run is repeatable and an interrupted one continues exactly where it stopped.
 """
 
 from __future__ import annotations
@@ -147,6 +147,7 @@ def fit(
         trainer.restore(state)
         best, best_quality, best_step = extra["best"], extra["best_quality"], extra["best_step"]
         history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
+        trainer.restarts = restarts
         reference = extra["reference"]
         plateau.restore(extra["plateau"])
 
@@ -178,6 +179,7 @@ def fit(
             value = float(loss[0])
             if _diverged(value, reference) or not trainer.finite():
                 restarts += 1
+                trainer.restarts = restarts
                 if restarts > 8:
                     raise FittingError(
                         f"the training diverged {restarts} times (last at step {trainer.step}, loss {value:g}): "
@@ -247,7 +249,7 @@ class _Trainer:
 
     def __init__(self, problem: Problem, settings: FitSettings):
         self.problem, self.settings = problem, settings
-        self.step, self.lr_scale = 0, 1.0
+        self.step, self.lr_scale, self.restarts = 0, 1.0, 0
         self.optimizer = Adam(lr=settings.lr)
         self.optimizer.update(problem.net)
         self.module = sys.modules[type(next(iter(self.optimizer.values()))).__module__]
@@ -262,7 +264,8 @@ class _Trainer:
         net, settings = self.problem.net, self.settings
         # A number that changes with the step must not be part of the kernel, or each step would compile anew:
         # the seed is opaque, and Adam makes a learning rate opaque if it is a Python float set parameter by parameter.
-        seed = dr.opaque(self.module.UInt64, (settings.seed << 32) + self.step)
+        # After a restart others are drawn, lest the same batch ends it again.
+        seed = dr.opaque(self.module.UInt64, (settings.seed << 32) + self.restarts * settings.steps + self.step)
         rng = dr.rng(seed=seed)
         net.update(self.optimizer)
         inputs, targets = self.problem.batch(rng, settings.batch)

@@ -205,10 +205,14 @@ class DifferentiableArray(nn.Module):
         """
         The array of one dimension less that remains where the *last* coordinate is ``x``, a number in an array of size
         1: ``array.at(x)([a]) == array([a, x])`` up to rounding. In single precision, its entries folded already;
-        differentiable with respect to the entries and to ``x``. Raises ``ValueError`` for an array of one dimension.
+        differentiable with respect to the entries and to ``x``. Raises ``ValueError`` for an array of one dimension or
+        several numbers.
         """
+        self._require_entries()
         if self.dims < 2:
             raise ValueError("an array of 1 dimension has no coordinate to fix but its only one")
+        if dr.width(x) != 1:
+            raise ValueError(f"x: found {dr.width(x)} numbers, 1 is needed")
         module, (*resolution, _) = _module(self.data), self.resolution
         index = dr.arange(module.UInt32, math.prod(resolution))
         positions = []

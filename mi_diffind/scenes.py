@@ -124,11 +124,9 @@ def learned_plugins(path: str | os.PathLike, defines: dict[str, str] | None = No
 
 def learned_materials(scene) -> list:
     """The instances of learned BSDFs in a loaded scene, wherever they hide (in a ``twosided``, a ``bumpmap``, …)."""
-    found = {}
-    for _, _, node, *_ in mi.traverse(scene).properties.values():
-        if isinstance(node, mi.BSDF) and hasattr(node, "report"):
-            found[id(node)] = node
-    return list(found.values())
+    # Not only nodes that own a parameter: tables of bytes are none
+    found = {id(node): node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.BSDF)}
+    return [node for node in found.values() if hasattr(node, "report")]
 
 
 def reports(scene) -> list[dict]:

@@ -269,6 +269,126 @@ def test_masked_lanes_are_zero(ad, storage):
     assert all(v.numpy()[0] == w.numpy()[0] and v.numpy()[1] == 0 for v, w in zip(values, net(x), strict=True))
 
 
+# -- a coordinate that is known ----------------------------------------------------------------------------------------
+
+
+def known(ad, dims, channels, storage, border="clamp", fold=False):
+    """An array of random entries, beyond [0, 1] if they are to be folded."""
+    low, high = (-2, 3) if fold else (0.5, 1.5)
+    table = np.random.default_rng(dims).uniform(low, high, (*(3, 4, 2, 5)[-dims:], channels))
+    array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, fold=fold)
+    return array if storage == "float32" else array.to(storage)
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+@pytest.mark.parametrize("dims, channels", [(2, 1), (2, 2), (2, 5), (3, 3), (4, 1), (4, 2)])
+@pytest.mark.parametrize("border", lookup.BORDERS)
+def test_what_remains_where_a_coordinate_is_known(ad, dims, channels, storage, border):
+    """``array.at(x)`` is read as the array is, with ``x`` as its last coordinate: inside, at entries, beyond, NaN."""
+    array = known(ad, dims, channels, storage, border)
+    rest = uniform(dims, 100, dims - 1) * 1.4 - 0.2
+    # Bytes are read at up to 1/64 of a step, and once more; the entries of a row are in single precision
+    tolerance = 0.05 * max(array.scale) if storage == "uint8" else 2e-6
+    for x in (0.0, 0.3, 0.5, 1.0, -0.2, 1.2, 0.999999, float("nan")):
+        row = array.at(ad.Float(x))
+        assert row.resolution == array.resolution[:-1] and row.border == array.border[:-1]
+        assert (row.channels, row.storage, row.folded) == (channels, "float32", False)
+        everywhere = np.column_stack([rest, np.full(len(rest), x, np.float32)])
+        np.testing.assert_allclose(read(row, ad, rest), read(array, ad, everywhere), atol=tolerance)
+        if border == "clamp":
+            position = np.nan_to_num(everywhere)
+            np.testing.assert_allclose(read(row, ad, rest), interpolate(array.numpy(), position), atol=tolerance)
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_what_remains_of_mixed_borders(ad, storage):
+    """Each axis keeps its own."""
+    rng = np.random.default_rng(1)
+    table, border = rng.uniform(0.5, 1.5, (4, 3, 5, 2)), ("repeat", "clamp", "repeat")
+    array = DifferentiableArray.from_numpy(table, ad.TensorXf, border)
+    array = array if storage == "float32" else array.to(storage)
+    rest = uniform(5, 100, 2) * 3 - 1
+    row = array.at(ad.Float(1.7))
+    assert row.border == ("repeat", "clamp")
+    expected = read(array, ad, np.column_stack([rest, np.full(100, 1.7, np.float32)]))
+    np.testing.assert_allclose(read(row, ad, rest), expected, atol=5e-4 if storage == "uint8" else 2e-6)
+
+
+def test_a_coordinate_may_be_a_number(ad):
+    array = known(ad, 2, 3, "float32")
+    np.testing.assert_array_equal(array.at(0.3).numpy(), array.at(ad.Float(0.3)).numpy())
+
+
+def test_what_remains_is_folded(ad):
+    """Entries that need folding, and a single entry along an axis."""
+    array = known(ad, 3, 3, "float32", fold=True)
+    expected = interpolate(
+        triangle(array.data.numpy()[..., :3]), np.column_stack([uniform(3, 50, 2), np.full(50, 0.4)])
+    )
+    np.testing.assert_allclose(read(array.at(ad.Float(0.4)), ad, uniform(3, 50, 2)), expected, atol=2e-6)
+    line = DifferentiableArray.from_numpy(np.arange(12.0).reshape(1, 4, 3), ad.TensorXf)
+    np.testing.assert_allclose(read(line.at(ad.Float(0.5)), ad, uniform(0, 5, 1)), [[4.5, 5.5, 6.5]] * 5)
+    single = DifferentiableArray.from_numpy(np.arange(12.0).reshape(4, 1, 3), ad.TensorXf)
+    np.testing.assert_array_equal(single.at(ad.Float(0.5)).numpy(), single.numpy()[:, 0])
+
+
+@pytest.mark.parametrize("dims", [2, 3, 4])
+@pytest.mark.parametrize("border", lookup.BORDERS)
+def test_gradients_of_what_remains(ad, dims, border):
+    """With respect to the entries (linear: any step will do) and to the known coordinate, against differences."""
+    rng = np.random.default_rng(dims)
+    table = rng.uniform(0, 1, (*(3, 2, 4, 5)[-dims:], 3)).astype(np.float32)
+    rest, x = uniform(7, 30, dims - 1), 0.37
+    weights = rng.uniform(-1, 1, (30, 3)).astype(np.float32)
+
+    def total(table, x):
+        array = DifferentiableArray.from_numpy(table, ad.TensorXf, border)
+        x = ad.Float(x)
+        dr.enable_grad(array.data, x)
+        values = array.at(x)([ad.Float(np.ascontiguousarray(v)) for v in rest.T])
+        return (
+            array,
+            x,
+            sum(dr.sum(v * ad.Float(np.ascontiguousarray(w))) for v, w in zip(values, weights.T, strict=True)),
+        )
+
+    def number(table, x):
+        return float(total(table, x)[2][0])
+
+    array, coordinate, value = total(table, x)
+    dr.backward(value)
+    gradient = array.data.grad.numpy()
+    assert not gradient[..., 3:].any()
+    assert np.count_nonzero(gradient) > 0.1 * table.size
+    for index in rng.choice(table.size, 12, replace=False):
+        index = np.unravel_index(index, table.shape)
+        step = np.zeros_like(table)
+        step[index] = 1
+        expected = (number(table + step, x) - number(table - step, x)) / 2
+        assert gradient[index] == pytest.approx(expected, rel=1e-3, abs=1e-4)
+    expected = (number(table, x + 1e-2) - number(table, x - 1e-2)) / 2e-2  # linear within a cell
+    assert coordinate.grad.numpy()[0] == pytest.approx(expected, rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("storage", lookup.STORAGES)
+def test_a_row_of_an_indirection(ad, storage):
+    net = pair(ad, primary=(5, 6))
+    net = net if storage == "float32" else net.to(storage)
+    x = uniform(2, 100, 1)
+    row = Indirection(net.primary[0].at(ad.Float(0.6)), net.cascaded)
+    expected = read(net, ad, np.column_stack([x, np.full(100, 0.6, np.float32)]))
+    np.testing.assert_allclose(read(row, ad, x), expected, atol=2e-3 if storage == "uint8" else 2e-5)
+
+
+def test_an_array_of_one_dimension_has_nothing_that_remains(ad):
+    with pytest.raises(ValueError, match="1 dimension"):
+        DifferentiableArray(4).alloc(ad.TensorXf).at(ad.Float(0.5))
+    with pytest.raises(RuntimeError, match="no entries yet"):
+        DifferentiableArray((4, 4)).at(ad.Float(0.5))
+    with pytest.raises(ValueError, match="found 4 numbers"):
+        DifferentiableArray((4, 4)).alloc(ad.TensorXf).at(ad.Float(0, 0.1, 0.2, 0.3))
+
+
 # -- what coordinates can be -------------------------------------------------------------------------------------------
 
 

@@ -293,8 +293,9 @@ def fit_ggx(
     """
     Train the arrays of a level of quality, of ``primary``² × 2 and ``cascaded``² × 1 entries, and return them with
     their errors (:func:`measure`, in the storage form) and the run's record. ``settings`` are those of
-    :data:`DEFAULT_SETTINGS` unless given.
+    :data:`DEFAULT_SETTINGS` unless given. Raises ``ValueError`` for a quality, storage form or size that is unknown.
     """
+    _check(quality, storage)
     settings = settings or DEFAULT_SETTINGS[quality]
     types = array_module(backend)
     net = indirection(primary, cascaded).alloc(types.TensorXf)
@@ -362,9 +363,7 @@ def load_ggx(filename: str | os.PathLike, dtype, storage: str = "", quality: str
     A file is read and checked once, and what is returned shares its memory; assigning to one copy does not change
     another.
     """
-    for name, found, allowed in (("quality", quality, tuple(ENCODINGS)), ("storage", storage, STORAGES)):
-        if found and found not in allowed:
-            raise ValueError(f'parameter "{name}": found "{found}", allowed are {", ".join(allowed)}')
+    _check(quality, storage)
     path = table_file(filename, quality)
     net, encoding = _load(path, path.stat().st_mtime_ns if path.is_file() else 0, dtype, storage)
     has = next((name for name, e in ENCODINGS.items() if e == encoding), "tables")
@@ -375,6 +374,12 @@ def load_ggx(filename: str | os.PathLike, dtype, storage: str = "", quality: str
         copies.append(array._like())
         copies[-1].data = type(array.data)(array.data)
     return LearnedGGX(Indirection(*copies), encoding), has
+
+
+def _check(quality: str, storage: str) -> None:
+    for name, found, allowed in (("quality", quality, tuple(ENCODINGS)), ("storage", storage, STORAGES)):
+        if found and found not in allowed:
+            raise ValueError(f'parameter "{name}": found "{found}", allowed are {", ".join(allowed)}')
 
 
 @functools.lru_cache(maxsize=64)
