@@ -195,6 +195,10 @@ def read_packed(
 
     convert = len(resolution) > 2
 
+    inner_weights = [None]
+    for _, _, w in axes[outer:]:
+        inner_weights = [v if b is None else b * v for b in inner_weights for v in (1 - w, w)]
+
     def fetch(index) -> list:
         """All words of a texel, each also rotated."""
         found = []
@@ -222,9 +226,12 @@ def read_packed(
             index = lower if index is None else dr.fma(index, n, lower)
         found = fetch(index)
         corners = [[byte(found, k * stride + channel) for channel in range(channels)] for k in range(2**inner)]
-        for _, _, w in reversed(axes[outer:]):
-            pairs = zip(corners[::2], corners[1::2], strict=True)
-            corners = [[dr.fma(w, b - a, a) for a, b in zip(*pair, strict=True)] for pair in pairs]
+        if channels > 2:  # weights that all channels share are less work than a step along each axis for each
+            corners = [_weighted_sum(zip(inner_weights, corners, strict=True))] if inner else corners
+        else:
+            for _, _, w in reversed(axes[outer:]):
+                pairs = zip(corners[::2], corners[1::2], strict=True)
+                corners = [[dr.fma(w, b - a, a) for a, b in zip(*pair, strict=True)] for pair in pairs]
         terms.append((weight, corners[0]))
     sums = terms[0][1] if terms[0][0] is None else _weighted_sum(terms)
     values = []

@@ -80,9 +80,9 @@ class NeuralGGX(mi.BSDF):
     read, so an error of the table is an error of the image and never one of the estimator: the weight of a sample is
     D̂/D times that of the exact plugin.
 
-    **Derivatives are coarser than values**, those of a bilinear read being constant from entry to entry: with respect to
-    ``alpha`` they are off by 4% to 13% on average, and near 1 (from 0.95) may have the wrong sign. Fits of ``alpha`` from
-    images converge all the same.
+    **Derivatives are coarser than values**, those of a bilinear read being constant from entry to entry: with respect
+    to ``alpha`` they are off by 4% to 13% on average, and near 1 (from 0.95) may have the wrong sign. Fits of ``alpha``
+    from images converge all the same.
 
     Sampling is detached, as in ``disney``: gradients flow through the value of a sample, not through its position or
     density. Like its counterpart it reflects on the front side only; put it into a :monosp:`twosided` for both.
@@ -136,9 +136,8 @@ class NeuralGGX(mi.BSDF):
         self._watched_alpha = Watched(self.alpha)
         self._watched_ior = [Watched(self.eta, colour=True), Watched(self.k, colour=True)]
         self._watched_factor = Watched(self.specular_reflectance, colour=True) if given else None
-        #: What depends on a constant roughness alone, evaluated, and the tables that it was made of.
-        self._constant: dict | None = None
-        self._constant_net = None
+        #: What depends on a constant roughness alone, evaluated.
+        self._constant: ggx.Roughness | None = None
 
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
         if any(texture.is_spatially_varying() for texture in self._textures().values()):
@@ -190,11 +189,8 @@ class NeuralGGX(mi.BSDF):
             with dr.suspend_grad():
                 alpha = mi.Float(self.alpha.eval_1(dr.zeros(mi.SurfaceInteraction3f)))
                 found = self.distribution.constant_roughness(alpha)
-            self._constant, self._constant_net = vars(found) | {"net": None}, found.net
-            # The arrays that a frozen function finds in it; for others it is recorded anew
-            self._constant["row"] = found.net.primary[0].data
-            dr.make_opaque(self._constant)
-            found.net.primary[0].data = self._constant["row"]
+            dr.make_opaque(found)
+            self._constant = found
 
     def _is_constant(self) -> bool:
         """Is the roughness the same everywhere, and neither it nor a table being optimised or changed since?"""
@@ -204,8 +200,7 @@ class NeuralGGX(mi.BSDF):
 
     def _roughness(self, si, active) -> ggx.Roughness:
         if self._constant is not None and self._is_constant():
-            found = {k: v for k, v in self._constant.items() if k != "row"}
-            return ggx.Roughness(**found | {"net": self._constant_net})
+            return self._constant
         return self.distribution.roughness(self.alpha.eval_1(si, active))
 
     def _reflects_all(self) -> bool:
