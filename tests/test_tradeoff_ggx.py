@@ -145,7 +145,7 @@ def verdicts(report, **changes):
         if "psnr_db" in c["errors"]:
             c["errors"]["psnr_db"] = found
     lines = study.conclusions(result, "16→8")
-    return {line.split("  ")[1].strip(): line for line in lines if line.startswith("  ")}, lines
+    return {line[2:22].strip(): line for line in lines if line.startswith("  ")}, lines
 
 
 def test_equal_quality(quick):
