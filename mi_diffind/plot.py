@@ -222,6 +222,8 @@ def _label(renderer, axes, panel: Panel, styles: dict, front) -> None:
     if front:
         x, y = pixel(front[0].time, front[0].accuracy)
         soft.append(Bbox([[x - 1, inside.y0], [x + 1, y]]))
+        y = pixel(front[-1].time, front[-1].accuracy)[1]  # the words "Pareto front"
+        taken.append(Bbox([[inside.x1 - 54 * scale, y - 13 * scale], [inside.x1, y]]))
 
     def overlap(a: Bbox, b: Bbox) -> float:
         return max(0.0, min(a.x1, b.x1) - max(a.x0, b.x0)) * max(0.0, min(a.y1, b.y1) - max(a.y0, b.y0))

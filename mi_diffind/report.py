@@ -152,7 +152,7 @@ def figure(result: dict, path: str | os.PathLike) -> None:
             c = result["candidates"][name]
             shown = result["accuracy"] in c["errors"]
             if shown and not (c["is_truth"] or c["is_reference"]) and c["bytes"] > 0:
-                sizes.append((name, c))
+                sizes.append(c)
             if c["is_truth"] or c["is_reference"]:
                 least = HIDDEN * t["floor"]
                 label = c["label"] if t["time"] >= least else f"{c['label']}, below {least:.2g} ns"
@@ -168,10 +168,10 @@ def figure(result: dict, path: str | os.PathLike) -> None:
     plot.write(path, result["title"], panels, result["accuracy_label"], caption(result))
 
 
-def _by_bytes(candidates: list[tuple[str, dict]], accuracy: str) -> list[plot.Point]:
+def _by_bytes(candidates: list[dict], accuracy: str) -> list[plot.Point]:
     """Accuracy against bytes, of what differs in either only: two forms of one thing are one point."""
     points = {}
-    for _, c in candidates:
+    for c in candidates:
         points.setdefault((c["bytes"], c["training"] or c["errors"][accuracy]), c)
     front = pareto([(math.log(c["bytes"]), -c["errors"][accuracy]) for c in points.values()])
     return [

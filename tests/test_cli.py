@@ -307,13 +307,6 @@ def test_tradeoff_of_a_scene_is_interrupted(tmp_path, capsys, monkeypatch, mi_rg
     assert capsys.readouterr().out == f"first\nsecond\n\nwritten     {tmp_path}/a.csv, {tmp_path}/a.json\n"
 
 
-def test_the_command_names_every_study():
-    from mi_diffind.commands.tradeoff import STUDIES
-    from mi_diffind.tradeoffs import TASKS
-
-    assert set(STUDIES) == set(TASKS)
-
-
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 

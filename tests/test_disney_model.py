@@ -21,13 +21,12 @@ from mi_diffind.tasks.disney.library import (
 from mi_diffind.tasks.disney.model import ALPHA_MIN, PARAMETERS, exact_factors
 from mi_diffind.tasks.disney.training import (
     DEFAULT_SETTINGS,
-    EXPONENTIAL_RATE,
-    exponential_like,
     fit_disney,
     measure,
     shade,
     uniform_hemisphere,
 )
+from mi_diffind.tasks.distributions import EXPONENTIAL_RATE, exponential_like
 
 N = 100_000
 

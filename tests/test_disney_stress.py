@@ -20,6 +20,7 @@ from mi_diffind.tasks.disney import training
 from mi_diffind.tasks.disney.effects import Known, find_effects
 from mi_diffind.tasks.disney.library import SHIPPED, load_decoder, load_disney_table
 from mi_diffind.tasks.disney.model import Material
+from mi_diffind.tasks.distributions import EXPONENTIAL_RATE
 
 QUALITIES = ("fast", "tables", "paper")
 
@@ -1189,7 +1190,7 @@ def random_population(rng, n, distribution):
     color, m, wi, wo = burley.random_case(rng, n, low_cosine=1e-5)
     if distribution == "training":
         for name in ("metallic", "roughness"):  # inverse of the exponential-like distribution's CDF
-            m[name] = -np.log(1 - m[name] * (1 - np.exp(-training.EXPONENTIAL_RATE))) / training.EXPONENTIAL_RATE
+            m[name] = -np.log(1 - m[name] * (1 - np.exp(-EXPONENTIAL_RATE))) / EXPONENTIAL_RATE
     return color.astype("f4"), {k: v.astype("f4") for k, v in m.items()}, wi.astype("f4"), wo.astype("f4")
 
 

@@ -15,6 +15,7 @@ from mi_diffind.fitting import fit
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import TableError, save_table
 from mi_diffind.tasks import ggx
+from mi_diffind.tasks.distributions import EXPONENTIAL_RATE
 from mi_diffind.tasks.ggx import ALPHA_FLOOR, ALPHA_MIN, BANDS, ENCODINGS, SHIPPED, Encoding, LearnedGGX
 
 QUALITIES = tuple(ENCODINGS)
@@ -199,7 +200,7 @@ def test_training_distributions(ad):
     assert alpha.min() == np.float32(ALPHA_MIN) and alpha.max() <= 1
     for t in (0.1, 0.5, 0.9):
         assert abs(np.mean(sin2 < t) - t) < 0.005  # cosine-weighted
-        cdf = (1 - np.exp(-ggx.EXPONENTIAL_RATE * t)) / (1 - np.exp(-ggx.EXPONENTIAL_RATE))
+        cdf = (1 - np.exp(-EXPONENTIAL_RATE * t)) / (1 - np.exp(-EXPONENTIAL_RATE))
         assert abs(np.mean(alpha < t) - cdf) < 0.005
     assert np.median(alpha) == pytest.approx(0.21, abs=0.005)
 

@@ -6,6 +6,7 @@ import argparse
 import importlib
 
 from ..files import writable_folder
+from ..tradeoffs import TASKS
 from .common import (
     UsageError,
     defines_of,
@@ -20,19 +21,13 @@ from .common import (
     verb,
 )
 
-#: Tasks with a study in :mod:`mi_diffind.tradeoffs`.
-STUDIES = {
-    "disney": "all forms of the Disney BRDF",
-    "ggx": "all forms of the GGX distribution",
-}
-
 
 def add(commands) -> None:
     """Add the verb, its tasks and their options to ``commands``, the subparsers of the command line."""
     tasks = tasks_of(
         verb(commands, "tradeoff", run, "measure time against accuracy, of all forms of a task or of a scene")
     )
-    for name, about in STUDIES.items():
+    for name, about in TASKS.items():
         sub = task(tasks, name, f"measure time against accuracy of {about}")
         _add_common(sub)
         variant_option(sub)

@@ -41,6 +41,7 @@ from ..indirection import DifferentiableArray, Indirection
 from ..lookup import STORAGES, clamp
 from ..runtime import array_module
 from ..tables import Table, TableError, load_table
+from .distributions import exponential_like
 
 TASK = "ggx"
 
@@ -49,9 +50,6 @@ ALPHA_MIN = 1e-3
 
 #: Least roughness of all: that of Mitsuba's ``MicrofacetDistribution``.
 ALPHA_FLOOR = 1e-4
-
-#: Rate of the exponential-like distribution of the roughness: half of the samples lie below 0.21.
-EXPONENTIAL_RATE = 3.0
 
 #: Bands of roughness for which errors are reported.
 BANDS = ((0.001, 0.01), (0.01, 0.1), (0.1, 0.5), (0.5, 1.0))
@@ -206,8 +204,7 @@ def draw(rng, types, size: int, quality: str = "paper"):
     or with half of the normals from the peak (``"tables"``), see the module.
     """
     u, v = (rng.random(types.Float, size) for _ in range(2))
-    a = -dr.log(1 - v * (1 - math.exp(-EXPONENTIAL_RATE))) / EXPONENTIAL_RATE
-    alpha = dr.clip(a, ALPHA_MIN, 1)
+    alpha = dr.maximum(exponential_like(v), ALPHA_MIN)
     sin2 = u
     if quality == "tables":
         which, a2 = rng.random(types.Float, size), dr.square(alpha)

@@ -86,7 +86,8 @@ def study(quick: bool = False) -> Study:
         )
     package = Path(__file__).resolve().parents[1]
     plugin_files = Path(plugins_package.__file__).parent.glob("*.py")  # elsewhere in a checkout than if installed
-    sources = [package / name for name in ("lookup.py", "indirection.py", "operations.py", "tradeoff.py")]
+    names = ("lookup.py", "indirection.py", "operations.py", "tradeoff.py", "tasks/distributions.py")
+    sources = [package / name for name in names]
     sources += [Path(__file__), *(package / "tasks" / "disney").glob("*.py"), *(package / "data").glob("*.npz")]
     return Study(
         task="disney",

@@ -88,7 +88,10 @@ def study(quick: bool = False) -> Study:
         *_conductors(made),
     ]
     package = Path(__file__).resolve().parents[1]
-    trained_by = [package / f"{n}.py" for n in ("lookup", "indirection", "fitting", "tasks/ggx", "tradeoffs/networks")]
+    trained_by = [
+        package / f"{n}.py"
+        for n in ("lookup", "indirection", "fitting", "tasks/distributions", "tasks/ggx", "tradeoffs/networks")
+    ]
     sources = [*trained_by, *(package / f"{n}.py" for n in ("operations", "tradeoff", "convergence")), Path(__file__)]
     sources += [*package.glob("data/ggx*.npz"), Path(plugins_package.__file__).parent / "neural_ggx.py"]
     reference = made.name(f"{PRIMARY}→{CASCADED}", "plain")

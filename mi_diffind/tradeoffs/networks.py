@@ -84,7 +84,7 @@ class Network(nn.Module):
         The multiplications by weights and their sums, which a kernel does not show (they are calls or loops): one
         multiplication and one addition a weight, each weight and bias read once.
         """
-        weights = [v for key in self.mlp if key.endswith("weights") for v in [self.mlp[key]]]
+        weights = [self.mlp[key] for key in self.mlp if key.endswith("weights")]
         macs = sum(dr.width(w) for w in weights)
         read = sum(dr.width(self.mlp[key]) for key in self.mlp)
         return Operations(add=macs, mul=macs, gathers=len(weights), bytes_gathered=4 * read, instructions=macs)

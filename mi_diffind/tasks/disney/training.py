@@ -18,15 +18,13 @@ import drjit as dr
 from ...fitting import FitResult, FitSettings, fit
 from ...runtime import array_module
 from ...tables import Table
+from ..distributions import exponential_like
 from . import model
 from .arrays import Arrays
 from .decoder import Decoder
 from .effects import Effects
 from .library import LAYOUTS, decoder_of
 from .model import PARAMETERS, Material, compose, exact_factors
-
-#: Rate of the exponential-like distribution on [0, 1]: half of the samples lie below 0.21.
-EXPONENTIAL_RATE = 3.0
 
 #: The settings that made the shipped tables. Those of one coordinate start close to their optimum: a large rate would
 #: only shake them (75 instead of 90 dB).
@@ -44,11 +42,6 @@ def uniform_hemisphere(types, u, v):
     r = dr.sqrt(dr.maximum(1 - u * u, 0))
     sin, cos = dr.sincos(2 * dr.pi * v)
     return types.Array3f(r * cos, r * sin, u)
-
-
-def exponential_like(u, rate: float = EXPONENTIAL_RATE):
-    """A number in [0, 1] with density ∝ exp(−rate·x) from a uniform one."""
-    return dr.minimum(-dr.log(1 - u * (1 - math.exp(-rate))) / rate, 1)
 
 
 def random_materials(rng, types, size: int, distribution: str = "training") -> Material:
