@@ -1,5 +1,5 @@
 """
-``mi-diffind``: render, compare, regress, inspect, tradeoff, encode, fit (:mod:`mi_diffind.commands`).
+``mi-diffind``: render, compare, regress, inspect, tradeoff, encode, decode, fit (:mod:`mi_diffind.commands`).
 
 Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
 """
@@ -11,14 +11,15 @@ import os
 import sys
 
 from . import __version__
-from .commands import compare, encode, fit, inspect, regress, render, tradeoff
+from .commands import compare, decode, encode, fit, inspect, regress, render, tradeoff
 from .commands.common import UsageError
 from .files import OutputError, writable_file, write_json
 from .fitting import FittingError
 from .tables import TableError
+from .tasks.image.source import SourceError
 
 #: In the order of the help.
-VERBS = (render, compare, regress, inspect, tradeoff, encode, fit)
+VERBS = (render, compare, regress, inspect, tradeoff, encode, decode, fit)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -33,7 +34,7 @@ def main(argv: list[str] | None = None) -> int:
         if arguments.json is not None:
             write_json(arguments.json, result)
         return 130 if result.get("interrupted") else 1 if result.get("failed") else 0
-    except (UsageError, OutputError, TableError, FittingError, SceneError) as e:
+    except (UsageError, OutputError, TableError, FittingError, SourceError, SceneError) as e:
         print(f"mi-diffind: error: {e}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

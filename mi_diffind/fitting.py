@@ -48,6 +48,9 @@ class Problem(Protocol):
     #: Optional: what the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
     about: dict
 
+    def begin(self, step: int, steps: int) -> None:
+        """Optional: called before step ``step`` of ``steps``, for a problem that changes on the way."""
+
     def batch(self, rng, size: int):
         """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
 
@@ -268,6 +271,8 @@ class _Trainer:
         seed = dr.opaque(self.module.UInt64, (settings.seed << 32) + self.restarts * settings.steps + self.step)
         rng = dr.rng(seed=seed)
         net.update(self.optimizer)
+        if hasattr(self.problem, "begin"):
+            self.problem.begin(self.step, settings.steps)
         inputs, targets = self.problem.batch(rng, settings.batch)
         outputs = self.problem.predict(net, inputs)
         loss = 0

@@ -8,6 +8,7 @@ optimiser, ``net.update(opt)`` takes them back, and ``nn.Sequential``, hash grid
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 from collections.abc import Sequence
@@ -73,6 +74,7 @@ class DifferentiableArray(nn.Module):
         "border": tuple,
         "folded": bool,
         "storage": str,
+        "bits": int,
         "scale": tuple,
         "offset": tuple,
         "init": object,
@@ -99,6 +101,7 @@ class DifferentiableArray(nn.Module):
         self.border = border
         self.folded = bool(fold)
         self.storage = "float32"
+        self.bits = 8
         self.scale = ()
         self.offset = ()
         self.init = init
@@ -155,11 +158,12 @@ class DifferentiableArray(nn.Module):
         return self.from_numpy(self.numpy(), _module(self.data).TensorXf, self.border, storage)
 
     @classmethod
-    def from_numpy(cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None):
+    def from_numpy(cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None, bits=8):
         """
         An allocated array holding ``values`` of shape ``(N_1, …, N_d, channels)``.
 
-        With ``storage="uint8"``, ``quantization = (scale, offset)`` says that ``values`` are already bytes.
+        With ``storage="uint8"``, ``quantization = (scale, offset)`` says that ``values`` are already bytes, and
+        ``bits`` < 8 that they need only so many bits each, which is then what they take in memory.
         """
         values = np.asarray(values)
         if storage not in lookup.STORAGES:
@@ -176,7 +180,12 @@ class DifferentiableArray(nn.Module):
             result.scale, result.offset = tuple(map(float, scale)), tuple(map(float, offset))
             _require_backend(dtype)
             UInt32 = _module(dtype).UInt32
-            packed = lookup.pack(codes, result.border)
+            result.bits = bits
+            if bits < 8:
+                packed = lookup.pack_bits(codes, bits)
+                packed = np.pad(packed, (0, 4 + -len(packed) % 4)).view(np.uint32)
+            else:
+                packed = lookup.pack(codes, result.border)
             words = _aligned(packed.shape, np.uint32)
             words[...] = packed
             result.data = UInt32(words)
@@ -199,6 +208,11 @@ class DifferentiableArray(nn.Module):
         """The bytes of an array in ``"uint8"`` storage, shape ``(N_1, …, N_d, channels)``."""
         if self.storage != "uint8":
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
+        if self.bits < 8:
+            count = math.prod(self.resolution) * self.channels
+            return lookup.unpack_bits(self.data.numpy().view(np.uint8), count, self.bits).reshape(
+                *self.resolution, self.channels
+            )
         return lookup.unpack(self.data.numpy(), self.resolution, self.channels)
 
     def at(self, x) -> DifferentiableArray:
@@ -237,7 +251,7 @@ class DifferentiableArray(nn.Module):
         if self.storage != "uint8":
             return False
         pairs = list(zip(self.scale, self.offset, strict=True))
-        return all(offset >= 0 and scale >= 0 and offset + 255 * scale <= 1 for scale, offset in pairs)
+        return all(offset >= 0 and scale >= 0 and offset + (2**self.bits - 1) * scale <= 1 for scale, offset in pairs)
 
     def check_shape(self) -> None:
         """Raise ``ValueError`` if ``data`` is a tensor of any shape but the two that can be read."""
@@ -253,7 +267,8 @@ class DifferentiableArray(nn.Module):
     @property
     def nbytes(self) -> int:
         """Bytes of the entries in their storage form, without padding: what a file has to hold."""
-        return int(np.prod(self.resolution)) * self.channels * {"float32": 4, "float16": 2, "uint8": 1}[self.storage]
+        bits = {"float32": 32, "float16": 16, "uint8": self.bits}[self.storage]
+        return (math.prod(self.resolution) * self.channels * bits + 7) // 8
 
     @property
     def memory_nbytes(self) -> int:
@@ -280,7 +295,8 @@ class DifferentiableArray(nn.Module):
         if len(coordinates) != self.dims:
             raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(coordinates)} coordinate(s)")
         if self.storage == "uint8":
-            values = lookup.read_packed(
+            read = lookup.read_packed if self.bits == 8 else functools.partial(lookup.read_bits, bits=self.bits)
+            values = read(
                 self.data,
                 self.scale,
                 self.offset,

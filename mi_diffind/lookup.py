@@ -72,9 +72,11 @@ def _packet(count: int) -> int:
     return next(p for p in (4, 2, 1) if count % p == 0)
 
 
-def gathers(resolution: Sequence[int], channels: int, storage: str) -> int:
+def gathers(resolution: Sequence[int], channels: int, storage: str, bits: int = 8) -> int:
     """Number of gather instructions that one read takes."""
     dims = len(resolution)
+    if storage == "uint8" and bits < 8:
+        return 2**dims * channels_words(channels, bits)
     if storage == "uint8":
         inner, _, words = packed_layout(resolution, channels)
         return 2 ** (dims - inner) * (words // _packet(words))
@@ -241,6 +243,73 @@ def read_packed(
         values.append(dr.fma(s, step, offset[k] - ones))
     # A masked gather gives the byte 0, which means `offset`, not 0.
     return values if active is True else [dr.select(active, v, 0) for v in values]
+
+
+def channels_words(channels: int, bits: int) -> int:
+    """Words of 32 bits that have to be read to find all bits of an entry in a table of fewer than 8 bits a channel."""
+    width = channels * bits
+    return 1 if 32 % width == 0 else (width + 62) // 32
+
+
+def read_bits(
+    words,
+    scale,
+    offset,
+    resolution: Sequence[int],
+    channels: int,
+    x: Sequence,
+    border: Sequence[str],
+    active=True,
+    inside: bool = False,
+    bits: int = 4,
+):
+    """
+    Read a table whose channels have ``bits`` bits each, fewer than 8 (:func:`pack_bits`, in words of 32 bits and one
+    word more): it takes no more memory than that. One gather a corner if an entry is a half, a quarter … of a word, two
+    if it may begin in one and end in the next. Otherwise as :func:`read_packed`.
+    """
+    Float, UInt32 = type(x[0]), type(words)
+    Int32, width = dr.int32_array_t(type(words)), channels * bits
+    count = channels_words(channels, bits)
+    axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
+
+    def fetch(index) -> list:
+        start = index * width
+        first, shift = start >> 5, start & 31
+        found = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
+        if count > 1:  # what is left of a word, and what the next one adds above it
+            pairs = zip(found, [*found[1:], UInt32(0)], strict=True)
+            found = [(low >> shift) | ((high << (31 - shift)) << 1) for low, high in pairs]
+        else:
+            found = [found[0] >> shift]
+        values = []
+        for k in range(channels):
+            word, at = divmod(k * bits, 32)
+            value = found[word] >> at
+            if at + bits > 32:
+                value |= found[word + 1] << (32 - at)
+            values.append(Float(Int32(value & (2**bits - 1))))
+        return values
+
+    sums = _weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
+    values = [dr.fma(s, scale[k], offset[k]) for k, s in enumerate(sums)]
+    return values if active is True else [dr.select(active, v, 0) for v in values]
+
+
+def pack_bits(codes, bits: int):
+    """The lower ``bits`` bits of each byte of a NumPy array, one after the other, lowest first: flat ``uint8``."""
+    import numpy as np
+
+    found = np.unpackbits(np.asarray(codes, np.uint8).reshape(-1, 1), axis=1, bitorder="little")
+    return np.packbits(found[:, :bits], bitorder="little")
+
+
+def unpack_bits(packed, count: int, bits: int):
+    """The ``count`` bytes that :func:`pack_bits` packed: flat ``uint8``."""
+    import numpy as np
+
+    found = np.unpackbits(packed, count=count * bits, bitorder="little").reshape(count, bits)
+    return np.packbits(np.pad(found, ((0, 0), (0, 8 - bits))), axis=1, bitorder="little").reshape(count)
 
 
 def quantize(values, channels: int):

@@ -1,8 +1,9 @@
 """
 The file that holds one trained thing: a ``.npz`` archive (readable by ``numpy.load``, never pickled).
 
-It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``, and
-an array ``meta`` of UTF-8 bytes: JSON with the format version, the task, the storage form, each array's shape, borders
+It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``, or, of
+entries with fewer than 8 bits, their bits one after the other (:func:`.lookup.pack_bits`), and an array ``meta`` of
+UTF-8 bytes: JSON with the format version, the task, the storage form, each array's shape, borders
 and (for bytes) affine map, the training settings, the seed and the measured quality. The same content gives the same
 bytes.
 """
@@ -21,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from .files import replacing
-from .lookup import BORDERS, STORAGES
+from .lookup import BORDERS, STORAGES, pack_bits, unpack_bits
 
 #: Version of the format that is written. A file with another version is refused.
 FORMAT_VERSION = 1
@@ -43,6 +44,7 @@ class Table:
 
     ``arrays`` maps names to entries of shape ``(N_1, …, N_d, c)`` in the dtype of ``storage``; ``borders`` gives each
     array's borders, ``quantization`` its ``(scale, offset)`` (one number a channel) if ``storage`` is ``"uint8"``.
+    ``bits`` says of which arrays of bytes fewer than 8 bits an entry are stored, 1 to 7.
     ``settings`` are those of the training, ``quality`` what was measured (units in the names, e.g. ``psnr_db``).
     """
 
@@ -54,11 +56,17 @@ class Table:
     settings: dict = field(default_factory=dict)
     seed: int = 0
     quality: dict[str, float] = field(default_factory=dict)
+    bits: dict[str, int] = field(default_factory=dict)
 
     @property
     def nbytes(self) -> int:
         """Bytes of all entries."""
-        return sum(a.nbytes for a in self.arrays.values())
+        return sum(map(self.nbytes_of, self.arrays))
+
+    def nbytes_of(self, name: str) -> int:
+        """Bytes of the entries of one array, as stored."""
+        array = self.arrays[name]
+        return math.ceil(array.size * self.bits[name] / 8) if name in self.bits else array.nbytes
 
     def to(self, storage: str) -> Table:
         """A copy in another storage form; from ``"uint8"`` or ``"float16"`` nothing that was lost comes back."""
@@ -118,6 +126,10 @@ def save_table(path: str | os.PathLike, table: Table) -> None:
             scale, offset = table.quantization.get(name, ((), ()))
             _check_affine(path, name, array.shape, scale, offset)
             described[name] |= {"scale": list(scale), "offset": list(offset)}
+        if name in table.bits:
+            described[name]["bits"] = _check_bits(path, name, table.bits[name], table.storage)
+            if array.max() >> table.bits[name]:
+                raise TableError(f'{path}: array "{name}" has entries of more than {table.bits[name]} bits')
     meta = {
         "format_version": FORMAT_VERSION,
         "task": table.task,
@@ -134,6 +146,8 @@ def save_table(path: str | os.PathLike, table: Table) -> None:
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, array in {"meta": text, **table.arrays}.items():
             buffer = io.BytesIO()
+            if name in table.bits:
+                array = pack_bits(array, table.bits[name])
             np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
             # A fixed date: numpy.savez stamps the current one, and equal content would give unequal files.
             archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), buffer.getvalue())
@@ -222,11 +236,17 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
             raise TableError(
                 f'{path}: the description of array "{name}" is damaged ({type(e).__name__}: {e})'
             ) from None
+        bits = entry.get("bits")
+        if bits is not None:
+            table.bits[name] = _check_bits(path, name, bits, storage)
         wanted = shapes[name] if shapes is not None else shape
         if len(shape) != len(wanted) or any(w is not None and s != w for s, w in zip(shape, wanted, strict=True)):
             raise TableError(f'{path}: array "{name}" has the shape {shape}, expected {tuple(wanted)}')
         _check_shape(path, name, shape, border)
-        array = _array(archive, members[name], path, name, _DTYPES[storage], shape)
+        stored = shape if bits is None else (math.ceil(math.prod(shape) * bits / 8),)
+        array = _array(archive, members[name], path, name, _DTYPES[storage], stored)
+        if bits is not None:
+            array = unpack_bits(array, math.prod(shape), bits).reshape(shape)
         if affine is not None:
             _check_affine(path, name, shape, *affine)
             table.quantization[name] = (affine[0], affine[1])
@@ -242,6 +262,12 @@ def _check_shape(path, name: str, shape: tuple, border: tuple) -> None:
         raise TableError(f'{path}: array "{name}" has the shape {shape}, expected 1 to 4 dimensions and channels')
     if len(border) != len(shape) - 1 or any(b not in BORDERS for b in border):
         raise TableError(f'{path}: array "{name}" has the borders {border}, allowed are {BORDERS} for each axis')
+
+
+def _check_bits(path, name: str, bits, storage: str) -> int:
+    if storage != "uint8" or not isinstance(bits, int) or not 1 <= bits <= 7:
+        raise TableError(f'{path}: array "{name}" has {bits} bits an entry, allowed are 1 to 7, and of bytes only')
+    return bits
 
 
 def _check_affine(path, name: str, shape: tuple, scale: tuple, offset: tuple) -> None:

@@ -10,6 +10,7 @@ from ..fitting import SCHEDULES, FitSettings, FittingError
 from ..lookup import STORAGES
 from ..tasks import ggx
 from ..tasks.disney import training as disney
+from . import fit_image
 from .common import UsageError, natural, positive, task, tasks_of, verb
 
 
@@ -26,6 +27,7 @@ def add(commands) -> None:
             metavar="N",
             help=f"entries along each side of the {name} array (default: {default})",
         )
+    fit_image.add(tasks)
 
 
 def _add_task(tasks, name: str, help: str, train, levels: dict[str, FitSettings]):

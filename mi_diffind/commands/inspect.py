@@ -42,14 +42,15 @@ def run(arguments) -> dict:
         arrays[name] = {
             "resolution": list(array.shape[:-1]),
             "channels": array.shape[-1],
-            "bytes": array.nbytes,
-            "gathers_per_read": gathers(array.shape[:-1], array.shape[-1], table.storage),
+            "bytes": table.nbytes_of(name),
+            "bits": table.bits.get(name, 8 * array.itemsize),
+            "gathers_per_read": gathers(array.shape[:-1], array.shape[-1], table.storage, table.bits.get(name, 8)),
             "min": float(values.min()),
             "max": float(values.max()),
         }
         size = " x ".join(map(str, array.shape[:-1]))
         print(
-            f"  {name:22} {size:>9}, {array.shape[-1]} channels, {array.nbytes:6,} bytes, "
+            f"  {name:22} {size:>9}, {array.shape[-1]} channels, {table.nbytes_of(name):6,} bytes, "
             f"{arrays[name]['gathers_per_read']} gathers a read, "
             f"values {values.min():.4g} to {values.max():.4g}"
         )

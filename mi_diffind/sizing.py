@@ -1,0 +1,312 @@
+"""
+Bytes and resolutions: how large the arrays of task 3 are for a wanted size (the paper's supplement, section 1.3).
+
+Equation 1, ``bytes = 4 N_p² + k N_c⁴``, is for square images, a four-dimensional cascaded array and one byte an entry.
+Here the primary has ``rows × columns`` entries in place of ``N_p²`` (in the proportions of the image), ``dims``
+channels of ``bits`` bits, and the cascaded array ``N_c^dims`` entries of one byte for each of the ``k`` channels.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+#: Best resolution ratio for compression ratios of RGB textures at 4K (the supplement's table 2).
+RATIOS = {3: 128, 6: 128, 12: 80, 24: 72}
+
+#: Resolution ratio that is safe at 12x, for the side of the image in texels (the supplement's section 1.3).
+SAFE_RATIOS = {1024: 64, 2048: 64, 4096: 96}
+
+#: Largest side of a cascaded array that is chosen by itself, of 1 to 4 dimensions.
+CASCADED_LIMITS = (256, 64, 32, 16)
+
+#: Useful range of the resolution ratio (the supplement's section 1.3).
+RATIO_RANGE = (40, 128)
+
+#: Both sides of a primary that the paper's search finds are multiples of the first, the cascaded array's of the second.
+PRIMARY_STEP, CASCADED_STEP = 8, 4
+
+#: How far the bytes may be from what was asked for before :func:`explain` says why.
+TOLERANCE = 0.05
+
+
+def image_bytes(primary_entries: int, cascaded: int, channels: int, dims: int = 4, bits: int = 8) -> int:
+    """
+    Bytes of a primary array of ``primary_entries`` texels (``dims`` channels of ``bits`` bits, without gaps) and a
+    cascaded array of side ``cascaded`` (``dims`` dimensions, one byte a channel).
+
+    With ``primary_entries = N_p²`` and the defaults this is the supplement's equation 1: ``4 N_p² + k N_c⁴``.
+    """
+    return (dims * bits * primary_entries + 7) // 8 + channels * cascaded**dims
+
+
+def ratio(compression: float, resolution: float) -> float:
+    """
+    Default of the resolution ratio ``ρ = N_p / N_c`` for a compression ratio and the side of the image in texels
+    (non-square: the square root of its texels).
+
+    :data:`RATIOS`, interpolated linearly in ``log2(compression)`` and constant outside of 3 … 24, times a factor for
+    the resolution: 1 at 4096, and from 2048 downwards what makes it the safe default at 12x, 64 (:data:`SAFE_RATIOS`;
+    at 4K the 80 that was measured best is taken, not the safe 96), interpolated linearly in ``log2(resolution)``. The
+    product is limited to :data:`RATIO_RANGE`.
+    """
+    for name, value in (("compression", compression), ("resolution", resolution)):
+        if not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"{name}: found {value}, allowed are finite numbers > 0")
+    at_4k = np.interp(math.log2(compression), np.log2(list(RATIOS)), list(RATIOS.values()))
+    factor = np.interp(math.log2(resolution), [11, 12], [SAFE_RATIOS[2048] / RATIOS[12], 1])
+    return float(np.clip(at_4k * factor, *RATIO_RANGE))
+
+
+_default_ratio = ratio  # where "ratio" is the argument that replaces it
+
+
+@dataclass(frozen=True)
+class Size:
+    """
+    Resolutions of a pair of arrays: the primary's ``rows`` and ``columns``, the side of the ``cascaded`` array, its
+    ``channels``, the ``dims`` of the pointer and the ``bits`` of each of its coordinates.
+
+    ``full`` says that the primary is as large as the image, or as the search lets it be; sizes compare without it.
+    """
+
+    rows: int
+    columns: int
+    cascaded: int
+    channels: int
+    dims: int = 4
+    bits: int = 8
+    full: bool = field(default=False, compare=False)
+
+    def __post_init__(self):
+        for name in ("rows", "columns", "cascaded", "channels", "dims", "bits"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ 1")
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of both arrays, :func:`image_bytes`."""
+        return image_bytes(self.rows * self.columns, self.cascaded, self.channels, self.dims, self.bits)
+
+    @property
+    def ratio(self) -> float:
+        """``ρ``, the primary's side (non-square: the square root of its entries) over the cascaded array's."""
+        return math.sqrt(self.rows * self.columns) / self.cascaded
+
+    def compression(self, uncompressed_bytes: int) -> float:
+        """How many times smaller than ``uncompressed_bytes`` this is."""
+        return uncompressed_bytes / self.nbytes
+
+
+# -- resolutions from bytes -------------------------------------------------------------------------------------------
+
+
+def paper_search(
+    uncompressed_bytes: int,
+    compression: float,
+    channels: int,
+    height: int,
+    width: int,
+    ratio: float,
+    dims: int = 4,
+    bits: int = 8,
+) -> Size:
+    """
+    The paper's linear search: of all sides ``N_c`` = 4, 8, 12, … of the cascaded array, the one that minimises
+    ``|compression − uncompressed_bytes / bytes|``, with ``N_p = ratio · N_c`` rounded to a multiple of 8.
+
+    Where equation 1 has squares only, a non-square image spreads the ``N_p²`` entries in its own proportions, in whole
+    rows and columns. The primary is never larger than the image (a square one: than the largest multiple of 8 in it,
+    as long as there is one).
+    """
+    _check_image(uncompressed_bytes, channels, height, width)
+    if not (compression > 0 and math.isfinite(compression)):
+        raise ValueError(f"compression: found {compression}, allowed are finite numbers > 0")
+    if not (ratio > 0 and math.isfinite(ratio)):
+        raise ValueError(f"ratio: found {ratio}, allowed are finite numbers > 0")
+    best, distance = None, math.inf
+    cascaded = 0
+    while True:
+        cascaded += CASCADED_STEP
+        side = PRIMARY_STEP * max(1, round(ratio * cascaded / PRIMARY_STEP))
+        size = Size(*_spread(side, height, width), cascaded, channels, dims, bits)
+        achieved = size.compression(uncompressed_bytes)
+        if abs(compression - achieved) < distance:
+            best, distance = size, abs(compression - achieved)
+        if achieved <= compression:  # more bytes only lead away
+            largest = _spread(PRIMARY_STEP * max(height, width), height, width)
+            return replace(best, full=(best.rows, best.columns) == largest)
+
+
+def search(
+    uncompressed_bytes: int,
+    compression: float,
+    channels: int,
+    height: int,
+    width: int,
+    dims: int = 4,
+    bits: int = 8,
+    ratio: float | None = None,
+) -> Size:
+    """
+    The resolutions for a compression ratio: :func:`paper_search` with ``ratio``, by default that of :func:`ratio`.
+
+    Sides in such steps may miss ``compression`` by far (4K RGB asked for 12x gets 13.4x at ρ = 80). If it is by more
+    than 5%, the cascaded array is kept and the primary becomes what fits, :func:`fit_bytes`: down to 1×1 for images so
+    small that even the smallest cascaded array (``N_c`` = 4) is more than was asked for.
+    """
+    _check_image(uncompressed_bytes, channels, height, width)
+    if ratio is None:
+        ratio = _default_ratio(compression, math.sqrt(height * width))
+    size = paper_search(uncompressed_bytes, compression, channels, height, width, ratio, dims, bits)
+    budget = uncompressed_bytes / compression
+    if abs(size.nbytes / budget - 1) > TOLERANCE:
+        return fit_bytes(budget, channels, height, width, size.cascaded, dims, bits)
+    return size
+
+
+def cascaded_side(budget: float, channels: int, dims: int = 4, share: float = 0.08) -> int:
+    """
+    The side of a cascaded array that takes about ``share`` of ``budget`` bytes: a multiple of 4 from 4 to
+    :data:`CASCADED_LIMITS`, no larger than that unless it is the smallest.
+    """
+    side = int((max(budget * share, 1) / channels) ** (1 / dims) + 1e-9)
+    return min(max(CASCADED_STEP, side // CASCADED_STEP * CASCADED_STEP), CASCADED_LIMITS[dims - 1])
+
+
+def fit_bytes(
+    budget: float, channels: int, height: int, width: int, cascaded: int, dims: int = 4, bits: int = 8
+) -> Size:
+    """
+    The largest primary that fits into ``budget`` bytes beside a cascaded array of side ``cascaded``, in the proportions
+    of the image (a square one exactly, others to 2% or one texel) and no larger than it. At least 1×1: only then can
+    the bytes exceed ``budget``.
+    """
+    _check_image(1, channels, height, width)
+    if not math.isfinite(budget):
+        raise ValueError(f"budget: found {budget}, allowed are finite numbers of bytes")
+    entries = int((budget - channels * cascaded**dims) * 8) // (dims * bits)
+    entries = min(max(entries, 1), height * width)
+    if height == width:
+        side = math.isqrt(entries)
+        return Size(side, side, cascaded, channels, dims, bits, full=side == height)
+    short, long = sorted((height, width))
+    wanted = short * math.sqrt(entries / (height * width))
+    margin = max(1.0, 0.02 * wanted)
+    best = None
+    for one in range(max(1, math.ceil(wanted - margin)), min(short, math.floor(wanted + margin)) + 1):
+        other = min(entries // one, long)
+        if other >= 1:
+            rank = (one * other, -abs(one - wanted))
+            best = max(best, (rank, one, other)) if best else (rank, one, other)
+    _, one, other = best
+    rows, columns = (one, other) if height <= width else (other, one)
+    return Size(rows, columns, cascaded, channels, dims, bits, full=(rows, columns) == (height, width))
+
+
+def _spread(side: int, height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of about ``side²`` entries in the proportions of an image, and no larger than it."""
+    if height == width:
+        side = min(side, height // PRIMARY_STEP * PRIMARY_STEP or height)
+        return side, side
+    short, long = sorted((height, width))
+    one = min(max(1, round(side * math.sqrt(short / long))), short)
+    other = min(max(1, round(side**2 / one)), long)
+    return (one, other) if height < width else (other, one)
+
+
+def _check_image(uncompressed_bytes: int, channels: int, height: int, width: int) -> None:
+    for name, value in (
+        ("uncompressed_bytes", uncompressed_bytes),
+        ("channels", channels),
+        ("height", height),
+        ("width", width),
+    ):
+        if not value >= 1:
+            raise ValueError(f"{name}: found {value}, allowed are numbers ≥ 1")
+
+
+# -- what a user asks for ---------------------------------------------------------------------------------------------
+
+_NUMBER = r"(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
+_UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
+
+
+def parse_compression(text: str | float) -> float:
+    """A compression ratio such as ``12x`` or ``12``. Raises ``ValueError``."""
+    match = re.fullmatch(rf"(?P<number>{_NUMBER})\s*[x×]?", str(text).strip(), re.IGNORECASE | re.ASCII)
+    return _positive(match, text, "a compression ratio", "12x or 7.5")
+
+
+def parse_bpp(text: str | float) -> float:
+    """Bits per texel of the image, all its channels together, such as ``2``. Raises ``ValueError``."""
+    match = re.fullmatch(rf"(?P<number>{_NUMBER})", str(text).strip(), re.IGNORECASE | re.ASCII)
+    return _positive(match, text, "a number of bits per texel", "2 or 0.5")
+
+
+def parse_bytes(text: str | float) -> int:
+    """
+    A number of bytes such as ``262144``, ``256k`` or ``1.5M`` (k = 1024, M = 1024², G = 1024³, in either case and with
+    or without ``B`` or ``iB``). Raises ``ValueError``.
+    """
+    pattern = rf"(?P<number>{_NUMBER})\s*(?P<unit>[kmg]?)(i?b)?"
+    match = re.fullmatch(pattern, str(text).strip(), re.IGNORECASE | re.ASCII)
+    unit = _UNITS[match["unit"].lower()] if match else 1
+    value = _positive(match, text, "a number of bytes", "262144, 256k or 1.5M") * unit
+    if not 1 <= value < 2**63:
+        raise ValueError(f"{text!r} is {value:.3g} bytes, allowed are 1 to 2⁶³")
+    return round(value)
+
+
+def parse_size(
+    uncompressed_bytes: int,
+    texels: int,
+    compression: str | float | None = None,
+    nbytes: str | float | None = None,
+    bpp: str | float | None = None,
+) -> int:
+    """
+    The bytes that are asked for (at least 1), from exactly one of a ``compression`` ratio of ``uncompressed_bytes``, a
+    number of bytes and bits for each of ``texels``. Raises ``ValueError``.
+    """
+    given = {"compression": compression, "bytes": nbytes, "bpp": bpp}
+    given = {name: value for name, value in given.items() if value is not None}
+    if len(given) != 1:
+        raise ValueError(f"size: found {', '.join(given) or 'nothing'}, give exactly one of compression, bytes and bpp")
+    if nbytes is not None:
+        return parse_bytes(nbytes)
+    wanted = parse_bpp(bpp) * texels / 8 if bpp is not None else uncompressed_bytes / parse_compression(compression)
+    if not math.isfinite(wanted):
+        raise ValueError(f"size: {next(iter(given))} {next(iter(given.values()))} is out of range")
+    return max(1, round(wanted))
+
+
+def explain(size: Size, uncompressed_bytes: int, asked_bytes: float) -> tuple[float, str | None]:
+    """The compression ratio that ``size`` reaches and, unless its bytes are within 5% of ``asked_bytes``, why not."""
+    achieved = size.compression(uncompressed_bytes)
+    if abs(size.nbytes / asked_bytes - 1) <= TOLERANCE:
+        return achieved, None
+    asked = f"{round(asked_bytes):,} bytes ({uncompressed_bytes / asked_bytes:.4g}x) were asked for"
+    found = f"{size.nbytes:,} bytes ({achieved:.4g}x)"
+    if size.nbytes > asked_bytes and size.rows * size.columns == 1:
+        return achieved, f"{asked}, but the smallest table with a cascaded side of {size.cascaded} has {found}"
+    if size.nbytes > asked_bytes and size.cascaded <= CASCADED_STEP:
+        return achieved, f"{asked}, but the smallest table with a resolution ratio of {size.ratio:.3g} has {found}"
+    if size.nbytes < asked_bytes and size.full:
+        return achieved, (
+            f"{asked}, but at {found} the primary is as large as the image and more of it would be of no use"
+        )
+    return achieved, (
+        f"{asked}, but {found} are the nearest that sides in steps of {PRIMARY_STEP} (primary) and {CASCADED_STEP} "
+        f"(cascaded) allow at a resolution ratio of {size.ratio:.3g}"
+    )
+
+
+def _positive(match: re.Match | None, text, what: str, example: str) -> float:
+    value = float(match["number"]) if match else math.nan
+    if not (value > 0 and math.isfinite(value)):
+        raise ValueError(f"{text!r} is not {what}, allowed are finite numbers > 0 such as {example}")
+    return value

@@ -1,0 +1,1 @@
+"""Task 3: images and materials as one primary and one cascaded array."""

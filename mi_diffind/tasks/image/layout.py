@@ -1,0 +1,240 @@
+"""
+Which channels of a material are stored, and how its maps come back from them.
+
+The maps of a material (:mod:`.source`) have more channels than they have content: a grey base colour is the same
+channel three times, the third component of a normal follows from the other two, a metallic map may be black. A
+:class:`Layout` names the channels that are stored, each brought to [0, 1], and for each map where its channels come
+from. Nothing here knows whether numbers are NumPy's or Dr.Jit's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from .source import KINDS, Map, Source
+
+#: dB. A normal map is stored as two channels if the third follows from them at least as precisely.
+NORMAL_FLOOR_DB = 45.0
+
+#: What a channel of a map can be in place of the number of a stored one.
+FROM_NORMAL = "z"
+
+
+@dataclass(frozen=True)
+class MapLayout:
+    """
+    One map. ``where`` says of each channel which stored channel holds it, or ``"z"``: the third component of a unit
+    normal whose others are the map's first two channels, or ``("constant", value)``. A stored number s in [0, 1] stands
+    for ``low + (high − low)·s``, or with ``knee`` > 0, for values beyond 1 in high dynamic range, for
+    ``knee·((1 + high/knee)^s − 1)``.
+    """
+
+    name: str
+    kind: str
+    color_space: str
+    depth: int
+    where: tuple
+    low: float = 0.0
+    high: float = 1.0
+    knee: float = 0.0
+
+    @property
+    def channels(self) -> int:
+        """Channels of the map."""
+        return len(self.where)
+
+    def encode(self, values):
+        """The numbers in [0, 1] that stand for ``values``; outside of the range of the map, the nearest."""
+        if self.knee > 0:
+            s = np.log1p(np.maximum(values, 0) / self.knee) / math.log1p(self.high / self.knee)
+        else:
+            s = (values - self.low) / (self.high - self.low)
+        return np.clip(s, 0, 1)
+
+    def decode(self, s, exp2=np.exp2):
+        """The inverse of :meth:`encode`, of a NumPy array or, with Dr.Jit's ``exp2``, of one of its."""
+        if self.knee > 0:
+            return self.knee * (exp2(s * math.log2(1 + self.high / self.knee)) - 1)
+        return s if (self.low, self.high) == (0, 1) else self.low + (self.high - self.low) * s
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    Size and maps of a material, and which channels of it are stored: ``initial`` gives for each of them the value that
+    the paper's initialisation has, ``groups`` the map that it comes from.
+    """
+
+    width: int
+    height: int
+    maps: tuple[MapLayout, ...]
+    initial: tuple[float, ...]
+    groups: tuple[str, ...]
+
+    @staticmethod
+    def of(source: Source, once: bool = True, two_channel_normals: bool | None = None) -> Layout:
+        """
+        The layout of ``source``. ``once``: equal channels are stored once, constant ones as a number.
+        ``two_channel_normals``: leave out the third component of normal maps; ``None``: where it follows from the other
+        two to :data:`NORMAL_FLOOR_DB`.
+        """
+        maps, stored, initial, groups = [], [], [], []
+        for m in source.maps:
+            shell = _range(m)
+            where = []
+            for c in range(m.values.shape[-1]):
+                values = shell.encode(m.values[..., c])
+                low = float(values.min())
+                if once and low == values.max():
+                    where.append(("constant", float(m.values[0, 0, c])))
+                    continue
+                if c == 2 and _drops_z(m, where, two_channel_normals):
+                    where.append(FROM_NORMAL)
+                    continue
+                same = [i for i, v in enumerate(stored) if once and np.array_equal(v, values)]
+                if not same:
+                    same = [len(stored)]
+                    stored.append(values)
+                    initial.append(_initial(m.kind, c))
+                    groups.append(m.name)
+                where.append(same[0])
+            maps.append(
+                MapLayout(m.name, m.kind, m.color_space, m.depth, tuple(where), shell.low, shell.high, shell.knee)
+            )
+        return Layout(source.width, source.height, tuple(maps), tuple(initial), tuple(groups))
+
+    @property
+    def stored(self) -> int:
+        """Number of stored channels."""
+        return len(self.groups)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the maps."""
+        return tuple(m.name for m in self.maps)
+
+    @property
+    def source_nbytes(self) -> int:
+        """Bytes of the source, uncompressed, at its own depth."""
+        return self.width * self.height * sum(m.channels * m.depth for m in self.maps)
+
+    def __getitem__(self, name: str) -> MapLayout:
+        """The map called ``name``. Raises ``KeyError`` with one sentence."""
+        for m in self.maps:
+            if m.name == name:
+                return m
+        raise KeyError(f'found the map "{name}", the file holds {", ".join(self.names)}')
+
+    def needed(self, name: str) -> tuple[int, ...]:
+        """The stored channels that a map is made of."""
+        return tuple(dict.fromkeys(w for w in self[name].where if isinstance(w, int)))
+
+    def encode(self, source: Source) -> np.ndarray:
+        """The stored channels of ``source``, float32 in [0, 1], shape ``(height, width, stored)``."""
+        found = np.zeros((self.height, self.width, self.stored), np.float32)
+        for m, layout in zip(source.maps, self.maps, strict=True):
+            for c, where in enumerate(layout.where):
+                if isinstance(where, int):
+                    found[..., where] = layout.encode(m.values[..., c])
+        return found
+
+    def decode(self, name: str, stored: Sequence, exp2=np.exp2, root=None) -> list:
+        """
+        The channels of a map, in the color space that it has, from the stored channels in [0, 1] (those that it does
+        not need may be ``None``). ``exp2`` and ``root``, a square root that makes 0 of what is negative, are NumPy's
+        unless given.
+        """
+        layout = self[name]
+        root = root or (lambda v: np.sqrt(np.maximum(v, 0)))
+        found = []
+        for where in layout.where:
+            if isinstance(where, int):
+                found.append(layout.decode(stored[where], exp2))
+            elif where == FROM_NORMAL:
+                x, y = 2 * found[0] - 1, 2 * found[1] - 1
+                found.append(0.5 + 0.5 * root(1 - x * x - y * y))
+            else:
+                found.append(where[1])
+        return found
+
+    def to_json(self) -> dict:
+        """For the settings of a table file."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "maps": [
+                {**asdict(m), "where": [list(w) if isinstance(w, tuple) else w for w in m.where]} for m in self.maps
+            ],
+            "initial": list(self.initial),
+            "groups": list(self.groups),
+        }
+
+    @staticmethod
+    def from_json(found: dict) -> Layout:
+        """The inverse of :meth:`to_json`. Raises ``KeyError``, ``TypeError`` or ``ValueError`` for anything else."""
+        maps = []
+        for entry in found["maps"]:
+            where = tuple(_where(w, len(found["groups"])) for w in entry["where"])
+            kind, color_space = str(entry["kind"]), str(entry["color_space"])
+            low, high, knee = (float(entry[k]) for k in ("low", "high", "knee"))
+            depth = int(entry["depth"])
+            if not where or kind not in KINDS or color_space not in ("srgb", "linear") or depth not in (1, 2, 4):
+                raise ValueError(f'the map "{entry["name"]}" is of no kind that is known')
+            if FROM_NORMAL in where and (where.index(FROM_NORMAL) != 2 or where.count(FROM_NORMAL) != 1):
+                raise ValueError(f'the map "{entry["name"]}" has its third component in another place')
+            if not (all(map(math.isfinite, (low, high, knee))) and low < high and knee >= 0):
+                raise ValueError(f'the map "{entry["name"]}" has no range of values')
+            maps.append(MapLayout(str(entry["name"]), kind, color_space, depth, where, low, high, knee))
+        width, height = int(found["width"]), int(found["height"])
+        initial, groups = tuple(map(float, found["initial"])), tuple(map(str, found["groups"]))
+        if min(width, height) < 1 or not maps or len(initial) != len(groups):
+            raise ValueError("the size or the channels of the image are damaged")
+        if len({m.name for m in maps}) != len(maps):
+            raise ValueError("two maps have the same name")
+        return Layout(width, height, tuple(maps), initial, groups)
+
+
+def _where(w, stored: int):
+    if isinstance(w, int) and not isinstance(w, bool) and 0 <= w < stored:
+        return w
+    if w == FROM_NORMAL:
+        return w
+    if isinstance(w, (list, tuple)) and len(w) == 2 and w[0] == "constant" and math.isfinite(w[1]):
+        return ("constant", float(w[1]))
+    raise ValueError(f"found {w!r} in place of a channel")
+
+
+def _range(m: Map) -> MapLayout:
+    """A layout without channels that says what range of values a map has."""
+    low, high, knee = 0.0, 1.0, 0.0
+    smallest, largest = float(m.values.min()), float(m.values.max())
+    if smallest >= 0 and largest > 1:
+        # Logarithmic above the knee, linear below: relative precision for what is bright, and none wasted on the dark
+        knee, high = max(float(np.median(m.values)), 1e-3 * largest), largest
+    elif smallest < 0:
+        low, high = smallest, max(largest, smallest + 1e-6 * max(1.0, abs(smallest)))
+    return MapLayout(m.name, m.kind, m.color_space, m.depth, (), low, high, knee)
+
+
+def _drops_z(m: Map, where: list, wanted: bool | None) -> bool:
+    """Is the third channel of this map left out? ``where``: what was said of the first two."""
+    if m.kind != "normal" or m.values.shape[-1] != 3 or wanted is False:
+        return False
+    if not all(isinstance(w, int) for w in where) or m.values.min() < 0 or m.values.max() > 1:
+        return False
+    if wanted:
+        return True
+    x, y = 2 * m.values[..., 0] - 1, 2 * m.values[..., 1] - 1
+    z = 0.5 + 0.5 * np.sqrt(np.maximum(1 - x * x - y * y, 0))
+    return float(np.mean((z - m.values[..., 2]) ** 2)) <= 10 ** (-NORMAL_FLOOR_DB / 10)
+
+
+def _initial(kind: str, channel: int) -> float:
+    """Initial value of the cascaded array (supplement 1.3): grey, white, light blue, grey; others 0."""
+    if kind == "normal":
+        return 1.0 if channel == 2 else 0.5
+    return {"albedo": 0.5, "ao": 1.0, "roughness": 0.5}.get(kind, 0.0)

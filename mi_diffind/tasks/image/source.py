@@ -1,0 +1,455 @@
+"""
+What is to be compressed: one image, or the maps of a material that a JSON manifest lists.
+
+A manifest names the maps and their files (relative to the manifest's folder)::
+
+    {"maps": {"albedo": "base.png",
+              "normal": {"file": "n.png", "color_space": "linear"},
+              "roughness": {"file": "orm.png", "channels": "g"},
+              "ao": {"file": "orm.png", "channels": "r"}}}
+
+or is the content of ``"maps"`` alone. ``channels`` selects, as letters among ``r``, ``g``, ``b`` and ``a`` or as a list
+of indices (the only way for a multi-channel EXR). Images are whatever ``mitsuba.Bitmap`` reads: PNG, JPEG, EXR, HDR,
+PFM, BMP, TGA; no variant needs to be set for it, and none is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+#: The largest number of channels of all maps together.
+MAX_CHANNELS = 16
+
+COLOR_SPACES = ("srgb", "linear")
+KINDS = ("albedo", "normal", "roughness", "ao", "metallic", "other")
+NONFINITE = ("error", "clean")
+
+_SYNONYMS = {
+    "albedo": ("albedo", "basecolor", "diffuse", "diffusecolor", "color", "colour"),
+    "normal": ("normal", "normals", "nrm"),
+    "roughness": ("roughness", "rough"),
+    "ao": ("ao", "occlusion", "ambientocclusion"),
+    "metallic": ("metallic", "metalness", "metal"),
+}
+_DEPTHS = {"uint8": 1, "uint16": 2, "uint32": 4, "float16": 2, "float32": 4, "float64": 4}
+_ENCODED = ("uint8", "uint16")  # the types whose full range stands for 0 … 1
+
+
+class SourceError(ValueError):
+    """What is to be compressed cannot be used; the message is one sentence that names the file and the fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """
+    One map: ``values`` of shape ``(height, width, channels)``, float32, as they are stored in ``file`` (bytes over 255,
+    16-bit numbers over 65535, others as they are).
+
+    ``color_space`` is ``"srgb"`` if they carry the sRGB transfer function, ``"linear"`` if they are data as they are;
+    ``kind`` is one of :data:`KINDS`; ``depth`` the bytes of a channel in the source (1, 2 or 4).
+    """
+
+    name: str
+    values: np.ndarray
+    color_space: str
+    kind: str
+    depth: int
+    file: str = ""
+
+    @property
+    def channels(self) -> int:
+        return self.values.shape[2]
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """
+    The ``maps``, all of ``height`` × ``width`` texels and with at most :data:`MAX_CHANNELS` channels together.
+
+    ``digest`` is a SHA-256 over their names, layout and values; ``cleaned`` counts the NaN and infinite values that
+    were replaced.
+    """
+
+    maps: tuple[Map, ...]
+    height: int
+    width: int
+    digest: str
+    cleaned: int = 0
+
+    @property
+    def channels(self) -> int:
+        """Channels of all maps together."""
+        return sum(m.channels for m in self.maps)
+
+    @property
+    def texels(self) -> int:
+        return self.height * self.width
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes without compression, each channel at its depth in the source."""
+        return self.texels * sum(m.channels * m.depth for m in self.maps)
+
+
+def load_source(path: str | os.PathLike, name: str | None = None, nonfinite: str = "error") -> Source:
+    """
+    Read an image or a manifest (``.json``).
+
+    An image is one map, called ``name`` (default: ``"image"``); its alpha channel is another one, ``"alpha"``. It is
+    sRGB if it is grey or RGB of 8 or 16 bits (and ``name`` is not that of another kind of map), else linear. A map of
+    a manifest is sRGB by default if it is an albedo of 8 or 16 bits and 1 or 3 channels; its alpha channel is left out
+    if it is 1 everywhere, otherwise ``channels`` has to say what is meant. A roughness, AO or metallic map whose three
+    channels are equal keeps one.
+
+    NaN and infinite values are an error or, with ``nonfinite="clean"``, replaced: NaN by 0, infinity by the largest (if
+    negative, the smallest) finite value of the channel, 0 if there is none. Raises :class:`SourceError`.
+    """
+    path = Path(path)
+    _check_nonfinite(nonfinite)
+    if path.suffix.lower() == ".json":
+        if name is not None:
+            raise SourceError(f'{path}: is a manifest, which names its maps itself: found the name "{name}"')
+        return _load_manifest(path, nonfinite)
+
+    name = "image" if name is None else name
+    _check_name(path, name)
+    image = _read(path)
+    kind = kind_of(name)
+    if kind == "other" and name != "alpha" and image.named:
+        kind = "albedo"
+    maps = [_Raw(name, image.values[:, :, : image.colors], kind, str(path))]
+    if image.has_alpha:
+        if name == "alpha":
+            raise SourceError(f'{path}: has an alpha channel, so the name "alpha" is taken')
+        maps.append(_Raw("alpha", image.values[:, :, image.colors :], "other", str(path)))
+    return _assemble(maps, path, nonfinite)
+
+
+def from_arrays(
+    arrays: dict[str, np.ndarray], color_spaces: dict[str, str] | None = None, nonfinite: str = "error"
+) -> Source:
+    """
+    The same from arrays, name → ``(height, width)`` or ``(height, width, channels)`` of 8- or 16-bit unsigned integers
+    or floats.
+
+    ``color_spaces`` (name → ``"srgb"`` or ``"linear"``) replaces the defaults, which are a manifest's; the name
+    ``"image"`` stands for an albedo if it has 1 or 3 channels. Nothing is taken for alpha. Raises
+    :class:`SourceError`.
+    """
+    _check_nonfinite(nonfinite)
+    color_spaces = dict(color_spaces or {})
+    maps = []
+    for name, array in arrays.items():
+        where = f'array "{name}"'
+        _check_name("arrays", name)
+        values = np.asarray(array)
+        if values.dtype.name not in _DEPTHS or values.dtype.name == "uint32":
+            raise SourceError(
+                f"{where}: has the type {values.dtype}, allowed are uint8, uint16 and floats up to float64"
+            )
+        if values.ndim not in (2, 3) or values.size == 0:
+            raise SourceError(
+                f"{where}: has the shape {values.shape}, expected (height, width, channels), none of them 0"
+            )
+        values = values.reshape(*values.shape[:2], -1)
+        kind = kind_of(name)
+        if name == "image" and values.shape[2] in (1, 3):
+            kind = "albedo"
+        color_space = color_spaces.pop(name, None)
+        if color_space is not None and color_space not in COLOR_SPACES:
+            raise SourceError(f'{where}: has the color space "{color_space}", allowed are {COLOR_SPACES}')
+        maps.append(_Raw(name, _one_of_equal(values, kind), kind, "", color_space))
+    if color_spaces:
+        raise SourceError(f'arrays: a color space is given for "{next(iter(color_spaces))}", which is not among them')
+    return _assemble(maps, "arrays", nonfinite)
+
+
+def kind_of(name: str) -> str:
+    """The one of :data:`KINDS` that the name of a map stands for, such as ``"albedo"`` for ``"base_color"``."""
+    plain = name.lower().replace("_", "").removesuffix("texture").removesuffix("map")
+    return next((kind for kind, names in _SYNONYMS.items() if plain in names), "other")
+
+
+# -- manifests --------------------------------------------------------------------------------------------------------
+
+
+def _load_manifest(path: Path, nonfinite: str) -> Source:
+    try:
+        content = json.loads(_read_bytes(path).decode("utf-8-sig"), object_pairs_hook=_unique)
+    except (ValueError, RecursionError) as e:
+        if isinstance(e, SourceError):
+            raise
+        raise SourceError(f"{path}: is not valid JSON ({_reason(e)})") from None
+    entries = content
+    if isinstance(content, dict) and "maps" in content:
+        entries = content["maps"]
+        for key in content:
+            if key != "maps":
+                raise SourceError(f'{path}: has the key "{key}" beside "maps", which allows no other')
+    if not isinstance(entries, dict) or not entries:
+        raise SourceError(f"{path}: has no maps, expected an object that gives each map's name a file")
+
+    maps, images = [], {}
+    for name, entry in entries.items():
+        _check_name(path, name)
+        if isinstance(entry, str):
+            entry = {"file": entry}
+        if not isinstance(entry, dict):
+            raise SourceError(f'{path}: map "{name}" is {entry!r:.40}, expected a file name or an object')
+        for key in entry:
+            if key not in ("file", "channels", "color_space"):
+                raise SourceError(
+                    f'{path}: map "{name}" has the key "{key}", allowed are "file", "channels" and "color_space"'
+                )
+        file = entry.get("file")
+        if not isinstance(file, str) or not file:
+            raise SourceError(f'{path}: map "{name}" has the file {file!r:.40}, expected a file name')
+        color_space = entry.get("color_space")
+        if color_space is not None and color_space not in COLOR_SPACES:
+            raise SourceError(
+                f'{path}: map "{name}" has the color space {color_space!r:.40}, allowed are {COLOR_SPACES}'
+            )
+        file = path.parent / file
+        if file not in images:
+            images[file] = _read(file)
+        kind = kind_of(name)
+        if "channels" in entry:
+            values = images[file].select(entry["channels"], f'{path}: map "{name}"')
+        else:
+            values = _one_of_equal(images[file].opaque(f'{path}: map "{name}"'), kind)
+        maps.append(_Raw(name, values, kind, str(file), color_space))
+    return _assemble(maps, path, nonfinite)
+
+
+def _unique(pairs: list) -> dict:
+    """An object of a JSON file, in which no key may come twice."""
+    result = {}
+    for key, value in pairs:
+        if key in result:
+            raise ValueError(f'the key "{key}" comes twice')
+        result[key] = value
+    return result
+
+
+# -- images -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """A file's content in its own type, ``(height, width, channels)``: ``colors`` channels, then perhaps alpha."""
+
+    values: np.ndarray
+    colors: int
+    has_alpha: bool
+    named: bool  # grey or RGB, not the channels of a multi-channel EXR
+
+    def select(self, channels, where: str) -> np.ndarray:
+        """What ``channels`` of a manifest select; grey is its own red, green and blue."""
+        count = self.values.shape[2]
+        if isinstance(channels, str) and channels and self.named:
+            letters = {"r": 0, "g": 1 % self.colors, "b": 2 % self.colors}
+            if self.has_alpha:
+                letters["a"] = self.colors
+            indices = [letters.get(letter) for letter in channels]
+            allowed = f"letters among {''.join(letters)}"
+        else:
+            indices = channels if isinstance(channels, list) and channels else [None]
+            indices = [i if type(i) is int and 0 <= i < count else None for i in indices]
+            allowed = f"a list of indices from 0 to {count - 1}"
+        if None in indices:
+            raise SourceError(f"{where} has the channels {channels!r:.40}, allowed for its file are {allowed}")
+        if len(set(channels)) < len(channels):
+            raise SourceError(f"{where} has the channels {channels!r:.40}, one of them twice")
+        return self.values[:, :, indices]
+
+    def opaque(self, where: str) -> np.ndarray:
+        """The colours, if there is no transparency that would be lost."""
+        colors, alpha = self.values[:, :, : self.colors], self.values[:, :, self.colors :]
+        one = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
+        if self.has_alpha and (alpha != one).any():
+            raise SourceError(
+                f"{where} is from a file with transparency, "
+                f'"channels" has to say which it means ("rgb", and "a" for a map of its own)'
+            )
+        return colors
+
+
+def _read(path: Path) -> _Image:
+    """An image file. Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it or it is cut short."""
+    import mitsuba as mi
+
+    _check_complete(path, _read_bytes(path))
+    # A TGA file has no signature, only newer ones have a footer that tells them.
+    form = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
+    try:
+        bitmap = mi.Bitmap(str(path), form)
+        values = np.array(bitmap)
+        pixels = bitmap.pixel_format()
+    except (RuntimeError, MemoryError, ValueError) as e:
+        raise SourceError(
+            f"{path}: cannot be read as an image, it is damaged, cut short or of an unknown kind ({_reason(e)})"
+        ) from None
+    if values.size == 0 or values.dtype.name not in _DEPTHS:
+        raise SourceError(f"{path}: has the shape {values.shape} and type {values.dtype}, which is not supported")
+    if values.dtype.name == "uint32" and values.max() > 2**24:
+        raise SourceError(f"{path}: has whole numbers up to {values.max():,}, single precision is exact to {2**24:,}")
+    values = values.reshape(*values.shape[:2], -1)
+    if values.shape[2] > MAX_CHANNELS:
+        raise SourceError(f"{path}: has {values.shape[2]} channels, at most {MAX_CHANNELS} are supported")
+    formats = mi.Bitmap.PixelFormat
+    has_alpha = pixels in (formats.YA, formats.RGBA)
+    named = has_alpha or pixels in (formats.Y, formats.RGB)
+    return _Image(values, values.shape[2] - has_alpha, has_alpha, named)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise SourceError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise SourceError(f"{path}: is a folder, an image or a manifest (.json) is expected") from None
+    except (OSError, ValueError) as e:
+        raise SourceError(f"{path}: cannot be read ({_reason(e)})") from None
+
+
+_JPEG_MARKER = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")  # none of those that are part of the compressed data
+
+
+def _check_complete(path: Path, data: bytes) -> None:
+    """Raise :class:`SourceError` for the faults that the decoders pass over: a missing end, colours from a palette."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n") and not _png_ends(data):
+        raise SourceError(f"{path}: is cut short, a PNG file ends with an IEND chunk")
+    if data.startswith(b"\xff\xd8\xff") and not _jpeg_ends(data):
+        raise SourceError(f"{path}: is cut short, a JPEG file ends with an end-of-image marker")
+    if data.startswith(b"BM") and data[28:30] == b"\x08\x00":
+        start = 14 + int.from_bytes(data[14:18], "little")
+        entries = min(int.from_bytes(data[46:50], "little") or 256, 256)
+        if any(set(data[start + 4 * i : start + 4 * i + 3]) != {i} for i in range(entries)):
+            raise SourceError(f"{path}: is a BMP file with a palette, which is not supported")
+
+
+def _png_ends(data: bytes) -> bool:
+    position = 8
+    while position + 12 <= len(data):
+        if data[position + 4 : position + 8] == b"IEND":
+            return True
+        position += 12 + int.from_bytes(data[position : position + 4], "big")
+    return False
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    position = 0
+    while match := _JPEG_MARKER.search(data, position):
+        position, marker = match.end(), match[1][0]
+        if marker == 0xD9:
+            return True
+        if marker not in (0x01, 0xD8):  # these have no length
+            position += int.from_bytes(data[position : position + 2], "big")
+    return False
+
+
+# -- maps -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Raw:
+    """A map before its values are converted; without a color space it gets the default."""
+
+    name: str
+    values: np.ndarray
+    kind: str
+    file: str
+    color_space: str | None = None
+
+
+def _one_of_equal(values: np.ndarray, kind: str) -> np.ndarray:
+    """One of three equal channels, if one is what a map of this kind has."""
+    if kind not in ("roughness", "ao", "metallic") or values.shape[2] != 3:
+        return values
+    nan = values.dtype.kind == "f"
+    equal = all(np.array_equal(values[:, :, 0], values[:, :, i], equal_nan=nan) for i in (1, 2))
+    return values[:, :, :1] if equal else values
+
+
+def _assemble(raw: list[_Raw], where, nonfinite: str) -> Source:
+    """The source with these maps, if they go together."""
+    if not raw:
+        raise SourceError(f"{where}: has no maps")
+    first = raw[0]
+    for other in raw[1:]:
+        if other.values.shape[:2] != first.values.shape[:2]:
+            sizes = ["{1}×{0}".format(*m.values.shape) for m in (first, other)]
+            raise SourceError(
+                f'{where}: map "{first.name}" has {sizes[0]} texels and map "{other.name}" {sizes[1]}, '
+                f"all maps need the same size"
+            )
+    channels = sum(m.values.shape[2] for m in raw)
+    if channels > MAX_CHANNELS:
+        raise SourceError(f"{where}: has {channels} channels in all, at most {MAX_CHANNELS} are supported")
+
+    maps, cleaned = [], 0
+    digest = hashlib.sha256()
+    for m in raw:
+        kind_of_number = m.values.dtype.name
+        color_space = m.color_space
+        if color_space is None:
+            srgb = m.kind == "albedo" and kind_of_number in _ENCODED and m.values.shape[2] in (1, 3)
+            color_space = "srgb" if srgb else "linear"
+        with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, which is told below
+            values = m.values.astype("<f4", order="C")
+        if kind_of_number in _ENCODED:
+            values /= np.iinfo(m.values.dtype).max
+        else:
+            cleaned += _check_finite(values, f'{m.file or where}: map "{m.name}"', nonfinite)
+        values.flags.writeable = False
+        depth = _DEPTHS[kind_of_number]
+        maps.append(Map(m.name, values, color_space, m.kind, depth, m.file))
+        layout = [m.name, color_space, m.kind, depth, *values.shape]
+        digest.update(json.dumps(layout).encode() + b"\n")
+        digest.update(values)
+    height, width = first.values.shape[:2]
+    return Source(tuple(maps), height, width, digest.hexdigest(), cleaned)
+
+
+def _check_finite(values: np.ndarray, where: str, nonfinite: str) -> int:
+    """How many values are NaN or infinite, after they were replaced in place or, by default, refused."""
+    bad = ~np.isfinite(values)
+    count = int(bad.sum())
+    if count and nonfinite == "error":
+        y, x, channel = np.unravel_index(bad.argmax(), bad.shape)
+        raise SourceError(
+            f"{where} has {count:,} values that are NaN or infinite, the first at x = {x}, y = {y} (channel {channel})"
+        )
+    if count:
+        for channel in np.flatnonzero(bad.any(axis=(0, 1))):
+            plane = values[:, :, channel]
+            finite = plane[~bad[:, :, channel]]
+            low, high = (finite.min(), finite.max()) if finite.size else (0, 0)
+            plane[...] = np.nan_to_num(plane, nan=0, posinf=high, neginf=low)
+    return count
+
+
+def _check_name(where, name) -> None:
+    if not isinstance(name, str) or not name.isidentifier():
+        raise SourceError(
+            f"{where}: a map is called {name!r:.40}, allowed are letters, digits and _ (not first a digit)"
+        )
+
+
+def _check_nonfinite(nonfinite: str) -> None:
+    if nonfinite not in NONFINITE:
+        raise ValueError(f'nonfinite: found "{nonfinite}", allowed are {NONFINITE}')
+
+
+def _reason(e: Exception) -> str:
+    """What ``e`` says, on one line and no longer than one."""
+    return textwrap.shorten(str(e), 100, placeholder="…") or type(e).__name__

@@ -1,0 +1,283 @@
+"""
+Training of task 3: the recipe of the supplement, and ours, whose differences can be switched off one by one.
+
+A step draws a texel of the source for each sample, stratified, and reads the target there: at the texel's centre, or at
+a place that is jittered within the texel, where it is the bilinear value. The supplement's recipe jitters all samples.
+Then a table becomes the picture that bilinear interpolation makes, smoother than the one that is stored; half of the
+steps at centres, half jittered, is better at both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+
+from ... import lookup
+from ...fitting import FitResult, FitSettings, fit
+from ...indirection import DifferentiableArray, Indirection, fold
+from ...runtime import array_module
+from ...sizing import Size
+from ...tables import Table
+from . import arrays
+from .compressed import CompressedImage, to_table
+from .layout import Layout
+from .source import Source
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """
+    How an image is stored and trained.
+
+    ``once``: equal and constant channels are stored once (:meth:`.Layout.of`). ``normals``: leave out the third
+    component of normals where it follows from the others. ``components``: start from principal components, not from
+    the ramp. ``jitter``: share of the steps whose samples are jittered. ``rounded``: share of the steps, the last ones,
+    that see entries as they will be stored. ``bits`` of an entry of the primary array. ``dims``: channels of the
+    primary array. ``settings``: the rest.
+    """
+
+    once: bool = True
+    normals: bool = True
+    components: bool = True
+    jitter: float = 0.5
+    rounded: float = 0.3
+    bits: int = 6
+    dims: int = 4
+    settings: FitSettings = dataclasses.field(default_factory=FitSettings)
+
+
+#: Steps of 262,144 samples of a training that is not told how long it may take.
+STEPS = 1500
+
+_OURS = FitSettings(steps=STEPS, batch=2**18, lr=1e-2, schedule="cosine", loss="mse", quality_every=STEPS // 10)
+_PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
+
+RECIPES = {
+    "ours": Recipe(settings=_OURS),
+    "paper": Recipe(False, False, False, 1.0, 0.0, 8, 4, _PAPER),
+}
+
+#: What of ours can be switched off: to what the supplement does.
+IMPROVEMENTS = {
+    "once": "equal and constant channels are stored once",
+    "normals": "normals as two channels where the third follows",
+    "components": "arrays start from principal components",
+    "jitter": "half of the samples at texel centres",
+    "rounded": "the last steps see rounded entries",
+    "bits": "fewer bits an entry of the primary array, more entries",
+    "loss": "squared errors",
+    "rate": "rate of 0.01 that falls to zero",
+    "batch": "steps of 262,144 samples",
+}
+
+
+def without(recipe: Recipe, names) -> Recipe:
+    """``recipe`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown one."""
+    paper = RECIPES["paper"]
+    for name in names:
+        if name not in IMPROVEMENTS:
+            raise ValueError(f'found the improvement "{name}", allowed are {", ".join(IMPROVEMENTS)}')
+        if name == "loss":
+            recipe = replaced(recipe, loss=paper.settings.loss)
+        elif name == "rate":
+            recipe = replaced(recipe, lr=paper.settings.lr, schedule=paper.settings.schedule)
+        elif name == "batch":
+            batches = paper.settings.batch // recipe.settings.batch
+            recipe = replaced(recipe, batch=paper.settings.batch, steps=max(1, recipe.settings.steps // batches))
+        else:
+            recipe = dataclasses.replace(recipe, **{name: getattr(paper, name)})
+    return recipe
+
+
+def replaced(recipe: Recipe, **settings) -> Recipe:
+    """``recipe`` with other settings of the training."""
+    return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **settings))
+
+
+def layout_of(source: Source, recipe: Recipe) -> Layout:
+    """What of ``source`` is stored by a recipe."""
+    return Layout.of(source, recipe.once, None if recipe.normals else False)
+
+
+class ImageProblem:
+    """
+    The training problem of :mod:`mi_diffind.fitting`. ``net`` maps (v, u) to the stored channels; ``values`` are those,
+    ``(height, width, stored)``; ``border`` is that of the image along v and u.
+    """
+
+    def __init__(self, net, layout: Layout, values: np.ndarray, border, recipe: Recipe, types, digest: str = ""):
+        self.net, self.layout, self.types, self.recipe, self.border = net, layout, types, recipe, border
+        self.height, self.width, self.channels = values.shape
+        self.texels = self.height * self.width
+        stored = lookup.padded_channels(self.channels)
+        padded = np.zeros((self.height, self.width, stored), np.float32)
+        padded[..., : self.channels] = values
+        self.values = types.TensorXf(padded)
+        self.groups = {}
+        for i, name in enumerate(layout.groups):
+            self.groups.setdefault(name, []).append(i)
+        self.weights = {name: len(found) / self.channels for name, found in self.groups.items()}
+        self.about = {"source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}}
+        self.rounded = self.jittered = False
+
+    def begin(self, step: int, steps: int) -> None:
+        """Called before each step: does it see rounded entries, are its samples jittered?"""
+        self.rounded = step >= (1 - self.recipe.rounded) * steps
+        share = self.recipe.jitter
+        self.jittered = int((step + 1) * share) > int(step * share)
+
+    def _texel(self, rng, size: int):
+        """Index of a texel for each sample: one of each of ``size`` equal stretches of the image."""
+        UInt32, Float = self.types.UInt32, self.types.Float
+        if size % self.texels == 0:
+            return dr.arange(UInt32, size) % self.texels
+        edges = np.arange(size + 1, dtype=np.uint64) * self.texels // size
+        first, count = edges[:-1].astype(np.uint32), np.maximum(np.diff(edges), 1).astype(np.uint32)
+        count = UInt32(count)
+        return UInt32(first) + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
+
+    def batch(self, rng, size: int):
+        Float = self.types.Float
+        index = self._texel(rng, size)
+        x, y = Float(index % self.width) + 0.5, Float(index // self.width) + 0.5
+        if self.jittered:
+            x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
+            target = self.target(y, x)
+        else:
+            target = self._texels(index)
+        return [y / self.height, x / self.width], {
+            name: [target[i] for i in found] for name, found in self.groups.items()
+        }
+
+    def _texels(self, index) -> list:
+        """The stored channels of texels."""
+        stored = self.values.shape[-1]
+        if stored <= 2:
+            return [dr.gather(self.types.Float, self.values.array, index * stored + i) for i in range(self.channels)]
+        found = []
+        for group in range(stored // 4):
+            found += list(dr.gather(self.types.Array4f, self.values.array, index * (stored // 4) + group))
+        return found[: self.channels]
+
+    def target(self, y, x) -> list:
+        """The stored channels at a place in texels, (0, 0) a corner of the image: bilinear, as ``bitmap`` has them."""
+        UInt32, Int32, Float = self.types.UInt32, self.types.Int32, self.types.Float
+        corners = []
+        for position, n, border in ((y, self.height, self.border[0]), (x, self.width, self.border[1])):
+            lower = dr.floor(position - 0.5)
+            weight = position - 0.5 - lower
+            i = Int32(lower)
+            if border == "repeat":
+                both = [dr.select(i < 0, i + n, i), dr.select(i + 1 >= n, i + 1 - n, i + 1)]
+            else:
+                both = [dr.clip(i, 0, n - 1), dr.clip(i + 1, 0, n - 1)]
+            corners.append([(UInt32(both[0]), 1 - weight), (UInt32(both[1]), weight)])
+        total = [Float(0)] * self.channels
+        for row, a in corners[0]:
+            for column, b in corners[1]:
+                found = self._texels(row * self.width + column)
+                total = [dr.fma(a * b, v, t) for v, t in zip(found, total, strict=True)]
+        return total
+
+    def predict(self, net, inputs) -> dict[str, list]:
+        found = rounded_read(net, inputs, self.recipe.bits) if self.rounded else net(inputs)
+        return {name: [found[i] for i in channels] for name, channels in self.groups.items()}
+
+    def quality(self, net) -> dict[str, float]:
+        """PSNR of the stored channels, with rounded entries, at the centres of 2¹⁸ texels at most."""
+        rng = dr.rng(seed=dr.opaque(self.types.UInt64, 2023))
+        size = min(self.texels, 2**18)
+        with dr.suspend_grad():
+            index = self._texel(rng, size)
+            x, y = self.types.Float(index % self.width) + 0.5, self.types.Float(index // self.width) + 0.5
+            found = rounded_read(net, [y / self.height, x / self.width], self.recipe.bits)
+            errors = [dr.mean(dr.square(a - b)) for a, b in zip(found, self._texels(index), strict=True)]
+            total = sum(float(e[0]) for e in errors) / self.channels
+        return {"psnr_db": -10 * math.log10(max(total, 1e-12))}
+
+
+def rounded_read(net: Indirection, x, bits: int) -> list:
+    """
+    ``net(x)`` as if its entries were rounded as they will be stored, with the gradients of the entries as they are
+    (straight-through estimation).
+    """
+    (primary,), cascaded = net.primary, net.cascaded
+    for array, steps in ((primary, 2**bits - 1), (cascaded, 255)):
+        entries = fold(array.data.array)
+        entries += dr.detach(dr.round(dr.detach(entries) * steps) / steps - dr.detach(entries))
+        x = lookup.read_float(entries, array.resolution, array.channels, x, array.border, stored=array.data.shape[-1])
+    return x
+
+
+def problem_of(
+    source: Source, size: Size, recipe: Recipe, types, layout: Layout | None = None, border=None
+) -> ImageProblem:
+    """The problem of training ``source`` at a size by a recipe, its arrays at their initial values."""
+    layout = layout or layout_of(source, recipe)
+    values = layout.encode(source)
+    border = border or arrays.borders(values)
+    net = arrays.from_components(values, size, border) if recipe.components else arrays.from_ramp(layout, size, border)
+    return ImageProblem(net.alloc(types.TensorXf), layout, values, border, recipe, types, source.digest)
+
+
+def fit_image(
+    source: Source,
+    size: Size | None,
+    recipe: Recipe | None = None,
+    backend: str | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    progress: bool = True,
+    border: tuple[str, str] | None = None,
+    title: str | None = None,
+) -> tuple[Table, FitResult]:
+    """
+    Train the arrays of ``source`` and return them as they are stored, with their errors
+    (:meth:`.CompressedImage.measure`), and the run's record. ``size`` may be ``None`` for an image of one colour, which
+    needs no arrays. ``border`` is that along v and u, found out unless given.
+    """
+    recipe = recipe or RECIPES["ours"]
+    layout, types = layout_of(source, recipe), array_module(backend)
+    if not layout.stored:
+        image = CompressedImage(layout, None)
+        return _with_quality(to_table(image, {}, 0), source, types), FitResult({}, 0, 0, 0.0, False, 0)
+    problem = problem_of(source, size, recipe, types, layout, border)
+    result = fit(problem, recipe.settings, checkpoint, resume, progress, title=title)
+    about = {**dataclasses.asdict(recipe.settings), **problem.about, "ratio": size.ratio}
+    table = to_table(CompressedImage(layout, stored_form(problem.net, recipe.bits)), about, recipe.settings.seed)
+    return _with_quality(table, source, types), result
+
+
+def _with_quality(table: Table, source: Source, types) -> Table:
+    found = CompressedImage.from_table(table, types.TensorXf).measure(source)
+    table.quality = {k: float(f"{v:.5g}") for k, v in found.items()}
+    return table
+
+
+def stored_form(net: Indirection, bits: int) -> Indirection:
+    """The arrays as they are stored: the primary's entries rounded to ``bits``, the cascaded array's to 8."""
+    found = []
+    for array, width in ((net.primary[0], bits), (net.cascaded, 8)):
+        steps, dtype = 2**width - 1, type(array.data)
+        codes = np.rint(array.numpy().astype(np.float64) * steps).astype(np.uint8)
+        affine = ((1 / steps,) * array.channels, (0.0,) * array.channels)
+        found.append(DifferentiableArray.from_numpy(codes, dtype, array.border, "uint8", False, affine, width))
+    return Indirection(*found)
+
+
+def steps_in(seconds: float, source: Source, size: Size, recipe: Recipe, types) -> int:
+    """
+    How many steps of a training take ``seconds`` here: measured, on the cores that it may use, after two that compile.
+    """
+    problem = problem_of(source, size, recipe, types)
+    fit(problem, dataclasses.replace(recipe.settings, steps=4, quality_every=4), progress=False)
+    count = 10
+    start = time.perf_counter()
+    fit(problem, dataclasses.replace(recipe.settings, steps=count, quality_every=count), progress=False)
+    return max(1, round(seconds * count / (time.perf_counter() - start)))

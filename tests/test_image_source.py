@@ -1,0 +1,537 @@
+"""Sources of task 3: what each kind of file gives, exactly, and one sentence for what cannot be used."""
+
+import json
+import struct
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+from mi_diffind.tasks.image.source import SourceError, from_arrays, kind_of, load_source
+
+
+def pattern(height, width, channels, dtype=np.uint8, seed=0):
+    rng = np.random.default_rng(seed)
+    if np.dtype(dtype).kind == "f":
+        return rng.normal(0.5, 2, (height, width, channels)).astype(dtype)
+    return rng.integers(0, np.iinfo(dtype).max, (height, width, channels), dtype, endpoint=True)
+
+
+def write(path, array):
+    mi.Bitmap(array).write(str(path))
+    return path
+
+
+def manifest(folder, content):
+    path = folder / "material.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+    return path
+
+
+def described(source):
+    return [(m.name, m.kind, m.color_space, m.depth, m.channels) for m in source.maps]
+
+
+def sentence(error):
+    text = str(error.value)
+    assert "\n" not in text and not text.endswith("."), text
+    return text
+
+
+# -- images -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("height, width", [(1, 1), (7, 5), (1, 4096), (4096, 1)])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("dtype, depth", [(np.uint8, 1), (np.uint16, 2)])
+def test_png_is_exact(tmp_path, height, width, channels, dtype, depth):
+    array = pattern(height, width, channels, dtype)
+    source = load_source(write(tmp_path / "a.png", array))
+    colors = 1 if channels < 3 else 3
+    assert described(source)[0] == ("image", "albedo", "srgb", depth, colors)
+    assert described(source)[1:] == [("alpha", "other", "linear", depth, 1)] * (channels in (2, 4))
+    values = np.concatenate([m.values for m in source.maps], 2)
+    assert values.dtype == np.float32 and values.shape == (height, width, channels)
+    assert np.array_equal(np.rint(values.astype(np.float64) * np.iinfo(dtype).max), array)
+    assert (source.height, source.width, source.channels) == (height, width, channels)
+    assert source.nbytes == array.nbytes and source.texels == height * width
+
+
+def test_16_bits_are_the_nearest_floats(tmp_path):
+    array = np.arange(65536, dtype=np.uint16).reshape(256, 256, 1)
+    source = load_source(write(tmp_path / "a.png", array))
+    assert np.array_equal(source.maps[0].values, (array / 65535.0).astype(np.float32))
+
+
+@pytest.mark.parametrize("dtype, depth", [(np.float16, 2), (np.float32, 4)])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 7, 16])
+def test_exr_is_exact(tmp_path, channels, dtype, depth):
+    array = pattern(5, 7, channels, dtype)
+    assert (array < 0).any()
+    source = load_source(write(tmp_path / "a.exr", array))
+    assert np.array_equal(np.concatenate([m.values for m in source.maps], 2), array.astype(np.float32))
+    assert {m.color_space for m in source.maps} == {"linear"} and {m.depth for m in source.maps} == {depth}
+    names = [m.name for m in source.maps]
+    assert names == (["image", "alpha"] if channels in (2, 4) else ["image"])
+    assert source.maps[0].kind == ("albedo" if channels < 5 else "other")
+
+
+def test_exr_with_named_channels_is_one_map(tmp_path):
+    planes = {
+        name: pattern(5, 7, 1, np.float32, i)[..., 0] for i, name in enumerate(("N.X", "N.Y", "base.R", "base.Z"))
+    }
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, dict(planes)) as file:
+        file.write(str(tmp_path / "a.exr"))
+    source = load_source(tmp_path / "a.exr")
+    assert described(source) == [("image", "other", "linear", 4, 4)]
+    assert np.array_equal(source.maps[0].values, np.stack(list(planes.values()), 2))
+
+
+@pytest.mark.parametrize("largest", [2**24, 2**24 + 1])
+def test_exr_of_whole_numbers(tmp_path, largest):
+    planes = {"id": np.full((2, 3), largest, np.uint32)}
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, dict(planes)) as file:
+        file.write(str(tmp_path / "a.exr"))
+    if largest > 2**24:
+        with pytest.raises(SourceError, match="16,777,217, single precision is exact to 16,777,216"):
+            load_source(tmp_path / "a.exr")
+    else:
+        assert (load_source(tmp_path / "a.exr").maps[0].values == largest).all()
+
+
+def test_hdr_and_pfm(tmp_path):
+    array = abs(pattern(5, 7, 3, np.float32)) + 0.1
+    hdr = load_source(write(tmp_path / "a.hdr", array))
+    assert described(hdr) == [("image", "albedo", "linear", 4, 3)]
+    assert np.allclose(hdr.maps[0].values, array, atol=array.max() / 128)
+    assert np.array_equal(load_source(write(tmp_path / "a.pfm", array)).maps[0].values, array)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_jpeg(tmp_path, channels):
+    array = np.full((7, 5, channels), 100, np.uint8)
+    source = load_source(write(tmp_path / "a.jpg", array))
+    assert described(source) == [("image", "albedo", "srgb", 1, channels)]
+    assert np.allclose(source.maps[0].values * 255, 100, atol=2)
+
+
+def tga(array):
+    height, width, channels = array.shape
+    header = struct.pack("<3B5x4H2B", 0, 0, 2, 0, 0, width, height, 8 * channels, 0x20)
+    return header + array[..., ::-1].tobytes()
+
+
+def bmp(array, palette=b""):
+    height, width = array.shape[:2]
+    bits = 8 if palette else 24
+    rows = array[::-1] if palette else array[::-1, :, ::-1]
+    data = b"".join(row.tobytes() + bytes(-len(row.tobytes()) % 4) for row in rows)
+    start = 54 + len(palette)
+    info = struct.pack("<I2i2H6I", 40, width, height, 1, bits, 0, len(data), 0, 0, len(palette) // 4, 0)
+    return b"BM" + struct.pack("<I4xI", start + len(data), start) + info + palette + data
+
+
+@pytest.mark.parametrize("form", [tga, bmp])
+def test_tga_and_bmp(tmp_path, form):
+    array = pattern(7, 5, 3)
+    path = tmp_path / f"a.{form.__name__}"
+    path.write_bytes(form(array))
+    assert np.array_equal(np.rint(load_source(path).maps[0].values * 255), array)
+    for length in (0, 1, 17, 60, len(form(array)) - 4):
+        path.write_bytes(form(array)[:length])
+        with pytest.raises(SourceError, match="cannot be read as an image"):
+            load_source(path)
+
+
+def test_bmp_with_a_palette(tmp_path):
+    array = pattern(7, 5, 1) // 2
+    grey = b"".join(bytes((i, i, i, 0)) for i in range(256))
+    (tmp_path / "grey.bmp").write_bytes(bmp(array, grey))
+    assert np.array_equal(np.rint(load_source(tmp_path / "grey.bmp").maps[0].values * 255), array)
+    (tmp_path / "colors.bmp").write_bytes(bmp(array, grey[::-1]))
+    with pytest.raises(SourceError, match=r"colors\.bmp: is a BMP file with a palette"):
+        load_source(tmp_path / "colors.bmp")
+
+
+@pytest.mark.parametrize(
+    "name, expected",
+    [("image", ("albedo", "srgb")), ("photo", ("albedo", "srgb")), ("base_color", ("albedo", "srgb")),
+     ("normal", ("normal", "linear")), ("roughness", ("roughness", "linear"))],
+)  # fmt: skip
+def test_name_of_an_image(tmp_path, name, expected):
+    m = load_source(write(tmp_path / "a.png", pattern(5, 7, 3)), name).maps[0]
+    assert (m.name, m.kind, m.color_space) == (name, *expected)
+
+
+@pytest.mark.parametrize(
+    "name, kind",
+    [("albedo", "albedo"), ("baseColor", "albedo"), ("base_color_map", "albedo"), ("diffuse", "albedo"),
+     ("Color", "albedo"), ("normalTexture", "normal"), ("occlusion", "ao"), ("AO", "ao"), ("metalness", "metallic"),
+     ("roughness", "roughness"), ("alpha", "other"), ("height", "other"), ("map", "other")],
+)  # fmt: skip
+def test_kinds(name, kind):
+    assert kind_of(name) == kind
+
+
+def test_no_variant_is_set_or_changed(tmp_path, mi_rgb):
+    path = write(tmp_path / "a.png", pattern(5, 7, 3))
+    before = mi_rgb.variant()
+    digest = load_source(path).digest
+    assert mi_rgb.variant() == before
+    code = (
+        "import sys; from mi_diffind.tasks.image import source\n"
+        "print(source.load_source(sys.argv[1]).digest); import mitsuba; assert mitsuba.variant() is None"
+    )
+    run = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == digest
+
+
+# -- images that cannot be used ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "extension, size", [("png", 7), ("png", 200), ("jpg", 7), ("jpg", 200), ("exr", 7), ("exr", 99)]
+)
+def test_cut_short(tmp_path, capfd, extension, size):
+    array = pattern(size, size + 1, 3, np.float16 if extension == "exr" else np.uint8)
+    data = write(tmp_path / f"whole.{extension}", array).read_bytes()
+    load_source(tmp_path / f"whole.{extension}")
+    path = tmp_path / f"cut.{extension}"
+    count = len(data)
+    for length in (
+        0,
+        1,
+        4,
+        8,
+        20,
+        count // 4,
+        count // 2,
+        count * 3 // 4,
+        count - 20,
+        count - 12,
+        count - 2,
+        count - 1,
+    ):
+        path.write_bytes(data[:length])
+        with pytest.raises(SourceError) as e:
+            load_source(path)
+        assert sentence(e).startswith(f"{path}: ")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("extension", ["png", "jpg"])
+def test_more_after_the_end_is_fine(tmp_path, extension):
+    path = write(tmp_path / f"a.{extension}", pattern(7, 5, 3))
+    digest = load_source(path).digest
+    path.write_bytes(path.read_bytes() + bytes(10) + b"more")
+    assert load_source(path).digest == digest
+
+
+def test_jpeg_with_a_thumbnail_is_not_taken_for_whole(tmp_path):
+    data = write(tmp_path / "a.jpg", pattern(50, 50, 3)).read_bytes()
+    inner = write(tmp_path / "b.jpg", pattern(5, 5, 3)).read_bytes()
+    segment = b"\xff\xe1" + struct.pack(">H", len(inner) + 2) + inner
+    (tmp_path / "c.jpg").write_bytes(data[:2] + segment + data[2:])
+    assert load_source(tmp_path / "c.jpg").digest == load_source(tmp_path / "a.jpg").digest
+    (tmp_path / "c.jpg").write_bytes(data[:2] + segment + data[2:-100])
+    with pytest.raises(SourceError, match="is cut short, a JPEG file ends"):
+        load_source(tmp_path / "c.jpg")
+
+
+def test_not_an_image(tmp_path):
+    for name, match in {"missing.png": "no such file", "folder": "is a folder", "text.png": "cannot be read"}.items():
+        path = tmp_path / name
+        if name == "folder":
+            path.mkdir()
+        elif name == "text.png":
+            path.write_text("This is text, and not an image. " * 3)
+        with pytest.raises(SourceError, match=match) as e:
+            load_source(path)
+        assert sentence(e).startswith(f"{path}: ")
+
+
+def test_damaged_png(tmp_path):
+    path = write(tmp_path / "a.png", pattern(50, 50, 3))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x55
+    path.write_bytes(data)
+    with pytest.raises(SourceError, match="cannot be read as an image") as e:
+        load_source(path)
+    sentence(e)
+
+
+def test_too_many_channels(tmp_path):
+    path = write(tmp_path / "a.exr", pattern(5, 7, 17, np.float16))
+    with pytest.raises(SourceError, match=r"a\.exr: has 17 channels, at most 16"):
+        load_source(path)
+    write(tmp_path / "b.exr", pattern(5, 7, 9, np.float16))
+    with pytest.raises(SourceError, match=r"material\.json: has 18 channels in all, at most 16"):
+        load_source(manifest(tmp_path, {"a": "b.exr", "b": "b.exr"}))
+
+
+@pytest.mark.parametrize("name", ["", "a b", "1a", "a-b", "ä b"])
+def test_bad_names(tmp_path, name):
+    path = write(tmp_path / "a.png", pattern(5, 7, 3))
+    with pytest.raises(SourceError, match="a map is called"):
+        load_source(path, name)
+    with pytest.raises(SourceError, match="a map is called"):
+        load_source(manifest(tmp_path, {name: "a.png"}))
+
+
+def test_the_name_alpha(tmp_path):
+    assert load_source(write(tmp_path / "a.png", pattern(5, 7, 1)), "alpha").maps[0].color_space == "linear"
+    with pytest.raises(SourceError, match='the name "alpha" is taken'):
+        load_source(write(tmp_path / "b.png", pattern(5, 7, 4)), "alpha")
+
+
+# -- NaN and infinity -------------------------------------------------------------------------------------------------
+
+
+def test_nonfinite_values(tmp_path):
+    array = pattern(5, 7, 3, np.float32)
+    expected = array.copy()
+    array[2, 4, 1], expected[2, 4, 1] = np.nan, 0
+    array[3, 0, 0], array[4, 6, 0] = np.inf, -np.inf
+    expected[3, 0, 0] = np.delete(array[..., 0], [21, 34]).max()
+    expected[4, 6, 0] = np.delete(array[..., 0], [21, 34]).min()
+    path = write(tmp_path / "a.exr", array)
+    with pytest.raises(SourceError, match=r'map "image" has 3 values that are NaN or infinite.*x = 4, y = 2') as e:
+        load_source(path)
+    assert sentence(e).startswith(str(path))
+    source = load_source(path, nonfinite="clean")
+    assert source.cleaned == 3 and np.array_equal(source.maps[0].values, expected)
+    assert load_source(write(tmp_path / "b.exr", expected), nonfinite="clean").cleaned == 0
+    with pytest.raises(ValueError, match='nonfinite: found "zero", allowed are'):
+        load_source(path, nonfinite="zero")
+
+
+def test_a_channel_without_finite_values_becomes_0():
+    source = from_arrays({"a": np.full((2, 3), np.inf, np.float16)}, nonfinite="clean")
+    assert source.cleaned == 6 and not source.maps[0].values.any()
+
+
+def test_only_selected_channels_have_to_be_finite(tmp_path):
+    array = pattern(5, 7, 3, np.float32)
+    array[0, 0, 0] = np.nan
+    write(tmp_path / "a.exr", array)
+    assert load_source(manifest(tmp_path, {"ao": {"file": "a.exr", "channels": "g"}})).cleaned == 0
+
+
+# -- manifests --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_manifest(tmp_path, flat):
+    (tmp_path / "textures").mkdir()
+    orm = pattern(5, 7, 3)
+    base = pattern(5, 7, 3, np.uint16)
+    write(tmp_path / "textures" / "orm.png", orm)
+    write(tmp_path / "base.png", base)
+    write(tmp_path / "n.png", pattern(5, 7, 3, seed=2))
+    maps = {
+        "albedo": "base.png",
+        "normal": {"file": "n.png", "color_space": "linear"},
+        "roughness": {"file": "textures/orm.png", "channels": "g"},
+        "ao": {"file": "textures/orm.png", "channels": [0]},
+    }
+    source = load_source(manifest(tmp_path, maps if flat else {"maps": maps}))
+    assert described(source) == [
+        ("albedo", "albedo", "srgb", 2, 3),
+        ("normal", "normal", "linear", 1, 3),
+        ("roughness", "roughness", "linear", 1, 1),
+        ("ao", "ao", "linear", 1, 1),
+    ]
+    assert np.array_equal(np.rint(source.maps[2].values * 255), orm[..., 1:2])
+    assert np.array_equal(np.rint(source.maps[3].values * 255), orm[..., :1])
+    assert source.maps[3].file == str(tmp_path / "textures" / "orm.png")
+    assert source.nbytes == 35 * (3 * 2 + 3 + 1 + 1) and source.channels == 8
+    arrays = {"albedo": base, "normal": pattern(5, 7, 3, seed=2), "roughness": orm[..., 1], "ao": orm[..., 0]}
+    assert from_arrays(arrays).digest == source.digest
+
+
+def test_color_spaces_of_a_manifest(tmp_path):
+    write(tmp_path / "a.png", pattern(5, 7, 3))
+    write(tmp_path / "a.exr", pattern(5, 7, 3, np.float16))
+    maps = {
+        "diffuse": {"file": "a.png", "color_space": "linear"},
+        "albedo": "a.exr",
+        "normal": "a.png",
+        "sheen": "a.png",
+    }
+    source = load_source(manifest(tmp_path, maps))
+    assert [m.color_space for m in source.maps] == ["linear"] * 4
+    source = load_source(manifest(tmp_path, {"sheen": {"file": "a.png", "color_space": "srgb"}}))
+    assert source.maps[0].color_space == "srgb"
+
+
+def test_equal_channels(tmp_path):
+    write(tmp_path / "grey.png", np.repeat(pattern(5, 7, 1), 3, 2))
+    write(tmp_path / "rgb.png", pattern(5, 7, 3))
+    maps = {
+        "roughness": "grey.png",
+        "ao": "grey.png",
+        "metallic": "rgb.png",
+        "albedo": "grey.png",
+        "height": "grey.png",
+    }
+    source = load_source(manifest(tmp_path, maps))
+    assert [m.channels for m in source.maps] == [1, 1, 3, 3, 3]
+    kept = {"ao": {"file": "grey.png", "channels": "rgb"}}
+    assert load_source(manifest(tmp_path, kept)).channels == 3
+
+
+def test_alpha_in_a_manifest(tmp_path):
+    array = pattern(5, 7, 4)
+    write(tmp_path / "a.png", array)
+    with pytest.raises(SourceError, match='map "albedo" is from a file with transparency, "channels" has to say'):
+        load_source(manifest(tmp_path, {"albedo": "a.png"}))
+    maps = {"albedo": {"file": "a.png", "channels": "rgb"}, "alpha": {"file": "a.png", "channels": "a"}}
+    source = load_source(manifest(tmp_path, maps))
+    assert [m.color_space for m in source.maps] == ["srgb", "linear"]
+    assert np.array_equal(np.rint(source.maps[1].values * 255), array[..., 3:])
+    array[..., 3] = 255
+    write(tmp_path / "a.png", array)
+    assert load_source(manifest(tmp_path, {"albedo": "a.png"})).channels == 3
+
+
+def test_channels_of_a_grey_file(tmp_path):
+    array = pattern(5, 7, 2)
+    write(tmp_path / "a.png", array)
+    maps = {"ao": {"file": "a.png", "channels": "r"}, "x": {"file": "a.png", "channels": "ag"}}
+    source = load_source(manifest(tmp_path, maps))
+    assert np.array_equal(np.rint(source.maps[0].values * 255), array[..., :1])
+    assert np.array_equal(np.rint(source.maps[1].values * 255), array[..., ::-1])
+
+
+@pytest.mark.parametrize("channels", ["", "x", "ra", "rr", [], [3], [-1], [0, 0], [True], ["r"], 1, None, {}])
+def test_bad_channels(tmp_path, channels):
+    write(tmp_path / "a.png", pattern(5, 7, 3))
+    with pytest.raises(SourceError, match='map "ao" has the channels') as e:
+        load_source(manifest(tmp_path, {"ao": {"file": "a.png", "channels": channels}}))
+    sentence(e)
+
+
+def test_letters_do_not_select_from_many_channels(tmp_path):
+    array = pattern(5, 7, 6, np.float32)
+    write(tmp_path / "a.exr", array)
+    source = load_source(manifest(tmp_path, {"normal": {"file": "a.exr", "channels": [5, 0]}}))
+    assert np.array_equal(source.maps[0].values, array[..., [5, 0]])
+    with pytest.raises(SourceError, match="a list of indices from 0 to 5"):
+        load_source(manifest(tmp_path, {"normal": {"file": "a.exr", "channels": "rg"}}))
+
+
+def test_sizes_have_to_agree(tmp_path):
+    write(tmp_path / "a.png", pattern(5, 7, 3))
+    write(tmp_path / "b.png", pattern(7, 5, 3))
+    with pytest.raises(SourceError, match='map "albedo" has 7×5 texels and map "normal" 5×7'):
+        load_source(manifest(tmp_path, {"albedo": "a.png", "normal": "b.png"}))
+
+
+@pytest.mark.parametrize(
+    "content, match",
+    [
+        ('{"maps": ', "is not valid JSON"),
+        ("", "is not valid JSON"),
+        ('{"a": "a.png", "a": "a.png"}', 'the key "a" comes twice'),
+        ("[" * 100_000, "is not valid JSON"),
+        ([], "has no maps"),
+        ({}, "has no maps"),
+        ({"maps": {}}, "has no maps"),
+        ({"maps": "a.png"}, "has no maps"),
+        ({"maps": {"a": "a.png"}, "size": 3}, 'has the key "size" beside "maps"'),
+        ({"a": 3}, 'map "a" is 3, expected'),
+        ({"a": {"path": "a.png"}}, 'map "a" has the key "path", allowed are'),
+        ({"a": {"channels": "r"}}, 'map "a" has the file None'),
+        ({"a": {"file": "a.png", "color_space": "rgb"}}, "has the color space 'rgb', allowed are"),
+        ({"a": {"file": "a.png", "color_space": []}}, "has the color space"),
+        ({"a": "missing.png"}, r"missing\.png: no such file"),
+        ({"a": "."}, "is a folder"),
+        ({"a": "a\0.png"}, "cannot be read|no such file"),
+    ],
+)
+def test_bad_manifests(tmp_path, content, match):
+    write(tmp_path / "a.png", pattern(5, 7, 3))
+    with pytest.raises(SourceError, match=match) as e:
+        load_source(manifest(tmp_path, content))
+    sentence(e)
+
+
+def test_manifest_that_is_no_text(tmp_path):
+    (tmp_path / "a.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SourceError, match="is not valid JSON"):
+        load_source(tmp_path / "a.json")
+    with pytest.raises(SourceError, match="which names its maps itself"):
+        load_source(tmp_path / "a.json", "image")
+
+
+# -- arrays -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "extension, dtype", [("png", np.uint8), ("png", np.uint16), ("exr", np.float16), ("exr", np.float32)]
+)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_arrays_are_the_same_as_files(tmp_path, extension, dtype, channels):
+    array = pattern(7, 5, channels, dtype)
+    source = load_source(write(tmp_path / f"a.{extension}", array))
+    again = from_arrays({"image": array})
+    assert described(again) == described(source) and again.digest == source.digest
+    assert again.nbytes == source.nbytes == array.nbytes
+
+
+def test_the_digest_tells_everything_apart():
+    array = pattern(6, 4, 2)
+    changed = array.copy()
+    changed[5, 3, 1] ^= 1
+    sources = [
+        from_arrays({"a": array}),
+        from_arrays({"b": array}),
+        from_arrays({"a": array}, {"a": "srgb"}),
+        from_arrays({"a": array.reshape(4, 6, 2)}),
+        from_arrays({"a": array[..., :1], "b": array[..., 1:]}),
+        from_arrays({"a": changed}),
+        from_arrays({"a": array.astype(np.float32) / 255}),
+    ]
+    assert len({s.digest for s in sources}) == len(sources)
+    assert sources[0].digest == from_arrays({"a": np.asfortranarray(array)}).digest
+
+
+def test_arrays_are_copied():
+    array = pattern(5, 7, 3, np.float32)
+    source = from_arrays({"albedo": array})
+    assert not np.shares_memory(array, source.maps[0].values)
+    with pytest.raises(ValueError, match="read-only"):
+        source.maps[0].values[0] = 0
+
+
+@pytest.mark.parametrize(
+    "arrays, match",
+    [
+        ({}, "arrays: has no maps"),
+        ({"a": np.zeros((0, 3))}, r'array "a": has the shape \(0, 3\)'),
+        ({"a": np.zeros((3, 3, 0))}, "has the shape"),
+        ({"a": np.zeros(3)}, "has the shape"),
+        ({"a": np.zeros((2, 2), np.int32)}, "has the type int32, allowed are"),
+        ({"a": np.zeros((2, 2), bool)}, "has the type bool, allowed are"),
+        ({"a": np.zeros((2, 2), object)}, "has the type object, allowed are"),
+        ({"a": np.zeros((2, 2, 17))}, "has 17 channels in all, at most 16"),
+        ({"a b": np.zeros((2, 2))}, "a map is called 'a b'"),
+        ({3: np.zeros((2, 2))}, "a map is called 3"),
+        ({"a": np.zeros((2, 2)), "b": np.zeros((2, 3))}, 'map "a" has 2×2 texels and map "b" 3×2'),
+        ({"a": np.full((2, 2), 1e300)}, 'map "a" has 4 values that are NaN or infinite'),
+    ],
+)
+def test_bad_arrays(arrays, match):
+    with pytest.raises(SourceError, match=match) as e:
+        from_arrays(arrays)
+    sentence(e)
+
+
+def test_bad_color_spaces():
+    with pytest.raises(SourceError, match='array "a": has the color space "rgb", allowed are'):
+        from_arrays({"a": np.zeros((2, 2))}, {"a": "rgb"})
+    with pytest.raises(SourceError, match='a color space is given for "b", which is not among them'):
+        from_arrays({"a": np.zeros((2, 2))}, {"b": "srgb"})
