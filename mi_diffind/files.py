@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import tempfile
+import textwrap
 from pathlib import Path
 
 
@@ -49,21 +50,27 @@ def writable_file(path: str | os.PathLike) -> Path:
 def replacing(path: str | os.PathLike):
     """
     Yield the path of a temporary file beside ``path`` (with the same extension); rename it to ``path`` on success,
-    remove it on failure. Raises :class:`OutputError` if the folder cannot be written.
+    remove it on failure. Raises :class:`OutputError` if the folder or the file cannot be written, as on a full disk.
     """
     path = writable_file(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
+    name = None
     try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
         yield Path(name)
         umask = os.umask(0)
         os.umask(umask)
         os.chmod(name, 0o666 & ~umask)
         os.replace(name, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-        raise
+    except BaseException as e:
+        if name is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(name)
+        if isinstance(e, OutputError) or not (isinstance(e, OSError) or type(e) is RuntimeError):
+            raise
+        # Mitsuba has no other exception than RuntimeError, nor one line for it.
+        reason = getattr(e, "strerror", None) or textwrap.shorten(str(e), 100, placeholder="…")
+        raise OutputError(f'output file "{path}" cannot be written: {reason}') from e
 
 
 def write_json(path: str | os.PathLike, content) -> None:

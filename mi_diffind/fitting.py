@@ -48,8 +48,11 @@ class Problem(Protocol):
     #: Optional: what the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
     about: dict
 
-    def begin(self, step: int, steps: int) -> None:
-        """Optional: called before step ``step`` of ``steps``, for a problem that changes on the way."""
+    def begin(self, step: int, steps: int) -> str:
+        """
+        Optional: called before step ``step`` of ``steps``, for a problem that changes on the way. Returns the kind of
+        step: only losses of the same kind are compared.
+        """
 
     def batch(self, rng, size: int):
         """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
@@ -142,7 +145,7 @@ def fit(
             raise FittingError(f'the checkpoint "{checkpoint}" would replace a file that is not one')
     trainer, plateau = _Trainer(problem, settings), _Plateau(settings)
     best, best_quality, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
-    reference = None  # a running mean of the loss; from the first step on, lest an explosion right after it sets it
+    references = {}  # running means of the loss by kind of step; from the first on, lest an explosion after it sets one
     if resume:
         if checkpoint is None:
             raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
@@ -151,7 +154,7 @@ def fit(
         best, best_quality, best_step = extra["best"], extra["best_quality"], extra["best_step"]
         history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
         trainer.restarts = restarts
-        reference = extra["reference"]
+        references = extra["references"]
         plateau.restore(extra["plateau"])
 
     start = time.perf_counter() - spent
@@ -177,6 +180,7 @@ def fit(
             bar.update(1)
             last = trainer.step == settings.steps
             due = trainer.step % settings.check_every == 0 or trainer.step % settings.quality_every == 0
+            reference = references.get(trainer.kind)
             if not (due or last or reference is None):
                 continue
             value = float(loss[0])
@@ -196,7 +200,7 @@ def fit(
                 trainer.restore(good)
                 bar.n = trainer.step
                 continue
-            reference = value if reference is None else 0.5 * (reference + value)
+            references[trainer.kind] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if trainer.step % settings.quality_every == 0 or last:
@@ -205,7 +209,7 @@ def fit(
                     extra = {
                         "best": best, "best_quality": best_quality, "best_step": best_step, "history": history,
                         "restarts": restarts, "seconds": time.perf_counter() - start, "plateau": plateau.state(),
-                        "reference": reference,
+                        "references": references,
                     }  # fmt: skip
                     _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), extra)
         if stop.is_set() and trainer.step < settings.steps:
@@ -252,7 +256,7 @@ class _Trainer:
 
     def __init__(self, problem: Problem, settings: FitSettings):
         self.problem, self.settings = problem, settings
-        self.step, self.lr_scale, self.restarts = 0, 1.0, 0
+        self.step, self.lr_scale, self.restarts, self.kind = 0, 1.0, 0, ""
         self.optimizer = Adam(lr=settings.lr)
         self.optimizer.update(problem.net)
         self.module = sys.modules[type(next(iter(self.optimizer.values()))).__module__]
@@ -272,7 +276,7 @@ class _Trainer:
         rng = dr.rng(seed=seed)
         net.update(self.optimizer)
         if hasattr(self.problem, "begin"):
-            self.problem.begin(self.step, settings.steps)
+            self.kind = self.problem.begin(self.step, settings.steps) or ""
         inputs, targets = self.problem.batch(rng, settings.batch)
         outputs = self.problem.predict(net, inputs)
         loss = 0
@@ -356,11 +360,14 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
             {k: (int(arrays[f"t/{k}"]), arrays[f"m/{k}"], arrays[f"v/{k}"]) for k in keys},
         )  # fmt: skip
         best = {k: arrays[f"best/{k}"] for k in keys}
-        for key in ("best_quality", "best_step", "history", "restarts", "seconds", "plateau", "reference"):
+        for key in ("best_quality", "best_step", "history", "restarts", "seconds", "plateau", "references"):
             meta[key]  # a KeyError here, not later
         stored_settings = dict(meta["settings"])
     except Exception as e:  # zipfile, json and numpy each have their own for a damaged file
         raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({type(e).__name__}: {e})') from None
+    sources = [s["source"] for s in (stored_settings, settings) if "source" in s]
+    if len(sources) == 2 and sources[0] != sources[1]:
+        raise FittingError(f'the checkpoint "{path}" is of another source, or the source has changed since')
     for key in keys:
         shape = trainer.optimizer[key].shape
         moments_fit = all(m.shape == (math.prod(shape),) for m in state.moments[key][1:])  # Adam keeps them flat

@@ -29,11 +29,37 @@ def flip(reference: np.ndarray, image: np.ndarray) -> float:
     Mean LDR-FLIP (Andersson et al. 2020), 0 = equal to the eye, of the images as displayed (:func:`srgb`) at the
     default viewing distance of 67 pixels per degree.
     """
+    return flip_shown(srgb(reference), srgb(image))
+
+
+def flip_shown(reference: np.ndarray, image: np.ndarray) -> float:
+    """As :func:`flip`, of images that are displayed as they are, in [0, 1]."""
     import flip_evaluator
 
-    pair = [np.ascontiguousarray(srgb(i), dtype=np.float32) for i in (reference, image)]
+    pair = [np.ascontiguousarray(i, dtype=np.float32) for i in (reference, image)]
     _, mean, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)
     return float(mean)
+
+
+def ssim(reference: np.ndarray, image: np.ndarray) -> float | None:
+    """
+    Structural similarity (Wang et al. 2004) of values in [0, 1], the mean over channels; ``None`` if scikit-image is
+    not installed or the image is smaller than the window of 7 texels.
+    """
+    try:
+        from skimage.metrics import structural_similarity
+    except ImportError:
+        return None
+    if min(reference.shape[:2]) < 7:
+        return None
+    return float(structural_similarity(reference, image, data_range=1.0, channel_axis=-1))
+
+
+def angle(reference: np.ndarray, image: np.ndarray) -> float:
+    """Mean angle in degrees between unit normals, stored as (n + 1)/2, that were brought to length 1."""
+    a, b = (2 * v[..., :3].astype(np.float64) - 1 for v in (reference, image))
+    a, b = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-6) for v in (a, b))
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1))).mean())
 
 
 def compare(reference: np.ndarray, image: np.ndarray) -> dict[str, float]:

@@ -21,6 +21,7 @@ STYLES = (
     ("#1b7837", "^"),
     ("#762a83", "v"),
     ("#4d4d4d", "P"),
+    ("#12908e", "X"),
 )
 
 
@@ -72,7 +73,7 @@ def draw(title: str, panels: Sequence[Panel], y_label: str, caption: str):
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     width = 6.4 * columns
-    text = "\n".join(textwrap.wrap(caption, int(19 * width)))
+    text = "\n".join(textwrap.wrap(caption, int(18 * width)))
     below = 0.17 * (text.count("\n") + 1) + 0.15
     styles = {}
     for panel in panels:

@@ -22,6 +22,7 @@ from .files import replacing
 from .operations import bsdf_operations
 from .tasks import ggx
 from .tasks.disney import library as disney
+from .tasks.image import compressed as image
 
 #: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
 MAX_DEPTHS = {
@@ -33,6 +34,7 @@ MAX_DEPTHS = {
 _TABLES = {
     "neural_disney": (disney.table_file, disney.load_disney_table),
     "neural_ggx": (ggx.table_file, ggx.load_ggx_table),
+    "neural_image": (lambda name, quality: name, image.load_image_table),
 }
 
 
@@ -77,12 +79,7 @@ def swap_exact(state) -> int:
                 raise RuntimeError(
                     f'"{props.id()}" has its parameters encoded (latents); its exact counterpart needs the originals'
                 )
-            props.set_plugin_name(counterpart.name)
-            for key in counterpart.learned_only:
-                if key in props:
-                    del props[key]
-            for key, value in counterpart.given.items():
-                props[key] = value
+            counterpart.replace(props)
             count += 1
     return count
 

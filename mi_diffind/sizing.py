@@ -65,10 +65,27 @@ _default_ratio = ratio  # where "ratio" is the argument that replaces it
 
 
 @dataclass(frozen=True)
+class Coarse:
+    """
+    A second primary array, of lower resolution: how many ``dims`` of the pointer it holds, their ``bits``, and its
+    sides in units of those of the first, ``scale``.
+    """
+
+    dims: int = 2
+    bits: int = 6
+    scale: float = 0.35
+
+    def __post_init__(self):
+        if self.dims < 1 or not 1 <= self.bits <= 8 or not 0 < self.scale <= 1:
+            raise ValueError(f"found {self}, allowed are dims ≥ 1, 1 to 8 bits and a scale above 0 and up to 1")
+
+
+@dataclass(frozen=True)
 class Size:
     """
     Resolutions of a pair of arrays: the primary's ``rows`` and ``columns``, the side of the ``cascaded`` array, its
-    ``channels``, the ``dims`` of the pointer and the ``bits`` of each of its coordinates.
+    ``channels``, the ``dims`` of the pointer and the ``bits`` of each of its coordinates. With ``coarse``, so many of
+    the ``dims`` are in a second primary.
 
     ``full`` says that the primary is as large as the image, or as the search lets it be; sizes compare without it.
     """
@@ -80,16 +97,29 @@ class Size:
     dims: int = 4
     bits: int = 8
     full: bool = field(default=False, compare=False)
+    coarse: Coarse | None = None
 
     def __post_init__(self):
+        if self.coarse is not None and self.coarse.dims >= self.dims:
+            raise ValueError(f"coarse: found {self.coarse.dims} of {self.dims} dims, at least one has to remain")
         for name in ("rows", "columns", "cascaded", "channels", "dims", "bits"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ 1")
 
     @property
     def nbytes(self) -> int:
-        """Bytes of both arrays, :func:`image_bytes`."""
-        return image_bytes(self.rows * self.columns, self.cascaded, self.channels, self.dims, self.bits)
+        """Bytes of all arrays, :func:`image_bytes`."""
+        found = self.channels * self.cascaded**self.dims
+        return found + sum((dims * bits * rows * columns + 7) // 8 for rows, columns, dims, bits in self.primaries)
+
+    @property
+    def primaries(self) -> list[tuple[int, int, int, int]]:
+        """Rows, columns, dims and bits of each primary array."""
+        if self.coarse is None:
+            return [(self.rows, self.columns, self.dims, self.bits)]
+        c = self.coarse
+        sides = (max(1, round(self.rows * c.scale)), max(1, round(self.columns * c.scale)))
+        return [(self.rows, self.columns, self.dims - c.dims, self.bits), (*sides, c.dims, c.bits)]
 
     @property
     def ratio(self) -> float:
@@ -178,7 +208,14 @@ def cascaded_side(budget: float, channels: int, dims: int = 4, share: float = 0.
 
 
 def fit_bytes(
-    budget: float, channels: int, height: int, width: int, cascaded: int, dims: int = 4, bits: int = 8
+    budget: float,
+    channels: int,
+    height: int,
+    width: int,
+    cascaded: int,
+    dims: int = 4,
+    bits: int = 8,
+    coarse: Coarse | None = None,
 ) -> Size:
     """
     The largest primary that fits into ``budget`` bytes beside a cascaded array of side ``cascaded``, in the proportions
@@ -188,6 +225,8 @@ def fit_bytes(
     _check_image(1, channels, height, width)
     if not math.isfinite(budget):
         raise ValueError(f"budget: found {budget}, allowed are finite numbers of bytes")
+    if coarse is not None:
+        return _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse)
     entries = int((budget - channels * cascaded**dims) * 8) // (dims * bits)
     entries = min(max(entries, 1), height * width)
     if height == width:
@@ -205,6 +244,29 @@ def fit_bytes(
     _, one, other = best
     rows, columns = (one, other) if height <= width else (other, one)
     return Size(rows, columns, cascaded, channels, dims, bits, full=(rows, columns) == (height, width))
+
+
+def _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse: Coarse) -> Size:
+    """:func:`fit_bytes` of two primaries: the sides in proportion, then the longer one alone, both by bisection."""
+    short, long = sorted((height, width))
+
+    def sized(one: int, other: int) -> Size:
+        rows, columns = (one, other) if height <= width else (other, one)
+        return Size(rows, columns, cascaded, channels, dims, bits, (rows, columns) == (height, width), coarse)
+
+    def largest(at) -> Size:
+        low, high = 1, long
+        while low < high:
+            middle = (low + high + 1) // 2
+            low, high = (middle, high) if at(middle).nbytes <= budget else (low, middle - 1)
+        return at(low)
+
+    best = largest(lambda n: sized(min(max(1, round(n * short / long)), short), n))
+    if short < long:
+        one = min(best.rows, best.columns)
+        longer = [largest(lambda n, one=one: sized(one, n)) for one in (one, one + 1) if one <= short]
+        best = max((size for size in longer if size.nbytes <= budget), key=lambda size: size.nbytes, default=best)
+    return best
 
 
 def _spread(side: int, height: int, width: int) -> tuple[int, int]:

@@ -1,8 +1,8 @@
 """
 The file that holds one trained thing: a ``.npz`` archive (readable by ``numpy.load``, never pickled).
 
-It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``, or, of
-entries with fewer than 8 bits, their bits one after the other (:func:`.lookup.pack_bits`), and an array ``meta`` of
+It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``, or,
+of entries with fewer than 8 bits, their bits one after the other (:func:`.lookup.pack_bits`), and an array ``meta`` of
 UTF-8 bytes: JSON with the format version, the task, the storage form, each array's shape, borders
 and (for bytes) affine map, the training settings, the seed and the measured quality. The same content gives the same
 bytes.
@@ -265,7 +265,7 @@ def _check_shape(path, name: str, shape: tuple, border: tuple) -> None:
 
 
 def _check_bits(path, name: str, bits, storage: str) -> int:
-    if storage != "uint8" or not isinstance(bits, int) or not 1 <= bits <= 7:
+    if storage != "uint8" or type(bits) is not int or not 1 <= bits <= 7:
         raise TableError(f'{path}: array "{name}" has {bits} bits an entry, allowed are 1 to 7, and of bytes only')
     return bits
 

@@ -12,26 +12,44 @@ import importlib
 import sys
 from dataclasses import dataclass, field
 
-#: Modules of this package that define a plugin, in an order in which each follows those that it builds upon.
-MODULES = ("disney", "neural_disney", "neural_ggx")
+#: Modules of this package that define a plugin, and what it is, in an order in which each follows those that it builds
+#: upon.
+MODULES = {"disney": "bsdf", "neural_disney": "bsdf", "neural_ggx": "bsdf", "neural_image": "texture"}
 
 
 @dataclass(frozen=True)
 class Counterpart:
     """
     What is exact where a learned plugin is not: the ``name`` of a plugin that takes the same parameters but those of
-    ``learned_only``, and needs those of ``given`` in addition.
+    ``learned_only``, and needs those of ``given`` in addition. ``convert``, as ``"module.function"`` of this package,
+    is what turns the properties of the one into those of the other if that is not all there is to it.
     """
 
     name: str
     learned_only: tuple[str, ...]
     given: dict[str, str] = field(default_factory=dict)
+    convert: str = ""
+
+    def replace(self, props) -> None:
+        """Turn the properties (``mi.Properties``) of the learned plugin into those of the exact one, in place."""
+        if self.convert:
+            module, function = self.convert.split(".")
+            getattr(importlib.import_module(f"{__name__}.{module}"), function)(props)
+        props.set_plugin_name(self.name)
+        for key in self.learned_only:
+            if key in props:
+                del props[key]
+        for key, value in self.given.items():
+            props[key] = value
 
 
 #: The exact counterpart of each learned plugin.
 EXACT_COUNTERPARTS = {
     "neural_disney": Counterpart("disney", ("quality", "effects", "filename", "storage")),
     "neural_ggx": Counterpart("roughconductor", ("quality", "filename", "storage"), {"distribution": "ggx"}),
+    "neural_image": Counterpart(
+        "bitmap", ("filename", "channels", "storage", "source"), convert="image_files.to_bitmap"
+    ),
 }
 
 _registered: set[str] = set()
@@ -62,8 +80,8 @@ def register(variant: str) -> None:
     if variant in _registered:
         return
     if not supported(variant):
-        for name in MODULES:
-            mi.register_bsdf(name, _refusal(name, variant))
+        for name, kind in MODULES.items():
+            getattr(mi, f"register_{kind}")(name, _refusal(name, variant))
     else:
         for name in MODULES:
             qualified = f"{__name__}.{name}"

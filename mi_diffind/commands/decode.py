@@ -18,7 +18,8 @@ def add(commands) -> None:
     sub.add_argument("file", metavar="FILE.npz")
     sub.add_argument(
         "-o", "--output", required=True, metavar="OUT.exr|OUT.png",
-        help="image to write; of several maps, one file each: OUT_albedo.png, …; .png: 8 bits, .exr: half precision",
+        help="image to write; of several maps, one file each: OUT_albedo.png, …; .png: 8 bits; .exr: half precision, "
+        "single if there are numbers beyond 65504",
     )  # fmt: skip
     sub.add_argument("--map", action="append", metavar="NAME", help="only this map; may be repeated (default: all)")
     sub.add_argument("--width", type=positive, help="width in texels (default: that of the source)")
@@ -74,4 +75,5 @@ def _write(path: Path, values: np.ndarray, color_space: str) -> None:
             return
         if color_space == "srgb":
             values = np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
-        mi.Bitmap(np.ascontiguousarray(values, dtype=np.float16)).write(str(temporary))
+        form = np.float16 if np.abs(values).max() < 65520 else np.float32  # what rounds to a finite number
+        mi.Bitmap(np.ascontiguousarray(values, dtype=form)).write(str(temporary))

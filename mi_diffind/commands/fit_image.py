@@ -11,6 +11,7 @@ from .. import sizing
 from ..files import writable_file
 from ..fitting import LOSSES, SCHEDULES, FittingError
 from ..runtime import array_module
+from ..tables import MAX_BYTES
 from ..tasks.image import search, training
 from ..tasks.image.source import NONFINITE, Source, load_source
 from .common import UsageError, natural, positive, task
@@ -45,7 +46,11 @@ def add(tasks) -> None:
         choices=list(training.IMPROVEMENTS),
         help="switch one of the improvements of our recipe off; may be repeated",
     )
-    sub.add_argument("--bits", type=positive, choices=range(1, 9), help="bits of an entry of the primary array")
+    sub.add_argument(
+        "--structure",
+        choices=["auto", *training.STRUCTURES],
+        help="bits of an entry of the primary array, or of two (default: auto for ours, 8 bits for the paper's)",
+    )
     sub.add_argument("--dims", type=positive, choices=range(1, 5), help="dimensions of the cascaded array")
     sub.add_argument("--cascaded", type=positive, metavar="N", help="entries along each side of the cascaded array")
     sub.add_argument(
@@ -133,6 +138,8 @@ def _check(arguments, output: Path) -> None:
         raise UsageError(
             "--checkpoint keeps one training, --ratio-search and --psnr make several: give only one of them"
         )
+    if arguments.resume and arguments.seconds:
+        raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
     if arguments.ratio_search and (arguments.psnr or arguments.cascaded):
         raise UsageError("--ratio-search finds the sides of arrays of a given size: leave out --psnr and --cascaded")
     if arguments.psnr and arguments.cascaded:
@@ -143,8 +150,10 @@ def _check(arguments, output: Path) -> None:
 
 def _recipe(arguments) -> training.Recipe:
     recipe = training.without(training.RECIPES[arguments.recipe], arguments.without)
-    given = {k: getattr(arguments, k) for k in ("bits", "dims") if getattr(arguments, k) is not None}
+    given = {k: getattr(arguments, k) for k in ("structure", "dims") if getattr(arguments, k) is not None}
     recipe = dataclasses.replace(recipe, **given)
+    if training.STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
+        raise UsageError(f'--structure "{recipe.structure}" has two primary arrays and needs --dims 3 or 4')
     given = {k: getattr(arguments, k) for k in ("steps", "batch", "lr", "loss", "schedule", "seed")}
     given = {k: v for k, v in given.items() if v is not None}
     steps = given.get("steps", recipe.settings.steps)
@@ -164,13 +173,16 @@ def _train(arguments, source: Source, recipe: training.Recipe, types):
         given = {"compression": arguments.compression, "nbytes": arguments.bytes, "bpp": arguments.bpp}
         if not any(given.values()):
             given["compression"] = 12
-        asked = sizing.parse_size(source.nbytes, source.texels, **given)
+        try:
+            asked = sizing.parse_size(source.nbytes, source.texels, **given)
+        except ValueError as e:
+            raise UsageError(str(e)) from None
     if arguments.ratio_search:
         found = search.ratio_search(source, asked, recipe, arguments.recipe != "paper", **options)
         tried, recipe, size = found.tried, found.recipe, found.size
         for t in tried:
             print(
-                f"  tried {t['columns']} x {t['rows']} x {t['dims']} of {t['bits']} bits → {t['cascaded']}: "
+                f"  tried {t['columns']} x {t['rows']} x {t['dims']} of {t['structure']} → {t['cascaded']}: "
                 f"{t['psnr_db']:.2f} dB at texels, {t['psnr_between_db']:.2f} between"
             )
         if found.interrupted:
@@ -179,6 +191,11 @@ def _train(arguments, source: Source, recipe: training.Recipe, types):
         return _train_for_quality(arguments, source, recipe, types, options)
     elif arguments.cascaded:
         size = search.sized(source, asked, recipe, arguments.cascaded)
+        if size.nbytes > MAX_BYTES:
+            raise UsageError(
+                f"--cascaded: found {arguments.cascaded}, which makes {size.nbytes:,} bytes of {size.dims} dimensions, "
+                f"allowed are {MAX_BYTES:,}"
+            )
     else:
         size = search.default_size(source, asked, recipe)
     recipe = _timed(arguments, source, size, recipe, types)

@@ -31,6 +31,27 @@ def add(commands) -> None:
         sub = task(tasks, name, f"measure time against accuracy of {about}")
         _add_common(sub)
         variant_option(sub)
+    sub = task(tasks, "image", "measure bytes, training and time against quality of a compressed image or material")
+    sub.add_argument("source", metavar="IMAGE|MATERIAL.json")
+    sub.add_argument("--compression", action="append", default=[], metavar="N", help="12x (default); may be repeated")
+    for option, about, kind in (
+        ("--seconds", "of each training by our recipe (default: 60; --quick: 2)", positive),
+        ("--paper-seconds", "of each by the paper's recipe (default: the longest of --seconds)", positive),
+        ("--dims", "dimensions of the cascaded array, 2, 3 or 4 (default: all)", positive),
+    ):
+        choices = (2, 3, 4) if option == "--dims" else None
+        sub.add_argument(
+            option,
+            action="append",
+            default=[],
+            type=kind,
+            choices=choices,
+            metavar="N",
+            help=f"{about}; may be repeated",
+        )
+    sub.add_argument("--ablation", action="store_true", help="also switch off each improvement of our recipe")
+    _add_common(sub)
+    variant_option(sub)
     sub = task(tasks, "scene", "measure time against accuracy of a scene, learned and exact, at several sample counts")
     sub.add_argument("scene", metavar="SCENE.xml")
     _add_common(sub)
@@ -47,11 +68,15 @@ def _add_common(sub: argparse.ArgumentParser) -> None:
 def run(arguments) -> dict:
     """
     Measure and write table and plot. Returns the result with its ``files``; after Ctrl-C, what there is up to then.
-    Raises :class:`UsageError`, :class:`~mi_diffind.files.OutputError`, and
-    :class:`~mi_diffind.scenes.SceneError`.
+    Raises :class:`UsageError`, :class:`~mi_diffind.files.OutputError`,
+    :class:`~mi_diffind.tasks.image.source.SourceError` and :class:`~mi_diffind.scenes.SceneError`.
     """
     if arguments.task == "scene":
         require_scene(arguments.scene)
+    if arguments.task == "image":
+        from ..tasks.image.source import load_source
+
+        source = load_source(arguments.source)
     writable_folder(arguments.out, create=True)
     set_variant(arguments.variant)
     import mitsuba as mi
@@ -61,7 +86,27 @@ def run(arguments) -> dict:
     if not plugins.supported(mi.variant()):
         usable = ", ".join(v for v in mi.variants() if plugins.supported(v))
         raise UsageError(f'the plugins do not run in the variant "{mi.variant()}"; use one of {usable}')
+    if arguments.task == "image":
+        return _image(arguments, source)
     return _scene(arguments) if arguments.task == "scene" else _study(arguments)
+
+
+def _image(arguments, source) -> dict:
+    from .. import report
+    from ..tradeoffs import image
+
+    try:
+        settings = image.request(
+            arguments.compression, arguments.seconds, arguments.paper_seconds, arguments.dims, arguments.ablation,
+            arguments.quick,
+        )  # fmt: skip
+    except ValueError as e:
+        raise UsageError(str(e)) from None
+    result = image.measure(source, arguments.source, settings, arguments.out)
+    paths = image.write(result, arguments.out)
+    print("\n".join(image.summary(result)))
+    print("\nwritten     " + ", ".join(paths.values()))
+    return {**report.finite(result), "files": paths}
 
 
 def _study(arguments) -> dict:

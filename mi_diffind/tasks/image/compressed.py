@@ -1,5 +1,5 @@
 """
-An image or a material as a table file holds it: a layout of its maps, and the two arrays that hold its channels.
+An image or a material as a table file holds it: a layout of its maps, and the arrays that hold its channels.
 """
 
 from __future__ import annotations
@@ -14,10 +14,14 @@ import numpy as np
 
 from ...indirection import DifferentiableArray, Indirection
 from ...tables import Table, TableError, load_table
+from .arrays import joined
 from .layout import Layout
 from .source import Source
 
 TASK = "image"
+
+#: Names of the primary arrays: the second is of lower resolution, and not always there.
+PRIMARIES = ("primary", "coarse")
 
 #: Texels that are decoded at a time.
 CHUNK = 2**20
@@ -45,7 +49,7 @@ class CompressedImage:
                 raise ValueError("its arrays are missing")
             return CompressedImage(layout, None)
         found = {}
-        for name in ("primary", "cascaded"):
+        for name in table.arrays:
             border = table.borders[name]
             if storage == "float32" or table.storage != "uint8":
                 found[name] = DifferentiableArray.from_numpy(table.values(name), dtype, border, "float32", fold=True)
@@ -54,7 +58,7 @@ class CompressedImage:
                 found[name] = DifferentiableArray.from_numpy(
                     table.arrays[name], dtype, border, "uint8", False, quantization, table.bits.get(name, 8)
                 )
-        return CompressedImage(layout, Indirection(found["primary"], found["cascaded"]))
+        return CompressedImage(layout, joined([found[name] for name in PRIMARIES if name in found], found["cascaded"]))
 
     # -- reading ----------------------------------------------------------------------------------------------------
 
@@ -170,7 +174,8 @@ def to_table(image: CompressedImage, settings: dict, seed: int) -> Table:
     table = Table(TASK, {}, "uint8", settings={**settings, "layout": image.layout.to_json()}, seed=seed)
     if image.net is None:
         return table
-    for name, array in (("primary", image.net.primary[0]), ("cascaded", image.net.cascaded)):
+    named = [*zip(PRIMARIES, image.net.primary, strict=False), ("cascaded", image.net.cascaded)]
+    for name, array in named:
         table.arrays[name] = array.codes()
         table.borders[name] = array.border
         table.quantization[name] = (array.scale, array.offset)
@@ -184,21 +189,25 @@ def load_image_table(path: str | os.PathLike) -> tuple[Table, Layout]:
     table = load_table(path, TASK)
     try:
         layout = Layout.from_json(table.settings["layout"])
-    except (KeyError, TypeError, ValueError) as e:
+    except (KeyError, TypeError, ValueError, OverflowError) as e:
         raise TableError(f"{path}: its settings describe no image ({e})") from None
-    expected = {"primary", "cascaded"} if layout.stored else set()
-    if set(table.arrays) != expected:
-        raise TableError(f"{path}: holds the arrays {sorted(table.arrays)}, expected {sorted(expected)}")
+    found = set(table.arrays)
+    expected = [{"primary", "cascaded"}, {*PRIMARIES, "cascaded"}] if layout.stored else [set()]
+    if found not in expected:
+        names = " or ".join(", ".join(sorted(e)) or "none" for e in expected)
+        raise TableError(f"{path}: holds the arrays {', '.join(sorted(found)) or 'none'}, expected {names}")
     if not layout.stored:
         return table, layout
-    primary, cascaded = (table.arrays[name].shape for name in ("primary", "cascaded"))
-    if len(primary) != 3 or len(cascaded) != primary[-1] + 1 or cascaded[-1] != layout.stored:
+    shapes = {name: array.shape for name, array in table.arrays.items()}
+    cascaded = shapes.pop("cascaded")
+    pointers = sum(shape[-1] for shape in shapes.values())
+    if any(len(s) != 3 for s in shapes.values()) or len(cascaded) != pointers + 1 or cascaded[-1] != layout.stored:
         raise TableError(
-            f"{path}: a primary array of the shape {primary} and a cascaded one of {cascaded} make no image of "
-            f"{layout.stored} stored channel(s)"
+            f"{path}: primary arrays of the shapes {', '.join(map(str, shapes.values()))} and a cascaded one of "
+            f"{cascaded} make no image of {layout.stored} stored channel(s)"
         )
     if table.storage == "uint8":
-        for name in expected:
+        for name in found:
             steps = 2 ** table.bits.get(name, 8) - 1
             if any(o < 0 or s < 0 or o + steps * s > 1 + 1e-6 for s, o in zip(*table.quantization[name], strict=True)):
                 raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')

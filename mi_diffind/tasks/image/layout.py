@@ -20,6 +20,9 @@ from .source import KINDS, Map, Source
 #: dB. A normal map is stored as two channels if the third follows from them at least as precisely.
 NORMAL_FLOOR_DB = 45.0
 
+#: Largest magnitude that is told apart: half of what single precision holds, so that no difference overflows.
+LARGEST = 1.7e38
+
 #: What a channel of a map can be in place of the number of a stored one.
 FROM_NORMAL = "z"
 
@@ -52,7 +55,7 @@ class MapLayout:
         if self.knee > 0:
             s = np.log1p(np.maximum(values, 0) / self.knee) / math.log1p(self.high / self.knee)
         else:
-            s = (values - self.low) / (self.high - self.low)
+            s = (np.clip(values, self.low, self.high) - self.low) / (self.high - self.low)
         return np.clip(s, 0, 1)
 
     def decode(self, s, exp2=np.exp2):
@@ -175,9 +178,14 @@ class Layout:
 
     @staticmethod
     def from_json(found: dict) -> Layout:
-        """The inverse of :meth:`to_json`. Raises ``KeyError``, ``TypeError`` or ``ValueError`` for anything else."""
+        """
+        The inverse of :meth:`to_json`. Raises ``KeyError``, ``TypeError``, ``ValueError`` or ``OverflowError`` for
+        anything else.
+        """
         maps = []
         for entry in found["maps"]:
+            if not isinstance(entry["name"], str) or not entry["name"].isidentifier():
+                raise ValueError(f"a map is called {entry['name']!r:.40}")
             where = tuple(_where(w, len(found["groups"])) for w in entry["where"])
             kind, color_space = str(entry["kind"]), str(entry["color_space"])
             low, high, knee = (float(entry[k]) for k in ("low", "high", "knee"))
@@ -186,7 +194,8 @@ class Layout:
                 raise ValueError(f'the map "{entry["name"]}" is of no kind that is known')
             if FROM_NORMAL in where and (where.index(FROM_NORMAL) != 2 or where.count(FROM_NORMAL) != 1):
                 raise ValueError(f'the map "{entry["name"]}" has its third component in another place')
-            if not (all(map(math.isfinite, (low, high, knee))) and low < high and knee >= 0):
+            finite = max(-low, high, knee) <= LARGEST
+            if not (finite and low < high and knee >= 0) or (knee > 0 and not 0 < high <= 1e6 * knee):
                 raise ValueError(f'the map "{entry["name"]}" has no range of values')
             maps.append(MapLayout(str(entry["name"]), kind, color_space, depth, where, low, high, knee))
         width, height = int(found["width"]), int(found["height"])
@@ -211,10 +220,11 @@ def _where(w, stored: int):
 def _range(m: Map) -> MapLayout:
     """A layout without channels that says what range of values a map has."""
     low, high, knee = 0.0, 1.0, 0.0
-    smallest, largest = float(m.values.min()), float(m.values.max())
+    smallest, largest = (min(max(float(v), -LARGEST), LARGEST) for v in (m.values.min(), m.values.max()))
     if smallest >= 0 and largest > 1:
         # Logarithmic above the knee, linear below: relative precision for what is bright, and none wasted on the dark
-        knee, high = max(float(np.median(m.values)), 1e-3 * largest), largest
+        middle = float(np.median(np.minimum(m.values, largest)))
+        knee, high = max(middle, 1e-3 * largest), largest
     elif smallest < 0:
         low, high = smallest, max(largest, smallest + 1e-6 * max(1.0, abs(smallest)))
     return MapLayout(m.name, m.kind, m.color_space, m.depth, (), low, high, knee)

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 from ... import sizing
 from ...fitting import FitResult
-from ...sizing import Size
+from ...sizing import Coarse, Size
 from ...tables import Table
 from .source import Source
-from .training import Recipe, fit_image, layout_of, replaced
+from .training import STRUCTURES, Recipe, fit_image, layout_of, replaced, structure_of
 
 #: A candidate of a search is trained for this share of the steps.
 SHORT = 1 / 8
@@ -23,8 +23,8 @@ SHORT = 1 / 8
 #: Sides of the cascaded array to try, by its dimensions.
 SIDES = {1: (64, 256), 2: (16, 32, 64), 3: (8, 16, 32), 4: (4, 8, 12, 16)}
 
-#: Bits of an entry of the primary array to try.
-BITS = (3, 4, 5, 6, 8)
+#: Structures of the primary to try.
+TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits")
 
 #: A search by quality ends when the file is at most this much larger than one that is known to be too small.
 NEAR = 1.06
@@ -49,20 +49,17 @@ def default_size(source: Source, nbytes: float, recipe: Recipe) -> Size:
     The size of a recipe for so many bytes: the supplement's search, or with ``components`` a cascaded array of
     :func:`.sizing.cascaded_side` and whatever primary fits beside it.
     """
-    layout = layout_of(source, recipe)
-    if recipe.components:
-        side = sizing.cascaded_side(nbytes, max(1, layout.stored), recipe.dims)
-        return sized(source, nbytes, recipe, side)
+    stored, (bits, coarse) = max(1, layout_of(source, recipe).stored), STRUCTURES[structure_of(source, recipe)]
+    if recipe.components or coarse:
+        return sized(source, nbytes, recipe, sizing.cascaded_side(nbytes, stored, recipe.dims))
     compression = source.nbytes / nbytes
-    return sizing.search(
-        source.nbytes, compression, max(1, layout.stored), source.height, source.width, recipe.dims, recipe.bits
-    )
+    return sizing.search(source.nbytes, compression, stored, source.height, source.width, recipe.dims, bits)
 
 
 def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
     """The size for so many bytes, with a cascaded array of a given side."""
-    stored = max(1, layout_of(source, recipe).stored)
-    return sizing.fit_bytes(nbytes, stored, source.height, source.width, cascaded, recipe.dims, recipe.bits)
+    stored, (bits, coarse) = max(1, layout_of(source, recipe).stored), STRUCTURES[structure_of(source, recipe)]
+    return sizing.fit_bytes(nbytes, stored, source.height, source.width, cascaded, recipe.dims, bits, coarse)
 
 
 def _steps(recipe: Recipe, share: float) -> Recipe:
@@ -73,20 +70,21 @@ def _steps(recipe: Recipe, share: float) -> Recipe:
 def ratio_search(source: Source, nbytes: float, recipe: Recipe, free: bool = True, **options) -> Found:
     """
     The best of several sizes of ``nbytes``, each trained for :data:`SHORT` of the steps: the side of the cascaded
-    array, and so the ratio ρ; with ``free`` then bits of an entry, dimensions (with sides of their own). One is varied
-    after the other, the best kept. ``options`` are those of :func:`.fit_image`.
+    array, and so the ratio ρ; with ``free`` then the structure of the primary and dimensions (with sides of their
+    own). One is varied after the other, the best kept. ``options`` are those of :func:`.fit_image`.
     """
     tried, tables = [], []
 
     def attempt(recipe: Recipe, side: int) -> bool:
         """Train a candidate; was that interrupted?"""
         size = sized(source, nbytes, recipe, side)
-        known = [t for t in tried if (t["dims"], t["bits"], t["cascaded"]) == (recipe.dims, recipe.bits, side)]
+        structure = structure_of(source, recipe)
+        known = [t for t in tried if (t["dims"], t["structure"], t["cascaded"]) == (recipe.dims, structure, side)]
         if known or size.nbytes > nbytes * (1 + sizing.TOLERANCE):
             return False
-        table, result = fit_image(source, size, _steps(recipe, SHORT), title=_title(size), **options)
+        table, result = fit_image(source, size, _steps(recipe, SHORT), title=_title(size, structure), **options)
         tried.append({
-            "dims": size.dims, "bits": size.bits, "cascaded": side, "rows": size.rows, "columns": size.columns,
+            "dims": size.dims, "structure": structure, "cascaded": side, "rows": size.rows, "columns": size.columns,
             "ratio": size.ratio, "bytes": size.nbytes, "psnr_db": table.quality["psnr_db"],
             "psnr_between_db": table.quality["psnr_between_db"],
         })  # fmt: skip
@@ -94,18 +92,18 @@ def ratio_search(source: Source, nbytes: float, recipe: Recipe, free: bool = Tru
             tables[:] = [(table, result)]
         return result.interrupted
 
-    def best() -> dict:
-        return max(tried, key=_merit)
+    def best() -> dict | None:
+        return max(tried, key=_merit, default=None)
 
     start, interrupted = default_size(source, nbytes, recipe), False
-    for stage in _stages(recipe, start.cascaded, free, best):
+    for stage in _stages(recipe, structure_of(source, recipe), start.cascaded, free, best):
         interrupted = any(attempt(candidate, side) for candidate, side in stage)
         if interrupted:
             break
     if not tried:
         return Found(start, recipe, tried)
     chosen = best()
-    recipe = dataclasses.replace(recipe, bits=chosen["bits"], dims=chosen["dims"])
+    recipe = dataclasses.replace(recipe, structure=chosen["structure"], dims=chosen["dims"])
     return Found(sized(source, nbytes, recipe, chosen["cascaded"]), recipe, tried, tables[0], interrupted)
 
 
@@ -114,27 +112,27 @@ def _merit(tried: dict) -> float:
     return 0.5 * (tried["psnr_db"] + tried["psnr_between_db"])
 
 
-def _title(size: Size) -> str:
-    return f"try {size.columns}×{size.rows}×{size.dims} of {size.bits} bits → {size.cascaded}"
+def _title(size: Size, structure: str) -> str:
+    return f"try {size.columns}×{size.rows}×{size.dims} of {structure} → {size.cascaded}"
 
 
-def _stages(recipe: Recipe, side: int, free: bool, best: Callable) -> Iterator[list]:
+def _stages(recipe: Recipe, structure: str, side: int, free: bool, best: Callable) -> Iterator[list]:
     """Lists of (recipe, side) to try, each made when the results of those before are there."""
     yield [(recipe, s) for s in sorted(SIDES[recipe.dims], key=lambda s: abs(math.log(s / side)))]
-    if not free:
+    if not free or best() is None:  # not even the smallest cascaded array fits
         return
     found = best()
-    yield [(dataclasses.replace(recipe, bits=b), found["cascaded"]) for b in BITS if abs(b - found["bits"]) == 1]
+    several = recipe.dims > Coarse().dims
+    tried = [s for s, (_, coarse) in STRUCTURES.items() if s in TRIED and s != structure and (several or not coarse)]
+    yield [(dataclasses.replace(recipe, structure=s), found["cascaded"]) for s in tried]
     found = best()
-    if found["bits"] != recipe.bits:
-        step = 1 if found["bits"] > recipe.bits else -1
-        yield [(dataclasses.replace(recipe, bits=b), found["cascaded"]) for b in BITS if b == found["bits"] + step]
-    found = best()
-    other = [d for d in (2, 3, 4) if d != recipe.dims]
-    yield [(dataclasses.replace(recipe, bits=found["bits"], dims=d), SIDES[d][1]) for d in other]
-    found = best()
-    if found["dims"] != recipe.dims:
-        recipe = dataclasses.replace(recipe, bits=found["bits"], dims=found["dims"])
+    recipe = dataclasses.replace(recipe, structure=found["structure"])
+    yield [(recipe, s) for s in SIDES[recipe.dims] if abs(math.log2(s / found["cascaded"])) <= 1]
+    if STRUCTURES[found["structure"]][1] is None:
+        other = [d for d in (2, 3, 4) if d != recipe.dims]
+        yield [(dataclasses.replace(recipe, dims=d), SIDES[d][1]) for d in other]
+        found = best()
+        recipe = dataclasses.replace(recipe, dims=found["dims"])
         yield [(recipe, s) for s in SIDES[found["dims"]]]
 
 
@@ -145,13 +143,15 @@ def psnr_search(
     The smallest file whose ``psnr_db`` is at least ``goal``: trainings of full length, sizes by the secant of quality
     over the logarithm of bytes, until one that is large enough is within :data:`NEAR` of one that is not, or ``most``
     were tried. Returns the table (``None``: not even the largest primary reaches it), the record of its training and
-    what was tried. ``log`` is told of each.
+    what was tried. ``log`` is told of each. After Ctrl-C, the record says ``interrupted``; ``KeyboardInterrupt`` is
+    raised if nothing reached ``goal`` before.
     """
     tried, kept = [], None
-    nbytes = source.nbytes / 12
+    nbytes = middle = source.nbytes / 12
     while len(tried) < most:
-        size = default_size(source, nbytes, recipe)
-        if any(t["bytes"] == size.nbytes for t in tried):
+        sizes = [default_size(source, n, recipe) for n in (nbytes, middle)]
+        size = next((s for s in sizes if all(t["bytes"] != s.nbytes for t in tried)), None)
+        if size is None:
             break
         table, result = fit_image(source, size, recipe, title=f"try {size.nbytes:,} bytes", **options)
         psnr = table.quality["psnr_db"]
@@ -159,7 +159,10 @@ def psnr_search(
         log(f"{size.nbytes:,} bytes: {psnr:.2f} dB")
         if psnr >= goal and (kept is None or table.nbytes < kept[0].nbytes):
             kept = table, result
+        if result.interrupted and kept is None:
+            raise KeyboardInterrupt
         if result.interrupted:
+            kept[1].interrupted = True
             break
         enough = min((t["bytes"] for t in tried if t["psnr_db"] >= goal), default=None)
         short = max((t["bytes"] for t in tried if t["psnr_db"] < goal), default=None)
@@ -167,7 +170,11 @@ def psnr_search(
             break
         if short and size.full and not enough:
             break
-        nbytes = _next(tried, goal, enough, short)
+        nbytes = middle = _next(tried, goal, enough, short)
+        if (
+            enough and short
+        ):  # where sizes come in steps, the one before may be all that fits into the bytes of the secant
+            middle = math.sqrt(enough * short)
     return (*(kept or (None, None)), tried)
 
 

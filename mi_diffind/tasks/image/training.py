@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,12 +23,23 @@ from ... import lookup
 from ...fitting import FitResult, FitSettings, fit
 from ...indirection import DifferentiableArray, Indirection, fold
 from ...runtime import array_module
-from ...sizing import Size
+from ...sizing import Coarse, Size
 from ...tables import Table
 from . import arrays
 from .compressed import CompressedImage, to_table
 from .layout import Layout
 from .source import Source
+
+#: How the primary is stored: bits of an entry, and a second primary or none. The fewer bits, the more entries fit.
+STRUCTURES: dict[str, tuple[int, Coarse | None]] = {
+    **{f"{bits} bits": (bits, None) for bits in (8, 7, 6, 5, 4, 3)},
+    "4 + 8 bits": (4, Coarse(2, 8, 0.5)),
+    "3 + 6 bits": (3, Coarse(2, 6, 0.4)),
+    "2 + 6 bits": (2, Coarse(2, 6, 0.35)),
+}
+
+#: dB of :func:`.arrays.detail` from which on an image is smooth enough for one primary.
+SMOOTH_DB = 28.0
 
 
 @dataclass(frozen=True)
@@ -38,16 +50,16 @@ class Recipe:
     ``once``: equal and constant channels are stored once (:meth:`.Layout.of`). ``normals``: leave out the third
     component of normals where it follows from the others. ``components``: start from principal components, not from
     the ramp. ``jitter``: share of the steps whose samples are jittered. ``rounded``: share of the steps, the last ones,
-    that see entries as they will be stored. ``bits`` of an entry of the primary array. ``dims``: channels of the
-    primary array. ``settings``: the rest.
+    that see entries as they will be stored. ``structure``: one of :data:`STRUCTURES`, or ``"auto"``. ``dims``: channels
+    of the primary arrays. ``settings``: the rest.
     """
 
     once: bool = True
     normals: bool = True
     components: bool = True
     jitter: float = 0.5
-    rounded: float = 0.3
-    bits: int = 6
+    rounded: float = 1.0
+    structure: str = "auto"
     dims: int = 4
     settings: FitSettings = dataclasses.field(default_factory=FitSettings)
 
@@ -55,12 +67,12 @@ class Recipe:
 #: Steps of 262,144 samples of a training that is not told how long it may take.
 STEPS = 1500
 
-_OURS = FitSettings(steps=STEPS, batch=2**18, lr=1e-2, schedule="cosine", loss="mse", quality_every=STEPS // 10)
+_OURS = FitSettings(steps=STEPS, batch=2**18, lr=3e-2, schedule="cosine", loss="mse", quality_every=STEPS // 10)
 _PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
 
 RECIPES = {
     "ours": Recipe(settings=_OURS),
-    "paper": Recipe(False, False, False, 1.0, 0.0, 8, 4, _PAPER),
+    "paper": Recipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
 }
 
 #: What of ours can be switched off: to what the supplement does.
@@ -69,10 +81,10 @@ IMPROVEMENTS = {
     "normals": "normals as two channels where the third follows",
     "components": "arrays start from principal components",
     "jitter": "half of the samples at texel centres",
-    "rounded": "the last steps see rounded entries",
-    "bits": "fewer bits an entry of the primary array, more entries",
+    "rounded": "training sees rounded entries",
+    "structure": "fewer bits an entry of the primary array, a second one for noisy images",
     "loss": "squared errors",
-    "rate": "rate of 0.01 that falls to zero",
+    "rate": "a higher rate that falls to zero",
     "batch": "steps of 262,144 samples",
 }
 
@@ -100,6 +112,14 @@ def replaced(recipe: Recipe, **settings) -> Recipe:
     return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **settings))
 
 
+def structure_of(source: Source, recipe: Recipe) -> str:
+    """The structure of a recipe; for ``"auto"`` what suits the image."""
+    if recipe.structure != "auto":
+        return recipe.structure
+    smooth = recipe.dims < 3 or arrays.detail(layout_of(source, recipe).encode(source)) >= SMOOTH_DB
+    return "6 bits" if smooth else "2 + 6 bits"
+
+
 def layout_of(source: Source, recipe: Recipe) -> Layout:
     """What of ``source`` is stored by a recipe."""
     return Layout.of(source, recipe.once, None if recipe.normals else False)
@@ -107,12 +127,14 @@ def layout_of(source: Source, recipe: Recipe) -> Layout:
 
 class ImageProblem:
     """
-    The training problem of :mod:`mi_diffind.fitting`. ``net`` maps (v, u) to the stored channels; ``values`` are those,
-    ``(height, width, stored)``; ``border`` is that of the image along v and u.
+    The training problem of :mod:`mi_diffind.fitting`. ``net`` maps (v, u) to the stored channels, ``bits`` are
+    those of the entries of each primary, ``values`` the stored channels, ``(height, width, stored)``; ``border`` is
+    that of the image along v and u.
     """
 
-    def __init__(self, net, layout: Layout, values: np.ndarray, border, recipe: Recipe, types, digest: str = ""):
-        self.net, self.layout, self.types, self.recipe, self.border = net, layout, types, recipe, border
+    def __init__(self, net, bits, layout: Layout, values: np.ndarray, border, recipe: Recipe, types, digest: str = ""):
+        self.net, self.bits, self.layout, self.types = net, tuple(bits), layout, types
+        self.recipe, self.border = recipe, border
         self.height, self.width, self.channels = values.shape
         self.texels = self.height * self.width
         stored = lookup.padded_channels(self.channels)
@@ -126,11 +148,12 @@ class ImageProblem:
         self.about = {"source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}}
         self.rounded = self.jittered = False
 
-    def begin(self, step: int, steps: int) -> None:
-        """Called before each step: does it see rounded entries, are its samples jittered?"""
+    def begin(self, step: int, steps: int) -> str:
+        """Called before each step: does it see rounded entries, are its samples jittered? Says so."""
         self.rounded = step >= (1 - self.recipe.rounded) * steps
         share = self.recipe.jitter
         self.jittered = int((step + 1) * share) > int(step * share)
+        return f"rounded: {self.rounded}, jittered: {self.jittered}"
 
     def _texel(self, rng, size: int):
         """Index of a texel for each sample: one of each of ``size`` equal stretches of the image."""
@@ -186,7 +209,7 @@ class ImageProblem:
         return total
 
     def predict(self, net, inputs) -> dict[str, list]:
-        found = rounded_read(net, inputs, self.recipe.bits) if self.rounded else net(inputs)
+        found = rounded_read(net, inputs, self.bits) if self.rounded else net(inputs)
         return {name: [found[i] for i in channels] for name, channels in self.groups.items()}
 
     def quality(self, net) -> dict[str, float]:
@@ -196,23 +219,27 @@ class ImageProblem:
         with dr.suspend_grad():
             index = self._texel(rng, size)
             x, y = self.types.Float(index % self.width) + 0.5, self.types.Float(index // self.width) + 0.5
-            found = rounded_read(net, [y / self.height, x / self.width], self.recipe.bits)
+            found = rounded_read(net, [y / self.height, x / self.width], self.bits)
             errors = [dr.mean(dr.square(a - b)) for a, b in zip(found, self._texels(index), strict=True)]
             total = sum(float(e[0]) for e in errors) / self.channels
         return {"psnr_db": -10 * math.log10(max(total, 1e-12))}
 
 
-def rounded_read(net: Indirection, x, bits: int) -> list:
+def rounded_read(net: Indirection, x, bits: Sequence[int]) -> list:
     """
     ``net(x)`` as if its entries were rounded as they will be stored, with the gradients of the entries as they are
-    (straight-through estimation).
+    (straight-through estimation). ``bits`` are those of each primary.
     """
-    (primary,), cascaded = net.primary, net.cascaded
-    for array, steps in ((primary, 2**bits - 1), (cascaded, 255)):
-        entries = fold(array.data.array)
-        entries += dr.detach(dr.round(dr.detach(entries) * steps) / steps - dr.detach(entries))
-        x = lookup.read_float(entries, array.resolution, array.channels, x, array.border, stored=array.data.shape[-1])
-    return x
+    pointer = []
+    for array, width in zip(net.primary, bits, strict=True):
+        pointer += _rounded(array, x, width)
+    return _rounded(net.cascaded, pointer, 8)
+
+
+def _rounded(array: DifferentiableArray, x, bits: int) -> list:
+    steps, entries = 2**bits - 1, fold(array.data.array)
+    entries += dr.detach(dr.round(dr.detach(entries) * steps) / steps - dr.detach(entries))
+    return lookup.read_float(entries, array.resolution, array.channels, x, array.border, stored=array.data.shape[-1])
 
 
 def problem_of(
@@ -223,7 +250,8 @@ def problem_of(
     values = layout.encode(source)
     border = border or arrays.borders(values)
     net = arrays.from_components(values, size, border) if recipe.components else arrays.from_ramp(layout, size, border)
-    return ImageProblem(net.alloc(types.TensorXf), layout, values, border, recipe, types, source.digest)
+    bits = [bits for *_, bits in size.primaries]
+    return ImageProblem(net.alloc(types.TensorXf), bits, layout, values, border, recipe, types, source.digest)
 
 
 def fit_image(
@@ -250,7 +278,7 @@ def fit_image(
     problem = problem_of(source, size, recipe, types, layout, border)
     result = fit(problem, recipe.settings, checkpoint, resume, progress, title=title)
     about = {**dataclasses.asdict(recipe.settings), **problem.about, "ratio": size.ratio}
-    table = to_table(CompressedImage(layout, stored_form(problem.net, recipe.bits)), about, recipe.settings.seed)
+    table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), about, recipe.settings.seed)
     return _with_quality(table, source, types), result
 
 
@@ -260,15 +288,15 @@ def _with_quality(table: Table, source: Source, types) -> Table:
     return table
 
 
-def stored_form(net: Indirection, bits: int) -> Indirection:
-    """The arrays as they are stored: the primary's entries rounded to ``bits``, the cascaded array's to 8."""
+def stored_form(net: Indirection, bits: Sequence[int]) -> Indirection:
+    """The arrays as they are stored: the entries of each primary rounded to its ``bits``, the cascaded array's to 8."""
     found = []
-    for array, width in ((net.primary[0], bits), (net.cascaded, 8)):
+    for array, width in zip((*net.primary, net.cascaded), (*bits, 8), strict=True):
         steps, dtype = 2**width - 1, type(array.data)
         codes = np.rint(array.numpy().astype(np.float64) * steps).astype(np.uint8)
         affine = ((1 / steps,) * array.channels, (0.0,) * array.channels)
         found.append(DifferentiableArray.from_numpy(codes, dtype, array.border, "uint8", False, affine, width))
-    return Indirection(*found)
+    return arrays.joined(found[:-1], found[-1])
 
 
 def steps_in(seconds: float, source: Source, size: Size, recipe: Recipe, types) -> int:

@@ -1,0 +1,162 @@
+"""Files of compressed images as textures share them, and the originals that they were made from."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind.tables import TableError
+from mi_diffind.tasks.image.compressed import PRIMARIES, CompressedImage, load_image_table
+from mi_diffind.tasks.image.layout import Layout, MapLayout
+from mi_diffind.tasks.image.source import SourceError, load_source
+
+from .knowledge import has_gradient
+
+STORAGES = ("uint8", "float32")
+
+#: Kinds of maps that hold data, not colours.
+DATA_KINDS = ("normal", "roughness", "ao", "metallic")
+
+_cache: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
+_lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
+
+
+class SharedImage:
+    """A file's arrays, the same Dr.Jit variables for all textures that read them, and what else these share."""
+
+    def __init__(self, image: CompressedImage):
+        self.image = image
+        self._loaded = self.state()
+        self._transforms = {}
+
+    @property
+    def tables(self) -> dict:
+        """The arrays that can be optimised, by name."""
+        net = self.image.net
+        named = [] if net is None else [*zip(PRIMARIES, net.primary, strict=False), ("cascaded", net.cascaded)]
+        return {name: array for name, array in named if array.storage == "float32"}
+
+    def state(self) -> list:
+        """What the arrays hold at present; keeps it alive, so that nothing else gets its index."""
+        return [dr.detach(array.data.array) for array in self.tables.values()]
+
+    def unchanged(self, state: list) -> bool:
+        """Do the arrays hold what they held then?"""
+        return [a.index for a in state] == [a.index for a in self.state()]
+
+    def as_loaded(self) -> bool:
+        """Do the arrays hold what the file holds, and is nobody about to change that?"""
+        return self.unchanged(self._loaded) and not any(has_gradient(a.data) for a in self.tables.values())
+
+    def transform(self, matrix: list):
+        """
+        The transformation by a 3×3 ``matrix``: one and the same variable for equal ones, so that the reads of several
+        textures are recognised as one.
+        """
+        key = (mi.variant(), tuple(map(tuple, matrix)))
+        with _lock:
+            if key not in self._transforms:
+                found = mi.AffineTransform3f(mi.ScalarAffineTransform3f(matrix))
+                dr.make_opaque(found)
+                self._transforms[key] = found
+            return self._transforms[key]
+
+
+def open_image(path: str | Path, storage: str) -> SharedImage:
+    """
+    The arrays in a file, shared with everybody who has them open, unless they have been changed since. Raises
+    ``TableError``.
+    """
+    path = Path(path)
+    with _lock:
+        try:
+            stat = path.stat()
+            key = (str(path.resolve()), stat.st_mtime_ns, stat.st_size, storage, mi.TensorXf)
+        except OSError:
+            key = None
+        found = _cache.get(key)
+        if found is None or not found.as_loaded():
+            table, _ = load_image_table(path)  # raises for what is no file, too
+            found = SharedImage(CompressedImage.from_table(table, mi.TensorXf, storage))
+            if key is not None:
+                _cache[key] = found
+        return found
+
+
+def map_of(layout: Layout, channels: str) -> MapLayout:
+    """The map called ``channels``; if that is empty, the only one, or the only one that holds colours."""
+    if channels and channels not in layout.names:
+        raise RuntimeError(f'parameter "channels": found "{channels}", the file holds {", ".join(layout.names)}')
+    if channels:
+        found = layout[channels]
+    else:
+        candidates = layout.maps if len(layout.maps) == 1 else [m for m in layout.maps if m.kind == "albedo"]
+        if len(candidates) != 1:
+            names = ", ".join(layout.names)
+            raise RuntimeError(f'parameter "channels": not given, and the file holds several maps: {names}')
+        found = candidates[0]
+    if found.channels not in (1, 3):
+        raise RuntimeError(
+            f'parameter "channels": the map "{found.name}" has {found.channels} channels, a texture has 1 or 3'
+        )
+    return found
+
+
+def is_data(layout: MapLayout) -> bool:
+    """Does a map hold data that are never converted, so that ``raw`` is its default?"""
+    return layout.kind in DATA_KINDS and layout.color_space == "linear"
+
+
+# -- the exact counterpart ---------------------------------------------------------------------------------------------
+
+
+def to_bitmap(props) -> None:
+    """Give the properties of a ``neural_image`` what a ``bitmap`` needs to show the original of its map."""
+    path = Path(str(mi.file_resolver().resolve(str(props.get("filename", "")))))
+    try:
+        table, layout = load_image_table(path)
+        found = map_of(layout, str(props.get("channels", "")))
+        original = _original(props, path, table.settings)
+        values = _values(original, found)
+    except (TableError, SourceError) as e:
+        raise RuntimeError(str(e)) from None
+    # A byte is what it was; of half precision, which "bitmap" would make of 16 bits, the texture knows nothing
+    bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if found.depth == 1 else np.ascontiguousarray(values))
+    bitmap.set_srgb_gamma(found.color_space == "srgb")
+    props["bitmap"] = bitmap
+    props["raw"] = bool(props.get("raw", is_data(found)))
+
+
+def _original(props, path: Path, settings: dict) -> Path:
+    given, recorded = str(props.get("source", "")), str(settings.get("source_path", ""))
+    if given:
+        found = Path(str(mi.file_resolver().resolve(given)))
+    elif recorded:
+        found = path.parent / recorded
+    else:
+        raise RuntimeError(f'{path}: does not say what it was made from, which is what the parameter "source" is for')
+    if not found.is_file():
+        advice = "" if given else '; the parameter "source" may say where it is now'
+        raise RuntimeError(f"{found}: no such file, {path.name} was made from it{advice}")
+    return found
+
+
+def _values(original: Path, layout: MapLayout) -> np.ndarray:
+    """The map as it is in its source, ``(height, width, channels)``."""
+    maps = load_source(original, nonfinite="clean").maps
+    named = [m for m in maps if m.name == layout.name]
+    if original.suffix.lower() == ".json" and not named:
+        raise RuntimeError(f'{original}: holds no map "{layout.name}", only {", ".join(m.name for m in maps)}')
+    values = (named or maps)[0].values
+    if layout.channels == 1 and values.shape[2] == 3 and (values == values[..., :1]).all():
+        values = values[..., :1]
+    if values.shape[2] != layout.channels:
+        raise RuntimeError(
+            f'{original}: has {values.shape[2]} channel(s), the map "{layout.name}" has {layout.channels}'
+        )
+    return values

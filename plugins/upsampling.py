@@ -1,0 +1,102 @@
+"""
+Spectra from colours at render time: Jakob and Hanika, *A Low-Dimensional Function Space for Efficient Spectral
+Upsampling*, Computer Graphics Forum 38(2), 2019, from the coefficients that come with Mitsuba.
+
+Mitsuba's textures are converted when they are loaded. This is the same read of the same table, 3 × 64³ × 3 numbers, of
+colours that are known only when they are needed, differentiable with respect to them.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind.indirection import DifferentiableArray
+from mi_diffind.lookup import clamp
+
+_models: dict = {}
+_lock = threading.RLock()
+
+
+def model():
+    """The table for the variant's backend: side, positions along the brightness, coefficients padded to four."""
+    key = mi.Float
+    with _lock:
+        if key not in _models:
+            _models[key] = _load()
+        return _models[key]
+
+
+def _load():
+    path = mi.file_resolver().resolve("data/srgb.coeff")
+    content = Path(str(path)).read_bytes()
+    side = struct.unpack("<I", content[4:8])[0]
+    count = 3 * side**3
+    if content[:4] != b"SPEC" or len(content) < 8 + 4 * side + 12 * count:
+        raise RuntimeError(f"{path}: is not the table of coefficients that is expected of Mitsuba")
+    positions = np.frombuffer(content, "<f4", side, 8)
+    entries = np.frombuffer(content, "<f4", 3 * count, 8 + 4 * side).reshape(count, 3)
+    table = DifferentiableArray.from_numpy(entries, mi.TensorXf)  # pads and aligns them
+    return side, mi.Float(positions.copy()), mi.Float(table.data.array)
+
+
+def coefficients(rgb):
+    """
+    Coefficients of the model for linear sRGB colours, clamped to [0, 1] as Mitsuba does; meaningless for greys, whose
+    spectra are constant.
+    """
+    side, positions, table = model()
+    r, g, b = (clamp(mi.Float(c), 0.0, 1.0) for c in rgb)
+    # The largest component, the last one of equals, and the two that follow it in turn
+    green, blue = (g >= r), (b >= dr.maximum(r, g))
+    z = dr.select(blue, b, dr.select(green, g, r))
+    x = dr.select(blue, r, dr.select(green, b, g))
+    y = dr.select(blue, g, dr.select(green, r, b))
+    plane = dr.select(blue, 2, dr.select(green, 1, mi.UInt32(0)))
+
+    scale = (side - 1) / dr.maximum(z, 1e-9)
+    z_ = dr.detach(z)
+    k = dr.binary_search(1, side - 1, lambda i: dr.gather(mi.Float, positions, i) <= z_) - 1
+    below, above = (dr.gather(mi.Float, positions, k + i) for i in (0, 1))
+    axes = [(k, (z - below) / (above - below))]
+    for v in (y * scale, x * scale):
+        i = dr.minimum(mi.UInt32(v), side - 2)
+        axes.append((i, v - mi.Float(i)))
+    total = [0, 0, 0]
+    for a in (0, 1):
+        for b_ in (0, 1):
+            for c in (0, 1):
+                index, weight = plane, 1
+                for (i, w), up in zip(axes, (a, b_, c), strict=True):
+                    index = dr.fma(index, side, i + up)
+                    weight = weight * (w if up else 1 - w)
+                found = dr.gather(mi.Vector4f, table, index)
+                total = [dr.fma(weight, found[n], total[n]) for n in range(3)]
+    return total
+
+
+def spectrum(rgb, wavelengths):
+    """The reflectance at ``wavelengths`` (nm), for linear sRGB colours in [0, 1]."""
+    r, g, b = (clamp(mi.Float(c), 0.0, 1.0) for c in rgb)
+    c0, c1, c2 = coefficients(rgb)
+    v = dr.fma(dr.fma(c0, wavelengths, c1), wavelengths, c2)
+    found = dr.fma(0.5 * v, dr.rsqrt(dr.fma(v, v, 1)), 0.5)
+    grey = (r == g) & (g == b)
+    return mi.UnpolarizedSpectrum(dr.select(grey, r, found))
+
+
+def mean(rgb):
+    """Mean of the spectrum over the wavelengths, as Mitsuba has it: of 16 of them."""
+    wavelengths = np.linspace(mi.MI_CIE_MIN, mi.MI_CIE_MAX, 16)
+    c0, c1, c2 = coefficients(rgb)
+    total = 0
+    for wavelength in wavelengths.tolist():
+        v = dr.fma(dr.fma(c0, wavelength, c1), wavelength, c2)
+        total = total + dr.fma(0.5 * v, dr.rsqrt(dr.fma(v, v, 1)), 0.5)
+    r, g, b = (clamp(mi.Float(c), 0.0, 1.0) for c in rgb)
+    return dr.select((r == g) & (g == b), r, total / len(wavelengths))
