@@ -130,12 +130,12 @@ def figure(comparison: Comparison, path: str | os.PathLike) -> None:
 def summary(f: dict) -> list[str]:
     """The figures as lines of text."""
     ratio, seconds = f["time_ratio"], f["seconds_per_pass"]
-    materials = "1 material" if f["learned_plugins"] == 1 else f"{f['learned_plugins']} materials"
+    learned = "1 plugin" if f["learned_plugins"] == 1 else f"{f['learned_plugins']} plugins"
     spp = f"{f['spp']} of {f['spp_requested']} spp (interrupted)" if f["interrupted"] else f"{f['spp']} spp"
     return [
         f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {spp}",
         f"variant     {f['variant']}",
-        f"learned     {materials}, {f['table_bytes']:,} bytes of tables",
+        f"learned     {learned}, {f['table_bytes']:,} bytes of tables",
         "",
         f"PSNR        {f['psnr_db']:.2f} dB   (linear, clipped to [0, 1])",
         f"FLIP        {f['flip']:.4f}     (0 = equal to the eye)",

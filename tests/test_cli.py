@@ -112,7 +112,7 @@ def test_inspect_scene(tmp_path, capsys):
     report = tmp_path / "report.json"
     assert main(["inspect", str(SCENES / "still_life.xml"), "--json", str(report)]) == 0
     text = capsys.readouterr().out
-    assert "9 learned material(s), 2,048 bytes" in text
+    assert "9 learned plugin(s), 2,048 bytes" in text
     wood = text[text.index("wood: base_color texture, roughness texture") :]
     assert "in use    diffuse, dielectric, clearcoat" in wood
     assert "sheen (sheen is 0)" in wood and "anisotropic (anisotropic is 0)" in wood

@@ -10,6 +10,8 @@ from ..tasks import ggx
 from ..tasks.disney import arrays as disney_arrays
 from ..tasks.disney.library import decoder_of, load_disney_table
 from ..tasks.disney.training import measure
+from ..tasks.image import compressed as image
+from ..tasks.image.source import load_source
 from .common import UsageError, defines_of, scene_options, set_variant, verb
 
 
@@ -54,8 +56,10 @@ def run(arguments) -> dict:
             f"{arrays[name]['gathers_per_read']} gathers a read, "
             f"values {values.min():.4g} to {values.max():.4g}"
         )
+    settings = {k: v for k, v in table.settings.items() if k != "layout"}
+    about = _about_image(arguments.file, table) if table.task == image.TASK else {}
     for title, content in (
-        ("trained with", {**table.settings, "seed": table.seed}),
+        ("trained with", {**settings, "seed": table.seed}),
         ("measured", table.quality),
     ):
         print(f"  {title}: " + ", ".join(f"{k} {v}" for k, v in content.items()))
@@ -69,13 +73,48 @@ def run(arguments) -> dict:
         "settings": table.settings,
         "seed": table.seed,
         "quality": table.quality,
+        **about,
         **({"measured": measured} if measured else {}),
     }
 
 
+def _about_image(file: str, table) -> dict:
+    """Size, ratio and maps of a compressed image, printed and returned."""
+    table, layout = image.load_image_table(file)
+    ratio = layout.source_nbytes / table.nbytes if table.nbytes else None
+    print(
+        f"  {layout.width} x {layout.height}, {layout.stored} channel(s) stored of "
+        f"{sum(m.channels for m in layout.maps)}, {layout.source_nbytes:,} bytes uncompressed: "
+        + (f"{ratio:.2f}x" if ratio else "of one colour")
+    )
+    maps = {}
+    for m in layout.maps:
+        psnr = table.quality.get(f"psnr_{m.name}_db")
+        stored = [w if isinstance(w, int) else "from x and y" if w == "z" else f"is {w[1]:.4g}" for w in m.where]
+        maps[m.name] = {"channels": m.channels, "color_space": m.color_space, "stored_as": stored, "psnr_db": psnr}
+        quality = f", {psnr:.2f} dB" if psnr is not None else ""
+        kept = ", ".join(map(str, stored))
+        print(f"    {m.name:20} {m.channels} channel(s), {m.color_space}, stored as {kept}{quality}")
+    return {"width": layout.width, "height": layout.height, "source_bytes": layout.source_nbytes,
+            "compression": ratio, "maps": maps}  # fmt: skip
+
+
+def _measure_image(file: str) -> dict:
+    """Against the source, which has to be where it was."""
+    table, _ = image.load_image_table(file)
+    path = Path(file).parent / str(table.settings.get("source_path", ""))
+    source = load_source(path)
+    if source.digest != table.settings.get("source", source.digest):
+        raise UsageError(f"{file}: its source {path} has changed since it was compressed")
+    compressed = image.CompressedImage.from_table(table, runtime.array_module().TensorXf)
+    found = compressed.measure(source)
+    print("  against the source: " + ", ".join(f"{k} {v:.2f}" for k, v in found.items()))
+    return found
+
+
 def _measure(file: str, table) -> dict:
     """Accuracy of tables in each storage form, printed and returned."""
-    measures = {disney_arrays.TASK: _measure_disney, ggx.TASK: _measure_ggx}
+    measures = {disney_arrays.TASK: _measure_disney, ggx.TASK: _measure_ggx, image.TASK: _measure_image}
     if table.task not in measures:
         raise UsageError(f'{file}: holds tables for the task "{table.task}", which cannot be measured')
     return measures[table.task](file)
@@ -127,7 +166,11 @@ def _inspect_scene(arguments) -> dict:
     tables = scenes.tables_of(arguments.file, learned)
     materials = scenes.reports(scenes.load(arguments.file, defines=defines))
     total = sum(t.nbytes for t in tables.values())
-    print(f"{arguments.file}: {len(learned)} learned material(s), {total:,} bytes of tables in {len(tables)} file(s)")
+    print(f"{arguments.file}: {len(learned)} learned plugin(s), {total:,} bytes of tables in {len(tables)} file(s)")
+    for entry in learned:
+        if entry["plugin"] == "neural_image":
+            about = ", ".join(f"{k} {entry[k]}" for k in ("filename", "channels", "storage") if k in entry)
+            print(f"  {entry['id'] or '(no id)'}: neural_image, {about}")
     given = {entry["id"]: entry["parameters"] for entry in learned}
     for material in materials:
         parameters = given.get(material["id"]) or {}

@@ -278,6 +278,7 @@ def fit_image(
     problem = problem_of(source, size, recipe, types, layout, border)
     result = fit(problem, recipe.settings, checkpoint, resume, progress, title=title)
     about = {**dataclasses.asdict(recipe.settings), **problem.about, "ratio": size.ratio}
+    about["structure"] = structure_of(source, recipe)
     table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), about, recipe.settings.seed)
     return _with_quality(table, source, types), result
 
