@@ -1,9 +1,9 @@
 """
 Learned lookup tables that a renderer trusts: differentiable indirection for Mitsuba 3.
 
-``import mi_diffind`` makes the plugins (``neural_disney``, ``disney``) available to ``mi.load_file``,
-``mi.load_string`` and ``mi.load_dict`` in every variant, whichever of ``mitsuba`` and ``mi_diffind`` is imported
-first, and makes sure that Dr.Jit runs on an LLVM that does not abort (:mod:`mi_diffind.runtime`).
+``import mi_diffind`` makes the plugins (``neural_disney``, ``disney``, ``neural_ggx``, ``neural_image``) available to
+``mi.load_file``, ``mi.load_string`` and ``mi.load_dict`` in every variant, whichever of ``mitsuba`` and ``mi_diffind``
+is imported first, and makes sure that Dr.Jit runs on an LLVM that does not abort (:mod:`mi_diffind.runtime`).
 """
 
 from pathlib import Path as _Path

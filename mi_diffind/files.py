@@ -68,8 +68,8 @@ def replacing(path: str | os.PathLike):
                 os.unlink(name)
         if isinstance(e, OutputError) or not (isinstance(e, OSError) or type(e) is RuntimeError):
             raise
-        # Mitsuba has no other exception than RuntimeError, nor one line for it.
-        reason = getattr(e, "strerror", None) or textwrap.shorten(str(e), 100, placeholder="…")
+        # Mitsuba raises RuntimeError, of several lines
+        reason = getattr(e, "strerror", None) or textwrap.shorten(str(e).replace(str(name), path.name), 100)
         raise OutputError(f'output file "{path}" cannot be written: {reason}') from e
 
 

@@ -248,7 +248,7 @@ def read_packed(
 def channels_words(channels: int, bits: int) -> int:
     """Words of 32 bits that have to be read to find all bits of an entry in a table of fewer than 8 bits a channel."""
     width = channels * bits
-    return 1 if 32 % width == 0 else (width + 62) // 32
+    return (width + 63 - math.gcd(width, 32)) // 32  # entries begin at multiples of the divisor
 
 
 def read_bits(

@@ -185,17 +185,21 @@ def search(
     The resolutions for a compression ratio: :func:`paper_search` with ``ratio``, by default that of :func:`ratio`.
 
     Sides in such steps may miss ``compression`` by far (4K RGB asked for 12x gets 13.4x at ρ = 80). If it is by more
-    than 5%, the cascaded array is kept and the primary becomes what fits, :func:`fit_bytes`: down to 1×1 for images so
-    small that even the smallest cascaded array (``N_c`` = 4) is more than was asked for.
+    than 5%, the cascaded array is kept, unless it alone is more than half of what was asked for, and the primary
+    becomes what fits, :func:`fit_bytes`: down to 1×1 for images so small that even the smallest cascaded array (``N_c``
+    = 4) is more than was asked for.
     """
     _check_image(uncompressed_bytes, channels, height, width)
     if ratio is None:
         ratio = _default_ratio(compression, math.sqrt(height * width))
     size = paper_search(uncompressed_bytes, compression, channels, height, width, ratio, dims, bits)
     budget = uncompressed_bytes / compression
-    if abs(size.nbytes / budget - 1) > TOLERANCE:
-        return fit_bytes(budget, channels, height, width, size.cascaded, dims, bits)
-    return size
+    if abs(size.nbytes / budget - 1) <= TOLERANCE:
+        return size
+    side = size.cascaded
+    while side > CASCADED_STEP and channels * side**dims > budget / 2:
+        side -= CASCADED_STEP
+    return fit_bytes(budget, channels, height, width, side, dims, bits)
 
 
 def cascaded_side(budget: float, channels: int, dims: int = 4, share: float = 0.08) -> int:
@@ -362,8 +366,8 @@ def explain(size: Size, uncompressed_bytes: int, asked_bytes: float) -> tuple[fl
             f"{asked}, but at {found} the primary is as large as the image and more of it would be of no use"
         )
     return achieved, (
-        f"{asked}, but {found} are the nearest that sides in steps of {PRIMARY_STEP} (primary) and {CASCADED_STEP} "
-        f"(cascaded) allow at a resolution ratio of {size.ratio:.3g}"
+        f"{asked}, but {found} are the nearest that whole sides of the primary allow beside a cascaded side of "
+        f"{size.cascaded}"
     )
 
 

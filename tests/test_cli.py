@@ -233,8 +233,8 @@ def test_interrupted_renders_keep_what_they_have(tmp_path):
     assert (folder / "comparison.png").exists()
 
 
-VERBS = ("render", "compare", "regress", "inspect", "tradeoff", "encode", "fit")
-TASKS = {"fit": ("disney", "ggx"), "tradeoff": ("disney", "ggx", "scene")}
+VERBS = ("render", "compare", "regress", "inspect", "tradeoff", "encode", "decode", "fit")
+TASKS = {"fit": ("disney", "ggx", "image"), "tradeoff": ("disney", "ggx", "image", "scene")}
 
 HELP = """
 import contextlib, io, json, sys

@@ -302,6 +302,38 @@ def test_entries_lost_in_a_step_whose_loss_was_fine(ad, monkeypatch):
     assert all(np.isfinite(problem.net[key].numpy()).all() for key in problem.net)
 
 
+class Stages(Curve):
+    """From step 30 on, what is fitted lies 5 higher, and the problem says so if it is to."""
+
+    def __init__(self, ad, tells, at=None):
+        super().__init__(ad, at)
+        self.tells, self.high = tells, False
+
+    def begin(self, step, steps):
+        self.high = step >= 30
+        return ("high" if self.high else "low") if self.tells else None
+
+    def target(self, x):
+        return super().target(x) + (5 if self.high else 0)
+
+
+def test_losses_of_different_kinds_are_not_compared(ad, tmp_path):
+    """A loss that rises since the problem changes is no explosion if it is said to; one within its kind is."""
+    result, messages = run(Stages(ad, True), settings())
+    assert (result.restarts, result.steps, messages) == (0, 60, [])
+    assert result.history[-1]["loss"] > 10 * result.history[0]["loss"]
+    with pytest.raises(FittingError, match="diverged 9 times"):
+        run(Stages(ad, False), settings())
+    for step in (20, 50):  # the first step of a kind is looked at, so that there is something to compare with
+        result, messages = run(Stages(ad, True, {step: lambda y: y + 1e3}), settings())
+        assert result.restarts == 1 and messages[0].startswith(f"step {step}: "), step
+    # What to compare with is in the checkpoint, too: the first step after it (the 41st) explodes
+    each, path = settings(check_every=1), tmp_path / "c.npz"
+    run(Stages(ad, True, {42: interrupt}), each, checkpoint=path)
+    result, messages = run(Stages(ad, True, {1: lambda y: y + 1e3}), each, checkpoint=path, resume=True)
+    assert result.restarts == 1 and messages[0].startswith("step 41: ")
+
+
 def test_explosion_is_noticed(ad):
     """A loss that jumps by more than an order of magnitude counts as divergence as well."""
     problem = Curve(ad, {35: lambda y: y + 1e6})

@@ -417,6 +417,142 @@ def test_gathers_that_the_kernel_makes():
         assert len(calls) == lookup.gathers(resolution, channels, "uint8"), (resolution, channels)
 
 
+# -- fewer than 8 bits an entry ----------------------------------------------------------------------------------------
+
+
+def few_bits(ad, rng, resolution, channels, bits, border):
+    """An array of random codes, smallest and largest among them, and the entries that they stand for, in float64."""
+    codes = rng.integers(0, 2**bits, (*resolution, channels)).astype(np.uint8)
+    codes.reshape(-1)[-1:] = 2**bits - 1
+    codes.reshape(-1)[:1] = 0
+    scale, offset = rng.uniform(0.5, 2, channels) / (2**bits - 1), rng.uniform(-1, 1, channels)
+    made = DifferentiableArray.from_numpy(codes, ad.TensorXf, border, "uint8", quantization=(scale, offset), bits=bits)
+    return made, codes, offset + scale * codes.astype(np.float64)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("bits", range(1, 8))
+def test_few_bits_equal_scipy(ad, bits, channels):
+    """Inside, outside, at the special coordinates; in 1D to 3D, with each border along all axes and mixed ones."""
+    rng = np.random.default_rng(10 * bits + channels)
+    cases = []
+    for dims in (1, 2, 3):
+        for border in borders(dims)[:3]:
+            array, _, held = few_bits(ad, rng, RESOLUTION[:dims], channels, bits, border)
+            x = rng.uniform(-1.2, 2.2, (100, dims)).astype(np.float32)
+            x[:60] = np.mod(x[:60], 1)
+            x[: len(SPECIAL), -1] = SPECIAL
+            cases.append((held, x, border, array([ad.Float(x[:, k].copy()) for k in range(dims)])))
+    dr.eval([values for *_, values in cases])  # one kernel
+    for held, x, border, values in cases:
+        found = np.stack([v.numpy() for v in values], axis=-1)
+        np.testing.assert_allclose(found, reference(held, x, border), atol=1e-5, err_msg=str(border))
+
+
+@pytest.mark.parametrize("channels", [5, 6, 7, 16])
+@pytest.mark.parametrize("bits", [3, 5, 7])
+def test_few_bits_of_many_channels(ad, bits, channels):
+    """Entries of more than one word, the last one at the very end of the memory."""
+    rng = np.random.default_rng(channels)
+    for n in (1, 5, 32):
+        array, _, held = few_bits(ad, rng, (n, 3), channels, bits, ("clamp", "repeat"))
+        x = np.concatenate([rng.uniform(0, 1, (50, 2)), [[1, 0.99], [1, 1], [0, 0]]]).astype(np.float32)
+        np.testing.assert_allclose(read(array, ad, x), reference(held, x, array.border), atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("bits", range(1, 8))
+def test_few_bits_are_differentiable_in_the_coordinate(ad, bits, channels):
+    rng = np.random.default_rng(bits)
+    dims = 1 + (bits + channels) % 3
+    border = (lookup.BORDERS[bits % 2],) * dims
+    array, _, held = few_bits(ad, rng, RESOLUTION[:dims], channels, bits, border)
+    x = inside(rng, 50, RESOLUTION[:dims], border)
+    point = [ad.Float(x[:, k].copy()) for k in range(dims)]
+    dr.enable_grad(point)
+    weight = rng.uniform(-1, 1, channels)
+    dr.backward(sum(float(w) * v for w, v in zip(weight, array(point), strict=True)))
+    dr.eval([v.grad for v in point])
+    for k, v in enumerate(point):
+        h = 1e-5 * np.eye(dims)[k]
+        slope = (reference(held, x + h, border) - reference(held, x - h, border)) @ weight / 2e-5
+        np.testing.assert_allclose(v.grad.numpy(), slope, rtol=1e-3, atol=1e-4 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("bits", range(1, 8))
+def test_masked_lanes_of_few_bits_are_zero(ad, bits):
+    rng = np.random.default_rng(bits)
+    array, *_ = few_bits(ad, rng, (4, 3), 3, bits, "clamp")
+    x = rng.uniform(0, 1, (64, 2)).astype(np.float32)
+    mask = rng.integers(0, 2, 64).astype(bool)
+    everything = read(array, ad, x)
+    assert (everything[~mask] != 0).any()
+    x[~mask] = np.nan
+    np.testing.assert_array_equal(read(array, ad, x, active=ad.Bool(mask)), np.where(mask[:, None], everything, 0))
+
+
+@pytest.mark.parametrize("bits", range(1, 9))
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 31, 64, 1001])
+def test_bits_survive_packing(bits, count):
+    """Bit ``i`` of code ``k`` is bit ``k · bits + i`` of the bytes, the lowest first."""
+    codes = np.random.default_rng(count).integers(0, 2**bits, count).astype(np.uint8)
+    packed = lookup.pack_bits(codes, bits)
+    assert packed.dtype == np.uint8 and packed.shape == (-(-count * bits // 8),)
+    number = sum(int(code) << (k * bits) for k, code in enumerate(codes))
+    assert packed.tobytes() == number.to_bytes(len(packed), "little")
+    unpacked = lookup.unpack_bits(packed, count, bits)
+    assert unpacked.dtype == np.uint8
+    np.testing.assert_array_equal(unpacked, codes)
+    wider = codes | np.uint8(0xFF << bits & 0xFF)  # what lies above is left out
+    np.testing.assert_array_equal(lookup.pack_bits(wider, bits), packed)
+
+
+@pytest.mark.parametrize("bits", range(1, 8))
+def test_few_bits_take_that_memory(ad, bits):
+    rng = np.random.default_rng(bits)
+    for resolution, channels in (((1,), 1), ((7, 5), 3), ((33, 2, 3), 4), ((64, 64), 2)):
+        array, codes, held = few_bits(ad, rng, resolution, channels, bits, "repeat")
+        expected = -(-codes.size * bits // 8)
+        assert array.nbytes == expected and expected <= array.memory_nbytes <= expected + 8
+        assert array.memory_nbytes % 4 == 0
+        np.testing.assert_array_equal(array.codes(), codes)
+        np.testing.assert_allclose(array.numpy(), held, rtol=1e-6, atol=1e-7)
+
+
+def test_gathers_of_few_bits_that_the_kernel_makes():
+    """One a corner where no entry crosses a word, and as many as :func:`mi_diffind.lookup.gathers` says."""
+    ad = array_module("llvm")
+    for bits, channels, words in (
+        (4, 4, 1),
+        (1, 1, 1),
+        (2, 4, 1),
+        (4, 3, 2),
+        (5, 4, 2),
+        (6, 4, 2),
+        (7, 4, 2),
+        (7, 8, 3),
+    ):
+        assert lookup.channels_words(channels, bits) == words, (bits, channels)
+        array, *_ = few_bits(ad, np.random.default_rng(0), (5, 7), channels, bits, "clamp")
+        x = [dr.linspace(ad.Float, 0, 1, 123) for _ in range(2)]
+        dr.eval(x)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(array(x))
+            code = "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
+        calls = [line for line in code.splitlines() if "call" in line and "gather" in line]
+        assert len(calls) == 4 * words == lookup.gathers((5, 7), channels, "uint8", bits), (bits, channels)
+
+
+def test_no_entry_needs_more_words_than_are_read():
+    """Counted for each entry of a table: from the word with its first bit to that with its last."""
+    for bits in range(1, 8):
+        for channels in range(1, 17):
+            width = bits * channels
+            most = max((k * width + width - 1) // 32 - k * width // 32 + 1 for k in range(64))
+            assert lookup.channels_words(channels, bits) == most, (bits, channels)
+
+
 def test_clamp_keeps_the_gradient_at_its_bounds(ad):
     x = ad.Float([0.0, 1.0, 0.5, -0.1, 1.1, np.nan])
     dr.enable_grad(x)

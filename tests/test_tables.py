@@ -149,6 +149,101 @@ def test_columns_in_fortran_order_and_views(tmp_path):
     np.testing.assert_array_equal(load_table(tmp_path / "f.npz").arrays["cascaded"], values)
 
 
+# -- fewer than 8 bits an entry ----------------------------------------------------------------------------------------
+
+
+def narrow(bits=5, shape=(5, 3, 2)) -> Table:
+    """A table whose first array has ``bits`` bits an entry, the second one 8."""
+    rng = np.random.default_rng(bits)
+    arrays = {
+        "few": rng.integers(0, 2**bits, shape).astype(np.uint8),
+        "bytes": rng.integers(0, 256, (4, 3), dtype=np.uint8),
+    }
+    affine = {name: ((0.5,) * a.shape[-1], (-1.0,) * a.shape[-1]) for name, a in arrays.items()}
+    return Table("t", arrays, "uint8", quantization=affine, bits={"few": bits})
+
+
+@pytest.mark.parametrize("bits", range(1, 8))
+def test_few_bits_make_the_round_trip(tmp_path, bits):
+    table, path, again = narrow(bits), tmp_path / "t.npz", tmp_path / "again.npz"
+    save_table(path, table)
+    loaded = load_table(path)
+    assert loaded.bits == {"few": bits} and loaded.quantization == table.quantization
+    for name, array in table.arrays.items():
+        assert loaded.arrays[name].dtype == np.uint8
+        np.testing.assert_array_equal(loaded.arrays[name], array)
+        np.testing.assert_array_equal(loaded.values(name), np.float32(0.5 * array - 1.0))
+    size = -(-30 * bits // 8)
+    assert loaded.nbytes_of("few") == size and loaded.nbytes == size + 12
+    assert np.load(path)["few"].shape == (size,)  # what is in the file, too
+    save_table(again, loaded)
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_few_bits_in_other_forms(tmp_path):
+    """What is no byte any more has no bits either."""
+    table = narrow(3)
+    for storage in ("float32", "float16"):
+        other, path = table.to(storage), tmp_path / f"{storage}.npz"
+        save_table(path, other)
+        np.testing.assert_array_equal(load_table(path).values("few"), table.values("few"))
+        assert not other.bits and other.nbytes == (30 + 12) * {"float32": 4, "float16": 2}[storage]
+    assert table.to("uint8").bits == {"few": 3}
+
+
+@pytest.mark.parametrize("bits", [0, 8, 9, -1, True, 2.0, "x", [3], 10**30])
+def test_impossible_bits(tmp_path, bits):
+    """Neither written nor read."""
+    path = tmp_path / "t.npz"
+    table = narrow()
+    table.bits["few"] = bits
+    with pytest.raises(TableError, match=r"few.* bits an entry, allowed are 1 to 7"):
+        save_table(path, table)
+    assert not os.listdir(tmp_path)
+    save_table(path, narrow())
+    change_meta(path, lambda meta: meta["arrays"]["few"].update(bits=bits))
+    refused(path, "few.* bits an entry, allowed are 1 to 7")
+
+
+def test_entries_that_need_more_bits(tmp_path):
+    table = narrow(5)
+    table.arrays["few"] = table.arrays["few"].copy()
+    table.arrays["few"][-1, -1, -1] = 32
+    with pytest.raises(TableError, match=r"few.*entries of more than 5 bits"):
+        save_table(tmp_path / "t.npz", table)
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+def test_bits_are_of_bytes_only(tmp_path, storage):
+    table = narrow().to(storage)
+    table.bits["few"] = 5
+    with pytest.raises(TableError, match="of bytes only"):
+        save_table(tmp_path / "t.npz", table)
+    table.bits.clear()
+    save_table(tmp_path / "t.npz", table)
+    change_meta(tmp_path / "t.npz", lambda meta: meta["arrays"]["few"].update(bits=5))
+    refused(tmp_path / "t.npz", "of bytes only")
+
+
+def test_other_lengths_than_the_bits_say(tmp_path):
+    path = tmp_path / "t.npz"
+    for change in (-1, 1):
+        save_table(path, narrow(5))
+        members = parts(path)
+        members["few.npy"] = npy(np.zeros(19 + change, np.uint8))
+        rebuild(path, members)
+        refused(path, "few.*shape")
+    for bits in (1, 2, 3, 4, 6, 7):  # another number of bits of the same shape
+        save_table(path, narrow(5))
+        change_meta(path, lambda meta, bits=bits: meta["arrays"]["few"].update(bits=bits))
+        refused(path, "few.*shape")
+    for shape in ([5, 3, 3], [2**40, 2**40, 2**40], [5, -3, 2]):
+        save_table(path, narrow(5))
+        change_meta(path, lambda meta, shape=shape: meta["arrays"]["few"].update(shape=shape))
+        refused(path)
+
+
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 

@@ -56,7 +56,13 @@ def run(arguments) -> dict:
         image = CompressedImage.from_table(table, array_module().TensorXf)
     except RuntimeError as e:
         raise TableError(f"{arguments.file}: {e}") from e
-    decoded = image.decode(names, arguments.width or 0, arguments.height or 0)
+    width, height = arguments.width or layout.width, arguments.height or layout.height
+    try:
+        if width * height >= 2**32:
+            raise MemoryError
+        decoded = image.decode(names, width, height)
+    except MemoryError:
+        raise UsageError(f"{arguments.file}: {width} x {height} texels are more than fit into memory") from None
     files = []
     for name, values in decoded.items():
         path = output if len(names) == 1 else output.with_name(f"{output.stem}_{name}{output.suffix}")

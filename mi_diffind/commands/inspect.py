@@ -102,8 +102,10 @@ def _about_image(file: str, table) -> dict:
 def _measure_image(file: str) -> dict:
     """Against the source, which has to be where it was."""
     table, _ = image.load_image_table(file)
-    path = Path(file).parent / str(table.settings.get("source_path", ""))
-    source = load_source(path)
+    if "source_path" not in table.settings:
+        raise UsageError(f"{file}: does not say which image it was made from, so it cannot be measured")
+    path = Path(file).parent / str(table.settings["source_path"])
+    source = load_source(path, nonfinite="clean")  # if it was not cleaned before either, the digest tells
     if source.digest != table.settings.get("source", source.digest):
         raise UsageError(f"{file}: its source {path} has changed since it was compressed")
     compressed = image.CompressedImage.from_table(table, runtime.array_module().TensorXf)

@@ -78,10 +78,10 @@ def joined(primaries: Sequence[DifferentiableArray], cascaded: DifferentiableArr
     return Indirection(primaries, cascaded, [(0, 1)] * len(primaries))
 
 
-def detail(values: np.ndarray) -> float:
+def smoothness(values: np.ndarray) -> float:
     """
-    How much of an image, ``(height, width, k)`` in [0, 1], is fine detail: the PSNR, in dB, of the mean of the four
-    neighbours of a texel in place of the texel. Noise has little, a photograph much.
+    How smooth an image, ``(height, width, k)`` in [0, 1], is: the PSNR, in dB, of the mean of the four neighbours of a
+    texel in place of the texel. Noise has 20, a photograph 40.
     """
     if min(values.shape[:2]) < 3:
         return 120.0

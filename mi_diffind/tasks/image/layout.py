@@ -23,6 +23,9 @@ NORMAL_FLOOR_DB = 45.0
 #: Largest magnitude that is told apart: half of what single precision holds, so that no difference overflows.
 LARGEST = 1.7e38
 
+#: Data of more than 8 bits whose range is narrower than this is stored relative to its range, not to [0, 1].
+NARROW = 0.25
+
 #: What a channel of a map can be in place of the number of a stored one.
 FROM_NORMAL = "z"
 
@@ -200,7 +203,7 @@ class Layout:
             maps.append(MapLayout(str(entry["name"]), kind, color_space, depth, where, low, high, knee))
         width, height = int(found["width"]), int(found["height"])
         initial, groups = tuple(map(float, found["initial"])), tuple(map(str, found["groups"]))
-        if min(width, height) < 1 or not maps or len(initial) != len(groups):
+        if min(width, height) < 1 or width * height >= 2**32 or not maps or len(initial) != len(groups):
             raise ValueError("the size or the channels of the image are damaged")
         if len({m.name for m in maps}) != len(maps):
             raise ValueError("two maps have the same name")
@@ -225,7 +228,7 @@ def _range(m: Map) -> MapLayout:
         # Logarithmic above the knee, linear below: relative precision for what is bright, and none wasted on the dark
         middle = float(np.median(np.minimum(m.values, largest)))
         knee, high = max(middle, 1e-3 * largest), largest
-    elif smallest < 0:
+    elif smallest < 0 or (m.depth > 1 and m.color_space == "linear" and 0 < largest - smallest < NARROW):
         low, high = smallest, max(largest, smallest + 1e-6 * max(1.0, abs(smallest)))
     return MapLayout(m.name, m.kind, m.color_space, m.depth, (), low, high, knee)
 

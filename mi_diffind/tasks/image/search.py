@@ -102,6 +102,7 @@ def ratio_search(source: Source, nbytes: float, recipe: Recipe, free: bool = Tru
             break
     if not tried:
         return Found(start, recipe, tried)
+    tables[0][1].interrupted = interrupted
     chosen = best()
     recipe = dataclasses.replace(recipe, structure=chosen["structure"], dims=chosen["dims"])
     return Found(sized(source, nbytes, recipe, chosen["cascaded"]), recipe, tried, tables[0], interrupted)

@@ -38,7 +38,7 @@ STRUCTURES: dict[str, tuple[int, Coarse | None]] = {
     "2 + 6 bits": (2, Coarse(2, 6, 0.35)),
 }
 
-#: dB of :func:`.arrays.detail` from which on an image is smooth enough for one primary.
+#: dB of :func:`.arrays.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
 
 
@@ -116,7 +116,7 @@ def structure_of(source: Source, recipe: Recipe) -> str:
     """The structure of a recipe; for ``"auto"`` what suits the image."""
     if recipe.structure != "auto":
         return recipe.structure
-    smooth = recipe.dims < 3 or arrays.detail(layout_of(source, recipe).encode(source)) >= SMOOTH_DB
+    smooth = recipe.dims < 3 or arrays.smoothness(layout_of(source, recipe).encode(source)) >= SMOOTH_DB
     return "6 bits" if smooth else "2 + 6 bits"
 
 
@@ -274,7 +274,9 @@ def fit_image(
     layout, types = layout_of(source, recipe), array_module(backend)
     if not layout.stored:
         image = CompressedImage(layout, None)
-        return _with_quality(to_table(image, {}, 0), source, types), FitResult({}, 0, 0, 0.0, False, 0)
+        return _with_quality(to_table(image, {"source": source.digest}, 0), source, types), FitResult(
+            {}, 0, 0, 0.0, False, 0
+        )
     problem = problem_of(source, size, recipe, types, layout, border)
     result = fit(problem, recipe.settings, checkpoint, resume, progress, title=title)
     about = {**dataclasses.asdict(recipe.settings), **problem.about, "ratio": size.ratio}
