@@ -261,13 +261,14 @@ def astc_material(
     choose: str | float = "medium",
     cache: dict | None = None,
     progress: Callable[[str], None] | None = None,
+    split: bool = True,
 ) -> tuple[dict[str, Encoded], int]:
     """
     The ``maps`` of a material, name → image, in ``nbytes`` together, with the least squared error over all their texels
     and channels: each texture at its own block size and resolution (one of ``reduces``, see :func:`astc`), each map one
     texture or several (three channels: all groupings, four: also 3 + 1 and 1 + 1 + 1 + 1), three equal channels as
-    luminance, the maps named in ``normals`` with or without z. ``uniform``: one block size and resolution for all
-    textures instead, the best one.
+    luminance, the maps named in ``normals`` with or without z. Without ``split``, each
+    map is one texture. ``uniform``: one block size and resolution for all textures instead, the best one.
 
     The choice is the best one for the errors with the preset ``choose``, for which each map is encoded some hundred
     times (minutes for 1024×1024 texels); ``quality`` is for the result. A ``cache``, only for calls with the same maps,
@@ -280,7 +281,7 @@ def astc_material(
     settings = list(itertools.product(ASTC_BLOCKS, reduces))
     known: dict[tuple, list[_Part]] = {}
     for name, image in rounded.items():
-        for channels, normal in dict.fromkeys(p for packing in _packings(name, image, normals) for p in packing):
+        for channels, normal in dict.fromkeys(p for packing in _packings(name, image, normals, split) for p in packing):
             parts, tried = known.setdefault((name, channels, normal), []), 0
             for block, reduce in settings:
                 size = astc_bytes(image.shape, block, reduce)
@@ -300,7 +301,7 @@ def astc_material(
         front: list[_Way] = [(0, 0.0, ())]
         for name, image in rounded.items():
             one: list[_Way] = []
-            for packing in _packings(name, image, normals):
+            for packing in _packings(name, image, normals, split):
                 packed: list[_Way] = [(0, 0.0, ())]
                 for group in packing:
                     parts = [(p.nbytes, p.error, (p,)) for p in known[(name, *group)] if allowed(p)]
@@ -333,12 +334,14 @@ def astc_material(
     return result, sum(e.nbytes for e in result.values())
 
 
-def _packings(name: str, image: np.ndarray, normals: Collection[str]) -> list[tuple]:
+def _packings(name: str, image: np.ndarray, normals: Collection[str], split: bool = True) -> list[tuple]:
     """The ways to put the channels of a map into textures, each a tuple of (channels, whether only x and y)."""
     channels = tuple(range(image.shape[2]))
     packings = [((channels, False),)]
     if len(channels) == 3 and name in normals:
         packings.append(((channels, True),))
+    if not split:
+        return packings
     if len(channels) == 4:
         packings.append((((0, 1, 2), False), ((3,), False)))
     if len(channels) == 3 and not _grey(image):

@@ -48,10 +48,10 @@ class Problem(Protocol):
     #: Optional: what the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
     about: dict
 
-    def begin(self, step: int, steps: int) -> str:
+    def begin(self, step: int, share: float) -> str:
         """
-        Optional: called before step ``step`` of ``steps``, for a problem that changes on the way. Returns the kind of
-        step: only losses of the same kind are compared.
+        Optional: called before step ``step``, when the ``share`` of the training is over, for a problem that changes on
+        the way. Returns the kind of step: only losses of the same kind are compared.
         """
 
     def batch(self, rng, size: int):
@@ -125,13 +125,22 @@ class _State:
 
 
 def fit(
-    problem: Problem, settings: FitSettings, checkpoint=None, resume=False, progress=True, log=None, title=None
+    problem: Problem,
+    settings: FitSettings,
+    checkpoint=None,
+    resume=False,
+    progress=True,
+    log=None,
+    title=None,
+    seconds: float | None = None,
 ) -> FitResult:
     """
     Train ``problem.net`` in place and leave the best state found in it.
 
     ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
-    read first (it must belong to the same settings). ``title`` stands before the progress bar. Ctrl-C ends the training
+    read first (it must belong to the same settings). ``title`` stands before the progress bar. With ``seconds``, the
+    training ends after so long, its schedules follow the clock in place of the steps, of which there are as many as can
+    be made, and quality is measured ten times. Ctrl-C ends the training
     after the current step and keeps the best state so far. If the loss or a parameter becomes NaN, or the loss
     explodes, the last good state is restored and the learning rate halved; ``log`` (default: print to stderr) is told
     so in one sentence.
@@ -158,8 +167,17 @@ def fit(
         plateau.restore(extra["plateau"])
 
     start = time.perf_counter() - spent
+
+    def share() -> float:
+        """How much of the training is over."""
+        if seconds is None:
+            return trainer.step / settings.steps
+        return min(1.0, (time.perf_counter() - start) / seconds)
+
+    trainer.share = share()
     good = trainer.snapshot()
-    bar = tqdm(total=settings.steps, initial=trainer.step, desc=title, disable=None if progress else True, unit="step")
+    total = settings.steps if seconds is None else None
+    bar = tqdm(total=total, initial=trainer.step, desc=title, disable=None if progress else True, unit="step")
     log = log or (lambda message: tqdm.write(message, file=sys.stderr))
     interrupted = False
 
@@ -174,12 +192,19 @@ def fit(
         bar.set_postfix({"loss": f"{loss:.3g}", name: f"{value:.2f}"})
 
     with interruptible() as stop, _cores(settings.deterministic), bar:
-        while trainer.step < settings.steps and not stop.is_set():
-            before = trainer.snapshot()
+        while trainer.share < 1 and not stop.is_set():
+            before, share_before = trainer.snapshot(), trainer.share
             loss = trainer.take_step(plateau.factor)
+            if seconds is not None:
+                dr.eval(loss)
+                dr.sync_thread()
             bar.update(1)
-            last = trainer.step == settings.steps
-            due = trainer.step % settings.check_every == 0 or trainer.step % settings.quality_every == 0
+            trainer.share = share()
+            last = trainer.share >= 1
+            measured = trainer.step % settings.quality_every == 0
+            if seconds is not None:
+                measured = int(10 * trainer.share) > int(10 * share_before)
+            due = trainer.step % settings.check_every == 0 or measured
             reference = references.get(trainer.kind)
             if not (due or last or reference is None):
                 continue
@@ -198,12 +223,13 @@ def fit(
                 )
                 good.lr_scale /= 2
                 trainer.restore(good)
+                trainer.share = share()
                 bar.n = trainer.step
                 continue
             references[trainer.kind] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
             good = before  # not the state after this step: nobody has seen its loss yet
-            if trainer.step % settings.quality_every == 0 or last:
+            if measured or last:
                 measure(value)
                 if checkpoint is not None:
                     extra = {
@@ -212,7 +238,7 @@ def fit(
                         "references": references,
                     }  # fmt: skip
                     _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), extra)
-        if stop.is_set() and trainer.step < settings.steps:
+        if stop.is_set() and trainer.share < 1:
             interrupted = True
             if best is None and trainer.finite():
                 measure(float("nan"))
@@ -257,6 +283,7 @@ class _Trainer:
     def __init__(self, problem: Problem, settings: FitSettings):
         self.problem, self.settings = problem, settings
         self.step, self.lr_scale, self.restarts, self.kind = 0, 1.0, 0, ""
+        self.share = 0.0  # of the training that is over
         self.optimizer = Adam(lr=settings.lr)
         self.optimizer.update(problem.net)
         self.module = sys.modules[type(next(iter(self.optimizer.values()))).__module__]
@@ -264,7 +291,7 @@ class _Trainer:
     def learning_rate(self, plateau: float) -> float:
         rate = self.settings.lr * self.lr_scale
         if self.settings.schedule == "cosine":
-            rate *= 0.5 * (1 + math.cos(math.pi * self.step / self.settings.steps))
+            rate *= 0.5 * (1 + math.cos(math.pi * self.share))
         return rate * plateau
 
     def take_step(self, plateau: float = 1.0):
@@ -276,7 +303,7 @@ class _Trainer:
         rng = dr.rng(seed=seed)
         net.update(self.optimizer)
         if hasattr(self.problem, "begin"):
-            self.kind = self.problem.begin(self.step, settings.steps) or ""
+            self.kind = self.problem.begin(self.step, self.share) or ""
         inputs, targets = self.problem.batch(rng, settings.batch)
         outputs = self.problem.predict(net, inputs)
         loss = 0

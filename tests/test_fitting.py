@@ -309,7 +309,7 @@ class Stages(Curve):
         super().__init__(ad, at)
         self.tells, self.high = tells, False
 
-    def begin(self, step, steps):
+    def begin(self, step, share):
         self.high = step >= 30
         return ("high" if self.high else "low") if self.tells else None
 

@@ -1,7 +1,7 @@
 """Training of task 3: initial arrays, samples, targets, rounding, and what a trained file is worth."""
 
 import dataclasses
-import types as python_types
+import itertools
 
 import drjit as dr
 import numpy as np
@@ -303,7 +303,7 @@ def test_shares_of_the_steps(ad, share, rounded):
     found = problem(ad, waves(4, 4, 1), dataclasses.replace(OURS, jitter=share, rounded=rounded))
     kinds = []
     for step in range(40):
-        name = found.begin(step, 40)
+        name = found.begin(step, step / 40)
         kinds.append((name, found.jittered, found.rounded))
     assert sum(jittered for _, jittered, _ in kinds) == 40 * share
     assert [r for *_, r in kinds] == [step >= 40 * (1 - rounded) for step in range(40)]
@@ -636,20 +636,32 @@ def test_no_seam(ad):
             assert np.isfinite(read(np.full(8, u, np.float32), odd)).all()
 
 
-def test_steps_in_a_time(ad, monkeypatch):
-    """With a clock that only trainings move: a hundredth of a second a step, and a second to compile the first one."""
-    clock, compiled = [0.0], []
+def test_training_for_a_time(ad, monkeypatch):
+    """With a clock of its own, a fortieth of a second a look: the training ends on time, and its rate with it."""
+    from mi_diffind import fitting
 
-    def pretended(problem, settings, progress):
-        clock[0] += 0.01 * settings.steps + (0 if compiled else 1)
-        compiled.append(settings.steps)
+    clock, rates = [0.0], []
 
-    monkeypatch.setattr(training, "fit", pretended)
-    monkeypatch.setattr(training, "time", python_types.SimpleNamespace(perf_counter=lambda: clock[0]))
-    source, size = from_arrays({"image": waves(8, 8)}), Size(4, 4, 4, 3, 4, 6)
-    assert training.steps_in(3, source, size, OURS, ad) == 300
-    compiled.clear()
-    assert training.steps_in(1e-9, source, size, OURS, ad) == 1
+    def tick():
+        clock[0] += 1 / 40
+        return clock[0]
+
+    rate = fitting._Trainer.learning_rate
+
+    def watched(self, plateau):
+        rates.append(rate(self, plateau))
+        return rates[-1]
+
+    monkeypatch.setattr(fitting.time, "perf_counter", tick)
+    monkeypatch.setattr(fitting._Trainer, "learning_rate", watched)
+    table, result = training.fit_image(
+        from_arrays({"image": waves(8, 8)}), Size(4, 4, 4, 3, 4, 6), OURS, progress=False, seconds=1
+    )
+    assert result.steps == len(rates) == table.settings["steps"] and 30 <= len(rates) <= 40
+    assert table.settings["seconds"] == 1 and not result.interrupted
+    assert 8 <= len(result.history) <= 11
+    assert rates[0] > 0.98 * OURS.settings.lr and rates[-1] < 0.02 * OURS.settings.lr
+    assert all(a >= b for a, b in itertools.pairwise(rates))
 
 
 # -- hard cases -------------------------------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ def add(tasks) -> None:
     sub.add_argument("--backend", choices=["llvm", "cuda"], help="where to train (default: the GPU if there is one)")
     length = sub.add_mutually_exclusive_group()
     length.add_argument("--steps", type=positive, help="optimisation steps")
-    length.add_argument("--seconds", type=positive, help="as many steps as take so long here, by a measurement before")
+    length.add_argument("--seconds", type=positive, help="time of the training, in place of steps")
     for option, about, kind in (
         ("batch", "samples a step", {"type": positive}),
         ("lr", "Adam's learning rate", {"type": float}),
@@ -120,8 +120,8 @@ def run(arguments) -> dict:
     source = load_source(arguments.source, nonfinite=arguments.nonfinite)
     recipe = _recipe(arguments)
     try:
-        types = array_module(arguments.backend)
-        table, result, tried, recipe, asked = _train(arguments, source, recipe, types)
+        array_module(arguments.backend)  # says what is missing before anything else does
+        table, result, tried, asked = _train(arguments, source, recipe)
     except RuntimeError as e:
         raise FittingError(str(e)) from e
     table.settings |= {"recipe": arguments.recipe, "source_path": _relative(arguments.source, output)}
@@ -160,14 +160,15 @@ def _recipe(arguments) -> training.Recipe:
     return training.replaced(recipe, deterministic=not arguments.all_cores, quality_every=max(1, steps // 10), **given)
 
 
-def _train(arguments, source: Source, recipe: training.Recipe, types):
-    """The table, the record of its training, what searches have tried, and the recipe and bytes that were asked for."""
+def _train(arguments, source: Source, recipe: training.Recipe):
+    """The table, the record of its training, what searches have tried, and the bytes that were asked for."""
     border = None if arguments.border == "auto" else (arguments.border,) * 2
     options = {"backend": arguments.backend, "border": border}
+    timed = {**options, "seconds": arguments.seconds}
     tried = []
     if not training.layout_of(source, recipe).stored:  # of one colour: nothing to choose
         table, result = training.fit_image(source, None, recipe, **options)
-        return table, result, tried, recipe, None
+        return table, result, tried, None
     asked = None
     if arguments.psnr is None:
         given = {"compression": arguments.compression, "nbytes": arguments.bytes, "bpp": arguments.bpp}
@@ -186,9 +187,9 @@ def _train(arguments, source: Source, recipe: training.Recipe, types):
                 f"{t['psnr_db']:.2f} dB at texels, {t['psnr_between_db']:.2f} between"
             )
         if found.interrupted:
-            return *found.best, tried, recipe, asked
+            return *found.best, tried, asked
     elif arguments.psnr is not None:
-        return _train_for_quality(arguments, source, recipe, types, options)
+        return _train_for_quality(arguments, source, recipe, timed)
     elif arguments.cascaded:
         size = search.sized(source, asked, recipe, arguments.cascaded)
         if size.nbytes > MAX_BYTES:
@@ -198,19 +199,17 @@ def _train(arguments, source: Source, recipe: training.Recipe, types):
             )
     else:
         size = search.default_size(source, asked, recipe)
-    recipe = _timed(arguments, source, size, recipe, types)
     table, result = training.fit_image(
-        source, size, recipe, checkpoint=arguments.checkpoint, resume=arguments.resume, **options
+        source, size, recipe, checkpoint=arguments.checkpoint, resume=arguments.resume, **timed
     )
     _, sentence = sizing.explain(size, source.nbytes, asked)
     if sentence:
         print(sentence)
-    return table, result, tried, recipe, asked
+    return table, result, tried, asked
 
 
-def _train_for_quality(arguments, source: Source, recipe: training.Recipe, types, options):
+def _train_for_quality(arguments, source: Source, recipe: training.Recipe, options):
     goal = float(arguments.psnr)
-    recipe = _timed(arguments, source, search.default_size(source, source.nbytes / 12, recipe), recipe, types)
     table, result, tried = search.psnr_search(source, goal, recipe, **options)
     if table is None:
         best = max(tried, key=lambda t: t["psnr_db"])
@@ -218,15 +217,7 @@ def _train_for_quality(arguments, source: Source, recipe: training.Recipe, types
             f"{arguments.source}: {goal:g} dB were not reached; the best of {len(tried)} sizes had "
             f"{best['psnr_db']:.2f} dB in {best['bytes']:,} bytes: give more --steps or a lower --psnr"
         )
-    return table, result, tried, recipe, None
-
-
-def _timed(arguments, source: Source, size, recipe: training.Recipe, types) -> training.Recipe:
-    """With as many steps as take ``--seconds``."""
-    if arguments.seconds is None:
-        return recipe
-    steps = training.steps_in(arguments.seconds, source, size, recipe, types)
-    return training.replaced(recipe, steps=steps, quality_every=max(1, steps // 10))
+    return table, result, tried, None
 
 
 def _relative(source: str, output: Path) -> str:

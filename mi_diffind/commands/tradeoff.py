@@ -49,6 +49,12 @@ def add(commands) -> None:
             metavar="N",
             help=f"{about}; may be repeated",
         )
+    sub.add_argument(
+        "--astc",
+        choices=("fastest", "fast", "medium", "thorough", "verythorough", "exhaustive"),
+        default="exhaustive",
+        help="preset of the ASTC encoder (default: exhaustive; 2048² takes minutes a map)",
+    )
     sub.add_argument("--ablation", action="store_true", help="also switch off each improvement of our recipe")
     _add_common(sub)
     variant_option(sub)
@@ -97,7 +103,8 @@ def _image(arguments, source) -> dict:
 
     try:
         settings = image.request(
-            arguments.compression, arguments.seconds, arguments.paper_seconds, arguments.dims, arguments.ablation,
+            arguments.compression, arguments.seconds, arguments.paper_seconds, arguments.dims, arguments.astc,
+            arguments.ablation,
             arguments.quick,
         )  # fmt: skip
     except ValueError as e:

@@ -64,7 +64,7 @@ class Settings:
     paper_seconds: tuple[float, ...] = (60.0,)
     dims: tuple[int, ...] = (2, 3, 4)
     ablation: bool = False
-    astc: str = "thorough"
+    astc: str = "exhaustive"
     lanes: int = 2**20
     rounds: int = 21
     quick: bool = False
@@ -169,9 +169,7 @@ def _trained(source, folder: Path, compression: float, name: str, kind: str, rec
         types = array_module("cuda" if mi.variant().startswith("cuda") else "llvm")
         own = training.replaced(recipe, deterministic=False)
         size = search.default_size(source, source.nbytes / compression, own)
-        steps = training.steps_in(seconds, source, size, own, types)
-        own = training.replaced(own, steps=steps, quality_every=max(1, steps // 10))
-        table, result = training.fit_image(source, size, own, title=name)
+        table, result = training.fit_image(source, size, own, title=name, seconds=seconds)
         if result.interrupted:
             raise _Interrupted
         save_table(path, table)
@@ -199,7 +197,7 @@ def _codecs(source: Source, compression: float, settings: Settings, cache: dict)
         def make():
             start = time.perf_counter()
             encoded, nbytes = codecs.astc_material(
-                values, budget, settings.astc, uniform, normals, choose="fast", cache=cache
+                values, budget, settings.astc, uniform, normals, (1, 2), "fastest", cache, split=False
             )
             known = {"how": {name: e.codec for name, e in encoded.items()}}
             return nbytes, time.perf_counter() - start, {name: e.image for name, e in encoded.items()}, known
@@ -479,7 +477,7 @@ def _verdicts(result: dict) -> list[str]:
     return lines
 
 
-def request(compressions, seconds, paper_seconds, dims, ablation: bool, quick: bool) -> Settings:
+def request(compressions, seconds, paper_seconds, dims, astc: str, ablation: bool, quick: bool) -> Settings:
     """Settings from what the command line has, lists of which any may be empty; raises ``ValueError``."""
     found = tuple(sizing.parse_compression(c) for c in compressions) or (12.0,)
     seconds = tuple(seconds) or (2.0 if quick else 60.0,)
@@ -490,4 +488,4 @@ def request(compressions, seconds, paper_seconds, dims, ablation: bool, quick: b
     }
     if quick:
         return Settings(found[:1], **about, ablation=ablation, astc="fast", lanes=2**16, rounds=3, quick=True)
-    return Settings(found, **about, ablation=ablation)
+    return Settings(found, **about, ablation=ablation, astc=astc)

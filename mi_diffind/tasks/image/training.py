@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,11 +147,11 @@ class ImageProblem:
         self.about = {"source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}}
         self.rounded = self.jittered = False
 
-    def begin(self, step: int, steps: int) -> str:
+    def begin(self, step: int, share: float) -> str:
         """Called before each step: does it see rounded entries, are its samples jittered? Says so."""
-        self.rounded = step >= (1 - self.recipe.rounded) * steps
-        share = self.recipe.jitter
-        self.jittered = int((step + 1) * share) > int(step * share)
+        self.rounded = share >= 1 - self.recipe.rounded
+        jitter = self.recipe.jitter
+        self.jittered = int((step + 1) * jitter) > int(step * jitter)
         return f"rounded: {self.rounded}, jittered: {self.jittered}"
 
     def _texel(self, rng, size: int):
@@ -264,11 +263,13 @@ def fit_image(
     progress: bool = True,
     border: tuple[str, str] | None = None,
     title: str | None = None,
+    seconds: float | None = None,
 ) -> tuple[Table, FitResult]:
     """
     Train the arrays of ``source`` and return them as they are stored, with their errors
     (:meth:`.CompressedImage.measure`), and the run's record. ``size`` may be ``None`` for an image of one colour, which
-    needs no arrays. ``border`` is that along v and u, found out unless given.
+    needs no arrays. ``border`` is that along v and u, found out unless given. ``seconds``: train for so long, in place
+    of the recipe's steps.
     """
     recipe = recipe or RECIPES["ours"]
     layout, types = layout_of(source, recipe), array_module(backend)
@@ -278,8 +279,10 @@ def fit_image(
             {}, 0, 0, 0.0, False, 0
         )
     problem = problem_of(source, size, recipe, types, layout, border)
-    result = fit(problem, recipe.settings, checkpoint, resume, progress, title=title)
+    result = fit(problem, recipe.settings, checkpoint, resume, progress, title=title, seconds=seconds)
     about = {**dataclasses.asdict(recipe.settings), **problem.about, "ratio": size.ratio}
+    if seconds is not None:
+        about |= {"seconds": seconds, "steps": result.steps}
     about["structure"] = structure_of(source, recipe)
     table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), about, recipe.settings.seed)
     return _with_quality(table, source, types), result
@@ -300,15 +303,3 @@ def stored_form(net: Indirection, bits: Sequence[int]) -> Indirection:
         affine = ((1 / steps,) * array.channels, (0.0,) * array.channels)
         found.append(DifferentiableArray.from_numpy(codes, dtype, array.border, "uint8", False, affine, width))
     return arrays.joined(found[:-1], found[-1])
-
-
-def steps_in(seconds: float, source: Source, size: Size, recipe: Recipe, types) -> int:
-    """
-    How many steps of a training take ``seconds`` here: measured, on the cores that it may use, after two that compile.
-    """
-    problem = problem_of(source, size, recipe, types)
-    fit(problem, dataclasses.replace(recipe.settings, steps=4, quality_every=4), progress=False)
-    count = 10
-    start = time.perf_counter()
-    fit(problem, dataclasses.replace(recipe.settings, steps=count, quality_every=count), progress=False)
-    return max(1, round(seconds * count / (time.perf_counter() - start)))
