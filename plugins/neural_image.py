@@ -103,7 +103,7 @@ class NeuralImage(mi.Texture):
     the seam, where :monosp:`bitmap` blends over the width of a texel.
 
     **Spectral variants** upsample the colour that was read to a spectrum by Jakob and Hanika's model, from the table of
-    coefficients that :monosp:`bitmap` uses when it is loaded: the same spectra at texel centres (116 dB), and 52 dB
+    coefficients that :monosp:`bitmap` uses when it is loaded: the same spectra at texel centres (114 dB), and 52 dB
     between those of smooth colours, 48 × 64 texels, at 400 to 700 nm. As in :monosp:`bitmap`, colours are clamped to
     [0, 1] for that, also those of emitters, and a map of three channels answers for spectra only if it is not ``raw``,
     for numbers only if it is.

@@ -87,6 +87,9 @@ def _about_image(file: str, table) -> dict:
         f"{sum(m.channels for m in layout.maps)}, {layout.source_nbytes:,} bytes uncompressed: "
         + (f"{ratio:.2f}x" if ratio else "of one colour")
     )
+    net = image.CompressedImage.from_table(table, runtime.array_module().TensorXf).net
+    memory = sum(a.memory_nbytes for a in (*net.primary, net.cascaded)) if net else 0
+    print(f"  {memory:,} bytes in memory")
     maps = {}
     for m in layout.maps:
         psnr = table.quality.get(f"psnr_{m.name}_db")
@@ -96,7 +99,7 @@ def _about_image(file: str, table) -> dict:
         kept = ", ".join(map(str, stored))
         print(f"    {m.name:20} {m.channels} channel(s), {m.color_space}, stored as {kept}{quality}")
     return {"width": layout.width, "height": layout.height, "source_bytes": layout.source_nbytes,
-            "compression": ratio, "maps": maps}  # fmt: skip
+            "memory_bytes": memory, "compression": ratio, "maps": maps}  # fmt: skip
 
 
 def _measure_image(file: str) -> dict:

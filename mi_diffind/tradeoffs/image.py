@@ -227,7 +227,8 @@ def _codecs(source: Source, compression: float, settings: Settings, cache: dict)
         return jobs
     if "astc" in found:
         jobs.append(_Job(f"ASTC {mark}, one block size", "ASTC", compression, blocks(True)))
-        jobs.append(_Job(f"ASTC {mark}, each map its own", "ASTC", compression, blocks(False)))
+        if len(values) > 1:
+            jobs.append(_Job(f"ASTC {mark}, each map its own", "ASTC", compression, blocks(False)))
     if "bc7" in found and compression == settings.compressions[0]:
         jobs.append(_Job("BC7", "BC7", 0.0, bc7))
     for codec, name, access in (("jpeg", "JPEG", False), ("webp", "WebP", False), ("bicubic", "bicubic", True)):
