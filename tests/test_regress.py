@@ -14,7 +14,7 @@ from mi_diffind.cli import main
 
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
-STORED = [*(SCENES / f"{name}.xml" for name in ("materials", "metals", "still_life")), TESTS / "lamp.xml"]
+STORED = [*(SCENES / f"{name}.xml" for name in ("materials", "metals", "still_life", "tiles")), TESTS / "lamp.xml"]
 
 
 @pytest.fixture

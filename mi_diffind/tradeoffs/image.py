@@ -46,6 +46,9 @@ MEASURES = (
     ("FLIP", "flip", ".4f", False),
 )
 
+#: ns; what takes less, or less than the floor by noise, is drawn there.
+SHORTEST = 0.01
+
 #: What is measured of a candidate so far, until the result is written.
 PARTIAL = "tradeoff_image.partial.json"
 
@@ -405,8 +408,12 @@ def figure(result: dict, path: str | os.PathLike) -> None:
     reads = result["reads"].get("random", {})
     timed = [r for r in rows if r.get("read") in reads]
     if timed:
-        lines = [plot.Line(k, v["ns_per_read"], k == "bitmap, 8 bits") for k, v in reads.items() if "bitmap" in k]
-        points = _points(timed, lambda r: reads[r["read"]]["ns_per_read"])
+        lines = [
+            plot.Line(k, max(v["ns_per_read"], SHORTEST), k == "bitmap, 8 bits")
+            for k, v in reads.items()
+            if "bitmap" in k
+        ]
+        points = _points(timed, lambda r: max(reads[r["read"]]["ns_per_read"], SHORTEST))
         panels.append(plot.Panel("Quality against time", "ns to read all maps, random places (log)", points, lines))
     caption = (
         f"{result['source']}, {result['width']} × {result['height']}, {len(result['maps'])} map(s), "
