@@ -195,12 +195,13 @@ def _codecs(source: Source, compression: float, settings: Settings, cache: dict)
     values = {m.name: _shown(m.values) for m in source.maps}
     found = codecs.available()
     normals = [m.name for m in source.maps if m.kind == "normal"]
+    choose = "fast" if settings.quick else "medium"  # presets differ by dB, and not by the same for each block size
 
     def blocks(uniform: bool):
         def make():
             start = time.perf_counter()
             encoded, nbytes = codecs.astc_material(
-                values, budget, settings.astc, uniform, normals, (1, 2), "fastest", cache, split=False
+                values, budget, settings.astc, uniform, normals, (1, 2), choose, cache, split=False
             )
             known = {"how": {name: e.codec for name, e in encoded.items()}}
             return nbytes, time.perf_counter() - start, {name: e.image for name, e in encoded.items()}, known
