@@ -409,9 +409,18 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
 @contextlib.contextmanager
 def _cores(deterministic: bool):
     before = dr.thread_count()
+
+    def use(cores: int) -> None:
+        # Sums that a kernel makes have a place for each thread there was when the kernel was launched: none may be
+        # under way while the number of threads changes, lest a new one writes beyond.
+        if cores != dr.thread_count():
+            dr.eval()
+            dr.sync_thread()
+            dr.set_thread_count(cores)
+
     if deterministic:
-        dr.set_thread_count(1)
+        use(1)
     try:
         yield
     finally:
-        dr.set_thread_count(before)
+        use(before)
