@@ -22,6 +22,7 @@ from drjit.opt import Adam
 from tqdm import tqdm
 
 from .files import replacing, writable_file
+from .indirection import unfolded
 from .interrupt import interruptible
 
 SCHEDULES = ("constant", "cosine", "plateau")
@@ -191,7 +192,7 @@ def fit(
             best, best_quality, best_step = trainer.snapshot().parameters, quality, trainer.step
         bar.set_postfix({"loss": f"{loss:.3g}", name: f"{value:.2f}"})
 
-    with interruptible() as stop, _cores(settings.deterministic), bar:
+    with interruptible() as stop, _cores(settings.deterministic), _room_for_sums(), bar:
         while trainer.share < 1 and not stop.is_set():
             before, share_before = trainer.snapshot(), trainer.share
             loss = trainer.take_step(plateau.factor)
@@ -305,20 +306,24 @@ class _Trainer:
         if hasattr(self.problem, "begin"):
             self.kind = self.problem.begin(self.step, self.share) or ""
         inputs, targets = self.problem.batch(rng, settings.batch)
-        outputs = self.problem.predict(net, inputs)
-        loss = 0
+        outputs, losses = self.problem.predict(unfolded(net), inputs), []
         for name, target in targets.items():
             errors = [o - t for o, t in zip(outputs[name], target, strict=True)]
             errors = [dr.abs(e) if settings.loss == "mae" else dr.square(e) for e in errors]
             weight = self.problem.weights.get(name, 1.0) / (len(errors) * settings.batch)
-            loss += weight * dr.sum(sum(errors[1:], errors[0]))
-        dr.backward(loss)
+            losses.append(weight * sum(errors[1:], errors[0]))
+        # The loss is the sum of these; the same kernel writes them and sums the gradients of the entries.
+        dr.schedule(dr.detach(losses))
+        for values in losses:
+            dr.set_grad(values, 1)
+            dr.enqueue(dr.ADMode.Backward, values)
+        dr.traverse(dr.ADMode.Backward)
         rate = self.learning_rate(plateau)
         self.optimizer.set_learning_rate({name: rate for name in self.optimizer})
         self.optimizer.step()
         net.update(self.optimizer)
         self.step += 1
-        loss = dr.detach(loss)
+        loss = sum(dr.sum(values) for values in dr.detach(losses))
         dr.schedule(loss)
         return loss
 
@@ -404,6 +409,21 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
         changed = [k for k in {**settings, **stored_settings} if stored_settings.get(k) != settings.get(k)]
         raise FittingError(f'the checkpoint "{path}" was made with other settings ({", ".join(changed)})')
     return state, {**meta, "best": best}
+
+
+#: Entries, of all cores together, that the copies of an array may have in which each core sums gradients on its own.
+LARGEST_SUMS = 2**28
+
+
+@contextlib.contextmanager
+def _room_for_sums():
+    """Let each core sum the gradients of larger arrays on its own, too: 2 to 3 times faster than together."""
+    before = dr.expand_threshold()
+    dr.set_expand_threshold(max(before, LARGEST_SUMS // dr.thread_count()))
+    try:
+        yield
+    finally:
+        dr.set_expand_threshold(before)
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ optimiser, ``net.update(opt)`` takes them back, and ``nn.Sequential``, hash grid
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import sys
@@ -144,6 +145,18 @@ class DifferentiableArray(nn.Module):
         result = type(self)()
         for name in self.DRJIT_STRUCT:
             setattr(result, name, getattr(self, name))
+        return result
+
+    def unfolded(self, change=None) -> DifferentiableArray:
+        """
+        A copy that holds its entries folded already, after ``change`` (a function of a flat array) if given;
+        differentiable with respect to the entries of this one. For floats.
+        """
+        self._require_entries()
+        result, entries = self._like(), self.data.array
+        entries = fold(entries) if self.folded else entries
+        result.data = type(self.data)(entries if change is None else change(entries), self.data.shape)
+        result.folded = False
         return result
 
     def to(self, storage: str) -> DifferentiableArray:
@@ -408,6 +421,26 @@ class Indirection(nn.Module):
 
     def __repr__(self) -> str:
         return f"Indirection({', '.join(map(repr, self.primary))} -> {self.cascaded!r})"
+
+
+def unfolded(net):
+    """
+    A copy of a module, or of a tuple or list of modules, in which all arrays are :meth:`.DifferentiableArray.unfolded`.
+
+    For training: if all entries are folded before anything is read, then a backward pass comes to all reads before it
+    comes to a fold, and the sums of all gradients are made by one kernel. (To pass through a fold it has to wait for
+    the sums behind it, and what follows would have to repeat the reads.)
+    """
+    if isinstance(net, DifferentiableArray):
+        return net if net.storage == "uint8" else net.unfolded()
+    if isinstance(net, (tuple, list)):
+        return type(net)(map(unfolded, net))
+    if not isinstance(net, nn.Module):
+        return net
+    result = copy.copy(net)
+    for name in getattr(net, "DRJIT_STRUCT", ()):
+        setattr(result, name, unfolded(getattr(net, name)))
+    return result
 
 
 def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.ndarray:

@@ -7,6 +7,7 @@ import signal
 import drjit as dr
 import numpy as np
 import pytest
+from drjit import nn
 
 from mi_diffind import DifferentiableArray, Indirection, fitting
 from mi_diffind.files import OutputError
@@ -464,6 +465,78 @@ def test_no_compilation_after_the_first_steps(ad, schedule):
     # Measurements (step 20) and the restart (step 35) have kernels of their own, later steps have none.
     assert growth[-1] == growth[44] and growth[19] == growth[11] and growth[-1] <= growth[11] + 6
     assert len(growth) > 80
+
+
+class Several(Curve):
+    """Two indirections and an array, of which one is read by two targets."""
+
+    def __init__(self, ad):
+        super().__init__(ad)
+        first = Indirection(DifferentiableArray(16, 2, "ramp", fold=True), DifferentiableArray((8, 8), 1, fold=True))
+        second = Indirection(DifferentiableArray(8, 1, "ramp", fold=True), DifferentiableArray(8, 3))
+        parts = (first, second, DifferentiableArray(9, 1, fold=True))
+        self.net = nn.Sequential(*(part.alloc(ad.TensorXf) for part in parts))
+
+    def batch(self, rng, size):
+        x = rng.random(self.ad.Float, size)
+        return [x], {"y": [self.target(x)] * 4, "z": [dr.square(x)]}
+
+    def predict(self, net, inputs):
+        first, second, third = net.layers
+        return {"y": first(inputs) + second(inputs), "z": third(inputs)}
+
+    def quality(self, net):
+        return {"q": 1.0}
+
+
+@pytest.mark.parametrize("problem", [Curve, Several])
+def test_a_step_is_one_kernel(ad, problem):
+    """Reads, losses and the sums of all gradients: what else there is has the sizes of the arrays."""
+    trainer = fitting._Trainer(problem(ad), settings(batch=1000))
+    trainer.take_step()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for _ in range(2):
+            dr.eval()
+            dr.kernel_history_clear()
+            dr.eval(trainer.take_step())
+            kernels = [k["size"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+            assert kernels.count(1000) == 1 and max(k for k in kernels if k != 1000) <= 8 * 8
+
+
+def test_the_loss_and_its_gradient(ad):
+    """A step of gradient descent on both targets, in NumPy; weights and numbers of channels count."""
+
+    class Linear(Several):
+        def __init__(self, ad):
+            super().__init__(ad)
+            self.weights = {"y": 3.0}
+            self.net = DifferentiableArray(2, 3, np.array([[0.2, 0.9, 0.4], [0.7, 0.1, 0.3]])).alloc(ad.TensorXf)
+
+        def predict(self, net, inputs):
+            a, b, c = net(inputs)
+            return {"y": [a, b, a, b], "z": [c]}
+
+    problem = Linear(ad)
+    trainer = fitting._Trainer(problem, settings(batch=1000, loss="mse"))
+    entries = problem.net.numpy().astype(np.float64)
+    seed = dr.opaque(ad.UInt64, 0)
+    x = np.array(problem.batch(dr.rng(seed=seed), 1000)[0][0]).astype(np.float64)
+    weights = np.stack([1 - x, x])
+    errors = np.einsum("is,ic->cs", weights, entries) - np.stack([*[0.5 + 0.3 * np.sin(6 * x)] * 2, x**2])
+    scale = np.array([[3 / 2], [3 / 2], [1]])
+    gradient = np.einsum("cs,is->ic", 2 * scale * errors, weights) / 1000
+    loss = trainer.take_step()
+    assert float(loss[0]) == pytest.approx(float((scale * errors**2).sum() / 1000), rel=1e-4)
+    _, _, _, (_, moment, _, _) = trainer.optimizer.state["data"]
+    found = np.array(moment).reshape(2, 4)[:, :3] / 0.1  # of Adam's first step: (1 - 0.9) times the gradient
+    np.testing.assert_allclose(found, gradient, rtol=1e-4, atol=1e-6)
+
+
+def test_limits_are_restored(ad):
+    before, seen = dr.expand_threshold(), []
+    run(Curve(ad, {3: lambda y: seen.append(dr.expand_threshold()) or y}), settings(steps=5))
+    run(Curve(ad, {3: interrupt}), settings(steps=5))
+    assert dr.expand_threshold() == before < seen[0]
 
 
 # -- mistakes ---------------------------------------------------------------------------------------------------------

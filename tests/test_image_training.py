@@ -9,7 +9,7 @@ import pytest
 from conftest import BACKENDS
 from scipy.ndimage import map_coordinates
 
-from mi_diffind import DifferentiableArray, Indirection, save_table
+from mi_diffind import DifferentiableArray, Indirection, fitting, save_table
 from mi_diffind.fitting import fit
 from mi_diffind.runtime import array_module
 from mi_diffind.sizing import Coarse, Size
@@ -350,9 +350,28 @@ def test_rounded_entries_are_the_stored_ones(ad, bits, dims):
         assert codes.max() <= steps and np.ptp(codes) > 0.9 * steps and made.bits == width
         folded = 1 - np.abs(1 - np.mod(array.data.numpy()[..., : array.channels].astype(np.float64), 2))
         assert np.abs(codes / steps - folded).max() <= 0.5001 / steps
-    rounded = numpy_of(training.rounded_read(net, x, bits))
+    rounded = numpy_of(training.rounded(net, bits)(x))
     np.testing.assert_allclose(rounded, numpy_of(stored(x)), atol=1e-6)
     assert np.abs(rounded - numpy_of(net(x))).max() > 1e-3  # it does something
+
+
+@pytest.mark.parametrize("recipe", ["ours", "paper"])
+@pytest.mark.parametrize("structure", ["6 bits", "2 + 6 bits"])
+def test_a_step_is_one_kernel(ad, recipe, structure):
+    """Samples, targets, rounded reads and the sums of all gradients."""
+    image = np.random.default_rng(2).integers(0, 255, (64, 80, 3), dtype=np.uint8)
+    recipe = training.replaced(dataclasses.replace(training.RECIPES[recipe], structure=structure), batch=3000)
+    source = from_arrays({"albedo": image})
+    problem = training.problem_of(source, search.default_size(source, 4000, recipe), recipe, ad)
+    trainer = fitting._Trainer(problem, recipe.settings)
+    trainer.share = 0.9
+    for _ in range(4):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.eval()
+            dr.kernel_history_clear()
+            dr.eval(trainer.take_step())
+            kernels = [k["size"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        assert kernels.count(3000) == 1
 
 
 @pytest.mark.parametrize("bits", [(4,), (2, 5)])
@@ -363,7 +382,7 @@ def test_the_gradient_passes_through_rounding(ad, bits):
     parts = (*net.primary, net.cascaded)
     for array in parts:
         dr.enable_grad(array.data)
-    dr.backward(sum(float(w) * v for w, v in zip(weight, training.rounded_read(net, x, bits), strict=True)))
+    dr.backward(sum(float(w) * v for w, v in zip(weight, training.rounded(net, bits)(x), strict=True)))
 
     exact = []
     for array, width in zip(parts, (*bits, 8), strict=True):
@@ -388,7 +407,7 @@ def test_rounding_changes_nothing_that_is_round(ad):
         DifferentiableArray((4,) * 3, 2, rng.integers(0, 255, (4, 4, 4, 2)) / 255, fold=True),
     ).alloc(ad.TensorXf)
     x, found = random_places(ad), []
-    for read in (lambda: net(x), lambda: training.rounded_read(net, x, [4])):
+    for read in (lambda: net(x), lambda: training.rounded(net, [4])(x)):
         for array in (net.primary[0], net.cascaded):
             dr.disable_grad(array.data)
             dr.enable_grad(array.data)
@@ -638,7 +657,6 @@ def test_no_seam(ad):
 
 def test_training_for_a_time(ad, monkeypatch):
     """With a clock of its own, a fortieth of a second a look: the training ends on time, and its rate with it."""
-    from mi_diffind import fitting
 
     clock, rates = [0.0], []
 

@@ -8,7 +8,7 @@ from drjit.opt import Adam
 from scipy.ndimage import map_coordinates
 
 from mi_diffind import DifferentiableArray, Indirection, fold, lookup
-from mi_diffind.indirection import ramp
+from mi_diffind.indirection import ramp, unfolded
 from mi_diffind.runtime import array_module
 
 BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
@@ -276,6 +276,42 @@ def test_copies_keep_few_bits(ad):
     np.testing.assert_allclose(
         read(rest, ad, x[:, :1]), interpolate(codes / 31, np.stack([x[:, 0], np.full(50, 0.3)], 1)), atol=1e-5
     )
+
+
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+def test_unfolded(ad, storage):
+    """The same values and gradients, from arrays that hold what the others are folded to."""
+    rng = np.random.default_rng(8)
+    tables = [rng.uniform(-3, 3, s) for s in ((5, 6, 2), (4, 4, 3), (7, 2))]
+    first = Indirection(*(DifferentiableArray(t.shape[:-1], t.shape[-1], t, fold=True) for t in tables[:2]))
+    net = nn.Sequential(first.alloc(ad.TensorXf), DifferentiableArray((7,), 2, tables[2]).alloc(ad.TensorXf))
+    if storage == "float16":
+        net.layers = (net.layers[0].to("float16"), net.layers[1].to("float16"))
+    x, found = uniform(9, 300, 2), []
+    arrays = [net.layers[0].primary[0], net.layers[0].cascaded, net.layers[1]]
+    for change in (lambda n: n, unfolded):
+        for array in arrays:
+            dr.disable_grad(array.data)
+            dr.enable_grad(array.data)
+        first, last = change(net).layers
+        values = [*first([ad.Float(v) for v in x.T]), *last([ad.Float(x[:, 0])])]
+        dr.backward(sum(((i + 1) * v for i, v in enumerate(values)), 0))
+        found.append([np.array(v) for v in values] + [a.data.grad.numpy() for a in arrays])
+    for a, b in zip(*found, strict=True):
+        assert np.abs(a).max() > 0.1
+        np.testing.assert_array_equal(a, b)
+    changed = unfolded(net)
+    assert list(changed) == list(net) and not changed.layers[0].cascaded.folded
+    for made, array in zip((*changed.layers[0].primary, changed.layers[0].cascaded), arrays, strict=False):
+        np.testing.assert_array_equal(made.data.numpy()[..., : made.channels], array.numpy())
+    assert [a.folded for a in arrays] == [storage == "float32"] * 2 + [False]  # the net is as it was
+
+
+def test_what_has_no_float_entries_stays(ad):
+    packed = DifferentiableArray(4, 2, "ramp").alloc(ad.TensorXf).to("uint8")
+    layer = nn.Linear(3, 4)
+    assert unfolded(packed) is packed and unfolded(5) == 5
+    assert type(unfolded((packed, layer))) is tuple and type(unfolded(layer)) is nn.Linear
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)

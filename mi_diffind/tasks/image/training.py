@@ -20,7 +20,7 @@ import numpy as np
 
 from ... import lookup
 from ...fitting import FitResult, FitSettings, fit
-from ...indirection import DifferentiableArray, Indirection, fold
+from ...indirection import DifferentiableArray, Indirection
 from ...runtime import array_module
 from ...sizing import Coarse, Size
 from ...tables import Table
@@ -146,6 +146,7 @@ class ImageProblem:
         self.weights = {name: len(found) / self.channels for name, found in self.groups.items()}
         self.about = {"source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}}
         self.rounded = self.jittered = False
+        self._stretches = {}  # size of a batch → first texel and number of texels of each stretch
 
     def begin(self, step: int, share: float) -> str:
         """Called before each step: does it see rounded entries, are its samples jittered? Says so."""
@@ -159,10 +160,12 @@ class ImageProblem:
         UInt32, Float = self.types.UInt32, self.types.Float
         if size % self.texels == 0:
             return dr.arange(UInt32, size) % self.texels
-        edges = np.arange(size + 1, dtype=np.uint64) * self.texels // size
-        first, count = edges[:-1].astype(np.uint32), np.maximum(np.diff(edges), 1).astype(np.uint32)
-        count = UInt32(count)
-        return UInt32(first) + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
+        if size not in self._stretches:
+            edges = np.arange(size + 1, dtype=np.uint64) * self.texels // size
+            counts = np.maximum(np.diff(edges), 1).astype(np.uint32)
+            self._stretches[size] = UInt32(edges[:-1].astype(np.uint32)), UInt32(counts)
+        first, count = self._stretches[size]
+        return first + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
 
     def batch(self, rng, size: int):
         Float = self.types.Float
@@ -208,7 +211,7 @@ class ImageProblem:
         return total
 
     def predict(self, net, inputs) -> dict[str, list]:
-        found = rounded_read(net, inputs, self.bits) if self.rounded else net(inputs)
+        found = (rounded(net, self.bits) if self.rounded else net)(inputs)
         return {name: [found[i] for i in channels] for name, channels in self.groups.items()}
 
     def quality(self, net) -> dict[str, float]:
@@ -218,27 +221,28 @@ class ImageProblem:
         with dr.suspend_grad():
             index = self._texel(rng, size)
             x, y = self.types.Float(index % self.width) + 0.5, self.types.Float(index // self.width) + 0.5
-            found = rounded_read(net, [y / self.height, x / self.width], self.bits)
+            found = rounded(net, self.bits)([y / self.height, x / self.width])
             errors = [dr.mean(dr.square(a - b)) for a, b in zip(found, self._texels(index), strict=True)]
             total = sum(float(e[0]) for e in errors) / self.channels
         return {"psnr_db": -10 * math.log10(max(total, 1e-12))}
 
 
-def rounded_read(net: Indirection, x, bits: Sequence[int]) -> list:
+def rounded(net: Indirection, bits: Sequence[int]) -> Indirection:
     """
-    ``net(x)`` as if its entries were rounded as they will be stored, with the gradients of the entries as they are
+    A copy of ``net`` whose entries are rounded as they will be stored, with the gradients of the entries as they are
     (straight-through estimation). ``bits`` are those of each primary.
     """
-    pointer = []
-    for array, width in zip(net.primary, bits, strict=True):
-        pointer += _rounded(array, x, width)
-    return _rounded(net.cascaded, pointer, 8)
+    primary = [array.unfolded(_rounding(width)) for array, width in zip(net.primary, bits, strict=True)]
+    return Indirection(primary, net.cascaded.unfolded(_rounding(8)), net.inputs)
 
 
-def _rounded(array: DifferentiableArray, x, bits: int) -> list:
-    steps, entries = 2**bits - 1, fold(array.data.array)
-    entries += dr.detach(dr.round(dr.detach(entries) * steps) / steps - dr.detach(entries))
-    return lookup.read_float(entries, array.resolution, array.channels, x, array.border, stored=array.data.shape[-1])
+def _rounding(bits: int):
+    steps = 2**bits - 1
+
+    def change(entries):
+        return entries + dr.detach(dr.round(dr.detach(entries) * steps) / steps - dr.detach(entries))
+
+    return change
 
 
 def problem_of(
