@@ -13,6 +13,12 @@ def srgb(image: np.ndarray) -> np.ndarray:
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 0.0031308), 1 / 2.4) - 0.055)
 
 
+def linear(values: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`srgb`; not clipped, negative values become multiples of themselves."""
+    c = np.maximum(values, 0.04045)
+    return np.where(values <= 0.04045, values / 12.92, (c / 1.055 + 0.055 / 1.055) ** 2.4)
+
+
 def psnr(reference: np.ndarray, image: np.ndarray) -> float:
     """Peak signal-to-noise ratio in dB of linear values clipped to [0, 1]; infinite for equal images."""
     mse = float(np.mean((np.clip(reference, 0, 1) - np.clip(image, 0, 1)) ** 2, dtype=np.float64))

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import metrics
 from mi_diffind.indirection import fold
 from mi_diffind.lookup import clamp
 from mi_diffind.tables import TableError
@@ -331,7 +332,7 @@ class NeuralImage(mi.Texture):
             values = pool.submit(decode).result()
         if self.raw or self.map.color_space != "srgb":
             return values
-        return np.where(values < 0.04045, values / 12.92, (np.maximum(values, 0) / 1.055 + 0.055 / 1.055) ** 2.4)
+        return metrics.linear(values)
 
     # -- sampling of positions ----------------------------------------------------------------------------------------
 

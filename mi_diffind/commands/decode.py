@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import metrics
 from ..files import replacing, writable_file
 from ..runtime import array_module
 from ..tables import TableError
@@ -80,6 +81,6 @@ def _write(path: Path, values: np.ndarray, color_space: str) -> None:
             mi.Bitmap(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).write(str(temporary))
             return
         if color_space == "srgb":
-            values = np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4)
+            values = metrics.linear(values)
         form = np.float16 if np.abs(values).max() < 65520 else np.float32  # what rounds to a finite number
         mi.Bitmap(np.ascontiguousarray(values, dtype=form)).write(str(temporary))
