@@ -307,7 +307,7 @@ def _picture(values: np.ndarray) -> np.ndarray:
 def _reads(source: Source, settings: Settings, folder: Path, rows: dict, stop) -> dict:
     """ns for all maps at a place, in turn: bitmaps of 8 bits and of floats, and the files that were trained."""
     readers = {"bitmap, 8 bits": _bitmaps(source, True), "bitmap, floats": _bitmaps(source, False)}
-    for name, row in rows.items():
+    for name, row in sorted(rows.items(), key=lambda item: -item[1]["errors"]["psnr_db"]):  # the best of each kind
         if "file" in row and row["compression"] == settings.compressions[0] and Path(row["file"]).is_file():
             key = f"neural_image 2D→{row['dims']}D, {row['structure']}, {row['cascaded']}"
             if key not in readers:
