@@ -59,7 +59,10 @@ class Problem(Protocol):
         """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
 
     def predict(self, net, inputs) -> dict[str, list]:
-        """What the tables say for ``inputs``, in the form of the targets."""
+        """
+        What the tables say for ``inputs``, in the form of the targets. ``net`` is a copy of the problem's, with entries
+        that are folded already (:func:`.indirection.unfolded`).
+        """
 
     def quality(self, net) -> dict[str, float]:
         """Measured quality on held-out data; the first entry decides which state is the best (higher is better)."""
