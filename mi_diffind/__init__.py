@@ -1,35 +1,49 @@
 """
 Learned lookup tables that a renderer trusts: differentiable indirection for Mitsuba 3.
 
-``import mi_diffind`` makes the plugins (``neural_disney``, ``disney``, ``neural_ggx``, ``neural_image``) available to
+``import mi_diffind`` makes the plugins (``neural_disney``, ``disney``, ``neural_ggx``, ``neural_image``, …) known to
 ``mi.load_file``, ``mi.load_string`` and ``mi.load_dict`` in every variant, whichever of ``mitsuba`` and ``mi_diffind``
-is imported first, and makes sure that Dr.Jit runs on an LLVM that does not abort (:mod:`mi_diffind.runtime`).
+is imported first, and makes sure that Dr.Jit runs on an LLVM that does not abort (:mod:`mi_diffind.runtime`). It
+imports neither of them itself: what is listed below is imported when it is asked for.
 """
 
+import importlib as _importlib
 from pathlib import Path as _Path
 
 from . import runtime as _runtime
+from .errors import DiffindError
+
+__version__ = "0.1.0"
 
 _here = _Path(__file__).resolve().parent
 if not (_here / "plugins").is_dir():  # a checkout has the folder `plugins` beside this one, an installation inside
     __path__.append(str(_here.parent))
 
-_runtime.select_llvm()  # before Dr.Jit starts
+#: Name → module that holds it.
+_NAMES = {
+    "DifferentiableArray": "indirection",
+    "Indirection": "indirection",
+    "fold": "indirection",
+    "StoredArray": "tables",
+    "Table": "tables",
+    "TableError": "tables",
+    "load_table": "tables",
+    "save_table": "tables",
+    "fit": "tasks.task",
+    "load_model": "tasks.task",
+}
 
-from . import plugins as _plugins  # noqa: E402
-from .indirection import DifferentiableArray, Indirection, fold  # noqa: E402
-from .tables import TableError, load_table, save_table  # noqa: E402
+__all__ = ["DiffindError", "__version__", *_NAMES]
 
-_plugins.install()
 
-__version__ = "0.1.0"
+def __getattr__(name: str):
+    if name in _NAMES:
+        return getattr(_importlib.import_module(f".{_NAMES[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
-__all__ = [
-    "DifferentiableArray",
-    "Indirection",
-    "TableError",
-    "__version__",
-    "fold",
-    "load_table",
-    "save_table",
-]
+
+def __dir__():
+    return sorted({*globals(), *__all__})
+
+
+_runtime.install()

@@ -1,5 +1,5 @@
 """
-``mi-diffind``: render, compare, regress, inspect, tradeoff, encode, decode, fit (:mod:`mi_diffind.commands`).
+``mi-diffind``: one verb a module of :mod:`mi_diffind.commands`.
 
 Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
 """
@@ -7,26 +7,22 @@ Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 
 from . import __version__
-from .commands import compare, decode, encode, fit, inspect, regress, render, tradeoff
-from .commands.common import UsageError
-from .files import OutputError, writable_file, write_json
-from .fitting import FittingError
-from .tables import TableError
-from .tasks.image.source import SourceError
+from .errors import DiffindError
+from .files import writable_file, write_json
 
 #: In the order of the help.
-VERBS = (render, compare, regress, inspect, tradeoff, encode, decode, fit)
+VERBS = ("render", "compare", "regress", "inspect", "tradeoff", "encode", "decode", "fit")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    arguments = _parser().parse_args(argv)
-    from .scenes import SceneError  # imports Mitsuba
-
+    argv = sys.argv[1:] if argv is None else argv
+    arguments = _parser(argv).parse_args(argv)
     try:
         if arguments.json is not None:
             writable_file(arguments.json)
@@ -34,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
         if arguments.json is not None:
             write_json(arguments.json, result)
         return 130 if result.get("interrupted") else 1 if result.get("failed") else 0
-    except (UsageError, OutputError, TableError, FittingError, SourceError, SceneError) as e:
+    except DiffindError as e:
         print(f"mi-diffind: error: {e}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -45,14 +41,20 @@ def main(argv: list[str] | None = None) -> int:
         return 1
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(argv: list[str]) -> argparse.ArgumentParser:
+    """The parser of all verbs, or of the one that is asked for: those of tasks need not be looked for then."""
     parser = argparse.ArgumentParser(
         prog="mi-diffind", description="Learned lookup tables for Mitsuba 3: differentiable indirection."
     )
     parser.add_argument("--version", action="version", version=f"mi-diffind {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for verb in VERBS:
-        verb.add(commands)
+    asked = next((word for word in argv if not word.startswith("-")), None)
+    for name in VERBS:
+        module = importlib.import_module(f"{__package__}.commands.{name}")
+        if name == asked:
+            module.add(commands)
+        else:
+            commands.add_parser(name, help=module.HELP)
     return parser
 
 

@@ -6,11 +6,12 @@ import contextlib
 import json
 import os
 import tempfile
-import textwrap
 from pathlib import Path
 
+from .errors import DiffindError, reason
 
-class OutputError(OSError):
+
+class OutputError(DiffindError, OSError):
     """An output file or folder cannot be written; the message is one sentence that names it."""
 
 
@@ -69,8 +70,8 @@ def replacing(path: str | os.PathLike):
         if isinstance(e, OutputError) or not (isinstance(e, OSError) or type(e) is RuntimeError):
             raise
         # Mitsuba raises RuntimeError, of several lines
-        reason = getattr(e, "strerror", None) or textwrap.shorten(str(e).replace(str(name), path.name), 100)
-        raise OutputError(f'output file "{path}" cannot be written: {reason}') from e
+        why = getattr(e, "strerror", None) or reason(e).replace(str(name), path.name)
+        raise OutputError(f'output file "{path}" cannot be written: {why}') from e
 
 
 def write_json(path: str | os.PathLike, content) -> None:

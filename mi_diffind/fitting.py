@@ -13,8 +13,8 @@ import math
 import os
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Protocol
 
 import drjit as dr
 import numpy as np
@@ -24,95 +24,105 @@ from tqdm import tqdm
 from .files import replacing, writable_file
 from .indirection import unfolded
 from .interrupt import interruptible
+from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
 
-SCHEDULES = ("constant", "cosine", "plateau")
-LOSSES = ("mae", "mse")
-
-
-class FittingError(RuntimeError):
-    """A training cannot go on; the message is one sentence."""
+__all__ = ["LOSSES", "SCHEDULES", "FitResult", "FitSettings", "FittingError", "Problem", "fit"]
 
 
-class Problem(Protocol):
-    """What a task has to provide to be trained."""
+class Problem:
+    """
+    What is to be trained: the base class, with defaults, of what every task provides.
 
-    #: The trainable module (``drjit.nn.Module``), allocated.
+    Most problems draw samples (:meth:`batch`) and say what the tables have for them (:meth:`predict`). One that is not
+    of that kind replaces :meth:`loss`, for instance by that of a render: its ``net`` may then be the parameters of a
+    loaded scene (``mi.SceneParameters``, reduced to those that are trained by ``keep``), which is a mapping that takes
+    an optimiser's values by ``update`` just as a ``drjit.nn.Module`` does. Gradients can be shaped on their way by
+    custom operations (``dr.custom``).
+    """
+
+    #: The trainable module (``drjit.nn.Module``), allocated, or another mapping of names to arrays with ``update``.
     net: object
 
     #: Weight of each named target in the loss; a missing name counts 1.
-    weights: dict[str, float]
+    weights: Mapping[str, float] = {}
 
-    #: Optional: states whose quality (first entry) differs by less than this count as equally good, and the later one
-    #: is kept. (Default: 0)
-    tolerance: float
+    #: States whose first measured number differs by less than this count as equally good, and the later one is kept.
+    tolerance: float = 0.0
 
-    #: Optional: what the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
-    about: dict
+    #: What the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
+    identity: Mapping = {}
+
+    #: The settings of the training; set by :func:`fit`.
+    settings: FitSettings = FitSettings()
 
     def begin(self, step: int, share: float) -> str:
         """
-        Optional: called before step ``step``, when the ``share`` of the training is over, for a problem that changes on
-        the way. Returns the kind of step: only losses of the same kind are compared.
+        Called before step ``step``, when the ``share`` of the training is over, for a problem that changes on the way.
+        Returns the kind of step: only losses of the same kind are compared.
         """
+        return ""
 
     def batch(self, rng, size: int):
         """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
+        raise NotImplementedError(f"{type(self).__name__} has neither batch() and predict() nor a loss() of its own")
 
     def predict(self, net, inputs) -> dict[str, list]:
         """
         What the tables say for ``inputs``, in the form of the targets. ``net`` is a copy of the problem's, with entries
         that are folded already (:func:`.indirection.unfolded`).
         """
+        raise NotImplementedError
 
-    def quality(self, net) -> dict[str, float]:
-        """Measured quality on held-out data; the first entry decides which state is the best (higher is better)."""
+    def loss(self, net, rng, size: int):
+        """
+        The loss of a step that may draw ``size`` samples from ``rng``: differentiable with respect to ``net``, an array
+        or a list of arrays, whose entries are summed.
 
+        Here: the weighted mean of the differences between :meth:`predict` and the targets of :meth:`batch`, absolute
+        or squared (``settings.loss``), as one array of ``size`` numbers for each target. They are not summed here, so
+        that one kernel can write them and sum the gradients of all entries.
+        """
+        inputs, targets = self.batch(rng, size)
+        outputs, losses = self.predict(unfolded(net), inputs), []
+        for name, target in targets.items():
+            errors = [o - t for o, t in zip(outputs[name], target, strict=True)]
+            errors = [dr.abs(e) if self.settings.loss == "mae" else dr.square(e) for e in errors]
+            losses.append(self.weights.get(name, 1.0) / (len(errors) * size) * sum(errors[1:], errors[0]))
+        return losses
 
-@dataclass
-class FitSettings:
-    """
-    How to train. ``lr`` is Adam's learning rate, ``schedule`` its course: ``"constant"``, ``"cosine"`` (to zero) or
-    ``"plateau"`` (halved when the loss has not improved for a tenth of the steps). ``quality_every`` and
-    ``check_every`` are numbers of steps between measurements and between looks at the loss.
-
-    With ``deterministic``, the same settings give the same bytes: the LLVM backend then trains on one core, since
-    the sums that several make together depend on who comes first (in their last digits). No effect on CUDA, where
-    sums are made by atomics.
-    """
-
-    steps: int = 2000
-    batch: int = 65536
-    lr: float = 1e-3
-    schedule: str = "cosine"
-    loss: str = "mae"
-    seed: int = 0
-    quality_every: int = 200
-    check_every: int = 20
-    deterministic: bool = True
-
-    def __post_init__(self):
-        for name, low in (("steps", 1), ("batch", 1), ("quality_every", 1), ("check_every", 1), ("seed", 0)):
-            if getattr(self, name) < low:
-                raise FittingError(f"{name}: found {getattr(self, name)}, at least {low} is needed")
-        if not (math.isfinite(self.lr) and self.lr > 0):
-            raise FittingError(f"lr: found {self.lr}, a positive number is needed")
-        if self.schedule not in SCHEDULES:
-            raise FittingError(f'schedule: found "{self.schedule}", allowed are {SCHEDULES}')
-        if self.loss not in LOSSES:
-            raise FittingError(f'loss: found "{self.loss}", allowed are {LOSSES}')
+    def measure(self, net) -> dict[str, float]:
+        """What is measured on held-out data; the first number decides which state is the best (higher is better)."""
+        raise NotImplementedError
 
 
 @dataclass
 class FitResult:
-    """The best state that was seen: its quality, the step it was reached at, and how the run went."""
+    """
+    The best state that was seen: what was ``measured`` of it, the ``step`` it was reached at, and how the run went.
+    ``history`` has what was measured on the way, with the loss (``None`` if it was not known).
+    """
 
-    quality: dict[str, float]
+    measured: dict[str, float]
     step: int
     steps: int
     seconds: float
     interrupted: bool
     restarts: int
     history: list[dict] = field(default_factory=list)
+
+    @property
+    def outcome(self) -> str:
+        """Which state was kept, and after Ctrl-C why it is not the last one: for a sentence."""
+        if not self.interrupted:
+            return f"best step {self.step}"
+        name, value = next(iter(self.measured.items()))
+        last = next((h for h in reversed(self.history) if h["step"] == self.steps), None)
+        if self.step == self.steps or last is None:
+            return f"interrupted at step {self.steps}, kept step {self.step}"
+        return (
+            f"interrupted at step {self.steps}, kept step {self.step}, which was better ({name} {value:.2f} against "
+            f"{last[name]:.2f})"
+        )
 
 
 @dataclass
@@ -144,27 +154,26 @@ def fit(
     ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
     read first (it must belong to the same settings). ``title`` stands before the progress bar. With ``seconds``, the
     training ends after so long, its schedules follow the clock in place of the steps, of which there are as many as can
-    be made, and quality is measured ten times. Ctrl-C ends the training
-    after the current step and keeps the best state so far. If the loss or a parameter becomes NaN, or the loss
-    explodes, the last good state is restored and the learning rate halved; ``log`` (default: print to stderr) is told
-    so in one sentence.
+    be made, and it is measured ten times. Ctrl-C ends the training after the current step, which is measured, too, and
+    keeps the best state so far. If the loss or a parameter becomes NaN, or the loss explodes, the last good state is
+    restored and the learning rate halved; ``log`` (default: print to stderr) is told so in one sentence.
 
     Raises :class:`FittingError` if the training diverges again and again, or the checkpoint does not fit.
     """
-    net = problem.net
+    net, problem.settings = problem.net, settings
     if checkpoint is not None:
         writable_file(checkpoint)
         if os.path.exists(checkpoint) and not resume and not _is_checkpoint(checkpoint):
             raise FittingError(f'the checkpoint "{checkpoint}" would replace a file that is not one')
     trainer, plateau = _Trainer(problem, settings), _Plateau(settings)
-    best, best_quality, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
+    best, best_measured, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
     references = {}  # running means of the loss by kind of step; from the first on, lest an explosion after it sets one
     if resume:
         if checkpoint is None:
             raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
         state, extra = _load_checkpoint(checkpoint, _all_settings(problem, settings), trainer)
         trainer.restore(state)
-        best, best_quality, best_step = extra["best"], extra["best_quality"], extra["best_step"]
+        best, best_measured, best_step = extra["best"], extra["best_measured"], extra["best_step"]
         history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
         trainer.restarts = restarts
         references = extra["references"]
@@ -180,32 +189,32 @@ def fit(
 
     trainer.share = share()
     good = trainer.snapshot()
-    total = settings.steps if seconds is None else None
-    bar = tqdm(total=total, initial=trainer.step, desc=title, disable=None if progress else True, unit="step")
+    bar = _Bar(settings.steps, seconds, title, progress)
+    bar.show(trainer)
     log = log or (lambda message: tqdm.write(message, file=sys.stderr))
     interrupted = False
 
-    def measure(loss):
-        nonlocal best, best_quality, best_step
-        quality = {k: float(v) for k, v in problem.quality(net).items()}
-        name, value = next(iter(quality.items()))
-        history.append({"step": trainer.step, "loss": loss, **quality})
+    def measure(loss: float | None):
+        nonlocal best, best_measured, best_step
+        measured = {k: float(v) for k, v in problem.measure(net).items()}
+        name, value = next(iter(measured.items()))
+        history.append({"step": trainer.step, "loss": loss, **measured})
         top = max((h[name] for h in history if math.isfinite(h[name])), default=value)
-        if best is None or value >= top - getattr(problem, "tolerance", 0.0):
-            best, best_quality, best_step = trainer.snapshot().parameters, quality, trainer.step
-        bar.set_postfix({"loss": f"{loss:.3g}", name: f"{value:.2f}"})
+        if best is None or value >= top - problem.tolerance:
+            best, best_measured, best_step = trainer.snapshot().parameters, measured, trainer.step
+        bar.measured(loss, name, value)
 
-    with interruptible() as stop, _cores(settings.deterministic), _room_for_sums(), bar:
+    with interruptible() as stop, _cores(settings.deterministic), _room_for_sums(), bar.shown:
         while trainer.share < 1 and not stop.is_set():
             before, share_before = trainer.snapshot(), trainer.share
             loss = trainer.take_step(plateau.factor)
             if seconds is not None:
                 dr.eval(loss)
                 dr.sync_thread()
-            bar.update(1)
             trainer.share = share()
+            bar.show(trainer)
             last = trainer.share >= 1
-            measured = trainer.step % settings.quality_every == 0
+            measured = trainer.step % settings.measure_every == 0
             if seconds is not None:
                 measured = int(10 * trainer.share) > int(10 * share_before)
             due = trainer.step % settings.check_every == 0 or measured
@@ -228,7 +237,7 @@ def fit(
                 good.lr_scale /= 2
                 trainer.restore(good)
                 trainer.share = share()
-                bar.n = trainer.step
+                bar.show(trainer)
                 continue
             references[trainer.kind] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
@@ -237,20 +246,43 @@ def fit(
                 measure(value)
                 if checkpoint is not None:
                     extra = {
-                        "best": best, "best_quality": best_quality, "best_step": best_step, "history": history,
+                        "best": best, "best_measured": best_measured, "best_step": best_step, "history": history,
                         "restarts": restarts, "seconds": time.perf_counter() - start, "plateau": plateau.state(),
                         "references": references,
                     }  # fmt: skip
                     _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), extra)
         if stop.is_set() and trainer.share < 1:
             interrupted = True
-            if best is None and trainer.finite():
-                measure(float("nan"))
+            if trainer.step > 0 and (not history or history[-1]["step"] != trainer.step) and trainer.finite():
+                measure(None)
 
     if best is None:
         raise FittingError("the training was stopped before its first measurement: there is nothing to keep")
     trainer.load_parameters(best)
-    return FitResult(best_quality, best_step, trainer.step, time.perf_counter() - start, interrupted, restarts, history)
+    spent = time.perf_counter() - start
+    return FitResult(best_measured, best_step, trainer.step, spent, interrupted, restarts, history)
+
+
+class _Bar:
+    """The progress bar: in steps, or in the seconds that a training is given, so that it shows the time left."""
+
+    def __init__(self, steps: int, seconds: float | None, title: str | None, progress: bool):
+        options = {"desc": title, "disable": None if progress else True}
+        if seconds is not None:
+            form = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
+            self.shown = tqdm(total=1.0, bar_format=form, **options)
+        else:
+            self.shown = tqdm(total=steps, unit="step", **options)
+        self.timed, self.text = seconds is not None, {}
+
+    def show(self, trainer: _Trainer) -> None:
+        self.shown.update((trainer.share if self.timed else trainer.step) - self.shown.n)
+
+    def measured(self, loss: float | None, name: str, value: float) -> None:
+        if loss is not None:
+            self.text["loss"] = f"{loss:.3g}"
+        self.text[name] = f"{value:.2f}"
+        self.shown.set_postfix(self.text)
 
 
 def _diverged(value: float, reference: float | None) -> bool:
@@ -306,15 +338,9 @@ class _Trainer:
         seed = dr.opaque(self.module.UInt64, (settings.seed << 32) + self.restarts * settings.steps + self.step)
         rng = dr.rng(seed=seed)
         net.update(self.optimizer)
-        if hasattr(self.problem, "begin"):
-            self.kind = self.problem.begin(self.step, self.share) or ""
-        inputs, targets = self.problem.batch(rng, settings.batch)
-        outputs, losses = self.problem.predict(unfolded(net), inputs), []
-        for name, target in targets.items():
-            errors = [o - t for o, t in zip(outputs[name], target, strict=True)]
-            errors = [dr.abs(e) if settings.loss == "mae" else dr.square(e) for e in errors]
-            weight = self.problem.weights.get(name, 1.0) / (len(errors) * settings.batch)
-            losses.append(weight * sum(errors[1:], errors[0]))
+        self.kind = self.problem.begin(self.step, self.share)
+        losses = self.problem.loss(net, rng, settings.batch)
+        losses = losses if isinstance(losses, list) else [losses]
         # The loss is the sum of these; the same kernel writes them and sums the gradients of the entries.
         dr.schedule(dr.detach(losses))
         for values in losses:
@@ -352,13 +378,12 @@ class _Trainer:
         self.problem.net.update(self.optimizer)
 
     def load_parameters(self, parameters: dict) -> None:
-        for key, value in parameters.items():
-            self.problem.net[key] = type(self.optimizer[key])(value)
+        self.problem.net.update({key: type(self.optimizer[key])(value) for key, value in parameters.items()})
 
 
 def _all_settings(problem: Problem, settings: FitSettings) -> dict:
     """What a checkpoint has to agree in."""
-    return {**asdict(settings), **json.loads(json.dumps(getattr(problem, "about", {})))}
+    return {**asdict(settings), **json.loads(json.dumps(dict(problem.identity)))}
 
 
 def _save_checkpoint(path, settings: dict, state: _State, extra: dict) -> None:
@@ -395,7 +420,7 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
             {k: (int(arrays[f"t/{k}"]), arrays[f"m/{k}"], arrays[f"v/{k}"]) for k in keys},
         )  # fmt: skip
         best = {k: arrays[f"best/{k}"] for k in keys}
-        for key in ("best_quality", "best_step", "history", "restarts", "seconds", "plateau", "references"):
+        for key in ("best_measured", "best_step", "history", "restarts", "seconds", "plateau", "references"):
             meta[key]  # a KeyError here, not later
         stored_settings = dict(meta["settings"])
     except Exception as e:  # zipfile, json and numpy each have their own for a damaged file

@@ -147,6 +147,13 @@ class DifferentiableArray(nn.Module):
             setattr(result, name, getattr(self, name))
         return result
 
+    def copy(self) -> DifferentiableArray:
+        """A copy that shares the entries; assigning to one does not change the other."""
+        self._require_entries()
+        result = self._like()
+        result.data = type(self.data)(self.data)
+        return result
+
     def unfolded(self, change=None) -> DifferentiableArray:
         """
         A copy that holds its entries folded already, after ``change`` (a function of a flat array) if given;

@@ -3,7 +3,7 @@ What has to be right before anything can run: LLVM.
 
 On a CPU, Dr.Jit compiles through LLVM, which it looks for the moment ``drjit`` is imported. Dr.Jit 1.5
 accepts LLVM 15 to 18, but the first kernel with a minimum or maximum then aborts the whole process (``Cannot
-select: fminimum``), which no ``try`` can catch. :func:`select_llvm` therefore chooses the library before that:
+select: fminimum``), which no ``try`` can catch. :func:`install` therefore chooses the library before that:
 
 1. ``DRJIT_LIBLLVM_PATH``, if the user has set it;
 2. the library that pip installed (``karellen-llvm-core``);
@@ -19,13 +19,17 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import glob
+import importlib.abc
 import importlib.metadata
+import importlib.util
 import os
 import re
 import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+
+from .errors import UsageError
 
 ENV = "DRJIT_LIBLLVM_PATH"
 
@@ -148,45 +152,101 @@ def llvm_problem() -> str | None:
     return _problem
 
 
-def select_llvm() -> Choice:
+def install() -> None:
     """
-    Make Dr.Jit use the library that :func:`choose_llvm` names. Called by ``import mi_diffind``.
+    See to it that Dr.Jit starts with a usable LLVM and that Mitsuba knows the plugins, whether these two have been
+    imported already or will be. Called by ``import mi_diffind``, which imports neither of them itself.
+    """
+    hooks = {}
+    if "drjit" in sys.modules:
+        correct_llvm()
+    else:
+        hooks["drjit"] = _starting_drjit
+    if "mitsuba" in sys.modules:
+        _register_plugins()
+    else:
+        hooks["mitsuba"] = _starting_mitsuba
+    if hooks:
+        sys.meta_path.insert(0, _Hook(hooks))
+
+
+class _Hook(importlib.abc.MetaPathFinder):
+    """Opens a context around the first import of each of some packages; an importer that finds nothing itself."""
+
+    def __init__(self, contexts: dict):
+        self.contexts = contexts
+
+    def find_spec(self, name, path=None, target=None):
+        context = self.contexts.pop(name, None)
+        if context is None:
+            return None
+        spec = importlib.util.find_spec(name)  # asks us again, and the others then
+        if spec is None:
+            return None
+        execute = spec.loader.exec_module
+
+        def exec_module(module):
+            with context():
+                execute(module)
+
+        spec.loader.exec_module = exec_module
+        return spec
+
+
+@contextlib.contextmanager
+def _starting_mitsuba():
+    yield
+    _register_plugins()
+
+
+def _register_plugins() -> None:
+    from . import plugins
+
+    plugins.install()
+
+
+@contextlib.contextmanager
+def _starting_drjit():
+    """Around the import of Dr.Jit, which then uses the library that :func:`choose_llvm` names, or none."""
+    global _problem
+    choice = choose_llvm()
+    _problem = choice.problem
+    with _hidden_llvm() if _problem else contextlib.nullcontext():
+        if _problem is None and choice.path is not None:
+            os.environ[ENV] = choice.path
+        yield
+        running = sys.modules["drjit"].detail.llvm_version()  # waits for the asynchronous start
+    if _problem is None and 0 <= running[0] < MIN_LLVM:  # only where the search was left to Dr.Jit
+        _problem = f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
+        _restart_llvm(None)
+    _warn()
+
+
+def correct_llvm() -> Choice:
+    """
+    Make Dr.Jit, which has been imported already, use the library that :func:`choose_llvm` names.
 
     Raises ``ImportError`` with one sentence if Dr.Jit already runs kernels on, or holds objects of, an LLVM that
     would abort. Warns (``RuntimeWarning``) and switches the LLVM backend off if there is no usable library.
     """
     global _problem
-    if "drjit" in sys.modules:
-        running = sys.modules["drjit"].detail.llvm_version()
-        if running[0] >= MIN_LLVM:
-            return Choice(os.environ.get(ENV), "already running")
+    running = sys.modules["drjit"].detail.llvm_version()
+    if running[0] >= MIN_LLVM:
+        return Choice(os.environ.get(ENV), "already running")
     choice = choose_llvm()
     _problem = choice.problem
-
-    if "drjit" not in sys.modules:
-        if choice.problem is None:
-            if choice.path is not None:
-                os.environ[ENV] = choice.path
-            import drjit
-
-            running = drjit.detail.llvm_version()  # waits for the asynchronous start
-            if 0 <= running[0] < MIN_LLVM:  # only where the search was left to Dr.Jit
-                _problem = f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
-                _restart_llvm(None)
-        else:
-            with _hidden_llvm():
-                import drjit
-
-                drjit.detail.llvm_version()
-    elif choice.problem is None and choice.path is not None:
+    if choice.problem is None and choice.path is not None:
         _restart_llvm(choice.path)
     elif running[0] >= 0:
         _problem = _problem or f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
         _restart_llvm(None)
+    _warn()
+    return choice
 
+
+def _warn() -> None:
     if _problem:
         warnings.warn(f"LLVM variants are switched off: {_problem}", RuntimeWarning, stacklevel=4)
-    return choice
 
 
 @contextlib.contextmanager
@@ -263,25 +323,25 @@ def _core_library() -> str:
     return os.path.join(os.path.dirname(drjit.__file__), name)
 
 
-def array_module(backend: str | None = None):
+def array_module(variant: str | None = None):
     """
     The module of differentiable Dr.Jit types to compute with outside of Mitsuba: ``drjit.llvm.ad`` or
-    ``drjit.cuda.ad``. ``backend`` is ``"llvm"``, ``"cuda"``, or ``None`` for the GPU if there is one.
+    ``drjit.cuda.ad``, that of a Mitsuba ``variant``; ``None`` means the GPU if there is one.
 
-    Raises ``RuntimeError`` with one sentence if that backend cannot run here.
+    Raises :class:`~mi_diffind.errors.UsageError` if that cannot run here.
     """
     import drjit as dr
 
     has_cuda = dr.has_backend(dr.JitBackend.CUDA)
-    backend = backend or ("cuda" if has_cuda else "llvm")
-    if backend == "cuda":
+    variant = variant or ("cuda" if has_cuda else "llvm")
+    if variant.startswith("cuda"):
         if not has_cuda:
-            raise RuntimeError('the backend "cuda" needs an NVIDIA GPU and its driver, and none was found')
+            raise UsageError(f'the variant "{variant}" needs an NVIDIA GPU and its driver, and none was found')
         import drjit.cuda.ad as module
-    elif backend == "llvm":
+    elif variant.startswith("llvm"):
         if not dr.has_backend(dr.JitBackend.LLVM):
-            raise RuntimeError(llvm_problem() or f"Dr.Jit could not start its LLVM backend: {_ADVICE}.")
+            raise UsageError(llvm_problem() or f"Dr.Jit could not start its LLVM backend: {_ADVICE}.")
         import drjit.llvm.ad as module
     else:
-        raise RuntimeError(f'the backend "{backend}" is unknown, allowed are "llvm" and "cuda"')
+        raise UsageError(f'the variant "{variant}" is not vectorised; use one that begins with "llvm" or "cuda"')
     return module

@@ -3,8 +3,8 @@ The file that holds one trained thing: a ``.npz`` archive (readable by ``numpy.l
 
 It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``, or,
 of entries with fewer than 8 bits, their bits one after the other (:func:`.lookup.pack_bits`), and an array ``meta`` of
-UTF-8 bytes: JSON with the format version, the task, the storage form, each array's shape, borders
-and (for bytes) affine map, the training settings, the seed and the measured quality. The same content gives the same
+UTF-8 bytes: JSON with the format version, the task and its preset, for each array its shape, borders, storage form, and
+(of bytes) affine map and bits, the training settings, the seed and what was measured. The same content gives the same
 bytes.
 """
 
@@ -14,18 +14,19 @@ import io
 import json
 import math
 import os
-import textwrap
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from .errors import DiffindError, reason
 from .files import replacing
-from .lookup import BORDERS, STORAGES, pack_bits, unpack_bits
+from .indirection import DifferentiableArray
+from .lookup import BORDERS, STORAGES, pack_bits, quantize, unpack_bits
 
 #: Version of the format that is written. A file with another version is refused.
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 #: Largest file content that is accepted, in bytes: a header that claims more is refused before anything is allocated.
 MAX_BYTES = 2**30
@@ -33,121 +34,148 @@ MAX_BYTES = 2**30
 _DTYPES = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2"), "uint8": np.dtype("u1")}
 
 
-class TableError(ValueError):
+class TableError(DiffindError, ValueError):
     """A table file cannot be used; the message is one sentence that names the file and the fault."""
+
+
+@dataclass(frozen=True)
+class StoredArray:
+    """
+    One array as a file holds it: ``entries`` of shape ``(N_1, …, N_d, c)``, whose dtype is the ``storage`` form, and
+    the ``border`` of each axis (default: ``"clamp"``). Bytes stand for ``offset + scale · byte``, one number a channel,
+    and are stored with ``bits`` bits each, 1 to 8.
+    """
+
+    entries: np.ndarray
+    border: tuple[str, ...] = ()
+    scale: tuple[float, ...] = ()
+    offset: tuple[float, ...] = ()
+    bits: int = 8
+
+    def __post_init__(self):
+        if not self.border:
+            object.__setattr__(self, "border", ("clamp",) * (self.entries.ndim - 1))
+
+    @staticmethod
+    def of(array: DifferentiableArray) -> StoredArray:
+        """What has to be stored of an allocated array, in its storage form."""
+        if array.storage == "uint8":
+            return StoredArray(array.codes(), array.border, array.scale, array.offset, array.bits)
+        return StoredArray(array.numpy().astype(_DTYPES[array.storage]), array.border)
+
+    def allocate(self, dtype, storage: str = "", fold: bool = False) -> DifferentiableArray:
+        """
+        An array of the tensor type ``dtype`` that holds these entries, in a storage form ("": this one). ``fold``: the
+        entries pass through the fold if they are floats, so that an optimiser may leave the range.
+        """
+        form = self.to(storage or self.storage)
+        affine = (form.scale, form.offset) if form.storage == "uint8" else None
+        return DifferentiableArray.from_numpy(
+            form.entries, dtype, form.border, form.storage, fold and form.storage == "float32", affine, form.bits
+        )
+
+    def to(self, storage: str) -> StoredArray:
+        """In another storage form; from bytes or half precision nothing that was lost comes back."""
+        if storage not in STORAGES:
+            raise ValueError(f'storage: found "{storage}", allowed are {STORAGES}')
+        if storage == self.storage:
+            return self
+        values = self.values
+        if storage != "uint8":
+            return StoredArray(values.astype(_DTYPES[storage]), self.border)
+        codes, scale, offset = quantize(values, values.shape[-1])
+        return StoredArray(codes, self.border, tuple(scale.tolist()), tuple(offset.tolist()))
+
+    @property
+    def values(self) -> np.ndarray:
+        """The entries as float32, dequantised if they are bytes."""
+        if self.storage != "uint8":
+            return self.entries.astype(np.float32)
+        return (np.asarray(self.offset) + np.asarray(self.scale) * self.entries.astype(np.float64)).astype(np.float32)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Entries along each axis, and channels."""
+        return self.entries.shape
+
+    @property
+    def storage(self) -> str:
+        """The storage form."""
+        return next((s for s, dtype in _DTYPES.items() if self.entries.dtype == dtype), str(self.entries.dtype))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the entries, as stored."""
+        return math.ceil(self.entries.size * self.bits / 8) if self.bits < 8 else self.entries.nbytes
+
+    @property
+    def is_pointer(self) -> bool:
+        """Do all entries that can be stored lie in [0, 1]? (For bytes; floats are folded when they are read.)"""
+        steps = 2**self.bits - 1
+        pairs = zip(self.scale, self.offset, strict=True)
+        return all(o >= 0 and s >= 0 and o + steps * s <= 1 + 1e-6 for s, o in pairs)
 
 
 @dataclass
 class Table:
     """
-    What a table file holds.
-
-    ``arrays`` maps names to entries of shape ``(N_1, …, N_d, c)`` in the dtype of ``storage``; ``borders`` gives each
-    array's borders, ``quantization`` its ``(scale, offset)`` (one number a channel) if ``storage`` is ``"uint8"``.
-    ``bits`` says of which arrays of bytes fewer than 8 bits an entry are stored, 1 to 7.
-    ``settings`` are those of the training, ``quality`` what was measured (units in the names, e.g. ``psnr_db``).
+    What a table file holds: named ``arrays``, the ``task`` and the ``preset`` that they are of, the ``settings`` of the
+    training and its ``seed``, and what was ``measured`` (units in the names, e.g. ``psnr_db``). ``path`` is the file
+    that it was read from, if any.
     """
 
     task: str
-    arrays: dict[str, np.ndarray]
-    storage: str = "float32"
-    borders: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    quantization: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
+    arrays: dict[str, StoredArray]
+    preset: str = ""
     settings: dict = field(default_factory=dict)
     seed: int = 0
-    quality: dict[str, float] = field(default_factory=dict)
-    bits: dict[str, int] = field(default_factory=dict)
+    measured: dict[str, float] = field(default_factory=dict)
+    path: Path | None = None
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all entries."""
-        return sum(map(self.nbytes_of, self.arrays))
+        """Bytes of all entries, as stored."""
+        return sum(array.nbytes for array in self.arrays.values())
 
-    def nbytes_of(self, name: str) -> int:
-        """Bytes of the entries of one array, as stored."""
-        array = self.arrays[name]
-        return math.ceil(array.size * self.bits[name] / 8) if name in self.bits else array.nbytes
+    @property
+    def storage(self) -> str:
+        """The storage form of all arrays, those of all with a "/" between them if there are several, "" of none."""
+        return "/".join(dict.fromkeys(array.storage for array in self.arrays.values()))
 
     def to(self, storage: str) -> Table:
-        """A copy in another storage form; from ``"uint8"`` or ``"float16"`` nothing that was lost comes back."""
-        from .lookup import quantize
-
-        if storage not in STORAGES:
-            raise ValueError(f'storage: found "{storage}", allowed are {STORAGES}')
-        if storage == self.storage:
-            return self
-        arrays, quantization = {}, {}
-        for name in self.arrays:
-            values = self.values(name)
-            if storage == "uint8":
-                codes, scale, offset = quantize(values, values.shape[-1])
-                arrays[name], quantization[name] = codes, (tuple(scale.tolist()), tuple(offset.tolist()))
-            else:
-                arrays[name] = values.astype(_DTYPES[storage])
-        return Table(
-            self.task,
-            arrays,
-            storage,
-            self.borders,
-            quantization,
-            self.settings,
-            self.seed,
-            dict(self.quality),
-        )
-
-    def values(self, name: str) -> np.ndarray:
-        """The entries of one array as float32, dequantised if they are bytes."""
-        array = self.arrays[name]
-        if self.storage != "uint8":
-            return array.astype(np.float32)
-        scale, offset = self.quantization[name]
-        return (np.asarray(offset) + np.asarray(scale) * array.astype(np.float64)).astype(np.float32)
+        """A copy with all arrays in another storage form."""
+        return replace(self, arrays={name: array.to(storage) for name, array in self.arrays.items()})
 
 
 def save_table(path: str | os.PathLike, table: Table) -> None:
     """Write ``table`` to ``path`` through a temporary file. Raises :class:`TableError` if it is inconsistent."""
-    dtype = _DTYPES.get(table.storage)
-    if dtype is None:
-        raise TableError(f'{path}: storage "{table.storage}" is unknown, allowed are {STORAGES}')
     described = {}
     for name, array in table.arrays.items():
         if name == "meta" or not name.isprintable():
             raise TableError(f"{path}: an array cannot be called {name!r}")
-        if array.dtype != dtype:
-            raise TableError(
-                f'{path}: array "{name}" has the type {array.dtype}, storage "{table.storage}" needs {dtype}'
-            )
-        if dtype.kind == "f" and not np.isfinite(array).all():
-            raise TableError(f'{path}: array "{name}" contains NaN or infinity')
-        border = tuple(table.borders.get(name, ("clamp",) * (array.ndim - 1)))
-        _check_shape(path, name, array.shape, border)
-        described[name] = {"shape": list(array.shape), "border": list(border)}
-        if table.storage == "uint8":
-            scale, offset = table.quantization.get(name, ((), ()))
-            _check_affine(path, name, array.shape, scale, offset)
-            described[name] |= {"scale": list(scale), "offset": list(offset)}
-        if name in table.bits:
-            described[name]["bits"] = _check_bits(path, name, table.bits[name], table.storage)
-            if array.max() >> table.bits[name]:
-                raise TableError(f'{path}: array "{name}" has entries of more than {table.bits[name]} bits')
+        if array.storage not in STORAGES:
+            raise TableError(f'{path}: array "{name}" has the type {array.storage}, allowed are {STORAGES}')
+        _check(path, name, array)
+        described[name] = {"shape": list(array.shape), "border": list(array.border), "storage": array.storage}
+        if array.storage == "uint8":
+            described[name] |= {"scale": list(array.scale), "offset": list(array.offset), "bits": array.bits}
     meta = {
         "format_version": FORMAT_VERSION,
         "task": table.task,
-        "storage": table.storage,
+        "preset": table.preset,
         "arrays": described,
         "settings": table.settings,
         "seed": table.seed,
-        "quality": table.quality,
+        "measured": table.measured,
     }
     try:
         text = np.frombuffer(json.dumps(meta, indent=1, allow_nan=False).encode(), dtype=np.uint8)
     except (ValueError, TypeError) as e:
-        raise TableError(f"{path}: its settings, seed or quality cannot be written ({_reason(e)})") from None
+        raise TableError(f"{path}: its settings, seed or measurements cannot be written ({reason(e)})") from None
+    entries = {n: pack_bits(a.entries, a.bits) if a.bits < 8 else a.entries for n, a in table.arrays.items()}
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, array in {"meta": text, **table.arrays}.items():
+        for name, array in {"meta": text, **entries}.items():
             buffer = io.BytesIO()
-            if name in table.bits:
-                array = pack_bits(array, table.bits[name])
             np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
             # A fixed date: numpy.savez stamps the current one, and equal content would give unequal files.
             archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), buffer.getvalue())
@@ -171,16 +199,11 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
     except IsADirectoryError:
         raise TableError(f"{path}: is a folder, a table file (.npz) is expected") from None
     except zipfile.BadZipFile as e:
-        raise TableError(f"{path}: not a table file (.npz), or a truncated one ({_reason(e)})") from None
+        raise TableError(f"{path}: not a table file (.npz), or a truncated one ({reason(e)})") from None
     except TableError:
         raise
     except Exception as e:  # zipfile, zlib, lzma and numpy each have their own for a damaged file
-        raise TableError(f"{path}: cannot be read ({_reason(e)})") from None
-
-
-def _reason(e: Exception) -> str:
-    """What ``e`` says, on one line and no longer than one."""
-    return textwrap.shorten(str(e), 100, placeholder="…") or type(e).__name__
+        raise TableError(f"{path}: cannot be read ({reason(e)})") from None
 
 
 def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
@@ -205,17 +228,20 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
             raise TableError(
                 f"{path}: is the checkpoint of a training, the table file is what it writes at its end (-o)"
             )
-        version, stored_task, storage = meta["format_version"], meta["task"], meta["storage"]
+        version, stored_task = meta["format_version"], meta["task"]
+        if version != FORMAT_VERSION:
+            raise TableError(
+                f"{path}: has the format version {version}, this package reads version {FORMAT_VERSION}: make it again "
+                f"with mi-diffind fit {stored_task if isinstance(stored_task, str) else 'TASK'}"
+            )
         described = {name: entry for name, entry in meta["arrays"].items()}
-        settings, seed, quality = meta["settings"], meta["seed"], meta["quality"]
-        if not isinstance(settings, dict) or not isinstance(quality, dict):
-            raise TypeError("the settings and the quality have to be objects")
+        preset, settings, seed, measured = (meta[key] for key in ("preset", "settings", "seed", "measured"))
+        if not isinstance(settings, dict) or not isinstance(measured, dict):
+            raise TypeError("the settings and the measurements have to be objects")
+    except TableError:
+        raise
     except (ValueError, TypeError, KeyError, AttributeError) as e:
         raise TableError(f'{path}: its "meta" array is damaged ({type(e).__name__}: {e})') from None
-    if version != FORMAT_VERSION:
-        raise TableError(f"{path}: has the format version {version}, this package reads version {FORMAT_VERSION}")
-    if storage not in STORAGES:
-        raise TableError(f'{path}: has the storage form "{storage}", allowed are {STORAGES}')
     if task is not None and stored_task != task:
         raise TableError(f'{path}: holds tables for the task "{stored_task}", expected "{task}"')
 
@@ -225,36 +251,60 @@ def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
     for name in sorted(set(members) - expected) + sorted(set(described) ^ set(members)):
         raise TableError(f'{path}: has an unexpected array "{name}"')
 
-    table = Table(str(stored_task), {}, storage, settings=settings, seed=seed, quality=quality)
-    for name in described:
-        entry = described[name]
+    table = Table(str(stored_task), {}, str(preset), settings, seed, measured, path)
+    for name, entry in described.items():
         try:
-            shape = tuple(int(n) for n in entry["shape"])
-            border = tuple(entry["border"])
-            affine = [tuple(float(v) for v in entry[k]) for k in ("scale", "offset")] if storage == "uint8" else None
+            shape, border, storage = tuple(int(n) for n in entry["shape"]), tuple(entry["border"]), entry["storage"]
+            scale, offset, bits = (), (), 8
+            if storage == "uint8":
+                scale, offset = (tuple(float(v) for v in entry[k]) for k in ("scale", "offset"))
+                bits = entry["bits"]
         except (ValueError, TypeError, KeyError, OverflowError) as e:
             raise TableError(
                 f'{path}: the description of array "{name}" is damaged ({type(e).__name__}: {e})'
             ) from None
-        bits = entry.get("bits")
-        if bits is not None:
-            table.bits[name] = _check_bits(path, name, bits, storage)
+        if storage not in STORAGES:
+            raise TableError(f'{path}: array "{name}" has the storage form "{storage}", allowed are {STORAGES}')
         wanted = shapes[name] if shapes is not None else shape
         if len(shape) != len(wanted) or any(w is not None and s != w for s, w in zip(shape, wanted, strict=True)):
             raise TableError(f'{path}: array "{name}" has the shape {shape}, expected {tuple(wanted)}')
         _check_shape(path, name, shape, border)
-        stored = shape if bits is None else (math.ceil(math.prod(shape) * bits / 8),)
-        array = _array(archive, members[name], path, name, _DTYPES[storage], stored)
-        if bits is not None:
-            array = unpack_bits(array, math.prod(shape), bits).reshape(shape)
-        if affine is not None:
-            _check_affine(path, name, shape, *affine)
-            table.quantization[name] = (affine[0], affine[1])
-        elif not np.isfinite(array).all():
-            raise TableError(f'{path}: array "{name}" contains NaN or infinity')
-        table.arrays[name] = array
-        table.borders[name] = border
+        _check_bits(path, name, bits)
+        stored = shape if bits == 8 else (math.ceil(math.prod(shape) * bits / 8),)
+        entries = _array(archive, members[name], path, name, _DTYPES[storage], stored)
+        if bits < 8:
+            entries = unpack_bits(entries, math.prod(shape), bits).reshape(shape)
+        table.arrays[name] = StoredArray(entries, border, scale, offset, bits)
+        _check(path, name, table.arrays[name])
     return table
+
+
+def check_ranges(table: Table, ranges: dict[str, tuple[float, float]]) -> None:
+    """Raise :class:`TableError` if entries lie outside of (low, high) by more than what storing as bytes rounds."""
+    for name, (low, high) in ranges.items():
+        values, slack = table.arrays[name].values, 1e-3 * (high - low)
+        if values.min() < low - slack or values.max() > high + slack:
+            raise TableError(
+                f'{table.path}: entries of "{name}" lie in [{values.min():.4g}, {values.max():.4g}], '
+                f"allowed is [{low:g}, {high:g}]"
+            )
+
+
+def _check(path, name: str, array: StoredArray) -> None:
+    """Raise :class:`TableError` unless the array is one that a file may hold."""
+    _check_shape(path, name, array.shape, array.border)
+    if array.storage != "uint8":
+        if array.bits != 8 or array.scale or array.offset:
+            raise TableError(f'{path}: array "{name}" is stored as {array.storage}, only bytes have bits and a scale')
+        if not np.isfinite(array.entries).all():
+            raise TableError(f'{path}: array "{name}" contains NaN or infinity')
+        return
+    _check_bits(path, name, array.bits)
+    for values in (array.scale, array.offset):
+        if len(values) != array.shape[-1] or not all(map(math.isfinite, values)):
+            raise TableError(f'{path}: array "{name}" needs a finite scale and offset for each channel')
+    if array.bits < 8 and array.entries.max() >> array.bits:
+        raise TableError(f'{path}: array "{name}" has entries of more than {array.bits} bits')
 
 
 def _check_shape(path, name: str, shape: tuple, border: tuple) -> None:
@@ -264,15 +314,9 @@ def _check_shape(path, name: str, shape: tuple, border: tuple) -> None:
         raise TableError(f'{path}: array "{name}" has the borders {border}, allowed are {BORDERS} for each axis')
 
 
-def _check_bits(path, name: str, bits, storage: str) -> int:
-    if storage != "uint8" or type(bits) is not int or not 1 <= bits <= 7:
-        raise TableError(f'{path}: array "{name}" has {bits} bits an entry, allowed are 1 to 7, and of bytes only')
-    return bits
-
-
-def _check_affine(path, name: str, shape: tuple, scale: tuple, offset: tuple) -> None:
-    if any(len(v) != shape[-1] or not all(map(math.isfinite, v)) for v in (scale, offset)):
-        raise TableError(f'{path}: array "{name}" needs a finite scale and offset for each channel')
+def _check_bits(path, name: str, bits) -> None:
+    if type(bits) is not int or not 1 <= bits <= 8:
+        raise TableError(f'{path}: array "{name}" has {bits} bits an entry, allowed are 1 to 8')
 
 
 def _array(archive, info, path, name: str, dtype: np.dtype, shape: tuple | None) -> np.ndarray:
@@ -286,7 +330,7 @@ def _array(archive, info, path, name: str, dtype: np.dtype, shape: tuple | None)
             }[version]
             found_shape, fortran, found_dtype = reader(stream)
         except (ValueError, KeyError) as e:
-            raise TableError(f'{path}: array "{name}" has a damaged header ({_reason(e)})') from None
+            raise TableError(f'{path}: array "{name}" has a damaged header ({reason(e)})') from None
         if found_dtype != dtype:
             raise TableError(f'{path}: array "{name}" has the type {found_dtype}, expected {dtype}')
         if fortran or (shape is not None and found_shape != shape):

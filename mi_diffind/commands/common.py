@@ -6,11 +6,8 @@ import argparse
 from pathlib import Path
 
 from .. import runtime
-
-
-class UsageError(Exception):
-    """Bad input that the argument parser cannot see."""
-
+from ..arguments import natural, positive
+from ..errors import UsageError
 
 # -- parsers ----------------------------------------------------------------------------------------------------------
 
@@ -23,14 +20,14 @@ def verb(commands, name: str, run, help: str) -> argparse.ArgumentParser:
     return sub
 
 
-def tasks_of(sub: argparse.ArgumentParser):
-    """The subparsers of a verb that has another parser for each task, for :func:`task`; the choice is ``.task``."""
-    return sub.add_subparsers(dest="task", required=True, metavar="TASK")
+def alternatives(sub: argparse.ArgumentParser, name: str):
+    """The subparsers of a verb that has another parser for each ``name`` (a task, a study), for :func:`alternative`."""
+    return sub.add_subparsers(dest=name, required=True, metavar=name.upper())
 
 
-def task(tasks, name: str, help: str) -> argparse.ArgumentParser:
-    """The parser of a new task among ``tasks``."""
-    sub = tasks.add_parser(name, help=help, description=help)
+def alternative(parsers, name: str, help: str) -> argparse.ArgumentParser:
+    """The parser of one of the alternatives of a verb."""
+    sub = parsers.add_parser(name, help=help, description=help)
     _json_option(sub, argparse.SUPPRESS)  # a default would replace what was given before the task
     return sub
 
@@ -58,28 +55,6 @@ def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
     if rendering:
         sub.add_argument("--spp", type=positive, help="samples per pixel (default: the scene's)")
         sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
-
-
-# -- kinds of arguments -----------------------------------------------------------------------------------------------
-
-
-def positive(text: str) -> int:
-    """A whole number ≥ 1. Raises ``ArgumentTypeError``."""
-    value = natural(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value
-
-
-def natural(text: str) -> int:
-    """A whole number ≥ 0. Raises ``ArgumentTypeError``."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number ≥ 0")
-    return value
 
 
 # -- before the work starts -------------------------------------------------------------------------------------------

@@ -5,10 +5,12 @@ from __future__ import annotations
 from ..files import writable_folder
 from .common import defines_of, positive, require_scene, scene_options, set_variant, verb
 
+HELP = "render a scene as written and with exact plugins, and show the difference"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "compare", run, "render a scene as written and with exact plugins, and show the difference")
+    sub = verb(commands, "compare", run, HELP)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("--out", default="out", metavar="DIR", help="folder for pictures (default: out)")
     sub.add_argument("--passes", type=positive, default=5, help="passes to split the samples into (default: 5)")

@@ -7,10 +7,12 @@ from pathlib import Path
 from ..files import writable_folder
 from .common import defines_of, positive, require_scene, scene_options, set_variant, verb
 
+HELP = "turn the parameter textures of a material into latent textures"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "encode", run, "turn the parameter textures of a material into latent textures")
+    sub = verb(commands, "encode", run, HELP)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("--material", required=True, metavar="ID", help="id of the material")
     sub.add_argument("-o", "--output", required=True, metavar="DIR", help="folder for textures and material.xml")

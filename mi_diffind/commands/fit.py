@@ -2,73 +2,65 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
+from ..arguments import add_arguments, natural, positive
+from ..errors import UsageError
 from ..files import writable_file
-from ..fitting import SCHEDULES, FitSettings, FittingError
-from ..lookup import STORAGES
-from ..tasks import ggx
-from ..tasks.disney import training as disney
-from . import fit_image
-from .common import UsageError, natural, positive, task, tasks_of, verb
+from ..settings import LOSSES, SCHEDULES, FittingError
+from ..tasks.task import Task, fit, tasks
+from .common import alternative, alternatives, set_variant, variant_option, verb
+
+#: Settings of a training that every task has: what they are, and the options of their parsers.
+SETTINGS = (
+    ("batch", "samples a step", {"type": positive}),
+    ("lr", "Adam's learning rate", {"type": float}),
+    ("loss", "what is minimised", {"choices": LOSSES}),
+    ("schedule", "of the learning rate", {"choices": SCHEDULES}),
+    ("seed", "seed of the random numbers", {"type": natural}),
+)
+
+HELP = "train tables"
 
 
 def add(commands) -> None:
     """Add the verb, its tasks and their options to ``commands``, the subparsers of the command line."""
-    tasks = tasks_of(verb(commands, "fit", run, "train tables"))
-    _add_task(tasks, "disney", "train the tables of the Disney BRDF", _fit_disney, disney.DEFAULT_SETTINGS)
-    sub = _add_task(tasks, "ggx", "train the tables of the GGX distribution", _fit_ggx, ggx.DEFAULT_SETTINGS)
-    for name, default in (("primary", 16), ("cascaded", 8)):
-        sub.add_argument(
-            f"--{name}",
-            type=positive,
-            default=default,
-            metavar="N",
-            help=f"entries along each side of the {name} array (default: {default})",
-        )
-    fit_image.add(tasks)
+    parsers = alternatives(verb(commands, "fit", run, HELP), "task")
+    for task in tasks().values():
+        _add(alternative(parsers, task.name, f"train tables of {task.title} ({task.section})"), task)
 
 
-def _add_task(tasks, name: str, help: str, train, levels: dict[str, FitSettings]):
-    """
-    A task with the options that all have. ``train(arguments, settings)`` returns table and record; ``levels`` are its
-    levels of quality, the default first.
-    """
-    sub = task(tasks, name, help)
-    sub.set_defaults(train=train, levels=levels)
-    quality = next(iter(levels))
+def _add(sub, task: Task) -> None:
+    add_arguments(sub, task.arguments)
     sub.add_argument("-o", "--output", required=True, metavar="FILE.npz", help="table file to write")
-    sub.add_argument("--quality", choices=list(levels), default=quality, help=f"level of quality (default: {quality})")
-    sub.add_argument("--storage", choices=STORAGES, default="float32", help="storage form (default: float32)")
-    sub.add_argument("--backend", choices=["llvm", "cuda"], help="where to train (default: the GPU if there is one)")
-    for option, about, kind in (
-        ("steps", "optimisation steps", {"type": positive}),
-        ("batch", "samples a step", {"type": positive}),
-        ("lr", "Adam's learning rate", {"type": float}),
-        ("schedule", "of the learning rate", {"choices": SCHEDULES}),
-        ("seed", "seed of the random numbers", {"type": natural}),
-    ):
-        sub.add_argument(f"--{option}", **kind, help=f"{about} (default: {_default(levels, option)})")
+    preset = next(iter(task.presets))
+    sub.add_argument("--preset", choices=list(task.presets), default=preset, help=f"how (default: {preset})")
+    if task.storages:
+        default = task.storages[0]
+        sub.add_argument("--storage", choices=task.storages, default=default, help=f"storage form (default: {default})")
+    variant_option(sub)
+    length = sub.add_mutually_exclusive_group()
+    length.add_argument("--steps", type=positive, help=f"optimisation steps (default: {_default(task, 'steps')})")
+    length.add_argument("--seconds", type=positive, help="time of the training, in place of steps")
+    for name, text, kind in SETTINGS:
+        sub.add_argument(f"--{name}", **kind, help=f"{text} (default: {_default(task, name)})")
     sub.add_argument("--all-cores", action="store_true", help="faster, but not the same bytes each time")
     sub.add_argument("--checkpoint", metavar="FILE", help="keep the state of the training in FILE")
     sub.add_argument("--resume", action="store_true", help="go on from --checkpoint, with the same settings")
-    return sub
 
 
-def _default(levels: dict[str, FitSettings], option: str) -> str:
-    """For a help text: the setting of each level, or one for all if they agree."""
-    values = {level: str(getattr(settings, option)) for level, settings in levels.items()}
+def _default(task: Task, name: str) -> str:
+    """For a help text: the setting of each preset, or one for all if they agree."""
+    values = {preset: str(getattr(settings, name)) for preset, settings in task.presets.items()}
     if len(set(values.values())) == 1:
         return next(iter(values.values()))
-    return ", ".join(f"{value} for {level}" for level, value in values.items())
+    return ", ".join(f"{value} for {preset}" for preset, value in values.items())
 
 
 def run(arguments) -> dict:
     """
     Train and write the table file. Returns its size, accuracy and how the training went; after Ctrl-C, of the best so
-    far. Raises :class:`UsageError`, :class:`~mi_diffind.fitting.FittingError` and
-    :class:`~mi_diffind.files.OutputError`.
+    far. Raises :class:`~mi_diffind.errors.DiffindError`.
     """
     output = Path(arguments.output)
     if output.suffix.lower() != ".npz":
@@ -76,45 +68,38 @@ def run(arguments) -> dict:
     if arguments.checkpoint is not None and Path(arguments.checkpoint).resolve() == output.resolve():
         raise UsageError(f'"{output}" cannot be the output and the checkpoint')
     writable_file(output)
+    task = tasks()[arguments.task]
+    given = {name: getattr(arguments, name) for name in ("steps", *(name for name, *_ in SETTINGS))}
+    given = {name: value for name, value in given.items() if value is not None}
+    given |= {argument.name: getattr(arguments, argument.name) for argument in task.arguments}
+    set_variant(arguments.variant)
     from ..tables import save_table
 
-    given = {k: getattr(arguments, k) for k in ("steps", "batch", "lr", "schedule", "seed")}
-    given = {k: v for k, v in given.items() if v is not None}
-    settings = dataclasses.replace(arguments.levels[arguments.quality], deterministic=not arguments.all_cores, **given)
     try:
-        table, result = arguments.train(arguments, settings)
+        fitted = fit(
+            task.name, arguments.preset, arguments.variant, getattr(arguments, "storage", ""), arguments.seconds,
+            arguments.checkpoint, arguments.resume, output=output, deterministic=not arguments.all_cores, **given,
+        )  # fmt: skip
     except RuntimeError as e:
         raise FittingError(str(e)) from e
+    table, result = fitted.table, fitted.result
     save_table(output, table)
-    quality = ", ".join(f"{k} {v}" for k, v in table.quality.items())
-    state = f"interrupted at step {result.steps}, kept" if result.interrupted else "best"
-    print(f"{output}: {table.nbytes:,} bytes as {table.storage}; {state} step {result.step}; {quality}")
+    measured = ", ".join(f"{k} {v}" for k, v in table.measured.items())
+    print(f"{output}: {table.nbytes:,} bytes as {table.storage}; {result.outcome}; {measured}")
+    for line in fitted.lines:
+        print(f"  {line}")
     return {
         "interrupted": result.interrupted,
         "output": str(output),
+        "task": task.name,
+        "preset": table.preset,
         "bytes": table.nbytes,
         "storage": table.storage,
         "settings": table.settings,
-        "quality": table.quality,
+        "measured": table.measured,
         "step": result.step,
         "seconds": result.seconds,
         "restarts": result.restarts,
         "history": result.history,
+        **fitted.figures,
     }
-
-
-def _fit_disney(arguments, settings: FitSettings):
-    return disney.fit_disney(settings, **_common(arguments))
-
-
-def _fit_ggx(arguments, settings: FitSettings):
-    sizes = {"primary": arguments.primary, "cascaded": arguments.cascaded}
-    try:
-        ggx.indirection(**sizes)  # nothing is allocated yet
-    except ValueError as e:
-        raise UsageError(str(e)) from None
-    return ggx.fit_ggx(settings, **_common(arguments), **sizes)
-
-
-def _common(arguments) -> dict:
-    return {k: getattr(arguments, k) for k in ("backend", "quality", "storage", "checkpoint", "resume")}

@@ -7,10 +7,12 @@ from pathlib import Path
 from ..files import writable_folder
 from .common import UsageError, defines_of, natural, positive, require_scene, scene_options, set_variant, verb
 
+HELP = "check that scenes render as their stored references do"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "regress", run, "check that scenes render as their stored references do")
+    sub = verb(commands, "regress", run, HELP)
     sub.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     sub.add_argument("--update", action="store_true", help="render the references again and store them")
     sub.add_argument(

@@ -11,10 +11,12 @@ from ..files import writable_file
 from ..interrupt import interruptible
 from .common import UsageError, defines_of, positive, require_scene, scene_options, set_variant, verb
 
+HELP = "render a scene that names learned plugins"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "render", run, "render a scene that names learned plugins")
+    sub = verb(commands, "render", run, HELP)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("-o", "--output", metavar="FILE", help="image, .exr or .png (default: SCENE.exr)")
     sub.add_argument(

@@ -15,18 +15,22 @@ from .common import (
     require_scene,
     scene_options,
     set_variant,
-    task,
-    tasks_of,
     variant_option,
     verb,
 )
+from .common import (
+    alternative as task,
+)
+from .common import (
+    alternatives as tasks_of,
+)
+
+HELP = "measure time against accuracy, of all forms of a task or of a scene"
 
 
 def add(commands) -> None:
     """Add the verb, its tasks and their options to ``commands``, the subparsers of the command line."""
-    tasks = tasks_of(
-        verb(commands, "tradeoff", run, "measure time against accuracy, of all forms of a task or of a scene")
-    )
+    tasks = tasks_of(verb(commands, "tradeoff", run, HELP), "task")
     for name, about in TASKS.items():
         sub = task(tasks, name, f"measure time against accuracy of {about}")
         _add_common(sub)

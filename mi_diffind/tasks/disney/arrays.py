@@ -12,10 +12,8 @@ import numpy as np
 from drjit import nn
 
 from ...indirection import DifferentiableArray
-from ...tables import Table
+from ...tables import StoredArray, Table
 from .decoder import warp_roughness
-
-TASK = "disney"
 
 
 class Arrays(nn.Module):
@@ -24,8 +22,8 @@ class Arrays(nn.Module):
     to hold, :meth:`from_table` from trained ones. Parameters are called ``NAME.data``.
     """
 
-    #: The quality level that the layout stands for.
-    QUALITY = ""
+    #: The preset that the layout stands for.
+    PRESET = ""
 
     #: Sizes: name → shape with channels last.
     SHAPES: dict[str, tuple] = {}  # noqa: RUF012
@@ -59,34 +57,11 @@ class Arrays(nn.Module):
         """The positions of a table's entries, one array of the table's size for each axis."""
         return np.meshgrid(*(np.linspace(0, 1, n) for n in cls.SHAPES[name][:-1]), indexing="ij")
 
-    @classmethod
-    def from_table(cls, table: Table, dtype, storage: str = "float32"):
-        """Allocate from a :class:`Table` that :func:`.library.load_disney_table` has checked, in a storage form."""
-        return cls(
-            {name: DifferentiableArray.from_numpy(table.values(name), dtype, storage=storage) for name in cls.SHAPES}
-        )
-
-    def to_table(self, storage: str = "float32", **about) -> Table:
-        """The entries, limited to their ranges, as a :class:`Table`; ``about`` are its further fields."""
-        arrays = {
-            name: np.clip(getattr(self, name).numpy(), *self.RANGES[name]).astype(np.float32) for name in self.SHAPES
-        }
-        return Table(TASK, arrays, "float32", **about).to(storage)
-
-    @property
-    def storage(self) -> str:
-        """The storage form of the entries."""
-        return getattr(self, next(iter(self.SHAPES))).storage
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all entries in their storage form."""
-        return sum(getattr(self, name).nbytes for name in self.SHAPES)
-
-    @property
-    def memory_nbytes(self) -> int:
-        """Bytes in memory, with padding and repeated entries."""
-        return sum(getattr(self, name).memory_nbytes for name in self.SHAPES)
+    def to_table(self) -> Table:
+        """The entries, limited to their ranges, in single precision."""
+        arrays = {name: np.clip(getattr(self, name).numpy(), *self.RANGES[name]) for name in self.SHAPES}
+        stored = {name: StoredArray(values.astype(np.float32)) for name, values in arrays.items()}
+        return Table("disney", stored, self.PRESET)
 
     def encode(self, material, active=True):
         """

@@ -1,5 +1,5 @@
 """
-``quality="tables"``: a better factorisation than the paper's, in tables of one coordinate where one suffices.
+``preset="tables"``: a better factorisation than the paper's, in tables of one coordinate where one suffices.
 
 =============== ========= ======== =============================== ===================================================
 array           size      channels read at                         holds
@@ -29,7 +29,7 @@ import drjit as dr
 import numpy as np
 
 from ...lookup import clamp, quantize
-from ...tables import Table
+from ...tables import StoredArray, Table
 from . import decoder, model
 from .arrays import Arrays
 from .model import ALPHA_MIN, TINY, positive
@@ -45,7 +45,7 @@ LOG_ALPHA, LOG_ASPECT = (-12.0, 0.1), (-1.2, 0.0)
 class FactoredArrays(Arrays):
     """Encoder and decoder as one trainable module."""
 
-    QUALITY = "tables"
+    PRESET = "tables"
 
     SHAPES = {  # noqa: RUF012
         "encoder_roughness": (8, 2),
@@ -76,18 +76,19 @@ class FactoredArrays(Arrays):
         alpha, norm, rest_alpha, rest_norm = self.coat([gloss], active)
         return [alpha + rest_alpha, norm + rest_norm]
 
-    def to_table(self, storage: str = "float32", **about) -> Table:
-        table = super().to_table("float32", **about)
+    def to_table(self) -> Table:
+        table = super().to_table()
         for name in self.SPLIT:
-            values = table.arrays[name]
+            values = table.arrays[name].entries
             half = values.shape[-1] // 2
             total = values[..., :half] + values[..., half:]
             if name in ("encoder_anisotropic", "aspect"):
                 total[0] = 0  # an anisotropy of 0 is none, to the last bit: it may be left out
             codes, scale, offset = quantize(total, half)
             coarse = np.asarray(offset) + np.asarray(scale) * codes.astype(np.float64)
-            table.arrays[name] = np.concatenate([coarse, total - coarse], axis=-1).astype(np.float32)
-        return table.to(storage)
+            entries = np.concatenate([coarse, total - coarse], axis=-1).astype(np.float32)
+            table.arrays[name] = StoredArray(entries)
+        return table
 
     # -- training ---------------------------------------------------------------------------------------------------
 

@@ -1,5 +1,5 @@
 """
-``quality="paper"``: the layout of the paper's Table 1, with a small encoder before it.
+``preset="paper"``: the layout of the paper's Table 1, with a small encoder before it.
 
 The *encoder* is two 1D primary arrays, which map roughness (warped, see :func:`.decoder.warp_roughness`) and anisotropy
 to coordinates; it depends on the material only. The *decoder* is five cascaded arrays, the same for every material:
@@ -34,7 +34,7 @@ from .model import ALPHA_MIN, COAT_F0, LOBES, TINY, Factors, compose, diffuse_fa
 class PaperArrays(Arrays):
     """Encoder and decoder as one trainable module."""
 
-    QUALITY = "paper"
+    PRESET = "paper"
 
     SHAPES = {  # noqa: RUF012
         "encoder_roughness": (8, 1),

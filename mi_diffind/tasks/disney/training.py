@@ -1,5 +1,5 @@
 """
-Training of the Disney tables: distributions, per-factor targets, quality.
+Training of the Disney tables: distributions, per-factor targets, errors.
 
 Each factor is learned against its own analytic target, because the product of all of them is unbounded and dominated
 by the specular peak (METHOD task 2, supplemental 1.2). View and light directions are uniform over the hemisphere,
@@ -9,29 +9,18 @@ metallic and roughness exponential-like (many low values), the rest uniform.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
-from ...fitting import FitResult, FitSettings, fit
-from ...runtime import array_module
-from ...tables import Table
-from ..distributions import exponential_like
+from ...fitting import Problem
+from ..sampling import exponential_like
 from . import model
 from .arrays import Arrays
 from .decoder import Decoder
 from .effects import Effects
-from .library import LAYOUTS, decoder_of
 from .model import PARAMETERS, Material, compose, exact_factors
-
-#: The settings that made the shipped tables. Those of one coordinate start close to their optimum: a large rate would
-#: only shake them (75 instead of 90 dB).
-DEFAULT_SETTINGS = {
-    "tables": FitSettings(steps=2000, batch=65536, lr=3e-4, schedule="cosine", seed=1, quality_every=200),
-    "paper": FitSettings(steps=2000, batch=65536, lr=3e-3, schedule="cosine", seed=1, quality_every=200),
-}
 
 #: Luminance weights of linear sRGB, as ``mi.luminance``.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
@@ -81,22 +70,18 @@ def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects
     return decoder.value(c, effects, effects.lobes, p, wi, wo)
 
 
-class DisneyProblem:
+class DisneyProblem(Problem):
     """
-    The training problem of :mod:`mi_diffind.fitting` for the layout of a quality level. ``quality_samples`` random
-    directions and materials, seeded and held out, measure ``psnr_db``: PSNR of BRDF · cosine, clipped to [0, 1],
-    against the analytic model.
+    The training problem of a layout ``net``, which ``decoder`` (its class) reads. ``samples`` random directions and
+    materials, seeded and held out, measure ``psnr_db``: PSNR of BRDF · cosine, clipped to [0, 1], against the analytic
+    model.
     """
-
-    weights: dict[str, float] = {}  # noqa: RUF012
 
     #: dB. The peak of a smooth surface gains long after the mean over random directions has settled.
     tolerance = 0.2
 
-    def __init__(self, backend: str | None = None, quality: str = "tables", quality_samples: int = 2**18):
-        self.types = array_module(backend)
-        self.net = LAYOUTS[quality]().alloc(self.types.TensorXf)
-        self.quality_samples = quality_samples
+    def __init__(self, net: Arrays, decoder: type[Decoder], types, samples: int = 2**18):
+        self.net, self.decoder, self.types, self.samples = net, decoder, types, samples
 
     def batch(self, rng, size: int):
         m, (wi, wo) = random_materials(rng, self.types, size), random_directions(rng, self.types, size)
@@ -106,8 +91,8 @@ class DisneyProblem:
     def predict(self, net: Arrays, inputs) -> dict[str, list]:
         return net.predict(*inputs)
 
-    def quality(self, net: Arrays) -> dict[str, float]:
-        return measure(decoder_of(net), self.types, self.quality_samples)
+    def measure(self, net: Arrays) -> dict[str, float]:
+        return measure(self.decoder(net), self.types, self.samples)
 
 
 def measure(
@@ -133,26 +118,3 @@ def measure(
         "psnr_brdf_db": -10 * math.log10(clipped_mse(truth / cosine, found / cosine)),
         "mae": float(sum(dr.mean(dr.abs(e))[0] for e in error) / 3),
     }
-
-
-def fit_disney(
-    settings: FitSettings | None = None,
-    backend: str | None = None,
-    quality: str = "tables",
-    storage: str = "float32",
-    checkpoint: str | Path | None = None,
-    resume: bool = False,
-    progress: bool = True,
-) -> tuple[Table, FitResult]:
-    """
-    Train the tables of a quality level and return them with their accuracy (measured in the storage form) and the run's
-    record. ``settings`` are those of :data:`DEFAULT_SETTINGS` unless given.
-    """
-    settings = settings or DEFAULT_SETTINGS[quality]
-    problem = DisneyProblem(backend, quality)
-    result = fit(problem, settings, checkpoint, resume, progress)
-    about = {**asdict(settings), "quality": quality}
-    table = problem.net.to_table(storage, settings=about, seed=settings.seed)
-    stored = type(problem.net).from_table(table, problem.types.TensorXf)
-    table.quality = {k: round(v, 4) for k, v in measure(decoder_of(stored), problem.types).items()}
-    return table, result

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...indirection import DifferentiableArray, Indirection, ramp
-from ...sizing import Size
 from .layout import Layout
+from .sizing import Size
 
 #: Room between the components' range and the ends of [0, 1], and the share of texels beyond the range at either end.
 MARGIN, OUTSIDE = 0.02, 1e-3

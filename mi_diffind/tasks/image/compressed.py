@@ -13,12 +13,10 @@ import drjit as dr
 import numpy as np
 
 from ...indirection import DifferentiableArray, Indirection
-from ...tables import Table, TableError, load_table
+from ...tables import StoredArray, Table, TableError, load_table
 from .arrays import joined
 from .layout import Layout
 from .source import Source
-
-TASK = "image"
 
 #: Names of the primary arrays: the second is of lower resolution, and not always there.
 PRIMARIES = ("primary", "coarse")
@@ -38,27 +36,9 @@ class CompressedImage:
         self.layout, self.net = layout, net
 
     @staticmethod
-    def from_table(table: Table, dtype, storage: str = "") -> CompressedImage:
-        """
-        From a table, for the tensor type ``dtype``. ``storage`` ``"uint8"`` (default) can be read only, ``"float32"``
-        be optimised. Raises ``ValueError`` if the table's settings describe no image.
-        """
-        layout = Layout.from_json(table.settings["layout"])
-        if not table.arrays:
-            if layout.stored:
-                raise ValueError("its arrays are missing")
-            return CompressedImage(layout, None)
-        found = {}
-        for name in table.arrays:
-            border = table.borders[name]
-            if storage == "float32" or table.storage != "uint8":
-                found[name] = DifferentiableArray.from_numpy(table.values(name), dtype, border, "float32", fold=True)
-            else:
-                quantization = table.quantization[name]
-                found[name] = DifferentiableArray.from_numpy(
-                    table.arrays[name], dtype, border, "uint8", False, quantization, table.bits.get(name, 8)
-                )
-        return CompressedImage(layout, joined([found[name] for name in PRIMARIES if name in found], found["cascaded"]))
+    def of(table: Table, dtype, storage: str = "") -> CompressedImage:
+        """The image of a checked table, see :func:`allocate`."""
+        return CompressedImage(Layout.from_json(table.settings["layout"]), joined_of(allocate(table, dtype, storage)))
 
     # -- reading ----------------------------------------------------------------------------------------------------
 
@@ -169,24 +149,33 @@ def _decibel(mse: float) -> float:
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def to_table(image: CompressedImage, settings: dict, seed: int) -> Table:
-    """The table file of an image whose arrays are stored as bytes."""
-    table = Table(TASK, {}, "uint8", settings={**settings, "layout": image.layout.to_json()}, seed=seed)
-    if image.net is None:
-        return table
-    named = [*zip(PRIMARIES, image.net.primary, strict=False), ("cascaded", image.net.cascaded)]
-    for name, array in named:
-        table.arrays[name] = array.codes()
-        table.borders[name] = array.border
-        table.quantization[name] = (array.scale, array.offset)
-        if array.bits < 8:
-            table.bits[name] = array.bits
-    return table
+def allocate(table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
+    """
+    The arrays of a checked table for the tensor type ``dtype``: as bytes, if it has them as bytes, which can be read
+    only; with the ``storage`` ``"float32"``, as floats that pass through the fold, which can be optimised.
+    """
+    as_bytes = storage != "float32" and table.storage == "uint8"
+    form = "uint8" if as_bytes else "float32"
+    return {name: array.allocate(dtype, form, fold=True) for name, array in table.arrays.items()}
 
 
-def load_image_table(path: str | os.PathLike) -> tuple[Table, Layout]:
+def joined_of(found: dict[str, DifferentiableArray]) -> Indirection | None:
+    """The indirection of named arrays; ``None`` of none."""
+    return joined([found[name] for name in PRIMARIES if name in found], found["cascaded"]) if found else None
+
+
+def to_table(image: CompressedImage, settings: dict) -> Table:
+    """The table file of an image."""
+    named = []
+    if image.net is not None:
+        named = [*zip(PRIMARIES, image.net.primary, strict=False), ("cascaded", image.net.cascaded)]
+    stored = {name: StoredArray.of(array) for name, array in named}
+    return Table("image", stored, settings={**settings, "layout": image.layout.to_json()})
+
+
+def load(path: str | os.PathLike) -> Table:
     """Read and check a table file of this task. Raises :class:`~mi_diffind.tables.TableError`."""
-    table = load_table(path, TASK)
+    table = load_table(path, "image")
     try:
         layout = Layout.from_json(table.settings["layout"])
     except (KeyError, TypeError, ValueError, OverflowError) as e:
@@ -197,7 +186,7 @@ def load_image_table(path: str | os.PathLike) -> tuple[Table, Layout]:
         names = " or ".join(", ".join(sorted(e)) or "none" for e in expected)
         raise TableError(f"{path}: holds the arrays {', '.join(sorted(found)) or 'none'}, expected {names}")
     if not layout.stored:
-        return table, layout
+        return table
     shapes = {name: array.shape for name, array in table.arrays.items()}
     cascaded = shapes.pop("cascaded")
     pointers = sum(shape[-1] for shape in shapes.values())
@@ -206,9 +195,7 @@ def load_image_table(path: str | os.PathLike) -> tuple[Table, Layout]:
             f"{path}: primary arrays of the shapes {', '.join(map(str, shapes.values()))} and a cascaded one of "
             f"{cascaded} make no image of {layout.stored} stored channel(s)"
         )
-    if table.storage == "uint8":
-        for name in found:
-            steps = 2 ** table.bits.get(name, 8) - 1
-            if any(o < 0 or s < 0 or o + steps * s > 1 + 1e-6 for s, o in zip(*table.quantization[name], strict=True)):
-                raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
-    return table, layout
+    for name, array in table.arrays.items():
+        if not array.is_pointer:
+            raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
+    return table

@@ -10,12 +10,14 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from ... import sizing
 from ...fitting import FitResult
-from ...sizing import Coarse, Size
 from ...tables import Table
+from ..task import Request
+from . import sizing
+from .presets import STRUCTURES, Recipe, replaced
+from .sizing import Coarse, Size
 from .source import Source
-from .training import STRUCTURES, Recipe, fit_image, layout_of, replaced, structure_of
+from .training import fit_image, layout_of, structure_of
 
 #: A candidate of a search is trained for this share of the steps.
 SHORT = 1 / 8
@@ -64,14 +66,16 @@ def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
 
 def _steps(recipe: Recipe, share: float) -> Recipe:
     steps = max(20, round(recipe.settings.steps * share))
-    return replaced(recipe, steps=steps, quality_every=steps)
+    return replaced(recipe, steps=steps, measure_every=steps)
 
 
-def ratio_search(source: Source, nbytes: float, recipe: Recipe, free: bool = True, **options) -> Found:
+def ratio_search(
+    source: Source, nbytes: float, recipe: Recipe, request: Request, free: bool = True, border=None
+) -> Found:
     """
     The best of several sizes of ``nbytes``, each trained for :data:`SHORT` of the steps: the side of the cascaded
     array, and so the ratio ρ; with ``free`` then the structure of the primary and dimensions (with sides of their
-    own). One is varied after the other, the best kept. ``options`` are those of :func:`.fit_image`.
+    own). One is varied after the other, the best kept. ``request`` and ``border`` are those of :func:`.fit_image`.
     """
     tried, tables = [], []
 
@@ -82,11 +86,11 @@ def ratio_search(source: Source, nbytes: float, recipe: Recipe, free: bool = Tru
         known = [t for t in tried if (t["dims"], t["structure"], t["cascaded"]) == (recipe.dims, structure, side)]
         if known or size.nbytes > nbytes * (1 + sizing.TOLERANCE):
             return False
-        table, result = fit_image(source, size, _steps(recipe, SHORT), title=_title(size, structure), **options)
+        table, result = fit_image(source, size, _steps(recipe, SHORT), request, border, _title(size, structure))
         tried.append({
             "dims": size.dims, "structure": structure, "cascaded": side, "rows": size.rows, "columns": size.columns,
-            "ratio": size.ratio, "bytes": size.nbytes, "psnr_db": table.quality["psnr_db"],
-            "psnr_between_db": table.quality["psnr_between_db"],
+            "ratio": size.ratio, "bytes": size.nbytes, "psnr_db": table.measured["psnr_db"],
+            "psnr_between_db": table.measured["psnr_between_db"],
         })  # fmt: skip
         if best() is tried[-1]:
             tables[:] = [(table, result)]
@@ -138,7 +142,13 @@ def _stages(recipe: Recipe, structure: str, side: int, free: bool, best: Callabl
 
 
 def psnr_search(
-    source: Source, goal: float, recipe: Recipe, most: int = 8, log: Callable[[str], None] = print, **options
+    source: Source,
+    goal: float,
+    recipe: Recipe,
+    request: Request,
+    border=None,
+    most: int = 8,
+    log: Callable[[str], None] = print,
 ) -> tuple[Table | None, FitResult | None, list[dict]]:
     """
     The smallest file whose ``psnr_db`` is at least ``goal``: trainings of full length, sizes by the secant of quality
@@ -154,8 +164,8 @@ def psnr_search(
         size = next((s for s in sizes if all(t["bytes"] != s.nbytes for t in tried)), None)
         if size is None:
             break
-        table, result = fit_image(source, size, recipe, title=f"try {size.nbytes:,} bytes", **options)
-        psnr = table.quality["psnr_db"]
+        table, result = fit_image(source, size, recipe, request, border, f"try {size.nbytes:,} bytes")
+        psnr = table.measured["psnr_db"]
         tried.append({"bytes": size.nbytes, "psnr_db": psnr, "rows": size.rows, "cascaded": size.cascaded})
         log(f"{size.nbytes:,} bytes: {psnr:.2f} dB")
         if psnr >= goal and (kept is None or table.nbytes < kept[0].nbytes):

@@ -19,11 +19,12 @@ import hashlib
 import json
 import os
 import re
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from ...errors import DiffindError, reason
 
 #: The largest number of channels of all maps together.
 MAX_CHANNELS = 16
@@ -43,7 +44,7 @@ _DEPTHS = {"uint8": 1, "uint16": 2, "uint32": 4, "float16": 2, "float32": 4, "fl
 _ENCODED = ("uint8", "uint16")  # the types whose full range stands for 0 … 1
 
 
-class SourceError(ValueError):
+class SourceError(DiffindError, ValueError):
     """What is to be compressed cannot be used; the message is one sentence that names the file and the fault."""
 
 
@@ -187,7 +188,7 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
     except (ValueError, RecursionError) as e:
         if isinstance(e, SourceError):
             raise
-        raise SourceError(f"{path}: is not valid JSON ({_reason(e)})") from None
+        raise SourceError(f"{path}: is not valid JSON ({reason(e)})") from None
     entries = content
     if isinstance(content, dict) and "maps" in content:
         entries = content["maps"]
@@ -295,7 +296,7 @@ def _read(path: Path) -> _Image:
         pixels = bitmap.pixel_format()
     except (RuntimeError, MemoryError, ValueError) as e:
         raise SourceError(
-            f"{path}: cannot be read as an image, it is damaged, cut short or of an unknown kind ({_reason(e)})"
+            f"{path}: cannot be read as an image, it is damaged, cut short or of an unknown kind ({reason(e)})"
         ) from None
     if values.size == 0 or values.dtype.name not in _DEPTHS:
         raise SourceError(f"{path}: has the shape {values.shape} and type {values.dtype}, which is not supported")
@@ -318,7 +319,7 @@ def _read_bytes(path: Path) -> bytes:
     except IsADirectoryError:
         raise SourceError(f"{path}: is a folder, an image or a manifest (.json) is expected") from None
     except (OSError, ValueError) as e:
-        raise SourceError(f"{path}: cannot be read ({_reason(e)})") from None
+        raise SourceError(f"{path}: cannot be read ({reason(e)})") from None
 
 
 _JPEG_MARKER = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")  # none of those that are part of the compressed data
@@ -448,8 +449,3 @@ def _check_name(where, name) -> None:
 def _check_nonfinite(nonfinite: str) -> None:
     if nonfinite not in NONFINITE:
         raise ValueError(f'nonfinite: found "{nonfinite}", allowed are {NONFINITE}')
-
-
-def _reason(e: Exception) -> str:
-    """What ``e`` says, on one line and no longer than one."""
-    return textwrap.shorten(str(e), 100, placeholder="…") or type(e).__name__

@@ -1,5 +1,5 @@
 """
-Training of task 3: the recipe of the supplement, and ours, whose differences can be switched off one by one.
+Training of task 3: its samples, its targets and its steps (what they are made of: :mod:`.presets`).
 
 A step draws a texel of the source for each sample, stratified, and reads the target there: at the texel's centre, or at
 a place that is jittered within the texel, where it is the bilinear value. The supplement's recipe jitters all samples.
@@ -12,103 +12,24 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
 
 from ... import lookup
-from ...fitting import FitResult, FitSettings, fit
+from ...fitting import FitResult, Problem
 from ...indirection import DifferentiableArray, Indirection
-from ...runtime import array_module
-from ...sizing import Coarse, Size
 from ...tables import Table
+from ..task import Request
 from . import arrays
 from .compressed import CompressedImage, to_table
 from .layout import Layout
+from .presets import Recipe
+from .sizing import Size
 from .source import Source
-
-#: How the primary is stored: bits of an entry, and a second primary or none. The fewer bits, the more entries fit.
-STRUCTURES: dict[str, tuple[int, Coarse | None]] = {
-    **{f"{bits} bits": (bits, None) for bits in (8, 7, 6, 5, 4, 3)},
-    "4 + 8 bits": (4, Coarse(2, 8, 0.5)),
-    "3 + 6 bits": (3, Coarse(2, 6, 0.4)),
-    "2 + 6 bits": (2, Coarse(2, 6, 0.35)),
-}
 
 #: dB of :func:`.arrays.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """
-    How an image is stored and trained.
-
-    ``once``: equal and constant channels are stored once (:meth:`.Layout.of`). ``normals``: leave out the third
-    component of normals where it follows from the others. ``components``: start from principal components, not from
-    the ramp. ``jitter``: share of the steps whose samples are jittered. ``rounded``: share of the steps, the last ones,
-    that see entries as they will be stored. ``structure``: one of :data:`STRUCTURES`, or ``"auto"``. ``dims``: channels
-    of the primary arrays. ``settings``: the rest.
-    """
-
-    once: bool = True
-    normals: bool = True
-    components: bool = True
-    jitter: float = 0.5
-    rounded: float = 1.0
-    structure: str = "auto"
-    dims: int = 4
-    settings: FitSettings = dataclasses.field(default_factory=FitSettings)
-
-
-#: Steps of 262,144 samples of a training that is not told how long it may take.
-STEPS = 1500
-
-_OURS = FitSettings(steps=STEPS, batch=2**18, lr=3e-2, schedule="cosine", loss="mse", quality_every=STEPS // 10)
-_PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
-
-RECIPES = {
-    "ours": Recipe(settings=_OURS),
-    "paper": Recipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
-}
-
-#: What of ours can be switched off: to what the supplement does.
-IMPROVEMENTS = {
-    "once": "equal and constant channels are stored once",
-    "normals": "normals as two channels where the third follows",
-    "components": "arrays start from principal components",
-    "jitter": "half of the samples at texel centres",
-    "rounded": "training sees rounded entries",
-    "structure": "fewer bits an entry of the primary array, a second one for noisy images",
-    "loss": "squared errors",
-    "rate": "a higher rate that falls to zero",
-    "batch": "steps of 262,144 samples",
-}
-
-
-def without(recipe: Recipe, names) -> Recipe:
-    """``recipe`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown one."""
-    paper = RECIPES["paper"]
-    for name in names:
-        if name not in IMPROVEMENTS:
-            raise ValueError(f'found the improvement "{name}", allowed are {", ".join(IMPROVEMENTS)}')
-        if name == "loss":
-            recipe = replaced(recipe, loss=paper.settings.loss)
-        elif name == "rate":
-            recipe = replaced(recipe, lr=paper.settings.lr, schedule=paper.settings.schedule)
-        elif name == "batch":
-            batches = paper.settings.batch // recipe.settings.batch
-            recipe = replaced(recipe, batch=paper.settings.batch, steps=max(1, recipe.settings.steps // batches))
-        else:
-            recipe = dataclasses.replace(recipe, **{name: getattr(paper, name)})
-    return recipe
-
-
-def replaced(recipe: Recipe, **settings) -> Recipe:
-    """``recipe`` with other settings of the training."""
-    return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **settings))
 
 
 def structure_of(source: Source, recipe: Recipe) -> str:
@@ -124,7 +45,7 @@ def layout_of(source: Source, recipe: Recipe) -> Layout:
     return Layout.of(source, recipe.once, None if recipe.normals else False)
 
 
-class ImageProblem:
+class ImageProblem(Problem):
     """
     The training problem of :mod:`mi_diffind.fitting`. ``net`` maps (v, u) to the stored channels, ``bits`` are
     those of the entries of each primary, ``values`` the stored channels, ``(height, width, stored)``; ``border`` is
@@ -144,7 +65,7 @@ class ImageProblem:
         for i, name in enumerate(layout.groups):
             self.groups.setdefault(name, []).append(i)
         self.weights = {name: len(found) / self.channels for name, found in self.groups.items()}
-        self.about = {"source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}}
+        self.identity = {"source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}}
         self.rounded = self.jittered = False
         self._stretches = {}  # size of a batch → first texel and number of texels of each stretch
 
@@ -214,7 +135,7 @@ class ImageProblem:
         found = (rounded(net, self.bits) if self.rounded else net)(inputs)
         return {name: [found[i] for i in channels] for name, channels in self.groups.items()}
 
-    def quality(self, net) -> dict[str, float]:
+    def measure(self, net) -> dict[str, float]:
         """PSNR of the stored channels, with rounded entries, at the centres of 2¹⁸ texels at most."""
         rng = dr.rng(seed=dr.opaque(self.types.UInt64, 2023))
         size = min(self.texels, 2**18)
@@ -260,42 +181,34 @@ def problem_of(
 def fit_image(
     source: Source,
     size: Size | None,
-    recipe: Recipe | None = None,
-    backend: str | None = None,
-    checkpoint: str | Path | None = None,
-    resume: bool = False,
-    progress: bool = True,
+    recipe: Recipe,
+    request: Request,
     border: tuple[str, str] | None = None,
     title: str | None = None,
-    seconds: float | None = None,
 ) -> tuple[Table, FitResult]:
     """
     Train the arrays of ``source`` and return them as they are stored, with their errors
     (:meth:`.CompressedImage.measure`), and the run's record. ``size`` may be ``None`` for an image of one colour, which
-    needs no arrays. ``border`` is that along v and u, found out unless given. ``seconds``: train for so long, in place
-    of the recipe's steps.
+    needs no arrays. ``border`` is that along v and u, found out unless given; ``request`` says where to train, for how
+    long and with which checkpoint; its settings are those of the ``recipe``.
     """
-    recipe = recipe or RECIPES["ours"]
-    layout, types = layout_of(source, recipe), array_module(backend)
+    request = dataclasses.replace(request, settings=recipe.settings)
+    layout, types = layout_of(source, recipe), request.types
     if not layout.stored:
-        image = CompressedImage(layout, None)
-        return _with_quality(to_table(image, {"source": source.digest}, 0), source, types), FitResult(
-            {}, 0, 0, 0.0, False, 0
-        )
-    problem = problem_of(source, size, recipe, types, layout, border)
-    result = fit(problem, recipe.settings, checkpoint, resume, progress, title=title, seconds=seconds)
-    about = {**dataclasses.asdict(recipe.settings), **problem.about, "ratio": size.ratio}
-    if seconds is not None:
-        about |= {"seconds": seconds, "steps": result.steps}
-    about["structure"] = structure_of(source, recipe)
-    table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), about, recipe.settings.seed)
-    return _with_quality(table, source, types), result
-
-
-def _with_quality(table: Table, source: Source, types) -> Table:
-    found = CompressedImage.from_table(table, types.TensorXf).measure(source)
-    table.quality = {k: float(f"{v:.5g}") for k, v in found.items()}
-    return table
+        table = to_table(CompressedImage(layout, None), {"source": source.digest})
+        result = FitResult({}, 0, 0, 0.0, False, 0)
+    else:
+        problem = problem_of(source, size, recipe, types, layout, border)
+        result = request.train(problem, title)
+        settings = {**request.about(), **problem.identity, "ratio": size.ratio}
+        if request.seconds is not None:
+            settings["steps"] = result.steps
+        settings["structure"] = structure_of(source, recipe)
+        table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), settings)
+    table.preset, table.seed = request.preset, recipe.settings.seed
+    found = CompressedImage.of(table, types.TensorXf).measure(source)
+    table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
+    return table, result
 
 
 def stored_form(net: Indirection, bits: Sequence[int]) -> Indirection:

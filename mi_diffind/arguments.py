@@ -1,0 +1,51 @@
+"""Arguments of the command line that tasks and studies declare, and kinds of numbers that they may be."""
+
+from __future__ import annotations
+
+import argparse
+
+
+class Argument:
+    """
+    An argument of ``fit`` or ``decode`` that only a task adds: as for ``argparse.ArgumentParser.add_argument``, and the
+    name of the ``group`` of which at most one may be given.
+    """
+
+    def __init__(self, *flags: str, group: str = "", **options):
+        self.flags, self.group, self.options = flags, group, options
+
+    @property
+    def name(self) -> str:
+        """Its name in Python, and in :attr:`Request.options`."""
+        return self.options.get("dest", self.flags[0].lstrip("-").replace("-", "_"))
+
+    @property
+    def default(self):
+        """What stands for it if it is not given."""
+        return self.options.get("default", False if self.options.get("action") == "store_true" else None)
+
+
+def add_arguments(parser: argparse.ArgumentParser, arguments: tuple[Argument, ...]) -> None:
+    """Add arguments to a parser; positional ones come first, as they stand."""
+    groups = {name: parser.add_mutually_exclusive_group() for name in dict.fromkeys(a.group for a in arguments) if name}
+    for argument in arguments:
+        groups.get(argument.group, parser).add_argument(*argument.flags, **argument.options)
+
+
+def positive(text: str) -> int:
+    """A whole number ≥ 1. Raises ``ArgumentTypeError``."""
+    value = natural(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def natural(text: str) -> int:
+    """A whole number ≥ 0. Raises ``ArgumentTypeError``."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number ≥ 0")
+    return value

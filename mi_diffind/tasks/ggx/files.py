@@ -1,0 +1,42 @@
+"""Table files of task 1, and what they stand for."""
+
+from __future__ import annotations
+
+import os
+
+from ...indirection import Indirection
+from ...lookup import STORAGES
+from ...tables import Table, TableError, check_ranges, load_table
+from ..task import Model
+from . import training
+from .model import Encoding, LearnedGGX
+
+
+class GGXModel(Model):
+    """The ``distribution`` as a file has it (:class:`.model.LearnedGGX`)."""
+
+    forms = STORAGES
+
+    def build(self):
+        net = Indirection(self.arrays["primary"], self.arrays["cascaded"])
+        self.distribution = LearnedGGX(net, encoding_of(self.table))
+
+    def measure(self, samples: int = 10**6) -> dict[str, float]:
+        """See :func:`.training.measure`."""
+        return training.measure(self.distribution, self.types, samples)
+
+
+def encoding_of(table: Table) -> Encoding:
+    """What stands between the entries of a table and the distribution. Raises :class:`TableError`."""
+    try:
+        return Encoding(table.settings["inputs"], table.settings["output"])
+    except (KeyError, TypeError, ValueError) as e:
+        raise TableError(f"{table.path}: its settings name no encoding that is known ({e})") from None
+
+
+def load(path: str | os.PathLike) -> Table:
+    """Read and check a table file of this task. Raises :class:`TableError`."""
+    table = load_table(path, "ggx", {"primary": (None, None, 2), "cascaded": (None, None, 1)})
+    bounded = encoding_of(table).output == "root"
+    check_ranges(table, {"primary": (0.0, 1.0), **({"cascaded": (-0.5, 1.5)} if bounded else {})})
+    return table

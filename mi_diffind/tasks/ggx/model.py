@@ -1,0 +1,172 @@
+"""
+Task 1: the isotropic GGX distribution of normals, read from arrays (METHOD task 1, supplemental 1.1).
+
+The truth is Trowbridge and Reitz's distribution (Walter et al. 2007, equation 33) with the normal (0, 0, 1),
+
+    D(h) = α² / (π q²),   q = sin²θ_h + α² cos²θ_h,
+
+whose peak 1/(π α²) is unbounded: 0.3 at α = 1, 318,310 at α = 0.001. Between entries and D stands therefore an
+:class:`Encoding`, and which one it is matters more than how the arrays are made:
+
+``"tables"`` (default)
+    *Inputs* on logarithmic axes: v = 1 + log α / log(1/α_min) and u = 1 + log(sin²θ_h (1 − ε) + ε) / log(1/ε) with ε =
+    α_min²/4. Every decade of roughness gets the same number of entries, and the same resolution within its peak: in
+    units of α, all peaks look alike. *Output* y = (D / D_peak)^¼ = α/√q, which lies in (0, 1]: the peak is 1 whatever
+    α is, so the relative error of D at the peak is 4 times the error of an entry, at any roughness. The error measure
+    is the mean absolute error of y. Half of the training samples follow the cosine-weighted hemisphere, three
+    eighths are distributed as the peak itself, and one eighth lies at its very centre, which a cosine-weighted draw
+    never sees (at α = 0.001 one sample in a million comes close).
+
+``"paper"``
+    *Inputs* cos θ_h and α as they are, *output* D as it is, mean absolute error, cosine-weighted samples: the
+    supplement's recipe. It misses the peak at low roughness: an entry is 1/15 wide, the peak α².
+
+Roughness is drawn from an exponential-like distribution, as for the Disney BRDF, and clamped to α ≥ 0.001.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ...indirection import DifferentiableArray, Indirection
+from ...lookup import clamp
+
+#: Least roughness that is learned. Below it, the distribution is read there, at an angle that is scaled accordingly.
+ALPHA_MIN = 1e-3
+
+#: Least roughness of all: that of Mitsuba's ``MicrofacetDistribution``.
+ALPHA_FLOOR = 1e-4
+
+INPUTS, OUTPUTS = ("logarithmic", "plain"), ("root", "raw")
+
+
+def ggx(sin2, alpha):
+    """D per solid angle of normals, from sin²θ_h and α (both in [0, 1], α > 0); exact also next to the peak."""
+    a2 = dr.square(alpha)
+    q = dr.fma(1 - sin2, a2, sin2)
+    return a2 / (dr.pi * dr.square(q))
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """
+    What stands between (θ_h, α) and the coordinates at which arrays are read (``inputs``: ``"logarithmic"`` or
+    ``"plain"``), and between what is read and D (``output``: ``"root"`` or ``"raw"``). See the module.
+    """
+
+    inputs: str = "logarithmic"
+    output: str = "root"
+
+    def __post_init__(self):
+        if self.inputs not in INPUTS or self.output not in OUTPUTS:
+            raise ValueError(f"found the encoding {self}, allowed are inputs {INPUTS} and outputs {OUTPUTS}")
+
+    def coordinate_alpha(self, alpha):
+        """The coordinate in [0, 1] that belongs to α ≥ :data:`ALPHA_FLOOR`."""
+        if self.inputs == "plain":
+            return alpha
+        return dr.fma(dr.log2(dr.maximum(alpha, ALPHA_MIN)), -1 / math.log2(ALPHA_MIN), 1)
+
+    def stretch(self, alpha):
+        """By how much sin²θ_h is stretched, since nothing below :data:`ALPHA_MIN` is learned; at least 1."""
+        if self.inputs == "plain":
+            return 1
+        return dr.square(dr.maximum(ALPHA_MIN * dr.rcp(alpha), 1))
+
+    def coordinate_normal(self, cos, sin2, stretch=1):
+        """The coordinate in [0, 1] that belongs to the angle of the half vector (cos θ_h ≥ 0 and sin²θ_h)."""
+        if self.inputs == "plain":
+            return cos
+        ε = ALPHA_MIN**2 / 4
+        return dr.fma(dr.log2(dr.fma(dr.minimum(sin2 * stretch, 1), 1 - ε, ε)), -1 / math.log2(ε), 1)
+
+    def coordinates(self, cos, sin2, alpha) -> list:
+        """Both coordinates: of the normal and of α."""
+        return [self.coordinate_normal(cos, sin2, self.stretch(alpha)), self.coordinate_alpha(alpha)]
+
+    def encode(self, d, alpha):
+        """What arrays are to hold where the distribution is ``d``."""
+        return d if self.output == "raw" else dr.sqrt(dr.sqrt(d * self.peak_inverse(alpha)))
+
+    def peak_inverse(self, alpha):
+        """1/D_peak = π α²."""
+        return dr.pi * dr.square(alpha)
+
+    def decode(self, y, peak):
+        """D from what was read, and from ``peak`` = 1/(π α²), which depends on α alone. Never negative."""
+        return dr.maximum(y, 0) if self.output == "raw" else dr.square(dr.square(y)) * peak
+
+
+#: The encoding of each preset.
+ENCODINGS = {"tables": Encoding(), "paper": Encoding("plain", "raw")}
+
+
+@dataclass
+class Roughness:
+    """
+    What a read of the distribution needs to know about α: ``alpha2`` = α², ``peak`` = 1/(π α²), by how much sin²θ_h is
+    to be stretched, and the coordinate of α, or the function of the other coordinate that remains once it is known
+    (``net``).
+    """
+
+    alpha2: Any
+    peak: Any
+    stretch: Any
+    coordinate: Any = None
+    net: Callable | None = None
+
+
+class LearnedGGX:
+    """
+    The distribution as ``net`` has it, any function from a list of two coordinates in [0, 1] to a list of one array:
+    an :class:`~mi_diffind.indirection.Indirection`, a single array, a network.
+    """
+
+    def __init__(self, net: Callable, encoding: Encoding):
+        self.net, self.encoding = net, encoding
+
+    def roughness(self, alpha) -> Roughness:
+        """Whatever depends on α alone; α is limited to [:data:`ALPHA_FLOOR`, 1], NaN becomes the former."""
+        alpha = clamp(alpha, ALPHA_FLOOR, 1)
+        alpha2, e = dr.square(alpha), self.encoding
+        return Roughness(alpha2, dr.rcp(dr.pi * alpha2), e.stretch(alpha), e.coordinate_alpha(alpha))
+
+    def constant_roughness(self, alpha) -> Roughness:
+        """
+        The same for an α that is one number: what remains of an indirection's primary array is a row of it, two
+        entries to read instead of four.
+        """
+        found = self.roughness(alpha)
+        if isinstance(self.net, Indirection):
+            row = self.net.primary[0].at(found.coordinate)
+            found.net, found.coordinate = Indirection(row, self.net.cascaded), None
+        return found
+
+    def read(self, r: Roughness, cos, sin2, active=True):
+        """D per solid angle of normals, from cos θ_h ≥ 0 and sin²θ_h."""
+        x = [self.encoding.coordinate_normal(cos, sin2, r.stretch)]
+        y = self.net([*x, r.coordinate], active) if r.net is None else r.net(x, active)
+        return self.encoding.decode(y[0], r.peak)
+
+    def __call__(self, cos, sin2, alpha):
+        """D per solid angle of normals, from cos θ_h, sin²θ_h and α."""
+        return self.read(self.roughness(alpha), cos, sin2)
+
+
+def indirection(primary: int = 16, cascaded: int = 8) -> Indirection:
+    """
+    The arrays of task 1, not yet allocated: a primary of ``primary``² × 2 entries, the undistorted uv ramp, and a
+    cascaded one of ``cascaded``² × 1, constant 0.5, with no non-linearity on its output. Raises ``ValueError``.
+    """
+    for name, n in (("primary", primary), ("cascaded", cascaded)):
+        if not 2 <= n <= 4096:
+            raise ValueError(f"{name}: found {n}, allowed are 2 to 4096 entries a side")
+    return Indirection(
+        DifferentiableArray((primary, primary), 2, "ramp", fold=True),
+        DifferentiableArray((cascaded, cascaded), 1, "constant", 0.5),
+    )

@@ -1,0 +1,88 @@
+"""How an image is stored and trained: the recipe of the supplement and ours, whose differences can be switched off."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from ...settings import FitSettings
+from .sizing import Coarse
+
+#: How the primary is stored: bits of an entry, and a second primary or none. The fewer bits, the more entries fit.
+STRUCTURES: dict[str, tuple[int, Coarse | None]] = {
+    **{f"{bits} bits": (bits, None) for bits in (8, 7, 6, 5, 4, 3)},
+    "4 + 8 bits": (4, Coarse(2, 8, 0.5)),
+    "3 + 6 bits": (3, Coarse(2, 6, 0.4)),
+    "2 + 6 bits": (2, Coarse(2, 6, 0.35)),
+}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """
+    How an image is stored and trained.
+
+    ``once``: equal and constant channels are stored once (:meth:`.Layout.of`). ``normals``: leave out the third
+    component of normals where it follows from the others. ``components``: start from principal components, not from
+    the ramp. ``jitter``: share of the steps whose samples are jittered. ``rounded``: share of the steps, the last ones,
+    that see entries as they will be stored. ``structure``: one of :data:`STRUCTURES`, or ``"auto"``. ``dims``: channels
+    of the primary arrays. ``settings``: the rest.
+    """
+
+    once: bool = True
+    normals: bool = True
+    components: bool = True
+    jitter: float = 0.5
+    rounded: float = 1.0
+    structure: str = "auto"
+    dims: int = 4
+    settings: FitSettings = dataclasses.field(default_factory=FitSettings)
+
+
+#: Steps of 262,144 samples of a training that is not told how long it may take.
+STEPS = 1500
+
+_OURS = FitSettings(steps=STEPS, batch=2**18, lr=3e-2, schedule="cosine", loss="mse", measure_every=STEPS // 10)
+_PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
+
+#: The first is the default.
+PRESETS = {
+    "ours": Recipe(settings=_OURS),
+    "paper": Recipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
+}
+
+#: What of ours can be switched off: to what the supplement does.
+IMPROVEMENTS = {
+    "once": "equal and constant channels are stored once",
+    "normals": "normals as two channels where the third follows",
+    "components": "arrays start from principal components",
+    "jitter": "half of the samples at texel centres",
+    "rounded": "training sees rounded entries",
+    "structure": "fewer bits an entry of the primary array, a second one for noisy images",
+    "loss": "squared errors",
+    "rate": "a higher rate that falls to zero",
+    "batch": "steps of 262,144 samples",
+}
+
+
+def without(recipe: Recipe, names) -> Recipe:
+    """``recipe`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown one."""
+    paper = PRESETS["paper"]
+    for name in names:
+        if name not in IMPROVEMENTS:
+            raise ValueError(f'found the improvement "{name}", allowed are {", ".join(IMPROVEMENTS)}')
+        if name == "loss":
+            recipe = replaced(recipe, loss=paper.settings.loss)
+        elif name == "rate":
+            recipe = replaced(recipe, lr=paper.settings.lr, schedule=paper.settings.schedule)
+        elif name == "batch":
+            batches = paper.settings.batch // recipe.settings.batch
+            recipe = replaced(recipe, batch=paper.settings.batch, steps=max(1, recipe.settings.steps // batches))
+        else:
+            recipe = dataclasses.replace(recipe, **{name: getattr(paper, name)})
+    return recipe
+
+
+def replaced(recipe: Recipe, **settings) -> Recipe:
+    """``recipe`` with other settings of the training."""
+    return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **settings))
