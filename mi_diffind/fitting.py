@@ -341,6 +341,7 @@ class _Trainer:
         self.kind = self.problem.begin(self.step, self.share)
         losses = self.problem.loss(net, rng, settings.batch)
         losses = losses if isinstance(losses, list) else [losses]
+        losses = [values.array if dr.is_tensor_v(values) else values for values in losses]
         # The loss is the sum of these; the same kernel writes them and sums the gradients of the entries.
         dr.schedule(dr.detach(losses))
         for values in losses:
