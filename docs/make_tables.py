@@ -1,0 +1,124 @@
+"""
+Write the tables of the documentation: ``tasks.md`` from what tasks declare, and in the other pages what stands between
+``<!-- table NAME -->`` and ``<!-- end -->`` from the JSON in ``docs/measured/``.
+
+    python docs/make_tables.py [--check]
+
+Each file of ``docs/measured/`` was written by ``mi-diffind … --json docs/measured/NAME.json``; the commands stand in the
+pages. With ``--check`` nothing is written; exit code 1 if a page is not as it would be written.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import mi_diffind
+from mi_diffind.tasks.task import tasks
+
+DOCS = Path(__file__).resolve().parent
+
+
+def measured(name: str) -> dict:
+    """What a command wrote."""
+    return json.loads((DOCS / "measured" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def table(head: list[str], rows: list[list]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def page_of_tasks() -> str:
+    """All tasks: presets, and the files that ship."""
+    parts = [
+        "# All tasks\n\nMade from the declarations of the tasks by `python docs/make_tables.py`: "
+        "change those, not this page.\n"
+    ]
+    for task in tasks().values():
+        parts.append(f"## `{task.name}`: {task.title}\n\nPaper: {task.section}. Page: [{task.name}]({task.name}.md).\n")
+        rows = [
+            [f"`{name}`" + (" (default)" if i == 0 else ""), s.steps, f"{s.batch:,}", f"{s.lr:g}", s.schedule, s.loss]
+            for i, (name, s) in enumerate(task.presets.items())
+        ]
+        parts.append(table(["preset", "steps", "samples a step", "learning rate", "schedule", "loss"], rows) + "\n")
+        if task.shipped:
+            rows = []
+            for preset in task.shipped:
+                found = task.load(task.file(preset=preset))
+                rows.append([
+                    f"`{found.path.name}`", f"`{preset}`", f"{found.nbytes:,}",
+                    f"{found.measured['psnr_db']:.1f}",
+                    f"`mi-diffind fit {task.name} --preset {preset} -o {found.path.name}`",
+                ])  # fmt: skip
+            parts.append(table(["file that ships", "preset", "bytes of entries", "PSNR, dB", "made by"], rows) + "\n")
+        if task.arguments:
+            parts.append(
+                "Arguments of its own: " + ", ".join(f"`{a.flags[0]}`" for a in task.arguments) + "; see "
+                f"`mi-diffind fit {task.name} --help`.\n"
+            )
+    return "\n".join(parts)
+
+
+def disney_forms() -> str:
+    """Accuracy, bytes and time of each form of the Disney BRDF."""
+    study = measured("tradeoff_disney")
+    timings = {name: case["queries"]["eval"] for name, case in study["cases"].items()}
+    cases = [name for name in ("constant, all lobes", "constant, diffuse + specular") if name in timings]
+    reference = {case: timings[case]["principled"]["time"] for case in cases}
+    rows = []
+    for name, candidate in study["candidates"].items():
+        if candidate["representation"] == "one table" or not all(name in timings[case] for case in cases):
+            continue
+        errors = candidate["errors"]
+        accuracy = " / ".join(f"{errors[k]:.1f}" for k in ("psnr_db_training", "psnr_db_uniform") if k in errors)
+        times = [f"{timings[case][name]['time'] / reference[case]:.2f}" for case in cases]
+        rows.append([f"`{name}`", f"{candidate['bytes']:,}", accuracy or "–", *times])
+    return table(["form", "bytes", "PSNR, dB: training / uniform", *(f"eval, {c.split(', ')[1]}" for c in cases)], rows)
+
+
+def comparisons() -> str:
+    """What ``compare`` found for the scenes."""
+    rows = []
+    for path in sorted((DOCS / "measured").glob("compare_*.json")):
+        f = measured(path.stem)
+        against = f.get("against") or "exact counterparts"
+        rows.append([
+            f"`{Path(f['scene']).name}`", against, f"{f['psnr_db']:.1f}", f"{f['flip']:.4f}",
+            f"{f['time_ratio']['median']:.2f}",
+        ])  # fmt: skip
+    return table(["scene", "against", "PSNR, dB", "FLIP", "time of a pass over that of the other"], rows)
+
+
+TABLES = {"disney_forms": disney_forms, "comparisons": comparisons}
+
+
+def written() -> dict[Path, str]:
+    """Page → its text."""
+    pages = {DOCS / "tasks.md": page_of_tasks()}
+    for path in sorted(DOCS.glob("*.md")):
+        text = pages.get(path) or path.read_text(encoding="utf-8")
+        pages[path] = re.sub(
+            r"(<!-- table (\w+) -->\n).*?(\n<!-- end -->)",
+            lambda m: m[1] + TABLES[m[2]]() + m[3],
+            text,
+            flags=re.DOTALL,
+        )
+    return pages
+
+
+def main(check: bool) -> int:
+    """Write the pages that differ, or with ``check`` name them; returns the exit code."""
+    differing = [p for p, text in written().items() if not p.is_file() or p.read_text(encoding="utf-8") != text]
+    for path in differing:
+        print(f"{path.name}: {'is not as it would be written' if check else 'written'} ({mi_diffind.__version__})")
+        if not check:
+            path.write_text(written()[path], encoding="utf-8")
+    return int(check and bool(differing))
+
+
+if __name__ == "__main__":
+    sys.exit(main("--check" in sys.argv[1:]))
