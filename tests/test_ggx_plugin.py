@@ -180,7 +180,7 @@ def test_the_exact_plugin_times_what_the_table_says(mi_any, rng, material):
             found, given = found.numpy()[..., valid].astype(np.float64), given.numpy()[..., valid]
             sin2 = walter.half_sin2(wi[valid], out[valid])
             ratio = normals("tables")(sin2, alpha) / walter.distribution(sin2, alpha)
-            assert np.median(np.abs(ratio - 1)) < 0.02
+            assert np.median(np.abs(ratio - 1)) < 0.03  # that of the tail, which is the same all along
             expected = given * ratio
             scale = np.abs(expected).reshape(-1, len(sin2)).max(axis=0)
             if material == "black":
