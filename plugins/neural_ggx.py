@@ -80,6 +80,12 @@ class NeuralGGX(mi.BSDF):
     read, so an error of the table is an error of the image and never one of the estimator: the weight of a sample is
     D̂/D times that of the exact plugin.
 
+    With ``tables``, D̂/D lies between 0.9 and 1.1 at any angle and roughness, in every storage form, and the mean weight
+    is at most 0.02 (bytes: 0.035) above the exact one. That is because the tail, beyond 8/9 of the projected area of
+    the normals, is not read but continued by its analytic form. ``paper`` reads all of D, and what it misses of the
+    peak it adds to the tail: at an angle of 89.999°, where 0.92 to 0.94 are exact, the mean weight is 1.3 at ``alpha``
+    0.003, 3.5 at 0.001 and 29 at 0.0001, and single ones reach 600, 5,000 and 200,000.
+
     **Derivatives are coarser than values**, those of a bilinear read being constant from entry to entry: with respect
     to ``alpha`` they are off by 4% to 13% on average, and near 1 (from 0.95) may have the wrong sign. Fits of ``alpha``
     from images converge all the same.
@@ -215,7 +221,8 @@ class NeuralGGX(mi.BSDF):
 
     def _prepare(self, ctx, si, wo, active):
         """Directions that are safe to compute with in every lane, and the lanes whose result counts."""
-        active = active & (si.wi.z > 0) & (wo.z > 0)
+        # Directions have a length of 1; what is NaN or infinite has none below any bound
+        active = active & (si.wi.z > 0) & (wo.z > 0) & (dr.squared_norm(si.wi) + dr.squared_norm(wo) < 100)
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
             active = mi.Bool(False)
         up = mi.Vector3f(0, 0, 1)
@@ -272,13 +279,14 @@ class NeuralGGX(mi.BSDF):
             alpha = dr.sqrt(dr.detach(r.alpha2))
             half, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True).sample(wi, sample2)
             wo = dr.detach(mi.reflect(wi, half))
+            wo = dr.select(dr.squared_norm(wo) < 100, wo, -wi)  # of NaN and infinities
 
         bs = dr.zeros(mi.BSDFSample3f)
         bs.wo = wo
         bs.eta = 1.0
         bs.sampled_component = 0
         bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-        active &= dr.isfinite(wo.z) & (wo.z > 0)
+        active &= wo.z > 0
         safe = dr.select(active, wo, up)
         bs.pdf = self._density(r, wi, safe, active)
         active &= bs.pdf > 0

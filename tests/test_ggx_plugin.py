@@ -180,7 +180,7 @@ def test_the_exact_plugin_times_what_the_table_says(mi_any, rng, material):
             found, given = found.numpy()[..., valid].astype(np.float64), given.numpy()[..., valid]
             sin2 = walter.half_sin2(wi[valid], out[valid])
             ratio = normals("tables")(sin2, alpha) / walter.distribution(sin2, alpha)
-            assert np.median(np.abs(ratio - 1)) < 0.02
+            assert np.median(np.abs(ratio - 1)) < 0.03  # that of the tail, which is the same all along
             expected = given * ratio
             scale = np.abs(expected).reshape(-1, len(sin2)).max(axis=0)
             if material == "black":
@@ -389,6 +389,36 @@ def test_energy(mi_rgb, rng, form):
         assert weight.numpy().max() < 5
 
 
+@pytest.mark.parametrize("textured", [False, True])
+@pytest.mark.parametrize("form", ["tables", "tables float16", "tables uint8"])
+def test_nothing_is_gained_at_the_horizon(mi_rgb, rng, form, textured):
+    """
+    From no roughness to all of it: against the exact weights of the same samples, which are Smith's masking, no single
+    weight is higher by more than a tenth, and their mean by no more than the table's own error.
+    """
+    mi, side = mi_rgb, 128
+    alphas = [0.0, 1e-4, 2e-4, 5e-4, 7e-4, 1e-3, 0.0015, 0.003, 0.005, 0.01, 0.0133, 0.05, 0.132, 0.4, 1.0]
+    alphas = alphas if textured else [0.0, 5e-4, 0.005]
+    angles = (60, 89, 89.9, 89.99, 89.999, 90 - 1e-5, 90 - 1e-9)
+    x, y = (v.ravel() + rng.random(side**2) for v in np.mgrid[:side, :side])
+    u = [np.minimum(v / side, 1 - 2**-24).astype("f4") for v in (x, y)]
+    theta = np.radians(np.repeat(angles, side**2))
+    wi = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=1)
+    u = mi.Point2f(*(np.tile(v, len(angles)) for v in u))
+    texture = texels(mi, alphas)
+    for i, alpha in enumerate(alphas):
+        bsdf = mi.load_dict({**FORMS[form], "alpha": texture if textured else alpha})
+        si = interactions(mi, vectors(mi, wi), np.full(len(wi), i), len(alphas))
+        bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), u)
+        valid, cosine = bs.pdf.numpy() > 0, np.maximum(bs.wo.z.numpy().astype(np.float64), 1e-30)
+        expected = np.where(valid, walter.smith(cosine, max(np.float32(alpha), ggx.ALPHA_FLOOR)), 0)
+        weight = weight.x.numpy().astype(np.float64)
+        assert valid.mean() > 0.5
+        assert (weight <= 1.1 * expected).all(), (alpha, np.max(weight[valid] / expected[valid]))
+        gain = (weight - expected).reshape(len(angles), -1).mean(axis=1)
+        assert gain.max() < (0.035 if form == "tables uint8" else 0.02), (alpha, gain)
+
+
 # -- extreme inputs ----------------------------------------------------------------------------------------------------
 
 SPECIAL_ALPHAS = (0.0, 1e-40, 1e-4, 1e-3, 0.05, 0.5, 1.0, 2.0, -1.0, float("nan"), float("inf"), -float("inf"))
@@ -465,6 +495,86 @@ def test_extreme_inputs(form, variant):
                 dr.backward(total(value) + total(weight))
                 for key in keys:
                     assert np.isfinite(params[key].grad.numpy()).all(), key
+
+
+def all_finite(mi, bsdf, si, wo, u, what):
+    """… and not negative: value, density, weight; the sample itself, too."""
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), u)
+    dr.eval(value, pdf, bs, weight)
+    for v in (value, pdf, weight, bs.pdf):
+        v = v.numpy()
+        assert np.isfinite(v).all() and (v[0, 0] if v.ndim == 4 else v).min() >= 0, what
+    assert np.isfinite(bs.wo.numpy()).all(), what
+    return value, pdf, bs, weight
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("textured", [False, True])
+def test_tables_of_anything(mi_rgb, rng, quality, textured):
+    """Entries may be wrong, and nothing else becomes so; gradients are finite where the entries are."""
+    mi, n = mi_rgb, 2000
+    wi, wo = extreme_directions()
+    lane = rng.integers(len(wi), size=n)
+    si = interactions(mi, vectors(mi, wi[lane]), lane % 3, 3)
+    wo, u = vectors(mi, wo[lane]), uniform(mi, rng, n)[1]
+    bsdf = mi.load_dict({**FORMS[quality], "alpha": texels(mi, [1e-4, 0.1, 1.0]) if textured else 0.1, "eta": 0.5})
+    params = mi.traverse(bsdf)
+    alpha = "alpha.data" if textured else "alpha.value"
+    for key in ("tables.primary", "tables.cascaded"):
+        before = params[key].numpy()
+        for wrong in (float("nan"), 1e30, -1e30, float("inf"), -float("inf")):
+            for share in (1, 0.2):
+                values = np.where(rng.random(before.shape) < share, np.float32(wrong), before)
+                params[key] = mi.TensorXf(values)
+                params.update()
+                all_finite(mi, bsdf, si, wo, u, (key, wrong, share))
+                if not math.isfinite(wrong):
+                    continue
+                dr.enable_grad(params[alpha])
+                params.update()
+                value, _, _, weight = all_finite(mi, bsdf, si, wo, u, (key, wrong, share))
+                dr.backward(dr.sum(value.x) + dr.sum(weight.x))
+                assert np.isfinite(params[alpha].grad.numpy()).all(), (key, wrong, share)
+                dr.disable_grad(params[alpha])
+        params[key] = mi.TensorXf(before)
+        params.update()
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize("form", QUALITIES)
+def test_directions_that_are_none(rng, form, variant):
+    """NaN, infinities and lengths beyond all measure: nothing is reflected, and gradients know nothing of it."""
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    wrong = np.array([np.nan, np.inf, -np.inf, 1e10, 1e20, -1e20, 3e38], np.float32)
+    normal = np.array([0.6, 0.0, 0.8], np.float32)
+    broken = []
+    for value in wrong:
+        for which in range(1, 8):
+            w = normal.copy()
+            w[[bool(which >> k & 1) for k in range(3)]] = value
+            broken.append(w)
+    broken = np.array(broken)
+    fine = np.tile(normal, (len(broken), 1)) * [-1, 1, 1]
+    wi = np.concatenate([broken, fine, broken, broken, fine])
+    wo = np.concatenate([fine, broken, broken, -broken, fine])
+    n, good = len(wi), np.arange(len(wi)) >= len(wi) - len(broken)
+    samples = rng.random((n, 2)).astype(np.float32)
+    samples[::3] = np.resize([np.nan, np.inf, -np.inf, -1, 2, 1e30], len(samples[::3]))[:, None]
+    u = mi.Point2f(np.ascontiguousarray(samples.T))
+    for alpha, key in ((0.1, "alpha.value"), (texels(mi, [1e-4, 0.3]), "alpha.data")):
+        bsdf = mi.load_dict({**FORMS[form], "alpha": alpha, "eta": 0.5, "k": 2.0})
+        params = mi.traverse(bsdf)
+        dr.enable_grad(params[key])
+        params.update()
+        si = interactions(mi, vectors(mi, wi), np.arange(n) % 2, 2)
+        value, pdf, _, weight = all_finite(mi, bsdf, si, vectors(mi, wo), u, alpha)
+        assert not value.numpy()[..., ~good].any() and not pdf.numpy()[~good].any()
+        assert pdf.numpy()[good].all()
+        dr.backward(total(value) + total(weight))
+        assert np.isfinite(params[key].grad.numpy()).all()
 
 
 @pytest.mark.parametrize("quality", QUALITIES)

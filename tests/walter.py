@@ -71,11 +71,13 @@ def learned(table, inputs, output):
             floor = 1e-3
             least = floor**2 / 4
             known = np.maximum(alpha, floor)
-            stretched = np.minimum(sin2 * (known / alpha) ** 2, 1)
+            end = np.minimum(8 * alpha**2, 1)  # of what is read: the rest falls like 1/q²
+            tail = np.minimum((end + alpha**2 * (1 - end)) / (sin2 + alpha**2 * (1 - sin2)), 1) ** 2
+            stretched = np.minimum(sin2, end) * (known / alpha) ** 2
             x = 1 - np.log(stretched * (1 - least) + least) / math.log(least), 1 - np.log(known) / math.log(floor)
         else:
-            x = np.sqrt(1 - sin2), alpha
+            x, tail = (np.sqrt(1 - sin2), alpha), 1
         (y,) = read(arrays["cascaded"], *read(arrays["primary"], *x))
-        return y**4 / (np.pi * alpha**2) if output == "root" else np.maximum(y, 0)
+        return tail * (y**4 / (np.pi * alpha**2) if output == "root" else np.maximum(y, 0))
 
     return normals

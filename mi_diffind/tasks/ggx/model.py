@@ -17,6 +17,11 @@ whose peak 1/(π α²) is unbounded: 0.3 at α = 1, 318,310 at α = 0.001. Betwe
     eighths are distributed as the peak itself, and one eighth lies at its very centre, which a cosine-weighted draw
     never sees (at α = 0.001 one sample in a million comes close).
 
+    *The tail* is continued: an error of 0.005 in y says nothing about a D of 10⁻⁹ D_peak, which is what most of the
+    hemisphere sees of a narrow lobe. But all tails fall alike. Where sin²θ_h > 8 α², beyond 8/9 of the projected area
+    of the normals, D is what is read at 8 α², times the ratio of the 1/q²; also below α_min, where nothing was learned.
+    D is then nowhere more than 1.1 times what it should be, and the PSNR rises from 52.4 to 58.2 dB.
+
 ``"paper"``
     *Inputs* cos θ_h and α as they are, *output* D as it is, mean absolute error, cosine-weighted samples: the
     supplement's recipe. It misses the peak at low roughness: an entry is 1/15 wide, the peak α².
@@ -41,6 +46,12 @@ ALPHA_MIN = 1e-3
 
 #: Least roughness of all: that of Mitsuba's ``MicrofacetDistribution``.
 ALPHA_FLOOR = 1e-4
+
+#: Where sin²θ_h is more than so many times α², the distribution is not read but continued: it falls like 1/q².
+TAIL = 8
+
+#: So many times the peak is the most that a table can say, whatever its entries are.
+PEAKS = 16
 
 INPUTS, OUTPUTS = ("logarithmic", "plain"), ("root", "raw")
 
@@ -78,12 +89,15 @@ class Encoding:
             return 1
         return dr.square(dr.maximum(ALPHA_MIN * dr.rcp(alpha), 1))
 
-    def coordinate_normal(self, cos, sin2, stretch=1):
-        """The coordinate in [0, 1] that belongs to the angle of the half vector (cos θ_h ≥ 0 and sin²θ_h)."""
+    def coordinate_normal(self, cos, sin2, stretch=1, limit=1):
+        """
+        The coordinate in [0, 1] that belongs to the angle of the half vector (cos θ_h ≥ 0 and sin²θ_h); the stretched
+        sine counts up to ``limit``.
+        """
         if self.inputs == "plain":
             return cos
         ε = ALPHA_MIN**2 / 4
-        return dr.fma(dr.log2(dr.fma(dr.minimum(sin2 * stretch, 1), 1 - ε, ε)), -1 / math.log2(ε), 1)
+        return dr.fma(dr.log2(dr.fma(dr.minimum(sin2 * stretch, limit), 1 - ε, ε)), -1 / math.log2(ε), 1)
 
     def coordinates(self, cos, sin2, alpha) -> list:
         """Both coordinates: of the normal and of α."""
@@ -98,8 +112,13 @@ class Encoding:
         return dr.pi * dr.square(alpha)
 
     def decode(self, y, peak):
-        """D from what was read, and from ``peak`` = 1/(π α²), which depends on α alone. Never negative."""
-        return dr.maximum(y, 0) if self.output == "raw" else dr.square(dr.square(y)) * peak
+        """
+        D from what was read, and from ``peak`` = 1/(π α²), which depends on α alone. Limited to 0 to :data:`PEAKS`
+        times ``peak``; NaN becomes 0.
+        """
+        if self.output == "raw":
+            return clamp(y, 0, PEAKS * peak)
+        return dr.square(dr.square(clamp(y, 0, PEAKS**0.25))) * peak
 
 
 #: The encoding of each preset.
@@ -110,13 +129,15 @@ ENCODINGS = {"tables": Encoding(), "paper": Encoding("plain", "raw")}
 class Roughness:
     """
     What a read of the distribution needs to know about α: ``alpha2`` = α², ``peak`` = 1/(π α²), by how much sin²θ_h is
-    to be stretched, and the coordinate of α, or the function of the other coordinate that remains once it is known
-    (``net``).
+    to be stretched and what it is then limited to, where the tail begins (``tail``, a q; None: nowhere), and the
+    coordinate of α, or the function of the other coordinate that remains once it is known (``net``).
     """
 
     alpha2: Any
     peak: Any
     stretch: Any
+    limit: Any = 1
+    tail: Any = None
     coordinate: Any = None
     net: Callable | None = None
 
@@ -124,17 +145,23 @@ class Roughness:
 class LearnedGGX:
     """
     The distribution as ``net`` has it, any function from a list of two coordinates in [0, 1] to a list of one array:
-    an :class:`~mi_diffind.indirection.Indirection`, a single array, a network.
+    an :class:`~mi_diffind.indirection.Indirection`, a single array, a network. Without ``tail``, it is also read where
+    it would be continued, as training does.
     """
 
-    def __init__(self, net: Callable, encoding: Encoding):
+    def __init__(self, net: Callable, encoding: Encoding, tail: bool = True):
         self.net, self.encoding = net, encoding
+        self.tail = tail and encoding.inputs != "plain"
 
     def roughness(self, alpha) -> Roughness:
         """Whatever depends on α alone; α is limited to [:data:`ALPHA_FLOOR`, 1], NaN becomes the former."""
         alpha = clamp(alpha, ALPHA_FLOOR, 1)
         alpha2, e = dr.square(alpha), self.encoding
-        return Roughness(alpha2, dr.rcp(dr.pi * alpha2), e.stretch(alpha), e.coordinate_alpha(alpha))
+        found = Roughness(alpha2, dr.rcp(dr.pi * alpha2), e.stretch(alpha), coordinate=e.coordinate_alpha(alpha))
+        if self.tail:
+            reach = dr.minimum(TAIL * alpha2, 1)
+            found.limit, found.tail = reach * found.stretch, dr.fma(reach, 1 - alpha2, alpha2)
+        return found
 
     def constant_roughness(self, alpha) -> Roughness:
         """
@@ -149,9 +176,13 @@ class LearnedGGX:
 
     def read(self, r: Roughness, cos, sin2, active=True):
         """D per solid angle of normals, from cos θ_h ≥ 0 and sin²θ_h."""
-        x = [self.encoding.coordinate_normal(cos, sin2, r.stretch)]
+        x = [self.encoding.coordinate_normal(cos, sin2, r.stretch, r.limit)]
         y = self.net([*x, r.coordinate], active) if r.net is None else r.net(x, active)
-        return self.encoding.decode(y[0], r.peak)
+        d = self.encoding.decode(y[0], r.peak)
+        if r.tail is None:
+            return d
+        q = dr.fma(1 - sin2, r.alpha2, sin2)
+        return d * dr.select(q > r.tail, dr.square(r.tail * dr.rcp(q)), 1)
 
     def __call__(self, cos, sin2, alpha):
         """D per solid angle of normals, from cos θ_h, sin²θ_h and α."""

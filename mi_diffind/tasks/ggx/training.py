@@ -86,4 +86,4 @@ class GGXProblem(Problem):
         return {"d": net(inputs)}
 
     def measure(self, net) -> dict[str, float]:
-        return measure(LearnedGGX(net, self.encoding), self.types, 2**18)
+        return measure(LearnedGGX(net, self.encoding, tail=False), self.types, 2**18)
