@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from . import __version__, plugins, scenes, sheet
+from . import __version__, compat, plugins, scenes, sheet
 from .files import OutputError, replacing, writable_file, writable_folder
 from .interrupt import interruptible
 
@@ -272,21 +272,12 @@ def _advice(scene, spp: int, seed: int, path, progress: bool, stop: threading.Ev
 @contextlib.contextmanager
 def _smaller(scene, pixels: int):
     """Give the scene's film the same shape with at most so many pixels, if it can be given another size."""
-    params = mi.traverse(scene.sensors()[0])
-    film = scene.sensors()[0].film()
-    width, height = (int(v) for v in film.size())
-    cropped = (width, height) != tuple(int(v) for v in film.crop_size())
-    if "film.size" not in params or cropped or width * height <= pixels:
+    sensor = scene.sensors()[0]
+    width, height = (int(v) for v in sensor.film().size())
+    scale = min(1.0, math.sqrt(pixels / (width * height)))
+    size = max(1, int(width * scale)), max(1, int(height * scale))
+    with compat.film_size(sensor, *size) if scale < 1 else contextlib.nullcontext():
         yield
-        return
-    scale = math.sqrt(pixels / (width * height))
-    params["film.size"] = mi.ScalarVector2u(max(1, int(width * scale)), max(1, int(height * scale)))
-    params.update()
-    try:
-        yield
-    finally:
-        params["film.size"] = mi.ScalarVector2u(width, height)
-        params.update()
 
 
 # -- references --------------------------------------------------------------------------------------------------------
