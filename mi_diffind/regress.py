@@ -8,9 +8,12 @@ plugins included: this finds changes, and how far an approximation is from the t
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import math
 import os
+import statistics
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from . import __version__, scenes, sheet
+from . import __version__, compat, plugins, scenes, sheet
 from .files import OutputError, replacing, writable_file, writable_folder
 from .interrupt import interruptible
 
@@ -38,10 +41,25 @@ REFERENCE_FACTOR = 16
 #: … in this many independent passes, whose scatter is its variance.
 REFERENCE_PASSES = 128
 
+#: A probe finds out in seconds whether a reference will pass its own check: of a smaller image, it takes as many
+#: samples a pixel as both would, in so many passes, each pair of which is checked against the others.
+PROBE_PASSES = 2 * (1 + REFERENCE_FACTOR)
+#: All samples of a probe are about so many …
+PROBE_SAMPLES = 1 << 22
+#: … and its pixels within these.
+PROBE_PIXELS = (256, 1 << 14)
+#: A scene is refused if a probe finds more than so many times the pixels that may fail, and so many pixels of the image
+#: more. Less is too close to call.
+_HOPELESS, _CHANCE = 2, 3
+#: How many times the samples are tried to say how many would do.
+_FACTORS = (2, 4, 8, 16)
+
 #: Of Mitsuba's seeds ``(seed << 16) + i``, checks use those with ``i`` below, references those from here on.
 _REFERENCE_SEEDS = 1 << 15
 #: Samples of the whole image in one pass of a check, to bound the memory it takes.
 _PASS = 1 << 22
+#: Where the passes of a probe begin.
+_PROBE_SEEDS = (1 << 16) - PROBE_PASSES
 #: The seed of the check that a new reference has to pass.
 _OWN_CHECK = (1 << 16) - 1
 _ATTRIBUTE = "mi_diffind"
@@ -107,10 +125,41 @@ def z_test(
         z = np.abs(image.astype(np.float64) - reference) / np.sqrt(spread)
     p_values = np.array([math.erfc(v) if v == v else 0.0 for v in (z / math.sqrt(2)).flat]).reshape(image.shape)
     pixels = image.shape[0] * image.shape[1]
-    alpha = -math.expm1(math.log1p(-SIGNIFICANCE) / pixels)
+    alpha = _alpha(pixels)
     failing = (p_values <= alpha).any(axis=-1)
     fraction = 1 - int(failing.sum()) / pixels
     return ZTest(p_values, alpha, failing, fraction, fraction >= REQUIRED)
+
+
+def _alpha(pixels: int) -> float:
+    """Šidák's threshold of the p-value of one of so many pixels."""
+    return -math.expm1(math.log1p(-SIGNIFICANCE) / pixels)
+
+
+@dataclass
+class Moments:
+    """
+    Passes of a render that were added up so far: the ``mean`` of all ``samples`` of a pixel, ``(height, width,
+    channels)``, float64; ``squares``, the sum over the ``passes`` of their samples times their squared deviation from
+    it.
+    """
+
+    mean: np.ndarray | float = 0.0
+    squares: np.ndarray | float = 0.0
+    samples: int = 0
+    passes: int = 0
+
+    def add(self, image: np.ndarray, samples: int) -> None:
+        """One more pass, of so many samples a pixel."""
+        self.samples, self.passes = self.samples + samples, self.passes + 1
+        deviation = image - self.mean  # West's recurrence: no difference of large numbers
+        self.mean = self.mean + deviation / (self.samples / samples)
+        self.squares = self.squares + samples * (deviation * (image - self.mean))
+
+    @property
+    def variance(self) -> np.ndarray:
+        """The variance of one sample, found from the scatter of the passes."""
+        return self.squares / max(self.passes - 1, 1)
 
 
 def render_with_variance(
@@ -120,11 +169,13 @@ def render_with_variance(
     passes: int = REFERENCE_PASSES,
     on_pass: Callable[[], object] | None = None,
     stop: threading.Event | None = None,
+    moments: Moments | None = None,
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """
     Render ``passes`` (at least 2) independent images of ``spp / passes`` samples a pixel, rounded up to a power of two:
     then no pixel is shared by two threads, which would add up its samples in any order, and the same arguments give the
-    same bits.
+    same bits. ``moments`` holds passes that were rendered before with the same seed: only what is missing is rendered,
+    and added to them.
 
     Returns their mean and the variance of one sample (that of the passes, times the samples of a pass), both
     ``(height, width, channels)``, float32, with 3 channels or 1, and the samples per pixel that were taken.
@@ -137,20 +188,99 @@ def render_with_variance(
     """
     if passes < 2:
         raise ValueError(f"passes: found {passes}, at least 2 are needed")
-    n = 1 << (-(-spp // passes) - 1).bit_length()
-    mean, squares, done = 0.0, 0.0, 0
-    for i in range(passes):
-        image = _colour(scenes.render_pass(scene, n, (seed << 16) + _REFERENCE_SEEDS + i))
-        done += 1
-        deviation = image - mean  # Welford's recurrence: no difference of large numbers
-        mean = mean + deviation / done
-        squares = squares + deviation * (image - mean)
+    moments = Moments() if moments is None else moments
+    n = _samples_of_a_pass(spp, passes)
+    for _ in range(_missing(moments, spp, passes)):
+        moments.add(_colour(scenes.render_pass(scene, n, (seed << 16) + _REFERENCE_SEEDS + moments.passes)), n)
         if on_pass is not None:
             on_pass()
         if stop is not None and stop.is_set():
             break
-    variance = n * squares / max(done - 1, 1)
-    return mean.astype(np.float32), variance.astype(np.float32), n * done
+    return np.float32(moments.mean), np.float32(moments.variance), moments.samples
+
+
+def _samples_of_a_pass(spp: int, passes: int) -> int:
+    return 1 << (-(-spp // passes) - 1).bit_length()
+
+
+def _missing(moments: Moments, spp: int, passes: int) -> int:
+    """Passes that are still to be rendered."""
+    n = _samples_of_a_pass(spp, passes)
+    return max(0, passes - moments.samples // n)
+
+
+# -- will a new reference pass its own check? --------------------------------------------------------------------------
+
+
+def probe(
+    scene,
+    spp: int,
+    seed: int = 0,
+    on_pass: Callable[[], object] | None = None,
+    stop: threading.Event | None = None,
+) -> float:
+    """
+    The part of the pixels that would fail a check at ``spp`` samples a pixel although nothing has changed, 0 to 1.
+
+    It is tried out, with the samples a pixel of a check and of its reference, on an image of fewer pixels that see more
+    of the scene each: four million samples altogether, unless 256 pixels need more. Of 34 passes, each pair in turn is
+    the check, and the others are its reference. Once ``stop`` is set, the pass that is running is the last, and the
+    result is not a number. Raises :class:`~mi_diffind.scenes.SceneError`, also for pixels that are not finite.
+    """
+    n = max(1, spp // 2)
+    pixels = math.prod(map(int, scene.sensors()[0].film().crop_size()))
+    size = min(max(PROBE_SAMPLES // (n * PROBE_PASSES), PROBE_PIXELS[0]), PROBE_PIXELS[1])
+    images = []
+    with _smaller(scene, size):
+        for i in range(PROBE_PASSES):
+            images.append(_colour(scenes.render_pass(scene, n, (seed << 16) + _PROBE_SEEDS + i)))
+            if on_pass is not None:
+                on_pass()
+            if stop is not None and stop.is_set():
+                return math.nan
+    images = np.stack(images)
+    bad = int((~np.isfinite(images)).any(axis=(0, -1)).sum())
+    if bad:
+        size = f"{images.shape[2]} x {images.shape[1]}"
+        raise scenes.SceneError(f"{bad} pixel(s) are not finite in a probe of {size}, so this cannot be a reference")
+    threshold, parts = statistics.NormalDist().inv_cdf(1 - _alpha(pixels) / 2), []
+    for i in range(0, PROBE_PASSES, 2):
+        check, others = images[i : i + 2].mean(axis=0), np.delete(images, (i, i + 1), axis=0)
+        variance = np.maximum(n * others.var(axis=0, ddof=1), VARIANCE_FLOOR)
+        spread = np.sqrt(variance * (1 / (2 * n) + 1 / (n * len(others))))
+        parts.append(float((np.abs(check - others.mean(axis=0)) > threshold * spread).any(axis=-1).mean()))
+    return statistics.fmean(parts)
+
+
+def _probe(scene, spp: int, seed: int, path, progress: bool, stop: threading.Event) -> float:
+    """A probe with its bar."""
+    with _bar(f"{Path(path).stem}: probe at {spp} spp", PROBE_PASSES, progress) as bar, scenes.scene_errors(path):
+        return probe(scene, spp, seed, bar.update, stop)
+
+
+def _advice(scene, spp: int, seed: int, path, progress: bool, stop: threading.Event) -> str:
+    """How many samples would do, if ``spp`` are too few, found by trying; or that 16 times as many would not."""
+    for factor in _FACTORS:
+        failing = _probe(scene, factor * spp, seed, path, progress, stop)
+        if failing <= 1 - REQUIRED:
+            return f"--spp {factor * spp} should do, or fewer bounces (the scene's max_depth)"
+        if stop.is_set():
+            return "more samples (--spp) or fewer bounces (the scene's max_depth) are needed"
+    return f"not even {factor} times the samples would do: give fewer bounces (the scene's max_depth)"
+
+
+@contextlib.contextmanager
+def _smaller(scene, pixels: int):
+    """Give the scene's film the same shape with at most so many pixels, if it can be given another size."""
+    sensor = scene.sensors()[0]
+    width, height = (int(v) for v in sensor.film().size())
+    scale = min(1.0, math.sqrt(pixels / (width * height)))
+    size = max(1, int(width * scale)), max(1, int(height * scale))
+    with compat.film_size(sensor, *size) if scale < 1 else contextlib.nullcontext():
+        yield
+
+
+# -- references --------------------------------------------------------------------------------------------------------
 
 
 def reference_path(path: str | os.PathLike, references: str | os.PathLike | None = None) -> Path:
@@ -189,15 +319,24 @@ def update_reference(
     Render a reference of the scene file ``path`` in the current variant and store it (:func:`reference_path`), in one
     piece; ``spp`` are the samples per pixel that a check will take, and the reference gets 16 times as many or more.
 
-    The reference is checked once against another render; one that fails though nothing has changed is not stored.
+    The reference is checked once against another render; one that fails though nothing has changed is not stored. That
+    is found out early: a probe (:func:`probe`) of a few seconds estimates how many pixels will fail, and a scene that
+    has no chance is refused, with the samples that would do, found by further probes. What was rendered is kept in a
+    file ``SCENE.VARIANT.partial.npz`` beside the reference after Ctrl-C, and after a check that fails nevertheless: the
+    same command, also with another ``spp``, goes on from there, unless the scene, its files, or this package have
+    changed.
+
     What is not given is as in the reference that is being replaced: ``spp`` (else two million samples of the image),
     ``seed`` (else 0) and each of ``defines``, which replace the scene's ``<default>`` values. If the scene's filter is
-    a box, the same arguments give the same bytes on the same machine.
+    a box, the same arguments give the same bytes on the same machine, whether interrupted in between or not; not so if
+    passes were rendered with another ``spp``.
 
     Returns ``scene``, ``reference`` (the file), ``variant``, ``width``, ``height``, ``budget``, ``spp``, ``seed``,
-    ``defines``, ``seconds``, ``bytes``, ``failing_pixels`` and ``fraction`` (of pixels that pass) of that check, and
-    ``interrupted``: after Ctrl-C nothing has been written. Raises
-    :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.files.OutputError`.
+    ``defines``, ``seconds``, ``bytes``, ``failing_pixels`` and ``fraction`` (of pixels that pass) of that check,
+    ``expected_fraction`` (what the probe expected, ``None`` without one), ``reused_spp`` (of ``spp``, those that had
+    been kept), and ``interrupted``: after Ctrl-C no reference has been written, and ``partial`` is the file that keeps
+    what there is (else ``None``). Raises :class:`~mi_diffind.scenes.SceneError` and
+    :class:`~mi_diffind.files.OutputError`.
     """
     output = reference_path(path, references)
     before = read_reference(path, references).about if output.is_file() else {}
@@ -205,51 +344,106 @@ def update_reference(
     scene = scenes.load(path, defines=defines)
     writable_folder(output.parent, create=True)
     writable_file(output)
-    width, height = scene.sensors()[0].film().crop_size()
-    budget = spp or before.get("budget") or max(1, BUDGET // (int(width) * int(height)))
+    width, height = (int(v) for v in scene.sensors()[0].film().crop_size())
+    budget = spp or before.get("budget") or max(1, BUDGET // (width * height))
     seed = before.get("seed", 0) if seed is None else seed
-    start = time.perf_counter()
-    with interruptible() as stop, _bar(path, REFERENCE_PASSES, progress) as bar:
-        image, variance, done = render_with_variance(
-            scene, REFERENCE_FACTOR * budget, seed, REFERENCE_PASSES, bar.update, stop
-        )
-    again = None if stop.is_set() else _colour(scenes.render(scene, budget, _OWN_CHECK, _passes(scene, budget))[0])
+    partial = output.with_suffix(".partial.npz")
+    key = {"scene": Path(path).stem, "variant": mi.variant(), "defines": defines, "seed": seed}
+    key["sources"] = _fingerprint(path, defines)
+    moments = _read_partial(partial, key)
+    start, reused = time.perf_counter(), moments.samples
     result = {
         "scene": str(path),
         "reference": str(output),
         "variant": mi.variant(),
-        "width": image.shape[1],
-        "height": image.shape[0],
+        "width": width,
+        "height": height,
         "budget": budget,
-        "spp": done,
+        "spp": reused,
+        "reused_spp": reused,
         "seed": seed,
         "defines": defines,
-        "seconds": time.perf_counter() - start,
-        "interrupted": stop.is_set(),
+        "expected_fraction": None,
+        "partial": None,
     }
-    if result["interrupted"]:
-        return result
-    bad = int((~np.isfinite(image + variance)).any(axis=-1).sum())
-    if bad:
-        raise scenes.SceneError(f"{path}: {bad} pixel(s) are not finite, so this cannot be a reference")
-    test = z_test(again, image, variance, budget, done)
-    result |= {"failing_pixels": int(test.failing.sum()), "fraction": test.fraction}
-    if not test.passed:
-        raise scenes.SceneError(
-            f"{path}: fails the check although nothing has changed ({result['failing_pixels']} of {test.failing.size} "
-            "pixels), since bright paths are too rare; give more samples (--spp) or fewer bounces"
-        )
+    with interruptible() as stop:
+        trying = (scene, budget, seed, path, progress, stop)
+        failing = _probe(*trying)
+        if not stop.is_set():
+            result["expected_fraction"] = 1 - failing
+            if failing > _HOPELESS * (1 - REQUIRED) + _CHANCE / (width * height):
+                raise scenes.SceneError(
+                    f"{path}: would fail the check at {budget} samples a pixel although nothing has changed (about "
+                    f"{failing:.2%} of the pixels, {1 - REQUIRED:.2%} may), since bright paths are too rare; "
+                    f"{_advice(*trying)}"
+                )
+            missing = _missing(moments, REFERENCE_FACTOR * budget, REFERENCE_PASSES)
+            with _bar(f"{Path(path).stem}: reference", missing, progress) as bar:
+                image, variance, result["spp"] = render_with_variance(
+                    scene, REFERENCE_FACTOR * budget, seed, REFERENCE_PASSES, bar.update, stop, moments
+                )
+            bad = int((~np.isfinite(image + variance)).any(axis=-1).sum())
+            if bad:
+                raise scenes.SceneError(f"{path}: {bad} pixel(s) are not finite, so this cannot be a reference")
+        if not stop.is_set():
+            passes = _passes(scene, budget)
+            with _bar(f"{Path(path).stem}: check", passes, progress) as bar:
+                again = _colour(scenes.render(scene, budget, _OWN_CHECK, passes, bar.update, stop)[0])
+        result |= {"seconds": time.perf_counter() - start, "interrupted": stop.is_set()}
+        if stop.is_set():
+            if moments.passes:
+                _write_partial(partial, moments, key)
+                result["partial"] = str(partial)
+            return result
+        test = z_test(again, image, variance, budget, moments.samples)
+        result |= {"failing_pixels": int(test.failing.sum()), "fraction": test.fraction}
+        if not test.passed:
+            _write_partial(partial, moments, key)
+            raise scenes.SceneError(
+                f"{path}: fails the check at {budget} samples a pixel although nothing has changed "
+                f"({result['failing_pixels']} of {test.failing.size} pixels, {1 - REQUIRED:.2%} may), since bright "
+                f'paths are too rare; {_advice(*trying)}; what was rendered is kept in "{partial}", and the same '
+                "command goes on from there"
+            )
     about = {
         "scene": Path(path).stem,
         "variant": mi.variant(),
         "defines": defines,
         "budget": budget,
-        "spp": done,
+        "spp": moments.samples,
         "seed": seed,
         "versions": {"mi_diffind": __version__, "mitsuba": mi.__version__},
     }
     _write(output, Reference(image, variance, about))
+    partial.unlink(missing_ok=True)
     return {**result, "bytes": output.stat().st_size}
+
+
+def _fingerprint(path, defines: dict[str, str]) -> str:
+    """What a render depends on: the files that the scene consists of, this package with its tables, Mitsuba."""
+    package = Path(__file__).resolve().parent
+    folders = {package, *map(Path, plugins.__path__)}
+    files = {file for folder in folders for kind in ("*.py", "*.npz") for file in folder.rglob(kind)}
+    digest = hashlib.sha256(mi.__version__.encode())
+    for file in sorted(files | set(scenes.files_of(path, defines))):
+        digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _write_partial(path: Path, moments: Moments, key: dict) -> None:
+    about = json.dumps({**key, "samples": moments.samples, "passes": moments.passes}).encode()
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, mean=moments.mean, squares=moments.squares, about=np.frombuffer(about, np.uint8))
+
+
+def _read_partial(path: Path, key: dict) -> Moments:
+    """What was kept of the same render; nothing if there is none, or it is damaged."""
+    with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as data:
+        about = json.loads(data["about"].tobytes())
+        moments = Moments(data["mean"], data["squares"], about.pop("samples"), about.pop("passes"))
+        if about == key and np.isfinite(moments.mean + moments.squares).all():
+            return moments
+    return Moments()
 
 
 def regress(
@@ -282,7 +476,7 @@ def regress(
     spp = spp or about["budget"]
     passes = _passes(scene, spp)
     start = time.perf_counter()
-    with interruptible() as stop, _bar(path, passes, progress) as bar:
+    with interruptible() as stop, _bar(Path(path).stem, passes, progress) as bar:
         image, _ = scenes.render(scene, spp, seed, passes, bar.update, stop)
     image = _colour(image)
     result = {
@@ -421,8 +615,8 @@ def _same_size(path, reference: Reference, height: int, width: int, channels: in
         )
 
 
-def _bar(path, passes: int, progress: bool) -> tqdm:
-    return tqdm(total=passes, desc=Path(path).stem, unit="pass", disable=None if progress else True)
+def _bar(title: str, passes: int, progress: bool) -> tqdm:
+    return tqdm(total=passes, desc=title, unit="pass", disable=None if progress else True)
 
 
 def _channels(count: int) -> Iterator[str]:

@@ -29,6 +29,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+from . import compat
 from .errors import UsageError
 
 ENV = "DRJIT_LIBLLVM_PATH"
@@ -215,7 +216,7 @@ def _starting_drjit():
         if _problem is None and choice.path is not None:
             os.environ[ENV] = choice.path
         yield
-        running = sys.modules["drjit"].detail.llvm_version()  # waits for the asynchronous start
+        running = compat.llvm_version()  # waits for the asynchronous start
     if _problem is None and 0 <= running[0] < MIN_LLVM:  # only where the search was left to Dr.Jit
         _problem = f"Dr.Jit found LLVM {running[0]}, with which it aborts: {_ADVICE}."
         _restart_llvm(None)
@@ -230,7 +231,7 @@ def correct_llvm() -> Choice:
     would abort. Warns (``RuntimeWarning``) and switches the LLVM backend off if there is no usable library.
     """
     global _problem
-    running = sys.modules["drjit"].detail.llvm_version()
+    running = compat.llvm_version()
     if running[0] >= MIN_LLVM:
         return Choice(os.environ.get(ENV), "already running")
     choice = choose_llvm()
@@ -267,60 +268,35 @@ def _restart_llvm(path: str | None) -> None:
     """
     Stop Dr.Jit's LLVM backend and start it again with the library at ``path`` (``None``: leave it off).
 
-    Dr.Jit has no Python function for this; its library exports the C++ functions ``jit_shutdown(int)`` and
-    ``jit_init(uint32_t)``. Variables survive the restart, registered scene objects and kernels do not.
+    Dr.Jit has no Python function for this, its library has (:class:`.compat.JitCore`). Variables survive the restart,
+    registered scene objects and kernels do not.
     """
-    import drjit
-
-    version = drjit.detail.llvm_version()
+    version = compat.llvm_version()
     active = version[0] >= 0
     too_late = (
         f"Dr.Jit already uses LLVM {version[0]}, with which it aborts, and {{}}: import mi_diffind before loading "
         f"a scene or computing anything" + (f", or set {ENV}={path} beforehand." if path else f"; {_ADVICE}.")
     )
     try:
-        core = ctypes.CDLL(_core_library())
-        shutdown, init = core["_Z12jit_shutdowni"], core["_Z8jit_initj"]
-        launch_stats, id_bound = core["_Z16jit_launch_statsPmS_S_"], core["_Z21jit_registry_id_boundPKcS0_"]
+        core = compat.JitCore()
     except (OSError, AttributeError):
         if not active:
             return
         raise ImportError(too_late.format("this version of it cannot be restarted")) from None
 
     if active:
-        launches = [ctypes.c_size_t() for _ in range(3)]
-        launch_stats(*map(ctypes.byref, launches))
-        if launches[0].value:
+        if core.launches():
             raise ImportError(too_late.format("has run kernels on it"))
-        id_bound.argtypes, id_bound.restype = [ctypes.c_char_p] * 2, ctypes.c_uint32
-        if "mitsuba" in sys.modules:
-            for variant in sys.modules["mitsuba"].variants():
-                for domain in (
-                    b"Texture",
-                    b"BSDF",
-                    b"Shape",
-                    b"Emitter",
-                    b"Sensor",
-                    b"Scene",
-                    b"Sampler",
-                    b"Film",
-                ):
-                    if variant.startswith("llvm") and id_bound(variant.encode(), domain):
-                        raise ImportError(too_late.format("holds scene objects"))
+        variants = sys.modules["mitsuba"].variants() if "mitsuba" in sys.modules else ()
+        if any(core.holds_objects(v) for v in variants if v.startswith("llvm")):
+            raise ImportError(too_late.format("holds scene objects"))
 
-    shutdown(0)
+    core.shutdown()
     with contextlib.nullcontext() if path else _hidden_llvm():
         if path:
             os.environ[ENV] = path
-        init(1 << 2)  # JitBackend::LLVM
-    init(1 << 1)  # JitBackend::CUDA
-
-
-def _core_library() -> str:
-    import drjit
-
-    name = {"linux": "libdrjit-core.so", "darwin": "libdrjit-core.dylib"}.get(sys.platform, "drjit-core.dll")
-    return os.path.join(os.path.dirname(drjit.__file__), name)
+        core.init(core.LLVM)
+    core.init(core.CUDA)
 
 
 def array_module(variant: str | None = None):

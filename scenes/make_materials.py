@@ -9,6 +9,8 @@ A row starts from a material on which its parameter can be seen, and sweeps that
 
 from pathlib import Path
 
+from scene_xml import PRESET, element, environment, head, lying, plugin, softbox, transform, write
+
 COLUMNS = 6
 PITCH_X, PITCH_Z = 1.13, 2.75  # distance between sphere centres; a sphere has radius 0.5
 BLOCK_GAP = 0.5  # extra distance between the two blocks of rows
@@ -44,110 +46,9 @@ ROWS = [
 
 LABELS = [row[0] for row in ROWS]
 
-HEADER = """\
-<?xml version="1.0" encoding="utf-8"?>
-<!-- The ten parameters of the Disney BRDF. Written by make_materials.py: change that file, not this one.
+ABOUT = """The ten parameters of the Disney BRDF. Written by make_materials.py: change that file, not this one.
 
-     A row sweeps one parameter from 0 (left) to 1 (right). Material NAME_I is column I of row NAME. -->
-<scene version="3.0.0">
-    <default name="spp" value="64"/>
-    <default name="width" value="960"/>
-    <default name="height" value="552"/>
-    <default name="max_depth" value="5"/>
-    <default name="quality" value="tables"/>
-    <default name="effects" value="used"/>
-
-    <integrator type="path">
-        <integer name="max_depth" value="$max_depth"/>
-    </integrator>
-
-    <sensor type="perspective">
-        <string name="fov_axis" value="x"/>
-        <float name="fov" value="2.9"/>
-        <transform name="to_world">
-            <lookat origin="0, 150, 250" target="0, 0.25, 0.15" up="0, 1, 0"/>
-        </transform>
-        <sampler type="independent">
-            <integer name="sample_count" value="$spp"/>
-        </sampler>
-        <film type="hdrfilm">
-            <integer name="width" value="$width"/>
-            <integer name="height" value="$height"/>
-            <string name="pixel_format" value="rgb"/>
-            <string name="component_format" value="float32"/>
-            <rfilter type="box"/>
-        </film>
-    </sensor>
-
-    <!-- A hotel room by day, its window in front of the chart -->
-    <emitter type="envmap">
-        <string name="filename" value="assets/interior.exr"/>
-        <float name="scale" value="0.9"/>
-        <transform name="to_world">
-            <rotate y="1" angle="20"/>
-        </transform>
-    </emitter>
-
-    <!-- A wide softbox behind the chart, on the left: rims, sheen, long highlights -->
-    <shape type="rectangle">
-        <transform name="to_world">
-            <scale x="10" y="4.2"/>
-            <lookat origin="-7, 5.5, -21" target="0, 0, 0" up="0, 1, 0"/>
-        </transform>
-        <bsdf type="diffuse">
-            <rgb name="reflectance" value="0, 0, 0"/>
-        </bsdf>
-        <emitter type="area">
-            <rgb name="radiance" value="13, 12.6, 12"/>
-        </emitter>
-    </shape>
-
-    <shape type="rectangle">
-        <transform name="to_world">
-            <scale x="80" y="80"/>
-            <rotate x="1" angle="-90"/>
-        </transform>
-        <bsdf type="diffuse" id="floor">
-            <rgb name="reflectance" value="FLOOR"/>
-        </bsdf>
-    </shape>
-"""
-
-LABEL = """
-    <shape type="rectangle">
-        <transform name="to_world">
-            <scale x="{half_width:g}" y="{half_height:g}"/>
-            <rotate x="1" angle="-90"/>
-            <translate x="{x:.3f}" y="0.002" z="{z:.3f}"/>
-        </transform>
-        <bsdf type="diffuse">
-            <texture name="reflectance" type="bitmap">
-                <string name="filename" value="assets/labels.png"/>
-                <boolean name="raw" value="true"/>
-                <transform name="to_uv">
-                    <scale y="-{v_scale:g}"/>
-                    <translate y="{v_offset:g}"/>
-                </transform>
-            </texture>
-        </bsdf>
-    </shape>
-"""
-
-SPHERE = """
-    <shape type="sphere">
-        <transform name="to_world">
-            <scale value="0.5"/>
-            <rotate x="1" angle="-90"/>
-            <translate x="{x:.3f}" y="0.5" z="{z:.3f}"/>
-        </transform>
-        <bsdf type="neural_disney" id="{name}_{column}">
-            <string name="quality" value="$quality"/>
-            <string name="effects" value="$effects"/>
-            <rgb name="base_color" value="{color}"/>
-{parameters}
-        </bsdf>
-    </shape>
-"""
+A row sweeps one parameter from 0 (left) to 1 (right). Material NAME_I is column I of row NAME."""
 
 
 def place(row: int, column: int) -> tuple[float, float]:
@@ -159,46 +60,54 @@ def place(row: int, column: int) -> tuple[float, float]:
     return x, z
 
 
-def sphere(row: int, column: int) -> str:
-    """XML of one sphere and its material."""
+def sphere(row: int, column: int):
+    """One sphere and its material."""
     name, color, changes = ROWS[row]
-    values = {**DEFAULTS, **changes, name: column / (COLUMNS - 1)}
     x, z = place(row, column)
-    return SPHERE.format(
-        name=name,
-        column=column,
-        color=", ".join(f"{c:g}" for c in color),
-        parameters="\n".join(f'            <float name="{k}" value="{v:g}"/>' for k, v in values.items()),
-        x=x,
-        z=z,
+    placed = transform(
+        scale={"value": 0.5},
+        rotate={"x": 1, "angle": -90},
+        translate={"x": round(x, 3), "y": 0.5, "z": round(z, 3)},
     )
+    learned = {PRESET: f"${PRESET}", "effects": "$effects"}
+    values = {**DEFAULTS, **changes, name: column / (COLUMNS - 1)}
+    material = plugin("bsdf", "neural_disney", id=f"{name}_{column}", **learned, base_color=color, **values)
+    return plugin("shape", "sphere", placed, material)
 
 
-def label(row: int) -> str:
-    """XML of the name of a row, painted on the floor in front of the row's first spheres."""
+def label(row: int):
+    """The name of a row, painted on the floor in front of the row's first spheres."""
     half_width, rows = 1.9, len(ROWS)
-    half_height = STRETCH * half_width / rows
     x, z = place(row, 0)
     # the atlas holds one name in each tenth of its height, the first on top, where v = 0; hence the flip
-    return LABEL.format(
-        half_width=half_width,
-        half_height=half_height,
-        x=x - 0.5 + half_width,
-        z=z + 0.62,
-        v_scale=1 / rows,
-        v_offset=(row + 1) / rows,
+    atlas = plugin(
+        "texture",
+        "bitmap",
+        transform("to_uv", scale={"y": -1 / rows}, translate={"y": (row + 1) / rows}),
+        name="reflectance",
+        filename="assets/labels.png",
+        raw=True,
     )
+    where = {"x": round(x - 0.5 + half_width, 3), "y": 0.002, "z": round(z + 0.62, 3)}
+    return lying(half_width, STRETCH * half_width / rows, plugin("bsdf", "diffuse", atlas), **where)
 
 
-def document() -> str:
-    """The whole scene."""
-    parts = [HEADER.replace("FLOOR", f"{FLOOR:g}")]
-    for row in range(len(ROWS)):
-        parts.append(f"\n    <!-- {ROWS[row][0]} -->")
-        parts.append(label(row))
-        parts += [sphere(row, column) for column in range(COLUMNS)]
-    return "".join(parts) + "</scene>\n"
+def main() -> None:
+    camera = {"origin": (0, 150, 250), "target": (0, 0.25, 0.15), "up": (0, 1, 0)}
+    lamp = {"origin": (-7, 5.5, -21), "target": (0, 0, 0), "up": (0, 1, 0)}
+    floor = element("rgb", name="reflectance", value=FLOOR)
+    content = [
+        *head(960, 552, {PRESET: "tables", "effects": "used"}, fov=2.9, camera=camera),
+        "A hotel room by day, its window in front of the chart",
+        environment("interior.exr", scale=0.9, angle=20),
+        "A wide softbox behind the chart, on the left: rims, sheen, long highlights",
+        softbox((10, 4.2), lamp, radiance=(13, 12.6, 12)),
+        lying(80, 80, plugin("bsdf", "diffuse", floor, id="floor")),
+    ]
+    for row, (name, *_) in enumerate(ROWS):
+        content += [name, label(row), *(sphere(row, column) for column in range(COLUMNS))]
+    write(Path(__file__).with_name("materials.xml"), ABOUT, content)
 
 
 if __name__ == "__main__":
-    Path(__file__).with_name("materials.xml").write_text(document(), encoding="utf-8", newline="\n")
+    main()

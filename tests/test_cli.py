@@ -70,7 +70,8 @@ def test_compare(tmp_path, capsys):
     arguments = ["compare", str(SCENES / "materials.xml"), "--out", str(out), "--json", str(report), *SMALL]
     assert main([*arguments, "--passes", "2"]) == 0
     text = capsys.readouterr().out
-    assert "PSNR" in text and "FLIP" in text and "ratio" in text
+    assert "PSNR" in text and "FLIP" in text
+    assert "times that of exact (" in text and "of one pair of passes\n" in text
     assert sorted(os.listdir(out)) == ["comparison.png", "error.exr", "exact.exr", "written.exr"]
     assert np.array(mi.Bitmap(str(out / "comparison.png"))).std() > 20  # not blank
     found = json.loads(report.read_text())
@@ -79,6 +80,7 @@ def test_compare(tmp_path, capsys):
     mse = np.mean((np.clip(written, 0, 1) - np.clip(exact, 0, 1)) ** 2)
     assert found["psnr_db"] == pytest.approx(-10 * np.log10(mse), abs=0.01)
     assert found["time_ratio"]["min"] <= found["time_ratio"]["median"] <= found["time_ratio"]["max"]
+    assert found["time_ratio"]["pairs"] == 1  # the first compiled
     assert {"flip", "mae", "seconds_per_pass", "learned_plugins", "table_bytes"} <= set(found)
 
 
@@ -267,7 +269,7 @@ def test_help_is_fast():
     assert all(f"\n    {verb} " in found["texts"][0] for verb in VERBS)
     assert found["variant"] is None
     slow = {"matplotlib", "OpenEXR", "trimesh", "mi_diffind.scenes", "mi_diffind.tradeoff", "mi_diffind.budget"}
-    slow |= {"mi_diffind.compare", "mi_diffind.regress", "mi_diffind.transport", "mi_diffind.encode"}
+    slow |= {"mi_diffind.compare", "mi_diffind.regress", "mi_diffind.depth", "mi_diffind.encode"}
     assert not slow & set(found["modules"])
     assert not [name for name in found["modules"] if name.startswith("mi_diffind.tradeoffs.")]
     text = dict(zip(map(tuple, commands), found["texts"], strict=True))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -304,18 +305,122 @@ def test_an_update_that_does_not_end_changes_nothing(regress, tmp_path, capsys, 
     assert json.loads(report.read_text())["scenes"][0]["passed"] is None
 
 
+def rare_bright_paths(tmp_path):
+    """A rough metal ball throws the light of a small lamp onto the floor, on paths that are found by chance."""
+    path = tmp_path / "rare.xml"
+    path.write_text("""<scene version="3.0.0">
+        <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+        <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="48"/>
+                <integer name="height" value="36"/><rfilter type="box"/><string name="pixel_format" value="rgb"/></film>
+            <transform name="to_world"><lookat origin="0,3,6" target="0,0,0" up="0,1,0"/></transform></sensor>
+        <shape type="rectangle"><transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/></transform>
+            <bsdf type="diffuse"/></shape>
+        <shape type="sphere"><point name="center" x="0" y="1" z="0"/>
+            <bsdf type="roughconductor"><float name="alpha" value="0.4"/></bsdf></shape>
+        <shape type="sphere"><point name="center" x="-2" y="3" z="1"/><float name="radius" value="0.02"/>
+            <emitter type="area"><rgb name="radiance" value="2500"/></emitter></shape></scene>""")
+    return str(path)
+
+
+def test_a_probe_foretells_the_check(regress, tmp_path):
+    """What checks find against references of 16 times their samples, within a factor of two; other sizes included."""
+    scene = regress.scenes.load(rare_bright_paths(tmp_path))
+    params = regress.mi.traverse(scene.sensors()[0])
+    for spp, width in ((64, 48), (8, 160)):  # the second has more pixels than a probe
+        params["film.size"] = regress.mi.ScalarVector2u(width, width * 3 // 4)
+        params.update()
+        before = regress.scenes.render_pass(scene, 1, 0)
+        foretold = regress.probe(scene, spp)
+        assert np.array_equal(regress.scenes.render_pass(scene, 1, 0), before)  # the size is as it was
+        image, variance, done = regress.render_with_variance(scene, 16 * spp)
+        checks = [regress.scenes.render(scene, spp, seed)[0] for seed in range(3)]
+        found = [1 - regress.z_test(c, image, variance, spp, done).fraction for c in checks]
+        assert np.mean(found) / 2 - 1e-3 < foretold < 2 * np.mean(found) + 1e-3, (spp, found)
+        assert foretold > 5e-4
+
+
+def test_too_few_samples_are_refused_early(regress, tmp_path, capsys, monkeypatch):
+    """Before the reference is rendered, with the samples that do."""
+    path, taken, original = rare_bright_paths(tmp_path), [], regress.scenes.render_pass
+    monkeypatch.setattr(regress.scenes, "render_pass", lambda *a: taken.append(a[1]) or original(*a))
+    message = refused(capsys, "regress", path, "--update", "--spp", "12")
+    assert "would fail the check at 12 samples a pixel although nothing has changed (about " in message
+    assert "0.25% may" in message and "fewer bounces (the scene's max_depth)" in message
+    assert not list((tmp_path / "references").iterdir())
+    factor = len(taken) // regress.PROBE_PASSES  # of the samples that do; 2 to 16
+    wanted = int(re.search(r"--spp (\d+) should do", message)[1])
+    assert len(taken) % regress.PROBE_PASSES == 0 and wanted == 12 * 2 ** (factor - 1) > 12
+    assert main(["regress", path, "--update", "--spp", str(wanted)]) == 0
+    monkeypatch.setattr(regress, "probe", lambda *_: 0.02)
+    assert "not even 16 times the samples would do: give fewer" in refused(capsys, "regress", path, "--update")
+
+
 def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path, capsys, monkeypatch):
-    """Rare bright paths: one pixel in a hundred is struck in a pass, few of them in both renders."""
+    """Rare bright paths that no probe saw; what was rendered is not lost."""
 
     def fireflies(scene, spp, seed):
         return 0.5 + 100 * (rng.random((12, 16, 3)) < 1e-5 * spp)
 
-    monkeypatch.setattr(regress.scenes, "render_pass", fireflies)
-    path = scene_file(tmp_path)
-    assert "although nothing has changed" in refused(capsys, "regress", path, "--update", "--spp", "1000")
+    path, report = scene_file(tmp_path), tmp_path / "report.json"
+    update, partial = ["regress", path, "--update"], tmp_path / "references" / "scene.llvm_ad_rgb.partial.npz"
+    with monkeypatch.context() as patch:
+        patch.setattr(regress.scenes, "render_pass", fireflies)
+        assert "although nothing has changed (about " in refused(capsys, *update, "--spp", "1000")
+        assert not list(partial.parent.iterdir())
+        patch.setattr(regress, "probe", lambda scene, spp, *_: 0.01 if 1000 < spp < 4000 else 0.0)
+        message = refused(capsys, *update, "--spp", "1000")
+        assert "fails the check at 1000 samples a pixel although nothing has changed (" in message
+        assert "--spp 4000 should do, or fewer bounces" in message
+        assert f'what was rendered is kept in "{partial}", and the same command goes on from there' in message
+    monkeypatch.setattr(regress.scenes, "render_pass", lambda *_: np.full((12, 16, 3), 0.5))
+    assert [f.name for f in partial.parent.iterdir()] == [partial.name]
+    kept = partial.read_bytes()
+    assert main([*update, "--spp", "4000", "--json", str(report)]) == 0
+    found = json.loads(report.read_text())["scenes"][0]
+    assert found["reused_spp"] == 16384 and found["spp"] == 65536  # 96 more passes of 512
+    assert not partial.exists()
+    for content, seed in ((kept, "1"), (kept[:500], "0"), (b"", "0")):  # of other samples, or damaged
+        partial.write_bytes(content)
+        assert main([*update, "--spp", "40", "--seed", seed, "--json", str(report)]) == 0
+        assert json.loads(report.read_text())["scenes"][0]["reused_spp"] == 0
     monkeypatch.setattr(regress.scenes, "render_pass", lambda *_: np.full((12, 16, 3), np.nan))
-    assert "192 pixel(s) are not finite" in refused(capsys, "regress", path, "--update", "--spp", "10")
-    assert not list((tmp_path / "references").iterdir())
+    assert "192 pixel(s) are not finite" in refused(capsys, *update, "--spp", "10")
+    assert not partial.exists()
+
+
+def test_an_interrupted_update_goes_on(regress, tmp_path, capsys, monkeypatch):
+    """From where it was: the bytes of the reference are those of one that was never interrupted."""
+    path, report = scene_file(tmp_path), tmp_path / "report.json"
+    update = ["regress", path, "--update", "--spp", "20", "--json", str(report), "--references"]
+    assert main([*update, str(tmp_path / "undisturbed")]) == 0
+    original, taken = regress.scenes.render_pass, []
+
+    def interrupting(*arguments):
+        taken.append(1)
+        if len(taken) == regress.PROBE_PASSES + 50:
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(*arguments)
+
+    monkeypatch.setattr(regress.scenes, "render_pass", interrupting)
+    folder = tmp_path / "own"
+    capsys.readouterr()
+    assert main([*update, str(folder)]) == 130
+    partial = folder / "scene.llvm_ad_rgb.partial.npz"
+    assert f"{partial}: 200 samples a pixel are kept, the same command goes on" in capsys.readouterr().out
+    assert os.listdir(folder) == [partial.name]
+    before = len(taken)
+    assert main([*update, str(folder)]) == 0
+    assert len(taken) - before == regress.PROBE_PASSES + 128 - 50 + 1  # and the check
+    assert json.loads(report.read_text())["scenes"][0]["reused_spp"] == 200
+    name = "scene.llvm_ad_rgb.exr"
+    assert (folder / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
+    assert os.listdir(folder) == [name]
+
+    taken.clear()
+    assert main([*update, str(folder)]) == 130
+    scene_file(tmp_path, roughness=0.3)  # another scene: nothing of it is used
+    assert main([*update, str(folder)]) == 0
+    assert json.loads(report.read_text())["scenes"][0]["reused_spp"] == 0
 
 
 def test_references_serve_both_backends(regress, tmp_path, monkeypatch):

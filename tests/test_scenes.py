@@ -28,6 +28,24 @@ def test_scene_as_written_and_exact(mi_rgb, name):
     assert result.figures["table_bytes"] == 2048
 
 
+def test_times_of_a_comparison_do_not_contradict_each_other(mi_rgb):
+    """The ratio is the median over pairs, which the ratio of two medians is not; so one time is shown, not two."""
+    from mi_diffind import compare
+
+    seconds = {"written": 3.0, "exact": 2.0}
+    ratio = {"median": 1.25, "min": 1.0, "max": 2.0, "pairs": 4}
+    figures = {"scene": "a.xml", "variant": "v", "width": 4, "height": 3, "spp": 5, "spp_requested": 5, "passes": 5}
+    figures |= {"learned_plugins": 1, "table_bytes": 9, "psnr_db": 50, "flip": 0, "mae": 0, "interrupted": False}
+    lines = compare.summary({**figures, "seconds_per_pass": seconds, "time_ratio": ratio})
+    assert lines[-2:] == [
+        "time        1.25 times that of exact (2 s a pass)",
+        "            median of 4 pairs of passes in turn, 1.00 to 2.00",
+    ]
+    assert not any("3.0" in line or "1.50" in line for line in lines)
+    alone = {**figures, "seconds_per_pass": seconds, "time_ratio": {**ratio, "pairs": 1}, "passes": 1}
+    assert compare.summary(alone)[-1] == "            of one pair of passes, compilation included"
+
+
 @pytest.mark.parametrize("name", ["materials", "still_life"])
 def test_exact_scene_names_no_learned_plugin(mi_rgb, name):
     from mi_diffind import scenes
@@ -55,6 +73,7 @@ def test_scenes_are_what_their_scripts_write(tmp_path, name):
     (tmp_path / "scenes").mkdir()
     copy = tmp_path / "scenes" / f"make_{name}.py"
     copy.write_text((SCENES / f"make_{name}.py").read_text())
+    (tmp_path / "scenes" / "scene_xml.py").write_text((SCENES / "scene_xml.py").read_text())
     subprocess.run([sys.executable, str(copy)], check=True, cwd=tmp_path)
     assert (tmp_path / "scenes" / f"{name}.xml").read_bytes() == text
 

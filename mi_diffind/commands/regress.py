@@ -44,6 +44,8 @@ def run(arguments) -> dict:
         for path in arguments.scenes:
             results.append(regress.update_reference(path, arguments.references, **options))
             if results[-1]["interrupted"]:
+                if results[-1]["partial"]:
+                    print("{partial}: {spp} samples a pixel are kept, the same command goes on".format(**results[-1]))
                 break
             text = "{reference}: {width} x {height}, {spp} spp, {bytes:,} bytes; "
             text += "failing pixels in a check at {budget} spp: {failing_pixels}"

@@ -92,12 +92,12 @@ def run(arguments) -> dict:
 
 def _choose_depth(arguments, defines: dict[str, str]) -> dict:
     """The depth to render to, and why; what was not measured is None."""
-    from .. import scenes, transport
+    from .. import depth, scenes
 
     if arguments.depth == "auto":
-        tolerance = arguments.depth_tolerance or transport.TOLERANCE
-        found = transport.auto_depth(arguments.scene, tolerance, arguments.seed, defines=defines)
-        print("\n".join(transport.summary(found)))
+        tolerance = arguments.depth_tolerance or depth.TOLERANCE
+        found = depth.auto_depth(arguments.scene, tolerance, arguments.seed, defines=defines)
+        print("\n".join(depth.summary(found)))
         return {"requested": "auto", **found}
     own = None
     with contextlib.suppress(scenes.SceneError):  # no integrator with a depth: fine, unless one is asked for

@@ -61,70 +61,70 @@ def luminance(image):
 # -- the probe ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("albedo, depth, expected", [(0.5, -1, 9), (0.8, -1, 25), (0.5, 8, 8), (0.1, 8, 4)])
-def test_furnace(mi_rgb, tmp_path, albedo, depth, expected):
+@pytest.mark.parametrize("albedo, max_depth, expected", [(0.5, -1, 9), (0.8, -1, 25), (0.5, 8, 8), (0.1, 8, 4)])
+def test_furnace(mi_rgb, tmp_path, albedo, max_depth, expected):
     """
     Analytic: of the scattered light up to depth D, a render to depth d leaves out (ρ^(d-1) − ρ^(D-1)) / (1 − ρ^(D-1)).
 
     For ρ = 0.5 it falls below 0.5% after eight bounces (0.39%), for 0.8 after 24 (0.47%), for 0.1 after 3 (0.1%). With
     ρ = 0.5 and D = 8, depth 7 would leave out 0.79%: the scene's own depth stays.
     """
-    from mi_diffind import scenes, transport
+    from mi_diffind import depth, scenes
 
-    scene = scenes.load(scene_file(tmp_path, FURNACE, depth=depth, albedo=albedo))
-    light = transport.probe(scene, depth)
-    found = transport.bounces(light)
-    assert len(found) == (transport.MAX_BINS if depth < 0 else depth)
+    scene = scenes.load(scene_file(tmp_path, FURNACE, depth=max_depth, albedo=albedo))
+    light = depth.probe(scene, max_depth)
+    found = depth.bounces(light)
+    assert len(found) == (depth.MAX_BINS if max_depth < 0 else max_depth)
     assert [b.depth for b in found] == list(range(1, len(found) + 1))
     bounce = np.arange(len(found))
-    end = 0 if depth < 0 else albedo ** (depth - 1)
+    end = 0 if max_depth < 0 else albedo ** (max_depth - 1)
     means = light.mean((1, 2))
     assert np.allclose(means[:8], albedo ** bounce[:8], rtol=0.01)
     rest = np.array([b.rest for b in found])
     assert np.allclose(rest, np.maximum(0, albedo**bounce - end) / (1 - end), rtol=0.01, atol=2e-4)
     shares = np.array([b.share for b in found])
     assert shares[0] == 0 and shares.sum() == pytest.approx(1) and np.allclose(1 - np.cumsum(shares), rest)
-    assert transport.choose(found, depth) == expected
+    assert depth.choose(found, max_depth) == expected
 
 
 def test_deeper_than_the_bins(mi_rgb, tmp_path):
     """What arrives deeper than the bins reach is booked under the last, and such a scene keeps its own depth."""
-    from mi_diffind import scenes, transport
+    from mi_diffind import depth, scenes
 
     albedo = 0.95
     scene = scenes.load(scene_file(tmp_path, FURNACE, albedo=albedo))
-    light = transport.probe(scene, -1, spp=8)
+    light = depth.probe(scene, -1, spp=8)
     means = light.mean((1, 2))
     assert means.sum() == pytest.approx(1 / (1 - albedo), rel=0.02)
     assert means[-1] == pytest.approx(albedo**63 / (1 - albedo), rel=0.1)
-    assert transport.choose(transport.bounces(light), -1) == -1
-    limited = transport.probe(scene, 80, spp=8).mean((1, 2))
+    assert depth.choose(depth.bounces(light), -1) == -1
+    limited = depth.probe(scene, 80, spp=8).mean((1, 2))
     assert len(limited) == 64 and limited[-1] == pytest.approx((albedo**63 - albedo**80) / (1 - albedo), rel=0.1)
 
 
 def test_one_bounce_alone(mi_rgb, tmp_path):
-    from mi_diffind import transport
+    from mi_diffind import depth
 
-    found = transport.auto_depth(scene_file(tmp_path, CONVEX), progress=False)
+    found = depth.auto_depth(scene_file(tmp_path, CONVEX), progress=False)
     assert found["chosen"] == 2 and found["scene"] == -1 and found["left_out"] == 0
     assert [s["share"] for s in found["shares"][:3]] == [0, 1, 0]
-    assert transport.auto_depth(scene_file(tmp_path, CONVEX, depth=1), progress=False)["chosen"] == 1
-    assert transport.auto_depth(scene_file(tmp_path, CONVEX, depth=0), progress=False)["chosen"] == 0
+    assert depth.auto_depth(scene_file(tmp_path, CONVEX, depth=1), progress=False)["chosen"] == 1
+    assert depth.auto_depth(scene_file(tmp_path, CONVEX, depth=0), progress=False)["chosen"] == 0
 
 
 def test_without_scattered_light(mi_rgb, tmp_path):
-    from mi_diffind import transport
+    from mi_diffind import depth
 
-    found = transport.auto_depth(scene_file(tmp_path, '<emitter type="constant"/>'), progress=False)
+    found = depth.auto_depth(scene_file(tmp_path, '<emitter type="constant"/>'), progress=False)
     assert found["chosen"] == 1 and found["left_out"] == 0
 
 
 def test_each_depth_is_that_of_path(mi_rgb, tmp_path):
     """Against Mitsuba's own path tracer, image by image."""
-    from mi_diffind import scenes, transport
+    from mi_diffind import depth, scenes
 
     file, depths = scene_file(tmp_path, MIXED), 5
-    probed = transport.probe(scenes.load(file), depths, spp=64).mean((1, 2))
+    probed = depth.probe(scenes.load(file), depths, spp=64).mean((1, 2))
     renders = [scenes.render(scenes.load(file, longest_path=d), 256)[0] for d in range(1, depths + 1)]
     path = np.diff([luminance(image) for image in renders], prepend=0)
     assert np.allclose(probed, path, rtol=0.02), (probed, path)
@@ -132,19 +132,19 @@ def test_each_depth_is_that_of_path(mi_rgb, tmp_path):
 
 def test_in_each_variant(mi_any, tmp_path):
     """Spectra are sampled and polarisation is left out; what glass polarises is below the bound."""
-    from mi_diffind import scenes, transport
+    from mi_diffind import depth, scenes
 
     file = scene_file(tmp_path, MIXED)
-    probed = transport.probe(scenes.load(file), 4, spp=32).mean((1, 2))
+    probed = depth.probe(scenes.load(file), 4, spp=32).mean((1, 2))
     direct, full = (luminance(scenes.render(scenes.load(file, longest_path=d), 128)[0]) for d in (2, 4))
     assert probed[2:].sum() / probed.sum() == pytest.approx(1 - direct / full, rel=0.03)
 
 
 def test_same_seed_same_numbers(mi_rgb):
-    from mi_diffind import scenes, transport
+    from mi_diffind import depth, scenes
 
     scene = scenes.load(SCENES / "still_life.xml")
-    first, again, other = (transport.probe(scene, 5, spp=4, passes=2, seed=s) for s in (1, 1, 2))
+    first, again, other = (depth.probe(scene, 5, spp=4, passes=2, seed=s) for s in (1, 1, 2))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
     assert first.shape == (5, 80, 128)  # 960 x 580 in tiles of 8 pixels
 
@@ -152,10 +152,10 @@ def test_same_seed_same_numbers(mi_rgb):
 @pytest.mark.parametrize("name", ["materials", "still_life"])
 def test_left_out_is_what_a_render_lacks(mi_rgb, name):
     """The repository's scenes at 5%: the image to the chosen depth lacks what was announced, and less than allowed."""
-    from mi_diffind import scenes, transport
+    from mi_diffind import depth, scenes
 
     file = SCENES / f"{name}.xml"
-    found = transport.auto_depth(file, 0.05, progress=False)
+    found = depth.auto_depth(file, 0.05, progress=False)
     assert 2 < found["chosen"] < found["scene"] == 5
     emitted, chosen, full = (
         luminance(scenes.render(scenes.load(file, longest_path=d, defines=SMALL), 64)[0])
@@ -175,48 +175,48 @@ def images(*levels):
 
 
 def test_bright_lamps_and_highlights_hide_nothing():
-    from mi_diffind import transport
+    from mi_diffind import depth
 
     plain = images(0, 90, 10)
-    rest = transport.bounces(plain)[1].rest
+    rest = depth.bounces(plain)[1].rest
     assert rest == pytest.approx(0.1)
     lamp = plain.copy()
     lamp[0, :40] = 1e6
-    assert transport.bounces(lamp) == transport.bounces(plain)
+    assert depth.bounces(lamp) == depth.bounces(plain)
     highlight = plain.copy()
     highlight[1, 20:24, 50:60] = 1e6
-    assert transport.bounces(highlight)[1].rest == pytest.approx(rest, rel=0.05)
-    scaled = [b.rest for b in transport.bounces(plain * 1e-6)]
-    assert scaled == pytest.approx([b.rest for b in transport.bounces(plain)])
+    assert depth.bounces(highlight)[1].rest == pytest.approx(rest, rel=0.05)
+    scaled = [b.rest for b in depth.bounces(plain * 1e-6)]
+    assert scaled == pytest.approx([b.rest for b in depth.bounces(plain)])
 
 
 def test_a_corner_counts():
     """1 of 128 tiles would lose a third: 0.26% of the image, yet more than ten times the tolerance there."""
-    from mi_diffind import transport
+    from mi_diffind import depth
 
     light = images(0, 1, 0)
     light[2, :8, :8] = 0.5
-    bounce = transport.bounces(light)[1]
+    bounce = depth.bounces(light)[1]
     assert bounce.rest == pytest.approx(0.5 / (128 + 0.5)) and bounce.rest < 0.005
     assert bounce.rest_in_a_tile == pytest.approx(1 / 3)
-    assert transport.choose([*transport.bounces(light)], 3) == 3
-    assert transport.choose([*transport.bounces(light)], 3, tolerance=0.04) == 2
+    assert depth.choose([*depth.bounces(light)], 3) == 3
+    assert depth.choose([*depth.bounces(light)], 3, tolerance=0.04) == 2
     light[1:, :8, :8] *= 0.001  # nearly black there: nobody sees it
-    assert transport.choose([*transport.bounces(light)], 3) == 2
+    assert depth.choose([*depth.bounces(light)], 3) == 2
 
 
 def test_tolerance():
-    from mi_diffind import transport
+    from mi_diffind import depth
 
-    found = transport.bounces(images(5, 90, 9, 0.9, 0.1))
+    found = depth.bounces(images(5, 90, 9, 0.9, 0.1))
     assert [round(b.rest, 4) for b in found] == [1, 0.1, 0.01, 0.001, 0]
-    chosen = {t: transport.choose(found, 5, t) for t in (0.999, 0.11, 0.05, 0.009, 0.0011, 0.0009)}
+    chosen = {t: depth.choose(found, 5, t) for t in (0.999, 0.11, 0.05, 0.009, 0.0011, 0.0009)}
     assert chosen == {0.999: 2, 0.11: 2, 0.05: 3, 0.009: 4, 0.0011: 4, 0.0009: 5}
     for bad in (0, -0.1, 1, 2, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="allowed is more than 0 and less than 1"):
-            transport.choose(found, 5, bad)
+            depth.choose(found, 5, bad)
         with pytest.raises(ValueError, match="tolerance"):
-            transport.auto_depth("nowhere.xml", bad)
+            depth.auto_depth("nowhere.xml", bad)
 
 
 # -- the command -------------------------------------------------------------------------------------------------------
@@ -314,12 +314,12 @@ def test_bad_options(tmp_path, capsys):
 def test_interrupted_probe(tmp_path):
     """Ctrl-C while the probe runs: nothing to keep, exit code 130."""
     code = """
-import os, signal, sys, mi_diffind.transport as transport
-original = transport._pass
+import os, signal, sys, mi_diffind.depth as depth
+original = depth._pass
 def one_pass(*args):
     os.kill(os.getpid(), signal.SIGINT)
     return original(*args)
-transport._pass = one_pass
+depth._pass = one_pass
 from mi_diffind.cli import main
 sys.exit(main())"""
     out = tmp_path / "image.exr"

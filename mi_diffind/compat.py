@@ -1,0 +1,360 @@
+"""
+Every hook into what Mitsuba 3.9 and Dr.Jit 1.5 do not promise, one a function or constant, each with a test that says
+what broke (``tests/test_compat.py``). Where another version does it differently, this file changes and no other.
+
+What Mitsuba 3.10 brings, and where it belongs: *footprints* (``si.footprint``, a ``Matrix2f`` of which the columns are
+conjugate diameters in uv; ``RayFlags.Footprint``; a texture's ``filtered()``) replace footprints that we estimate;
+*Python shapes* (``mi.Shape`` with ``primitive_count`` and ``ray_intersect_preliminary``) replace factories that return
+native shapes; the *new mesh* interface concerns ``mi.Mesh`` subclasses alone. Nothing of these three is used yet: what
+will use them asks here.
+
+Mitsuba and Dr.Jit are imported when a function is called, so that importing this costs nothing and may come before LLVM
+is chosen (:mod:`.runtime`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import re
+import struct
+import sys
+from pathlib import Path
+
+# -- Dr.Jit's library: starting LLVM again -----------------------------------------------------------------------------
+
+
+def llvm_version() -> tuple[int, int, int]:
+    """
+    The LLVM that Dr.Jit has loaded, -1 first if none; waits for its start. ``dr.detail`` is not part of the interface;
+    a public function would replace this.
+    """
+    import drjit
+
+    return tuple(drjit.detail.llvm_version())
+
+
+def core_library() -> str:
+    """
+    The path of Dr.Jit's native library, whose name and place in the package are not promised. A public way to choose
+    LLVM again would replace this and :class:`JitCore`.
+    """
+    import drjit
+
+    name = {"linux": "libdrjit-core.so", "darwin": "libdrjit-core.dylib"}.get(sys.platform, "drjit-core.dll")
+    return os.path.join(os.path.dirname(drjit.__file__), name)
+
+
+class JitCore:
+    """
+    C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures:
+    ``jit_shutdown(int)``, ``jit_init(uint32_t)``, ``jit_launch_stats(size_t *, size_t *, size_t *)`` and
+    ``jit_registry_id_bound(const char *, const char *)``. Raises ``OSError`` or ``AttributeError`` where one is
+    missing.
+    """
+
+    #: ``JitBackend`` as ``jit_init`` takes it: a mask.
+    CUDA, LLVM = 1 << 1, 1 << 2
+
+    #: Classes of scene objects under which Mitsuba registers them with Dr.Jit.
+    DOMAINS = ("Texture", "BSDF", "Shape", "Emitter", "Sensor", "Scene", "Sampler", "Film")
+
+    def __init__(self):
+        core = ctypes.CDLL(core_library())
+        self._shutdown, self._init = core["_Z12jit_shutdowni"], core["_Z8jit_initj"]
+        self._launch_stats, self._id_bound = core["_Z16jit_launch_statsPmS_S_"], core["_Z21jit_registry_id_boundPKcS0_"]
+        self._id_bound.argtypes, self._id_bound.restype = [ctypes.c_char_p] * 2, ctypes.c_uint32
+
+    def launches(self) -> int:
+        """Kernels that have been launched since the start."""
+        counts = [ctypes.c_size_t() for _ in range(3)]
+        self._launch_stats(*map(ctypes.byref, counts))
+        return counts[0].value
+
+    def holds_objects(self, variant: str) -> bool:
+        """Are there scene objects of this Mitsuba variant?"""
+        return any(self._id_bound(variant.encode(), domain.encode()) for domain in self.DOMAINS)
+
+    def shutdown(self) -> None:
+        """Stop all backends; variables survive, kernels and registered objects do not."""
+        self._shutdown(0)
+
+    def init(self, backend: int) -> None:
+        """Start a backend: :attr:`LLVM` or :attr:`CUDA`."""
+        self._init(backend)
+
+
+# -- Dr.Jit: kernels ---------------------------------------------------------------------------------------------------
+
+
+def new_scope(dtype) -> None:
+    """
+    From here on, Dr.Jit merges no computation of the backend of ``dtype`` with an earlier one. ``dr.detail`` is not
+    part of the interface; nothing public does it.
+    """
+    import drjit as dr
+
+    dr.detail.new_scope(dr.backend_v(dtype))
+
+
+def kernel_code(entry: dict) -> str:
+    """
+    The intermediate code of an entry of ``dr.kernel_history()``: LLVM's or PTX, whose form is Dr.Jit's own affair
+    (:func:`is_ptx`, :func:`llvm_target`, :mod:`.operations`). Counters kept by Dr.Jit would replace reading it.
+    """
+    return entry["ir"].getvalue()
+
+
+def is_ptx(code: str) -> bool:
+    """Is this PTX, for CUDA, and not LLVM's? By its first word."""
+    return code.lstrip().startswith(".version")
+
+
+def llvm_target(code: str) -> tuple[str, int] | None:
+    """The processor that LLVM code is for and the lanes of its vectors, as Dr.Jit writes them; ``None``: not found."""
+    name, width = re.search(r'"target-cpu"="([^"]+)"', code), re.search(r"<(\d+) x float>", code)
+    return (name[1], int(width[1])) if name and width else None
+
+
+def kernel_seconds(history: list[dict]) -> float:
+    """Seconds that the kernels of a ``dr.kernel_history()`` took; the keys and the unit, ms, are not promised."""
+    return sum(entry["execution_time"] for entry in history) / 1e3
+
+
+def was_compiled(history: list[dict]) -> bool:
+    """Did a kernel of a ``dr.kernel_history()`` have to be compiled, or be fetched from the disk?"""
+    return any(not entry.get("cache_hit", True) or entry.get("cache_disk", False) for entry in history)
+
+
+@contextlib.contextmanager
+def room_for_sums(entries: int):
+    """
+    Let each core sum the gradients of arrays on its own as long as all copies together have at most so many entries
+    (``dr.set_expand_threshold``, of one copy; what it is compared with has changed between versions).
+    """
+    import drjit as dr
+
+    before = dr.expand_threshold()
+    dr.set_expand_threshold(max(before, entries // dr.thread_count()))
+    try:
+        yield
+    finally:
+        dr.set_expand_threshold(before)
+
+
+def use_threads(count: int) -> None:
+    """
+    Compute on so many cores. A sum that is under way has a place for each thread that there was at its start: Dr.Jit
+    does not check that none is, so this waits.
+    """
+    import drjit as dr
+
+    if count != dr.thread_count():
+        dr.eval()
+        dr.sync_thread()
+        dr.set_thread_count(count)
+
+
+# -- Dr.Jit: arrays ----------------------------------------------------------------------------------------------------
+
+
+def module_of(array):
+    """
+    The module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``: where its class says
+    that it comes from, which is a convention. ``dr.replace_type_t`` and its like, with all types, would replace it.
+    """
+    return sys.modules[(array if isinstance(array, type) else type(array)).__module__]
+
+
+def has_gradient(value) -> bool:
+    """
+    Is a derivative with respect to this array asked for, also where derivatives are suspended? ``dr.grad_enabled`` says
+    no in the latter case; ``index_ad`` is an inner number.
+    """
+    import drjit as dr
+
+    if dr.is_tensor_v(value):
+        return value.array.index_ad != 0
+    if dr.depth_v(value) > 1:
+        return any(has_gradient(v) for v in value)
+    return dr.is_diff_v(value) and value.index_ad != 0
+
+
+def identity(value) -> tuple:
+    """
+    What tells an array from another one that took its place, as long as somebody keeps it: numbers of Dr.Jit's
+    variables (``index``), which are given anew once one is gone. A counter of changes would replace it.
+    """
+    import drjit as dr
+
+    if dr.is_tensor_v(value):
+        return identity(value.array)
+    if dr.depth_v(value) > 1:
+        return tuple(i for v in value for i in identity(v))
+    return (value.index,) if dr.is_jit_v(value) else (value,)
+
+
+def adam_state(optimizer) -> dict[str, tuple]:
+    """
+    The state of an ``Adam``: name → ``(value, t, m, v)``, the parameter, the number of the step, the moments (flat).
+    The tuples in ``optimizer.state`` are Dr.Jit's own; a public way to save an optimiser would replace this.
+    """
+    return {key: (value, t, m, v) for key, (value, _, _, (t, m, v, _)) in optimizer.state.items()}
+
+
+def set_adam_state(optimizer, key: str, value, t, m, v) -> None:
+    """Give the parameter ``key`` of an ``Adam`` this state, of :func:`adam_state`, or as NumPy arrays and a number."""
+    import drjit as dr
+
+    old, promoted, rate, (t_old, m_old, v_old, v_max) = optimizer.state[key]
+    new = type(old)(value)
+    dr.make_opaque(new)
+    dr.enable_grad(new)
+    optimizer.state[key] = new, promoted, rate, (type(t_old)(t), type(m_old)(m), type(v_old)(v), v_max)
+
+
+# -- Mitsuba: variants, classes ----------------------------------------------------------------------------------------
+
+
+def on_variant_change(callback) -> None:
+    """
+    Call ``callback(old, new)`` after each ``mi.set_variant``; the same function a second time changes nothing.
+    ``mi.detail`` is not part of the interface; plugins found by Mitsuba itself would replace it.
+    """
+    import mitsuba as mi
+
+    mi.detail.add_variant_callback(callback)
+
+
+#: Mitsuba's classes of textures whose values are those of their parameters, wherever they are read. Others may call
+#: themselves constant and not be, as ``mesh_attribute`` does. ``is_spatially_varying`` would do if all told the truth.
+CONSTANT_TEXTURES = ("UniformSpectrum", "SRGBReflectanceSpectrum")
+
+
+def texture_class(texture) -> str:
+    """
+    Mitsuba's own name of a texture's class, ``""`` for one written in Python, which may be of any name. Names of
+    classes are not promised; names of plugins are, but a loaded object does not know its own.
+    """
+    return texture.class_name() if type(texture).__module__.startswith("mitsuba") else ""
+
+
+def is_constant_texture(texture) -> bool:
+    """Is it one of :data:`CONSTANT_TEXTURES`?"""
+    return texture_class(texture) in CONSTANT_TEXTURES
+
+
+def is_uniform_spectrum(texture) -> bool:
+    """Is it the same at all wavelengths, too? Its parameter is then ``value``."""
+    return texture_class(texture) == "UniformSpectrum"
+
+
+def is_bitmap(texture) -> bool:
+    """Is it a ``bitmap``, of any storage (``BitmapTextureImpl<…>``)? Its parameter is then ``data``."""
+    return texture_class(texture).startswith("BitmapTextureImpl")
+
+
+def srgb_coefficients() -> tuple:
+    """
+    Mitsuba's table for spectra from colours (Jakob and Hanika 2019), of which neither place nor form is promised:
+    its side ``n``, the positions ``(n,)`` along the largest component, the coefficients ``(3·n³, 3)``, all float32.
+    ``mi.srgb_model_fetch`` for arrays would replace it. Raises ``RuntimeError`` in one sentence.
+    """
+    import mitsuba as mi
+    import numpy as np
+
+    path = mi.file_resolver().resolve("data/srgb.coeff")
+    content = Path(str(path)).read_bytes()
+    side = struct.unpack("<I", content[4:8])[0] if len(content) >= 8 else 0
+    count = 3 * side**3
+    if content[:4] != b"SPEC" or len(content) < 8 + 4 * side + 12 * count:
+        raise RuntimeError(f"{path}: is not the table of coefficients that is expected of Mitsuba")
+    positions = np.frombuffer(content, "<f4", side, 8)
+    return side, positions, np.frombuffer(content, "<f4", 3 * count, 8 + 4 * side).reshape(count, 3)
+
+
+# -- Mitsuba: scenes ---------------------------------------------------------------------------------------------------
+
+
+def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -> tuple:
+    """
+    The configuration and the state of a parsed scene file (``mi.parser``, which is new in 3.8 and still moves), with
+    ``defines`` for its ``<default>`` values, before anything is built.
+    """
+    import mitsuba as mi
+
+    config = mi.parser.ParserConfig(mi.variant())
+    return config, mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in (defines or {}).items()})
+
+
+def instantiate(config, state):
+    """Build what a parsed scene describes: transforms and merges it, in place, as ``mi.load_file`` does."""
+    import mitsuba as mi
+
+    mi.parser.transform_all(config, state)
+    return mi.parser.instantiate(config, state)
+
+
+def properties_of(state, kind=None) -> list:
+    """
+    The properties (``mi.Properties``) of all objects of a parsed scene, or of those of a ``kind``, an
+    ``mi.ObjectType``; to change them changes the scene.
+    """
+    return [node.props for node in state.nodes if kind is None or node.type == kind]
+
+
+def parsed_files(state) -> list[str]:
+    """The files that were parsed: the scene and what it includes."""
+    return [str(file) for file in state.files]
+
+
+def property_kind(props, key: str) -> str:
+    """What a parsed parameter is: ``number``, ``colour``, ``text``, ``object`` (nested or referred to) or ``other``."""
+    import mitsuba as mi
+
+    kinds, found = mi.Properties.Type, props.type(key)
+    if found in (kinds.Float, kinds.Integer):
+        return "number"
+    if found in (kinds.Reference, kinds.ResolvedReference):
+        return "object"
+    return {kinds.Color: "colour", kinds.String: "text"}.get(found, "other")
+
+
+@contextlib.contextmanager
+def film_size(sensor, width: int, height: int):
+    """
+    Give the film of a loaded sensor another size (pixels) while the context is open; yields whether that is possible:
+    the parameter ``film.size`` is not in the manual, and a film with a crop window keeps its size.
+    """
+    import mitsuba as mi
+
+    film, params = sensor.film(), mi.traverse(sensor)
+    before = [int(n) for n in film.size()]
+    if "film.size" not in params or before != [int(n) for n in film.crop_size()]:
+        yield False
+        return
+    try:
+        params["film.size"] = mi.ScalarVector2u(width, height)
+        params.update()
+        yield True
+    finally:
+        params["film.size"] = mi.ScalarVector2u(*before)
+        params.update()
+
+
+def one_sentence(error: BaseException) -> str:
+    """
+    What went wrong, without the layers around it, of which the form is not promised: Mitsuba prefixes source lines
+    (``[file.cpp:12]``), embeds Python tracebacks, and hides the cause of an error at render time behind
+    ``drjit.custom(...) error``. Errors that keep their type would replace this.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    text = re.sub(r"\[[\w.]+:\d+\] ", "", str(error)).strip()
+    head, traceback, tail = text.partition("Traceback (most recent call last):")
+    if traceback:
+        last = [line for line in tail.splitlines() if re.match(r"[\w.]+: ", line)][-1]
+        location = re.sub(r"failed to instantiate.*", "", head.strip())
+        text = location + last.split(": ", 1)[1]
+    return " ".join(text.split())

@@ -1,0 +1,115 @@
+"""
+Writing scene files for people to read: what ``make_materials.py`` and ``make_metals.py`` share.
+
+Mitsuba's own writer (``mi.parser.write_file``, of a parsed dictionary) is made for converting scenes, and loses what
+these files are for: it knows no ``<default>`` but the width of the film, writes no comments, turns a ``lookat`` into
+another one whose target is a unit away, and writes 0.1 as 0.10000000000000001. So the tree is built with Python's
+``xml.etree``.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from itertools import pairwise
+from pathlib import Path
+
+#: The parameter of learned plugins that names how their tables were trained, also as the scene's ``<default>``.
+PRESET = "quality"
+
+
+class Whole(str):
+    """The name of a ``<default>`` (``$name``) that stands for a whole number; a plain text stands for a text."""
+
+
+def number(value: float) -> str:
+    """At most six digits, none that says nothing."""
+    return f"{value:g}"
+
+
+def element(tag: str, *children: ET.Element, **attributes) -> ET.Element:
+    """``<tag …>``; numbers become texts, several as ``x, y, z``."""
+    texts = {}
+    for key, value in attributes.items():
+        several = isinstance(value, (tuple, list))
+        texts[key] = value if isinstance(value, str) else ", ".join(map(number, value if several else (value,)))
+    found = ET.Element(tag, texts)
+    found.extend(children)
+    return found
+
+
+def plugin(tag: str, kind: str, *children: ET.Element, id: str = "", name: str = "", **parameters) -> ET.Element:
+    """
+    ``<tag type="kind">`` with its ``parameters``: ``True`` and ``False``, whole numbers, numbers, texts, and colours
+    (three numbers). ``name`` is the parameter of the parent that it is for.
+    """
+    labels = {key: value for key, value in (("id", id), ("name", name)) if value}
+    return element(tag, *(parameter(k, v) for k, v in parameters.items()), *children, type=kind, **labels)
+
+
+def parameter(name: str, value) -> ET.Element:
+    """The element of one parameter, by the type of its value."""
+    if isinstance(value, bool):
+        return element("boolean", name=name, value=str(value).lower())
+    kinds = ((Whole, "integer"), (str, "string"), (int, "integer"), (float, "float"), (tuple, "rgb"))
+    return element(next(tag for kind, tag in kinds if isinstance(value, kind)), name=name, value=value)
+
+
+def transform(name: str = "to_world", **steps: dict) -> ET.Element:
+    """``<transform>`` of ``steps`` (``scale``, ``rotate``, ``translate``, ``lookat``: attributes), in their order."""
+    return element("transform", *(element(step, **attributes) for step, attributes in steps.items()), name=name)
+
+
+def head(width: int, height: int, learned: dict[str, str], fov: float, camera: dict) -> list[ET.Element]:
+    """What both scenes begin with: ``<default>`` values (``learned``: of their plugins), path tracer, camera, film."""
+    defaults = {"spp": 64, "width": width, "height": height, "max_depth": 5, **learned}
+    film = plugin(
+        "film",
+        "hdrfilm",
+        plugin("rfilter", "box"),
+        width=Whole("$width"),
+        height=Whole("$height"),
+        pixel_format="rgb",
+        component_format="float32",
+    )
+    sampler = plugin("sampler", "independent", sample_count=Whole("$spp"))
+    return [
+        *(element("default", name=name, value=value) for name, value in defaults.items()),
+        plugin("integrator", "path", max_depth=Whole("$max_depth")),
+        plugin("sensor", "perspective", transform(lookat=camera), sampler, film, fov_axis="x", fov=fov),
+    ]
+
+
+def environment(file: str, scale: float, angle: float) -> ET.Element:
+    """A light probe, turned around y."""
+    turned = transform(rotate={"y": 1, "angle": angle})
+    return plugin("emitter", "envmap", turned, filename=f"assets/{file}", scale=scale)
+
+
+def softbox(size: tuple[float, float], lookat: dict, radiance: tuple[float, float, float]) -> ET.Element:
+    """A rectangle that shines and reflects nothing."""
+    placed = transform(scale={"x": size[0], "y": size[1]}, lookat=lookat)
+    black = plugin("bsdf", "diffuse", reflectance=(0, 0, 0))
+    return plugin("shape", "rectangle", placed, black, plugin("emitter", "area", radiance=radiance))
+
+
+def lying(half_width: float, half_depth: float, *children: ET.Element, **translate) -> ET.Element:
+    """A rectangle that lies on its back."""
+    steps = {"scale": {"x": half_width, "y": half_depth}, "rotate": {"x": 1, "angle": -90}}
+    if translate:
+        steps["translate"] = translate
+    return plugin("shape", "rectangle", transform(**steps), *children)
+
+
+def write(path: Path, about: str, content: list) -> None:
+    """Write a scene: ``about``, a comment for the reader, then ``content``, elements and comments (texts)."""
+    scene = element("scene", version="3.0.0")
+    first, *others = about.split("\n")
+    indented = [first, *(f"         {line}" if line else "" for line in others)]
+    scene.append(ET.Comment(" " + "\n".join(indented) + " "))
+    scene.extend(ET.Comment(f" {item} ") if isinstance(item, str) else item for item in content)
+    ET.indent(scene, "    ")
+    for item, follower in pairwise(scene):
+        if item.tag is not ET.Comment and not item.tag == follower.tag == "default":
+            item.tail = "\n" + item.tail  # an empty line between what belongs together
+    text = ET.tostring(scene, encoding="unicode")
+    path.write_text(f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n', encoding="utf-8", newline="\n")

@@ -1,0 +1,293 @@
+"""Each hook into what Mitsuba and Dr.Jit do not promise: a failure says which one broke."""
+
+import contextlib
+import subprocess
+import sys
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_diffind import compat, runtime
+
+SCENE = Path(__file__).resolve().parent / "lamp.xml"
+
+
+@contextlib.contextmanager
+def hook(what):
+    """Say ``what`` broke, whatever is raised."""
+    try:
+        yield
+    except Exception as e:
+        pytest.fail(f"compat.py needs a change: {what} ({type(e).__name__}: {e})", pytrace=True)
+
+
+@pytest.fixture
+def history():
+    """A function that computes, and what Dr.Jit recorded of it."""
+
+    def record(function):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.sync_thread()
+            dr.kernel_history_clear()
+            dr.eval(function())
+            dr.sync_thread()
+            return dr.kernel_history([dr.KernelType.JIT])
+
+    return record
+
+
+def test_importing_it_is_free():
+    """It comes before LLVM is chosen."""
+    code = "import importlib.util, sys; s = importlib.util.spec_from_file_location('compat', sys.argv[1])\n"
+    code += "s.loader.exec_module(importlib.util.module_from_spec(s)); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, compat.__file__], capture_output=True, text=True, check=True)
+    assert not {"drjit", "mitsuba", "numpy", "mi_diffind"} & set(done.stdout.split())
+
+
+# -- Dr.Jit ------------------------------------------------------------------------------------------------------------
+
+
+def test_llvm_version():
+    with hook("drjit.detail.llvm_version"):
+        assert len(compat.llvm_version()) == 3 and compat.llvm_version()[0] >= runtime.MIN_LLVM
+
+
+def test_functions_of_the_library(mi_rgb):
+    """Starting LLVM again itself is tested in processes of their own (``test_runtime.py``)."""
+    with hook("the place of Dr.Jit's library"):
+        assert Path(compat.core_library()).is_file(), compat.core_library()
+    with hook("mangled names of jit_shutdown, jit_init, jit_launch_stats or jit_registry_id_bound"):
+        core = compat.JitCore()
+    with hook("jit_launch_stats: kernels are not counted"):
+        before = core.launches()
+        dr.eval(dr.arange(mi_rgb.Float, 7) + 1)
+        assert core.launches() == before + 1
+    with hook("jit_registry_id_bound: names of classes under which Mitsuba registers its objects"):
+        bsdf = mi_rgb.load_dict({"type": "diffuse"})
+        assert bsdf is not None and core.holds_objects(mi_rgb.variant())
+        assert not core.holds_objects("llvm_ad_rgb_double")
+
+
+def test_kernels(mi_rgb, history):
+    def compute():  # of other numbers than any other test
+        x = dr.opaque(mi_rgb.Float, 0.1234, 1000)
+        return x * x + 4.321
+
+    kernels = history(compute)
+    with hook("keys of dr.kernel_history: ir"):
+        code = compat.kernel_code(kernels[0])
+        assert ("fmuladd" in code or "fma" in code) and compat.is_ptx(code) == mi_rgb.variant().startswith("cuda")
+    if not compat.is_ptx(code):
+        with hook("target-cpu and vectors in LLVM code"):
+            name, lanes = compat.llvm_target(code)
+            assert name and lanes in (1, 2, 4, 8, 16, 32)
+    with hook("keys and unit of dr.kernel_history: execution_time"):
+        assert 0 < compat.kernel_seconds(kernels) < 60
+    with hook("keys of dr.kernel_history: cache_hit, cache_disk"):
+        assert not compat.was_compiled(history(compute))
+        assert compat.was_compiled([{"cache_hit": False}]) and compat.was_compiled([{"cache_disk": True}])
+        assert {"cache_hit", "cache_disk"} <= set(kernels[0])
+
+
+def test_scopes(mi_rgb, history):
+    """Equal computations in different scopes are two computations."""
+    with hook("drjit.detail.new_scope"):
+        x = dr.opaque(mi_rgb.Float, 0.5, 100)
+        first, same = x + 1, x + 1
+        compat.new_scope(mi_rgb.Float)
+        other = x + 1
+        assert first.index == same.index != other.index
+
+
+def test_sums_and_threads():
+    with hook("dr.expand_threshold and set_expand_threshold"):
+        before = dr.expand_threshold()
+        with compat.room_for_sums(2**30):
+            assert dr.expand_threshold() == max(before, 2**30 // dr.thread_count())
+        assert dr.expand_threshold() == before
+    with hook("dr.thread_count and set_thread_count"):
+        threads = dr.thread_count()
+        compat.use_threads(1)
+        assert dr.thread_count() == 1
+        compat.use_threads(threads)
+        assert dr.thread_count() == threads
+
+
+def test_arrays(mi_rgb):
+    with hook("modules of array types"):
+        module = compat.module_of(mi_rgb.TensorXf)
+        assert module is compat.module_of(mi_rgb.Float(1)) and module.Float is mi_rgb.Float and module.Array4f
+    with hook("index: what tells arrays apart"):
+        a, tensor = mi_rgb.Float(1, 2), mi_rgb.TensorXf(np.ones((2, 2)))
+        colour = mi_rgb.Color3f(a, a + 1, 0)
+        assert compat.identity(a) == compat.identity(mi_rgb.Float(a)) != compat.identity(a + 1)
+        assert len(compat.identity(colour)) == 3 and compat.identity(tensor) == compat.identity(tensor.array)
+        kept = compat.identity(tensor), dr.detach(tensor)
+        tensor[:] = 2
+        assert compat.identity(tensor) != kept[0]
+    with hook("index_ad: whether a derivative is asked for"):
+        for value in (mi_rgb.Float(1, 2), mi_rgb.Color3f(1, 2, 3), mi_rgb.TensorXf(np.ones((2, 2)))):
+            assert not compat.has_gradient(value)
+            dr.enable_grad(value)
+            with dr.suspend_grad():
+                assert compat.has_gradient(value)
+        assert not compat.has_gradient(mi_rgb.UInt32(1))
+
+
+def test_state_of_adam(mi_rgb):
+    """An optimiser that is given the state of another one goes the same way."""
+
+    def step(optimizer):
+        dr.backward(dr.sum(dr.square(optimizer["x"] - 3), axis=None))
+        optimizer.step()
+
+    with hook("the tuples in Adam's state"):
+        first, second = mi_rgb.ad.Adam(lr=0.1), mi_rgb.ad.Adam(lr=0.1)
+        for optimizer in (first, second):
+            optimizer["x"] = mi_rgb.TensorXf(np.zeros((2, 3)))
+        for _ in range(3):
+            step(first)
+        value, t, m, v = compat.adam_state(first)["x"]
+        assert int(t[0]) == 3 and m.numpy().shape == v.numpy().shape == (6,) and (v.numpy() > 0).all()
+        compat.set_adam_state(second, "x", value.numpy(), int(t[0]), m.numpy(), v.numpy())
+        for optimizer in (first, second):
+            step(optimizer)
+        assert np.array_equal(first["x"].numpy(), second["x"].numpy()) and (first["x"].numpy() > 0.3).all()
+
+
+# -- Mitsuba -----------------------------------------------------------------------------------------------------------
+
+
+def test_callback_of_variants(mi_rgb):
+    seen, here = [], mi_rgb.variant()
+
+    def callback(old, new):
+        seen.append((old, new))
+
+    with hook("mi.detail.add_variant_callback"):
+        try:
+            compat.on_variant_change(callback)
+            compat.on_variant_change(callback)
+            mi_rgb.set_variant("scalar_rgb")
+        finally:
+            mi_rgb.set_variant(here)
+            mi_rgb.detail.remove_variant_callback(callback)
+        assert seen == [(here, "scalar_rgb"), ("scalar_rgb", here)]
+
+
+def test_classes_of_textures(mi_any):
+    bitmap = {"type": "bitmap", "raw": True}
+    uniform, colour, float_, bytes_, other = (
+        mi_any.load_dict(d)
+        for d in (
+            {"type": "uniform", "value": 0.5},
+            {"type": "srgb", "color": [0.1, 0.2, 0.3]}
+            if not mi_any.is_monochromatic
+            else {"type": "uniform", "value": 0.2},
+            {**bitmap, "data": mi_any.TensorXf(np.full((2, 2, 1), 0.5))},
+            {**bitmap, "bitmap": mi_any.Bitmap(np.full((2, 2, 3), 128, np.uint8))},
+            {"type": "checkerboard"},
+        )
+    )
+    with hook("class_name of UniformSpectrum and SRGBReflectanceSpectrum"):
+        assert compat.is_constant_texture(uniform) and compat.is_uniform_spectrum(uniform)
+        assert "value" in mi_any.traverse(uniform).keys()
+        assert compat.is_constant_texture(colour)
+        assert compat.is_uniform_spectrum(colour) == mi_any.is_monochromatic
+    with hook("class_name of bitmaps"):
+        assert compat.is_bitmap(float_) and compat.is_bitmap(bytes_)
+        assert "data" in mi_any.traverse(bytes_).keys()
+        assert not compat.is_bitmap(uniform) and not compat.is_bitmap(other) and not compat.is_constant_texture(other)
+
+    class UniformSpectrum(mi_any.Texture):
+        pass
+
+    with hook("modules of Mitsuba's classes"):
+        assert compat.texture_class(UniformSpectrum(mi_any.Properties())) == ""
+
+
+def test_table_of_spectra(mi_rgb):
+    with hook("data/srgb.coeff in Mitsuba's package"):
+        side, positions, coefficients = compat.srgb_coefficients()
+        assert positions.shape == (side,) and coefficients.shape == (3 * side**3, 3)
+        assert positions[0] == 0 and positions[-1] == 1 and (np.diff(positions) > 0).all()
+        assert np.isfinite(coefficients).all()
+        # A grid point: red is largest, green and blue of it a part
+        k, i, j = side // 2, side // 4, side // 3
+        z = float(positions[k])
+        rgb = [z, z * i / (side - 1), z * j / (side - 1)]
+        expected = np.array(mi_rgb.srgb_model_fetch(mi_rgb.ScalarColor3f(rgb))).ravel()
+        assert np.allclose(coefficients[(k * side + j) * side + i], expected, rtol=1e-3)
+
+
+def test_parsed_scenes(mi_rgb):
+    with hook("mi.parser"):
+        config, state = compat.parse_file(SCENE, {"width": "20", "height": "12"})
+        assert [Path(f).name for f in compat.parsed_files(state)] == ["lamp.xml"]
+        sensors = compat.properties_of(state, mi_rgb.ObjectType.Sensor)
+        assert [p.plugin_name() for p in sensors] == ["orthographic"]
+        names = [p.plugin_name() for p in compat.properties_of(state)]
+        assert "hdrfilm" in names
+        film = compat.properties_of(state)[names.index("hdrfilm")]
+        film["height"] = 10
+        scene = compat.instantiate(config, state)
+        assert isinstance(scene, mi_rgb.Scene) and tuple(scene.sensors()[0].film().size()) == (20, 10)
+    with hook("the size of a film as a parameter"):
+        sensor = scene.sensors()[0]
+        before = mi_rgb.render(scene, spp=1, seed=1).numpy()
+        with compat.film_size(sensor, 10, 5) as possible:
+            assert possible and mi_rgb.render(scene, spp=1).shape[:2] == (5, 10)
+        assert np.array_equal(mi_rgb.render(scene, spp=1, seed=1).numpy(), before)
+    with hook("film with a crop window"):
+        cropped = {"type": "hdrfilm", "width": 8, "height": 8, "crop_width": 4, "crop_height": 4}
+        with compat.film_size(mi_rgb.load_dict({"type": "perspective", "film": cropped}), 2, 2) as possible:
+            assert not possible
+
+
+def test_properties(mi_rgb):
+    with hook("mi.Properties: types of parameters"):
+        props = mi_rgb.Properties("diffuse")
+        props["number"], props["whole"], props["text"] = 0.5, 3, "grey"
+        props["colour"] = mi_rgb.ScalarColor3f(0.1, 0.2, 0.3)
+        props["flag"] = True
+        kinds = {key: compat.property_kind(props, key) for key in ("number", "whole", "text", "colour", "flag")}
+        assert kinds == {"number": "number", "whole": "number", "text": "text", "colour": "colour", "flag": "other"}
+    with hook("mi.Properties: objects in parsed scenes"):
+        _, state = compat.parse_file(SCENE)
+        found = [compat.property_kind(p, key) for p in compat.properties_of(state) for key in p]
+        assert "object" in found
+    with hook("mi.Properties: renaming, deleting"):
+        props.set_plugin_name("conductor")
+        del props["flag"]
+        assert props.plugin_name() == "conductor" and "flag" not in props and "number" in props
+
+
+def test_errors_in_one_sentence(mi_rgb, tmp_path):
+    """Real ones: of a plugin's constructor in a file, of a render, of the parser."""
+    path = tmp_path / "scene.xml"
+    start = '<scene version="3.0.0"><shape type="sphere"><bsdf type="neural_ggx">'
+    path.write_text(f'{start}<string name="storage" value="int3"/></bsdf></shape></scene>')
+    with hook("the form of errors of constructors"):
+        with pytest.raises(Exception) as caught:
+            compat.instantiate(*compat.parse_file(path))
+        text = compat.one_sentence(caught.value)
+        assert "int3" in text and "scene.xml" in text and "\n" not in text
+        assert not any(noise in text for noise in ("Traceback", ".cpp:", "RuntimeError", "failed to instantiate"))
+    path.write_text('<scene version="3.0.0"><shape/></scene>')
+    with hook("the form of errors of the parser"):
+        with pytest.raises(Exception) as caught:
+            compat.parse_file(path)
+        text = compat.one_sentence(caught.value)
+        assert "scene.xml" in text and '"type"' in text and "[" not in text
+
+    class Failing(mi_rgb.SamplingIntegrator):
+        def sample(self, *arguments, **others):
+            raise RuntimeError("the lamp is broken")
+
+    scene = mi_rgb.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    with hook("the form of errors at render time"):
+        with pytest.raises(Exception) as caught:
+            mi_rgb.render(scene, integrator=Failing(mi_rgb.Properties()), spp=1)
+        assert compat.one_sentence(caught.value) == "the lamp is broken"
