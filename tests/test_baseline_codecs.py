@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
+from mi_diffind.metrics import psnr
 from mi_diffind.studies.baselines import codecs
 from mi_diffind.studies.baselines.codecs import ASTC_BLOCKS, CodecError, Encoded
-from mi_diffind.metrics import psnr
 
 MODULES = {
     "astc": ("astc_encoder",),

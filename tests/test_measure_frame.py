@@ -399,5 +399,3 @@ def test_jobs_come_first_and_can_be_interrupted(tmp_path):
     paths = report.write(result, tmp_path)
     assert Path(paths["training"]).stat().st_size > 10_000
     assert "not converged" in "\n".join(report.summary(result))
-
-

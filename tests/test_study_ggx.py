@@ -9,15 +9,15 @@ import drjit as dr
 import numpy as np
 import pytest
 from conftest import BACKENDS
-from mi_diffind.tradeoffs.networks import Network
 
 from mi_diffind.cli import main
 from mi_diffind.fitting import FitSettings, fit
 from mi_diffind.runtime import array_module
+from mi_diffind.studies.baselines.networks import Network
+from mi_diffind.studies.ggx import candidates, conclusions
 from mi_diffind.tasks.ggx import Encoding, GGXProblem
-from mi_diffind.tradeoffs import ggx as study
 
-GRID = {**study.GRID, "hashmap_size": 64}
+GRID = {**candidates.GRID, "hashmap_size": 64}
 
 
 @pytest.fixture
@@ -91,10 +91,12 @@ def quick(tmp_path_factory):
 
 def test_quick_run_writes_what_it_promises(quick):
     folder, report = quick
-    pictures = ["tradeoff.png", "training.png"]
-    assert sorted(os.listdir(folder)) == ["ggx_models", "tradeoff.csv", "tradeoff.json", *pictures]
+    pictures = ["tradeoff_ggx.png", "tradeoff_ggx_training.png"]
+    assert sorted(os.listdir(folder)) == sorted(
+        [*pictures, "tradeoff_ggx.csv", "tradeoff_ggx.json", "tradeoff_ggx_models"]
+    )
     assert all((folder / name).stat().st_size > 50_000 for name in pictures)
-    with open(folder / "tradeoff.csv", encoding="utf-8", newline="") as file:
+    with open(folder / "tradeoff_ggx.csv", encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
     assert {row["case"] for row in table} == set(report["cases"])
     for row in table:
@@ -104,13 +106,13 @@ def test_quick_run_writes_what_it_promises(quick):
             assert {f"peak_error_{band}" for band in ("0.001_0.01", "0.5_1")} <= set(row)
     trained = {row["candidate"]: row for row in table if row["converged"]}
     assert all(float(row["training_seconds"]) > 0 for row in trained.values())
-    assert report["trainings"] and all(record["runs"] for record in report["trainings"].values())
+    assert report["jobs"] and all(record["runs"] for record in report["jobs"].values())
 
 
 def test_candidates_are_what_they_are_called(quick):
     _, report = quick
-    c, plain = report["candidates"], report["cases"][study.PLAIN]["queries"]["read"]
-    assert c["16→8"]["bytes"] == c["24²"]["bytes"] == 4 * study.ENTRIES == 2304  # equal bytes
+    c, plain = report["candidates"], report["cases"][conclusions.PLAIN]["queries"]["read"]
+    assert c["16→8"]["bytes"] == c["24²"]["bytes"] == 4 * conclusions.ENTRIES == 2304  # equal bytes
     for name in ("16→8", "24²", "16→8, log"):
         label, mark = name.split(",")[0], ", log" * ("log" in name)
         assert c[name]["bytes"] == 2 * c[f"{label} f16{mark}"]["bytes"] == 4 * c[f"{label} u8{mark}"]["bytes"]
@@ -144,7 +146,7 @@ def verdicts(report, **changes):
             c["converged"], found = False, 60.0
         if "psnr_db" in c["errors"]:
             c["errors"]["psnr_db"] = found
-    lines = study.conclusions(result, "16→8")
+    lines = conclusions.conclusions(result, "16→8")
     return {line[2:22].strip(): line for line in lines if line.startswith("  ")}, lines
 
 

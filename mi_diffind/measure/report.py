@@ -41,8 +41,9 @@ def write_files(
 ) -> dict[str, str]:
     """
     Write ``tradeoff_NAME.csv`` (``rows``), ``.json`` (``result``), and ``pictures``, functions that draw a Matplotlib
-    figure: ``"png"`` (``tradeoff_NAME.png``) or another KIND (``tradeoff_NAME_KIND.png``). Of a run that is complete, nothing else stays in ``folder`` but trained
-    models. Returns the paths. Raises :class:`~mi_diffind.files.OutputError`.
+    figure: ``"png"`` (``tradeoff_NAME.png``) or another KIND (``tradeoff_NAME_KIND.png``). Of a run that is complete,
+    nothing else stays in ``folder`` but trained models. Returns the paths. Raises
+    :class:`~mi_diffind.files.OutputError`.
     """
     folder = writable_folder(folder, create=True)
     start = str(folder / f"tradeoff_{name}")

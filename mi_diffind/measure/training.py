@@ -30,8 +30,8 @@ class Training(Job):
     A representation that is trained to convergence.
 
     ``problem()`` makes the problem anew, with untrained parameters; ``settings`` are those of the first, shortest run,
-    ``longest`` the steps of the longest that is tried. After :meth:`run` or :meth:`known`, ``net`` is the trained module
-    of the best run.
+    ``longest`` the steps of the longest that is tried. After :meth:`run` or :meth:`known`, ``net`` is the trained
+    module of the best run.
     """
 
     def __init__(self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int):

@@ -1,7 +1,7 @@
 """
 What is measured by ``mi-diffind tradeoff``: each module here, and each that an entry point of the group
 ``mi_diffind.studies`` names, declares a study as its ``STUDY`` (:class:`mi_diffind.measure.study.Study`). A study makes
-its candidates with the plugins, so this package lies above them; :mod:`.baselines` are what learned tables compete with.
+its candidates with the plugins, so this package lies above them; :mod:`.baselines` are what tables compete with.
 """
 
 from __future__ import annotations

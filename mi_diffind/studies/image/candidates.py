@@ -72,16 +72,24 @@ def plan(source: Source, name: str, request: Request) -> Plan:
 
     by_name = {job.name: job for job in jobs}
     cases = [
-        Case(f"{place} places", lambda lanes, p=place: _reads(source, by_name, p, lanes), None, {}, timed, None,
-             place == "random")
+        Case(
+            f"{place} places",
+            lambda lanes, p=place: _reads(source, by_name, p, lanes),
+            None,
+            {},
+            timed,
+            None,
+            place == "random",
+        )
         for place in ("random", "coherent")
     ]
-    missing = [name for name, package in (("SSIM", "skimage"),) if importlib.util.find_spec(package) is None]
-    missing = [*codecs.missing(), *missing]
-    notes = [f"{name}, {source.width} × {source.height}, {len(source.maps)} map(s), {source.nbytes:,} bytes. PSNR of all "
-             "channels together. JPEG and WebP have no random access."]  # fmt: skip
+    missing = [*codecs.missing(), *(["SSIM"] if importlib.util.find_spec("skimage") is None else [])]
+    notes = [
+        f"{name}, {source.width} × {source.height}, {len(source.maps)} map(s), {source.nbytes:,} bytes. PSNR of all "
+        "channels together. JPEG and WebP have no random access."
+    ]
     if missing:
-        notes.append(f'Left out, not being installed: {", ".join(missing)}; "pip install mi-diffind[compare]" does.')
+        notes.append(f'Left out, not being installed: {", ".join(missing)}; pip install "mi-diffind[compare]"')
     return Plan(
         study="image",
         title=f"Compressed image: {Path(name).stem}",
