@@ -18,7 +18,7 @@ from .common import (
 
 
 def add(commands) -> None:
-    """Add the verb, and the studies that are found with their options, to ``commands``, the command line's subparsers."""
+    """Add the verb and the studies that are found to ``commands``, the subparsers of the command line."""
     tasks = tasks_of(
         verb(commands, "tradeoff", run, "measure time against accuracy, of all forms of a task or of a scene")
     )

@@ -66,7 +66,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Label:
-    """A text to be placed near ``at`` (data coordinates), best ``angle`` radians from the right; ``radii`` in points."""
+    """A text to be placed near ``at`` (data coordinates), best at ``angle`` from the right; ``radii`` are in points."""
 
     text: str
     at: tuple[float, float]

@@ -132,7 +132,14 @@ def _candidates() -> tuple[list[Candidate], dict]:
             is_reference=True,
             note="another model (full Fresnel terms, no flatness without `thin`): no error against this one",
         ),
-        Candidate(FORMULAS, "formulas", is_truth=True, in_passes=False, queries=("eval",)),
+        Candidate(
+            FORMULAS,
+            "formulas",
+            is_truth=True,
+            in_passes=False,
+            queries=("eval",),
+            note="the formulas alone, without what a plugin adds: checks of directions, lobes that are asked for",
+        ),
         Candidate("disney", "arithmetic", errors=errors(Decoder)),
     ]
     plugins = {"principled": loaded(type="principled"), "disney": loaded(type="disney")}
@@ -203,7 +210,8 @@ def _queries(plugins: dict, material: str, parameters: dict, lanes: int) -> dict
     found = {query: {FLOOR: lambda i=i: i} for query, i in inputs.items()}
     values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}  # each one number for all lanes, as a plugin has them
     constants = Material(**{name: dr.opaque(mi.Float, value) for name, value in values.items()})
-    albedo = dr.opaque(mi.Color3f, mi.Color3f(BASE_COLOR))
+    albedo = mi.Color3f(BASE_COLOR)
+    dr.make_opaque(albedo)
     found["eval"][FORMULAS] = lambda: shade(None, constants, albedo, si.wi, wo)
     for name, build in plugins.items():
         bsdf = build(_material(material, parameters))
