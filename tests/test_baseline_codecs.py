@@ -280,11 +280,11 @@ def squared(maps, coded):
 
 @astc_only
 def test_material():
-    maps, cache, lines = material(), {}, []
+    maps, cache = material(), {}
     options = {"quality": "fast", "choose": "fast", "reduces": (1, 2), "cache": cache}
     errors = []
     for n in (60 * 72 // 4, 60 * 72 // 2):
-        best, total = codecs.astc_material(maps, n, **options, progress=lines.append)
+        best, total = codecs.astc_material(maps, n, **options)
         even, even_total = codecs.astc_material(maps, n, uniform=True, **options)
         assert total == sum(e.nbytes for e in best.values()) <= n and even_total <= n
         assert list(best) == list(even) == list(maps)
@@ -292,13 +292,11 @@ def test_material():
             check(maps[name], e, "astc")
             assert e.codec.startswith("ASTC ")
         assert np.array_equal(best["base"].image[..., 0], best["base"].image[..., 2])
-        settings = {
-            part for e in even.values() for part in e.codec.replace(" xy", "").removeprefix("ASTC ").split(" + ")
-        }
+        settings = {e.codec.replace(" xy", "") for e in even.values()}
         assert len(settings) == 1
         errors.append(squared(maps, best))
         assert errors[-1] < squared(maps, even)
-    assert errors[1] < errors[0] and lines
+    assert errors[1] < errors[0]
     known = len(cache)
     again, _ = codecs.astc_material(maps, 60 * 72 // 2, **options)
     assert len(cache) == known and {k: e.codec for k, e in again.items()} == {k: e.codec for k, e in best.items()}
@@ -321,18 +319,9 @@ def test_material_is_optimal():
 
 
 @astc_only
-def test_material_packings():
-    rng = np.random.default_rng(3)
-    unlike = np.concatenate([np.full((64, 64, 2), 0.25), rng.uniform(size=(64, 64, 1))], -1).astype(np.float32)
-    options = {"quality": "fast", "choose": "fast", "reduces": (1, 4)}
-    split, total = codecs.astc_material({"unlike": unlike}, 2000, **options)
-    assert "+" in split["unlike"].codec and total <= 2000
-    assert psnr(unlike, split["unlike"].image) > psnr(unlike, codecs.at_bytes("astc", unlike, 2000)[0].image) + 1
-    four = np.concatenate([np.repeat(picture(64, 64, 1), 3, -1), unlike[..., 2:]], -1)
-    both, total = codecs.astc_material({"four": four}, 64 * 64 // 2, **options)
-    check(four, both["four"], "astc")
-    assert total <= 64 * 64 // 2
+def test_normals_without_z_where_that_is_better():
     normal = {"normal": normal_map(48, 48)}
+    options = {"quality": "fast", "choose": "fast", "reduces": (1, 4)}
     errors = [
         squared(normal, codecs.astc_material(normal, 48 * 48 // 4, normals=names, **options)[0])
         for names in ((), ("normal",))

@@ -239,21 +239,8 @@ def at_bytes(codec: str, image: np.ndarray, nbytes: int, **options) -> list[Enco
     raise ValueError(f'codec: found "{codec}", one of {", ".join(_PACKAGES)} is needed')
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Channels of a map in one texture: how they are stored, its bytes and squared error."""
-
-    name: str
-    channels: tuple[int, ...]
-    normal: bool
-    block: str
-    reduce: int
-    nbytes: int
-    error: float
-
-
-#: One way to store something: bytes, squared error, parts.
-_Way = tuple[int, float, tuple[_Part, ...]]
+#: One way to store a map (its name, whether only x and y, block size, reduction), or several: bytes, squared error.
+_Way = tuple[int, float, tuple[tuple[str, bool, str, int], ...]]
 
 
 def astc_material(
@@ -265,104 +252,62 @@ def astc_material(
     reduces: Iterable[int] = (1, 2, 4),
     choose: str | float = "medium",
     cache: dict | None = None,
-    progress: Callable[[str], None] | None = None,
-    split: bool = True,
 ) -> tuple[dict[str, Encoded], int]:
     """
     The ``maps`` of a material, name → image, in ``nbytes`` together, with the least squared error over all their texels
-    and channels: each texture at its own block size and resolution (one of ``reduces``, see :func:`astc`), each map one
-    texture or several (three channels: all groupings, four: also 3 + 1 and 1 + 1 + 1 + 1), three equal channels as
-    luminance, the maps named in ``normals`` with or without z. Without ``split``, each
-    map is one texture. ``uniform``: one block size and resolution for all textures instead, the best one.
+    and channels: each map at its own block size and resolution (one of ``reduces``, see :func:`astc`), three equal
+    channels as luminance, the maps named in ``normals`` with or without z. ``uniform``: one block size and resolution
+    for all maps instead, the best one.
 
-    The choice is the best one for the errors with the preset ``choose``, for which each map is encoded some hundred
-    times (minutes for 1024×1024 texels); ``quality`` is for the result. A ``cache``, only for calls with the same maps,
-    saves encoding twice; ``progress`` is called with a line of text now and then. Returns the encoded maps by name, and
-    their bytes. Raises :class:`CodecError` if no choice fits.
+    The choice is the best one for the errors with the preset ``choose``, for which each map is encoded some dozens of
+    times; ``quality`` is for the result. A ``cache``, only for calls with the same maps, saves encoding twice. Returns
+    the encoded maps by name, and their bytes. Raises :class:`CodecError` if no choice fits.
     """
     _modules("astc")
     cache = {} if cache is None else cache
     rounded = {name: _texels(image) / np.float32(255) for name, image in maps.items()}
     settings = list(itertools.product(ASTC_BLOCKS, reduces))
-    known: dict[tuple, list[_Part]] = {}
-    for name, image in rounded.items():
-        for channels, normal in dict.fromkeys(p for packing in _packings(name, image, normals, split) for p in packing):
-            parts, tried = known.setdefault((name, channels, normal), []), 0
-            for block, reduce in settings:
-                size = astc_bytes(image.shape, block, reduce)
-                if size > nbytes:
-                    continue
-                key = (name, channels, normal, block, reduce, choose, "choice")
-                if key not in cache:
-                    coded = _encode(image, channels, normal, block, reduce, choose)
-                    cache[key] = _squared(image[..., channels], coded.image)
-                    tried += 1
-                parts.append(_Part(name, channels, normal, block, reduce, size, cache[key]))
-            if progress and tried:
-                progress(f"{name} {channels}{' xy' if normal else ''}: {tried} block sizes and resolutions tried")
 
-    def ways(allowed: Callable[[_Part], bool]) -> list[_Way]:
-        """The ways to store the material that nothing beats, of the parts allowed."""
+    def cached(kind: Callable, *part):
+        if (key := (kind.__name__, *part)) not in cache:
+            cache[key] = kind(rounded[part[0]], *part[1:])
+        return cache[key]
+
+    known: dict[str, list[_Way]] = {}
+    for name, image in rounded.items():
+        both = (False, True) if name in normals and image.shape[2] == 3 else (False,)
+        for normal, (block, reduce) in itertools.product(both, settings):
+            size = astc_bytes(image.shape, block, reduce)
+            if size <= nbytes:
+                error = cached(_error, name, normal, block, reduce, choose)
+                known.setdefault(name, []).append((size, error, ((name, normal, block, reduce),)))
+
+    def ways(allowed) -> list[_Way]:
+        """The ways to store the material that nothing beats, at the block sizes and resolutions allowed."""
         front: list[_Way] = [(0, 0.0, ())]
-        for name, image in rounded.items():
-            one: list[_Way] = []
-            for packing in _packings(name, image, normals, split):
-                packed: list[_Way] = [(0, 0.0, ())]
-                for group in packing:
-                    parts = [(p.nbytes, p.error, (p,)) for p in known[(name, *group)] if allowed(p)]
-                    packed = _front(((a, b) for a in packed for b in parts), nbytes)
-                one += packed
-            front = _front(((a, b) for a in front for b in one), nbytes)
+        for name in rounded:
+            one = [way for way in known.get(name, ()) if way[2][0][2:] in allowed]
+            front = _front(itertools.product(front, one), nbytes)
         return front
 
-    if uniform:
-        found = [w for b, r in settings for w in ways(lambda p, b=b, r=r: (p.block, p.reduce) == (b, r))]
-    else:
-        found = ways(lambda p: True)
+    found = [way for setting in settings for way in ways([setting])] if uniform else ways(settings)
     if not found:
         raise CodecError(f"ASTC cannot store {', '.join(maps)} in {nbytes:,} bytes")
-    _, _, parts = min(found, key=lambda w: w[1])
-
-    result = {}
-    for name, image in rounded.items():
-        decoded, coded = np.empty_like(image), []
-        for p in (p for p in parts if p.name == name):
-            key = (name, p.channels, p.normal, p.block, p.reduce, quality, "result")
-            if key not in cache:
-                cache[key] = _encode(image, p.channels, p.normal, p.block, p.reduce, quality)
-                if progress:
-                    progress(f"{name} {p.channels}: {cache[key].codec}, {cache[key].seconds:.0f} s")
-            decoded[..., p.channels] = cache[key].image
-            coded.append(cache[key])
-        label = "ASTC " + " + ".join(e.codec.removeprefix("ASTC ") for e in coded)
-        result[name] = Encoded(label, sum(e.nbytes for e in coded), decoded, True, sum(e.seconds for e in coded))
+    result = {part[0]: cached(_encode, *part, quality) for part in min(found, key=lambda way: way[1])[2]}
     return result, sum(e.nbytes for e in result.values())
 
 
-def _packings(name: str, image: np.ndarray, normals: Collection[str], split: bool = True) -> list[tuple]:
-    """The ways to put the channels of a map into textures, each a tuple of (channels, whether only x and y)."""
-    channels = tuple(range(image.shape[2]))
-    packings = [((channels, False),)]
-    if len(channels) == 3 and name in normals:
-        packings.append(((channels, True),))
-    if not split:
-        return packings
-    if len(channels) == 4:
-        packings.append((((0, 1, 2), False), ((3,), False)))
-    if len(channels) == 3 and not _grey(image):
-        packings += [((pair, False), ((c,), False)) for pair, c in (((0, 1), 2), ((0, 2), 1), ((1, 2), 0))]
-    if len(channels) > 1 and not _grey(image):
-        packings.append(tuple(((c,), False) for c in channels))
-    return packings
-
-
-def _encode(image: np.ndarray, channels: tuple[int, ...], normal: bool, block: str, reduce: int, quality) -> Encoded:
-    """Some channels of an image by :func:`astc`, three equal ones as luminance."""
-    part = image[..., channels]
-    if not _grey(part):
-        return astc(part, block, quality, normal, reduce)
-    coded = astc(part[..., :1], block, quality, False, reduce)
+def _encode(image: np.ndarray, normal: bool, block: str, reduce: int, quality) -> Encoded:
+    """An image by :func:`astc`, three equal channels as luminance."""
+    if not _grey(image):
+        return astc(image, block, quality, normal, reduce)
+    coded = astc(image[..., :1], block, quality, False, reduce)
     return replace(coded, image=np.repeat(coded.image, 3, -1))
+
+
+def _error(image: np.ndarray, *options) -> float:
+    """The squared error of :func:`_encode`."""
+    return _squared(image, _encode(image, *options).image)
 
 
 def _grey(image: np.ndarray) -> bool:

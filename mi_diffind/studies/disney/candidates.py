@@ -13,13 +13,14 @@ import numpy as np
 
 from ... import runtime
 from ...lookup import STORAGES
+from ...measure.bsdf import QUERIES, TEXTURE_SIZE, bsdf_queries, directions, noise_texture
 from ...measure.operations import FLOPS
-from ...measure.study import FLOOR, Candidate, Case, Plan
+from ...measure.study import Candidate, Case, Plan
 from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.factored import FactoredDecoder
 from ...tasks.disney.library import decoder_of, load_arrays, load_disney_table, table_file
 from ...tasks.disney.model import PARAMETERS, Material
-from ...tasks.disney.training import measure, random_directions, shade
+from ...tasks.disney.training import measure, shade
 from .conclusions import PAPER, conclusions
 
 #: A material that makes use of every part of the model, and one of the two lobes that most materials have.
@@ -37,9 +38,6 @@ ALL_LOBES = {
 }
 DIFFUSE_SPECULAR = {"roughness": 0.43, "specular": 0.6}
 BASE_COLOR = (0.8, 0.3, 0.2)
-
-#: Texels of a side of the textures; read at random, they come from the cache, and what they cost is the reading itself.
-TEXTURE_SIZE = 64
 
 #: The truth as a candidate; it is timed in ``eval`` only, with constant materials, in RGB.
 FORMULAS = "formulas"
@@ -76,7 +74,7 @@ def plan(quick: bool = False) -> Plan:
         variant=mi.variant(),
         candidates=candidates,
         cases=cases,
-        queries=("eval", "sample", "pdf"),
+        queries=QUERIES,
         accuracy="psnr_db_training",
         accuracy_label="PSNR of BRDF · cosine, dB",
         ratios=[
@@ -174,55 +172,21 @@ def _material(material: str, parameters: dict) -> dict:
     if material == "constant":
         return {"base_color": {"type": "rgb", "value": list(BASE_COLOR)}, **parameters}
     rng = np.random.default_rng(1)
-
-    def texture(values):
-        noise = rng.uniform(-0.1, 0.1, (TEXTURE_SIZE, TEXTURE_SIZE, len(values)))
-        data = np.clip(np.asarray(values) + noise, 0.01, 0.99).astype(np.float32)
-        return {"type": "bitmap", "data": mi.TensorXf(data), "raw": not mi.is_spectral or len(values) == 1}
-
     # `principled` takes no texture for `specular`, so it is a number for all
     return {
-        "base_color": texture(BASE_COLOR),
-        **{name: value if name == "specular" else texture([value]) for name, value in parameters.items()},
+        "base_color": noise_texture(BASE_COLOR, rng),
+        **{name: value if name == "specular" else noise_texture([value], rng) for name, value in parameters.items()},
     }
 
 
 def _queries(plugins: dict, material: str, parameters: dict, lanes: int) -> dict:
-    rng = dr.rng(seed=dr.opaque(mi.UInt64, 7))
-    types = runtime.array_module(mi.variant().split("_")[0])
-    si = dr.zeros(mi.SurfaceInteraction3f, lanes)
-    wi, wo = random_directions(rng, types, lanes)
-    si.wi, wo = mi.Vector3f(wi), mi.Vector3f(wo)
-    random = [rng.random(mi.Float, lanes) for _ in range(5)]
-    si.uv, sample1, sample2 = mi.Point2f(random[:2]), random[2], mi.Point2f(random[3:])
-    wavelengths = []
-    if mi.is_spectral:
-        si.wavelengths = 400 + 300 * rng.random(type(si.wavelengths), (dr.size_v(si.wavelengths), lanes))
-        wavelengths = [si.wavelengths]
-    dr.make_opaque(si.wi, si.uv, si.wavelengths, wo, sample1, sample2)
-    uv = [si.uv] if material == "textured" else []
-    context = mi.BSDFContext()
-    inputs = {
-        "eval": [si.wi, wo, *uv, *wavelengths],
-        "sample": [si.wi, sample1, sample2, *uv, *wavelengths],
-        "pdf": [si.wi, wo, *uv],
-    }
-    found = {query: {FLOOR: lambda i=i: i} for query, i in inputs.items()}
+    bsdfs = {name: build(_material(material, parameters)) for name, build in plugins.items()}
+    inputs = directions(lanes)
+    found = bsdf_queries(bsdfs, inputs, material == "textured")
     values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}  # each one number for all lanes, as a plugin has them
-    constants = Material(**{name: dr.opaque(mi.Float, value) for name, value in values.items()})
-    albedo = mi.Color3f(BASE_COLOR)
+    constants, albedo = {name: dr.opaque(mi.Float, value) for name, value in values.items()}, mi.Color3f(BASE_COLOR)
     dr.make_opaque(albedo)
-    found["eval"][FORMULAS] = lambda: shade(None, constants, albedo, si.wi, wo)
-    for name, build in plugins.items():
-        bsdf = build(_material(material, parameters))
-
-        def sample(bsdf=bsdf):
-            bs, weight = bsdf.sample(context, si, sample1, sample2)
-            return [bs.wo, bs.pdf, mi.Float(bs.sampled_component), weight]
-
-        found["eval"][name] = lambda b=bsdf: b.eval(context, si, wo)
-        found["sample"][name] = sample
-        found["pdf"][name] = lambda b=bsdf: b.pdf(context, si, wo)
+    found["eval"][FORMULAS] = lambda: shade(None, Material(**constants), albedo, inputs[0].wi, inputs[1])
     return found
 
 

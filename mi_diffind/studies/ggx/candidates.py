@@ -23,6 +23,7 @@ from ... import runtime
 from ...fitting import FitSettings
 from ...indirection import DifferentiableArray
 from ...lookup import STORAGES
+from ...measure.bsdf import QUERIES, bsdf_queries, directions, noise_texture
 from ...measure.operations import FLOPS, Operations, count_query
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
@@ -292,7 +293,7 @@ def _conductors(made: _Made) -> list[Case]:
             None,
             {"material": "Cu", "alpha": 0.2, "roughness": roughness},
             tuple(plugins),
-            ("eval", "sample", "pdf"),
+            QUERIES,
             False,
         )
         for roughness in ("constant", "textured")
@@ -300,35 +301,9 @@ def _conductors(made: _Made) -> list[Case]:
 
 
 def _bsdf_queries(plugins: dict, roughness: str, lanes: int) -> dict:
-    rng = dr.rng(seed=dr.opaque(mi.UInt64, 7))
-    si = dr.zeros(mi.SurfaceInteraction3f, lanes)
-    random = [rng.random(mi.Float, lanes) for _ in range(8)]
-    si.wi = mi.warp.square_to_uniform_hemisphere(mi.Point2f(random[:2]))
-    wo = mi.warp.square_to_uniform_hemisphere(mi.Point2f(random[2:4]))
-    si.uv, sample2 = mi.Point2f(random[4:6]), mi.Point2f(random[6:])
-    wavelengths = []
-    if mi.is_spectral:
-        si.wavelengths = 400 + 300 * rng.random(type(si.wavelengths), (dr.size_v(si.wavelengths), lanes))
-        wavelengths = [si.wavelengths]
-    dr.make_opaque(si.wi, si.uv, si.wavelengths, wo, sample2)
-    uv, context = [si.uv] if roughness == "textured" else [], mi.BSDFContext()
-    inputs = {
-        "eval": [si.wi, wo, *uv, *wavelengths],
-        "sample": [si.wi, sample2, *uv, *wavelengths],
-        "pdf": [si.wi, wo, *uv],
-    }
-    found = {query: {FLOOR: lambda i=i: i} for query, i in inputs.items()}
-    values = np.random.default_rng(1).uniform(0.1, 0.3, (64, 64, 1)).astype(np.float32)
-    for name, plugin in plugins.items():
-        # A tensor of its own for each: a bitmap takes it over
-        texture = {"type": "bitmap", "data": mi.TensorXf(values), "raw": True}
-        bsdf = mi.load_dict({**plugin, "material": "Cu", "alpha": texture if roughness == "textured" else 0.2})
+    def load(plugin: dict):
+        alpha = noise_texture([0.2], np.random.default_rng(1)) if roughness == "textured" else 0.2
+        return mi.load_dict({**plugin, "material": "Cu", "alpha": alpha})
 
-        def sample(bsdf=bsdf):
-            bs, weight = bsdf.sample(context, si, mi.Float(0.5), sample2)
-            return [bs.wo, bs.pdf, weight]
-
-        found["eval"][name] = lambda b=bsdf: b.eval(context, si, wo)
-        found["sample"][name] = sample
-        found["pdf"][name] = lambda b=bsdf: b.pdf(context, si, wo)
-    return found
+    bsdfs = {name: load(plugin) for name, plugin in plugins.items()}
+    return bsdf_queries(bsdfs, directions(lanes), roughness == "textured")

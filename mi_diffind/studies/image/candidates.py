@@ -225,7 +225,7 @@ def _codecs(source: Source, request: Request) -> list[_Codec]:
 
         def blocks(uniform: bool, nbytes=nbytes):
             return codecs.astc_material(
-                values, nbytes, request.astc, uniform, normals, (1, 2), request.astc_choice, cache, split=False
+                values, nbytes, request.astc, uniform, normals, (1, 2), request.astc_choice, cache
             )
 
         def maps(codec: str, nbytes=nbytes):
