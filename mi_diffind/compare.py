@@ -14,9 +14,10 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from . import metrics, plugins, scenes, sheet
+from . import metrics, plugins, scenes
 from .files import writable_folder
 from .interrupt import interruptible
+from .measure import sheet
 
 
 @dataclass

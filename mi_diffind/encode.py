@@ -19,8 +19,9 @@ import numpy as np
 
 from . import metrics, scenes
 from .files import replacing, writable_folder
+from .measure.clock import kernel_seconds, total
+from .measure.statistics import spread
 from .tasks.disney.model import SPECULAR_SCALE
-from .tradeoff import kernel_seconds, spread, total
 
 #: How latent textures may be stored: bytes as PNG, or half precision as EXR.
 STORAGES = ("uint8", "float16")

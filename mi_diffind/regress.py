@@ -24,9 +24,10 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from . import __version__, compat, plugins, scenes, sheet
+from . import __version__, compat, plugins, scenes
 from .files import OutputError, replacing, writable_file, writable_folder
 from .interrupt import interruptible
+from .measure import sheet
 
 #: Chance that a scene in which nothing has changed has a pixel below the threshold, were all pixels independent.
 SIGNIFICANCE = 0.01

@@ -19,7 +19,7 @@ import numpy as np
 
 from . import plugins
 from .files import replacing
-from .operations import bsdf_operations
+from .measure.operations import bsdf_operations
 from .tasks import ggx
 from .tasks.disney import library as disney
 from .tasks.image import compressed as image
@@ -130,7 +130,7 @@ def reports(scene) -> list[dict]:
     """
     For each learned material of a loaded scene, what it does: its ``id``, ``quality``, ``effects_in_use``,
     ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage`` and ``table_bytes``, and the ``operations``
-    of ``eval``, ``pdf`` and ``sample`` (:class:`~mi_diffind.operations.Operations`, by name).
+    of ``eval``, ``pdf`` and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name).
     """
     return [
         {

@@ -268,10 +268,10 @@ def test_help_is_fast():
         assert text.startswith(" ".join(["usage: mi-diffind", *command]) + " [-h]"), command
     assert all(f"\n    {verb} " in found["texts"][0] for verb in VERBS)
     assert found["variant"] is None
-    slow = {"matplotlib", "OpenEXR", "trimesh", "mi_diffind.scenes", "mi_diffind.tradeoff", "mi_diffind.budget"}
+    slow = {"matplotlib", "OpenEXR", "trimesh", "mi_diffind.scenes", "mi_diffind.measure.clock"}
     slow |= {"mi_diffind.compare", "mi_diffind.regress", "mi_diffind.depth", "mi_diffind.encode"}
     assert not slow & set(found["modules"])
-    assert not [name for name in found["modules"] if name.startswith("mi_diffind.tradeoffs.")]
+    assert not [name for name in found["modules"] if name.startswith("mi_diffind.studies.") and name.count(".") > 2]
     text = dict(zip(map(tuple, commands), found["texts"], strict=True))
     assert "--primary" in text["fit", "ggx"] and "--primary" not in text["fit", "disney"]  # those of the task only
     assert "-D NAME" in text["tradeoff", "scene"] and "-D NAME" not in text["tradeoff", "disney"]
@@ -291,20 +291,20 @@ def test_tradeoff_of_a_scene(tmp_path, capsys):
     assert main([*arguments, "--json", str(report), "--seed", "3", *SMALL]) == 0
     text, found = capsys.readouterr().out, json.loads(report.read_text())
     assert "materials.xml, 48 x 28" in text and "bias" in text and found["verdict"] in text
-    files = [str(out / f"tradeoff.{kind}") for kind in ("csv", "json", "png")]
+    files = [str(out / f"tradeoff_scene.{kind}") for kind in ("csv", "json", "png")]
     assert text.endswith("\nwritten     " + ", ".join(files) + "\n")
     assert list(found.pop("files").values()) == files and sorted(map(str, out.iterdir())) == files
-    assert json.loads((out / "tradeoff.json").read_text()) == found
+    assert json.loads((out / "tradeoff_scene.json").read_text()) == found
     assert found["counts"][-1] == 4 and found["seed"] == 3 and found["defines"] == {"width": "48", "height": "28"}
     assert found["settings"]["quick"] and not found["interrupted"]
 
 
 def test_tradeoff_of_a_scene_is_interrupted(tmp_path, capsys, monkeypatch, mi_rgb):
-    from mi_diffind import budget
+    from mi_diffind.studies.scene import renders, report
 
-    monkeypatch.setattr(budget, "measure", lambda *arguments: {"interrupted": True})
-    monkeypatch.setattr(budget, "write", lambda result, folder: {"csv": f"{folder}/a.csv", "json": f"{folder}/a.json"})
-    monkeypatch.setattr(budget, "summary", lambda result: ["first", "second"])
+    monkeypatch.setattr(renders, "measure", lambda *arguments: {"interrupted": True})
+    monkeypatch.setattr(report, "write", lambda result, folder: {"csv": f"{folder}/a.csv", "json": f"{folder}/a.json"})
+    monkeypatch.setattr(report, "summary", lambda result: ["first", "second"])
     assert main(["tradeoff", "scene", scene_file(tmp_path), "--out", str(tmp_path)]) == 130
     assert capsys.readouterr().out == f"first\nsecond\n\nwritten     {tmp_path}/a.csv, {tmp_path}/a.json\n"
 

@@ -62,7 +62,8 @@ def test_decode_inverts_encode(rng, quality):
 
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_encoded_materials_look_the_same(mi_rgb, rng, tmp_path, capsys, quality):
-    from mi_diffind import operations, scenes
+    from mi_diffind import scenes
+    from mi_diffind.measure import operations
 
     mi = mi_rgb
     scene, out, report = write_scene(tmp_path, rng), tmp_path / "out", tmp_path / "report.json"

@@ -19,7 +19,7 @@ from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 
 from mi_diffind import compare, scenes
-from mi_diffind.operations import bsdf_operations
+from mi_diffind.measure.operations import bsdf_operations
 from mi_diffind.tables import save_table
 from mi_diffind.tasks import ggx
 from mi_diffind.tasks.disney.effects import Known

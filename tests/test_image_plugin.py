@@ -20,7 +20,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from mi_diffind import compare, scenes, sizing
-from mi_diffind.operations import bsdf_operations, count
+from mi_diffind.measure.operations import bsdf_operations, count
 from mi_diffind.tables import Table, load_table, save_table
 from mi_diffind.tasks import ggx
 from mi_diffind.tasks.image import training

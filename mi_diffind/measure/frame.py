@@ -1,0 +1,299 @@
+"""
+What a representation costs and what it gives: time, memory and operations of each candidate beside its accuracy.
+
+This is the frame; what fills it in is a :class:`.study.Plan`: candidates, each a representation at a setting, and
+cases, each a situation in which all of them are timed.
+
+*Time* is that of the kernels alone (:mod:`.clock`). All candidates run in turn, one round of all before the next of
+any, so that a change of clock or of load hits all of them alike; given are medians and quartiles of the rounds. The
+*floor* is a kernel with the same inputs and outputs that computes nothing else: it is measured likewise, shown, and
+subtracted; what is hidden behind it is said to be below a bound (:mod:`.statistics`). Where a ratio of two candidates
+is given, it is the median of the ratios of the rounds.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import threading
+import time
+from dataclasses import asdict, dataclass
+
+import drjit as dr
+from tqdm import tqdm
+
+from ..interrupt import interruptible
+from .clock import machine, timed, total
+from .operations import count_query
+from .statistics import pareto, ratio, spread, timing
+from .store import Store, fingerprint, models_folder, sources
+from .study import FLOOR, Case, Plan
+
+#: What a whole pass is called where the names of queries stand: kernels alone, and everything.
+PASS, PASS_WALL = "render", "render, with tracing"
+
+#: Times that differ by a smaller factor count as equal: less is noise, and not worth an error.
+SAME_TIME = 1.05
+
+SECTIONS = ("jobs", "errors", "operations", "queries", "passes")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    How much is measured: ``lanes`` of a kernel, ``rounds`` of the queries, ``passes`` of whole jobs, ``samples`` for
+    the errors.
+    """
+
+    lanes: int
+    rounds: int = 31
+    passes: int = 9
+    samples: int = 10**6
+    quick: bool = False
+
+    @classmethod
+    def choose(cls, variant: str, quick: bool = False) -> Settings:
+        """For this machine: enough lanes that each core, or the GPU, gets several blocks of them."""
+        blocks = 2 ** math.ceil(math.log2(max(dr.thread_count(), 2)))
+        lanes = 2**22 if variant.startswith("cuda") else blocks * 2**16
+        return cls(lanes // 4, 3, 2, 2**17, True) if quick else cls(lanes)
+
+
+class Stopped(Exception):
+    """The first Ctrl-C has been seen."""
+
+
+def measure(plan: Plan, settings: Settings, folder: str | os.PathLike | None = None, progress: bool = True) -> dict:
+    """
+    Measure everything that ``plan`` asks for, or what is missing of it, if ``folder`` holds an interrupted run. What
+    is measured stays there until :func:`.report.write` has written the result.
+
+    Returns the result, a tree of numbers and strings (JSON): ``task`` (the study), ``interrupted``, ``resumed``,
+    ``machine``, ``settings``, ``details``; ``candidates``: name → what it is and its ``errors``; ``cases``: name →
+    ``queries``: name → candidate → ``time``, ``q1``, ``q3`` (ns a lane, floor subtracted), ``with_floor``, ``floor``,
+    ``rounds``, ``hidden`` (``time`` is only a bound), ``operations``, ``on_front``; ``passes``: candidate → likewise in
+    ms; ``ratios``: query → ``"a / b"`` → ``median``, ``q1``, ``q3``, ``with_floor``, ``hidden``; ``jobs``: their
+    records. After Ctrl-C it is what there is up to then.
+
+    Raises :class:`~mi_diffind.files.OutputError` if the folder cannot be written.
+    """
+    key = {
+        "settings": asdict(settings),
+        "machine": machine(plan.variant),
+        "sources": fingerprint([*sources(), *plan.sources]),
+        "details": plan.details,
+        "candidates": [c.name for c in plan.candidates],
+        "cases": [c.name for c in plan.cases],
+    }
+    store = Store(folder, plan.study, key, SECTIONS, progress)
+    interrupted = False
+    with interruptible() as stop:
+        steps = _Steps(plan, settings, store, stop, progress)
+        try:
+            steps.jobs()
+            cases = [plan.resolved(case, store.data["jobs"]) for case in plan.cases]
+            with steps.bar(cases):
+                steps.errors()
+                for case in cases:
+                    steps.queries(case)
+                    if case.passes is not None:
+                        steps.passes(case)
+        except Stopped:
+            interrupted = True
+            cases = [plan.resolved(case, store.data["jobs"]) for case in plan.cases]
+        finally:
+            store.save()
+    result = {
+        "task": plan.study,
+        "title": plan.title,
+        "interrupted": interrupted,
+        "resumed": store.resumed,
+        "machine": key["machine"],
+        "date": time.strftime("%Y-%m-%d"),
+        "settings": asdict(settings),
+        **{name: getattr(plan, name) for name in ("accuracy", "accuracy_label", "panels", "bytes_by_case", "details")},
+        "notes": list(plan.notes),
+        **_assemble(plan, cases, settings, store.data),
+    }
+    result["conclusions"] = plan.conclusions(result)
+    return result
+
+
+class _Steps:
+    """The steps of a run; each does what is missing, and raises :class:`Stopped` where it may be left off."""
+
+    def __init__(self, plan: Plan, settings: Settings, store: Store, stop: threading.Event, progress: bool):
+        self.plan, self.settings, self.store, self.stop, self.progress = plan, settings, store, stop, progress
+
+    def bar(self, cases: list[Case]) -> tqdm:
+        """The progress of all that follows the jobs; a unit is a kernel, an error or a pass."""
+        units = sum(c.errors is not None for c in self.plan.candidates)
+        for case in cases:
+            units += len(self._kernels(case)) * (1 + self.settings.rounds)
+            units += len(self._in_passes(case)) * (1 + self.settings.passes)
+        disable = None if self.progress else True
+        self._bar = tqdm(total=units, desc="measure", unit="step", smoothing=0.02, disable=disable)
+        return self._bar
+
+    def _kernels(self, case: Case) -> list[tuple[str, str]]:
+        return [(q, name) for q in case.query_names for name in (FLOOR, *self.plan.takers(case, q))]
+
+    def _in_passes(self, case: Case) -> list[str]:
+        found = [c.name for c in self.plan.candidates if c.in_passes and c.name in case.candidates]
+        return found if case.passes is not None else []
+
+    def _tick(self) -> None:
+        self._bar.update(1)
+        if self.stop.is_set():
+            raise Stopped
+
+    def jobs(self) -> None:
+        """Each has a progress bar of its own."""
+        plan, done = self.plan, self.store.data["jobs"]
+        folder = None
+        if self.store.folder is not None and plan.jobs:
+            folder = models_folder(self.store.folder, plan.study, plan.jobs_fingerprint)
+        for i, job in enumerate(plan.jobs):
+            record = job.known(folder, done.get(job.name))
+            if record is None:
+                if self.progress:
+                    print(f"{i + 1} of {len(plan.jobs)}: {job.name}", file=sys.stderr)
+                record = job.run(folder, self.progress)
+            if record is not None:
+                done[job.name] = record
+                self.store.save()
+            if record is None or self.stop.is_set():
+                raise Stopped
+
+    def errors(self) -> None:
+        done = self.store.data["errors"]
+        for candidate in self.plan.candidates:
+            if candidate.errors is None:
+                continue
+            if candidate.name not in done:
+                done[candidate.name] = candidate.errors(self.settings.samples)
+                self.store.save(5)
+            self._tick()
+
+    def queries(self, case: Case) -> None:
+        """Count, which compiles, then time in rounds."""
+        own = {c.name: c.operations for c in self.plan.candidates}
+        operations = self.store.data["operations"].setdefault(case.name, {})
+        times = self.store.data["queries"].setdefault(case.name, [])
+        if len(times) >= self.settings.rounds:
+            self._bar.update(len(self._kernels(case)) * (1 + self.settings.rounds))
+            return
+        functions = case.queries(self.settings.lanes)
+        flat = {(q, name): functions[q][name] for q, name in self._kernels(case)}
+        for (query, name), function in flat.items():
+            counted = operations.setdefault(query, {})
+            if name not in counted:
+                found = count_query(function)
+                counted[name] = (own[name](query) if own.get(name) else found).asdict()
+            self._tick()
+
+        def seconds(key) -> float:
+            return timed(lambda: total(flat[key]())[0]).seconds
+
+        self._rounds(times, list(flat), self.settings.rounds, seconds)
+
+    def passes(self, case: Case) -> None:
+        """Whole jobs, the first of each to compile it."""
+        names = self._in_passes(case)
+        times = self.store.data["passes"].setdefault(case.name, [])
+        if len(times) >= self.settings.passes:
+            self._bar.update(len(names) * (1 + self.settings.passes))
+            return
+        functions = case.passes()
+        for name in names:
+            timed(lambda f=functions[name]: f(0))
+            self._tick()
+
+        def seconds(key) -> float:
+            found = timed(lambda: functions[key[1]](1 + len(times)))
+            extra[key[1]] = found.seconds_wall
+            return found.seconds
+
+        extra: dict[str, float] = {}
+        self._rounds(times, [(PASS, name) for name in names], self.settings.passes, seconds, extra)
+
+    def _rounds(self, times: list, keys: list, number: int, seconds, walls: dict | None = None) -> None:
+        """Append what is missing to ``times``: of each round, query → name → seconds; every other one backwards."""
+        self._bar.update(len(keys) * len(times))
+        while len(times) < number:
+            found: dict[str, dict[str, float]] = {}
+            for key in keys if len(times) % 2 == 0 else reversed(keys):
+                found.setdefault(key[0], {})[key[1]] = seconds(key)
+                self._tick()
+            if walls:
+                found[PASS_WALL] = dict(walls)
+            times.append(found)
+            self.store.save(5)
+
+
+# -- the result -------------------------------------------------------------------------------------------------------
+
+
+def _assemble(plan: Plan, cases: list[Case], settings: Settings, data: dict) -> dict:
+    candidates, records = {}, data["jobs"]
+    for c in plan.candidates:
+        record = records.get(c.job, {})
+        if c.job and not record and c.errors is None:
+            continue  # not made yet
+        candidates[c.name] = {
+            **{k: getattr(c, k) for k in ("representation", "setting", "job", "is_truth", "is_reference", "competes")},
+            **{"label": c.label or c.name, "in_picture": c.in_picture, "note": c.note},
+            "bytes": record.get("bytes", c.bytes),
+            "training_seconds": record.get("seconds") if c.job else c.training_seconds,
+            "converged": record.get("converged"),
+            "details": {**c.details, **record.get("details", {})},
+            "errors": {**record.get("errors", {}), **data["errors"].get(c.name, {})},
+        }
+    found_cases = {}
+    for case in cases:
+        rounds, passes = data["queries"].get(case.name, []), data["passes"].get(case.name, [])
+        if not rounds:
+            continue
+        found = {"details": case.details, "in_picture": case.in_picture, "queries": {}, "passes": {}, "ratios": {}}
+        for query in case.query_names:
+            ns = _by_name(rounds, query, 1e9 / settings.lanes)
+            floor = spread(ns.pop(FLOOR))["median"]
+            counted = data["operations"][case.name][query]
+            found["queries"][query] = {
+                name: timing(values, floor) | {"operations": counted[name]} for name, values in ns.items()
+            }
+            _mark_front(found["queries"][query], candidates, plan.accuracy)
+            found["ratios"][query] = _ratios(plan.ratios, ns, floor)
+        for kind in (PASS, PASS_WALL) if passes else ():
+            ms = _by_name(passes, kind, 1e3)
+            found["passes"][kind] = {name: timing(values) for name, values in ms.items()}
+            found["ratios"][kind] = _ratios(plan.ratios, ms, 0.0)
+        found_cases[case.name] = found
+    return {"candidates": candidates, "cases": found_cases, "jobs": records}
+
+
+def _by_name(rounds: list[dict], query: str, scale: float) -> dict[str, list[float]]:
+    """In the order of the first round, which is that of the plan."""
+    return {name: [r[query][name] * scale for r in rounds] for name in rounds[0][query]}
+
+
+def _mark_front(timings: dict, candidates: dict, accuracy: str) -> None:
+    """Set ``on_front``, ``None`` for what is not in competition, as references and the truth."""
+    competing = {
+        name: (math.log(max(timings[name]["time"], 1e-6)), -c["errors"][accuracy])
+        for name, c in candidates.items()
+        if name in timings and accuracy in c["errors"] and in_competition(c)
+    }
+    front = dict(zip(competing, pareto(list(competing.values()), (math.log(SAME_TIME), 0)), strict=True))
+    for name in timings:
+        timings[name]["on_front"] = front.get(name)
+
+
+def in_competition(candidate: dict) -> bool:
+    """May a candidate of a result be on the Pareto front?"""
+    return candidate["competes"] and not (candidate["is_reference"] or candidate["is_truth"])
+
+
+def _ratios(pairs: list[tuple[str, str]], values: dict[str, list[float]], floor: float) -> dict:
+    return {f"{a} / {b}": ratio(values[a], values[b], floor) for a, b in pairs if a in values and b in values}

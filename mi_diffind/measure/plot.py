@@ -1,0 +1,336 @@
+"""
+Pictures of measurements that can be printed: panels of accuracy against time or bytes, with labelled points, the Pareto
+front and a caption; courses of trainings; and what other pictures need of that: sheets, logarithmic ticks, labels.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import textwrap
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..files import replacing
+
+#: Colour and marker of each representation, in the order in which they appear: told apart also without colour.
+STYLES = (
+    ("#b2182b", "o"),
+    ("#2166ac", "s"),
+    ("#c47a00", "D"),
+    ("#1b7837", "^"),
+    ("#762a83", "v"),
+    ("#4d4d4d", "P"),
+    ("#12908e", "X"),
+)
+
+#: Points (1/72 inch) from an anchor to the nearest edge of its label that are tried.
+RADII = (6, 9, 12, 18, 26, 36, 48, 62, 80)
+
+#: From so many points on, a thin line leads from an anchor to its label.
+_LEADER = 12
+
+
+@dataclass(frozen=True)
+class Point:
+    """A candidate: its time (median and quartiles), its accuracy, and whether it is on the Pareto front."""
+
+    name: str
+    time: float
+    q1: float
+    q3: float
+    accuracy: float
+    representation: str
+    on_front: bool
+
+
+@dataclass(frozen=True)
+class Line:
+    """Something without an error to show: the time of the truth itself, or of a reference."""
+
+    name: str
+    time: float
+    is_truth: bool
+
+
+@dataclass(frozen=True)
+class Panel:
+    title: str
+    x_label: str
+    points: Sequence[Point]
+    lines: Sequence[Line]
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text to be placed near ``at`` (data coordinates), best at ``angle`` from the right; ``radii`` are in points."""
+
+    text: str
+    at: tuple[float, float]
+    colour: str
+    weight: str = "normal"
+    radii: Sequence[float] = RADII
+    angle: float = 0.0
+
+
+# -- sheets -----------------------------------------------------------------------------------------------------------
+
+
+def sheet(title: str, caption: str, width: float, height: float, above: float = 0.3, dpi: int = 200):
+    """
+    A Matplotlib figure of ``width`` × ``height`` inches for axes, ``above`` which is the title and below which is the
+    caption; its layout is constrained until :func:`fix`.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    text = "\n".join(textwrap.wrap(caption, int(17.3 * width)))
+    below = 0.16 * (text.count("\n") + 1) + 0.15
+    found = Figure(figsize=(width, height + above + below), dpi=dpi, layout="constrained")
+    FigureCanvasAgg(found)
+    whole = found.get_figheight()
+    found.get_layout_engine().set(rect=(0, below / whole, 1, 1 - (above + below) / whole), w_pad=0.08, h_pad=0.08)
+    found.text(0.5, 1 - 0.08 / whole, title, fontsize=12, fontweight="bold", ha="center", va="top")
+    found.text(0.012, 0.06 / whole, text, fontsize=7.5, va="bottom", ha="left", color="0.25")
+    return found
+
+
+def fix(sheet) -> None:
+    """Fix the layout, in which labels are placed."""
+    sheet.draw_without_rendering()
+    sheet.set_layout_engine("none")
+
+
+def save(sheet, path: str | os.PathLike) -> None:
+    """Write ``path`` (``.png``). Raises :class:`~mi_diffind.files.OutputError`."""
+    with replacing(path) as temporary:
+        sheet.savefig(temporary, format=Path(path).suffix[1:])
+
+
+def log_ticks(axis, low: float, high: float, shown: Callable[[float], str]) -> None:
+    """Ticks of a logarithmic axis from ``low`` to ``high``, as many as there is room for."""
+    decades = math.log10(high / low)
+    fine: Sequence[float] = (1, *np.arange(1.2, 9.8, 0.4))
+    for limit, ticks in ((0.6, (1, 1.5, 2, 3, 4, 5, 7)), (1.1, (1, 2, 5)), (2.5, (1, 3)), (4, (1,))):
+        fine = ticks if decades > limit else fine
+    axis.set_ticks([m * 10.0**e for e in range(-12, 12) for m in fine if low <= m * 10.0**e <= high])
+    axis.set_major_formatter(lambda value, _: shown(value))
+    axis.set_minor_formatter(lambda value, _: "")
+
+
+def plain(value: float) -> str:
+    """A number at a tick."""
+    return f"{value:,.0f}" if value >= 1000 else f"{value:g}"
+
+
+# -- accuracy against time --------------------------------------------------------------------------------------------
+
+
+def draw(title: str, panels: Sequence[Panel], y_label: str, caption: str):
+    """
+    A Matplotlib figure with up to two panels a row, and with time or bytes on a logarithmic axis (accuracies in dB are
+    logarithms already). If there are several representations, a legend names them.
+    """
+    from matplotlib.lines import Line2D
+
+    columns = min(2, len(panels))
+    rows = -(-len(panels) // columns)
+    styles: dict[str, tuple[str, str]] = {}
+    for point in (x for panel in panels for x in panel.points):
+        styles.setdefault(point.representation, STYLES[len(styles) % len(STYLES)])
+    found = sheet(title, caption, 6.4 * columns, 4.6 * rows, 0.55 if len(styles) > 1 else 0.3)
+    if len(styles) > 1:
+        shown = [
+            Line2D([], [], color=colour, marker=marker, linestyle="none", markersize=6.5, label=name)
+            for name, (colour, marker) in styles.items()
+        ]
+        legend = found.legend(handles=shown, loc="upper center", fontsize=8.5, frameon=False, ncols=len(shown),
+                              bbox_to_anchor=(0.5, 1 - 0.24 / found.get_figheight()))  # fmt: skip
+        legend.set_in_layout(False)
+    accuracies = [x.accuracy for p in panels for x in p.points]
+    for k, panel in enumerate(panels):
+        axes = found.add_subplot(rows, columns, k + 1)
+        _draw(axes, panel, styles, accuracies)
+        axes.set_title(panel.title, fontsize=10)
+        axes.set_xlabel(panel.x_label, fontsize=9)
+        axes.set_ylabel(y_label, fontsize=9)
+    fix(found)
+    for axes, panel in zip(found.axes, panels, strict=True):
+        _label(axes, panel, styles)
+    return found
+
+
+def _draw(axes, panel: Panel, styles: dict, accuracies: list) -> None:
+    """All but the labels."""
+    axes.set_xscale("log")
+    times = [x.time for x in (*panel.points, *panel.lines)] or [1.0]
+    room = (max(times) / min(times)) ** 0.12 * 1.25  # for labels beside points
+    low, high = min(times) / room, max(times) * room
+    axes.set_xlim(low, high)
+    bottom, top = (min(accuracies), max(accuracies)) if accuracies else (0, 100)
+    margin = max(0.08 * (top - bottom), 2)
+    axes.set_ylim(bottom - 1.2 * margin, top + 2.2 * margin)
+    log_ticks(axes.xaxis, low, high, plain)
+    axes.tick_params(labelsize=8)
+    axes.grid(which="major", color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    front = sorted((p for p in panel.points if p.on_front), key=lambda p: p.time)
+    if front:
+        xs, ys = [front[0].time], [axes.get_ylim()[0]]
+        for p, following in zip(front, [*front[1:], None], strict=False):
+            xs += [p.time, axes.get_xlim()[1] if following is None else following.time]
+            ys += [p.accuracy, p.accuracy]
+        axes.plot(xs, ys, color="0.35", linewidth=1.0, zorder=2)
+        axes.annotate("Pareto front", (1, front[-1].accuracy), (-4, -3), xycoords=axes.get_yaxis_transform(),
+                      textcoords="offset points", fontsize=7, color="0.35", ha="right", va="top")  # fmt: skip
+        axes.fill_between(xs, ys, axes.get_ylim()[0], color="0.5", alpha=0.05, linewidth=0, zorder=1)
+    for line in panel.lines:
+        axes.axvline(line.time, color="0.1" if line.is_truth else "0.55", linewidth=1.0,
+                     linestyle=(0, (5, 2)) if line.is_truth else (0, (1, 1.5)), zorder=2)  # fmt: skip
+    for p in panel.points:
+        colour, marker = styles[p.representation]
+        error = [[max(p.time - max(p.q1, 1e-6), 0)], [max(p.q3 - p.time, 0)]]
+        axes.errorbar(p.time, p.accuracy, xerr=error, fmt=marker, color=colour, ecolor=colour, elinewidth=0.9,
+                      markersize=6.5, markerfacecolor=colour if p.on_front else "white", markeredgewidth=1.3,
+                      capsize=2, zorder=3)  # fmt: skip
+
+
+def _label(axes, panel: Panel, styles: dict) -> None:
+    """Name lines at the top, and points: first those on the front."""
+    labels = []
+    at_top = (axes.bbox.x0, axes.bbox.y1 - 9 * axes.figure.dpi / 72)
+    height = axes.transData.inverted().transform(at_top)[1]
+    for line in panel.lines:
+        colour = "0.1" if line.is_truth else "0.4"
+        if line.is_truth:
+            axes.plot([line.time], [1.0], marker="*", color=colour, markersize=9, clip_on=False, zorder=4,
+                      transform=axes.get_xaxis_transform())  # fmt: skip
+        text = f"{line.name} (exact)" if line.is_truth else line.name
+        labels.append(Label(text, (line.time, height), colour, radii=(4, 8, 12, 20, 30, 40, 52)))
+    for p in sorted(panel.points, key=lambda p: (not p.on_front, -p.accuracy, p.time)):
+        weight = "bold" if p.on_front else "normal"
+        labels.append(Label(p.name, (p.time, p.accuracy), styles[p.representation][0], weight))
+    spans = [((max(p.q1, 1e-6), p.accuracy), (p.q3, p.accuracy)) for p in panel.points]
+    place(axes, labels, [(p.time, p.accuracy) for p in panel.points], spans)
+
+
+# -- labels -----------------------------------------------------------------------------------------------------------
+
+
+def place(
+    axes,
+    labels: Iterable[Label],
+    points: Sequence[tuple[float, float]],
+    spans: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
+) -> None:
+    """
+    Write each label near its anchor, in this order, where it covers neither another text, nor one of ``points`` or
+    ``spans`` (pairs of ends; data coordinates), and if possible no line; a thin line leads to one that is away. The
+    layout must be fixed (:func:`fix`). Packages that do this move labels by forces for as long as there is time: the
+    picture would depend on the speed of the machine.
+    """
+    renderer, scale = axes.figure.canvas.get_renderer(), axes.figure.dpi / 72
+    inside = axes.get_window_extent(renderer).extents[None]
+    pixels = axes.transData.transform
+    # Boxes in pixels, as rows of left, bottom, right, top
+    texts = [*axes.texts, *([axes.get_legend()] if axes.get_legend() else [])]
+    hard = [text.get_window_extent(renderer).extents for text in texts]
+    hard += [np.tile(pixels(p), 2) + 5 * scale * _OUT for p in points]
+    hard += [np.concatenate([pixels(a), pixels(b)]) + 2 * _OUT for a, b in spans]
+    soft = _boxes([box for line in axes.lines for box in _chain(line, scale)])
+    hard, placed = _boxes(hard), _boxes([])
+    for label in labels:
+        note = axes.annotate(label.text, label.at, xytext=(0, 0), textcoords="offset points", fontsize=8, ha="center",
+                             va="center", color=label.colour, fontweight=label.weight, zorder=5,
+                             bbox={"boxstyle": "square,pad=0.1", "fc": "w", "ec": "none", "alpha": 0.8})  # fmt: skip
+        extent = note.get_window_extent(renderer)
+        size = np.array([extent.width + 3 * scale, extent.height + 1.5 * scale])
+        start = pixels(label.at)
+        others = np.reshape([pixels(p) for p in points if tuple(p) != tuple(label.at)], (-1, 2))
+        best = None
+        for radius in label.radii:
+            for k in range(16):
+                turn = (k + 1) // 2
+                angle = label.angle + 2 * math.pi * turn * (-1) ** k / 16
+                offset = (radius * scale + size / 2) * [math.cos(angle), math.sin(angle)]
+                box = np.concatenate([start + offset - size / 2, start + offset + size / 2])
+                cost = 50 * (size.prod() - _overlap(box, inside)) + (radius + turn / 4) * scale
+                cost += 30 * (_overlap(box, hard) + _overlap(box, placed)) + 20 * _overlap(box, soft)
+                # Whose label it is has to be plain: no other point nearer, nothing across the line that leads to it
+                end = np.clip(start, box[:2], box[2:])
+                nearer = math.dist(start, end) + 4 * scale - _distances(others, box)
+                cost += 30 * np.maximum(nearer, 0).sum() / scale
+                if radius > _LEADER:
+                    way = start + np.linspace(0, 1, 21)[:, None] * (end - start)
+                    cost += 300 * sum((_distances(way, other) == 0).any() for other in placed)
+                    cost += 300 * sum((np.hypot(*(way - o).T) < 6 * scale).any() for o in others)
+                if best is None or cost < best[0]:
+                    best = (cost, offset, box, end, radius)
+        _, offset, box, end, radius = best
+        note.set_position(offset / scale)
+        if radius > _LEADER:
+            ends = axes.transData.inverted().transform([start, end])
+            axes.plot(*ends.T, color=label.colour, linewidth=0.5, zorder=2.5)
+        placed = np.vstack([placed, box])
+
+
+_OUT = np.array([-1, -1, 1, 1])
+
+
+def _boxes(found: list) -> np.ndarray:
+    return np.reshape(np.array(found, dtype=float), (-1, 4))
+
+
+def _chain(line, scale: float):
+    """Small boxes along a line."""
+    pixels = line.get_transform().transform(np.column_stack([np.asarray(v, dtype=float) for v in line.get_data()]))
+    for a, b in zip(pixels, [*pixels[1:], pixels[-1]], strict=True):
+        if np.isfinite([*a, *b]).all():
+            for t in np.linspace(0, 1, 1 + max(1, min(400, math.ceil(math.dist(a, b) / (3 * scale))))):
+                yield np.tile(a + t * (b - a), 2) + scale * _OUT
+
+
+def _overlap(box: np.ndarray, boxes: np.ndarray) -> float:
+    """The area that a box shares with each of others, in sum."""
+    sides = np.minimum(box[2:], boxes[:, 2:]) - np.maximum(box[:2], boxes[:, :2])
+    return float(np.maximum(sides, 0).prod(axis=1).sum())
+
+
+def _distances(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """How far points are from a box."""
+    return np.hypot(*(points - np.clip(points, box[:2], box[2:])).T)
+
+
+# -- courses of trainings ---------------------------------------------------------------------------------------------
+
+
+def draw_courses(title: str, records: dict[str, dict], caption: str):
+    """
+    The courses of trainings (records of :class:`.training.Training`): PSNR over steps, one panel each, every run a
+    line, from the shortest (light) to the longest (dark); what has not converged is marked.
+    """
+    columns = min(5, len(records))
+    rows = -(-len(records) // columns)
+    about = "PSNR in dB over training steps; each line is a run of its own, twice as long as that before."
+    found = sheet(title, f"{about} {caption}", 2.6 * columns, 1.9 * rows, 0.4, 160)
+    for k, (name, record) in enumerate(records.items()):
+        axes = found.add_subplot(rows, columns, k + 1)
+        runs = record["runs"]
+        for i, run in enumerate(runs):
+            shade = str(0.75 * (1 - (i + 1) / len(runs)))
+            axes.plot(run["curve_steps"], run["curve_psnr_db"], color=shade, linewidth=1.1)
+        gain = "" if record["gain_db"] is None else f", last doubling {record['gain_db']:+.1f} dB"
+        state = "converged" if record["converged"] else "NOT converged"
+        axes.set_title(f"{name}: {record['psnr_db']:.1f} dB\n{state}{gain}", fontsize=7.5,
+                       color="0.1" if record["converged"] else "#b2182b")  # fmt: skip
+        axes.set_xscale("log")
+        top = max(v for run in runs for v in run["curve_psnr_db"])
+        axes.set_ylim(top - 20, top + 2)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.xaxis.set_minor_formatter(lambda value, _: "")
+        axes.tick_params(labelsize=6.5)
+        axes.grid(color="0.92", linewidth=0.5)
+    return found

@@ -1,0 +1,229 @@
+"""What was measured, for people: tables, pictures, lines of text; and the files of a study, named after it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Callable, Iterable
+
+from ..files import replacing, writable_folder, write_json
+from . import plot
+from .frame import PASS, in_competition
+from .statistics import finite, pareto
+from .store import Store
+from .study import Plan
+from .words import machine_line, ratio_cell, state, time_cell
+
+#: Columns of the table, before those of the errors and of the candidates' details.
+COLUMNS = (
+    *("task", "case", "query", "candidate", "representation", "setting"),
+    *("unit", "time", "time_q1", "time_q3", "time_with_floor", "floor", "hidden", "rounds"),
+    *("reads", "bytes_gathered", "add", "mul", "div", "sqrt", "log", "flops", "instructions"),
+    *("bytes", "training_seconds", "converged", "on_front", "note"),
+)
+
+#: What accuracy may be drawn against beside time: the label of the axis, and of the panel.
+QUANTITIES = {"bytes": ("bytes", "bytes"), "training_seconds": ("seconds of training", "training")}
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def write_files(
+    name: str,
+    folder: str | os.PathLike,
+    result: dict,
+    rows: list[dict],
+    columns: Iterable[str],
+    pictures: dict[str, Callable[[], object]],
+) -> dict[str, str]:
+    """
+    Write ``tradeoff_NAME.csv`` (``rows``), ``.json`` (``result``), and ``pictures``, functions that draw a Matplotlib
+    figure: ``"png"`` (``tradeoff_NAME.png``) or another KIND (``tradeoff_NAME_KIND.png``). Of a run that is complete,
+    nothing else stays in ``folder`` but trained models. Returns the paths. Raises
+    :class:`~mi_diffind.files.OutputError`.
+    """
+    folder = writable_folder(folder, create=True)
+    start = str(folder / f"tradeoff_{name}")
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    with replacing(f"{start}.csv") as temporary:
+        temporary.write_text(text.getvalue(), encoding="utf-8")
+    write_json(f"{start}.json", finite(result))
+    paths = {"csv": f"{start}.csv", "json": f"{start}.json"}
+    for kind, draw in pictures.items():
+        paths[kind] = f"{start}.png" if kind == "png" else f"{start}_{kind}.png"
+        plot.save(draw(), paths[kind])
+    if not result["interrupted"]:
+        Store.remove(folder, name)
+    return paths
+
+
+def publish(result: dict, paths: dict[str, str], lines: list[str]) -> dict:
+    """Print ``lines`` and ``paths``; returns the result, ready for JSON, with its ``files``."""
+    print("\n".join(lines))
+    print("\nwritten     " + ", ".join(paths.values()))
+    return {**finite(result), "files": paths}
+
+
+def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
+    """
+    :func:`write_files` of a result of :func:`.frame.measure`: the table (:func:`rows`), the picture, if there is
+    anything to draw, and the courses of trainings, if there were any.
+    """
+    table, pictures = rows(result), {}
+    courses = {name: record for name, record in result["jobs"].items() if "runs" in record}
+    found = panels(result)
+    if found:
+        pictures["png"] = lambda: plot.draw(result["title"], found, result["accuracy_label"], caption(result))
+    if courses:
+        title = f"{result['title']}: training"
+        pictures["training"] = lambda: plot.draw_courses(title, courses, machine_line(result))
+    names = dict.fromkeys(name for row in table for name in row if name not in COLUMNS)
+    return write_files(result["task"], folder, result, table, (*COLUMNS, *names), pictures)
+
+
+def rows(result: dict) -> list[dict]:
+    """
+    The result as a table: one row for each case, query (or whole pass) and candidate, and one for each candidate that
+    is in no case; with the columns :data:`COLUMNS`, one for each error and one for each number or text among the
+    details of candidates. ``time`` is in ``unit``, floor subtracted (``hidden``: it is only what the time is below);
+    what does not apply is missing.
+    """
+    found, timed = [], set()
+    for case, measured in result["cases"].items():
+        for query, timings in {**measured["queries"], **measured["passes"]}.items():
+            whole = query in measured["passes"]
+            for name, t in timings.items():
+                operations = dict(t.get("operations", {}))
+                if operations:
+                    operations = {"reads": operations.pop("gathers"), **operations}
+                timed.add(name)
+                found.append({
+                    **{"task": result["task"], "case": case, "query": query, **_candidate_cells(result, name)},
+                    "unit": "ms a pass" if whole else "ns",
+                    **{"time": t["time"], "time_q1": t["q1"], "time_q3": t["q3"], "time_with_floor": t["with_floor"]},
+                    "floor": None if whole else t["floor"],
+                    **{k: t[k] for k in ("hidden", "rounds")},
+                    "on_front": t.get("on_front"),
+                    **operations,
+                })  # fmt: skip
+    others = [name for name in result["candidates"] if name not in timed]
+    return found + [{"task": result["task"], **_candidate_cells(result, name)} for name in others]
+
+
+def _candidate_cells(result: dict, name: str) -> dict:
+    c = result["candidates"][name]
+    cells = {k: c[k] for k in ("representation", "setting", "bytes", "note", "training_seconds", "converged")}
+    details = {k: v for k, v in c["details"].items() if isinstance(v, (int, float, str))}
+    return {"candidate": name, **cells, **c["errors"], **details}
+
+
+# -- the picture ------------------------------------------------------------------------------------------------------
+
+
+def panels(result: dict) -> list[plot.Panel]:
+    """
+    Accuracy against the quantities asked for, of all candidates, then against time of the first query, one panel a
+    case: candidates labelled, quartiles as bars, the Pareto front drawn, references as vertical lines.
+    """
+    candidates = list(result["candidates"].values())
+    found = [_against(quantity, candidates, result, QUANTITIES[quantity][1]) for quantity in result["panels"]]
+    for case, measured in result["cases"].items():
+        if not measured["in_picture"]:
+            continue
+        query, timings = next(iter(measured["queries"].items()))
+        points, lines = [], []
+        for name, t in timings.items():
+            c = result["candidates"][name]
+            if c["is_truth"] or c["is_reference"]:
+                label = f"{c['label']}, below {t['time']:.2g} ns" if t["hidden"] else c["label"]
+                lines.append(plot.Line(label, t["time"], c["is_truth"]))
+            elif result["accuracy"] in c["errors"]:
+                points.append(_point(c, result, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
+        found.append(plot.Panel(case, f"time of one {query}, ns", points, lines))
+        if result["bytes_by_case"]:
+            found.append(_against("bytes", [result["candidates"][name] for name in timings], result, case))
+    return [panel for panel in found if panel.points or panel.lines]
+
+
+def _point(c: dict, result: dict, x: float, low: float, high: float, on_front: bool) -> plot.Point:
+    return plot.Point(c["label"], x, low, high, c["errors"][result["accuracy"]], c["representation"], on_front)
+
+
+def _against(quantity: str, candidates: list[dict], result: dict, title: str) -> plot.Panel:
+    """A panel of what differs in accuracy or in ``quantity`` only: two forms of one thing are one point."""
+    distinct: dict[tuple, dict] = {}
+    for c in candidates:
+        accuracy = c["errors"].get(result["accuracy"])
+        if accuracy is not None and not (c["is_truth"] or c["is_reference"]) and c["in_picture"] and c[quantity]:
+            distinct.setdefault((c[quantity], c["job"] or accuracy), c)
+    values = [
+        (math.log(c[quantity]), -c["errors"][result["accuracy"]]) if in_competition(c) else (math.nan, math.nan)
+        for c in distinct.values()
+    ]
+    points = [
+        _point(c, result, *[c[quantity]] * 3, on_front)
+        for c, on_front in zip(distinct.values(), pareto(values), strict=True)
+    ]
+    return plot.Panel(title, QUANTITIES[quantity][0], points, [])
+
+
+def caption(result: dict) -> str:
+    """What the figures were measured on and how, as one paragraph."""
+    s, made = result["settings"], result["jobs"]
+    sampled = any(c["errors"] and "errors" not in made.get(c["job"], {}) for c in result["candidates"].values())
+    errors = f"; errors from {s['samples']:,} samples" if sampled else ""
+    return " ".join([
+        *result["notes"],
+        f"{machine_line(result)} Medians and quartiles of {s['rounds']} interleaved rounds of {s['lanes']:,} lanes on "
+        f"all cores, input and output (the floor) subtracted{errors}.{state(result)}",
+    ])  # fmt: skip
+
+
+# -- lines of text ----------------------------------------------------------------------------------------------------
+
+
+def summary(result: dict, plan: Plan | None = None) -> list[str]:
+    """The result as lines of text: the plan's own table, times, ratios, and the plan's conclusions."""
+    lines = list(plan.table(result)) if plan else []
+    width = max(map(len, result["candidates"]), default=0) + 2
+    for case, measured in result["cases"].items():
+        queries, passes = measured["queries"], measured["passes"]
+        floors = ", ".join(f"{q} {next(iter(t.values()))['floor']:.2f}" for q, t in queries.items())
+        lines += ["", f"{case}: ns each, floor subtracted ({floors}); ± half the interquartile range"]
+        header = "".join(f"{q:>16}" for q in queries)
+        header += f"{'flops':>8}{'reads':>7}" + (f"{'ms ' + PASS:>18}" if passes else "")
+        lines.append(f"  {'':{width}}{header}{'bytes':>12}{'accuracy':>11}")
+        first = next(iter(queries.values()))
+        for name, t in first.items():
+            c = result["candidates"][name]
+            cells = "".join(f"{time_cell(timings.get(name)):>16}" for timings in queries.values())
+            cells += f"{t['operations']['flops']:>8}{t['operations']['gathers']:>7}"
+            if passes:
+                cells += f"{time_cell(passes[PASS].get(name), 1):>18}"
+            accuracy = c["errors"].get(result["accuracy"])
+            shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
+            marks = " *" * bool(t["on_front"]) + " not converged" * (c["converged"] is False)
+            lines.append(f"  {name:{width}}{cells}{c['bytes']:>12,}{shown:>11}{marks}")
+    if result["cases"]:
+        query = next(iter(queries))
+        lines.append(f"  (* on the Pareto front of accuracy and {query}; flops and reads are those of {query})")
+    notes = [f"  {name}: {c['note']}" for name, c in result["candidates"].items() if c["note"]]
+    lines += ["", *notes] if notes else []
+    for case, measured in result["cases"].items():
+        ratios = measured["ratios"]
+        pairs = dict.fromkeys(pair for found in ratios.values() for pair in found)
+        if pairs:
+            width = max(map(len, pairs)) + 2
+            lines += ["", f"{case}: ratios, medians of the rounds, floor subtracted [with the floor]"]
+            lines.append(f"  {'':{width}}" + "".join(f"{query:>22}" for query in ratios))
+        for pair in pairs:
+            cells = [ratio_cell(found.get(pair), query in measured["queries"]) for query, found in ratios.items()]
+            lines.append(f"  {pair:{width}}" + "".join(f"{cell:>22}" for cell in cells))
+    lines += ["", *result["conclusions"]] if result["conclusions"] else []
+    return [*lines, "", caption(result)]

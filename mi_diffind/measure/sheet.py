@@ -1,0 +1,64 @@
+"""Several pictures on one sheet: images, maps with a colour bar and lines of text, in a grid."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .. import metrics
+from ..files import replacing
+
+#: What draws one cell: a function of a Matplotlib figure and of the axes of the cell.
+Cell = Callable[[object, object], None]
+
+
+def picture(title: str, image: np.ndarray) -> Cell:
+    """A linear image, ``(height, width, 3)`` or ``(height, width, 1)``, as displayed."""
+
+    def draw(sheet, axes):
+        axes.imshow(metrics.srgb(np.repeat(image, 3, -1) if image.shape[-1] == 1 else image))
+        axes.set_title(title)
+
+    return draw
+
+
+def colour_map(title: str, values: np.ndarray, extend: str = "neither", **options) -> Cell:
+    """Values, ``(height, width)``, with a colour bar; ``options`` are those of Matplotlib's ``imshow``."""
+
+    def draw(sheet, axes):
+        shown = axes.imshow(values, **options)
+        axes.set_title(title)
+        sheet.colorbar(shown, ax=axes, extend=extend, shrink=0.9)
+
+    return draw
+
+
+def text(lines: Sequence[str]) -> Cell:
+    """Lines of text."""
+
+    def draw(sheet, axes):
+        axes.text(0.02, 0.95, "\n".join(lines), va="top", family="monospace", fontsize=12, transform=axes.transAxes)
+
+    return draw
+
+
+def write(path: str | os.PathLike, cells: Sequence[Cell], columns: int, shape: Sequence[int]) -> None:
+    """
+    Draw ``cells`` row by row, seven inches wide each, ``shape`` (height, width, …) being that of the pictures, and
+    write ``path`` (``.png``). Raises :class:`~mi_diffind.files.OutputError`.
+    """
+    from matplotlib.figure import Figure
+
+    rows = -(-len(cells) // columns)
+    size = (7 * columns, rows * (7 * shape[0] / shape[1] + 0.35))
+    sheet = Figure(figsize=size, dpi=110, layout="constrained")
+    grid = list(sheet.subplots(rows, columns, squeeze=False).flat)
+    for axes in grid:
+        axes.set_axis_off()
+    for cell, axes in zip(cells, grid, strict=False):
+        cell(sheet, axes)
+    with replacing(path) as temporary:
+        sheet.savefig(temporary, format=Path(path).suffix[1:])

@@ -1,0 +1,1 @@
+"""What learned tables are compared with: codecs of images, and networks."""

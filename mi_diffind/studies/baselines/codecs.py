@@ -1,0 +1,410 @@
+"""
+What learned textures are compared with: thin layers over maintained codecs, each of which is optional.
+
+An image is float32, ``(height, width, channels)`` with 1 to 4 channels and values in [0, 1], and is rounded to 8 bits
+first. What is decoded are the stored values, without any transfer function; errors are meant to be measured of these.
+Sizes that blocks do not divide are padded by repeating the edge and cropped after; the padded blocks count. All
+functions raise ``ValueError`` for another image and :class:`CodecError` if a package is missing.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import io
+import itertools
+import math
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+#: The 2D block sizes of ASTC, width × height, from the finest on, and their bits per texel.
+ASTC_BLOCKS = {
+    f"{w}x{h}": 128 / (w * h)
+    for w, h in (
+        *((4, 4), (5, 4), (5, 5), (6, 5), (6, 6), (8, 5), (8, 6)),
+        *((10, 5), (10, 6), (8, 8), (10, 8), (10, 10), (12, 10), (12, 12)),
+    )
+}
+#: Presets of the ASTC encoder, from the fastest on; a number from 0 to 100 will do as well.
+ASTC_QUALITIES = ("fastest", "fast", "medium", "thorough", "verythorough", "exhaustive")
+
+#: Codec → what pip installs, what is imported.
+_PACKAGES = {
+    "astc": (("astc-encoder-py", "astc_encoder"),),
+    "bc7": (("ispc_texcomp", "ispc_texcomp"), ("texture2ddecoder", "texture2ddecoder")),
+    "jpeg": (("pillow", "PIL.Image"),),
+    "webp": (("pillow", "PIL.Image"), ("pillow", "PIL._webp")),
+    "bicubic": (("pillow", "PIL.Image"),),
+}
+#: File format → its name, the longest side, the qualities, the options tried by :func:`at_bytes`.
+_FILES = {
+    "jpeg": ("JPEG", 65535, range(1, 101), ({"subsampling": "4:4:4"}, {"subsampling": "4:2:0"})),
+    "webp": ("WebP", 16383, range(0, 101), ({},)),
+}
+
+
+class CodecError(RuntimeError):
+    """A codec is not installed or cannot store an image; the message is one sentence."""
+
+
+@dataclass
+class Encoded:
+    """
+    An image after ``codec`` (e.g. ``"ASTC 8x8"``): the ``nbytes`` stored (payload of blocks and samples, whole files),
+    the decoded ``image`` (float32 in [0, 1], shape of the input), whether a texel can be read without decoding all of
+    them, and the ``seconds`` of encoding.
+    """
+
+    codec: str
+    nbytes: int
+    image: np.ndarray
+    random_access: bool
+    seconds: float
+
+
+def available() -> tuple[str, ...]:
+    """The codecs whose packages are installed, of ``astc``, ``bc7``, ``jpeg``, ``webp``, ``bicubic``."""
+    found = []
+    for codec in _PACKAGES:
+        try:
+            _modules(codec)
+        except CodecError:
+            continue
+        found.append(codec)
+    return tuple(found)
+
+
+def missing() -> list[str]:
+    """The names of the codecs that are not installed."""
+    return [{"bicubic": "bicubic scaling", "webp": "WebP"}.get(c, c.upper()) for c in _PACKAGES if c not in available()]
+
+
+def astc(
+    image: np.ndarray, block: str = "8x8", quality: str | float = "exhaustive", normal: bool = False, reduce: int = 1
+) -> Encoded:
+    """
+    ASTC, linear LDR profile, on one core (the package's threads do not run at once): one channel as luminance, two as
+    luminance and alpha with equal weights. ``block`` is one of :data:`ASTC_BLOCKS`, ``quality`` one of
+    :data:`ASTC_QUALITIES` or a number from 0 to 100.
+
+    ``normal``: of the three channels only x and y are stored, z is the square root of 1 - x² - y². ``reduce``: stored
+    at a width and height that many times smaller (rounded up), read with bicubic filtering.
+    """
+    (package,) = _modules("astc")
+    texels = _texels(image)
+    if block not in ASTC_BLOCKS:
+        raise ValueError(f'block: found "{block}", one of {", ".join(ASTC_BLOCKS)} is needed')
+    if isinstance(quality, str):
+        if quality not in ASTC_QUALITIES:
+            raise ValueError(f'quality: found "{quality}", one of {", ".join(ASTC_QUALITIES)} is needed')
+        quality = float(getattr(package.ASTCQualityPreset, quality.upper()))
+    if normal and texels.shape[2] != 3:
+        raise ValueError(f"image: found {texels.shape[2]} channels, a normal map has 3")
+    if reduce < 1:
+        raise ValueError(f"reduce: found {reduce}, at least 1 is needed")
+    if normal:
+        texels = texels[..., :2]
+    if reduce > 1:
+        texels = _rounded(_resized(texels / np.float32(255), *_reduced(texels.shape, reduce), "LANCZOS"))
+    height, width, channels = texels.shape
+    rgba = np.full((height, width, 4), 255, np.uint8)
+    rgba[..., :channels] = texels
+    stored, read = (("rrr1", [0]), ("rrrg", [0, 3]), ("rgb1", [0, 1, 2]), ("rgba", [0, 1, 2, 3]))[channels - 1]
+
+    context = _context(block, float(quality), channels == 2)
+    start = time.perf_counter()
+    source = package.ASTCImage(package.ASTCType.U8, width, height, 1, rgba.tobytes())
+    payload = context.compress(source, package.ASTCSwizzle.from_str(stored))
+    seconds = time.perf_counter() - start
+
+    target = package.ASTCImage(package.ASTCType.U8, width, height)
+    target = context.decompress(payload, target, package.ASTCSwizzle.from_str("rgba"))
+    decoded = np.frombuffer(target.data, np.uint8).reshape(height, width, 4)[..., read] / np.float32(255)
+    if reduce > 1:
+        decoded = _resized(decoded, *image.shape[:2], "BICUBIC")
+    if normal:
+        z = np.sqrt(np.maximum(0, 1 - np.sum((2 * decoded - 1) ** 2, -1, keepdims=True)))
+        decoded = np.concatenate([decoded, (z + 1) / 2], -1)
+    name = f"ASTC {block}{' xy' if normal else ''}{f' at 1/{reduce}' if reduce > 1 else ''}"
+    return Encoded(name, len(payload), np.ascontiguousarray(decoded, np.float32), True, seconds)
+
+
+@functools.lru_cache(maxsize=2 * len(ASTC_BLOCKS))
+def _context(block: str, quality: float, pair: bool):
+    """An ASTC encoder and decoder, which takes longer to make than a small image to encode."""
+    (package,) = _modules("astc")
+    flags = package.ASTCConfigFlags.USE_DECODE_UNORM8
+    if pair:
+        flags |= package.ASTCConfigFlags.MAP_NORMAL  # red and alpha weigh the same
+    size = map(int, block.split("x"))
+    return package.ASTCContext(package.ASTCConfig(package.ASTCProfile.LDR, *size, quality=quality, flags=int(flags)))
+
+
+def astc_bytes(shape: tuple[int, ...], block: str, reduce: int = 1) -> int:
+    """What :func:`astc` stores for an image of that shape, ``(height, width, ...)``."""
+    height, width = _reduced(shape, reduce)
+    w, h = map(int, block.split("x"))
+    return 16 * -(-width // w) * -(-height // h)
+
+
+def bc7(image: np.ndarray) -> Encoded:
+    """BC7 with the slowest preset: 16 bytes for 4×4 texels, one channel stored as grey, two as red and green."""
+    encoder, decoder = _modules("bc7")
+    texels = _texels(image)
+    height, width, channels = texels.shape
+    padded = np.pad(texels, ((0, -height % 4), (0, -width % 4), (0, 0)), "edge")
+    h, w = padded.shape[:2]
+    rgba = np.zeros((h, w, 4), np.uint8)
+    rgba[..., 3] = 255
+    rgba[..., : 3 if channels == 1 else channels] = padded
+
+    start = time.perf_counter()
+    settings = encoder.BC7EncSettings.from_profile("alpha_slow" if channels == 4 else "slow")
+    payload = encoder.compress_blocks_bc7(encoder.RGBASurface(rgba.tobytes(), w, h, 4 * w), settings)
+    seconds = time.perf_counter() - start
+
+    bgra = np.frombuffer(decoder.decode_bc7(payload, w, h), np.uint8).reshape(h, w, 4)
+    decoded = bgra[:height, :width, [2, 1, 0, 3][:channels]] / np.float32(255)
+    return Encoded("BC7", len(payload), np.ascontiguousarray(decoded), True, seconds)
+
+
+def jpeg(image: np.ndarray, quality: int, subsampling: str = "4:4:4") -> Encoded:
+    """
+    JPEG, progressive, Huffman tables optimised, ``quality`` from 1 to 100. Two channels are two files, four are one of
+    three channels and one of one; bytes add up.
+    """
+    return _files("jpeg", image, quality, progressive=True, optimize=True, subsampling=subsampling)
+
+
+def webp(image: np.ndarray, quality: int) -> Encoded:
+    """
+    Lossy WebP (which halves the resolution of colour), slowest method, ``quality`` from 0 to 100. Two channels are two
+    files, four are one of three channels and one of one; bytes add up.
+    """
+    return _files("webp", image, quality, method=6)
+
+
+def bicubic(image: np.ndarray, nbytes: int) -> Encoded:
+    """
+    The image at the highest resolution of the same aspect whose 8-bit samples fit into ``nbytes`` (1×1 if none does),
+    read with bicubic filtering. Downscaled by the antialiased Lanczos or bicubic filter, whichever errs less.
+    """
+    _modules("bicubic")
+    samples = _texels(image) / np.float32(255)
+    height, width, channels = samples.shape
+    start = time.perf_counter()
+    scales = np.unique(np.concatenate([np.arange(1, n + 1) / n for n in (height, width)]))
+    sizes = np.maximum(1, np.floor(np.outer(scales, (height, width)) + 1e-9)).astype(int)
+    fitting = sizes[sizes.prod(1) * channels <= nbytes]
+    h, w = map(int, fitting[-1]) if len(fitting) else (1, 1)
+    best, least = samples, math.inf
+    if (h, w) != (height, width):
+        for down in ("LANCZOS", "BICUBIC"):
+            small = _rounded(_resized(samples, h, w, down)) / np.float32(255)
+            found = _resized(small, height, width, "BICUBIC")
+            if (error := _squared(samples, found)) < least:
+                best, least = found, error
+    return Encoded(f"bicubic {w}x{h}", h * w * channels, best, True, time.perf_counter() - start)
+
+
+def at_bytes(codec: str, image: np.ndarray, nbytes: int, **options) -> list[Encoded]:
+    """
+    ``image`` in ``nbytes``. ``astc``: the largest that fits and the smallest that does not, if there are both.
+    ``jpeg`` and ``webp``: the highest quality that fits, else the lowest (JPEG: with or without chroma subsampling,
+    whichever errs less). ``bicubic`` as it is, ``bc7`` at its only size. ``options`` go to the codec. Raises
+    ``ValueError`` for an unknown codec.
+    """
+    if codec == "astc":
+        shape, reduce = _texels(image).shape, options.get("reduce", 1)
+        sizes = sorted(((astc_bytes(shape, b, reduce), i, b) for i, b in enumerate(ASTC_BLOCKS)), key=lambda s: s[:2])
+        below = [s for s in sizes if s[0] <= nbytes]
+        below = [next(s for s in below if s[0] == below[-1][0])] if below else []
+        chosen = below + [s for s in sizes if s[0] > nbytes][:1]
+        return [astc(image, block, **options) for _, _, block in chosen]
+    if codec in _FILES:
+        encode = {"jpeg": jpeg, "webp": webp}[codec]
+        _, _, qualities, tries = _FILES[codec]
+        given = [{**o, **options} for o in tries]
+        found = [_fitting(lambda q, o=o: encode(image, q, **o), qualities, nbytes) for o in given]
+        fitting = [e for e in found if e.nbytes <= nbytes] or [min(found, key=lambda e: e.nbytes)]
+        reference = _texels(image) / np.float32(255)
+        return [min(fitting, key=lambda e: _squared(reference, e.image))]
+    if codec == "bicubic":
+        return [bicubic(image, nbytes, **options)]
+    if codec == "bc7":
+        return [bc7(image, **options)]
+    raise ValueError(f'codec: found "{codec}", one of {", ".join(_PACKAGES)} is needed')
+
+
+#: One way to store a map (its name, whether only x and y, block size, reduction), or several: bytes, squared error.
+_Way = tuple[int, float, tuple[tuple[str, bool, str, int], ...]]
+
+
+def astc_material(
+    maps: Mapping[str, np.ndarray],
+    nbytes: int,
+    quality: str | float = "exhaustive",
+    uniform: bool = False,
+    normals: Collection[str] = ("normal",),
+    reduces: Iterable[int] = (1, 2, 4),
+    choose: str | float = "medium",
+    cache: dict | None = None,
+) -> tuple[dict[str, Encoded], int]:
+    """
+    The ``maps`` of a material, name → image, in ``nbytes`` together, with the least squared error over all their texels
+    and channels: each map at its own block size and resolution (one of ``reduces``, see :func:`astc`), three equal
+    channels as luminance, the maps named in ``normals`` with or without z. ``uniform``: one block size and resolution
+    for all maps instead, the best one.
+
+    The choice is the best one for the errors with the preset ``choose``, for which each map is encoded some dozens of
+    times; ``quality`` is for the result. A ``cache``, only for calls with the same maps, saves encoding twice. Returns
+    the encoded maps by name, and their bytes. Raises :class:`CodecError` if no choice fits.
+    """
+    _modules("astc")
+    cache = {} if cache is None else cache
+    rounded = {name: _texels(image) / np.float32(255) for name, image in maps.items()}
+    settings = list(itertools.product(ASTC_BLOCKS, reduces))
+
+    def cached(kind: Callable, *part):
+        if (key := (kind.__name__, *part)) not in cache:
+            cache[key] = kind(rounded[part[0]], *part[1:])
+        return cache[key]
+
+    known: dict[str, list[_Way]] = {}
+    for name, image in rounded.items():
+        both = (False, True) if name in normals and image.shape[2] == 3 else (False,)
+        for normal, (block, reduce) in itertools.product(both, settings):
+            size = astc_bytes(image.shape, block, reduce)
+            if size <= nbytes:
+                error = cached(_error, name, normal, block, reduce, choose)
+                known.setdefault(name, []).append((size, error, ((name, normal, block, reduce),)))
+
+    def ways(allowed) -> list[_Way]:
+        """The ways to store the material that nothing beats, at the block sizes and resolutions allowed."""
+        front: list[_Way] = [(0, 0.0, ())]
+        for name in rounded:
+            one = [way for way in known.get(name, ()) if way[2][0][2:] in allowed]
+            front = _front(itertools.product(front, one), nbytes)
+        return front
+
+    found = [way for setting in settings for way in ways([setting])] if uniform else ways(settings)
+    if not found:
+        raise CodecError(f"ASTC cannot store {', '.join(maps)} in {nbytes:,} bytes")
+    result = {part[0]: cached(_encode, *part, quality) for part in min(found, key=lambda way: way[1])[2]}
+    return result, sum(e.nbytes for e in result.values())
+
+
+def _encode(image: np.ndarray, normal: bool, block: str, reduce: int, quality) -> Encoded:
+    """An image by :func:`astc`, three equal channels as luminance."""
+    if not _grey(image):
+        return astc(image, block, quality, normal, reduce)
+    coded = astc(image[..., :1], block, quality, False, reduce)
+    return replace(coded, image=np.repeat(coded.image, 3, -1))
+
+
+def _error(image: np.ndarray, *options) -> float:
+    """The squared error of :func:`_encode`."""
+    return _squared(image, _encode(image, *options).image)
+
+
+def _grey(image: np.ndarray) -> bool:
+    """Whether there are three equal channels."""
+    return image.shape[2] == 3 and bool((image[..., :1] == image).all())
+
+
+def _front(pairs: Iterable[tuple[_Way, _Way]], nbytes: int) -> list[_Way]:
+    """Two ways at a time put together, of these the ones within ``nbytes`` that nothing beats."""
+    joined = [(a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in pairs if a[0] + b[0] <= nbytes]
+    kept, least = [], math.inf
+    for way in sorted(joined, key=lambda w: w[:2]):
+        if way[1] < least:
+            kept.append(way)
+            least = way[1]
+    return kept
+
+
+def _fitting(encode: Callable[[int], Encoded], qualities: range, nbytes: int) -> Encoded:
+    """The highest quality that fits into ``nbytes``, else the lowest, by bisection."""
+    low, high = qualities[0], qualities[-1] + 1
+    best = encode(low)
+    while high - low > 1:
+        middle = (low + high) // 2
+        coded = encode(middle)
+        if coded.nbytes <= nbytes:
+            low, best = middle, coded
+        else:
+            high = middle
+    return best
+
+
+def _files(kind: str, image: np.ndarray, quality: int, **options) -> Encoded:
+    """An image as one or two files that Pillow writes."""
+    pillow = _modules(kind)[0]
+    name, longest, qualities, _ = _FILES[kind]
+    texels = _texels(image)
+    height, width, channels = texels.shape
+    if max(height, width) > longest:
+        raise CodecError(f"{name} cannot store {width}x{height} texels, at most {longest} a side")
+    if quality not in qualities:
+        raise ValueError(f"quality: found {quality}, {qualities[0]} to {qualities[-1]} is needed")
+    groups = {1: [[0]], 2: [[0], [1]], 3: [[0, 1, 2]], 4: [[0, 1, 2], [3]]}[channels]
+    decoded, nbytes, seconds = np.empty(texels.shape, np.float32), 0, 0.0
+    for group in groups:
+        mode = "L" if len(group) == 1 else "RGB"
+        plane = texels[..., group[0]] if mode == "L" else texels[..., group]
+        source = pillow.fromarray(np.ascontiguousarray(plane))
+        file = io.BytesIO()
+        start = time.perf_counter()
+        source.save(file, kind.upper(), quality=quality, **options)
+        seconds += time.perf_counter() - start
+        nbytes += file.tell()
+        with pillow.open(file) as opened:
+            decoded[..., group] = np.asarray(opened.convert(mode)).reshape(height, width, -1) / np.float32(255)
+    return Encoded(f"{name} {quality}", nbytes, decoded, False, seconds)
+
+
+def _modules(codec: str) -> list:
+    """The modules a codec needs. Raises :class:`CodecError` that says how to install what is missing."""
+    found = []
+    for package, module in _PACKAGES[codec]:
+        try:
+            found.append(importlib.import_module(module))
+        except ImportError:
+            raise CodecError(f'the codec {codec} needs {package}, which "pip install {package}" installs') from None
+    return found
+
+
+def _texels(image: np.ndarray) -> np.ndarray:
+    """An image in 8 bits. Raises ``ValueError`` if it is none."""
+    image = np.asarray(image)
+    if image.ndim != 3 or not 1 <= image.shape[2] <= 4 or 0 in image.shape:
+        raise ValueError(f"image: found the shape {image.shape}, (height, width, 1 to 4 channels) is needed")
+    if not (image.min() >= 0 and image.max() <= 1):
+        raise ValueError(f"image: found values from {image.min():g} to {image.max():g}, 0 to 1 is needed")
+    return _rounded(image)
+
+
+def _rounded(image: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] in 8 bits."""
+    return np.rint(image * np.float32(255)).astype(np.uint8)
+
+
+def _reduced(shape: tuple[int, ...], reduce: int) -> tuple[int, int]:
+    """Height and width, a whole number of times smaller, rounded up."""
+    return -(-shape[0] // reduce), -(-shape[1] // reduce)
+
+
+def _resized(image: np.ndarray, height: int, width: int, resampling: str) -> np.ndarray:
+    """Each channel at another size (antialiased when that is smaller), clipped to [0, 1]."""
+    pillow = importlib.import_module("PIL.Image")
+    resampling = getattr(pillow.Resampling, resampling)
+    planes = [pillow.fromarray(np.ascontiguousarray(plane, np.float32)) for plane in np.moveaxis(image, -1, 0)]
+    return np.clip(np.stack([plane.resize((width, height), resampling) for plane in planes], -1), 0, 1)
+
+
+def _squared(reference: np.ndarray, image: np.ndarray) -> float:
+    """Sum of squared differences."""
+    return float(np.sum((reference - image) ** 2, dtype=np.float64))

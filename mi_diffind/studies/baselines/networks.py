@@ -1,0 +1,90 @@
+"""Competitors of tables: networks of ``drjit.nn``, alone, after a hash grid, and in front of a table."""
+
+from __future__ import annotations
+
+import sys
+
+import drjit as dr
+from drjit import nn
+
+from ...indirection import DifferentiableArray, fold
+from ...measure.operations import Operations
+
+
+class Network(nn.Module):
+    """
+    A multilayer perceptron from ``inputs`` coordinates to one number: ``layers`` hidden layers of ``width`` leaky
+    rectified units.
+
+    ``grid``, the options of ``nn.HashGridEncoding``, puts one before it; ``table``, entries of a side, lets it point
+    into a square :class:`~mi_diffind.indirection.DifferentiableArray`, as the primary array of an indirection does.
+    Called with a list of coordinates, it returns a list of one array. As allocated it computes with tensors, which is
+    the faster form to train; :meth:`cooperative` gives it in cooperative vectors.
+    """
+
+    DRJIT_STRUCT = {"entries": object, "mlp": nn.Module, "table": object}  # noqa: RUF012
+
+    def __init__(self, inputs: int = 2, width: int = 16, layers: int = 2, grid: dict | None = None, table: int = 0):
+        self.inputs, self.width, self.layers, self.grid, self.table_size = inputs, width, layers, grid, table
+        self.entries = self.mlp = self.table = self.encoding = None
+        self.is_cooperative = False
+
+    def _alloc(self, dtype, size=-1, rng=None):
+        result = Network(self.inputs, self.width, self.layers, self.grid, self.table_size)
+        size = self.inputs
+        if self.grid:
+            Float = sys.modules[dtype.__module__].Float
+            result.encoding = nn.HashGridEncoding(Float, self.inputs, rng=rng, **self.grid)
+            result.entries = dtype(result.encoding.params)
+            size = self.grid["n_levels"] * self.grid["n_features_per_level"]
+        outputs = 2 if self.table_size else 1
+        hidden = []
+        for _ in range(self.layers):
+            hidden += [nn.Linear(-1, self.width), nn.LeakyReLU()]
+        result.mlp = nn.Sequential(*hidden, nn.Linear(self.width, outputs)).alloc(dtype, size, rng)
+        if self.table_size:
+            array = DifferentiableArray((self.table_size,) * 2, 1, "constant", 0.5)
+            result.table = array.alloc(dtype)
+        return result, 1
+
+    def __call__(self, x, active=True):
+        n = max(dr.width(v) for v in x)
+        if self.encoding is not None:
+            self.encoding.data = self.entries.array
+            x = list(self.encoding(list(x)))
+        if self.is_cooperative:
+            y = list(self.mlp(nn.CoopVec(*x)))
+        else:
+            Tensor = dr.tensor_t(type(x[0]))
+            rows = [Tensor(v, (1, n)) if dr.width(v) == n else dr.full(Tensor, v[0], (1, n)) for v in x]
+            y = self.mlp(dr.concat(rows, axis=0))
+            y = [y.array] if y.shape[0] == 1 else [y[i, :].array for i in range(y.shape[0])]
+        return y if self.table is None else self.table([fold(v) for v in y], active)
+
+    def cooperative(self) -> Network:
+        """A copy in cooperative vectors, for reading only."""
+        result = Network(self.inputs, self.width, self.layers, self.grid, self.table_size)
+        for name in ("entries", "table", "encoding"):
+            setattr(result, name, getattr(self, name))
+        result.mlp, result.is_cooperative = nn.pack(self.mlp, layout="inference"), True
+        return result
+
+    @property
+    def parameters(self) -> int:
+        """Numbers that are trained."""
+        return sum(dr.width(self[key]) for key in self)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all parameters in single precision."""
+        return 4 * self.parameters
+
+    def products(self) -> Operations:
+        """
+        The multiplications by weights and their sums, which a kernel does not show (they are calls or loops): one
+        multiplication and one addition a weight, each weight and bias read once.
+        """
+        weights = [self.mlp[key] for key in self.mlp if key.endswith("weights")]
+        macs = sum(dr.width(w) for w in weights)
+        read = sum(dr.width(self.mlp[key]) for key in self.mlp)
+        return Operations(add=macs, mul=macs, gathers=len(weights), bytes_gathered=4 * read, instructions=macs)

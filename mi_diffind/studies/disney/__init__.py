@@ -1,0 +1,23 @@
+"""
+The Disney BRDF: ``disney``, ``neural_disney`` with each preset and in each storage form, and Mitsuba's ``principled``;
+with constant and with textured materials. :mod:`.candidates` says more.
+"""
+
+from __future__ import annotations
+
+from ...measure.study import Plan, Study
+
+
+class DisneyStudy(Study):
+    """Accuracy of the Disney BRDF against time."""
+
+    name = "disney"
+    title = "all forms of the Disney BRDF"
+
+    def plan(self, arguments) -> Plan:
+        from .candidates import plan
+
+        return plan(arguments.quick)
+
+
+STUDY = DisneyStudy()

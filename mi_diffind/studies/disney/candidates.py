@@ -1,0 +1,220 @@
+"""
+The Disney BRDF: ``disney``, which computes; ``neural_disney`` with each preset and in each storage form, and with one
+of its tables only; and Mitsuba's ``principled`` with the same parameters; with constant and with textured materials.
+
+The truth of all errors are the model's formulas (:mod:`~mi_diffind.tasks.disney.model`), which no plugin is made of.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ... import runtime
+from ...lookup import STORAGES
+from ...measure.bsdf import QUERIES, TEXTURE_SIZE, bsdf_queries, directions, noise_texture
+from ...measure.operations import FLOPS
+from ...measure.study import Candidate, Case, Plan
+from ...tasks.disney.decoder import Decoder
+from ...tasks.disney.factored import FactoredDecoder
+from ...tasks.disney.library import decoder_of, load_arrays, load_disney_table, table_file
+from ...tasks.disney.model import PARAMETERS, Material
+from ...tasks.disney.training import measure, shade
+from .conclusions import PAPER, conclusions
+
+#: A material that makes use of every part of the model, and one of the two lobes that most materials have.
+ALL_LOBES = {
+    "roughness": 0.43,
+    "anisotropic": 0.5,
+    "metallic": 0.3,
+    "specular": 0.6,
+    "spec_tint": 0.4,
+    "sheen": 0.5,
+    "sheen_tint": 0.6,
+    "flatness": 0.3,
+    "clearcoat": 0.7,
+    "clearcoat_gloss": 0.63,
+}
+DIFFUSE_SPECULAR = {"roughness": 0.43, "specular": 0.6}
+BASE_COLOR = (0.8, 0.3, 0.2)
+
+#: The truth as a candidate; it is timed in ``eval`` only, with constant materials, in RGB.
+FORMULAS = "formulas"
+
+PRESETS = ("tables", "paper")
+
+
+def plan(quick: bool = False) -> Plan:
+    """What is measured in the variant that is set; ``quick``: fewer cases, fewer and smaller pictures."""
+    candidates, plugins = _candidates()
+    lobes = {"all lobes": ALL_LOBES, "diffuse + specular": DIFFUSE_SPECULAR}
+    combinations = [(m, l) for m in ("constant", "textured") for l in lobes]
+    if quick:
+        combinations = [("constant", "all lobes"), ("textured", "diffuse + specular")]
+        for candidate in candidates:
+            candidate.in_passes &= candidate.setting in ("", "float32")
+    rendered = {c.name: plugins[c.name] for c in candidates if c.in_passes}
+    cases = []
+    for material, name in combinations:
+        parameters = lobes[name]
+        names = [*plugins, *([FORMULAS] if material == "constant" and mi.is_rgb else [])]
+        cases.append(
+            Case(
+                f"{material}, {name}",
+                lambda lanes, m=material, p=parameters: _queries(plugins, m, p, lanes),
+                None if quick and cases else lambda m=material, p=parameters: _passes(rendered, m, p, quick),
+                {"material": material, "lobes": name, "base_color": BASE_COLOR, **parameters},
+                tuple(names),
+            )
+        )
+    return Plan(
+        study="disney",
+        title="Disney BRDF: accuracy against time",
+        variant=mi.variant(),
+        candidates=candidates,
+        cases=cases,
+        queries=QUERIES,
+        accuracy="psnr_db_training",
+        accuracy_label="PSNR of BRDF · cosine, dB",
+        ratios=[
+            ("principled", "disney"),
+            *(("principled", name) for name in ("tables", "tables, uint8")),
+            *((name, "disney") for name in ("tables", "tables, uint8", "paper", "paper, uint8")),
+            (FORMULAS, "disney"),
+        ],
+        details={
+            "paper_operations": {name: o.asdict() for name, o in PAPER.items()},
+            "flops": FLOPS,
+            "texture_size": TEXTURE_SIZE,
+            "errors": "PSNR in dB and mean absolute error of BRDF · cosine, clipped to [0, 1], over random directions "
+            "and materials with all lobes: distributed as in training, and uniformly",
+        },
+        conclusions=conclusions,
+    )
+
+
+# -- candidates -------------------------------------------------------------------------------------------------------
+
+
+def _candidates() -> tuple[list[Candidate], dict]:
+    """The candidates, and for each plugin a function that makes its BSDF of parameters (as for ``mi.load_dict``)."""
+    types = runtime.array_module(mi.variant().split("_")[0])
+
+    def errors(decoder):
+        def measured(samples: int) -> dict[str, float]:
+            found = {}
+            for distribution in ("training", "uniform"):
+                m = measure(decoder(), types, samples, distribution)
+                found |= {f"psnr_db_{distribution}": m["psnr_db"], f"mae_{distribution}": m["mae"]}
+            return found
+
+        return measured
+
+    def loaded(**plugin):
+        return lambda parameters: mi.load_dict({**plugin, **parameters})
+
+    def with_decoder(decoder):
+        def build(parameters):
+            bsdf = mi.load_dict({"type": "neural_disney", "preset": "tables", **parameters})
+            bsdf.decoder = decoder(bsdf.decoder.arrays)
+            bsdf.parameters_changed()  # what is evaluated once depends on the decoder
+            return bsdf
+
+        return build
+
+    candidates = [
+        Candidate(
+            "principled",
+            "Mitsuba",
+            is_reference=True,
+            note="another model (full Fresnel terms, no flatness without `thin`): no error against this one",
+        ),
+        Candidate(
+            FORMULAS,
+            "formulas",
+            is_truth=True,
+            in_passes=False,
+            queries=("eval",),
+            note="the formulas alone, without what a plugin adds: checks of directions, lobes that are asked for",
+        ),
+        Candidate("disney", "arithmetic", errors=errors(Decoder)),
+    ]
+    plugins = {"principled": loaded(type="principled"), "disney": loaded(type="disney")}
+    for preset in PRESETS:
+        table, _ = load_disney_table(table_file("", preset))
+        seconds = table.settings.get("seconds")
+        for storage in STORAGES:
+            name = preset if storage == "float32" else f"{preset}, {storage}"
+            decoder = lambda p=preset, s=storage: decoder_of(load_arrays("", types.TensorXf, s, p))  # noqa: E731
+            candidates.append(Candidate(name, preset, storage, table.to(storage).nbytes, seconds, errors(decoder)))
+            plugins[name] = loaded(type="neural_disney", preset=preset, storage=storage)
+    table, _ = load_disney_table(table_file("", "tables"))
+    seconds = table.settings.get("seconds")
+    for factor in FactoredDecoder.FACTORS:
+        name = f"only {factor} read"
+        read = [n for n in table.arrays if n == factor or (factor == "alpha" and n.startswith("encoder"))]
+        size = sum(table.arrays[n].nbytes for n in read)
+        decoder = lambda f=factor: FactoredDecoder(load_arrays("", types.TensorXf, "", "tables"), read=(f,))  # noqa: E731
+        once = "read once where the material is constant" if factor in ("alpha", "coat") else ""
+        candidates.append(
+            Candidate(name, "one table", factor, size, seconds, errors(decoder), in_passes=False, note=once)
+        )
+        plugins[name] = with_decoder(lambda arrays, f=factor: FactoredDecoder(arrays, read=(f,)))
+    return candidates, plugins
+
+
+# -- what is timed ----------------------------------------------------------------------------------------------------
+
+
+def _material(material: str, parameters: dict) -> dict:
+    """Parameters as ``mi.load_dict`` takes them: numbers, or textures that vary around these."""
+    if material == "constant":
+        return {"base_color": {"type": "rgb", "value": list(BASE_COLOR)}, **parameters}
+    rng = np.random.default_rng(1)
+    # `principled` takes no texture for `specular`, so it is a number for all
+    return {
+        "base_color": noise_texture(BASE_COLOR, rng),
+        **{name: value if name == "specular" else noise_texture([value], rng) for name, value in parameters.items()},
+    }
+
+
+def _queries(plugins: dict, material: str, parameters: dict, lanes: int) -> dict:
+    bsdfs = {name: build(_material(material, parameters)) for name, build in plugins.items()}
+    inputs = directions(lanes)
+    found = bsdf_queries(bsdfs, inputs, material == "textured")
+    values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}  # each one number for all lanes, as a plugin has them
+    constants, albedo = {name: dr.opaque(mi.Float, value) for name, value in values.items()}, mi.Color3f(BASE_COLOR)
+    dr.make_opaque(albedo)
+    found["eval"][FORMULAS] = lambda: shade(None, Material(**constants), albedo, inputs[0].wi, inputs[1])
+    return found
+
+
+def _passes(plugins: dict, material: str, parameters: dict, quick: bool) -> dict:
+    """A sphere on a plane, both of the material, in light from everywhere and from one lamp."""
+    size, spp = (64, 4) if quick else (256, 16)
+    place = mi.ScalarTransform4f
+    found = {}
+    for name, build in plugins.items():
+        bsdf = build(_material(material, parameters))
+        scene = mi.load_dict({
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 5, "rr_depth": 100},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": place().look_at(origin=[0, -4.5, 2.2], target=[0, 0, 0.8], up=[0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+                "sampler": {"type": "independent", "sample_count": spp},
+            },
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}},
+            "lamp": {
+                "type": "rectangle",
+                "to_world": place().look_at(origin=[2, -2, 4], target=[0, 0, 0.5], up=[0, 1, 0]).scale(0.6),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 12.0}},
+            },
+            "floor": {"type": "rectangle", "to_world": place().scale(6), "bsdf": bsdf},
+            "ball": {"type": "sphere", "center": [0, 0, 1], "bsdf": bsdf},
+        })  # fmt: skip
+        found[name] = lambda number, scene=scene: mi.render(scene, spp=spp, seed=number)
+    return found

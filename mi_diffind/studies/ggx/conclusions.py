@@ -1,0 +1,105 @@
+"""What the study of the GGX distribution concludes: equal bytes, 8-bit reads, and equal quality beside the paper's."""
+
+from __future__ import annotations
+
+import math
+
+from ...lookup import STORAGES
+
+#: The reference of the equal-quality comparison: the paper's sizes.
+PRIMARY, CASCADED = 16, 8
+
+#: Numbers in its arrays.
+ENTRIES = 2 * PRIMARY**2 + CASCADED**2
+
+#: The cases of the two kinds of input.
+PLAIN, LOGARITHMIC = "inputs as in the paper", "logarithmic inputs"
+
+#: The paper's ratios to its own indirection at equal quality: flops, bytes read by a query, bytes stored.
+PAPER = {"network": (113.7, 256, 4), "single table": (0.33, 0.5, 512), "network + table": (28.4, 64, 0.5)}
+PAPER_FLOPS, PAPER_BYTES_READ, PAPER_BYTES = 36, 16, 1024
+
+#: dB by which a candidate may be worse and still count as of equal quality.
+EQUAL_DB = 0.25
+
+
+def conclusions(result: dict, reference: str) -> list[str]:
+    """Equal bytes, 8-bit reads, and equal quality beside the paper's ratios."""
+    return [*_equal_bytes(result), *_bytes_of_reads(result), "", *_equal_quality(result, reference)]
+
+
+def _accuracy(result: dict, name: str) -> float | None:
+    return result["candidates"].get(name, {}).get("errors", {}).get("psnr_db")
+
+
+def _equal_bytes(result: dict) -> list[str]:
+    """Indirection against a single table of as many entries."""
+    lines, side = [], math.isqrt(ENTRIES)
+    for what, mark in (("plain inputs", ""), ("plain inputs, raw output", " raw"), ("logarithmic inputs", ", log")):
+        names = [name + mark for name in (f"{PRIMARY}→{CASCADED}", f"{side}²")]
+        ours, table = (_accuracy(result, name) for name in names)
+        if ours is None or table is None:
+            continue
+        verdict = f"{'indirection' if ours > table else 'the single table'} wins by {abs(ours - table):.1f} dB"
+        if not all(result["candidates"][name]["converged"] for name in names):
+            verdict = "not both have converged: no statement is made"
+        lines.append(f"equal bytes, {what}: indirection {ours:.1f} dB, single table {table:.1f} dB: {verdict}")
+    return lines
+
+
+def _bytes_of_reads(result: dict) -> list[str]:
+    lines = []
+    for case, mark in ((PLAIN, ""), (LOGARITHMIC, ", log")):
+        pair = f"{PRIMARY}→{CASCADED} u8{mark} / {PRIMARY}→{CASCADED}{mark}"
+        ratio = result["cases"].get(case, {}).get("ratios", {}).get("read", {}).get(pair)
+        if ratio is not None:
+            lines.append(
+                f"8-bit reads, {case}: {ratio['median']:.2f} of the time of float32 ones ({ratio['with_floor']:.2f} "
+                "with input and output)"
+            )
+    return lines
+
+
+def _equal_quality(result: dict, reference: str) -> list[str]:
+    """For each family: the smallest that is as good as the reference, and what it costs in units of the reference's."""
+    measured = result["cases"].get(PLAIN)
+    if measured is None or _accuracy(result, reference) is None:
+        return []
+    timings, candidates = measured["queries"]["read"], result["candidates"]
+    own, goal = timings[reference], _accuracy(result, reference)
+    flops, read = own["operations"]["flops"], own["operations"]["bytes_gathered"]
+    lines = [
+        f"equal quality with indirection {reference} ({goal:.1f} dB; {flops} flops, {read} bytes read, "
+        f"{candidates[reference]['bytes']:,} bytes, {own['time']:.2f} ns), plain inputs; the paper's own: "
+        f"{PAPER_FLOPS} flops, {PAPER_BYTES_READ} bytes read, {PAPER_BYTES:,} bytes",
+        f"  {'':20}{'':16}{'dB':>7}{'flops':>9}{'bytes read':>12}{'bytes':>9}{'time':>8}"
+        "   the paper's: flops, read, bytes",
+    ]
+    if not candidates[reference]["converged"]:
+        return [*lines[:1], f"  {reference} has not converged: no statement is made"]
+    for family, paper in {**PAPER, "hash grid + network": None}.items():
+        members = [
+            name for name in timings
+            if candidates[name]["representation"] == family and candidates[name]["setting"] not in STORAGES[1:]
+            and "raw" not in name and candidates[name]["setting"] != "tensors"
+        ]  # fmt: skip
+        if not members:
+            continue
+        good = [name for name in members if _accuracy(result, name) >= goal - EQUAL_DB]
+        name = min(good or members, key=lambda n: candidates[n]["bytes"] if good else -_accuracy(result, n))
+        t, c = timings[name], candidates[name]
+        ratios = (
+            t["operations"]["flops"] / flops, t["operations"]["bytes_gathered"] / read,
+            c["bytes"] / candidates[reference]["bytes"], t["time"] / own["time"],
+        )  # fmt: skip
+        text = f"  {family:20}{name:16}{_accuracy(result, name):>7.1f}" + "".join(
+            f"{r:>{w - 1}.2f}x" for r, w in zip(ratios, (9, 12, 9, 8), strict=True)
+        )
+        if paper:
+            text += "   " + ", ".join(f"{r:g}x" for r in paper)
+        if not c["converged"]:
+            text += "; has not converged: no statement about equal quality"
+        elif not good:
+            text += "; the best of its family, which does NOT reach it"
+        lines.append(text)
+    return lines

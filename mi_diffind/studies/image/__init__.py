@@ -1,0 +1,69 @@
+"""
+``tradeoff image``: quality of a compressed image or material against bytes, seconds of training and time of a read,
+beside what codecs make of the same maps in the same bytes. :mod:`.candidates` says more.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from ...measure.study import Plan, Study
+
+#: Option → what it is of, the values that are allowed.
+_REPEATED = {
+    "--compression": ("12x (default)", None),
+    "--seconds": ("of each training by our preset (default: 60; --quick: 2)", None),
+    "--paper-seconds": ("of each by the paper's preset (default: the longest of --seconds)", None),
+    "--dims": ("dimensions of the cascaded array, 2, 3 or 4 (default: all)", (2, 3, 4)),
+}
+
+ASTC_PRESETS = ("fastest", "fast", "medium", "thorough", "verythorough", "exhaustive")
+
+
+class ImageStudy(Study):
+    """Quality of a compressed image or material against bytes, seconds of training and time of a read."""
+
+    name = "image"
+    title = "a compressed image or material, in bytes, training and reads"
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("source", metavar="IMAGE|MATERIAL.json")
+        for option, (text, choices) in _REPEATED.items():
+            kind = str if option == "--compression" else int
+            parser.add_argument(option, action="append", default=[], type=kind, choices=choices, metavar="N",
+                                help=f"{text}; may be repeated")  # fmt: skip
+        parser.add_argument("--astc", choices=ASTC_PRESETS, default="exhaustive",
+                            help="preset of the ASTC encoder (default: exhaustive; faster ones are up to several dB "
+                            "worse)")  # fmt: skip
+        parser.add_argument("--ablation", action="store_true", help="also switch off each improvement of our preset")
+
+    def check(self, arguments) -> None:
+        """Also reads the source, before anything is made of it; raises what :func:`.load_source` does."""
+        from ...sizing import parse_compression
+        from ...tasks.image.source import load_source
+
+        for option in ("seconds", "paper_seconds"):
+            wrong = next((v for v in getattr(arguments, option) if v < 1), None)
+            if wrong is not None:
+                raise ValueError(f"--{option.replace('_', '-')}: found {wrong}, at least 1 is needed")
+        arguments.compressions = tuple(map(parse_compression, arguments.compression)) or (12.0,)
+        arguments.loaded = load_source(arguments.source)
+
+    def plan(self, arguments) -> Plan:
+        from .candidates import Request, plan
+
+        quick = arguments.quick
+        seconds = tuple(map(float, arguments.seconds)) or (2.0 if quick else 60.0,)
+        request = Request(
+            arguments.compressions[:1] if quick else arguments.compressions,
+            seconds,
+            tuple(map(float, arguments.paper_seconds)) or (max(seconds),),
+            tuple(arguments.dims) or (2, 3, 4),
+            arguments.ablation,
+            "fast" if quick else arguments.astc,
+            "fast" if quick else "medium",
+        )
+        return plan(arguments.loaded, arguments.source, request)
+
+
+STUDY = ImageStudy()

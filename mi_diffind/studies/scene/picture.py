@@ -1,0 +1,187 @@
+"""The picture of the study of a scene: error against render time, learned and exact, with bias and crossover."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from ...measure import plot
+from ...measure.bias import practical, seconds_of
+from ...measure.words import duration, percent, rounded
+
+#: Colour and marker of each version.
+VERSIONS = {"exact": plot.STYLES[1], "learned": plot.STYLES[0]}
+
+#: The crossover is drawn if it takes at most so many times the samples of the last point; else a note says where it is.
+REACH = 100
+
+_GREY, _DASHES = "0.35", (0, (4, 2.5))
+
+
+def draw(result: dict, caption: str):
+    """
+    A Matplotlib figure of a result of :func:`.renders.measure` that has timed points: both axes logarithmic,
+    points with quartiles; dashed, what noise and bias add up to beyond the last; the bias as a horizontal band, or the
+    line that it is below; the crossover as a vertical line, if it is not too far away.
+    """
+    title = f"{Path(result['scene']).stem}: noise and bias at a given render time"
+    sheet = plot.sheet(title, caption, 7.6, 4.9)
+    axes = sheet.add_subplot()
+    axes.set_xlabel("seconds of a render (kernels)", fontsize=9)
+    axes.set_ylabel("relative RMS error", fontsize=9)
+    curves = {name: _curve(result, name) for name in VERSIONS}
+    _limits(axes, result, curves)
+    labels = _draw(axes, result, curves)
+    _legend(axes, curves)
+    plot.fix(sheet)
+    plot.place(axes, labels, [(p["seconds"], p["rmse"]) for curve in curves.values() for p in curve])
+    return sheet
+
+
+def _curve(result: dict, name: str) -> list[dict]:
+    return [p for p in result["points"] if p["version"] == name and p["timed"] and p["rmse"] > 0]
+
+
+def _floor(result: dict) -> float:
+    """The bias, or what it is below; 0 if there is none."""
+    bias = result["bias"]
+    return bias["rmse"] if bias["measured"] else bias["rmse_below"]
+
+
+def _crossover(result: dict) -> tuple[float, float] | None:
+    """Sample count and time of a crossover that is drawn."""
+    found = result["crossover"]
+    near = found.get("seconds") is not None and found["spp"] <= REACH * result["counts"][-1]
+    return (found["spp"], found["seconds"]) if near else None
+
+
+def _limits(axes, result: dict, curves: dict[str, list[dict]]) -> None:
+    points = [p for curve in curves.values() for p in curve]
+    times = [v for p in points for v in (p["seconds_q1"], p["seconds_q3"])]
+    errors = [v for p in points for v in (p["rmse"], math.sqrt(max(p["mse_q1"], 0)), math.sqrt(p["mse_q3"])) if v > 0]
+    crossover, floor = _crossover(result), _floor(result)
+    if crossover:
+        times.append(crossover[1])
+    if crossover or floor >= min(errors) / 4:
+        errors.append(floor)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlim(min(times) / 1.5, max(times) * (2.2 if crossover else 1.8))
+    axes.set_ylim(min(errors) / (2.0 if min(errors) == floor else 2.4), max(errors) * 2.0)
+    plot.log_ticks(axes.xaxis, *axes.get_xlim(), plot.plain)
+    plot.log_ticks(axes.yaxis, *axes.get_ylim(), percent)
+    axes.tick_params(labelsize=8)
+    axes.grid(which="major", color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def _draw(axes, result: dict, curves: dict[str, list[dict]]) -> list[plot.Label]:
+    """All but the labels; returns these in the order in which they are placed."""
+    labels = []
+    low = axes.get_ylim()[0]
+    bias, floor, crossover = result["bias"], _floor(result), _crossover(result)
+    if floor > low:
+        if bias["measured"]:
+            spread = 2 * bias["rmse_standard_error"]
+            axes.axhspan(max(floor - spread, low), floor + spread, color="#7a3b8f", alpha=0.18, linewidth=0, zorder=1.5)
+            name = f"bias of the approximation: {percent(floor)}"
+        else:
+            axes.axhspan(low, floor, color="#7a3b8f", alpha=0.08, linewidth=0, zorder=1.5)
+            name = f"bias of the approximation: none found, below {percent(floor)}"
+        axes.axhline(floor, color="#7a3b8f", linewidth=1.1, zorder=2)
+        axes.annotate(name + _decibel(bias), (0, floor), (5, -3), xycoords=axes.get_yaxis_transform(), va="top",
+                      textcoords="offset points", fontsize=8, color="#5e2a70")  # fmt: skip
+    else:
+        axes.annotate(_far(result), (0.012, 0.02), xycoords="axes fraction", fontsize=8, color="#5e2a70", va="bottom",
+                      linespacing=1.35)  # fmt: skip
+    for name, curve in curves.items():
+        if not curve:
+            continue
+        colour, marker = VERSIONS[name]
+        xs, ys = [p["seconds"] for p in curve], [p["rmse"] for p in curve]
+        roots = [[math.sqrt(max(p[k], 1e-30)) for p in curve] for k in ("mse_q1", "mse_q3")]
+        bars = {
+            "xerr": [np.subtract(xs, [p["seconds_q1"] for p in curve]),
+                     np.subtract([p["seconds_q3"] for p in curve], xs)],
+            "yerr": [np.subtract(ys, roots[0]), np.subtract(roots[1], ys)],
+        }  # fmt: skip
+        bars = {k: np.maximum(v, 0) for k, v in bars.items()}
+        axes.errorbar(xs, ys, **bars, fmt=f"{marker}-", color=colour, linewidth=1.1, elinewidth=0.9, capsize=2,
+                      markersize=5.5, markerfacecolor="white", markeredgewidth=1.3, zorder=3)  # fmt: skip
+        axes.plot(*_continued(result, name, curve, axes.get_xlim()[1], crossover), color=colour, linewidth=0.9,
+                  linestyle=_DASHES, alpha=0.75, zorder=2.5)  # fmt: skip
+    for spp in result["counts"]:
+        pair = [p for curve in curves.values() for p in curve if p["spp"] == spp]
+        if pair:
+            axes.plot([p["seconds"] for p in pair], [p["rmse"] for p in pair], color="0.6", linewidth=0.6, zorder=2.4)
+            anchor = max(p["seconds"] for p in pair), max(p["rmse"] for p in pair)
+            labels.append(plot.Label(f"{spp} spp", anchor, "0.15", "bold", angle=math.pi / 4))  # the curves fall
+    if crossover:
+        spp, seconds = crossover
+        axes.axvline(seconds, color=_GREY, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=2)
+        how = "extrapolated: " * result["crossover"]["extrapolated"]
+        bottom = low * (axes.get_ylim()[1] / low) ** 0.06
+        text = f"noise = bias\n{how}{rounded(spp)} spp, {duration(seconds)}"
+        labels.append(plot.Label(text, (seconds, bottom), _GREY, angle=math.pi / 4))
+    return labels
+
+
+def _legend(axes, curves: dict[str, list[dict]]) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = []
+    for name, curve in curves.items():
+        if curve:
+            colour, marker = VERSIONS[name]
+            handles.append(Line2D([], [], color=colour, marker=marker, markersize=5.5, markerfacecolor="white",
+                                  markeredgewidth=1.3, linewidth=1.1, label=name))  # fmt: skip
+    handles.append(Line2D([], [], color=_GREY, linewidth=0.9, linestyle=_DASHES, label="extrapolated"))
+    axes.legend(handles=handles, loc="upper right", fontsize=8, framealpha=1, edgecolor="0.8", handlelength=2.6)
+
+
+def _continued(result: dict, name: str, curve: list[dict], end: float, crossover) -> tuple[list, list]:
+    """What noise (and bias, if learned) add up to from the last point on: times and errors."""
+    times = {p["spp"]: p["seconds"] for p in curve}
+    last = curve[-1]
+    noise = result["noise"][name]["mse_of_a_sample"]
+    square = max(result["bias"]["mse"], 0.0) if name == "learned" and result["bias"]["measured"] else 0.0
+    law = last["mse"] - square - noise / last["spp"]  # begins where the last point is
+    xs, ys = [], []
+    for spp in last["spp"] * np.geomspace(1, 4 * REACH, 200):
+        seconds = seconds_of(spp, times)
+        if seconds <= end:
+            xs.append(seconds)
+            ys.append(math.sqrt(max(square + noise / spp + law * last["spp"] / spp, 0)))
+    return xs, ys
+
+
+def _decibel(bias: dict) -> str:
+    if "psnr_db" in bias:
+        return f" ({bias['psnr_db']:.1f} dB)"
+    return f" (above {bias['psnr_db_above']:.1f} dB)" if bias["psnr_db_above"] is not None else ""
+
+
+def _far(result: dict) -> str:
+    """Where the bias is, if it is too far below the points to be drawn."""
+    bias, crossover = result["bias"], result["crossover"]
+    if not bias["measured"]:
+        if not bias["rmse_below"]:
+            return "▼ learned and exact renders do not differ at all"
+        limit = (
+            f"up to {rounded(crossover['spp_above'])} spp at least" if practical(crossover) else "at any sample count"
+        )
+        return (
+            f"▼ bias of the approximation: none found, below {percent(bias['rmse_below'])}{_decibel(bias)};\n"
+            f"    noise dominates {limit}"
+        )
+    if bias["rounding_only"]:
+        return f"▼ learned and exact renders differ by rounding only: {percent(bias['rmse'])}{_decibel(bias)}"
+    last = min(p["rmse"] for p in result["points"] if p["version"] == "learned")
+    below = f"{rounded(last / bias['rmse'])} times below the last point"
+    where = "below what any practical number of samples would show"
+    if practical(crossover):
+        when = f", {duration(crossover['seconds'])}" if crossover["seconds"] is not None else ""
+        where = f"the noise would equal it at {rounded(crossover['spp'])} spp{when} (extrapolated)"
+    return f"▼ bias of the approximation: {percent(bias['rmse'])}{_decibel(bias)}, {below};\n    {where}"

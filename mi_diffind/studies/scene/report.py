@@ -1,0 +1,128 @@
+"""What the study of a scene says: a table, lines of text, a verdict, files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ...measure import report
+from ...measure.bias import PRACTICAL, practical, root
+from ...measure.words import duration, enumeration, machine_line, percent, rounded, state
+from . import picture
+from .renders import VERSIONS
+
+#: Columns of the table.
+COLUMNS = (
+    *("scene", "version", "spp", "mse", "mse_q1", "mse_q3", "rmse", "psnr_db", "images"),
+    *("seconds", "seconds_q1", "seconds_q3", "seconds_wall", "seconds_wall_q1", "seconds_wall_q3", "timed"),
+    *("time_ratio", "time_ratio_q1", "time_ratio_q3", "time_ratio_wall"),
+)
+
+
+def rows(result: dict) -> list[dict]:
+    """
+    The result as a table, with the columns :data:`COLUMNS`: one row for each version and sample count; time ratios
+    (learned / exact) are in the rows of ``learned``.
+    """
+    ratios = {r["spp"]: r for r in result["ratios"]}
+    found = []
+    for point in result["points"]:
+        row = {"scene": Path(result["scene"]).name, **point}
+        if point["version"] == "learned" and point["spp"] in ratios:
+            r = ratios[point["spp"]]
+            row |= {"time_ratio": r["median"], "time_ratio_q1": r["q1"], "time_ratio_q3": r["q3"]}
+            row["time_ratio_wall"] = r["wall"]
+        found.append(row)
+    return found
+
+
+def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
+    """:func:`~mi_diffind.measure.report.write_files` of a result, with a picture if there is anything to draw."""
+    pictures = {}
+    if any(p["timed"] and p["rmse"] for p in result["points"]):
+        pictures["png"] = lambda: picture.draw(result, caption(result))
+    return report.write_files("scene", folder, result, rows(result), COLUMNS, pictures)
+
+
+def caption(result: dict) -> str:
+    """What the figures were measured on and how, as one paragraph."""
+    reference, counts = result["reference"], enumeration(result["counts"])
+    defines = "".join(f", {k}={v}" for k, v in result["defines"].items())
+    bad = f" {result['not_finite']} values were not finite and counted as 0." if result["not_finite"] else ""
+    return (
+        f"{Path(result['scene']).name}{defines}, {result['width']} × {result['height']}, {counts} "
+        f"samples per pixel (spp). Relative RMS error against {reference['spp']} spp of the exact scene, whose own "
+        f"noise, {percent(reference['noise_rmse'])}, is subtracted. Medians and quartiles of {_images(result)} of "
+        f"different seeds; seconds of the kernels of a whole render. {machine_line(result)}{bad}{state(result)}"
+    )
+
+
+def _images(result: dict) -> str:
+    numbers = sorted({p["images"] for p in result["points"]})
+    return f"{numbers[0]} images" if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]} images"
+
+
+def summary(result: dict) -> list[str]:
+    """The result as lines of text: errors and times by sample count, then the bias, the crossover and the verdict."""
+    materials = "1 learned plugin" if result["learned_plugins"] == 1 else f"{result['learned_plugins']} learned plugins"
+    lines = [
+        f"scene       {Path(result['scene']).name}, {result['width']} x {result['height']}, {materials}",
+        f"variant     {result['variant']}",
+        "",
+    ]
+    if not result["points"]:
+        return [*lines, "interrupted before there was anything to show; the same command goes on from there"]
+    lines.append("relative RMS error and seconds of the kernels, medians ± half the interquartile range")
+    head = ("spp", "exact: error", "seconds", "learned: error", "seconds", "learned / exact")
+    widths = (8, 20, 18, 20, 18, 24)
+    lines.append("".join(f"{text:>{w}}" for text, w in zip(head, widths, strict=True)))
+    ratios = {r["spp"]: r for r in result["ratios"]}
+    for spp in result["counts"]:
+        cells = [f"{spp}"]
+        for name in VERSIONS:
+            point = next((p for p in result["points"] if (p["version"], p["spp"]) == (name, spp)), None)
+            cells += ["", ""] if point is None else [_error_cell(point), _seconds_cell(point)]
+        r = ratios.get(spp)
+        cells.append(f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" if r else "")
+        lines.append("".join(f"{text:>{w}}" for text, w in zip(cells, widths, strict=True)))
+    reference, bias, crossover = result["reference"], result["bias"], result["crossover"]
+    lines += ["", f"reference   {reference['spp']} spp, its own noise {percent(reference['noise_rmse'])} (subtracted)"]
+    psnr = f"PSNR {bias['psnr_db']:.1f} dB" if "psnr_db" in bias else f"PSNR {_psnr(bias['psnr_db_above'])}"
+    if bias["measured"]:
+        lines.append(f"bias        {percent(bias['rmse'])} ± {percent(bias['rmse_standard_error'], 2)}, {psnr}")
+    else:
+        lines.append(f"bias        below {percent(bias['rmse_below'])}, {psnr}")
+    lines.append(f"crossover   {_crossover(crossover)}")
+    if result["not_finite"]:
+        lines.append(f"not finite  {result['not_finite']} values, counted as 0")
+    if result["interrupted"]:
+        lines.append("interrupted: the same command goes on from there")
+    return [*lines, "", result["verdict"]]
+
+
+def _crossover(found: dict) -> str:
+    if "spp" not in found and found["spp_above"] is None:
+        return "none"
+    if not practical(found):
+        return f"at no practical number of samples (more than {rounded(PRACTICAL)} spp)"
+    if "spp" not in found:
+        return f"above {rounded(found['spp_above'])} spp"
+    seconds = f", {duration(found['seconds'])}" if found["seconds"] is not None else ""
+    between = f"{rounded(found['spp_low'])} to {rounded(found['spp_high'])}"
+    return f"{rounded(found['spp'])} spp ({between}){seconds}{', extrapolated' * found['extrapolated']}"
+
+
+def _psnr(db: float | None) -> str:
+    return "infinite" if db is None else f"above {db:.1f} dB"
+
+
+def _error_cell(point: dict) -> str:
+    half = (root(point["mse_q3"]) - root(point["mse_q1"])) / 2
+    return f"{percent(point['rmse'])} ± {percent(half, 2)}"
+
+
+def _seconds_cell(point: dict) -> str:
+    if not point["timed"]:
+        return "-"
+    half = (point["seconds_q3"] - point["seconds_q1"]) / 2
+    return f"{point['seconds']:.3g} ± {half:.2g}"

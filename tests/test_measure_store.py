@@ -1,0 +1,102 @@
+"""What is kept of a run: taken over under the same key, else discarded with one sentence."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from mi_diffind.files import OutputError
+from mi_diffind.measure.store import Store, fingerprint, models_folder, sources
+
+KEY = {"settings": {"rounds": 3, "sides": (1, 2)}, "machine": "here", "limit": float("nan")}
+
+
+def made(folder, key=KEY, progress=False):
+    return Store(folder, "small", key, ("errors", "rounds"), progress)
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """A folder with what a run has left."""
+    store = made(tmp_path)
+    store.data["errors"]["a"] = {"db": 20.0}
+    store.keep("image", exact=np.arange(6.0).reshape(2, 3), learned=np.ones(2))
+    store.save()
+    (tmp_path / "other.txt").write_text("stays")
+    return tmp_path
+
+
+def test_goes_on(kept, capsys):
+    store = made(kept, progress=True)
+    assert store.resumed and store.data == {"errors": {"a": {"db": 20.0}}, "rounds": {}}
+    assert np.array_equal(store.arrays["image"]["exact"], np.arange(6.0).reshape(2, 3))
+    assert capsys.readouterr().err == f"going on from {kept / 'tradeoff_small.partial.json'}\n"
+    Store.remove(kept, "small")
+    assert os.listdir(kept) == ["other.txt"]
+
+
+def damaged(path, what):
+    if what == "cut off":
+        path.write_text(path.read_text()[:-20])
+    elif what == "another kind":
+        path.write_text(json.dumps([1, 2]))
+    elif what == "another form":
+        path.write_text(json.dumps({**json.loads(path.read_text()), "data": {"errors": 3, "rounds": {}}}))
+    elif what == "no text":
+        path.write_bytes(b"\xff\x00\xfe")
+    elif what == "no array":
+        path.with_suffix(".image.npz").unlink()
+    else:
+        path.with_suffix(".image.npz").write_bytes(b"nothing")
+
+
+@pytest.mark.parametrize("what", ["cut off", "another kind", "another form", "no text", "no array", "array"])
+def test_what_is_damaged_is_discarded(kept, what, capsys):
+    path = kept / "tradeoff_small.partial.json"
+    damaged(path, what)
+    store = made(kept, progress=True)
+    assert not store.resumed and store.data == {"errors": {}, "rounds": {}} and not store.arrays
+    assert capsys.readouterr().err == f"{path} is damaged: starting anew\n"
+    assert os.listdir(kept) == ["other.txt"]
+
+
+@pytest.mark.parametrize("change", [{"machine": "there"}, {"settings": {"rounds": 4}, "machine": "x"}, {"new": 1}])
+def test_another_key_is_said(kept, change, capsys):
+    store = made(kept, {**KEY, **change}, progress=True)
+    assert not store.resumed
+    names = ", ".join(change)
+    path = kept / "tradeoff_small.partial.json"
+    assert capsys.readouterr().err == f"{path} is of a run with other {names}: starting anew\n"
+
+
+def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    store = made(None)
+    store.keep("image", exact=np.ones(2))
+    store.save()
+    assert os.listdir(tmp_path) == [] and store.arrays["image"]["exact"].size == 2
+    with pytest.raises(OutputError, match="does not exist"):
+        made(tmp_path / "nowhere" / "out")
+
+
+def test_fingerprint(tmp_path):
+    (tmp_path / "a.py").write_text("1")
+    (tmp_path / "b.py").write_text("2")
+    both = fingerprint([tmp_path / "b.py", tmp_path / "a.py"])
+    assert both == fingerprint([tmp_path / "a.py", tmp_path / "b.py"])
+    (tmp_path / "a.py").write_text("3")
+    assert both != fingerprint([tmp_path / "a.py", tmp_path / "b.py"])
+
+
+def test_sources_are_all_that_a_measurement_depends_on():
+    names = {path.name for path in sources()}
+    assert {"neural_image.py", "lookup.py", "clock.py", "candidates.py", "codecs.py"} < names
+    assert any(name.endswith(".npz") for name in names)
+
+
+def test_folder_is_emptied_for_other_sources(tmp_path):
+    folder = models_folder(tmp_path, "ggx", "a")
+    (folder / "model.npz").write_bytes(b"")
+    assert models_folder(tmp_path, "ggx", "a") == folder and (folder / "model.npz").exists()
+    assert models_folder(tmp_path, "ggx", "b") == folder and not (folder / "model.npz").exists()
