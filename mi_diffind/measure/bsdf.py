@@ -35,7 +35,7 @@ def directions(lanes: int, seed: int = 7):
 
 def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dict[str, dict]:
     """
-    The queries of a :class:`.study.Case`, :data:`QUERIES`, of BSDFs by name; ``inputs`` are those of :func:`directions`.
+    The queries (:data:`QUERIES`) of BSDFs by name; ``inputs`` are those of :func:`directions`.
     The floor has as many inputs, ``uv`` among them if the materials are ``textured``.
     """
     si, wo, sample1, sample2 = inputs

@@ -58,7 +58,7 @@ class Training(Job):
         file = None if folder is None else self._file(folder)
         runs, best, steps = [], None, self.settings.steps
         while True:
-            settings = dataclasses.replace(self.settings, steps=steps, quality_every=max(1, steps // 20))
+            settings = dataclasses.replace(self.settings, steps=steps, measure_every=max(1, steps // 20))
             problem = self.problem()
             checkpoint = None if file is None else file.with_name(f"{file.stem}_{steps}.checkpoint")
             resume = checkpoint is not None and checkpoint.is_file()
@@ -66,11 +66,11 @@ class Training(Job):
             result = fit(problem, settings, checkpoint, resume, progress, title=title)
             if result.interrupted:
                 return None
-            first = next(iter(result.quality))
+            first = next(iter(result.measured))
             runs.append({
                 "steps": steps,
                 "seconds": result.seconds,
-                "psnr_db": result.quality[first],
+                "psnr_db": result.measured[first],
                 "curve_steps": [h["step"] for h in result.history],
                 "curve_loss": [h["loss"] for h in result.history],
                 "curve_psnr_db": [h[first] for h in result.history],
@@ -101,7 +101,7 @@ class Training(Job):
         return Path(folder) / f"{file_name(self.name)}.npz"
 
     def _settings(self) -> dict:
-        return {**dataclasses.asdict(self.settings), "longest": self.longest, **getattr(self.problem(), "about", {})}
+        return {**dataclasses.asdict(self.settings), "longest": self.longest, **self.problem().identity}
 
     def _save(self, file: Path, record: dict) -> None:
         arrays = {f"parameter/{key}": self.net[key].numpy() for key in self.net}

@@ -16,9 +16,9 @@ from ...lookup import STORAGES
 from ...measure.bsdf import QUERIES, TEXTURE_SIZE, bsdf_queries, directions, noise_texture
 from ...measure.operations import FLOPS
 from ...measure.study import Candidate, Case, Plan
+from ...tasks.disney import TASK
 from ...tasks.disney.decoder import Decoder
 from ...tasks.disney.factored import FactoredDecoder
-from ...tasks.disney.library import decoder_of, load_arrays, load_disney_table, table_file
 from ...tasks.disney.model import PARAMETERS, Material
 from ...tasks.disney.training import measure, shade
 from .conclusions import PAPER, conclusions
@@ -99,13 +99,13 @@ def plan(quick: bool = False) -> Plan:
 
 def _candidates() -> tuple[list[Candidate], dict]:
     """The candidates, and for each plugin a function that makes its BSDF of parameters (as for ``mi.load_dict``)."""
-    types = runtime.array_module(mi.variant().split("_")[0])
+    types = runtime.array_module(mi.variant())
 
     def errors(decoder):
         def measured(samples: int) -> dict[str, float]:
             found = {}
             for distribution in ("training", "uniform"):
-                m = measure(decoder(), types, samples, distribution)
+                m = measure(decoder, types, samples, distribution)
                 found |= {f"psnr_db_{distribution}": m["psnr_db"], f"mae_{distribution}": m["mae"]}
             return found
 
@@ -116,7 +116,7 @@ def _candidates() -> tuple[list[Candidate], dict]:
 
     def with_decoder(decoder):
         def build(parameters):
-            bsdf = mi.load_dict({"type": "neural_disney", "preset": "tables", **parameters})
+            bsdf = mi.load_dict({"type": "neural_disney", "preset": "tables", "storage": "float32", **parameters})
             bsdf.decoder = decoder(bsdf.decoder.arrays)
             bsdf.parameters_changed()  # what is evaluated once depends on the decoder
             return bsdf
@@ -138,27 +138,24 @@ def _candidates() -> tuple[list[Candidate], dict]:
             queries=("eval",),
             note="the formulas alone, without what a plugin adds: checks of directions, lobes that are asked for",
         ),
-        Candidate("disney", "arithmetic", errors=errors(Decoder)),
+        Candidate("disney", "arithmetic", errors=errors(Decoder())),
     ]
     plugins = {"principled": loaded(type="principled"), "disney": loaded(type="disney")}
     for preset in PRESETS:
-        table, _ = load_disney_table(table_file("", preset))
-        seconds = table.settings.get("seconds")
         for storage in STORAGES:
             name = preset if storage == "float32" else f"{preset}, {storage}"
-            decoder = lambda p=preset, s=storage: decoder_of(load_arrays("", types.TensorXf, s, p))  # noqa: E731
-            candidates.append(Candidate(name, preset, storage, table.to(storage).nbytes, seconds, errors(decoder)))
+            model = TASK.open(types.TensorXf, preset=preset, storage=storage)
+            candidates.append(Candidate(name, preset, storage, model.nbytes, None, errors(model.decoder)))
             plugins[name] = loaded(type="neural_disney", preset=preset, storage=storage)
-    table, _ = load_disney_table(table_file("", "tables"))
-    seconds = table.settings.get("seconds")
+    model = TASK.open(types.TensorXf, preset="tables")
     for factor in FactoredDecoder.FACTORS:
         name = f"only {factor} read"
-        read = [n for n in table.arrays if n == factor or (factor == "alpha" and n.startswith("encoder"))]
-        size = sum(table.arrays[n].nbytes for n in read)
-        decoder = lambda f=factor: FactoredDecoder(load_arrays("", types.TensorXf, "", "tables"), read=(f,))  # noqa: E731
+        read = [n for n in model.arrays if n == factor or (factor == "alpha" and n.startswith("encoder"))]
+        size = sum(model.arrays[n].nbytes for n in read)
+        decoder = FactoredDecoder(model.layout, read=(factor,))
         once = "read once where the material is constant" if factor in ("alpha", "coat") else ""
         candidates.append(
-            Candidate(name, "one table", factor, size, seconds, errors(decoder), in_passes=False, note=once)
+            Candidate(name, "one table", factor, size, None, errors(decoder), in_passes=False, note=once)
         )
         plugins[name] = with_decoder(lambda arrays, f=factor: FactoredDecoder(arrays, read=(f,)))
     return candidates, plugins

@@ -28,8 +28,9 @@ from ...measure.operations import FLOPS, Operations, count_query
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...measure.training import Training
-from ...tasks import ggx
-from ...tasks.ggx import Encoding, GGXProblem, LearnedGGX
+from ...tasks.ggx import TASK
+from ...tasks.ggx.model import INPUTS, Encoding, LearnedGGX, ggx, indirection
+from ...tasks.ggx.training import GGXProblem, draw, measure
 from ..baselines.networks import Network
 from .conclusions import (
     CASCADED,
@@ -74,9 +75,9 @@ _SHORT = {"float32": "", "float16": " f16", "uint8": " u8"}
 
 def plan(quick: bool = False) -> Plan:
     """What is measured in the variant that is set; ``quick``: fewer candidates, trained for seconds."""
-    types = runtime.array_module(mi.variant().split("_")[0])
+    types = runtime.array_module(mi.variant())
     made = _Made(types, quick)
-    for inputs in ggx.INPUTS[::-1]:
+    for inputs in INPUTS[::-1]:
         _add_tables(made, inputs)
         _add_networks(made, inputs)
     _add_formula(made)
@@ -152,13 +153,13 @@ class _Made:
 
         def reader():
             if not cache:
-                cache.append(LearnedGGX(form(training.net), encoding))
+                cache.append(LearnedGGX(form(training.net), encoding, tail=False))
             return cache[0]
 
         self.candidates.append(
             Candidate(
                 name, representation, setting, size,
-                errors=lambda samples: ggx.measure(reader(), self.types, samples),
+                errors=lambda samples: measure(reader(), self.types, samples),
                 note=note, label=label, job=training.name, operations=operations, in_passes=False,
             )
         )  # fmt: skip
@@ -178,7 +179,7 @@ class _Made:
 
     def directions(self, lanes: int) -> tuple:
         """Inputs of ``lanes`` reads, evaluated."""
-        found = ggx.draw(dr.rng(seed=dr.opaque(self.types.UInt64, 7)), self.types, lanes)
+        found = draw(dr.rng(seed=dr.opaque(self.types.UInt64, 7)), self.types, lanes)
         dr.make_opaque(*found)
         return found
 
@@ -196,7 +197,7 @@ def _add_tables(made: _Made, inputs: str) -> None:
     how = f"indirection, {inputs}"
     for n in sizes:
         label = f"{n}→{n // 2}"
-        training = made.train(made.name(label, inputs), lambda n=n: ggx.indirection(n, n // 2), how, inputs)
+        training = made.train(made.name(label, inputs), lambda n=n: indirection(n, n // 2), how, inputs)
         for storage in STORAGES:
             size = (2 * n**2 + (n // 2) ** 2) * {"float32": 4, "float16": 2, "uint8": 1}[storage]
             form = lambda net, s=storage: net.to(s)  # noqa: E731
@@ -221,7 +222,7 @@ def _add_tables(made: _Made, inputs: str) -> None:
     side = math.isqrt(ENTRIES)
     table = lambda: DifferentiableArray((side, side), 1, "constant", 0.5)  # noqa: E731
     for label, representation, net in (
-        (f"{PRIMARY}→{CASCADED} raw", "indirection", lambda: ggx.indirection(PRIMARY, CASCADED)),
+        (f"{PRIMARY}→{CASCADED} raw", "indirection", lambda: indirection(PRIMARY, CASCADED)),
         (f"{side}² raw", "single table", table),
     ):
         training = made.train(label, net, "raw", inputs, "raw")
@@ -260,9 +261,9 @@ def _network_operations(made: _Made, training: Training, encoding: Encoding) -> 
 
 def _add_formula(made: _Made) -> None:
     made.candidates.append(Candidate("formula", "formula", is_truth=True, label="formula", in_passes=False))
-    made.readers["formula"] = lambda: lambda cos, sin2, alpha: ggx.ggx(sin2, alpha)
+    made.readers["formula"] = lambda: lambda cos, sin2, alpha: ggx(sin2, alpha)
     made.inputs["formula"] = "any"
-    for inputs in ggx.INPUTS[::-1]:
+    for inputs in INPUTS[::-1]:
         made.ratios.append((made.name(f"{PRIMARY}→{CASCADED}", inputs), "formula"))
 
 
@@ -273,16 +274,13 @@ def _conductors(made: _Made) -> list[Case]:
     """``neural_ggx`` with the tables that ship, and ``roughconductor``, of constant and of textured roughness."""
     plugins = {"roughconductor": {"type": "roughconductor", "distribution": "ggx"}}
     made.candidates.append(Candidate("roughconductor", "Mitsuba", is_truth=True, in_passes=False))
-    table, encoding = ggx.load_ggx_table(ggx.SHIPPED["tables"])
     for storage in STORAGES:
         name = "neural_ggx" + ("" if storage == "float32" else f", {storage}")
         plugins[name] = {"type": "neural_ggx", "storage": storage}
-        net = ggx.to_indirection(table, made.types.TensorXf, storage)
-        distribution = LearnedGGX(net, encoding)
+        model = TASK.open(made.types.TensorXf, storage=storage)
         made.candidates.append(
             Candidate(
-                name, "indirection", storage, net.nbytes, None,
-                lambda samples, d=distribution: ggx.measure(d, made.types, samples), in_passes=False,
+                name, "indirection", storage, model.nbytes, None, model.measure, in_passes=False,
             )
         )  # fmt: skip
         made.ratios.append((name, "roughconductor"))

@@ -39,7 +39,7 @@ class ImageStudy(Study):
 
     def check(self, arguments) -> None:
         """Also reads the source, before anything is made of it; raises what :func:`.load_source` does."""
-        from ...sizing import parse_compression
+        from ...tasks.image.sizing import parse_compression
         from ...tasks.image.source import load_source
 
         for option in ("seconds", "paper_seconds"):

@@ -30,8 +30,10 @@ from ...measure.store import file_name
 from ...measure.study import FLOOR, Candidate, Case, Job, Plan
 from ...runtime import array_module
 from ...tables import save_table
+from ...tasks import task
 from ...tasks.image import search, training
 from ...tasks.image.compressed import CompressedImage
+from ...tasks.image.presets import IMPROVEMENTS, PRESETS, Recipe, replaced, without
 from ...tasks.image.source import Source
 from ..baselines import codecs
 from .conclusions import conclusions, table
@@ -148,7 +150,8 @@ class _Made(Job):
 class _Training(_Made):
     """A training of so many seconds on all cores; its file stays in the folder of models."""
 
-    recipe: training.Recipe | None = None
+    recipe: Recipe | None = None
+    preset: str = ""
     seconds: float = 0.0
     file: str = ""
 
@@ -157,18 +160,19 @@ class _Training(_Made):
         return record if record and Path(self.file).is_file() else None
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        source, own = self.source, training.replaced(self.recipe, deterministic=False)
-        types = array_module(mi.variant().split("_")[0])
+        source, own = self.source, replaced(self.recipe, deterministic=False)
+        types = array_module(mi.variant())
+        asked = task.Request(self.preset, own.settings, types, seconds=self.seconds, progress=progress)
         size = search.default_size(source, source.nbytes / self.compression, own)
-        table, result = training.fit_image(source, size, own, title=self.name, seconds=self.seconds, progress=progress)
+        table, result = training.fit_image(source, size, own, asked, title=self.name)
         if result.interrupted:
             return None
         if self.file:
             save_table(self.file, table)
-        image = CompressedImage.from_table(table, types.TensorXf)
+        image = CompressedImage.of(table, types.TensorXf)
         course = [(h["step"] * result.seconds / result.steps, h["psnr_db"]) for h in result.history]
         return self.record(
-            table.nbytes, result.seconds, image.decode(), table.quality["psnr_between_db"], file=self.file,
+            table.nbytes, result.seconds, image.decode(), table.measured["psnr_between_db"], file=self.file,
             seconds_asked=self.seconds, steps=result.steps, structure=training.structure_of(source, own),
             dims=size.dims, rows=size.rows, cascaded=size.cascaded, course=course,
             memory_bytes=sum(a.memory_nbytes for a in (*image.net.primary, image.net.cascaded)),
@@ -192,7 +196,7 @@ class _Codec(_Made):
 
 def _trainings(source: Source, request: Request) -> list[_Training]:
     jobs = []
-    shortest, ours, paper = min(request.seconds), training.RECIPES["ours"], training.RECIPES["paper"]
+    shortest, ours, paper = min(request.seconds), PRESETS["ours"], PRESETS["paper"]
     for compression in request.compressions:
 
         def train(name: str, recipe, seconds: float, kind="indirection", compression=compression):
@@ -208,8 +212,8 @@ def _trainings(source: Source, request: Request) -> list[_Training]:
             train("paper", paper, seconds, "indirection, paper's preset")
         for dims in sorted({*request.dims} - {4}):
             train(f"ours 2D→{dims}D", dataclasses.replace(ours, dims=dims), shortest)
-        for name in training.IMPROVEMENTS if request.ablation else ():
-            train(f"ours without {name}", training.without(ours, [name]), shortest)
+        for name in IMPROVEMENTS if request.ablation else ():
+            train(f"ours without {name}", without(ours, [name]), shortest)
     return jobs
 
 
