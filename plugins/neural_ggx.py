@@ -5,8 +5,9 @@ import mitsuba as mi
 
 from mi_diffind.tasks import ggx
 
-from . import knowledge
-from .knowledge import Watched, when_outermost
+from . import Counterpart, Plugin
+from .support import properties, tables
+from .support.watched import Watched, when_outermost
 
 
 class NeuralGGX(mi.BSDF):
@@ -40,7 +41,7 @@ class NeuralGGX(mi.BSDF):
          0.0001 counts as 0.0001. (Default: 0.1)
        - |exposed|, |differentiable|, |discontinuous|
 
-     * - quality
+     * - preset
        - |string|
        - ``tables``: logarithmic inputs and a bounded output, accurate also in the peak of smooth surfaces; ``paper``:
          the paper's recipe, which misses the peak below a roughness of about 0.5, for comparison. (Default: that of
@@ -119,19 +120,13 @@ class NeuralGGX(mi.BSDF):
             if name in props:
                 raise RuntimeError(f'parameter "{name}": the tables are isotropic, give "alpha"')
 
-        number = "alpha" in props and props.type("alpha") in (mi.Properties.Type.Float, mi.Properties.Type.Integer)
-        if number and not 0 <= float(props["alpha"]) <= 1:  # NaN, too
-            raise RuntimeError(f'parameter "alpha": found {float(props["alpha"]):g}, allowed is [0, 1]')
+        properties.check_range(props, "alpha", 0, 1)
         self.alpha = props.get_unbounded_texture("alpha", 0.1)
         self.eta, self.k = _index_of_refraction(props)
         given = "specular_reflectance" in props
         self.specular_reflectance = props.get_texture("specular_reflectance") if given else None
 
-        filename = str(props.get("filename", ""))
-        if filename:
-            filename = str(mi.file_resolver().resolve(filename))
-        quality, storage = (str(props.get(name, "")) for name in ("quality", "storage"))
-        self.distribution, self.quality = ggx.load_ggx(filename, mi.TensorXf, storage, quality)
+        self.distribution, self.preset = tables.open_tables(props, ggx.load_ggx)
 
         self._watched_alpha = Watched(self.alpha)
         self._watched_ior = [Watched(self.eta, colour=True), Watched(self.k, colour=True)]
@@ -157,23 +152,17 @@ class NeuralGGX(mi.BSDF):
     def _tables(self) -> dict:
         """The arrays that are exposed."""
         net = self.distribution.net
-        arrays = {"primary": net.primary[0], "cascaded": net.cascaded}
-        return {name: array for name, array in arrays.items() if array.storage == "float32"}
+        return tables.exposed({"primary": net.primary[0], "cascaded": net.cascaded})
 
     def traverse(self, cb: mi.TraversalCallback):
         discontinuous = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
         for name, texture in self._textures().items():
             flags = mi.ParamFlags.Differentiable if name == "specular_reflectance" else discontinuous
             cb.put(name, texture, flags)
-        for name, array in self._tables().items():
-            cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
+        tables.traverse(cb, self._tables())
 
     def parameters_changed(self, keys: list[str] = ()):
-        for name, array in self._tables().items():
-            try:
-                array.check_shape()
-            except ValueError as e:
-                raise RuntimeError(f'parameter "tables.{name}": {e}') from None
+        tables.check_shapes(self._tables())
         self._prepare_constants()
 
     # -- what is evaluated once ---------------------------------------------------------------------------------------
@@ -195,8 +184,7 @@ class NeuralGGX(mi.BSDF):
     def _is_constant(self) -> bool:
         """Is the roughness the same everywhere, and neither it nor a table being optimised or changed since?"""
         w = self._watched_alpha
-        tables = any(knowledge.has_gradient(array.data) for array in self._tables().values())
-        return w.constant and not w.optimised() and not w.changed() and not tables
+        return w.constant and not w.optimised() and not w.changed() and not tables.optimised(self._tables())
 
     def _roughness(self, si, active) -> ggx.Roughness:
         if self._constant is not None and self._is_constant():
@@ -287,7 +275,7 @@ class NeuralGGX(mi.BSDF):
 
     def report(self) -> dict:
         """
-        What this instance does: ``quality``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
+        What this instance does: ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
         ``evaluated_once``, ``storage`` and ``table_bytes``.
         """
         left_out = {}
@@ -298,7 +286,7 @@ class NeuralGGX(mi.BSDF):
         effects = ("distribution", "masking", "fresnel", "specular_reflectance")
         net = self.distribution.net
         return {
-            "quality": self.quality,
+            "preset": self.preset,
             "effects_in_use": [name for name in effects if name not in left_out],
             "effects_left_out": left_out,
             "evaluated_once": [] if self._constant is None else ["roughness"],
@@ -309,7 +297,7 @@ class NeuralGGX(mi.BSDF):
     def to_string(self):
         net = self.distribution.net
         lines = [f"  {name} = {t!s}," for name, t in self._textures().items()]
-        lines.append(f"  quality = {self.quality}, {net.nbytes} bytes as {net.cascaded.storage},")
+        lines.append(f"  preset = {self.preset}, {net.nbytes} bytes as {net.cascaded.storage},")
         return "NeuralGGX[\n" + "\n".join(line.replace("\n", "\n  ") for line in lines) + "\n]"
 
 
@@ -379,4 +367,10 @@ def _scaled(reflectance, factor):
     return mi.Spectrum([[reflectance[i, j] * factor for j in range(4)] for i in range(4)])
 
 
-mi.register_bsdf("neural_ggx", NeuralGGX)
+PLUGIN = Plugin(
+    "neural_ggx",
+    "bsdf",
+    NeuralGGX,
+    task="ggx",
+    exact=Counterpart("roughconductor", ("preset", "filename", "storage"), {"distribution": "ggx"}),
+)

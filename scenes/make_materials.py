@@ -54,7 +54,8 @@ HEADER = """\
     <default name="width" value="960"/>
     <default name="height" value="552"/>
     <default name="max_depth" value="5"/>
-    <default name="quality" value="tables"/>
+    <default name="preset" value="tables"/>
+    <default name="storage" value="uint8"/>
     <default name="effects" value="used"/>
 
     <integrator type="path">
@@ -141,7 +142,8 @@ SPHERE = """
             <translate x="{x:.3f}" y="0.5" z="{z:.3f}"/>
         </transform>
         <bsdf type="neural_disney" id="{name}_{column}">
-            <string name="quality" value="$quality"/>
+            <string name="preset" value="$preset"/>
+            <string name="storage" value="$storage"/>
             <string name="effects" value="$effects"/>
             <rgb name="base_color" value="{color}"/>
 {parameters}

@@ -15,7 +15,7 @@ HEAD = """\
     <default name="width" value="960"/>
     <default name="height" value="500"/>
     <default name="max_depth" value="5"/>
-    <default name="quality" value="tables"/>
+    <default name="preset" value="tables"/>
     <default name="storage" value="float32"/>
 
     <integrator type="path">
@@ -70,7 +70,7 @@ HEAD = """\
             <rotate x="1" angle="-90"/>
         </transform>
         <bsdf type="neural_ggx" id="table">
-            <string name="quality" value="$quality"/>
+            <string name="preset" value="$preset"/>
             <string name="storage" value="$storage"/>
             <string name="material" value="W"/>
             <rgb name="specular_reflectance" value="0.35, 0.37, 0.4"/>
@@ -90,7 +90,7 @@ BALL = """
         <point name="center" x="{x:g}" y="0.5" z="{z:g}"/>
         <float name="radius" value="0.5"/>
         <bsdf type="neural_ggx" id="{name}_{column}">
-            <string name="quality" value="$quality"/>
+            <string name="preset" value="$preset"/>
             <string name="storage" value="$storage"/>
             <string name="material" value="{material}"/>
             <float name="alpha" value="{alpha:g}"/>

@@ -365,7 +365,7 @@ def load_ggx(filename: str | os.PathLike, dtype, storage: str = "", quality: str
     net, encoding = _load(path, path.stat().st_mtime_ns if path.is_file() else 0, dtype, storage)
     has = next((name for name, e in ENCODINGS.items() if e == encoding), "tables")
     if quality not in ("", has):
-        raise TableError(f'{path}: holds tables of the quality "{has}", "{quality}" was asked for')
+        raise TableError(f'{path}: holds tables of the preset "{has}", "{quality}" was asked for')
     copies = []
     for array in (*net.primary, net.cascaded):
         copies.append(array._like())
@@ -374,7 +374,7 @@ def load_ggx(filename: str | os.PathLike, dtype, storage: str = "", quality: str
 
 
 def _check(quality: str, storage: str) -> None:
-    for name, found, allowed in (("quality", quality, tuple(ENCODINGS)), ("storage", storage, STORAGES)):
+    for name, found, allowed in (("preset", quality, tuple(ENCODINGS)), ("storage", storage, STORAGES)):
         if found and found not in allowed:
             raise ValueError(f'parameter "{name}": found "{found}", allowed are {", ".join(allowed)}')
 

@@ -138,7 +138,7 @@ def _candidates() -> tuple[list[Candidate], dict]:
 
     def with_decoder(decoder):
         def build(parameters):
-            bsdf = mi.load_dict({"type": "neural_disney", "quality": "tables", **parameters})
+            bsdf = mi.load_dict({"type": "neural_disney", "preset": "tables", "storage": "float32", **parameters})
             bsdf.decoder = decoder(bsdf.decoder.arrays)
             bsdf.parameters_changed()  # what is evaluated once depends on the decoder
             return bsdf
@@ -158,7 +158,7 @@ def _candidates() -> tuple[list[Candidate], dict]:
     plugins = {
         "principled": loaded(type="principled"),
         "disney": loaded(type="disney"),
-        "fast": loaded(type="neural_disney", quality="fast"),
+        "fast": loaded(type="disney"),
     }
     for quality in ("tables", "paper"):
         table, _ = load_disney_table(table_file("", quality))
@@ -167,7 +167,7 @@ def _candidates() -> tuple[list[Candidate], dict]:
             name = quality if storage == "float32" else f"{quality}, {storage}"
             decoder = lambda q=quality, s=storage: decoder_of(load_arrays("", types.TensorXf, s, q))  # noqa: E731
             candidates.append(Candidate(name, quality, storage, table.to(storage).nbytes, seconds, errors(decoder)))
-            plugins[name] = loaded(type="neural_disney", quality=quality, storage=storage)
+            plugins[name] = loaded(type="neural_disney", preset=quality, storage=storage)
     table, _ = load_disney_table(table_file("", "tables"))
     seconds = table.settings.get("seconds")
     for factor in FactoredDecoder.FACTORS:

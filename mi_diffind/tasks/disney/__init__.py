@@ -5,13 +5,14 @@ Task 2: the Disney BRDF (Burley 2012), exact and as tables.
 - :mod:`.effects`: which parts of the model a material makes use of;
 - :mod:`.decoder`: the model in two steps, per material and per direction; what tables can replace;
 - :mod:`.arrays`, :mod:`.paper`, :mod:`.factored`: the tables, in the paper's layout and in a better one;
-- :mod:`.library`: quality levels, and the tables that ship;
+- :mod:`.library`: presets, and the tables that ship;
 - :mod:`.sampling`: importance sampling, and the density that goes with it;
 - :mod:`.training`: training distributions, quality.
 """
 
+from ..known import Known
 from .decoder import Decoder
-from .effects import Effects, Known, find_effects
+from .effects import Effects, find_effects
 from .factored import FactoredArrays
 from .library import load_decoder
 from .model import Factors, Material, compose, exact_factors

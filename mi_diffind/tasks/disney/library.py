@@ -13,11 +13,10 @@ from .decoder import Decoder
 from .factored import FactoredArrays, FactoredDecoder
 from .paper import PaperArrays, PaperDecoder
 
-#: Levels of quality, named by what they promise: ``"fast"``: arithmetic wherever it is faster than a table on a CPU;
-#: ``"tables"``: every factor from tables, in the best factorisation; ``"paper"``: the paper's layout.
-QUALITIES = ("fast", "tables", "paper")
-
 LAYOUTS = {"tables": FactoredArrays, "paper": PaperArrays}
+
+#: The presets: ``"tables"``, the best factorisation, and the default; ``"paper"``, the paper's layout.
+PRESETS = tuple(LAYOUTS)
 
 _FOLDER = Path(__file__).resolve().parents[2] / "data"
 
@@ -42,30 +41,27 @@ def load_disney_table(path: str | os.PathLike) -> tuple[Table, type[Arrays]]:
     return table, layout
 
 
-def table_file(filename: str | os.PathLike, quality: str) -> Path | None:
-    """
-    The file that a decoder reads: ``filename``, or the one that ships for ``quality``; ``None`` if it reads none.
-    """
-    if str(filename):
-        return Path(filename)
-    return SHIPPED.get(quality or "fast")
+def table_file(filename: str | os.PathLike, preset: str = "") -> Path:
+    """The file that is read: ``filename``, or the one that ships for ``preset`` ("": the default)."""
+    return Path(filename) if str(filename) else SHIPPED[preset or PRESETS[0]]
 
 
-def load_arrays(filename: str | os.PathLike, dtype, storage: str = "", quality: str = "") -> Arrays:
+def load_arrays(filename: str | os.PathLike, dtype, storage: str = "", preset: str = "") -> Arrays:
     """
     Tables allocated for the tensor type ``dtype`` in the given storage form, "" meaning the file's own; ``filename`` ""
-    means the shipped ones of ``quality``.
+    means the shipped ones of ``preset``.
 
     A file is read and checked once, and what is returned shares its memory (Dr.Jit arrays are never written in
     place), yet assigning to one copy does not change another. Raises :class:`TableError` or ``ValueError``.
     """
-    if storage and storage not in STORAGES:
-        raise ValueError(f'parameter "storage": found "{storage}", allowed are {", ".join(STORAGES)}')
-    path = table_file(filename, quality)
+    for name, found, allowed in (("storage", storage, STORAGES), ("preset", preset, PRESETS)):
+        if found and found not in allowed:
+            raise ValueError(f'parameter "{name}": found "{found}", allowed are {", ".join(allowed)}')
+    path = table_file(filename, preset)
     stamp = path.stat().st_mtime_ns if path.is_file() else 0
     original = _load(path, stamp, dtype, storage)
-    if quality not in ("", original.QUALITY):
-        raise TableError(f'{path}: holds tables of the quality "{original.QUALITY}", "{quality}" was asked for')
+    if preset not in ("", original.QUALITY):
+        raise TableError(f'{path}: holds tables of the preset "{original.QUALITY}", "{preset}" was asked for')
     arrays = {}
     for name in original.SHAPES:
         arrays[name] = getattr(original, name)._like()
@@ -73,27 +69,14 @@ def load_arrays(filename: str | os.PathLike, dtype, storage: str = "", quality: 
     return type(original)(arrays)
 
 
-def load_decoder(filename: str | os.PathLike, dtype, storage: str = "", quality: str = "") -> Decoder:
-    """
-    A decoder of the given quality, or of that of the file, or the default, ``"fast"``. Raises :class:`TableError` or
-    ``ValueError``.
-    """
-    if quality and quality not in QUALITIES:
-        raise ValueError(f'parameter "quality": found "{quality}", allowed are {", ".join(QUALITIES)}')
-    if table_file(filename, quality) is None or quality == "fast":
-        given = "filename" if str(filename) else "storage" if storage else ""
-        if given:
-            raise ValueError(
-                f'parameter "{given}": the quality "fast" reads no tables; give quality "tables" or "paper" with it'
-            )
-        return Decoder()
-    return decoder_of(load_arrays(filename, dtype, storage, quality))
+def load_decoder(filename: str | os.PathLike, dtype, storage: str = "", preset: str = "") -> Decoder:
+    """The decoder that reads what :func:`load_arrays` returns, and raises as that does."""
+    return decoder_of(load_arrays(filename, dtype, storage, preset))
 
 
-def decoder_of(arrays: Arrays | None) -> Decoder:
-    """The decoder that reads ``arrays``; the analytic one for ``None``."""
-    decoders = {type(None): Decoder, FactoredArrays: FactoredDecoder, PaperArrays: PaperDecoder}
-    return Decoder() if arrays is None else decoders[type(arrays)](arrays)
+def decoder_of(arrays: Arrays) -> Decoder:
+    """The decoder that reads ``arrays``."""
+    return {FactoredArrays: FactoredDecoder, PaperArrays: PaperDecoder}[type(arrays)](arrays)
 
 
 @functools.lru_cache(maxsize=64)

@@ -15,7 +15,7 @@ from mi_diffind.tasks.image.compressed import PRIMARIES, CompressedImage, load_i
 from mi_diffind.tasks.image.layout import Layout, MapLayout
 from mi_diffind.tasks.image.source import SourceError, load_source
 
-from .knowledge import has_gradient
+from .watched import has_gradient
 
 STORAGES = ("uint8", "float32")
 
@@ -29,8 +29,8 @@ _lock = threading.RLock()  # a thread that waits for a kernel may go on with ano
 class SharedImage:
     """A file's arrays, the same Dr.Jit variables for all textures that read them, and what else these share."""
 
-    def __init__(self, image: CompressedImage):
-        self.image = image
+    def __init__(self, image: CompressedImage, preset: str):
+        self.image, self.preset = image, preset
         self._loaded = self.state()
         self._transforms = {}
 
@@ -82,7 +82,10 @@ def open_image(path: str | Path, storage: str) -> SharedImage:
         found = _cache.get(key)
         if found is None or not found.as_loaded():
             table, _ = load_image_table(path)  # raises for what is no file, too
-            found = SharedImage(CompressedImage.from_table(table, mi.TensorXf, storage))
+            found = SharedImage(
+                CompressedImage.from_table(table, mi.TensorXf, storage),
+                str(table.settings.get("preset", table.settings.get("recipe", ""))),
+            )
             if key is not None:
                 _cache[key] = found
         return found
