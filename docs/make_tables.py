@@ -4,7 +4,7 @@ Write the tables of the documentation: ``tasks.md`` from what tasks declare, and
 
     python docs/make_tables.py [--check]
 
-Each file of ``docs/measured/`` was written by ``mi-diffind … --json docs/measured/NAME.json``; the commands stand in the
+Each file of ``docs/measured/`` was written by ``mi-diffind … --json docs/measured/NAME.json``; the commands are in the
 pages. With ``--check`` nothing is written; exit code 1 if a page is not as it would be written.
 """
 

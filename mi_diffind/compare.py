@@ -1,6 +1,7 @@
 """
 A scene as written beside the same scene with every learned plugin replaced by its exact counterpart: what the
-approximation costs in accuracy, and what it takes or saves in time.
+approximation costs in accuracy, and what it takes or saves in time. Or, with another counterpart, such as Mitsuba's
+``principled``: how one model differs from another.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class Comparison:
     """Both images (linear, ``(height, width, 3)``) and what was measured (see :func:`compare`)."""
 
     written: np.ndarray
-    exact: np.ndarray
+    reference: np.ndarray
     figures: dict
 
 
@@ -36,24 +37,33 @@ def compare(
     passes: int = 5,
     progress: bool = True,
     defines: dict[str, str] | None = None,
+    against: str = "exact",
 ) -> Comparison:
     """
-    Render ``path`` as written and exact, in turn, pass by pass, with the same random numbers.
+    Render ``path`` as written and exact, in turn, pass by pass, with the same random numbers. ``against`` may name
+    another counterpart, such as ``"principled"``, that every plugin which has it is replaced by, learned or not.
 
-    Figures: ``psnr_db``, ``flip``, ``mae`` of the image as written against the exact one; the median seconds of a pass
-    of each; ``time_ratio``, written over exact: median, minimum and maximum over the ``pairs`` of passes, rendered one
-    after the other, but the first pair, which compiles (it counts if there is no other); ``learned_plugins`` and the
-    ``table_bytes`` of each distinct table they read. What slows the machine down slows both passes of a pair: the ratio
-    is the number to quote, and not that of the two medians. Ctrl-C ends it after the current pair of passes; ``spp``
-    and ``passes`` then say how many there were, and ``interrupted`` is true.
+    Figures: ``against``; ``psnr_db``, ``flip``, ``mae`` of the image as written against the other one, and
+    ``brightness``, the ratio of their means; the median seconds of a pass of each; ``time_ratio``, written over the
+    other: median, minimum and maximum over the ``pairs`` of passes, rendered one after the other, but the first pair,
+    which compiles (it counts if there is no other); ``replaced_plugins``, how many; how many of them are
+    ``learned_plugins``, and the ``table_bytes`` of each distinct table these read. What slows the machine down slows
+    both passes of a pair: the ratio is the number to quote, and not that of the two medians. Ctrl-C ends it after the
+    current pair of passes; ``spp`` and ``passes`` then say how many there were, and ``interrupted`` is true.
 
-    Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no learned plugin.
+    Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no plugin with such a counterpart.
     """
-    learned = scenes.learned_plugins(path, defines=defines)
-    if not learned:
-        names = ", ".join(plugins.EXACT_COUNTERPARTS)
-        raise scenes.SceneError(f"{path}: names no learned plugin ({names}), so there is nothing to compare")
-    loaded = {"written": scenes.load(path, defines=defines), "exact": scenes.load(path, exact=True, defines=defines)}
+    names = plugins.with_counterpart(against)
+    if not names:
+        others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
+        raise scenes.SceneError(f'"{against}": no plugin has this counterpart; there are {", ".join(others)}')
+    replaced = scenes.learned_plugins(path, defines, against)
+    if not replaced:
+        what = "learned plugin" if against == "exact" else f'plugin that "{against}" can stand for'
+        raise scenes.SceneError(f"{path}: names no {what} ({', '.join(names)}), so there is nothing to compare")
+    learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
+    reference = scenes.load(path, exact=True, defines=defines, against=against)  # may refuse, and is so asked first
+    loaded = {"written": scenes.load(path, defines=defines), against: reference}
     spp = spp or loaded["written"].sensors()[0].sampler().sample_count()
     passes = max(1, min(passes, spp))
     images, seconds, done = {}, {name: [] for name in loaded}, 0
@@ -70,12 +80,12 @@ def compare(
             if stop.is_set():
                 break
 
-    requested, spp, passes = spp, done, len(seconds["exact"])
-    written, exact = ((images[name][..., :3] / spp).astype(np.float32) for name in ("written", "exact"))
+    requested, spp, passes = spp, done, len(seconds[against])
+    written, reference = ((images[name][..., :3] / spp).astype(np.float32) for name in loaded)
     if written.shape[-1] == 1:
-        written, exact = np.repeat(written, 3, -1), np.repeat(exact, 3, -1)
+        written, reference = np.repeat(written, 3, -1), np.repeat(reference, 3, -1)
     timed = slice(1, None) if passes > 1 else slice(None)
-    ratios = [w / e for w, e in zip(seconds["written"][timed], seconds["exact"][timed], strict=True)]
+    ratios = [w / e for w, e in zip(seconds["written"][timed], seconds[against][timed], strict=True)]
     figures = {
         "scene": str(path),
         "variant": mi.variant(),
@@ -83,7 +93,9 @@ def compare(
         "seed": seed,
         "width": written.shape[1],
         "height": written.shape[0],
-        **metrics.compare(exact, written),
+        "against": against,
+        **metrics.compare(reference, written),
+        "brightness": float(written.mean(dtype=np.float64) / max(reference.mean(dtype=np.float64), 1e-30)),
         "seconds_per_pass": {name: statistics.median(seconds[name][timed]) for name in loaded},
         "seconds_first_pass": {name: seconds[name][0] for name in loaded},
         "time_ratio": {
@@ -95,22 +107,24 @@ def compare(
         "passes": passes,
         "interrupted": done < requested,
         "spp_requested": requested,
+        "replaced_plugins": len(replaced),
         "learned_plugins": len(learned),
         "table_bytes": scenes.table_bytes(path, learned),
     }
-    return Comparison(written, exact, figures)
+    return Comparison(written, reference, figures)
 
 
 def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
     """
-    Write ``comparison.png`` and the EXRs ``written.exr``, ``exact.exr``, ``error.exr`` (absolute difference) into
-    ``folder``, which is made if its parent exists. Returns the paths. Raises :class:`OutputError`.
+    Write ``comparison.png`` and the EXRs ``written.exr``, ``exact.exr`` (or by the name of the other counterpart) and
+    ``error.exr`` (absolute difference) into ``folder``, which is made if its parent exists. Returns the paths. Raises
+    :class:`OutputError`.
     """
     folder = writable_folder(folder, create=True)
     images = {
         "written": comparison.written,
-        "exact": comparison.exact,
-        "error": np.abs(comparison.written - comparison.exact),
+        comparison.figures["against"]: comparison.reference,
+        "error": np.abs(comparison.written - comparison.reference),
     }
     paths = {}
     for name, image in images.items():
@@ -122,13 +136,14 @@ def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
 
 
 def figure(comparison: Comparison, path: str | os.PathLike) -> None:
-    """One picture to judge at a glance: as written, exact, error map with a colour bar, numbers."""
-    error = np.abs(comparison.written - comparison.exact).mean(axis=-1)
+    """One picture to judge at a glance: as written, the other, error map with a colour bar, numbers."""
+    error, against = np.abs(comparison.written - comparison.reference).mean(axis=-1), comparison.figures["against"]
     top = max(float(np.quantile(error, 0.995)), 1e-6)
     title = "absolute difference, mean of the channels (linear)"
+    learned = " (learned tables)" if comparison.figures["learned_plugins"] else ""
     cells = [
-        sheet.picture("as written (learned tables)", comparison.written),
-        sheet.picture("exact", comparison.exact),
+        sheet.picture(f"as written{learned}", comparison.written),
+        sheet.picture(against, comparison.reference),
         sheet.colour_map(title, error, "max", cmap="magma", vmin=0, vmax=top),
         sheet.text(summary(comparison.figures)),
     ]
@@ -141,17 +156,20 @@ def summary(f: dict) -> list[str]:
     pairs = f"median of {ratio['pairs']} pairs of passes in turn, {ratio['min']:.2f} to {ratio['max']:.2f}"
     if ratio["pairs"] == 1:
         pairs = "of one pair of passes" + (", compilation included" if f["passes"] == 1 else "")
-    learned = "1 plugin" if f["learned_plugins"] == 1 else f"{f['learned_plugins']} plugins"
+    replaced = "1 plugin" if f["replaced_plugins"] == 1 else f"{f['replaced_plugins']} plugins"
+    what = "learned" if f["against"] == "exact" else "replaced"
     spp = f"{f['spp']} of {f['spp_requested']} spp (interrupted)" if f["interrupted"] else f"{f['spp']} spp"
     return [
         f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {spp}",
         f"variant     {f['variant']}",
-        f"learned     {learned}, {f['table_bytes']:,} bytes of tables",
+        f"{what:12}{replaced}, {f['table_bytes']:,} bytes of tables",
         "",
         f"PSNR        {f['psnr_db']:.2f} dB   (linear, clipped to [0, 1])",
         f"FLIP        {f['flip']:.4f}     (0 = equal to the eye)",
         f"MAE         {f['mae']:.5f}",
+        f"brightness  {f['brightness']:.4f} of that of {f['against']}",
         "",
-        f"time        {ratio['median']:.2f} times that of exact ({f['seconds_per_pass']['exact']:.3g} s a pass)",
+        f"time        {ratio['median']:.2f} times that of {f['against']} "
+        f"({f['seconds_per_pass'][f['against']]:.3g} s a pass)",
         f"            {pairs}",
     ]

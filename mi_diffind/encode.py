@@ -3,7 +3,7 @@ The paper's material encoding: the parameter textures of a material become *late
 directly.
 
 A latent texture holds three parameters in its channels, so that one read brings three of them. Roughness and anisotropy
-are stored as the encoder's coordinates (of the material's quality level), where bytes are spaced as the decoder needs
+are stored as the encoder's coordinates (of the material's preset), where bytes are spaced as the decoder needs
 them, and the encoder need not be read when rendering; the others as they are. Only textures that have an effect are
 stored; constants remain parameters. The last texture has one channel if one is enough.
 """
@@ -11,17 +11,17 @@ stored; constants remain parameters. The last texture has one channel if one is 
 from __future__ import annotations
 
 import os
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import metrics, scenes
+from . import metrics, plugins, scenes
 from .files import replacing, writable_folder
 from .measure.clock import kernel_seconds, total
 from .measure.statistics import spread
-from .tasks.disney.model import SPECULAR_SCALE
 
 #: How latent textures may be stored: bytes as PNG, or half precision as EXR.
 STORAGES = ("uint8", "float16")
@@ -44,26 +44,19 @@ def encode(
     ``bytes_before`` of all textures in memory, and what :func:`measure` finds. Raises
     :class:`~mi_diffind.scenes.SceneError`.
     """
-    scene = scenes.load(path, defines=defines)
-    found = {m.id(): m for m in scenes.learned_materials(scene)}
-    if material not in found:
-        raise scenes.SceneError(f'{path}: has no learned material "{material}"; there are {", ".join(sorted(found))}')
-    bsdf = found[material]
-    if bsdf.latents:
-        raise scenes.SceneError(f'{path}: the parameters of "{material}" are encoded already')
-    names = bsdf.textured()
-    if not names:
-        raise scenes.SceneError(f'{path}: no parameter of "{material}" is a texture, so there is nothing to encode')
-    if bsdf.reflectance_name == "eta" and "specular" in names:
-        raise scenes.SceneError(f'{path}: "{material}" has a texture for eta, only one for specular can be encoded')
-    to_uv = _common_transform(path, {name: bsdf.parameter(name) for name in names})
-    sizes = [bsdf.parameter(name).resolution() for name in names]
-    width, height = (resolution, resolution) if resolution else (max(int(s[i]) for s in sizes) for i in (0, 1))
-    with dr.suspend_grad():
-        si = _texels(width, height, to_uv)
-        colour = [np.stack([c.numpy() for c in _rgb(bsdf.parameter("base_color"), si)], -1)] * ("base_color" in names)
-        names = [name for name in names if name != "base_color"]
-        channels = [np.asarray(bsdf.encoded(name, si).numpy()) for name in names]
+    with scenes.scene_errors(path):
+        bsdf = _material(scenes.load(path, defines=defines), material)
+        before = bsdf.encodable()
+        if not before:
+            raise RuntimeError(f'no parameter of "{material}" is a texture, so there is nothing to encode')
+        to_uv = _common_transform(before)
+        sizes = [texture.resolution() for texture in before.values()]
+        width, height = (resolution, resolution) if resolution else (max(int(s[i]) for s in sizes) for i in (0, 1))
+        names = [name for name in before if name not in bsdf.ENCODED_AS_COLOUR]
+        with dr.suspend_grad():
+            si = _texels(width, height, to_uv)
+            colours = {n: np.stack([c.numpy() for c in _rgb(t, si)], -1) for n, t in before.items() if n not in names}
+            channels = [np.asarray(bsdf.encoded(name, si).numpy()) for name in names]
     folder = writable_folder(folder, create=True)
     suffix, textures, size = {"uint8": ".png", "float16": ".exr"}[storage], {}, 0
     per_channel = width * height * {"uint8": 1, "float16": 2}[storage]
@@ -71,29 +64,41 @@ def encode(
         group = channels[i : i + 3]
         group += [np.zeros_like(group[0])] * (0 if len(group) == 1 else 3 - len(group))
         textures[f"latents_{i // 3}"] = np.stack(group, -1)
-    for name, values in (*textures.items(), *(("base_color", c) for c in colour)):
+    for name, values in (textures | colours).items():
         values = values.reshape(height, width, -1)
         size += per_channel * values.shape[-1]
         with replacing(folder / f"{name}{suffix}") as temporary:
-            _write(temporary, values, storage, name == "base_color")
-    snippet = _snippet(bsdf, names, textures, bool(colour), suffix, to_uv)
+            _write(temporary, values, storage, name in colours)
+    files = {name: f"{name}{suffix}" for name in textures | colours}
     with replacing(folder / "material.xml") as temporary:
-        temporary.write_text(snippet, encoding="utf-8")
+        temporary.write_text(_written(bsdf, names, files, set(textures), to_uv), encoding="utf-8")
     result = mi.load_file(str(folder / "material.xml"))
     return {
         "scene": str(path),
         "material": material,
-        "quality": bsdf.report()["quality"],
+        "preset": bsdf.report()["preset"],
         "layout": names,
-        "base_color": bool(colour),
+        "colours": list(colours),
         "width": width,
         "height": height,
         "storage": storage,
         "bytes": size,
-        "bytes_before": sum(_bytes(bsdf.parameter(n)) for n in (*names, *(["base_color"] if colour else []))),
-        "files": [str(folder / "material.xml"), *(str(folder / f"{n}{suffix}") for n in textures)],
+        "bytes_before": sum(_bytes(texture) for texture in before.values()),
+        "files": [str(folder / file) for file in ("material.xml", *files.values())],
         **measure(bsdf, result),
     }
+
+
+def _material(scene, material: str):
+    """The material with an id, which can be encoded."""
+    able = ", ".join(p.name for p in plugins.declared().values() if hasattr(p.factory, "encodable"))
+    found = {node.id(): node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.BSDF) and node.id()}
+    if not hasattr(found.get(material), "encodable"):
+        ids = ", ".join(sorted(name for name, node in found.items() if hasattr(node, "encodable"))) or "none"
+        if material in found:
+            raise RuntimeError(f'"{material}" has no latents, which only materials of {able} have; there are {ids}')
+        raise RuntimeError(f'has no material "{material}"; only materials of {able} can be encoded: {ids}')
+    return found[material]
 
 
 def measure(before, after, samples: int = 2**20, rounds: int = 15, seed: int = 0) -> dict:
@@ -124,12 +129,12 @@ def _hemisphere(rng, n: int):
     return mi.Vector3f(np.stack([r * np.cos(phi), r * np.sin(phi), z]).astype(np.float32))
 
 
-def _common_transform(path, textures: dict):
+def _common_transform(textures: dict):
     found = {name: mi.traverse(texture).get("to_uv") for name, texture in textures.items()}
     distinct = {str(transform.matrix) for transform in found.values() if transform is not None}
     if len(distinct) != 1 or None in found.values():
-        raise scenes.SceneError(
-            f"{path}: the textures {', '.join(textures)} have to be bitmaps with the same to_uv to be encoded together"
+        raise RuntimeError(
+            f"the textures {', '.join(textures)} have to be bitmaps with the same to_uv to be encoded together"
         )
     return next(iter(found.values()))
 
@@ -147,7 +152,7 @@ def _texels(width: int, height: int, to_uv):
 
 def _rgb(texture, si):
     if mi.is_spectral:
-        raise scenes.SceneError(f"the variant {mi.variant()} cannot encode colours; use an RGB variant")
+        raise RuntimeError(f"the variant {mi.variant()} cannot encode colours; use an RGB variant")
     return texture.eval_3(si) if mi.is_rgb else texture.eval(si)
 
 
@@ -164,37 +169,19 @@ def _write(path: Path, values: np.ndarray, storage: str, is_colour: bool) -> Non
         mi.Bitmap(np.ascontiguousarray(values.astype(np.float16))).write(str(path))
 
 
-def _snippet(bsdf, names, textures, colour: bool, suffix: str, to_uv) -> str:
-    """The XML of the encoded material: its constants, and the textures."""
+def _written(bsdf, names: list[str], files: dict[str, str], raw: set[str], to_uv) -> str:
+    """The XML of the encoded material: what it says itself, and the textures, of which ``raw`` hold no colours."""
     m = np.array(to_uv.matrix, np.float64).reshape(3, 3)
-    transform = ""
-    if not np.allclose(m, np.eye(3)):
-        full = np.eye(4)
-        full[:2, :2], full[:2, 3] = m[:2, :2], m[:2, 2]
-        matrix = " ".join(f"{v:.9g}" for v in full.ravel())
-        transform = f'<transform name="to_uv"><matrix value="{matrix}"/></transform>'
-    lines = [f'<bsdf version="3.0.0" type="neural_disney" id="{bsdf.id()}">']
-    lines.append(f'    <string name="quality" value="{bsdf.report()["quality"]}"/>')
-    constants = bsdf.constants()
-    if bsdf.reflectance_name == "eta" and "specular" in constants:
-        root = float(np.sqrt(SPECULAR_SCALE * constants.pop("specular")))
-        constants["eta"] = (1 + root) / (1 - root)
-    for name, value in constants.items():
-        if name == "base_color":
-            rgb = ", ".join(f"{v:.9g}" for v in value)
-            lines.append(f'    <rgb name="base_color" value="{rgb}"/>')
-        elif name not in names:
-            lines.append(f'    <float name="{name}" value="{value:.9g}"/>')
-    if names:
-        lines.append(f'    <string name="latents" value="{" ".join(names)}"/>')
-    files = [(name, True) for name in textures] + ([("base_color", False)] if colour else [])
-    for name, raw in files:
-        lines.append(f'    <texture name="{name}" type="bitmap">')
-        lines.append(f'        <string name="filename" value="{name}{suffix}"/>')
-        if raw:
-            lines.append('        <boolean name="raw" value="true"/>')
-        if transform:
-            lines.append(f"        {transform}")
-        lines.append("    </texture>")
-    lines.append("</bsdf>")
-    return "\n".join(lines) + "\n"
+    full = np.eye(4)
+    full[:2, :2], full[:2, 3] = m[:2, :2], m[:2, 2]
+    place = {} if np.allclose(m, np.eye(3)) else {"to_uv": mi.ScalarTransform4f(full)}
+    textures = {
+        name: {"type": "bitmap", "filename": file, **({"raw": True} if name in raw else {}), **place}
+        for name, file in files.items()
+    }
+    state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), {**bsdf.encoded_as(names), **textures})
+    state.root.type = mi.ObjectType.BSDF  # of plugins in Python it is not known yet
+    root = ET.fromstring(mi.parser.write_string(state))
+    root.set("id", bsdf.id())  # of the root, Mitsuba leaves it out
+    ET.indent(root, "    ")
+    return ET.tostring(root, encoding="unicode") + "\n"

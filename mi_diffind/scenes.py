@@ -18,11 +18,10 @@ import mitsuba as mi
 import numpy as np
 
 from . import plugins
+from .errors import DiffindError
 from .files import replacing
 from .measure.operations import bsdf_operations
-from .tasks import ggx
-from .tasks.disney import library as disney
-from .tasks.image import compressed as image
+from .tasks.task import tasks
 
 #: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
 MAX_DEPTHS = {
@@ -30,15 +29,8 @@ MAX_DEPTHS = {
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
 }
 
-#: For each learned plugin: which file it reads, by file name and quality, and how to read it.
-_TABLES = {
-    "neural_disney": (disney.table_file, disney.load_disney_table),
-    "neural_ggx": (ggx.table_file, ggx.load_ggx_table),
-    "neural_image": (lambda name, quality: name, image.load_image_table),
-}
 
-
-class SceneError(RuntimeError):
+class SceneError(DiffindError, RuntimeError):
     """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
 
 
@@ -47,9 +39,11 @@ def load(
     exact: bool = False,
     longest_path: int | None = None,
     defines: dict[str, str] | None = None,
+    against: str = "exact",
 ):
     """
-    Load a scene as ``mi.load_file`` does; with ``exact``, every learned plugin is replaced by its exact counterpart.
+    Load a scene as ``mi.load_file`` does; with ``exact``, every learned plugin is replaced by its exact counterpart, or
+    by the one that ``against`` names (:func:`swap`).
 
     ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
     infinite), and ``defines`` (name → value) the scene's ``<default>`` values. Raises :class:`SceneError`.
@@ -58,7 +52,7 @@ def load(
         config = mi.parser.ParserConfig(mi.variant())
         state = _parse(config, path, defines)
         if exact:
-            swap_exact(state)
+            swap(state, against)
         if longest_path is not None:
             _path_integrator(state)["max_depth"] = longest_path
         mi.parser.transform_all(config, state)
@@ -68,20 +62,22 @@ def load(
         return loaded
 
 
-def swap_exact(state) -> int:
-    """Replace learned plugins in a parsed scene (``mi.parser.ParserState``) by exact ones; returns how many."""
-    count = 0
-    for node in state.nodes:
-        props = node.props
-        counterpart = plugins.EXACT_COUNTERPARTS.get(props.plugin_name())
-        if counterpart is not None:
-            if "latents" in props:
-                raise RuntimeError(
-                    f'"{props.id()}" has its parameters encoded (latents); its exact counterpart needs the originals'
-                )
-            counterpart.replace(props)
-            count += 1
-    return count
+def swap(state, against: str = "exact") -> int:
+    """
+    Replace the plugins of a parsed scene (``mi.parser.ParserState``) that have one by their exact counterpart, or by
+    the one that ``against`` names, such as ``"principled"``; returns how many.
+    """
+    found = _declared_nodes(state, against)
+    for props, plugin in found:
+        plugin.counterpart(against).replace(props)
+    return len(found)
+
+
+def _declared_nodes(state, against: str) -> list:
+    """The properties of a parsed scene's nodes that are plugins of ours with such a counterpart, and the plugins."""
+    declared = plugins.declared()
+    found = [(node.props, declared.get(node.props.plugin_name())) for node in state.nodes]
+    return [(props, plugin) for props, plugin in found if plugin and plugin.counterpart(against)]
 
 
 def integrator_of(path: str | os.PathLike, defines: dict[str, str] | None = None) -> tuple[str, int]:
@@ -96,50 +92,52 @@ def integrator_of(path: str | os.PathLike, defines: dict[str, str] | None = None
         return name, int(props.get("max_depth", MAX_DEPTHS[name]))
 
 
-def learned_plugins(path: str | os.PathLike, defines: dict[str, str] | None = None) -> list[dict]:
+def learned_plugins(
+    path: str | os.PathLike, defines: dict[str, str] | None = None, against: str = "exact"
+) -> list[dict]:
     """
-    The learned plugins that a scene file names: ``plugin``, ``id``, ``parameters`` (constants as numbers, textures as
-    ``"texture"``), ``filename`` and ``storage`` of its tables. Raises :class:`SceneError`.
+    The learned plugins that a scene file names, in the file's order: ``plugin``, ``kind``, ``id``, ``parameters``
+    (constants as numbers, textures as ``"texture"``), and ``preset``, ``filename``, ``storage``, … as far as they are
+    given. With ``against``, all plugins that have the counterpart of that name. Raises :class:`SceneError`.
     """
-    found = []
     with scene_errors(path), _resolving(path):
         state = _parse(mi.parser.ParserConfig(mi.variant()), path, defines)
-        for node in state.nodes:
-            props = node.props
-            if props.plugin_name() not in plugins.EXACT_COUNTERPARTS:
-                continue
-            learned_only = plugins.EXACT_COUNTERPARTS[props.plugin_name()].learned_only
-            constants = {k: _constant(props, k) for k in props if k not in learned_only}
-            found.append({
-                "plugin": props.plugin_name(),
-                "id": props.id(),
-                "parameters": constants,
-                **{k: str(props[k]) for k in learned_only if k in props},
-            })  # fmt: skip
-    return found
+        return [plugin.described(props) for props, plugin in _declared_nodes(state, against)]
 
 
-def learned_materials(scene) -> list:
-    """The instances of learned BSDFs in a loaded scene, wherever they hide (in a ``twosided``, a ``bumpmap``, …)."""
+def instances(scene) -> list:
+    """
+    What the package's plugins made in a loaded scene, wherever it hides (in a ``twosided``, a ``bumpmap``, …): objects
+    of Mitsuba, each once.
+    """
     # Not only nodes that own a parameter: tables of bytes are none
-    found = {id(node): node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.BSDF)}
-    return [node for node in found.values() if hasattr(node, "report")]
+    found = {id(node): node for node in mi.traverse(scene).hierarchy if plugins.origin(node) is not None}
+    return list(found.values())
+
+
+def learned_instances(scene) -> list:
+    """Those of :func:`instances` that learned plugins made."""
+    learned = plugins.with_counterpart()
+    return [made for made in instances(scene) if plugins.origin(made)["plugin"] in learned]
 
 
 def reports(scene) -> list[dict]:
     """
-    For each learned material of a loaded scene, what it does: its ``id``, ``quality``, ``effects_in_use``,
-    ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage`` and ``table_bytes``, and the ``operations``
-    of ``eval``, ``pdf`` and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name).
+    What each learned plugin of a loaded scene does: ``plugin``, ``kind``, ``id`` and ``parameters`` as in
+    :func:`learned_plugins`; what it reports, ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
+    ``evaluated_once``, ``storage``, ``table_bytes`` and more; and for a BSDF the ``operations`` of ``eval``, ``pdf``
+    and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name).
     """
-    return [
-        {
-            "id": material.id(),
-            **material.report(),
-            "operations": {method: n.asdict() for method, n in bsdf_operations(material).items()},
-        }
-        for material in learned_materials(scene)
-    ]
+    found = []
+    for made in learned_instances(scene):
+        counts = bsdf_operations(made) if isinstance(made, mi.BSDF) else {}
+        found.append({
+            **plugins.origin(made),
+            "id": made.id(),
+            **(plugins.report(made) or {}),
+            "operations": {method: n.asdict() for method, n in counts.items()},
+        })  # fmt: skip
+    return found
 
 
 def table_bytes(scene: str | os.PathLike, learned: list[dict]) -> int:
@@ -151,11 +149,14 @@ def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, 
     """The distinct tables of a scene's learned plugins: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`."""
     found = {}
     for entry in learned:
-        name, storage = entry.get("filename", ""), entry.get("storage", "")
-        table_file, load_table = _TABLES[entry["plugin"]]
-        file = table_file(name and Path(scene).resolve().parent / name, entry.get("quality", ""))
-        if file is not None and (str(file), storage) not in found:
-            table, _ = load_table(file)
+        plugin = plugins.declared()[entry["plugin"]]
+        if not plugin.task:
+            continue
+        name, storage = entry.get("filename", ""), entry.get("storage", "") or plugin.storage
+        task = tasks()[plugin.task]
+        file = task.file(name and Path(scene).resolve().parent / name, entry.get("preset", ""))
+        if (str(file), storage) not in found:
+            table = task.load(file)
             found[str(file), storage] = table.to(storage or table.storage)
     return found
 
@@ -237,15 +238,6 @@ def _path_integrator(state):
         names = ", ".join(props.plugin_name() for props in integrators) or "none"
         raise RuntimeError(f"a depth needs one integrator of {', '.join(MAX_DEPTHS)}; found {names}")
     return found[0]
-
-
-def _constant(props, key: str):
-    kind, types = props.type(key), mi.Properties.Type
-    if kind in (types.Float, types.Integer):
-        return float(props[key])
-    if kind == types.Color:
-        return [float(v) for v in props[key]]
-    return "texture" if kind in (types.Reference, types.ResolvedReference) else str(props[key])
 
 
 @contextlib.contextmanager

@@ -1,40 +1,47 @@
 """
 Mitsuba plugins, one a file. ``import mi_diffind`` registers them; nothing here needs to be imported by hand.
 
-Mitsuba's classes differ from variant to variant (``mi.BSDF`` is another class in each). A plugin's module therefore
-defines its class for the variant that is set, as Mitsuba's own Python plugins do, and is executed once for each variant
-(:func:`register`), now or when the variant is set (:func:`install`).
+A plugin's module says in ``PLUGIN`` what it is (:class:`Plugin`). The modules of this package are found, and those that
+other packages name as entry points of the group ``mi_diffind.plugins``. Mitsuba's classes differ from variant to
+variant (``mi.BSDF`` is another class in each), so a module is executed afresh for each (:func:`register`), now or when
+the variant is set (:func:`install`): its classes keep the globals of their own variant.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
+import pkgutil
 import sys
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
-#: Modules of this package that define a plugin, and what it is, in an order in which each follows those that it builds
-#: upon.
-MODULES = {"disney": "bsdf", "neural_disney": "bsdf", "neural_ggx": "bsdf", "neural_image": "texture"}
+#: The group of entry points by which other packages add plugins, each naming a module that has a ``PLUGIN``.
+GROUP = "mi_diffind.plugins"
+
+#: What a plugin may be → the class in ``mitsuba`` whose instances its factory returns.
+KINDS = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
 
 
 @dataclass(frozen=True)
 class Counterpart:
     """
-    What is exact where a learned plugin is not: the ``name`` of a plugin that takes the same parameters but those of
-    ``learned_only``, and needs those of ``given`` in addition. ``convert``, as ``"module.function"`` of this package,
-    is what turns the properties of the one into those of the other if that is not all there is to it.
+    Another plugin that may stand in the place of one: the ``name`` of one that takes the same parameters but those of
+    ``learned_only``, and needs those of ``given`` in addition. ``convert(props)``, if that is not all there is to it,
+    turns the properties (``mi.Properties``) of the one into those of the other, or raises ``RuntimeError``.
     """
 
     name: str
-    learned_only: tuple[str, ...]
-    given: dict[str, str] = field(default_factory=dict)
-    convert: str = ""
+    learned_only: tuple[str, ...] = ()
+    given: dict[str, Any] = field(default_factory=dict)
+    convert: Callable[[Any], None] | None = None
 
     def replace(self, props) -> None:
-        """Turn the properties (``mi.Properties``) of the learned plugin into those of the exact one, in place."""
+        """Turn the properties of the plugin into those of the counterpart, in place."""
         if self.convert:
-            module, function = self.convert.split(".")
-            getattr(importlib.import_module(f"{__name__}.{module}"), function)(props)
+            self.convert(props)
         props.set_plugin_name(self.name)
         for key in self.learned_only:
             if key in props:
@@ -43,16 +50,49 @@ class Counterpart:
             props[key] = value
 
 
-#: The exact counterpart of each learned plugin.
-EXACT_COUNTERPARTS = {
-    "neural_disney": Counterpart("disney", ("quality", "effects", "filename", "storage")),
-    "neural_ggx": Counterpart("roughconductor", ("quality", "filename", "storage"), {"distribution": "ggx"}),
-    "neural_image": Counterpart(
-        "bitmap", ("filename", "channels", "storage", "source"), convert="image_files.to_bitmap"
-    ),
-}
+@dataclass(frozen=True)
+class Plugin:
+    """
+    A plugin: its ``name`` in a scene; its ``kind`` (:data:`KINDS`); ``factory(props)``, a class or a function, which
+    may return an object of Mitsuba's own; the ``task`` whose tables it reads, and their storage form by default ("":
+    the file's). One that has an ``exact`` counterpart is *learned*; ``others`` may stand in its place, too.
 
-_registered: set[str] = set()
+    Instances with a method ``report()`` say what they do (:func:`mi_diffind.scenes.reports`); for an object of
+    Mitsuba's own, its factory says so with :func:`reports_as`.
+    """
+
+    name: str
+    kind: str
+    factory: Callable[[Any], Any]
+    task: str = ""
+    storage: str = ""
+    exact: Counterpart | None = None
+    others: tuple[Counterpart, ...] = ()
+
+    def counterpart(self, against: str = "exact") -> Counterpart | None:
+        """The exact counterpart, or another one by its name; ``None`` if there is none."""
+        return self.exact if against == "exact" else next((c for c in self.others if c.name == against), None)
+
+    def described(self, props) -> dict:
+        """
+        What properties (``mi.Properties``) say: ``plugin``, ``kind``, ``id``, ``parameters`` (numbers, text, colours as
+        lists, ``"texture"`` for any object), and by themselves those that only the learned plugin has.
+        """
+        learned_only = self.exact.learned_only if self.exact else ()
+        return {
+            "plugin": self.name,
+            "kind": self.kind,
+            "id": props.id(),
+            "parameters": {key: _plain(props, key) for key in props if key not in learned_only},
+            **{key: str(props[key]) for key in learned_only if key in props},
+        }
+
+
+#: For each variant that was set: the plugins by name.
+_declared: dict[str, dict[str, Plugin]] = {}
+
+#: Objects of Mitsuba's own that factories returned: id → the object, what its properties said, what it does.
+_native: dict[int, list] = {}
 
 
 def supported(variant: str) -> bool:
@@ -69,6 +109,18 @@ def install() -> None:
         register(mi.variant())
 
 
+def declared() -> dict[str, Plugin]:
+    """The plugins of the variant that is set, by name."""
+    import mitsuba as mi
+
+    return _declared.get(mi.variant(), {})
+
+
+def with_counterpart(against: str = "exact") -> tuple[str, ...]:
+    """The names of the plugins that have this counterpart; of the learned ones by default."""
+    return tuple(plugin.name for plugin in declared().values() if plugin.counterpart(against))
+
+
 def _on_variant_change(old: str | None, new: str) -> None:
     register(new)
 
@@ -77,26 +129,136 @@ def register(variant: str) -> None:
     """Register every plugin with ``variant``, which must be the one that is set. Does nothing the second time."""
     import mitsuba as mi
 
-    if variant in _registered:
+    if variant in _declared:
         return
-    if not supported(variant):
-        for name, kind in MODULES.items():
-            getattr(mi, f"register_{kind}")(name, _refusal(name, variant))
-    else:
-        for name in MODULES:
-            qualified = f"{__name__}.{name}"
-            if qualified in sys.modules:
-                importlib.reload(sys.modules[qualified])
-            else:
-                importlib.import_module(qualified)
-    _registered.add(variant)
+    _declared[variant] = found = {}
+    for plugin in _load():
+        if plugin.name in found:
+            warnings.warn(f'there are two plugins called "{plugin.name}", the second one is ignored', stacklevel=2)
+            continue
+        found[plugin.name] = plugin
+        if supported(variant):
+            make = _checked(plugin)
+        elif plugin.kind != "volume":  # for scalar variants, Mitsuba cannot do without the type of what it loads
+            make = _refusal(plugin.name, variant)
+        else:
+            continue
+        # Of volumes, Mitsuba's Python interface knows nothing; in a scene, they are looked up among textures
+        getattr(mi, f"register_{'texture' if plugin.kind == 'volume' else plugin.kind}")(plugin.name, make)
+
+
+def _load() -> list[Plugin]:
+    """Execute the modules of plugins afresh, and return what they declare."""
+    own = [f"{__name__}.{module.name}" for module in pkgutil.iter_modules(__path__) if not module.ispkg]
+    entries = importlib.metadata.entry_points(group=GROUP)
+    modules = {
+        **dict.fromkeys(own, "this package"),
+        **{entry.module: f'the entry point "{entry.name}"' for entry in entries},
+    }
+    for name in modules:  # all of them first, since one may build upon another
+        sys.modules.pop(name, None)
+    found = []
+    for name, source in modules.items():
+        try:
+            plugin = importlib.import_module(name).PLUGIN
+            if plugin.kind not in KINDS:
+                raise ValueError(f'the kind of "{plugin.name}" is "{plugin.kind}", allowed are {", ".join(KINDS)}')
+            found.append(plugin)
+        except Exception as e:
+            if name in own:
+                raise
+            warnings.warn(f"the plugin of {source} ({name}) cannot be used: {type(e).__name__}: {e}", stacklevel=3)
+    return found
 
 
 def _refusal(name: str, variant: str):
-    def factory(props):
+    def make(props):
         import mitsuba as mi
 
         usable = ", ".join(v for v in mi.variants() if supported(v))
         raise RuntimeError(f'the plugin "{name}" does not run in the variant "{variant}"; use one of {usable}')
 
-    return factory
+    return make
+
+
+def _checked(plugin: Plugin):
+    """The factory as Mitsuba gets it: it returns what it should, and it is known what that was made from."""
+
+    def make(props):
+        import mitsuba as mi
+
+        made = plugin.factory(props)
+        kind = getattr(mi, KINDS[plugin.kind])
+        if not isinstance(made, kind):  # Mitsuba would crash, or speak of a bad cast
+            found = "nothing" if made is None else f"a {type(made).__name__}"
+            raise RuntimeError(f'the factory of the plugin "{plugin.name}" returned {found}, a {plugin.kind} is needed')
+        unknown = [key for key in props if not props.was_queried(key)]  # Mitsuba refuses these, if they stay so
+        said = plugin.described(props)
+        for key in unknown:
+            props.mark_queried(key, False)
+        if hasattr(made, "__dict__"):
+            made._made_from = _Origin(said)
+        else:
+            _forget_dead()
+            _native.setdefault(id(made), [made, said, None])[1] = said
+        return made
+
+    return make
+
+
+class _Origin:
+    """What an instance was made from: not a dictionary, in whose entries ``dr.freeze`` would look for arrays."""
+
+    def __init__(self, said: dict):
+        self.said = said
+
+
+def reports_as(made, report: Callable[[], dict]) -> None:
+    """
+    For a factory that is about to return ``made``, an object of Mitsuba's own: ``report()`` says what it does, as the
+    method of that name of a plugin written in Python does. It must not hold the object.
+    """
+    _forget_dead()
+    _native[id(made)] = [made, None, report]
+
+
+def _forget_dead() -> None:
+    """
+    Drop the native objects that nobody else holds. Mitsuba's classes allow no weak references; references from C++
+    count in Python, too, so those that remain here are three: the list of it, the name ``made``, the argument.
+    """
+    for key, entry in list(_native.items()):
+        made = entry[0]
+        if sys.getrefcount(made) <= 3:
+            del _native[key]
+        del made
+
+
+def origin(made) -> dict | None:
+    """What the properties of an instance of a plugin said (:meth:`Plugin.described`); ``None`` for any other object."""
+    found = getattr(made, "_made_from", None)
+    if found is not None:
+        return found.said
+    entry = _native.get(id(made))
+    return None if entry is None else entry[1]
+
+
+def report(made) -> dict | None:
+    """What an instance of a plugin says that it does; ``None`` if it says nothing."""
+    if hasattr(made, "report"):
+        return made.report()
+    entry = _native.get(id(made))
+    return None if entry is None or entry[2] is None else entry[2]()
+
+
+def _plain(props, key: str):
+    kind, types = props.type(key), type(props).Type
+    if kind in (types.Float, types.Integer):
+        return float(props[key])
+    if kind == types.Color:
+        return [float(v) for v in props[key]]
+    if kind in (types.Reference, types.ResolvedReference, types.Object):
+        return "texture"
+    if kind == types.Any:
+        return type(props[key]).__name__
+    return str(props[key])

@@ -3,10 +3,12 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.tasks import ggx
+from mi_diffind.tasks.ggx import TASK
+from mi_diffind.tasks.ggx.model import Roughness
 
-from . import knowledge
-from .knowledge import Watched, when_outermost
+from . import Counterpart, Plugin
+from .support import properties, tables
+from .support.watched import Watched, when_outermost
 
 
 class NeuralGGX(mi.BSDF):
@@ -40,7 +42,7 @@ class NeuralGGX(mi.BSDF):
          0.0001 counts as 0.0001. (Default: 0.1)
        - |exposed|, |differentiable|, |discontinuous|
 
-     * - quality
+     * - preset
        - |string|
        - ``tables``: logarithmic inputs and a bounded output, accurate also in the peak of smooth surfaces; ``paper``:
          the paper's recipe, which misses the peak below a roughness of about 0.5, for comparison. (Default: that of
@@ -125,25 +127,20 @@ class NeuralGGX(mi.BSDF):
             if name in props:
                 raise RuntimeError(f'parameter "{name}": the tables are isotropic, give "alpha"')
 
-        number = "alpha" in props and props.type("alpha") in (mi.Properties.Type.Float, mi.Properties.Type.Integer)
-        if number and not 0 <= float(props["alpha"]) <= 1:  # NaN, too
-            raise RuntimeError(f'parameter "alpha": found {float(props["alpha"]):g}, allowed is [0, 1]')
+        properties.check_range(props, "alpha", 0, 1)
         self.alpha = props.get_unbounded_texture("alpha", 0.1)
         self.eta, self.k = _index_of_refraction(props)
         given = "specular_reflectance" in props
         self.specular_reflectance = props.get_texture("specular_reflectance") if given else None
 
-        filename = str(props.get("filename", ""))
-        if filename:
-            filename = str(mi.file_resolver().resolve(filename))
-        quality, storage = (str(props.get(name, "")) for name in ("quality", "storage"))
-        self.distribution, self.quality = ggx.load_ggx(filename, mi.TensorXf, storage, quality)
+        opened = tables.open_tables(props, TASK)
+        self.distribution, self.preset = opened.distribution, opened.table.preset
 
         self._watched_alpha = Watched(self.alpha)
         self._watched_ior = [Watched(self.eta, colour=True), Watched(self.k, colour=True)]
         self._watched_factor = Watched(self.specular_reflectance, colour=True) if given else None
         #: What depends on a constant roughness alone, evaluated.
-        self._constant: ggx.Roughness | None = None
+        self._constant: Roughness | None = None
 
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
         if any(texture.is_spatially_varying() for texture in self._textures().values()):
@@ -160,26 +157,23 @@ class NeuralGGX(mi.BSDF):
             found["specular_reflectance"] = self.specular_reflectance
         return found
 
+    def _arrays(self) -> dict:
+        net = self.distribution.net
+        return {"primary": net.primary[0], "cascaded": net.cascaded}
+
     def _tables(self) -> dict:
         """The arrays that are exposed."""
-        net = self.distribution.net
-        arrays = {"primary": net.primary[0], "cascaded": net.cascaded}
-        return {name: array for name, array in arrays.items() if array.storage == "float32"}
+        return tables.exposed(self._arrays())
 
     def traverse(self, cb: mi.TraversalCallback):
         discontinuous = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
         for name, texture in self._textures().items():
             flags = mi.ParamFlags.Differentiable if name == "specular_reflectance" else discontinuous
             cb.put(name, texture, flags)
-        for name, array in self._tables().items():
-            cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
+        tables.traverse(cb, self._tables())
 
     def parameters_changed(self, keys: list[str] = ()):
-        for name, array in self._tables().items():
-            try:
-                array.check_shape()
-            except ValueError as e:
-                raise RuntimeError(f'parameter "tables.{name}": {e}') from None
+        tables.check_shapes(self._tables())
         self._prepare_constants()
 
     # -- what is evaluated once ---------------------------------------------------------------------------------------
@@ -201,10 +195,9 @@ class NeuralGGX(mi.BSDF):
     def _is_constant(self) -> bool:
         """Is the roughness the same everywhere, and neither it nor a table being optimised or changed since?"""
         w = self._watched_alpha
-        tables = any(knowledge.has_gradient(array.data) for array in self._tables().values())
-        return w.constant and not w.optimised() and not w.changed() and not tables
+        return w.constant and not w.optimised() and not w.changed() and not tables.optimised(self._tables())
 
-    def _roughness(self, si, active) -> ggx.Roughness:
+    def _roughness(self, si, active) -> Roughness:
         if self._constant is not None and self._is_constant():
             return self._constant
         return self.distribution.roughness(self.alpha.eval_1(si, active))
@@ -228,7 +221,7 @@ class NeuralGGX(mi.BSDF):
         up = mi.Vector3f(0, 0, 1)
         return dr.select(active, si.wi, up), dr.select(active, wo, up), active
 
-    def _value(self, ctx, si, r: ggx.Roughness, wi, wo, active):
+    def _value(self, ctx, si, r: Roughness, wi, wo, active):
         """f · cos = F D̂ (n·o) / (d(n·i) d(n·o)), with Smith's masking 2c/d(c): nothing to divide by at the horizon."""
         h, h2, sin2 = _half_vector(wi, wo)
         cos = h.z * dr.rsqrt(h2) if self.distribution.encoding.inputs == "plain" else None
@@ -250,7 +243,7 @@ class NeuralGGX(mi.BSDF):
         channels = range(dr.size_v(eta))
         return mi.Spectrum([mi.fresnel_conductor(cos, mi.Complex2f(eta[i], k[i])) for i in channels])
 
-    def _density(self, r: ggx.Roughness, wi, wo, active):
+    def _density(self, r: Roughness, wi, wo, active):
         """Density of visible normals mapped to directions, D G₁(n·i) / (4 n·i), from formulas alone; detached."""
         with dr.suspend_grad():
             _, _, sin2 = _half_vector(wi, wo)
@@ -295,7 +288,7 @@ class NeuralGGX(mi.BSDF):
 
     def report(self) -> dict:
         """
-        What this instance does: ``quality``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
+        What this instance does: ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
         ``evaluated_once``, ``storage`` and ``table_bytes``.
         """
         left_out = {}
@@ -304,20 +297,17 @@ class NeuralGGX(mi.BSDF):
         if not self._has_factor():
             left_out["specular_reflectance"] = "is 1" if self.specular_reflectance else "is not given"
         effects = ("distribution", "masking", "fresnel", "specular_reflectance")
-        net = self.distribution.net
         return {
-            "quality": self.quality,
+            **tables.described(self.preset, self._arrays()),
             "effects_in_use": [name for name in effects if name not in left_out],
             "effects_left_out": left_out,
             "evaluated_once": [] if self._constant is None else ["roughness"],
-            "storage": net.cascaded.storage,
-            "table_bytes": net.nbytes,
         }
 
     def to_string(self):
         net = self.distribution.net
         lines = [f"  {name} = {t!s}," for name, t in self._textures().items()]
-        lines.append(f"  quality = {self.quality}, {net.nbytes} bytes as {net.cascaded.storage},")
+        lines.append(f"  preset = {self.preset}, {net.nbytes} bytes as {net.cascaded.storage},")
         return "NeuralGGX[\n" + "\n".join(line.replace("\n", "\n  ") for line in lines) + "\n]"
 
 
@@ -328,7 +318,7 @@ def _half_vector(wi, wo):
     return h, h2, (dr.square(h.x) + dr.square(h.y)) * dr.rcp(h2)
 
 
-def _masking(r: ggx.Roughness, c):
+def _masking(r: Roughness, c):
     """d(c) = c + √(c² + α² (1 − c²)), of which Smith's masking is 2c/d(c)."""
     c2 = dr.square(c)
     return c + dr.sqrt(dr.fma(r.alpha2, 1 - c2, c2))
@@ -387,4 +377,10 @@ def _scaled(reflectance, factor):
     return mi.Spectrum([[reflectance[i, j] * factor for j in range(4)] for i in range(4)])
 
 
-mi.register_bsdf("neural_ggx", NeuralGGX)
+PLUGIN = Plugin(
+    "neural_ggx",
+    "bsdf",
+    NeuralGGX,
+    task="ggx",
+    exact=Counterpart("roughconductor", ("preset", "filename", "storage"), {"distribution": "ggx"}),
+)

@@ -7,26 +7,16 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import metrics
-from mi_diffind.indirection import fold
 from mi_diffind.lookup import clamp
 from mi_diffind.tables import TableError
 
-from . import upsampling
-from .image_files import STORAGES, is_data, map_of, open_image
-
-WRAP_MODES = ("repeat", "mirror", "clamp")
+from . import Counterpart, Plugin
+from .support import properties, tables, textures, upsampling
+from .support.image_files import STORAGES, is_data, map_of, open_image, to_bitmap
+from .support.textures import WRAP_MODES, Positions, luminance
 
 #: Texels, at most, that are decoded for the mean, the maximum and the sampling of positions; larger images are reduced.
 DECODED = 2**22
-
-#: ((x + 0.055) / 1.055)^2.4 from 0.04045 to 1 as a polynomial, within 3e-6 and 0.005%.
-SRGB = (
-    *(0.000844892288, 0.0357163657, 0.479150754, 0.90598945, -1.02686536),
-    *(1.28132485, -1.12294745, 0.573176484, -0.126392614),
-)
-
-#: Density of positions that are black, relative to the mean.
-FLOOR = 0.01
 
 
 class NeuralImage(mi.Texture):
@@ -131,15 +121,14 @@ class NeuralImage(mi.Texture):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        filename, channels = str(props.get("filename", "")), str(props.get("channels", ""))
-        if not filename:
+        self._path, channels = properties.filename(props), str(props.get("channels", ""))
+        if not self._path:
             raise RuntimeError('parameter "filename": not given, a compressed image (.npz) is needed')
-        storage = _one_of(props, "storage", STORAGES)
-        self.wrap_mode = _one_of(props, "wrap_mode", WRAP_MODES)
-        _one_of(props, "filter_type", ("bilinear",))
+        storage = properties.one_of(props, "storage", STORAGES)
+        self.wrap_mode = properties.one_of(props, "wrap_mode", WRAP_MODES)
+        properties.one_of(props, "filter_type", ("bilinear",))
         props.get("accel", True), props.get("source", "")  # of no use here
 
-        self._path = str(mi.file_resolver().resolve(filename))
         try:
             self._shared = open_image(self._path, storage)
         except TableError as e:
@@ -152,23 +141,18 @@ class NeuralImage(mi.Texture):
         if not isinstance(raw, bool):
             raise RuntimeError(f'parameter "raw": found {raw}, allowed are true and false')
         self.raw = raw
-        self.to_uv = _transformation(props)
+        self.to_uv = textures.transformation(props)
         self._look_at_transformation()
         self._forget()
 
     # -- parameters -------------------------------------------------------------------------------------------------
 
     def traverse(self, cb: mi.TraversalCallback):
-        for name, array in self._shared.tables.items():
-            cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
+        tables.traverse(cb, self._shared.tables)
         cb.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: list[str] = ()):
-        for name, array in self._shared.tables.items():
-            try:
-                array.check_shape()
-            except ValueError as e:
-                raise RuntimeError(f'parameter "tables.{name}": {e}') from None
+        tables.check_shapes(self._shared.tables)
         self._look_at_transformation()
         self._forget()
 
@@ -177,11 +161,11 @@ class NeuralImage(mi.Texture):
         matrix = [[float(m[i, j]) for j in range(3)] for i in range(3)]
         identity = matrix == [[float(i == j) for j in range(3)] for i in range(3)]
         self._transform = None if identity else self._shared.transform(matrix)
-        self._permutes = _permutes_corners(matrix)
+        self._permutes = textures.permutes_corners(matrix)
 
     def _forget(self) -> None:
         """Of what was found out by decoding."""
-        self._state, self._mean, self._max, self._distribution = self._shared.state(), None, None, None
+        self._state, self._mean, self._max, self._positions = self._shared.state(), None, None, None
 
     def _remember(self) -> None:
         """What was found out is still true, or forgotten: another texture may have changed the arrays."""
@@ -200,12 +184,9 @@ class NeuralImage(mi.Texture):
 
     def _wrapped(self, uv) -> list:
         """The coordinates u and v to read at."""
-        if self.wrap_mode == "repeat":  # arrays that do so themselves need no help
-            borders = [] if self.net is None else [reversed(array.border) for array in self.net.primary]
-            clamped = ["clamp" in along for along in zip(*borders, strict=True)] or [False, False]
-            return [x - dr.floor(x) if c else x for x, c in zip((uv.x, uv.y), clamped, strict=True)]
-        folded = (fold(x) if self.wrap_mode == "mirror" else x for x in (uv.x, uv.y))
-        return [clamp(x, 0.5 / n, 1 - 0.5 / n) for x, n in zip(folded, self._size, strict=True)]
+        borders = [] if self.net is None else [reversed(array.border) for array in self.net.primary]
+        repeats = ["clamp" not in along for along in zip(*borders, strict=True)] or [True, True]
+        return textures.wrapped(uv, self.wrap_mode, self._size, repeats)
 
     def _read(self, uv) -> list[mi.Float]:
         """
@@ -215,10 +196,14 @@ class NeuralImage(mi.Texture):
         stored = self.image.stored(*self._wrapped(uv))
         values = self.image.maps(stored, [self.map.name])[self.map.name]
         values = [mi.Float(v) for v in values]
-        if self.raw or self.map.color_space != "srgb":
+        if not self._is_encoded():
             return values
         bounded = self.map.low >= 0 and self.map.high <= 1 and self.map.knee == 0
-        return [_linear(v, bounded) for v in values]
+        return [textures.linear(v, bounded) for v in values]
+
+    def _is_encoded(self) -> bool:
+        """Are values in the file sRGB, and to be converted?"""
+        return not self.raw and self.map.color_space == "srgb"
 
     def _is_upsampled(self) -> bool:
         """Is this a colour that stands for a spectrum?"""
@@ -235,17 +220,12 @@ class NeuralImage(mi.Texture):
             raise RuntimeError(
                 f'eval: the map "{self.map.name}" was asked for a spectrum, but conversion is switched off (raw = true)'
             )
-        values = self._read(self._uv(si))
-        if len(values) == 1 or mi.is_monochromatic:
-            return mi.UnpolarizedSpectrum(_luminance(values))
-        if mi.is_spectral:
-            return upsampling.spectrum(values, si.wavelengths)
-        return mi.UnpolarizedSpectrum(*values)
+        return textures.spectrum(self._read(self._uv(si)), si.wavelengths, self._is_upsampled())
 
     def eval_1(self, si, active=True):
         if self._is_upsampled():
             self._refuse("eval_1", "a number")
-        return _luminance(self._read(self._uv(si)))
+        return luminance(self._read(self._uv(si)))
 
     def eval_3(self, si, active=True):
         if self.map.channels != 3:
@@ -263,7 +243,7 @@ class NeuralImage(mi.Texture):
         a, b = clamp(x - i, 0.0, 1.0), clamp(y - j, 0.0, 1.0)
 
         def texel(right, down):
-            return _luminance(self._read(mi.Point2f((i + right + 0.5) / width, (j + down + 0.5) / height)))
+            return luminance(self._read(mi.Point2f((i + right + 0.5) / width, (j + down + 0.5) / height)))
 
         f00, f10, f01, f11 = texel(0, 0), texel(1, 0), texel(0, 1), texel(1, 1)
         du = width * dr.lerp(f10 - f00, f11 - f01, b)
@@ -309,7 +289,7 @@ class NeuralImage(mi.Texture):
         index = dr.arange(mi.UInt32, width * height)
         uv = mi.Point2f((mi.Float(index % width) + 0.5) / width, (mi.Float(index // width) + 0.5) / height)
         values = self._read(uv)
-        value = upsampling.mean(values) if self._is_upsampled() else _luminance(values)
+        value = upsampling.mean(values) if self._is_upsampled() else luminance(values)
         return dr.mean(value)
 
     def max(self):
@@ -330,62 +310,53 @@ class NeuralImage(mi.Texture):
 
         with ThreadPoolExecutor(1) as pool:
             values = pool.submit(decode).result()
-        if self.raw or self.map.color_space != "srgb":
-            return values
-        return metrics.linear(values)
+        return metrics.linear(values) if self._is_encoded() else values
 
     # -- sampling of positions ----------------------------------------------------------------------------------------
 
-    def _positions(self):
-        """The distribution of texels, and their numbers along u and v."""
+    def _sampled(self) -> Positions:
         self._remember()
-        if self._distribution is None:
-            values = self._decoded()
-            weights = values[..., 0] if values.shape[-1] == 1 else values @ np.float32([0.212671, 0.715160, 0.072169])
-            weights = np.maximum(weights, 0)
-            mean = weights.mean(dtype=np.float64)
-            weights = (weights + FLOOR * mean if mean > 0 else np.ones_like(weights)).astype(np.float32)
-            self._distribution = mi.DiscreteDistribution2D(np.ascontiguousarray(weights)), weights.shape[::-1]
-        return self._distribution
+        if self._positions is None:
+            self._positions = Positions.of(self._decoded(), self.wrap_mode)
+        return self._positions
 
     def sample_position(self, sample, active=True):
         if not (self._permutes and self.is_spatially_varying()):
             return sample, mi.Float(1)
-        distribution, size = self._positions()
-        texel, _, sample = distribution.sample(sample, active)
-        uv = (mi.Point2f(texel) + 0.5 + mi.warp.square_to_tent(sample)) / mi.Point2f(*size)
-        if self.wrap_mode == "repeat":
-            uv -= dr.floor(uv)
-        else:
-            uv = dr.abs(uv)
-            uv = dr.select(uv > 1, 2 - uv, uv)
-        pdf = self._density(uv, active)
+        uv, pdf = self._sampled().sample(sample, active)
         return (uv if self._transform is None else self._transform.inverse() @ uv), pdf
 
     def pdf_position(self, pos, active=True):
         if not (self._permutes and self.is_spatially_varying()):
             return mi.Float(1)
-        uv = pos if self._transform is None else self._transform @ pos
-        return self._density(uv, active)
+        return self._sampled().density(pos if self._transform is None else self._transform @ pos, active)
 
-    def _density(self, uv, active):
-        """The bilinear interpolation of the texels' probabilities, with respect to area, at ``uv`` of the image."""
-        distribution, size = self._positions()
-        corners = []
-        for x, n in zip((uv.x, uv.y), size, strict=True):
-            position = dr.fma(clamp(x, 0.0, 1.0), n, -0.5)
-            lower = dr.floor(position)
-            i, w = mi.Int32(lower), position - lower
-            if self.wrap_mode == "repeat":
-                both = dr.select(i < 0, n - 1, i), dr.select(i + 1 >= n, 0, i + 1)
-            else:
-                both = dr.maximum(i, 0), dr.minimum(i + 1, n - 1)
-            corners.append(list(zip(both, (1 - w, w), strict=True)))
-        total = 0
-        for i, a in corners[0]:
-            for j, b in corners[1]:
-                total = total + a * b * distribution.pdf(mi.Point2u(mi.UInt32(i), mi.UInt32(j)), active)
-        return total * (size[0] * size[1])
+    # -- what it does -------------------------------------------------------------------------------------------------
+
+    def report(self) -> dict:
+        """
+        What this instance does: ``preset``, ``map``; ``channels_read`` and ``channels_left_out``, numbers of the
+        channels that the file stores; ``effects_in_use`` and ``effects_left_out`` (→ reason), the maps of the file
+        among them; ``evaluated_once``, ``storage`` and ``table_bytes``.
+        """
+        left_out = {name: "is another map of the file" for name in self.image.layout.names if name != self.map.name}
+        if not self._is_encoded():
+            left_out["srgb"] = "raw is true" if self.raw else "the map is linear"
+        if not self._is_upsampled():
+            left_out["upsampling"] = "raw is true" if self.raw else "a number or a colour is asked for"
+        if self._transform is None:
+            left_out["to_uv"] = "is the identity"
+        layout = self.image.layout
+        read = list(layout.needed(self.map.name))
+        return {
+            **tables.described(self._shared.preset, self._shared.arrays),
+            "map": self.map.name,
+            "channels_read": read,
+            "channels_left_out": [i for i in range(layout.stored) if i not in read],
+            "effects_in_use": [n for n in (self.map.name, "srgb", "upsampling", "to_uv") if n not in left_out],
+            "effects_left_out": left_out,
+            "evaluated_once": [],
+        }
 
     def to_string(self):
         layout, lines = self.image.layout, []
@@ -400,46 +371,10 @@ class NeuralImage(mi.Texture):
         return "NeuralImage[\n  " + ",\n  ".join(lines) + "\n]"
 
 
-def _one_of(props: mi.Properties, name: str, allowed: tuple[str, ...]) -> str:
-    """A parameter that is one of some words, the first by default."""
-    found = props.get(name, allowed[0])
-    if found not in allowed:
-        raise RuntimeError(f'parameter "{name}": found {found}, allowed: {", ".join(allowed)}')
-    return str(found)
-
-
-def _transformation(props: mi.Properties):
-    if "to_uv" not in props:
-        return mi.ScalarAffineTransform3f()
-    given = props["to_uv"]
-    if not hasattr(given, "extract"):
-        raise RuntimeError(f'parameter "to_uv": found {given}, a transformation is needed')
-    m = given.extract().matrix
-    return mi.ScalarAffineTransform3f([[float(m[i, j]) for j in range(3)] for i in range(3)])
-
-
-def _permutes_corners(matrix: list) -> bool:
-    """Does an affine map take the unit square to itself, by a flip, a transposition, or quarters of a turn?"""
-    m = np.array(matrix)
-    corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
-    images = (corners @ m.T)[:, :2]
-    distance = np.abs(images[:, None] - corners[None, :, :2]).max(axis=-1)
-    return bool((distance.min(axis=0) < 1e-4).all())
-
-
-def _linear(v, bounded: bool):
-    """The sRGB transfer function backwards; ``bounded``: of values in [0, 1] only, which is a power less."""
-    if not bounded:
-        power = dr.fma(dr.maximum(v, 0), 1 / 1.055, 0.055 / 1.055) ** 2.4
-    else:
-        power = mi.Float(SRGB[-1])
-        for c in reversed(SRGB[:-1]):
-            power = dr.fma(power, v, c)
-    return dr.select(v < 0.04045, v * (1 / 12.92), power)
-
-
-def _luminance(values: list):
-    return values[0] if len(values) == 1 else mi.luminance(mi.Color3f(*values))
-
-
-mi.register_texture("neural_image", NeuralImage)
+PLUGIN = Plugin(
+    "neural_image",
+    "texture",
+    NeuralImage,
+    task="image",
+    exact=Counterpart("bitmap", ("filename", "channels", "storage", "source"), convert=to_bitmap),
+)

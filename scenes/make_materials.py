@@ -69,7 +69,7 @@ def sphere(row: int, column: int):
         rotate={"x": 1, "angle": -90},
         translate={"x": round(x, 3), "y": 0.5, "z": round(z, 3)},
     )
-    learned = {PRESET: f"${PRESET}", "effects": "$effects"}
+    learned = {PRESET: f"${PRESET}", "storage": "$storage", "effects": "$effects"}
     values = {**DEFAULTS, **changes, name: column / (COLUMNS - 1)}
     material = plugin("bsdf", "neural_disney", id=f"{name}_{column}", **learned, base_color=color, **values)
     return plugin("shape", "sphere", placed, material)
@@ -97,7 +97,7 @@ def main() -> None:
     lamp = {"origin": (-7, 5.5, -21), "target": (0, 0, 0), "up": (0, 1, 0)}
     floor = element("rgb", name="reflectance", value=FLOOR)
     content = [
-        *head(960, 552, {PRESET: "tables", "effects": "used"}, fov=2.9, camera=camera),
+        *head(960, 552, {PRESET: "tables", "storage": "uint8", "effects": "used"}, fov=2.9, camera=camera),
         "A hotel room by day, its window in front of the chart",
         environment("interior.exr", scale=0.9, angle=20),
         "A wide softbox behind the chart, on the left: rims, sheen, long highlights",

@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 
 #: The parameter of learned plugins that names how their tables were trained, also as the scene's ``<default>``.
-PRESET = "quality"
+PRESET = "preset"
 
 
 class Whole(str):

@@ -50,7 +50,7 @@ def test_render(tmp_path, capsys):
     assert image.shape == (28, 48, 3) and np.isfinite(image).all() and image.mean() > 0.01
     found = json.loads(report.read_text())
     assert found["spp"] == 4 and found["width"] == 48 and found["variant"].endswith("_ad_rgb")
-    assert len(found["learned_plugins"]) == 9 and found["table_bytes"] == 2048 and found["seconds_render"] > 0
+    assert len(found["learned_plugins"]) == 9 and found["table_bytes"] == 512 and found["seconds_render"] > 0
     assert sorted(os.listdir(tmp_path)) == ["image.exr", "report.json"]  # nothing temporary stays
     assert main(["render", str(SCENES / "still_life.xml"), "-o", str(tmp_path / "image.png"), *SMALL]) == 0
     assert np.array(mi.Bitmap(str(tmp_path / "image.png"))).shape == (28, 48, 3)
@@ -114,11 +114,11 @@ def test_inspect_scene(tmp_path, capsys):
     report = tmp_path / "report.json"
     assert main(["inspect", str(SCENES / "still_life.xml"), "--json", str(report)]) == 0
     text = capsys.readouterr().out
-    assert "9 learned plugin(s), 2,048 bytes" in text
-    wood = text[text.index("wood: base_color texture, roughness texture") :]
+    assert "9 learned plugin(s), 512 bytes" in text
+    wood = text[text.index("wood: neural_disney, effects used, base_color texture, roughness texture") :]
     assert "in use    diffuse, dielectric, clearcoat" in wood
     assert "sheen (sheen is 0)" in wood and "anisotropic (anisotropic is 0)" in wood
-    materials = {m["id"]: m for m in json.loads(report.read_text())["learned_materials"]}
+    materials = {m["id"]: m for m in json.loads(report.read_text())["reports"]}
     assert len(materials) == 9  # wrapped ones are found, too
     assert materials["copper"]["effects_in_use"] == ["metal"]
     assert materials["copper"]["effects_left_out"]["diffuse"] == "metallic is 1"

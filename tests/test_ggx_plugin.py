@@ -31,8 +31,8 @@ FORMS = {
     "tables": {"type": "neural_ggx"},
     "tables float16": {"type": "neural_ggx", "storage": "float16"},
     "tables uint8": {"type": "neural_ggx", "storage": "uint8"},
-    "paper": {"type": "neural_ggx", "quality": "paper"},
-    "paper uint8": {"type": "neural_ggx", "quality": "paper", "storage": "uint8"},
+    "paper": {"type": "neural_ggx", "preset": "paper"},
+    "paper uint8": {"type": "neural_ggx", "preset": "paper", "storage": "uint8"},
 }
 
 QUALITIES = ("tables", "paper")
@@ -124,7 +124,7 @@ def roughness_of(material):
 def normals(form):
     """What the tables of a form say, read by NumPy and SciPy."""
     form = FORMS[form]
-    table, encoding = ggx.load_ggx_table(ggx.SHIPPED[form.get("quality", "tables")])
+    table, encoding = ggx.load_ggx_table(ggx.SHIPPED[form.get("preset", "tables")])
     return walter.learned(table.to(form.get("storage", "float32")), encoding.inputs, encoding.output)
 
 
@@ -1057,9 +1057,9 @@ def test_own_tables(mi_rgb, rng, tmp_path):
             '<bsdf version="3.0.0" type="neural_ggx"><string name="filename" value="own.npz"/></bsdf>'
         )
         own = mi.load_file(str(tmp_path / "m.xml"))
-        assert f"quality = {quality}, 576 bytes as uint8" in str(own)
+        assert f"preset = {quality}, 576 bytes as uint8" in str(own)
         report = own.report()
-        assert (report["quality"], report["storage"], report["table_bytes"]) == (quality, "uint8", 576)
+        assert (report["preset"], report["storage"], report["table_bytes"]) == (quality, "uint8", 576)
         expected = mi.load_dict({**FORMS[quality], "storage": "uint8"}).eval(mi.BSDFContext(), si, wo).numpy()
         np.testing.assert_array_equal(own.eval(mi.BSDFContext(), si, wo).numpy(), expected)
 
@@ -1200,7 +1200,7 @@ def test_two_hundred_materials(mi_rgb, rng):
         bsdfs.append({**forms[rng.integers(len(forms))], **m})
     size = 4 * columns
     scene = sphere_scene(mi, bsdfs, "direct", size, columns)
-    assert len(scenes.learned_materials(scene)) == count
+    assert len(scenes.learned_instances(scene)) == count
     image = mi.render(scene, spp=4).numpy()
     assert np.isfinite(image).all() and image.min() >= 0
     assert np.array_equal(image, mi.render(scene, spp=4).numpy())
@@ -1245,7 +1245,7 @@ def test_scenes_are_loaded_in_many_threads():
                     scene = {"type": "scene"}
                     for j in range(12):
                         bsdf = {"type": "neural_ggx", "material": ("Cu", "Au")[j % 2], "alpha": 0.05 * (j + 1)}
-                        bsdf |= {"quality": "paper"} if j % 3 else {"storage": "uint8"}
+                        bsdf |= {"preset": "paper"} if j % 3 else {"storage": "uint8"}
                         scene[f"s{j}"] = {"type": "sphere", "center": [j, i, k], "bsdf": bsdf}
                     loaded.append(mi.load_dict(scene))
             except BaseException as e:
@@ -1316,7 +1316,7 @@ def test_report(mi_any):
     assert report["effects_in_use"] == [e for e in effects[: 3 if polarised else 2]]
     assert report["effects_left_out"]["specular_reflectance"] == "is not given"
     assert report["evaluated_once"] == ["roughness"]
-    assert (report["quality"], report["storage"], report["table_bytes"]) == ("tables", "float32", 2304)
+    assert (report["preset"], report["storage"], report["table_bytes"]) == ("tables", "float32", 2304)
     report = mi.load_dict({**FORMS["tables"], "material": "Cu", "specular_reflectance": 0.5}).report()
     assert report["effects_in_use"] == effects and report["effects_left_out"] == {}
     report = mi.load_dict({**FORMS["tables"], "specular_reflectance": 1.0}).report()
@@ -1396,7 +1396,7 @@ SCENE = """
             <float name="color0" value="0.05"/><float name="color1" value="0.7"/>
             <transform name="to_uv"><scale value="8"/></transform></texture>
             <rgb name="specular_reflectance" value="0.9, 0.8, 0.6"/>
-            <string name="quality" value="tables"/></bsdf></shape>
+            <string name="preset" value="tables"/></bsdf></shape>
 </scene>
 """
 
@@ -1414,10 +1414,10 @@ def test_a_scene_and_its_exact_counterpart(mi_rgb, scene_file):
     text, distribution = str(exact), '<string name="distribution" value="ggx"/>'
     assert "NeuralGGX" not in text  # a twosided one has two sides
     assert text.count("RoughConductor[") == text.count("distribution = ggx") == 4
-    assert not scenes.learned_materials(exact)
+    assert not scenes.learned_instances(exact)
     written = scenes.load(scene_file)
     assert str(written).count("NeuralGGX[") == 4 and "RoughConductor" not in str(written)
-    by_hand = re.sub('<string name="(storage|quality)" value="[a-z0-9]*"/>', "", SCENE)
+    by_hand = re.sub('<string name="(storage|preset)" value="[a-z0-9]*"/>', "", SCENE)
     by_hand = re.sub('type="neural_ggx" (id="[a-z]*")>', r'type="roughconductor" \1>' + distribution, by_hand)
     assert "neural" not in by_hand and by_hand.count(distribution) == 3
     expected = mi.render(mi.load_string(by_hand), spp=4).numpy()
@@ -1478,7 +1478,7 @@ MISTAKES = [
     ({"material": "Cu", "eta": 1.5}, '"material" and "eta", "k" are two ways to say one thing, give only one'),
     ({"material": "Cu", "k": 1.5}, '"material" and "eta", "k" are two ways to say one thing, give only one'),
     ({"storage": "float8"}, 'parameter "storage": found "float8", allowed are float32, float16, uint8'),
-    ({"quality": "fast"}, 'parameter "quality": found "fast", allowed are tables, paper'),
+    ({"preset": "fast"}, 'parameter "preset": found "fast", allowed are tables, paper'),
     ({"filename": "nowhere.npz"}, "nowhere.npz: no such file"),
     ({"roughness": 0.5}, 'float "roughness"'),
     ({"specular_reflectance": rgb(1.5, 0, 0)}, "must be in the range [0, 1]"),
@@ -1498,8 +1498,8 @@ def test_bad_files_are_refused(mi_rgb, tmp_path):
     disney = ggx.SHIPPED["tables"].with_name("disney_tables.npz")
     with pytest.raises(RuntimeError, match=r'disney_tables\.npz: holds tables for the task "disney", expected "ggx"'):
         mi_rgb.load_dict({"type": "neural_ggx", "filename": str(disney)})
-    own = {"type": "neural_ggx", "filename": str(ggx.SHIPPED["paper"]), "quality": "tables"}
-    with pytest.raises(RuntimeError, match='holds tables of the quality "paper", "tables" was asked for'):
+    own = {"type": "neural_ggx", "filename": str(ggx.SHIPPED["paper"]), "preset": "tables"}
+    with pytest.raises(RuntimeError, match='holds tables of the preset "paper", "tables" was asked for'):
         mi_rgb.load_dict(own)
 
 

@@ -58,7 +58,7 @@ SCENE = """<scene version="3.0.0">
     <emitter type="directional"><vector name="direction" value="0.4, -0.8, -0.5"/></emitter>
     <shape type="sphere">MATERIAL</shape>
 </scene>"""
-LEARNED = """<bsdf type="neural_disney" id="ball"><string name="quality" value="paper"/>
+LEARNED = """<bsdf type="neural_disney" id="ball"><string name="preset" value="paper"/>
     <rgb name="base_color" value="0.5, 0.3, 0.2"/> <float name="roughness" value="0.6"/> EXTRA</bsdf>"""
 
 

@@ -1,4 +1,4 @@
-"""``mi-diffind compare``: a scene as written and with exact plugins, side by side."""
+"""``mi-diffind compare``: a scene as written and with other plugins, exact ones by default, side by side."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ def add(commands) -> None:
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("--out", default="out", metavar="DIR", help="folder for pictures (default: out)")
     sub.add_argument("--passes", type=positive, default=5, help="passes to split the samples into (default: 5)")
+    sub.add_argument(
+        "--against",
+        default="exact",
+        metavar="NAME",
+        help="compare with another counterpart than the exact one, such as Mitsuba's principled",
+    )
     scene_options(sub)
 
 
@@ -28,7 +34,7 @@ def run(arguments) -> dict:
     from .. import compare
 
     comparison = compare.compare(
-        arguments.scene, arguments.spp, arguments.seed, arguments.passes, defines=defines_of(arguments)
+        arguments.scene, arguments.spp, arguments.seed, arguments.passes, True, defines_of(arguments), arguments.against
     )
     paths = compare.write(comparison, arguments.out)
     print("\n".join(compare.summary(comparison.figures)))

@@ -42,11 +42,11 @@ def run(arguments) -> dict:
         defines_of(arguments),
     )
     layout = [found["layout"][i : i + 3] for i in range(0, len(found["layout"]), 3)]
-    print(f"{found['files'][0]}: {found['width']} x {found['height']}, quality {found['quality']}")
+    print(f"{found['files'][0]}: {found['width']} x {found['height']}, preset {found['preset']}")
     for i, names in enumerate(layout):
         print(f"  latents_{i}   {', '.join(names)}")
-    if found["base_color"]:
-        print("  base_color  albedo")
+    for name in found["colours"]:
+        print(f"  {name:11} a colour")
     ratio = found["time_ratio"]
     print(
         f"  {found['bytes']:,} bytes ({found['bytes_before']:,} before), PSNR {found['psnr_db']:.2f} dB, "

@@ -98,24 +98,19 @@ def _inspect_scene(arguments) -> dict:
     defines = defines_of(arguments)
     learned = scenes.learned_plugins(arguments.file, defines=defines)
     tables = scenes.tables_of(arguments.file, learned)
-    materials = scenes.reports(scenes.load(arguments.file, defines=defines))
+    reports = scenes.reports(scenes.load(arguments.file, defines=defines))
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned plugin(s), {total:,} bytes of tables in {len(tables)} file(s)")
-    for entry in learned:
-        if entry["plugin"] == "neural_image":
-            about = ", ".join(f"{k} {entry[k]}" for k in ("filename", "channels", "storage") if k in entry)
-            print(f"  {entry['id'] or '(no id)'}: neural_image, {about}")
-    given = {entry["id"]: entry["parameters"] for entry in learned}
-    for material in materials:
-        parameters = given.get(material["id"]) or {}
-        parameters = ", ".join(f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in parameters.items())
-        stored = f", {material['table_bytes']:,} bytes as {material['storage']}" if material["storage"] else ""
-        print(f"  {material['id'] or '(no id)'}: {parameters or 'defaults'}")
-        print(f"    quality   {material['quality']}{stored}")
-        print(f"    in use    {', '.join(material['effects_in_use']) or 'grazing reflection only'}")
-        left_out = ", ".join(f"{k} ({v})" for k, v in material["effects_left_out"].items())
+    for found in reports:
+        given = {k: found[k] for k in ("filename", "channels") if k in found} | found["parameters"]
+        given = (f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in given.items())
+        stored = f", {found['table_bytes']:,} bytes as {found['storage']}" if found.get("storage") else ""
+        print(f"  {found['id'] or '(no id)'}: {found['plugin']}, {', '.join(given) or 'defaults'}")
+        print(f"    preset    {found.get('preset') or '(unknown)'}{stored}")
+        print(f"    in use    {', '.join(found.get('effects_in_use', ())) or 'grazing reflection only'}")
+        left_out = ", ".join(f"{k} ({v})" for k, v in found.get("effects_left_out", {}).items())
         print(f"    left out  {left_out or 'nothing'}")
-        for method, n in material["operations"].items():
+        for method, n in found["operations"].items():
             print(
                 f"    {method:9} {n['gathers']} reads of {n['bytes_gathered']} bytes, {n['flops']} flops "
                 f"({n['add']} add, {n['mul']} mul, {n['div']} div, {n['sqrt']} sqrt), {n['instructions']} instructions"
@@ -123,7 +118,7 @@ def _inspect_scene(arguments) -> dict:
     return {
         "file": arguments.file,
         "learned_plugins": learned,
-        "learned_materials": materials,
+        "reports": reports,
         "table_bytes": total,
         "tables": [{"file": f, "storage": s, "bytes": t.nbytes} for (f, s), t in tables.items()],
     }

@@ -85,7 +85,7 @@ def run(arguments) -> dict:
         "seconds_load": loaded - start,
         "seconds_render": rendered - loaded,
         "learned_plugins": learned,
-        "learned_materials": scenes.reports(scene) if arguments.json is not None else [],
+        "reports": scenes.reports(scene) if arguments.json is not None else [],
         "table_bytes": scenes.table_bytes(arguments.scene, learned),
     }
 

@@ -240,7 +240,7 @@ class Task:
         if storage and storage not in STORAGES:
             raise ValueError(f'parameter "storage": found "{storage}", allowed are {", ".join(STORAGES)}')
         path = self.file(filename, preset)
-        original = _open(self, path, _stamp(path), dtype, storage)
+        original = _open(self, path, stamp(path), dtype, storage)
         if preset and original.table.preset != preset:
             from ..tables import TableError
 
@@ -248,7 +248,7 @@ class Task:
         return original.copy()
 
 
-def _stamp(path: Path) -> tuple:
+def stamp(path: Path) -> tuple:
     """What changes when a file does."""
     try:
         stat = path.stat()

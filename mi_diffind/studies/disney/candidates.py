@@ -154,9 +154,7 @@ def _candidates() -> tuple[list[Candidate], dict]:
         size = sum(model.arrays[n].nbytes for n in read)
         decoder = FactoredDecoder(model.layout, read=(factor,))
         once = "read once where the material is constant" if factor in ("alpha", "coat") else ""
-        candidates.append(
-            Candidate(name, "one table", factor, size, None, errors(decoder), in_passes=False, note=once)
-        )
+        candidates.append(Candidate(name, "one table", factor, size, None, errors(decoder), in_passes=False, note=once))
         plugins[name] = with_decoder(lambda arrays, f=factor: FactoredDecoder(arrays, read=(f,)))
     return candidates, plugins
 

@@ -115,7 +115,7 @@ def measure(
     defines = {k: str(v) for k, v in (defines or {}).items()}
     learned = scenes.learned_plugins(scene_path, defines)
     if not learned:
-        names = ", ".join(plugins.EXACT_COUNTERPARTS)
+        names = ", ".join(plugins.with_counterpart())
         raise scenes.SceneError(f"{scene_path}: names no learned plugin ({names}), so there is nothing to compare")
     loaded = {name: scenes.load(scene_path, exact=name == "exact", defines=defines) for name in VERSIONS}
     sensor = loaded["learned"].sensors()[0]

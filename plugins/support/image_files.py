@@ -11,11 +11,14 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind.tables import TableError
-from mi_diffind.tasks.image.compressed import PRIMARIES, CompressedImage, load_image_table
+from mi_diffind.tasks.image import TASK
+from mi_diffind.tasks.image.compressed import PRIMARIES, CompressedImage
 from mi_diffind.tasks.image.layout import Layout, MapLayout
 from mi_diffind.tasks.image.source import SourceError, load_source
+from mi_diffind.tasks.task import stamp
 
-from .knowledge import has_gradient
+from .tables import exposed
+from .watched import has_gradient
 
 STORAGES = ("uint8", "float32")
 
@@ -29,17 +32,21 @@ _lock = threading.RLock()  # a thread that waits for a kernel may go on with ano
 class SharedImage:
     """A file's arrays, the same Dr.Jit variables for all textures that read them, and what else these share."""
 
-    def __init__(self, image: CompressedImage):
-        self.image = image
+    def __init__(self, image: CompressedImage, preset: str):
+        self.image, self.preset = image, preset
         self._loaded = self.state()
         self._transforms = {}
 
     @property
+    def arrays(self) -> dict:
+        """All arrays by name."""
+        net = self.image.net
+        return {} if net is None else {**dict(zip(PRIMARIES, net.primary, strict=False)), "cascaded": net.cascaded}
+
+    @property
     def tables(self) -> dict:
         """The arrays that can be optimised, by name."""
-        net = self.image.net
-        named = [] if net is None else [*zip(PRIMARIES, net.primary, strict=False), ("cascaded", net.cascaded)]
-        return {name: array for name, array in named if array.storage == "float32"}
+        return exposed(self.arrays)
 
     def state(self) -> list:
         """What the arrays hold at present; keeps it alive, so that nothing else gets its index."""
@@ -74,17 +81,11 @@ def open_image(path: str | Path, storage: str) -> SharedImage:
     """
     path = Path(path)
     with _lock:
-        try:
-            stat = path.stat()
-            key = (str(path.resolve()), stat.st_mtime_ns, stat.st_size, storage, mi.TensorXf)
-        except OSError:
-            key = None
+        key = (str(path.resolve()), *stamp(path), storage, mi.TensorXf)
         found = _cache.get(key)
         if found is None or not found.as_loaded():
-            table, _ = load_image_table(path)  # raises for what is no file, too
-            found = SharedImage(CompressedImage.from_table(table, mi.TensorXf, storage))
-            if key is not None:
-                _cache[key] = found
+            model = TASK.model(TASK.load(path), mi.TensorXf, storage)
+            found = _cache[key] = SharedImage(model.image, model.table.preset)
         return found
 
 
@@ -119,8 +120,8 @@ def to_bitmap(props) -> None:
     """Give the properties of a ``neural_image`` what a ``bitmap`` needs to show the original of its map."""
     path = Path(str(mi.file_resolver().resolve(str(props.get("filename", "")))))
     try:
-        table, layout = load_image_table(path)
-        found = map_of(layout, str(props.get("channels", "")))
+        table = TASK.load(path)
+        found = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
         original = _original(props, path, table.settings)
         values = _values(original, found)
     except (TableError, SourceError) as e:

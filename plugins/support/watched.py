@@ -8,7 +8,7 @@ import threading
 import drjit as dr
 import mitsuba as mi
 
-from mi_diffind.tasks.disney.effects import Known
+from mi_diffind.tasks.known import Known
 
 _waiting = threading.local()
 

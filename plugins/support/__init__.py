@@ -1,0 +1,1 @@
+"""What several plugins need, and no plugin itself."""

@@ -1,0 +1,132 @@
+"""
+What textures of images need: colours from their sRGB encoding, coordinates beyond [0, 1], sampling of positions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind.indirection import fold
+from mi_diffind.lookup import clamp
+
+from . import upsampling
+
+WRAP_MODES = ("repeat", "mirror", "clamp")
+
+#: ((x + 0.055) / 1.055)^2.4 from 0.04045 to 1 as a polynomial, within 3e-6 and 0.005%.
+SRGB = (
+    *(0.000844892288, 0.0357163657, 0.479150754, 0.90598945, -1.02686536),
+    *(1.28132485, -1.12294745, 0.573176484, -0.126392614),
+)
+
+#: Density of positions that are black, relative to the mean.
+FLOOR = 0.01
+
+
+def linear(v, bounded: bool):
+    """The sRGB transfer function backwards; ``bounded``: of values in [0, 1] only, which is a power less."""
+    if not bounded:
+        power = dr.fma(dr.maximum(v, 0), 1 / 1.055, 0.055 / 1.055) ** 2.4
+    else:
+        power = mi.Float(SRGB[-1])
+        for c in reversed(SRGB[:-1]):
+            power = dr.fma(power, v, c)
+    return dr.select(v < 0.04045, v * (1 / 12.92), power)
+
+
+def luminance(values: list):
+    """Of one channel or three, linear."""
+    return values[0] if len(values) == 1 else mi.luminance(mi.Color3f(*values))
+
+
+def spectrum(values: list, wavelengths, upsampled: bool):
+    """What a texture's ``eval`` returns for one channel or three, linear; ``upsampled``: as a spectrum."""
+    if len(values) == 1 or mi.is_monochromatic:
+        return mi.UnpolarizedSpectrum(luminance(values))
+    return upsampling.spectrum(values, wavelengths) if upsampled else mi.UnpolarizedSpectrum(*values)
+
+
+def wrapped(uv, wrap_mode: str, size: tuple[int, int], repeats: list[bool]) -> list:
+    """
+    The coordinates u and v to read an image of ``size`` (width, height) at; ``repeats`` says along which of them the
+    arrays do so by themselves. ``mirror`` and ``clamp`` lead to nothing beyond the outermost texel centres.
+    """
+    if wrap_mode == "repeat":
+        return [x if own else x - dr.floor(x) for x, own in zip((uv.x, uv.y), repeats, strict=True)]
+    folded = (fold(x) if wrap_mode == "mirror" else x for x in (uv.x, uv.y))
+    return [clamp(x, 0.5 / n, 1 - 0.5 / n) for x, n in zip(folded, size, strict=True)]
+
+
+def transformation(props: mi.Properties):
+    """The property ``to_uv``."""
+    if "to_uv" not in props:
+        return mi.ScalarAffineTransform3f()
+    given = props["to_uv"]
+    if not hasattr(given, "extract"):
+        raise RuntimeError(f'parameter "to_uv": found {given}, a transformation is needed')
+    m = given.extract().matrix
+    return mi.ScalarAffineTransform3f([[float(m[i, j]) for j in range(3)] for i in range(3)])
+
+
+def permutes_corners(matrix: list) -> bool:
+    """Does an affine map take the unit square to itself, by a flip, a transposition, or quarters of a turn?"""
+    m = np.array(matrix)
+    corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+    images = (corners @ m.T)[:, :2]
+    distance = np.abs(images[:, None] - corners[None, :, :2]).max(axis=-1)
+    return bool((distance.min(axis=0) < 1e-4).all())
+
+
+@dataclass  # which is where functions that are frozen look for arrays
+class Positions:
+    """Positions in the unit square by a distribution of the texels of an image of ``size`` (width, height)."""
+
+    distribution: object
+    size: tuple[int, int]
+    repeats: bool
+
+    @classmethod
+    def of(cls, image: np.ndarray, wrap_mode: str) -> Positions:
+        """
+        With the density of the luminance of an image, ``(height, width, channels)``, interpolated as a texture of that
+        ``wrap_mode`` does.
+        """
+        weights = image[..., 0] if image.shape[-1] == 1 else image @ np.float32([0.212671, 0.715160, 0.072169])
+        weights = np.maximum(weights, 0)
+        mean = weights.mean(dtype=np.float64)
+        weights = (weights + FLOOR * mean if mean > 0 else np.ones_like(weights)).astype(np.float32)
+        distribution = mi.DiscreteDistribution2D(np.ascontiguousarray(weights))
+        return cls(distribution, weights.shape[::-1], wrap_mode == "repeat")
+
+    def sample(self, sample, active):
+        """A position, and its density."""
+        texel, _, sample = self.distribution.sample(sample, active)
+        uv = (mi.Point2f(texel) + 0.5 + mi.warp.square_to_tent(sample)) / mi.Point2f(*self.size)
+        if self.repeats:
+            uv -= dr.floor(uv)
+        else:
+            uv = dr.abs(uv)
+            uv = dr.select(uv > 1, 2 - uv, uv)
+        return uv, self.density(uv, active)
+
+    def density(self, uv, active):
+        """The bilinear interpolation of the texels' probabilities, with respect to area, at ``uv``."""
+        corners = []
+        for x, n in zip((uv.x, uv.y), self.size, strict=True):
+            position = dr.fma(clamp(x, 0.0, 1.0), n, -0.5)
+            lower = dr.floor(position)
+            i, w = mi.Int32(lower), position - lower
+            if self.repeats:
+                both = dr.select(i < 0, n - 1, i), dr.select(i + 1 >= n, 0, i + 1)
+            else:
+                both = dr.maximum(i, 0), dr.minimum(i + 1, n - 1)
+            corners.append(list(zip(both, (1 - w, w), strict=True)))
+        total = 0
+        for i, a in corners[0]:
+            for j, b in corners[1]:
+                total = total + a * b * self.distribution.pdf(mi.Point2u(mi.UInt32(i), mi.UInt32(j)), active)
+        return total * (self.size[0] * self.size[1])

@@ -1,0 +1,228 @@
+"""Plugins that declare themselves: found here and in other packages, checked, and known by what they were made from."""
+
+import sys
+import textwrap
+
+import drjit as dr
+import pytest
+
+from mi_diffind import plugins, scenes
+
+#: A learned shape whose factory returns a native object, another of Mitsuba's, a volume, and factories that fail.
+MODULES = {
+    "toy_ball": """
+        import mitsuba as mi
+        from mi_diffind.plugins import Counterpart, Plugin, reports_as
+
+        def make(props):
+            native = mi.Properties("sphere")
+            native.set_id(props.id())
+            size = float(props.get("size", 0.5))
+            native["radius"] = size
+            made = mi.PluginManager.instance().create_object(native)
+            preset = str(props.get("preset", "tables"))
+            reports_as(made, lambda: {"preset": preset, "size": size, "storage": "uint8", "table_bytes": 12})
+            return made
+
+        def to_sphere(props):
+            props["radius"] = float(props.get("size", 0.5))
+
+        PLUGIN = Plugin("toy_ball", "shape", make, exact=Counterpart("sphere", ("preset", "size"), convert=to_sphere))
+    """,
+    "toy_field": """
+        import drjit as dr
+        import mitsuba as mi
+        import numpy as np
+        from mi_diffind.plugins import Counterpart, Plugin
+
+        def make(props):
+            native = mi.Properties("sdfgrid")
+            native.set_id(props.id())
+            x = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 8)] * 3, indexing="ij"), -1)
+            for name, child in props.objects():
+                native[name] = child
+            native["grid"] = mi.TensorXf((np.linalg.norm(x, axis=-1) - 0.3).astype(np.float32)[..., None])
+            return mi.PluginManager.instance().create_object(native)
+
+        PLUGIN = Plugin("toy_field", "shape", make, exact=Counterpart("cube"))
+    """,
+    "toy_fog": """
+        import mitsuba as mi
+        from mi_diffind.plugins import Counterpart, Plugin
+
+        class Fog(mi.Volume):
+            def eval(self, it, active=True):
+                return mi.UnpolarizedSpectrum(0.7)
+
+            def eval_1(self, it, active=True):
+                return mi.Float(0.7)
+
+            def max(self):
+                return 0.7
+
+            def max_per_channel(self):
+                return [0.7]
+
+            def traverse(self, cb):
+                pass
+
+            def report(self):
+                return {"preset": "tables"}
+
+            def to_string(self):
+                return "Fog[]"
+
+        PLUGIN = Plugin("toy_fog", "volume", Fog, exact=Counterpart("constvolume", given={"value": 0.7}))
+    """,
+    "toy_nothing": """
+        from mi_diffind.plugins import Plugin
+        PLUGIN = Plugin("toy_nothing", "bsdf", lambda props: None)
+    """,
+    "toy_wrong": """
+        import mitsuba as mi
+        from mi_diffind.plugins import Plugin
+        PLUGIN = Plugin("toy_wrong", "bsdf", lambda props: mi.load_dict({"type": "sphere"}))
+    """,
+}
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    """A package of its own that names plugins as entry points; every variant is registered anew."""
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "toys").mkdir()
+    (folder / "toys" / "__init__.py").write_text("")
+    for name, text in MODULES.items():
+        (folder / "toys" / f"{name}.py").write_text(textwrap.dedent(text))
+    info = folder / "toys-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: toys\nVersion: 1.0\n")
+    names = "".join(f"{name} = toys.{name}\n" for name in MODULES)
+    (info / "entry_points.txt").write_text(f"[{plugins.GROUP}]\n{names}broken = toys.missing\n")
+    before = dict(plugins._declared)
+    sys.path.insert(0, str(folder))
+    plugins._declared.clear()
+    yield folder
+    sys.path.remove(str(folder))
+    plugins._declared.clear()
+    plugins._declared.update(before)
+
+
+@pytest.fixture(params=["llvm_ad_rgb", "scalar_rgb"])
+def mi_toys(request, package):
+    import mitsuba as mi
+
+    with pytest.warns(UserWarning, match=r'entry point "broken" \(toys.missing\) cannot be used: ModuleNotFoundError'):
+        plugins._declared.pop(request.param, None)
+        mi.set_variant("llvm_ad_mono")
+        plugins._declared.pop(request.param, None)
+        mi.set_variant(request.param)
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+SCENE = """
+<scene version="3.0.0">
+    <integrator type="direct"/>
+    <sensor type="perspective">
+        <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>
+    </sensor>
+    <emitter type="constant"/>
+    <shape type="toy_ball" id="ball"><string name="preset" value="paper"/></shape>
+    <shape type="toy_ball"><float name="size" value="0.25"/></shape>
+    <shape type="toy_field"><bsdf type="diffuse"/></shape>
+</scene>
+"""
+
+
+def test_plugins_of_this_package_say_what_they_are(mi_rgb):
+    declared = plugins.declared()
+    assert {name: p.kind for name, p in declared.items()} == {
+        "disney": "bsdf", "neural_disney": "bsdf", "neural_ggx": "bsdf", "neural_image": "texture"
+    }  # fmt: skip
+    assert plugins.with_counterpart() == ("neural_disney", "neural_ggx", "neural_image")
+    assert plugins.with_counterpart("principled") == ("disney", "neural_disney")
+
+
+def test_each_variant_has_classes_of_its_own():
+    import mitsuba as mi
+
+    found = []
+    for variant in ("llvm_ad_rgb", "llvm_ad_mono"):
+        mi.set_variant(variant)
+        found.append(plugins.declared()["neural_disney"].factory)
+        assert issubclass(found[-1], mi.BSDF) and issubclass(found[-1], plugins.declared()["disney"].factory)
+    assert found[0] is not found[1] and found[0].__init__.__globals__ is not found[1].__init__.__globals__
+
+
+def test_plugins_of_other_packages(mi_toys, tmp_path):
+    """Shapes whose factories return native objects are found, compared and inspected; also by scalar variants."""
+    mi = mi_toys
+    assert {"toy_ball", "toy_field", "toy_fog", "neural_disney"} <= set(plugins.declared())
+    (tmp_path / "scene.xml").write_text(SCENE)
+    found = scenes.learned_plugins(tmp_path / "scene.xml")
+    assert [(e["plugin"], e["id"], e.get("preset"), e.get("size")) for e in found] == [
+        ("toy_ball", "ball", "paper", None), ("toy_ball", "", None, "0.25"), ("toy_field", "", None, None)
+    ]  # fmt: skip
+    exact = scenes.load(tmp_path / "scene.xml", exact=True)
+    assert [shape.class_name() for shape in exact.shapes()] == ["Sphere", "Sphere", "Cube"]
+    assert scenes.instances(exact) == []
+    if not plugins.supported(mi.variant()):
+        with pytest.raises(scenes.SceneError, match='"toy_ball" does not run in the variant "scalar_rgb"'):
+            scenes.load(tmp_path / "scene.xml")
+        return
+    scene = scenes.load(tmp_path / "scene.xml")
+    reports = scenes.reports(scene)
+    assert [(r["plugin"], r["id"], r.get("preset")) for r in reports[:2]] == [
+        ("toy_ball", "ball", "paper"), ("toy_ball", "", "tables")
+    ]  # fmt: skip
+    assert [r["size"] for r in reports[:2]] == [0.5, 0.25] and reports[2]["plugin"] == "toy_field"
+    assert len(reports) == 3 and mi.render(scene, spp=1).numpy().std() >= 0
+
+
+def test_native_objects_are_forgotten(mi_toys):
+    """They cannot be referenced weakly: what nobody else holds is dropped when the next one is made."""
+    mi = mi_toys
+    if not plugins.supported(mi.variant()):
+        return
+    plugins._forget_dead()
+    before = len(plugins._native)
+    balls = [mi.load_dict({"type": "toy_ball", "size": 0.1 * i}) for i in (1, 2, 3)]
+    assert len(plugins._native) == before + 3 and plugins.report(balls[1])["size"] == pytest.approx(0.2)
+    del balls
+    mi.load_dict({"type": "toy_ball"})
+    plugins._forget_dead()
+    assert len(plugins._native) == before
+
+
+def test_volumes(mi_toys):
+    """Registered as textures, which is what makes them work in a scene; not at all in scalar variants."""
+    mi = mi_toys
+    medium = {"type": "heterogeneous", "albedo": 0.5, "sigma_t": {"type": "toy_fog"}}
+    scene = {"type": "scene", "shape": {"type": "sphere", "bsdf": {"type": "null"}, "interior": medium}}
+    if not plugins.supported(mi.variant()):
+        with pytest.raises(RuntimeError, match="toy_fog"):
+            mi.load_dict(scene)
+        return
+    loaded = mi.load_dict(scene)
+    (report,) = scenes.reports(loaded)
+    assert (report["plugin"], report["kind"], report["preset"]) == ("toy_fog", "volume", "tables")
+    volume = scenes.instances(loaded)[0]
+    assert dr.allclose(volume.eval_1(dr.zeros(mi.Interaction3f)), 0.7)
+
+
+@pytest.mark.parametrize("name, found", [("toy_nothing", "nothing"), ("toy_wrong", "a Shape")])
+def test_factories_that_return_something_else(mi_toys, name, found):
+    """Mitsuba would crash, or speak of a bad cast."""
+    if plugins.supported(mi_toys.variant()):
+        with pytest.raises(RuntimeError, match=f'"{name}" returned {found}, a bsdf is needed'):
+            mi_toys.load_dict({"type": name})
+
+
+def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
+    variant, plugin = mi_rgb.variant(), plugins.declared()["disney"]
+    monkeypatch.setattr(plugins, "_load", lambda: [plugin, plugin])
+    monkeypatch.setitem(plugins._declared, variant, {})
+    plugins._declared.pop(variant)
+    with pytest.warns(UserWarning, match='two plugins called "disney"'):
+        plugins.register(variant)
