@@ -330,8 +330,9 @@ def test_shipped_tables_are_what_their_files_say(ad, shipped, preset):
         assert measured[name] == pytest.approx(value, rel=2e-3, abs=1e-5), name
 
 
-#: What is promised for each storage form: PSNR in dB, largest error at the peak and in the lobe.
-PROMISED = {"float32": (50, 0.02, 0.06), "float16": (50, 0.02, 0.06), "uint8": (45, 0.02, 0.06)}
+#: What is promised for each storage form, a little less than what is reached: PSNR in dB, largest error at the peak
+#: and in the lobe.
+PROMISED = {"float32": (51.5, 0.001, 0.03), "float16": (51.5, 0.002, 0.03), "uint8": (47.5, 0.01, 0.035)}
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
