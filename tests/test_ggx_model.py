@@ -18,7 +18,7 @@ from mi_diffind.runtime import array_module
 from mi_diffind.tables import TableError, save_table
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.files import encoding_of
-from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, Encoding, LearnedGGX, ggx, indirection
+from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, PEAKS, Encoding, LearnedGGX, ggx, indirection
 from mi_diffind.tasks.ggx.training import BANDS, GGXProblem, draw, measure
 from mi_diffind.tasks.sampling import EXPONENTIAL_RATE
 from mi_diffind.tasks.task import Request
@@ -192,14 +192,14 @@ WRONG = (float("nan"), 1e30, -1e30, float("inf"), -float("inf"), 3.4e38)
 
 
 @pytest.mark.parametrize("storage", ["float32", "float16"])
-@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", ["primary", "cascaded"])
-def test_no_entry_leads_out_of_what_a_distribution_may_be(ad, shipped, rng, quality, storage, name):
+def test_no_entry_leads_out_of_what_a_distribution_may_be(ad, shipped, rng, preset, storage, name):
     """NaN and infinities, in all entries or some: finite, not negative, and gradients are finite if the entries are."""
     sin2, alpha = (ad.Float(v) for v in random_case(rng, 5000))
     for wrong in WRONG:
         for share in (1, 0.2):
-            read = stored(ad, shipped, quality, storage)
+            read = stored(ad, shipped, preset, storage)
             array = {"primary": read.net.primary[0], "cascaded": read.net.cascaded}[name]
             values = array.data.numpy()
             with np.errstate(over="ignore"):
@@ -209,7 +209,7 @@ def test_no_entry_leads_out_of_what_a_distribution_may_be(ad, shipped, rng, qual
                 dr.disable_grad(alpha)
             dr.enable_grad(alpha)
             d = read(dr.sqrt(1 - sin2), sin2, alpha)
-            limit = ggx.PEAKS / (np.pi * alpha.numpy().astype(np.float64) ** 2)
+            limit = PEAKS / (np.pi * alpha.numpy().astype(np.float64) ** 2)
             assert (d.numpy() >= 0).all() and (d.numpy() <= 1.001 * limit).all(), (wrong, share)
             if np.isfinite(values).all():
                 dr.backward(dr.sum(d))
