@@ -14,8 +14,14 @@ class UsageError(DiffindError):
     """Bad input that the argument parser cannot see."""
 
 
-def reason(error: BaseException) -> str:
-    """What ``error`` says, on one line and no longer than one: for a sentence that quotes it."""
+def reason(error: BaseException, **names: str) -> str:
+    """
+    What ``error`` says, on one line and no longer than one: for a sentence that quotes it. ``names`` (shown → in the
+    error) are shown in place of longer ones.
+    """
     import textwrap
 
-    return textwrap.shorten(str(error), 100, placeholder="…") or type(error).__name__
+    text = str(error)
+    for shown, name in names.items():
+        text = text.replace(name, shown)
+    return textwrap.shorten(text, 100, placeholder="…") or type(error).__name__

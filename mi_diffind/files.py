@@ -70,7 +70,7 @@ def replacing(path: str | os.PathLike):
         if isinstance(e, OutputError) or not (isinstance(e, OSError) or type(e) is RuntimeError):
             raise
         # Mitsuba raises RuntimeError, of several lines
-        why = getattr(e, "strerror", None) or reason(e).replace(str(name), path.name)
+        why = getattr(e, "strerror", None) or reason(e, **{path.name: str(name)})
         raise OutputError(f'output file "{path}" cannot be written: {why}') from e
 
 

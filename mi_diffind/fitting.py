@@ -264,19 +264,23 @@ def fit(
 
 
 class _Bar:
-    """The progress bar: in steps, or in the seconds that a training is given, so that it shows the time left."""
+    """The progress bar: in steps, or in the seconds that a training is given, of which it shows those that are left."""
 
     def __init__(self, steps: int, seconds: float | None, title: str | None, progress: bool):
+        self.seconds, self.text = seconds, {}
         options = {"desc": title, "disable": None if progress else True}
         if seconds is not None:
-            form = "{l_bar}{bar}| {elapsed}<{remaining}{postfix}"
-            self.shown = tqdm(total=1.0, bar_format=form, **options)
+            self.shown = tqdm(total=1.0, bar_format=self._form(0.0), **options)
         else:
             self.shown = tqdm(total=steps, unit="step", **options)
-        self.timed, self.text = seconds is not None, {}
+
+    def _form(self, share: float) -> str:
+        return "{l_bar}{bar}| {elapsed}<" + tqdm.format_interval((1 - share) * self.seconds) + "{postfix}"
 
     def show(self, trainer: _Trainer) -> None:
-        self.shown.update((trainer.share if self.timed else trainer.step) - self.shown.n)
+        if self.seconds is not None:
+            self.shown.bar_format = self._form(trainer.share)
+        self.shown.update((trainer.step if self.seconds is None else trainer.share) - self.shown.n)
 
     def measured(self, loss: float | None, name: str, value: float) -> None:
         if loss is not None:

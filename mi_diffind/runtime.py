@@ -21,7 +21,6 @@ import ctypes
 import glob
 import importlib.abc
 import importlib.metadata
-import importlib.util
 import os
 import re
 import sys
@@ -172,23 +171,27 @@ def install() -> None:
 
 
 class _Hook(importlib.abc.MetaPathFinder):
-    """Opens a context around the first import of each of some packages; an importer that finds nothing itself."""
+    """
+    Opens a context around the first import of each of some packages, which others find. To be asked where a package is
+    (``importlib.util.find_spec``) is no import, and one that fails may be tried again.
+    """
 
     def __init__(self, contexts: dict):
         self.contexts = contexts
 
     def find_spec(self, name, path=None, target=None):
-        context = self.contexts.pop(name, None)
-        if context is None:
+        if name not in self.contexts:
             return None
-        spec = importlib.util.find_spec(name)  # asks us again, and the others then
+        others = (finder.find_spec(name, path, target) for finder in sys.meta_path if finder is not self)
+        spec = next(filter(None, others), None)
         if spec is None:
             return None
         execute = spec.loader.exec_module
 
         def exec_module(module):
-            with context():
+            with self.contexts.get(name, contextlib.nullcontext)():
                 execute(module)
+            self.contexts.pop(name, None)
 
         spec.loader.exec_module = exec_module
         return spec

@@ -47,6 +47,21 @@ def collect_garbage():
 
 
 @pytest.fixture
+def few_samples(monkeypatch):
+    """What a training measures of its result in the end is measured at fewer places than for a user."""
+    from mi_diffind.tasks.disney.library import DisneyModel
+    from mi_diffind.tasks.ggx.files import GGXModel
+    from mi_diffind.tasks.image.compressed import CompressedImage
+
+    for function, samples in (
+        (CompressedImage._between, 2**13),
+        (GGXModel.measure, 2**17),
+        (DisneyModel.measure, 2**16),
+    ):
+        monkeypatch.setattr(function, "__defaults__", (samples,))
+
+
+@pytest.fixture
 def no_garbage_collection():
     """For frozen functions: Dr.Jit aborts if the collector frees its arrays while it records one."""
     gc.collect()

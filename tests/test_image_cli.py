@@ -12,14 +12,18 @@ import zipfile
 import numpy as np
 import pytest
 
+from mi_diffind import StoredArray, load_model
 from mi_diffind.cli import main
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import Table, load_table, save_table
 from mi_diffind.tasks.image import search, training
-from mi_diffind.tasks.image.compressed import CompressedImage, load_image_table
 from mi_diffind.tasks.image.layout import Layout, MapLayout
+from mi_diffind.tasks.image.presets import STRUCTURES
+from mi_diffind.tasks.task import tasks
 
-SHORT = ["--steps", "4", "--batch", "256", "--backend", "llvm", "--dims", "2"]
+SHORT = ["--steps", "4", "--batch", "256", "--variant", "llvm_ad_rgb", "--dims", "2"]
+
+pytestmark = pytest.mark.usefixtures("few_samples")
 
 
 @pytest.fixture
@@ -69,8 +73,8 @@ def refused(capsys, *arguments):
 
 
 def decoded(path="out.npz"):
-    table, layout = load_image_table(path)
-    return CompressedImage.from_table(table, array_module("llvm").TensorXf).decode(), layout, table
+    model = load_model(path, array_module("llvm").TensorXf)
+    return model.image.decode(), model.image.layout, model.table
 
 
 # -- sources of every kind --------------------------------------------------------------------------------------------
@@ -98,7 +102,7 @@ def test_sources_of_every_kind(folder, capsys, name):
     assert fit(file, "--json", "report.json") == 0
     report, (maps, layout, table) = json.loads((folder / "report.json").read_text()), decoded()
     size = (folder / "out.npz").stat().st_size
-    assert report["bytes"] == table.nbytes <= size and report["quality"] == table.quality
+    assert report["bytes"] == table.nbytes <= size and report["measured"] == table.measured
     assert (layout.height, layout.width) == array.shape[:2] and report["source_bytes"] == array.nbytes
     assert sum(v.shape[2] for v in maps.values()) == array.shape[2]
     assert all(np.isfinite(v).all() for v in maps.values()) and set(maps) == set(layout.names)
@@ -116,14 +120,14 @@ def test_sources_of_every_kind(folder, capsys, name):
     assert main(["inspect", "out.npz", "--json", "inspect.json"]) == 0
     text, found = capsys.readouterr().out, json.loads((folder / "inspect.json").read_text())
     assert 'tables for the task "image"' in text and found["bytes"] == table.nbytes
-    assert {n: a["bytes"] for n, a in found["arrays"].items()} == {n: table.nbytes_of(n) for n in table.arrays}
-    assert found["quality"] == table.quality and found["settings"]["source_path"] == file
+    assert {n: a["bytes"] for n, a in found["arrays"].items()} == {n: array.nbytes for n, array in table.arrays.items()}
+    assert found["measured"] == table.measured and found["settings"]["source_path"] == file
 
 
 @pytest.mark.parametrize("array", [noise(1, 1, 3), noise(7, 5, 3), np.full((6, 6, 3), 77, np.uint8)])
 def test_the_papers_recipe_on_the_smallest_sources(folder, array):
     write("a.png", array)
-    assert fit("a.png", "--recipe", "paper", "--dims", "4") == 0
+    assert fit("a.png", "--preset", "paper", "--dims", "4") == 0
     maps, layout, table = decoded()
     assert layout.stored == 3 and table.arrays["primary"].shape == (1, 1, 4)
     assert maps["image"].shape == array.shape and np.isfinite(maps["image"]).all()
@@ -170,7 +174,7 @@ def test_manifests(folder, capsys):
     assert [layout[n].color_space for n in maps] == ["srgb", "linear", "linear", "linear"]
     np.testing.assert_array_equal(np.rint(255 * found["normal"]), normal)
     assert table.settings["source_path"] == "maps/material.json"
-    assert {k for k in table.quality if k.startswith("psnr_")} == {
+    assert {k for k in table.measured if k.startswith("psnr_")} == {
         "psnr_db", "psnr_mean_db", "psnr_between_db", *(f"psnr_{n}_db" for n in maps),
     }  # fmt: skip
     (folder / "maps" / "material.json").write_text('{"maps": {"albedo": "gone.png"}}')
@@ -216,7 +220,7 @@ def test_one_size_only(folder, capsys):
         *(("--dims", v) for v in ("0", "5", "x")),
         *(("--cascaded", v) for v in ("0", "-4", "4.5")),
         *(("--steps", v) for v in ("0", "many")),
-        ("--seconds", "0"), ("--border", "mirror"), ("--recipe", "theirs"), ("--without", "speed"),
+        ("--seconds", "0"), ("--border", "mirror"), ("--preset", "theirs"), ("--without", "speed"),
         ("--nonfinite", "ignore"),
     ],
 )  # fmt: skip
@@ -245,7 +249,7 @@ def test_bad_values(folder, capsys, option, value):
         (["--ratio-search", "--cascaded", "8"], "leave out --psnr and --cascaded"),
         (["--ratio-search", "--psnr", "30"], "leave out --psnr and --cascaded"),
         (["--psnr", "30", "--cascaded", "8"], "leave out --cascaded"),
-        (["--recipe", "paper", "--without", "jitter"], "leave it out"),
+        (["--preset", "paper", "--without", "jitter"], "leave it out"),
         (["-o", "out.png"], "allowed is .npz"),
         (["-o", "gone/out.npz"], 'output folder "gone" does not exist'),
     ],
@@ -281,7 +285,7 @@ def test_the_smallest_of_a_quality(folder, capsys):
     options = ["--psnr", "15", "--steps", "10", "--dims", "3", "--lr", "0.01"]
     assert fit("a.png", *options, "--json", "r.json") == 0
     report = json.loads((folder / "r.json").read_text())
-    assert report["quality"]["psnr_db"] >= 15 and report["compression_asked"] is None
+    assert report["measured"]["psnr_db"] >= 15 and report["compression_asked"] is None
     assert report["bytes"] == min(t["bytes"] for t in report["tried"] if t["psnr_db"] >= 15)
     (folder / "out.npz").unlink()
     message = refused(capsys, "fit", "image", "a.png", "-o", "out.npz", *SHORT, "--psnr", "110")
@@ -316,9 +320,9 @@ def test_ctrl_c_keeps_the_best(folder, capsys, monkeypatch):
         assert fit("a.png", *RUN) == 130
     assert len(calls) == 11 and "interrupted at step 11" in capsys.readouterr().out
     report, (maps, _, table) = json.loads((folder / "r.json").read_text()), decoded()
-    assert report["interrupted"] and report["step"] <= 11 and report["quality"] == table.quality
+    assert report["interrupted"] and report["step"] <= 11 and report["measured"] == table.measured
     mse = np.mean((maps["image"] - waves() / 255) ** 2)
-    assert table.quality["psnr_db"] == pytest.approx(-10 * np.log10(mse), abs=0.01)
+    assert table.measured["psnr_db"] == pytest.approx(-10 * np.log10(mse), abs=0.01)
     assert sorted(os.listdir(folder)) == ["a.png", "out.npz", "r.json"]
 
 
@@ -370,7 +374,7 @@ def test_ctrl_c_in_a_search(folder, capsys, monkeypatch):
         assert fit("a.png", "--ratio-search", "--bytes", "1200", "--steps", "160", "--json", "r.json") == 130
     report = json.loads((folder / "r.json").read_text())
     assert len(calls) == 25 and len(report["tried"]) == 2 and report["interrupted"]
-    assert report["quality"]["psnr_db"] == max(t["psnr_db"] for t in report["tried"])
+    assert report["measured"]["psnr_db"] == max(t["psnr_db"] for t in report["tried"])
     (folder / "out.npz").unlink()
     with monkeypatch.context() as patch:
         ctrl_c(patch, 3)
@@ -379,7 +383,7 @@ def test_ctrl_c_in_a_search(folder, capsys, monkeypatch):
     with monkeypatch.context() as patch:
         ctrl_c(patch, 6)  # the first training reached it, the second one looks for less
         assert fit("a.png", "--psnr", "1", "--json", "r.json") == 130
-    assert json.loads((folder / "r.json").read_text())["quality"] == decoded()[2].quality
+    assert json.loads((folder / "r.json").read_text())["measured"] == decoded()[2].measured
 
 
 # -- full disks -------------------------------------------------------------------------------------------------------
@@ -451,16 +455,19 @@ MAPS = (
 )
 
 
+def in_bytes(entries, scale=1 / 255, offset=0.0):
+    channels = entries.shape[-1]
+    return StoredArray(entries, (), (scale,) * channels, (offset,) * channels)
+
+
 def make_file(path, height=5, width=7, maps=MAPS, seed=0):
     """A file of random arrays."""
     rng = np.random.default_rng(seed)
     stored = 1 + max(w for m in maps for w in m.where if isinstance(w, int))
     layout = Layout(width, height, tuple(maps), (0.5,) * stored, (maps[0].name,) * stored)
-    table = Table("image", {}, "uint8", settings={"layout": layout.to_json()})
+    table = Table("image", {}, settings={"layout": layout.to_json()})
     for name, shape in (("primary", (6, 5, 2)), ("cascaded", (4, 4, stored))):
-        table.arrays[name] = rng.integers(0, 256, shape, dtype=np.uint8)
-        table.borders[name] = ("clamp", "clamp")
-        table.quantization[name] = ((1 / 255,) * shape[-1], (0.0,) * shape[-1])
+        table.arrays[name] = in_bytes(rng.integers(0, 256, shape, dtype=np.uint8))
     save_table(path, table)
     return str(path)
 
@@ -504,7 +511,8 @@ def test_what_decode_refuses(folder, capsys):
     make_file("t.npz")
     many = [MapLayout("many", "other", "linear", 1, tuple(range(6)))]
     make_file("many.npz", maps=many)
-    save_table("other.npz", Table("ggx", {"a": np.zeros((2, 1), np.float32)}))
+    save_table("unknown.npz", Table("cloth", {"a": StoredArray(np.zeros((2, 1), np.float32))}))
+    save_table("other.npz", load_table(tasks()["ggx"].file()))
     before = sorted(os.listdir(folder))
     for arguments, sentence in (
         (["t.npz", "-o", "b.jpg"], 'output "b.jpg": found the extension ".jpg", allowed are .png and .exr'),
@@ -512,7 +520,12 @@ def test_what_decode_refuses(folder, capsys):
         (["t.npz", "-o", "gone/b.png"], 'output folder "gone" does not exist'),
         (["t.npz", "-o", "b.png", "--map", "colour"], 'found "colour", the file holds albedo, normal, ao'),
         (["gone.npz", "-o", "b.png"], "gone.npz: no such file"),
-        (["other.npz", "-o", "b.png"], 'other.npz: holds tables for the task "ggx", which stand for no image'),
+        (
+            ["other.npz", "-o", "b.png"],
+            'other.npz: holds tables for the task "ggx", which stand for nothing that could be decoded',
+        ),
+        (["other.npz", "-o", "b.png", "--map", "a"], "other.npz: --map is of no use for this kind of file"),
+        (["unknown.npz", "-o", "b.png"], 'unknown.npz: holds tables for the task "cloth", installed are disney, ggx'),
         (["many.npz", "-o", "b.png"], 'many.npz: "many" has 6 channels, PNG holds 4: use .exr'),
     ):
         assert sentence in refused(capsys, "decode", *arguments)
@@ -535,9 +548,14 @@ def _settings(change):
 
 def _grow(name, shape):
     def damage(table):
-        table.arrays[name] = np.zeros(shape, np.uint8)
-        table.borders[name] = ("clamp",) * (len(shape) - 1)
-        table.quantization[name] = ((1 / 255,) * shape[-1], (0.0,) * shape[-1])
+        table.arrays[name] = in_bytes(np.zeros(shape, np.uint8))
+
+    return damage
+
+
+def _affine(name, scale, offset):
+    def damage(table):
+        table.arrays[name] = in_bytes(table.arrays[name].entries, scale, offset)
 
     return damage
 
@@ -552,9 +570,9 @@ DAMAGE = {
     "other dimensions": _grow("primary", (6, 5, 3)),
     "a primary of 1D": _grow("primary", (30, 2)),
     "other channels": _grow("cascaded", (4, 4, 3)),
-    "beyond 1": lambda table: table.quantization.update(primary=((0.005,) * 2, (0.0,) * 2)),
-    "below 0": lambda table: table.quantization.update(cascaded=((1 / 255,) * 4, (-0.1,) * 4)),
-    "falling": lambda table: table.quantization.update(cascaded=((-1 / 255,) * 4, (1.0,) * 4)),
+    "beyond 1": _affine("primary", 0.005, 0.0),
+    "below 0": _affine("cascaded", 1 / 255, -0.1),
+    "falling": _affine("cascaded", -1 / 255, 1.0),
 }
 
 
@@ -572,10 +590,10 @@ def test_decoding_ends_of_a_file_that_tiles(folder):
     """A source that repeats is found to, and reads the same at both ends."""
     write("a.png", waves())
     assert fit("a.png", "--bytes", "1200") == 0
-    table, _ = load_image_table("out.npz")
-    assert table.borders["primary"] == ("repeat", "repeat")
     types = array_module("llvm")
-    image = CompressedImage.from_table(table, types.TensorXf)
+    model = load_model("out.npz", types.TensorXf)
+    assert model.table.arrays["primary"].border == ("repeat", "repeat")
+    image = model.image
     t, zero = np.linspace(0, 1, 33, dtype=np.float32), np.zeros(33, np.float32)
     for a, b in (((zero, t), (zero + 1, t)), ((t, zero), (t, zero + 1))):
         first, second = (
@@ -584,7 +602,7 @@ def test_decoding_ends_of_a_file_that_tiles(folder):
         assert np.isfinite(first).all() and np.ptp(first) > 0.05
         np.testing.assert_allclose(first, second, atol=1e-6)
     assert fit("a.png", "--bytes", "1200", "--border", "clamp") == 0
-    assert load_table("out.npz").borders["primary"] == ("clamp", "clamp")
+    assert load_table("out.npz").arrays["primary"].border == ("clamp", "clamp")
 
 
 def test_the_same_command_gives_the_same_file(folder):
@@ -608,8 +626,11 @@ def test_inspect_measures_against_the_source(folder, capsys, name):
     source = write("a.exr" if name == "cleaned" else "a.png", values)
     assert fit(source, "--nonfinite", "clean", output="files/out.npz") == 0
     assert main(["inspect", "files/out.npz", "--measure", "--json", "r.json"]) == 0
-    measured = json.loads((folder / "r.json").read_text())["measured"]
-    assert measured == pytest.approx(load_table("files/out.npz").quality, rel=1e-4)
+    ((form, measured),) = json.loads((folder / "r.json").read_text())["measured_in_each_form"].items()
+    model = load_model("files/out.npz", array_module("llvm").TensorXf)
+    assert form == model.storage and measured.pop("bytes") == model.nbytes
+    assert measured.pop("memory_bytes") == model.memory_nbytes
+    assert measured == pytest.approx(load_table("files/out.npz").measured, rel=1e-4)
     changed = np.nan_to_num(values)
     for other in (changed[:5], changed // 2 if name != "cleaned" else changed / 2, changed[..., :1]):
         write(source, other)
@@ -624,4 +645,4 @@ def test_inspect_measures_nothing_without_a_source(folder, capsys):
 
 
 def test_candidates_of_a_search_are_structures_that_exist():
-    assert set(search.TRIED) <= set(training.STRUCTURES)
+    assert set(search.TRIED) <= set(STRUCTURES)

@@ -7,15 +7,19 @@ import types as python_types
 import numpy as np
 import pytest
 
-from mi_diffind import sizing
 from mi_diffind.fitting import FitResult
 from mi_diffind.runtime import array_module
-from mi_diffind.sizing import Size
-from mi_diffind.tasks.image import search, training
+from mi_diffind.tasks.image import presets, search, sizing, training
 from mi_diffind.tasks.image.compressed import CompressedImage
+from mi_diffind.tasks.image.presets import PRESETS
+from mi_diffind.tasks.image.sizing import Size
 from mi_diffind.tasks.image.source import from_arrays
+from mi_diffind.tasks.task import Request
 
-OURS, PAPER = training.RECIPES["ours"], training.RECIPES["paper"]
+OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
+
+
+pytestmark = pytest.mark.usefixtures("few_samples")
 
 
 def image(height=16, width=16, channels=3, seed=0, dtype=np.uint8):
@@ -29,7 +33,16 @@ def smooth(side=24):
 
 
 def short(recipe=OURS, steps=8, **settings):
-    return training.replaced(recipe, steps=steps, **{"batch": 64, "quality_every": steps, **settings})
+    return presets.replaced(recipe, steps=steps, **{"batch": 64, "measure_every": steps, **settings})
+
+
+#: What a training is asked for, where none takes place.
+ASKED = Request("ours", OURS.settings, None)
+
+
+def asked():
+    """What it is asked for where one does."""
+    return Request("ours", OURS.settings, array_module("llvm"), progress=False)
 
 
 def nbytes_of(size, channels):
@@ -45,7 +58,7 @@ def nbytes_of(size, channels):
 # -- by rule ----------------------------------------------------------------------------------------------------------
 
 
-STRUCTURES = [pytest.param(dataclasses.replace(OURS, structure=name), id=name) for name in training.STRUCTURES]
+STRUCTURES = [pytest.param(dataclasses.replace(OURS, structure=name), id=name) for name in presets.STRUCTURES]
 
 
 @pytest.mark.parametrize("recipe", [*STRUCTURES, pytest.param(PAPER, id="paper")])
@@ -63,7 +76,7 @@ def test_default_size_is_what_was_asked_for(height, width, recipe, monkeypatch):
             size = search.default_size(source, asked, recipe)
             assert size.nbytes == nbytes_of(size, channels)
             assert (size.channels, size.dims) == (channels, recipe.dims)
-            assert (size.bits, size.coarse) == training.STRUCTURES[recipe.structure]
+            assert (size.bits, size.coarse) == presets.STRUCTURES[recipe.structure]
             assert 1 <= size.rows <= height and 1 <= size.columns <= width and size.cascaded % 4 == 0
             if size.full:
                 assert size.nbytes < 1.05 * asked
@@ -91,11 +104,11 @@ def test_the_structure_follows_the_image():
     noise, waves = from_arrays({"image": image(64, 64)}), from_arrays({"image": smooth(64)})
     for source, several in ((noise, True), (waves, False)):
         found = training.structure_of(source, dataclasses.replace(OURS, structure="auto", dims=4))
-        assert (training.STRUCTURES[found][1] is not None) == several
-        for name in training.STRUCTURES:
+        assert (presets.STRUCTURES[found][1] is not None) == several
+        for name in presets.STRUCTURES:
             assert training.structure_of(source, dataclasses.replace(OURS, structure=name)) == name
     for dims in (1, 2):
-        assert training.STRUCTURES[training.structure_of(noise, dataclasses.replace(OURS, dims=dims))][1] is None
+        assert presets.STRUCTURES[training.structure_of(noise, dataclasses.replace(OURS, dims=dims))][1] is None
 
 
 def test_a_size_with_a_given_side():
@@ -118,13 +131,14 @@ def pretended(quality, monkeypatch, interrupt=None):
     """
     calls = []
 
-    def fit_image(source, size, recipe, **options):
+    def fit_image(source, size, recipe, request, border=None, title=None):
+        assert request is ASKED
         calls.append((size, recipe))
         assert recipe.dims == size.dims
-        assert training.STRUCTURES[training.structure_of(source, recipe)] == (size.bits, size.coarse)
+        assert presets.STRUCTURES[training.structure_of(source, recipe)] == (size.bits, size.coarse)
         decibel = quality(size, recipe)
         table = python_types.SimpleNamespace(
-            nbytes=size.nbytes, quality={"psnr_db": decibel, "psnr_between_db": decibel + 2}
+            nbytes=size.nbytes, measured={"psnr_db": decibel, "psnr_between_db": decibel + 2}
         )
         return table, FitResult({}, 1, 1, 0.0, len(calls) == interrupt, 0)
 
@@ -137,14 +151,14 @@ def test_ratio_search_picks_the_best_that_it_tried(monkeypatch):
     for seed in range(10):
         rng = np.random.default_rng(seed)
         calls = pretended(lambda size, recipe, rng=rng: rng.uniform(20, 40), monkeypatch)
-        found = search.ratio_search(source, 3000, short(steps=400))
+        found = search.ratio_search(source, 3000, short(steps=400), ASKED)
         assert len(found.tried) == len(calls) >= 3 and not found.interrupted
         best = max(found.tried, key=lambda t: t["psnr_db"])
         assert (found.size.dims, found.size.cascaded) == (best["dims"], best["cascaded"])
-        assert (found.size.bits, found.size.coarse) == training.STRUCTURES[best["structure"]]
+        assert (found.size.bits, found.size.coarse) == presets.STRUCTURES[best["structure"]]
         assert (found.recipe.dims, found.recipe.structure) == (best["dims"], best["structure"])
         assert found.recipe.settings == short(steps=400).settings  # not those of the short trainings
-        assert found.best[0].quality["psnr_db"] == best["psnr_db"]
+        assert found.best[0].measured["psnr_db"] == best["psnr_db"]
         for t, (size, recipe) in zip(found.tried, calls, strict=True):
             assert t["bytes"] == size.nbytes == nbytes_of(size, 3) <= 3000 * 1.05
             assert recipe.settings.steps == 50
@@ -161,14 +175,14 @@ def test_ratio_search_finds_a_peak(monkeypatch):
         return 40 - abs(size.bits - 4) - 5 * two - 3 * abs(size.dims - 3) - abs(math.log2(size.cascaded / 16))
 
     pretended(peak, monkeypatch)
-    found = search.ratio_search(source, 20_000, base)
+    found = search.ratio_search(source, 20_000, base, ASKED)
     assert (found.size.dims, found.size.bits, found.size.coarse, found.size.cascaded) == (3, 4, None, 16)
-    held = search.ratio_search(source, 20_000, base, free=False)  # sides only
+    held = search.ratio_search(source, 20_000, base, ASKED, free=False)  # sides only
     assert {(t["dims"], t["structure"]) for t in held.tried} == {(4, "6 bits")}
     assert held.recipe == base and len(held.tried) >= 2
 
     pretended(lambda size, recipe: 40 - abs(size.bits - 3) - 5 * (size.coarse is None), monkeypatch)
-    found = search.ratio_search(source, 20_000, base)
+    found = search.ratio_search(source, 20_000, base, ASKED)
     assert found.size.bits == 3 and found.size.coarse is not None
 
 
@@ -176,7 +190,7 @@ def test_ratio_search_where_nothing_fits(monkeypatch):
     source = from_arrays({"image": image(7, 5)})
     calls = pretended(lambda size, recipe: 30, monkeypatch)
     for recipe in (OURS, PAPER):
-        found = search.ratio_search(source, 20, recipe, recipe is OURS)
+        found = search.ratio_search(source, 20, recipe, ASKED, recipe is OURS)
         assert found.tried == [] and not calls and found.recipe == recipe
         assert found.size == search.default_size(source, 20, recipe)
 
@@ -186,15 +200,15 @@ def test_ratio_search_is_interrupted(monkeypatch):
     for when in (1, 2, 3):
         rng = np.random.default_rng(when)
         calls = pretended(lambda size, recipe, rng=rng: rng.uniform(20, 40), monkeypatch, interrupt=when)
-        found = search.ratio_search(source, 3000, short())
+        found = search.ratio_search(source, 3000, short(), ASKED)
         assert found.interrupted and len(calls) == len(found.tried) == when
-        assert found.best[0].quality["psnr_db"] == max(t["psnr_db"] for t in found.tried)
+        assert found.best[0].measured["psnr_db"] == max(t["psnr_db"] for t in found.tried)
 
 
 def test_ratio_search_is_deterministic():
     source = from_arrays({"image": smooth(16)})
     recipe = short(dataclasses.replace(OURS, dims=2), steps=20)
-    runs = [search.ratio_search(source, 1000, recipe, free=False, backend="llvm", progress=False) for _ in range(2)]
+    runs = [search.ratio_search(source, 1000, recipe, asked(), free=False) for _ in range(2)]
     assert runs[0].tried == runs[1].tried and runs[0].size == runs[1].size and len(runs[0].tried) >= 1
     table, _ = runs[0].best
     assert table.nbytes == max(runs[0].tried, key=lambda t: t["psnr_db"] + t["psnr_between_db"])["bytes"]
@@ -219,7 +233,7 @@ def test_quality_search_is_small_enough(monkeypatch, slope, bend, wobble, goal):
     source = from_arrays({"image": image(256, 256)})
     quality = by_bytes(slope, bend, wobble)
     calls, log = pretended(quality, monkeypatch), []
-    table, result, tried = search.psnr_search(source, goal, short(), log=log.append)
+    table, result, tried = search.psnr_search(source, goal, short(), ASKED, log=log.append)
     assert len(tried) == len(calls) == len(log) <= 8
     assert [t["bytes"] for t in tried] == [size.nbytes for size, _ in calls]
     reached = [t["bytes"] for t in tried if t["psnr_db"] >= goal]
@@ -227,7 +241,7 @@ def test_quality_search_is_small_enough(monkeypatch, slope, bend, wobble, goal):
         assert not reached and max(quality(size, None) for size, _ in calls) < goal
         assert calls[-1][0].full or len(tried) == 8
         return
-    assert table.quality["psnr_db"] >= goal and table.nbytes == min(reached) and not result.interrupted
+    assert table.measured["psnr_db"] >= goal and table.nbytes == min(reached) and not result.interrupted
     missed = [t["bytes"] for t in tried if t["psnr_db"] < goal and t["bytes"] < table.nbytes]
     if wobble == 0 and len(tried) < 8 and missed:
         assert table.nbytes <= 1.1 * max(missed)  # few rows more make more than NEAR of a small file
@@ -240,7 +254,7 @@ def test_quality_search_needs_few_trainings(monkeypatch):
     source = from_arrays({"image": image(256, 256)})
     for goal in (26, 28, 30, 32):
         calls = pretended(by_bytes(2.5), monkeypatch)
-        table, *_ = search.psnr_search(source, goal, short(), log=lambda text: None)
+        table, *_ = search.psnr_search(source, goal, short(), ASKED, log=lambda text: None)
         exact = 1000 * 2 ** ((goal - 25) / 2.5)
         assert exact <= table.nbytes < 1.07 * exact and len(calls) <= 6
 
@@ -249,17 +263,17 @@ def test_quality_search_without_success(monkeypatch):
     """It ends at a primary as large as the image, at the latest after ``most`` trainings."""
     source = from_arrays({"image": image(64, 64)})
     calls = pretended(by_bytes(2.5), monkeypatch)
-    table, result, tried = search.psnr_search(source, 100, short(), log=lambda text: None)
+    table, result, tried = search.psnr_search(source, 100, short(), ASKED, log=lambda text: None)
     assert table is None and result is None and calls[-1][0].full and len(tried) == len(calls)
     assert not any(size.full for size, _ in calls[:-1])
     calls = pretended(by_bytes(0), monkeypatch)
-    assert search.psnr_search(source, 100, short(), most=1, log=lambda text: None)[0] is None and len(calls) == 1
+    assert search.psnr_search(source, 100, short(), ASKED, most=1, log=lambda text: None)[0] is None and len(calls) == 1
 
 
 def test_quality_search_below_the_smallest(monkeypatch):
     source = from_arrays({"image": image(64, 64)})
     calls = pretended(by_bytes(0), monkeypatch)
-    table, _, tried = search.psnr_search(source, 1, short(), log=lambda text: None)
+    table, _, tried = search.psnr_search(source, 1, short(), ASKED, log=lambda text: None)
     smallest = search.sized(source, 1, short(), 4)
     assert table.nbytes == smallest.nbytes == min(t["bytes"] for t in tried) and len(calls) < 8
 
@@ -269,12 +283,12 @@ def test_quality_search_is_interrupted(monkeypatch):
     source = from_arrays({"image": image(256, 256)})
     start = by_bytes(2.5)(search.default_size(source, source.nbytes / 12, short()), None)
     calls = pretended(by_bytes(2.5), monkeypatch, interrupt=2)
-    table, result, tried = search.psnr_search(source, start - 5, short(), log=lambda text: None)
+    table, result, tried = search.psnr_search(source, start - 5, short(), ASKED, log=lambda text: None)
     assert len(tried) == len(calls) == 2 and result.interrupted
     assert table.nbytes == min(t["bytes"] for t in tried if t["psnr_db"] >= start - 5)
     pretended(by_bytes(2.5), monkeypatch, interrupt=1)
     with pytest.raises(KeyboardInterrupt):
-        search.psnr_search(source, start + 5, short(), log=lambda text: None)
+        search.psnr_search(source, start + 5, short(), ASKED, log=lambda text: None)
 
 
 def test_quality_search_with_trainings():
@@ -283,10 +297,8 @@ def test_quality_search_with_trainings():
     source = from_arrays({"image": values})
     recipe = short(dataclasses.replace(OURS, dims=3), steps=30, batch=576, lr=1e-2)
     goal = 24.0
-    table, _, tried = search.psnr_search(
-        source, goal, recipe, most=4, log=lambda text: None, backend="llvm", progress=False
-    )
-    decoded = CompressedImage.from_table(table, array_module("llvm").TensorXf).decode()["image"]
+    table, _, tried = search.psnr_search(source, goal, recipe, asked(), most=4, log=lambda text: None)
+    decoded = CompressedImage.of(table, array_module("llvm").TensorXf).decode()["image"]
     assert -10 * np.log10(np.mean((decoded - values / 255.0) ** 2)) > goal - 0.01
     assert table.nbytes == min(t["bytes"] for t in tried if t["psnr_db"] >= goal)
 

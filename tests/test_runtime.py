@@ -3,7 +3,9 @@ The choice of LLVM: as a function, and in fresh processes, where a wrong one wou
 only a process of its own can show that it does not happen).
 """
 
+import contextlib
 import glob
+import importlib
 import os
 import subprocess
 import sys
@@ -12,6 +14,7 @@ import drjit as dr
 import pytest
 
 from mi_diffind import runtime
+from mi_diffind.errors import DiffindError, UsageError
 from mi_diffind.runtime import ENV, MIN_LLVM, choose_llvm, library_version, system_libraries
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="LLVM is searched for on Linux only")
@@ -139,13 +142,16 @@ def test_version_of_the_library_in_use():
 
 
 def test_array_module():
-    with pytest.raises(RuntimeError, match="metal"):
-        runtime.array_module("metal")
-    assert runtime.array_module("llvm").__name__ == "drjit.llvm.ad"
+    for name in ("metal", "scalar_rgb"):
+        with pytest.raises(UsageError, match=f'the variant "{name}" is not vectorised'):
+            runtime.array_module(name)
+    for name in ("llvm", "llvm_ad_rgb", "llvm_ad_spectral_double"):
+        assert runtime.array_module(name).__name__ == "drjit.llvm.ad"
     if not dr.has_backend(dr.JitBackend.CUDA):
         assert runtime.array_module() is runtime.array_module("llvm")
-        with pytest.raises(RuntimeError, match="NVIDIA"):
-            runtime.array_module("cuda")
+        for name in ("cuda", "cuda_ad_rgb"):
+            with pytest.raises(DiffindError, match=f'the variant "{name}" needs an NVIDIA GPU'):
+                runtime.array_module(name)
 
 
 # -- in fresh processes ------------------------------------------------------------------------------------------------
@@ -181,6 +187,97 @@ def old_library(*versions):
 def aborting():
     """An old LLVM that Dr.Jit loads all the same, and with which it would abort."""
     return old_library(15, 16, 17, 18)
+
+
+LIGHT = """
+import sys
+before = set(sys.meta_path)
+import mi_diffind
+assert not {"drjit", "mitsuba", "numpy"} & set(sys.modules), sorted(sys.modules)
+assert len(set(sys.meta_path) - before) == 1
+assert mi_diffind.runtime.llvm_problem() is None
+"""
+
+
+def test_importing_imports_nothing():
+    """Neither Dr.Jit nor Mitsuba: they are met when they come."""
+    succeeds(LIGHT)
+
+
+def test_each_import_is_met_once():
+    """The finder steps aside after Dr.Jit and Mitsuba; what is not there is not there."""
+    code = f"""{LIGHT}
+import importlib.util
+chosen = []
+original = mi_diffind.runtime.choose_llvm
+mi_diffind.runtime.choose_llvm = lambda *a: chosen.append(a) or original(*a)
+registered = []
+mi_diffind.runtime._register_plugins = lambda: registered.append(1)
+try:
+    import no_such_module_anywhere
+except ModuleNotFoundError:
+    pass
+assert importlib.util.find_spec("no_such_module_anywhere") is None
+import drjit
+assert len(chosen) == 1 and not registered
+import mitsuba
+import mitsuba, drjit
+assert len(chosen) == 1 and len(registered) == 1
+finder = next(f for f in sys.meta_path if f not in before)
+assert finder.contexts == {{}}
+assert mitsuba.variants() and drjit.detail.llvm_version()[0] >= {MIN_LLVM}
+assert os.environ["{ENV}"] if (os := __import__("os")) and {sys.platform.startswith("linux")} else True
+"""
+    succeeds(code)
+
+
+def test_a_question_about_an_import_imports_nothing():
+    """``importlib.util.find_spec``, by which many look for a package, is no import; later ones are met all the same."""
+    code = f"""{LIGHT}
+import importlib.util
+spec = importlib.util.find_spec("drjit")
+assert spec is not None and "drjit" not in sys.modules
+{KERNEL}{PRINT_VERSION}"""
+    assert int(succeeds(code).stdout.split()[-1]) >= MIN_LLVM
+
+
+def test_an_import_that_failed_is_met_again(tmp_path, monkeypatch):
+    (tmp_path / "flaky_at_first.py").write_text("import os\nassert 'FLAKY' in os.environ\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    events = []
+
+    @contextlib.contextmanager
+    def context():
+        events.append("before")
+        yield
+        events.append("after")
+
+    finder = runtime._Hook({"flaky_at_first": context})
+    monkeypatch.setattr(sys, "meta_path", [finder, *sys.meta_path])
+    with pytest.raises(AssertionError):
+        importlib.import_module("flaky_at_first")
+    monkeypatch.setenv("FLAKY", "1")
+    importlib.import_module("flaky_at_first")
+    assert events == ["before", "before", "after"] and not finder.contexts
+    del sys.modules["flaky_at_first"]
+    importlib.import_module("flaky_at_first")
+    assert len(events) == 3
+    del sys.modules["flaky_at_first"]
+
+
+@pytest.mark.parametrize("name", ["drjit", "mitsuba"])
+def test_a_package_that_is_not_installed(name):
+    """The usual exception, of the usual sentence."""
+    code = f"""{LIGHT}
+from importlib.machinery import PathFinder
+find = PathFinder.find_spec
+PathFinder.find_spec = classmethod(lambda cls, n, *a: None if n.split(".")[0] == {name!r} else find(n, *a))
+try:
+    import {name}
+except ModuleNotFoundError as e:
+    print(e)
+"""
+    assert succeeds(code).stdout.strip() == f"No module named '{name}'"
 
 
 @pytest.mark.parametrize(
@@ -235,7 +332,7 @@ for name, use in {{
 }}.items():
     try:
         use()
-    except RuntimeError as e:
+    except (RuntimeError, mi_diffind.DiffindError) as e:
         print(f"{{name}}: {{e}}")
 try:
     mi.set_variant("llvm_ad_rgb")

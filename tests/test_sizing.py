@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from mi_diffind import sizing
-from mi_diffind.sizing import Size, explain, fit_bytes, image_bytes, paper_search, parse_size, search
+from mi_diffind.tasks.image import sizing
+from mi_diffind.tasks.image.sizing import Size, explain, fit_bytes, image_bytes, paper_search, parse_size, search
 
 IMAGES = [(1, 1), (1, 4096), (4096, 1), (7, 5), (64, 64), (100, 100), (333, 1000), (1024, 1024), (4096, 4096)]
 

@@ -6,12 +6,25 @@ import os
 import random
 import tracemalloc
 import zipfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mi_diffind import TableError, load_table, lookup, save_table, tables
+from mi_diffind import (
+    DifferentiableArray,
+    DiffindError,
+    Indirection,
+    StoredArray,
+    TableError,
+    load_table,
+    lookup,
+    save_table,
+    tables,
+)
 from mi_diffind.files import OutputError
+from mi_diffind.runtime import array_module
 from mi_diffind.tables import Table
 
 SHAPES = {"primary.0.data": (4, 5, 2), "cascaded": (3, 3, 7)}
@@ -21,11 +34,23 @@ def example(storage="float32", seed=0) -> Table:
     rng = np.random.default_rng(seed)
     arrays = {name: rng.normal(0, 1, shape).astype(np.float32) for name, shape in SHAPES.items()}
     arrays["cascaded"][0, 0, :4] = [0.0, -0.0, 1e-45, -3e38] if storage == "float32" else [0.0, -0.0, 6e-8, -6e4]
-    table = Table(
-        "a task", arrays, "float32", {"cascaded": ("clamp", "repeat")}, {}, {"lr": 1e-3, "name": "α β"}, 7,
-        {"psnr_db": 33.25},
-    )  # fmt: skip
+    stored = {
+        "primary.0.data": StoredArray(arrays["primary.0.data"]),
+        "cascaded": StoredArray(arrays["cascaded"], ("clamp", "repeat")),
+    }
+    table = Table("a task", stored, "a preset", {"lr": 1e-3, "name": "α β"}, 7, {"psnr_db": 33.25})
     return table.to(storage)
+
+
+def same(a: StoredArray, b: StoredArray) -> bool:
+    """Are two arrays equal, bit by bit, with all that is said about them?"""
+    about = [(x.entries.dtype, x.shape, x.border, x.scale, x.offset, x.bits) for x in (a, b)]
+    return about[0] == about[1] and a.entries.tobytes() == b.entries.tobytes()
+
+
+def changed(table: Table, name: str, **changes) -> Table:
+    """A copy of ``table`` one of whose arrays is another."""
+    return replace(table, arrays={**table.arrays, name: replace(table.arrays[name], **changes)})
 
 
 def parts(path):
@@ -88,20 +113,118 @@ def test_round_trip_is_exact(tmp_path, storage):
     table, path = example(storage), tmp_path / "tables.npz"
     save_table(path, table)
     loaded = load_table(path, task="a task", shapes=SHAPES)
-    assert (loaded.task, loaded.storage, loaded.settings, loaded.seed, loaded.quality) == (
-        "a task", storage, {"lr": 1e-3, "name": "α β"}, 7, {"psnr_db": 33.25},
+    assert (loaded.task, loaded.preset, loaded.storage, loaded.settings, loaded.seed, loaded.measured) == (
+        "a task", "a preset", storage, {"lr": 1e-3, "name": "α β"}, 7, {"psnr_db": 33.25},
     )  # fmt: skip
+    assert loaded.path == path and table.path is None
     assert list(loaded.arrays) == list(table.arrays)
     for name, array in table.arrays.items():
-        assert loaded.arrays[name].dtype == array.dtype and loaded.arrays[name].shape == array.shape
-        assert loaded.arrays[name].tobytes() == array.tobytes()
-        np.testing.assert_array_equal(loaded.values(name), table.values(name))
-    assert loaded.borders == {"primary.0.data": ("clamp", "clamp"), "cascaded": ("clamp", "repeat")}
-    assert loaded.quantization == table.quantization and bool(loaded.quantization) == (storage == "uint8")
-    assert loaded.nbytes == sum(a.nbytes for a in table.arrays.values())
+        assert same(loaded.arrays[name], array)
+        np.testing.assert_array_equal(loaded.arrays[name].values, array.values)
+        assert bool(array.scale) == bool(array.offset) == (storage == "uint8") and array.bits == 8
+    assert {name: array.border for name, array in loaded.arrays.items()} == {
+        "primary.0.data": ("clamp", "clamp"), "cascaded": ("clamp", "repeat"),
+    }  # fmt: skip
+    assert loaded.nbytes == sum(a.entries.nbytes for a in table.arrays.values())
     again = tmp_path / "again.npz"
     save_table(again, loaded)
     assert again.read_bytes() == path.read_bytes()
+
+
+#: What a primary array may be beside what a cascaded one: bits of bytes, or floats.
+MIXTURES = [
+    ("uint8", 8, "float16"), ("uint8", 8, "float32"), ("uint8", 6, "float16"), ("uint8", 6, "float32"),
+    ("float32", 8, "uint8"), ("float16", 8, "float32"), ("uint8", 6, "uint8"),
+]  # fmt: skip
+
+
+def mixture(primary: str, bits: int, cascaded: str) -> Table:
+    """An indirection of 2 × 2 dimensions whose arrays have each a storage form, borders and bits of their own."""
+    rng = np.random.default_rng(bits)
+    pointer = StoredArray(rng.uniform(0, 1, (4, 5, 2)).astype(np.float32), ("repeat", "clamp")).to(primary)
+    if primary == "uint8":
+        steps = 2**bits - 1
+        codes = rng.integers(0, steps + 1, (4, 5, 2)).astype(np.uint8)
+        pointer = StoredArray(codes, pointer.border, (1 / steps,) * 2, (0.0,) * 2, bits)
+    answer = StoredArray(rng.normal(0, 100, (3, 3, 7)).astype(np.float32)).to(cascaded)
+    return Table("a task", {"primary": pointer, "cascaded": answer})
+
+
+@pytest.mark.parametrize(("primary", "bits", "cascaded"), MIXTURES)
+def test_each_array_has_its_own_form(tmp_path, primary, bits, cascaded):
+    """As radiance fields need them: pointers in bytes or fewer bits, what they point into as floats."""
+    table, path = mixture(primary, bits, cascaded), tmp_path / "t.npz"
+    save_table(path, table)
+    loaded = load_table(path, shapes={"primary": (4, 5, 2), "cascaded": (None, None, 7)})
+    assert loaded.storage == table.storage == (primary if primary == cascaded else f"{primary}/{cascaded}")
+    assert all(same(loaded.arrays[name], table.arrays[name]) for name in table.arrays)
+    each = {"float32": 32, "float16": 16, "uint8": 8}
+    width = bits if primary == "uint8" else each[primary]
+    assert loaded.nbytes == 40 * width // 8 + 63 * each[cascaded] // 8
+    described = json.loads(np.load(path)["meta"].tobytes())["arrays"]
+    for name, array in table.arrays.items():
+        assert described[name]["storage"] == array.storage and described[name]["border"] == list(array.border)
+        assert set(described[name]) >= {"scale", "offset", "bits"} or array.storage != "uint8"
+    again = tmp_path / "again.npz"
+    save_table(again, loaded)
+    assert again.read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize(("primary", "bits", "cascaded"), MIXTURES)
+def test_mixed_forms_are_allocated_as_they_are(primary, bits, cascaded):
+    """Stored, allocated and stored again is the same; and what is read is what interpolation of the values gives."""
+    ad, table = array_module("llvm"), mixture(primary, bits, cascaded)
+    arrays = {name: array.allocate(ad.TensorXf) for name, array in table.arrays.items()}
+    assert all(same(StoredArray.of(arrays[name]), array) for name, array in table.arrays.items())
+    assert [arrays["primary"].storage, arrays["cascaded"].storage] == [primary, cascaded]
+    assert arrays["primary"].nbytes == table.arrays["primary"].nbytes
+    for name, array in table.arrays.items():
+        np.testing.assert_array_equal(arrays[name].numpy(), array.values)
+    # Read at the entries of the primary, where its interpolation does not blur them, by an independent interpolation
+    net = Indirection(arrays["primary"], arrays["cascaded"])
+    i, j = np.meshgrid(np.arange(4), np.arange(5), indexing="ij")
+    x = [ad.Float((i.ravel() / 4).astype(np.float32)), ad.Float((j.ravel() / 4).astype(np.float32))]
+    found = np.stack([np.array(v) for v in net(x)], axis=-1)
+    p = np.clip(table.arrays["primary"].values.reshape(-1, 2).astype(np.float64), 0, 1) * 2
+    low = np.minimum(p.astype(int), 1)
+    w, values = p - low, table.arrays["cascaded"].values.astype(np.float64)
+    corners = [values[low[:, 0] + a, low[:, 1] + b] for a in (0, 1) for b in (0, 1)]
+    weights = [abs(1 - a - w[:, 0]) * abs(1 - b - w[:, 1]) for a in (0, 1) for b in (0, 1)]
+    expected = sum(weight[:, None] * corner for weight, corner in zip(weights, corners, strict=True))
+    np.testing.assert_allclose(found, expected, atol=0.05)  # of a range of 500, read from bytes with 1/64 of a step
+
+
+def test_of_and_allocate_are_each_others_inverse():
+    """One conversion between what is stored and what is allocated, in every form, and into every other."""
+    ad, rng = array_module("llvm"), np.random.default_rng(5)
+    original = StoredArray(rng.uniform(0, 1, (6, 3)).astype(np.float32), ("repeat",))
+    for stored in lookup.STORAGES:
+        form = original.to(stored)
+        assert same(StoredArray.of(form.allocate(ad.TensorXf)), form)
+        for other in lookup.STORAGES:
+            array = form.allocate(ad.TensorXf, other)
+            assert array.storage == other and array.border == ("repeat",)
+            assert same(StoredArray.of(array), form.to(other))
+    # A fold is for floats that an optimiser may drive out of the range; nothing else has one
+    for storage in lookup.STORAGES:
+        assert original.allocate(ad.TensorXf, storage, fold=True).folded == (storage == "float32")
+        assert not original.allocate(ad.TensorXf, storage).folded
+    # What has left the range under an optimiser is stored as it is read, folded
+    array = DifferentiableArray(3, 1, np.float32([[-0.25], [0.5], [1.75]]), fold=True).alloc(ad.TensorXf)
+    np.testing.assert_allclose(StoredArray.of(array).values, [[0.25], [0.5], [0.25]], atol=2e-7)
+    with pytest.raises(ValueError, match=r'"int4", allowed are'):
+        original.allocate(ad.TensorXf, "int4")
+
+
+def test_pointers():
+    """Only what stays in [0, 1] whatever byte is stored may be read without a look at the range."""
+    codes = np.zeros((2, 2), np.uint8)
+    for bits, scale, offset, expected in (
+        (8, 1 / 255, 0.0, True), (6, 1 / 63, 0.0, True), (6, 1 / 255, 0.5, True), (8, 1 / 63, 0.0, False),
+        (8, 1 / 255, 0.1, False), (8, 1 / 255, -0.1, False), (8, -1 / 255, 1.0, False),
+    ):  # fmt: skip
+        affine = ((1 / 255, scale), (0.0, offset))
+        assert StoredArray(codes, (), *affine, bits).is_pointer == expected, (bits, scale, offset)
 
 
 def test_numpy_reads_it(saved):
@@ -130,23 +253,26 @@ def test_same_content_gives_the_same_bytes(tmp_path, monkeypatch):
 def test_conversion(storage):
     """Each storage form is as close as it can be, and going there twice changes nothing."""
     rng = np.random.default_rng(1)
-    table = Table("t", {"a": rng.uniform(-1, 2, (6, 5, 3)).astype(np.float32)}, quality={"psnr_db": 1.0})
+    values = rng.uniform(-1, 2, (6, 5, 3)).astype(np.float32)
+    table = Table("t", {"a": StoredArray(values)}, "p", measured={"psnr_db": 1.0}, path=Path("x.npz"))
     converted = table.to(storage)
-    assert converted.storage == storage and converted.quality == table.quality and converted.to(storage) is converted
+    assert converted.storage == storage and converted.arrays["a"].to(storage) is converted.arrays["a"]
+    assert (converted.measured, converted.preset, converted.path) == (table.measured, "p", table.path)
     tolerance = {"float32": 0, "float16": 2 * 2.0**-11, "uint8": 3 / 255 / 2 * 1.001}[storage]
-    assert np.abs(converted.values("a") - table.values("a")).max() <= tolerance
-    np.testing.assert_array_equal(converted.to("float32").to(storage).values("a"), converted.values("a"))
+    assert np.abs(converted.arrays["a"].values - values).max() <= tolerance
+    again = converted.to("float32").to(storage)
+    np.testing.assert_array_equal(again.arrays["a"].values, converted.arrays["a"].values)
     assert table.nbytes == {"float32": 1, "float16": 2, "uint8": 4}[storage] * converted.nbytes
+    assert table.arrays["a"].entries is values  # a copy: the table itself stays as it is
     with pytest.raises(ValueError, match="int4"):
         table.to("int4")
 
 
 def test_columns_in_fortran_order_and_views(tmp_path):
     table = example()
-    values = table.arrays["cascaded"]
-    table.arrays["cascaded"] = np.asfortranarray(values)
-    save_table(tmp_path / "f.npz", table)
-    np.testing.assert_array_equal(load_table(tmp_path / "f.npz").arrays["cascaded"], values)
+    values = table.arrays["cascaded"].entries
+    save_table(tmp_path / "f.npz", changed(table, "cascaded", entries=np.asfortranarray(values)))
+    np.testing.assert_array_equal(load_table(tmp_path / "f.npz").arrays["cascaded"].entries, values)
 
 
 # -- fewer than 8 bits an entry ----------------------------------------------------------------------------------------
@@ -155,12 +281,10 @@ def test_columns_in_fortran_order_and_views(tmp_path):
 def narrow(bits=5, shape=(5, 3, 2)) -> Table:
     """A table whose first array has ``bits`` bits an entry, the second one 8."""
     rng = np.random.default_rng(bits)
-    arrays = {
-        "few": rng.integers(0, 2**bits, shape).astype(np.uint8),
-        "bytes": rng.integers(0, 256, (4, 3), dtype=np.uint8),
-    }
-    affine = {name: ((0.5,) * a.shape[-1], (-1.0,) * a.shape[-1]) for name, a in arrays.items()}
-    return Table("t", arrays, "uint8", quantization=affine, bits={"few": bits})
+    few = rng.integers(0, 2**bits, shape).astype(np.uint8)
+    whole = rng.integers(0, 256, (4, 3), dtype=np.uint8)
+    affine = {n: ((0.5,) * n, (-1.0,) * n) for n in (2, 3)}
+    return Table("t", {"few": StoredArray(few, (), *affine[2], bits), "bytes": StoredArray(whole, (), *affine[3])})
 
 
 @pytest.mark.parametrize("bits", range(1, 8))
@@ -168,13 +292,12 @@ def test_few_bits_make_the_round_trip(tmp_path, bits):
     table, path, again = narrow(bits), tmp_path / "t.npz", tmp_path / "again.npz"
     save_table(path, table)
     loaded = load_table(path)
-    assert loaded.bits == {"few": bits} and loaded.quantization == table.quantization
+    assert {name: a.bits for name, a in loaded.arrays.items()} == {"few": bits, "bytes": 8}
     for name, array in table.arrays.items():
-        assert loaded.arrays[name].dtype == np.uint8
-        np.testing.assert_array_equal(loaded.arrays[name], array)
-        np.testing.assert_array_equal(loaded.values(name), np.float32(0.5 * array - 1.0))
+        assert same(loaded.arrays[name], array)
+        np.testing.assert_array_equal(loaded.arrays[name].values, np.float32(0.5 * array.entries - 1.0))
     size = -(-30 * bits // 8)
-    assert loaded.nbytes_of("few") == size and loaded.nbytes == size + 12
+    assert loaded.arrays["few"].nbytes == size and loaded.nbytes == size + 12
     assert np.load(path)["few"].shape == (size,)  # what is in the file, too
     save_table(again, loaded)
     assert again.read_bytes() == path.read_bytes()
@@ -186,44 +309,43 @@ def test_few_bits_in_other_forms(tmp_path):
     for storage in ("float32", "float16"):
         other, path = table.to(storage), tmp_path / f"{storage}.npz"
         save_table(path, other)
-        np.testing.assert_array_equal(load_table(path).values("few"), table.values("few"))
-        assert not other.bits and other.nbytes == (30 + 12) * {"float32": 4, "float16": 2}[storage]
-    assert table.to("uint8").bits == {"few": 3}
+        np.testing.assert_array_equal(load_table(path).arrays["few"].values, table.arrays["few"].values)
+        assert other.arrays["few"].bits == 8 and other.nbytes == (30 + 12) * {"float32": 4, "float16": 2}[storage]
+    assert table.to("uint8").arrays["few"].bits == 3
 
 
-@pytest.mark.parametrize("bits", [0, 8, 9, -1, True, 2.0, "x", [3], 10**30])
+@pytest.mark.parametrize("bits", [0, 9, -1, True, 2.0, "x", [3], 10**30])
 def test_impossible_bits(tmp_path, bits):
     """Neither written nor read."""
     path = tmp_path / "t.npz"
-    table = narrow()
-    table.bits["few"] = bits
-    with pytest.raises(TableError, match=r"few.* bits an entry, allowed are 1 to 7"):
-        save_table(path, table)
+    with pytest.raises(TableError, match=r"few.* bits an entry, allowed are 1 to 8"):
+        save_table(path, changed(narrow(), "few", bits=bits))
     assert not os.listdir(tmp_path)
     save_table(path, narrow())
     change_meta(path, lambda meta: meta["arrays"]["few"].update(bits=bits))
-    refused(path, "few.* bits an entry, allowed are 1 to 7")
+    refused(path, "few.* bits an entry, allowed are 1 to 8")
 
 
 def test_entries_that_need_more_bits(tmp_path):
     table = narrow(5)
-    table.arrays["few"] = table.arrays["few"].copy()
-    table.arrays["few"][-1, -1, -1] = 32
+    entries = table.arrays["few"].entries.copy()
+    entries[-1, -1, -1] = 32
     with pytest.raises(TableError, match=r"few.*entries of more than 5 bits"):
-        save_table(tmp_path / "t.npz", table)
+        save_table(tmp_path / "t.npz", changed(table, "few", entries=entries))
     assert not os.listdir(tmp_path)
 
 
 @pytest.mark.parametrize("storage", ["float32", "float16"])
 def test_bits_are_of_bytes_only(tmp_path, storage):
-    table = narrow().to(storage)
-    table.bits["few"] = 5
-    with pytest.raises(TableError, match="of bytes only"):
-        save_table(tmp_path / "t.npz", table)
-    table.bits.clear()
-    save_table(tmp_path / "t.npz", table)
-    change_meta(tmp_path / "t.npz", lambda meta: meta["arrays"]["few"].update(bits=5))
-    refused(tmp_path / "t.npz", "of bytes only")
+    """Floats with bits, a scale or an offset are not written; if a file says so of them, it is not heeded."""
+    table, path = narrow().to(storage), tmp_path / "t.npz"
+    for change in ({"bits": 5}, {"scale": (1.0,) * 2}, {"offset": (0.0,) * 2}):
+        with pytest.raises(TableError, match="only bytes have bits and a scale"):
+            save_table(path, changed(table, "few", **change))
+    assert not os.listdir(tmp_path)
+    save_table(path, table)
+    change_meta(path, lambda meta: meta["arrays"]["few"].update(bits=5))
+    assert same(load_table(path).arrays["few"], table.arrays["few"])
 
 
 def test_other_lengths_than_the_bits_say(tmp_path):
@@ -297,29 +419,27 @@ def test_places_that_cannot_be_written(tmp_path):
         save_table(tmp_path / "file" / "t.npz", example())
 
 
-def _with(**changes):
-    table = example(changes.pop("storage", "float32"))
-    for key, value in changes.items():
-        setattr(table, key, value)
-    return table
+def _of(**arrays) -> Table:
+    return Table("a task", {name: StoredArray(entries) for name, entries in arrays.items()})
 
 
 UNWRITABLE = {
-    "unknown storage": (lambda: _with(storage="float32") and Table("t", {}, "float64"), '"float64"'),
-    "wrong type": (lambda: _with(arrays={"a": np.zeros((3, 1))}), "float64"),
-    "NaN": (lambda: _with(arrays={"a": np.full((3, 1), np.nan, np.float32)}), "NaN or infinity"),
-    "infinity": (lambda: _with(arrays={"a": np.full((3, 1), np.inf, np.float32)}), "NaN or infinity"),
-    "called meta": (lambda: _with(arrays={"meta": np.zeros((3, 1), np.float32)}), "meta"),
-    "no channels": (lambda: _with(arrays={"a": np.zeros(3, np.float32)}), r"shape \(3,\)"),
-    "unknown border": (lambda: _with(borders={"cascaded": ("clamp", "mirror")}), "mirror"),
-    "too few borders": (lambda: _with(borders={"cascaded": ("clamp",)}), "borders"),
-    "NaN quality": (lambda: _with(quality={"psnr_db": float("nan")}), "cannot be written"),
-    "odd settings": (lambda: _with(settings={"x": object()}), "cannot be written"),
-    "no affine map": (lambda: _with(storage="uint8", quantization={}), "scale and offset"),
+    "wrong type": (lambda: _of(a=np.zeros((3, 1))), "float64"),
+    "NaN": (lambda: _of(a=np.full((3, 1), np.nan, np.float32)), "NaN or infinity"),
+    "infinity": (lambda: _of(a=np.full((3, 1), np.inf, np.float32)), "NaN or infinity"),
+    "called meta": (lambda: _of(meta=np.zeros((3, 1), np.float32)), "meta"),
+    "no channels": (lambda: _of(a=np.zeros(3, np.float32)), r"shape \(3,\)"),
+    "no entries": (lambda: _of(a=np.zeros((0, 1), np.uint8)), r"shape \(0, 1\)"),
+    "unknown border": (lambda: changed(example(), "cascaded", border=("clamp", "mirror")), "mirror"),
+    "too few borders": (lambda: changed(example(), "cascaded", border=("clamp",)), "borders"),
+    "NaN measured": (lambda: replace(example(), measured={"psnr_db": float("nan")}), "cannot be written"),
+    "odd settings": (lambda: replace(example(), settings={"x": object()}), "cannot be written"),
+    "no affine map": (lambda: changed(example("uint8"), "cascaded", scale=(), offset=()), "scale and offset"),
     "short affine map": (
-        lambda: _with(storage="uint8", quantization=dict.fromkeys(SHAPES, ((1.0,), (0.0,)))),
+        lambda: changed(example("uint8"), "cascaded", scale=(1.0,), offset=(0.0,)),
         "scale and offset",
     ),
+    "infinite affine map": (lambda: changed(example("uint8"), "cascaded", scale=(np.inf,) * 7), "scale and offset"),
 }
 
 
@@ -388,10 +508,8 @@ def test_random_damage_is_refused_or_harmless(saved):
         else:
             outcomes[True] += 1
             for name, array in original.arrays.items():
-                assert loaded.arrays[name].tobytes() == array.tobytes()
-            assert (loaded.task, loaded.quantization, loaded.borders) == (
-                original.task, original.quantization, original.borders,
-            )  # fmt: skip
+                assert same(loaded.arrays[name], array)
+            assert loaded.task == original.task
     assert outcomes[False] > 300
 
 
@@ -515,9 +633,27 @@ def test_odd_shapes(plain, shape):
 
 
 def test_unknown_version(saved):
-    for version in (0, 2, "1", None, [1]):
+    for version in (0, 3, "2", None, [2]):
         change_meta(saved, lambda meta, version=version: meta.update(format_version=version))
-        refused(saved, "format version .*, this package reads version 1")
+        refused(saved, "format version .*, this package reads version 2")
+
+
+def test_an_old_file(saved):
+    """One sentence that says what to do. Version 1 had one storage form for all arrays, and other keys."""
+
+    def old(meta):
+        for array in meta["arrays"].values():
+            storage = array.pop("storage")
+        meta["quality"] = meta.pop("measured")
+        meta.pop("preset")
+        meta.update(format_version=1, storage=storage, task="ggx")
+
+    change_meta(saved, old)
+    message = refused(saved, "format version 1, this package reads version 2: make it again with mi-diffind fit ggx$")
+    assert message.count(". ") == 0
+    refused(saved, "version 1", task="ggx", shapes=SHAPES)
+    change_meta(saved, lambda meta: meta.update(task=["odd"]))
+    refused(saved, "make it again with mi-diffind fit TASK$")
 
 
 def test_missing_array(saved):
@@ -589,7 +725,7 @@ def test_not_finite(tmp_path, storage, value):
     path = tmp_path / "t.npz"
     table = example(storage)
     save_table(path, table)
-    broken = table.arrays["cascaded"].copy()
+    broken = table.arrays["cascaded"].entries.copy()
     broken[1, 2, 3] = value
     rebuild(path, {**parts(path), "cascaded.npy": npy(broken)})
     refused(path, '"cascaded" contains NaN or infinity')
@@ -621,7 +757,7 @@ def test_damaged_description(plain, text):
     refused(plain)
 
 
-@pytest.mark.parametrize("key", ["format_version", "task", "storage", "arrays", "settings", "seed", "quality"])
+@pytest.mark.parametrize("key", ["format_version", "task", "preset", "arrays", "settings", "seed", "measured"])
 def test_incomplete_description(plain, key):
     change_meta(plain, lambda meta: meta.pop(key) and None)
     refused(plain, f"damaged.*{key}")
@@ -629,11 +765,11 @@ def test_incomplete_description(plain, key):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("arrays", [1]), ("arrays", None), ("settings", 3), ("quality", "good"), ("storage", "float64"), ("storage", [])],
+    [("arrays", [1]), ("arrays", None), ("arrays", 3), ("settings", 3), ("measured", "good"), ("measured", [1.0])],
 )
 def test_mistyped_description(plain, key, value):
     change_meta(plain, lambda meta: meta.update({key: value}))
-    refused(plain, "damaged|storage form")
+    refused(plain, "damaged")
 
 
 @pytest.mark.parametrize(
@@ -641,7 +777,8 @@ def test_mistyped_description(plain, key, value):
     [
         {"shape": None}, {"shape": "abc"}, {"shape": [float("inf"), 3, 7]}, {"shape": [float("nan"), 3, 7]},
         {"shape": [21]}, {"shape": []}, {"shape": [3, 3]}, {"border": None}, {"border": ["clamp"]},
-        {"border": ["clamp", "mirror"]}, {"border": "clamp"}, {"border": [[], {}]},
+        {"border": ["clamp", "mirror"]}, {"border": "clamp"}, {"border": [[], {}]}, {"storage": "float64"},
+        {"storage": None}, {"storage": []}, {"storage": {}}, {"storage": "uint8"}, {"storage": "float16"},
     ],
 )  # fmt: skip
 def test_damaged_array_description(plain, change):
@@ -663,9 +800,32 @@ def test_damaged_affine_map(tmp_path, key, value):
     refused(path, "cascaded")
 
 
+@pytest.mark.parametrize("key", ["shape", "border", "storage"])
+def test_incomplete_array_description(plain, key):
+    change_meta(plain, lambda meta: meta["arrays"]["cascaded"].pop(key) and None)
+    refused(plain, f"cascaded.*damaged.*{key}")
+
+
+@pytest.mark.parametrize("low", [-0.02, 0.0])
+def test_ranges(tmp_path, low):
+    """Entries outside of what a task allows are named with the range, up to what rounding to bytes does."""
+    entries = np.float32([[low], [0.5], [1.0005]])
+    table = Table("t", {"a": StoredArray(entries)}, path=tmp_path / "t.npz")
+    if low < 0:
+        with pytest.raises(TableError, match=r't\.npz: entries of "a" lie in \[-0\.02, .*allowed is \[0, 1\]'):
+            tables.check_ranges(table, {"a": (0.0, 1.0)})
+    else:
+        tables.check_ranges(table, {"a": (0.0, 1.0)})
+
+
 def test_shipped_tables_load():
     folder = os.path.join(os.path.dirname(tables.__file__), "data")
     shipped = [name for name in os.listdir(folder) if name.endswith(".npz")]
     assert shipped
     for name in shipped:
         assert load_table(os.path.join(folder, name)).arrays
+
+
+def test_one_base_class_of_errors():
+    assert issubclass(TableError, DiffindError) and issubclass(TableError, ValueError)
+    assert issubclass(OutputError, DiffindError) and issubclass(OutputError, OSError)

@@ -58,7 +58,7 @@ def learned(table, inputs, output):
     The distribution that a ``Table`` holds, a function of sin²θ and α, under an encoding of the given names: two
     bilinear reads, one at the result of the other.
     """
-    arrays = {name: table.values(name).astype(np.float64) for name in table.arrays}
+    arrays = {name: array.values.astype(np.float64) for name, array in table.arrays.items()}
 
     def read(entries, *x):
         position = [np.clip(v, 0, 1) * (n - 1) for v, n in zip(x, entries.shape[:-1], strict=True)]

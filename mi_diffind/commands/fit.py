@@ -27,7 +27,8 @@ def add(commands) -> None:
     """Add the verb, its tasks and their options to ``commands``, the subparsers of the command line."""
     parsers = alternatives(verb(commands, "fit", run, HELP), "task")
     for task in tasks().values():
-        _add(alternative(parsers, task.name, f"train tables of {task.title} ({task.section})"), task)
+        section = f" ({task.section})" if task.section else ""
+        _add(alternative(parsers, task.name, f"train tables of {task.title}{section}"), task)
 
 
 def _add(sub, task: Task) -> None:
