@@ -470,7 +470,7 @@ def _errors(image: np.ndarray, truth: np.ndarray, weights: np.ndarray, truth_noi
 def _files(scene_path, learned: list[dict], defines: dict[str, str]) -> set[str]:
     """All files on which a render depends: the scene, what it includes and names, its tables, and this package."""
     package = Path(__file__).resolve().parent
-    found = {*package.rglob("*.py"), *Path(plugins.__file__).resolve().parent.glob("*.py")}
+    found = {*package.rglob("*.py"), *Path(plugins.__file__).resolve().parent.rglob("*.py")}
     found |= {Path(file) for file, _ in scenes.tables_of(scene_path, learned)}
     found |= set(scenes.files_of(scene_path, defines))
     return {str(path.resolve()) for path in found}
