@@ -75,8 +75,8 @@ class Plugin:
 
     def described(self, props) -> dict:
         """
-        What properties (``mi.Properties``) say: ``plugin``, ``kind``, ``id``, ``parameters`` (numbers, text, colours as
-        lists, ``"texture"`` for any object), and by themselves those that only the learned plugin has.
+        What properties (``mi.Properties``) say: ``plugin``, ``kind``, ``id``, ``parameters`` (numbers, text, colours
+        and matrices as lists, ``"texture"`` for any object), and by themselves those that only the learned plugin has.
         """
         learned_only = self.exact.learned_only if self.exact else ()
         return {
@@ -259,6 +259,9 @@ def _plain(props, key: str):
         return [float(v) for v in props[key]]
     if kind in (types.Reference, types.ResolvedReference, types.Object):
         return "texture"
+    if kind == types.Transform:
+        m = props[key].matrix
+        return [[float(m[i, j]) for j in range(4)] for i in range(4)]
     if kind == types.Any:
         return type(props[key]).__name__
     return str(props[key])
