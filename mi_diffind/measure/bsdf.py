@@ -35,16 +35,16 @@ def directions(lanes: int, seed: int = 7):
 
 def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dict[str, dict]:
     """
-    The queries of a :class:`.study.Case`, :data:`QUERIES`, of BSDFs by name; ``inputs`` are those of :func:`directions`.
-    The floor has as many inputs, ``uv`` among them if the materials are ``textured``.
+    The queries of a :class:`.study.Case`, :data:`QUERIES`, of BSDFs by name; ``inputs`` are :func:`directions`. The
+    floor has the same inputs, ``uv`` among them if the materials are ``textured``.
     """
     si, wo, sample1, sample2 = inputs
     context = mi.BSDFContext()
-    read = ([si.uv] if textured else []) + ([si.wavelengths] if mi.is_spectral else [])
+    uv, wavelengths = [si.uv] if textured else [], [si.wavelengths] if mi.is_spectral else []
     floors = {
-        "eval": [si.wi, wo, *read],
-        "sample": [si.wi, sample1, sample2, *read],
-        "pdf": [si.wi, wo, *read[:textured]],
+        "eval": [si.wi, wo, *uv, *wavelengths],
+        "sample": [si.wi, sample1, sample2, *uv, *wavelengths],
+        "pdf": [si.wi, wo, *uv],
     }
     found = {query: {FLOOR: lambda values=values: values} for query, values in floors.items()}
 
