@@ -252,7 +252,9 @@ STOPS = {
 
 
 @pytest.mark.parametrize("where", STOPS)
-def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, where):
+def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, monkeypatch, where):
+    monkeypatch.setattr(plot, "draw", lambda *arguments: None)
+    monkeypatch.setattr(plot, "save", lambda sheet, path: Path(path).touch())
     log = Log()
     log.stop_at = STOPS[where]
     result = measure(small_plan(log), SETTINGS, tmp_path, progress=False)

@@ -3,7 +3,7 @@
 import math
 
 from mi_diffind.measure.statistics import ratio, timing
-from mi_diffind.measure.words import duration, enumeration, percent, ratio_cell, rounded, time_cell
+from mi_diffind.measure.words import duration, enumeration, grid, percent, ratio_cell, rounded, time_cell
 
 
 def test_numbers():
@@ -15,6 +15,14 @@ def test_numbers():
     shown = ["12 ms", "0.35 s", "1.3 s", "80 s", "1.7 min", "67 min", "2.2 h", "1.2 days", "3.2 years"]
     assert [duration(v) for v in times] == shown
     assert [enumeration(v) for v in ([1], [1, 4], [1, 4, 16])] == ["1", "1 and 4", "1, 4 and 16"]
+
+
+def test_grid():
+    assert grid([["", "a", "bbb"], ["name", "1.5", ""], ["x", "20", "3"]]) == [
+        "          a  bbb",
+        "  name  1.5",
+        "  x      20    3",
+    ]
 
 
 def test_what_the_floor_hides_is_said_in_words():

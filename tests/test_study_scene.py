@@ -278,7 +278,7 @@ def made_up(size, sigma=0.2, ratio=1.3, counts=(1, 4, 16, 64), error=None, load=
     estimated = bias.Estimate(size**2, error, sigma**2 / counts[-1])
     result = {
         "scene": "some/where/room.xml", "variant": "llvm_ad_rgb", "width": 640, "height": 480, "seed": 0,
-        "defines": {"quality": "paper"}, "learned_plugins": 7, "settings": {"quick": False}, "counts": list(counts),
+        "defines": {"preset": "paper"}, "learned_plugins": 7, "settings": {"quick": False}, "counts": list(counts),
         "date": "2025-01-01", "interrupted": False, "resumed": False, "not_finite": 0, "points": points,
         "ratios": [{"spp": n, "median": ratio, "q1": ratio - 0.1, "q3": ratio + 0.1, "wall": ratio} for n in counts],
         "machine": {"cpu": "A processor", "instructions": "16 lanes a vector", "cores": 2, "gpu": None,

@@ -40,11 +40,11 @@ def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dic
     """
     si, wo, sample1, sample2 = inputs
     context = mi.BSDFContext()
-    read = ([si.uv] if textured else []) + ([si.wavelengths] if mi.is_spectral else [])
+    uv, wavelengths = [si.uv] if textured else [], [si.wavelengths] if mi.is_spectral else []
     floors = {
-        "eval": [si.wi, wo, *read],
-        "sample": [si.wi, sample1, sample2, *read],
-        "pdf": [si.wi, wo, *read[:textured]],
+        "eval": [si.wi, wo, *uv, *wavelengths],
+        "sample": [si.wi, sample1, sample2, *uv, *wavelengths],
+        "pdf": [si.wi, wo, *uv],
     }
     found = {query: {FLOOR: lambda values=values: values} for query, values in floors.items()}
 

@@ -14,7 +14,7 @@ from .frame import PASS, in_competition
 from .statistics import finite, pareto
 from .store import Store
 from .study import Plan
-from .words import machine_line, ratio_cell, state, time_cell
+from .words import grid, machine_line, ratio_cell, state, time_cell
 
 #: Columns of the table, before those of the errors and of the candidates' details.
 COLUMNS = (
@@ -191,27 +191,24 @@ def caption(result: dict) -> str:
 def summary(result: dict, plan: Plan | None = None) -> list[str]:
     """The result as lines of text: the plan's own table, times, ratios, and the plan's conclusions."""
     lines = list(plan.table(result)) if plan else []
-    width = max(map(len, result["candidates"]), default=0) + 2
     for case, measured in result["cases"].items():
-        queries, passes = measured["queries"], measured["passes"]
+        queries, passes = measured["queries"], measured["passes"].get(PASS, {})
         floors = ", ".join(f"{q} {next(iter(t.values()))['floor']:.2f}" for q, t in queries.items())
         lines += ["", f"{case}: ns each, floor subtracted ({floors}); ± half the interquartile range"]
-        header = "".join(f"{q:>16}" for q in queries)
-        header += f"{'flops':>8}{'reads':>7}" + (f"{'ms ' + PASS:>18}" if passes else "")
-        lines.append(f"  {'':{width}}{header}{'bytes':>12}{'accuracy':>11}")
-        first = next(iter(queries.values()))
-        for name, t in first.items():
-            c = result["candidates"][name]
-            cells = "".join(f"{time_cell(timings.get(name)):>16}" for timings in queries.values())
-            cells += f"{t['operations']['flops']:>8}{t['operations']['gathers']:>7}"
-            if passes:
-                cells += f"{time_cell(passes[PASS].get(name), 1):>18}"
+        query = next(iter(queries))
+        cells = [["", *queries, "flops", "reads", *([f"ms {PASS}"] if passes else []), "bytes", "accuracy", ""]]
+        for name, t in queries[query].items():
+            c, operations = result["candidates"][name], t["operations"]
             accuracy = c["errors"].get(result["accuracy"])
             shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
-            marks = " *" * bool(t["on_front"]) + " not converged" * (c["converged"] is False)
-            lines.append(f"  {name:{width}}{cells}{c['bytes']:>12,}{shown:>11}{marks}")
+            cells.append([
+                name, *(time_cell(timings.get(name)) for timings in queries.values()),
+                f"{operations['flops']}", f"{operations['gathers']}",
+                *([time_cell(passes.get(name), 1)] if passes else []), f"{c['bytes']:,}", shown,
+                f"{'*' if t['on_front'] else ' '}{' not converged' * (c['converged'] is False)}",
+            ])  # fmt: skip
+        lines += grid(cells)
     if result["cases"]:
-        query = next(iter(queries))
         lines.append(f"  (* on the Pareto front of accuracy and {query}; flops and reads are those of {query})")
     notes = [f"  {name}: {c['note']}" for name, c in result["candidates"].items() if c["note"]]
     lines += ["", *notes] if notes else []
@@ -219,11 +216,8 @@ def summary(result: dict, plan: Plan | None = None) -> list[str]:
         ratios = measured["ratios"]
         pairs = dict.fromkeys(pair for found in ratios.values() for pair in found)
         if pairs:
-            width = max(map(len, pairs)) + 2
             lines += ["", f"{case}: ratios, medians of the rounds, floor subtracted [with the floor]"]
-            lines.append(f"  {'':{width}}" + "".join(f"{query:>22}" for query in ratios))
-        for pair in pairs:
-            cells = [ratio_cell(found.get(pair), query in measured["queries"]) for query, found in ratios.items()]
-            lines.append(f"  {pair:{width}}" + "".join(f"{cell:>22}" for cell in cells))
+            cells = [[ratio_cell(r.get(pair), q in measured["queries"]) for q, r in ratios.items()] for pair in pairs]
+            lines += grid([["", *ratios], *([pair, *row] for pair, row in zip(pairs, cells, strict=True))])
     lines += ["", *result["conclusions"]] if result["conclusions"] else []
     return [*lines, "", caption(result)]

@@ -30,12 +30,15 @@ class Training(Job):
     A representation that is trained to convergence.
 
     ``problem()`` makes the problem anew, with untrained parameters; ``settings`` are those of the first, shortest run,
-    ``longest`` the steps of the longest that is tried. After :meth:`run` or :meth:`known`, ``net`` is the trained
-    module of the best run.
+    ``longest`` the steps of the longest that is tried; each is measured ``measurements`` times. After :meth:`run` or
+    :meth:`known`, ``net`` is the trained module of the best run.
     """
 
-    def __init__(self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int):
+    def __init__(
+        self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int, measurements: int = 20
+    ):
         self.name, self.problem, self.settings, self.longest = name, problem, settings, longest
+        self.measurements = measurements
         self.net = None
 
     def known(self, folder: Path | None, record: dict | None = None) -> dict | None:
@@ -58,7 +61,7 @@ class Training(Job):
         file = None if folder is None else self._file(folder)
         runs, best, steps = [], None, self.settings.steps
         while True:
-            settings = dataclasses.replace(self.settings, steps=steps, measure_every=max(1, steps // 20))
+            settings = dataclasses.replace(self.settings, steps=steps, measure_every=max(1, steps // self.measurements))
             problem = self.problem()
             checkpoint = None if file is None else file.with_name(f"{file.stem}_{steps}.checkpoint")
             resume = checkpoint is not None and checkpoint.is_file()

@@ -54,6 +54,13 @@ def ratio_cell(r: dict | None, floor: bool = True) -> str:
     return f"{median} [{r['with_floor']:.2f}]" if floor else median
 
 
+def grid(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
+    """Rows of cells as lines, each column as wide as it has to be: the first to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ([f"{cell:>{w + 2}}" for cell, w in zip(row[1:], widths[1:], strict=True)] for row in rows)
+    return [f"{indent}{row[0]:{widths[0]}}{''.join(line)}".rstrip() for row, line in zip(rows, lines, strict=True)]
+
+
 def machine_line(result: dict) -> str:
     """``machine`` (:func:`.clock.machine`) and ``date`` of a result, as a sentence."""
     m = result["machine"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from ...measure.operations import Operations
+from ...measure.words import grid
 
 #: The paper's count of operations of one evaluation (supplement, 1.2.1).
 PAPER = {
@@ -36,13 +37,12 @@ def conclusions(result: dict) -> list[str]:
         if details["material"] != "constant":
             continue
         lines.append(f"operations of one eval, {case} (add, mul 1 flop; div 2; sqrt, log 4)")
-        lines.append(f"  {'':24}" + "".join(f"{title:>9}" for title in _OPERATIONS.values()))
         found = {name: t["operations"] for name, t in measured["queries"]["eval"].items() if "float16" not in name}
         if details["lobes"] == "all lobes":
             unknown = dict.fromkeys(("bytes_gathered", "instructions"), "")
             found = {name: o.asdict() | unknown for name, o in PAPER.items()} | found
-        lines += [f"  {name:24}" + "".join(f"{o[key]:>9}" for key in _OPERATIONS) for name, o in found.items()]
-        lines.append("")
+        cells = ([name, *(str(o[key]) for key in _OPERATIONS)] for name, o in found.items())
+        lines += [*grid([["", *_OPERATIONS.values()], *cells]), ""]
     return [*lines, *_bars(result), *_verdict(result)]
 
 

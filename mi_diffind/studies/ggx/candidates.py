@@ -143,7 +143,7 @@ class _Made:
         def problem():
             return GGXProblem(net().alloc(self.types.TensorXf, 2, dr.rng(seed=1)), self.types, samples, encoding)
 
-        self.trainings.append(Training(name, problem, settings, longest))
+        self.trainings.append(Training(name, problem, settings, longest, 4 if self.quick else 20))
         return self.trainings[-1]
 
     def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):

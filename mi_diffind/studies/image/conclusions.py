@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from ...measure.words import grid
+
 #: What verdicts are about: a name, the error, how it is written, whether more is better.
 MEASURES = (
     ("PSNR", "psnr_db", ".2f", True),
@@ -14,29 +16,24 @@ MEASURES = (
 def table(result: dict) -> list[str]:
     """All candidates: bytes, seconds and errors."""
     d, made = result["details"], {n: c for n, c in result["candidates"].items() if "psnr_db" in c["errors"]}
-    lines = [
-        f"{d['source']}: {d['width']} x {d['height']}, {', '.join(f'{n} ({c})' for n, c in d['maps'].items())}, "
-        f"{d['source_bytes']:,} bytes",
-        *result["notes"][1:],
-        "",
-        f"{'':38}{'bytes':>11}{'ratio':>8}{'seconds':>9}{'PSNR':>7}{'between':>9}{'mean':>7}{'FLIP':>8}{'SSIM':>7}"
-        "   PSNR by map",
+    cells = [
+        ["", "bytes", "ratio", "seconds", "PSNR", "between", "mean", "FLIP", "SSIM", *(f"PSNR {n}" for n in d["maps"])]
     ]
     for name, c in sorted(
         made.items(), key=lambda m: (m[1]["details"]["compression"] or 0, -m[1]["errors"]["psnr_db"])
     ):
-        e = c["errors"]
-        ssim = f"{e['ssim']:.3f}" if e["ssim"] is not None else "-"
-        each = [", ".join(f"{n} {e[f'psnr_{n}_db']:.1f}" for n in d["maps"])]
-        each += [f"{e[f'angle_{n}_deg']:.2f}°" for n in d["maps"] if f"angle_{n}_deg" in e]
-        seconds = c["training_seconds"] or c["details"]["encoding_seconds"]
-        access = "" if c["details"]["random_access"] else "; no random access"
-        lines.append(
-            f"{name:38}{c['bytes']:>11,}{c['details']['ratio']:>7.2f}x{seconds:>9.1f}{e['psnr_db']:>7.2f}"
-            f"{e['psnr_between_db']:>9.2f}{e['psnr_mean_db']:>7.2f}{e['flip']:>8.4f}{ssim:>7}   "
-            f"{' '.join(each)}{access}"
-        )
-    return lines
+        e, known = c["errors"], c["details"]
+        angles = {n: f", {e[f'angle_{n}_deg']:.2f}°" if f"angle_{n}_deg" in e else "" for n in d["maps"]}
+        cells.append([
+            name + ("" if known["random_access"] else " (no random access)"), f"{c['bytes']:,}",
+            f"{known['ratio']:.2f}x", f"{c['training_seconds'] or known['encoding_seconds']:.1f}",
+            *(f"{e[key]:.2f}" for key in ("psnr_db", "psnr_between_db", "psnr_mean_db")), f"{e['flip']:.4f}",
+            "-" if e["ssim"] is None else f"{e['ssim']:.3f}",
+            *(f"{e[f'psnr_{n}_db']:.1f}{angles[n]}" for n in d["maps"]),
+        ])  # fmt: skip
+    maps = ", ".join(f"{n} ({c})" for n, c in d["maps"].items())
+    head = f"{d['source']}: {d['width']} x {d['height']}, {maps}, {d['source_bytes']:,} bytes"
+    return [head, *result["notes"][1:], "", *grid(cells, "")]
 
 
 def conclusions(result: dict) -> list[str]:

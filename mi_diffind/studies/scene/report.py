@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ...measure import report
 from ...measure.bias import PRACTICAL, practical, root
-from ...measure.words import duration, enumeration, machine_line, percent, rounded, state
+from ...measure.words import duration, enumeration, grid, machine_line, percent, rounded, state
 from . import picture
 from .renders import VERSIONS
 
@@ -73,18 +73,14 @@ def summary(result: dict) -> list[str]:
     if not result["points"]:
         return [*lines, "interrupted before there was anything to show; the same command goes on from there"]
     lines.append("relative RMS error and seconds of the kernels, medians ± half the interquartile range")
-    head = ("spp", "exact: error", "seconds", "learned: error", "seconds", "learned / exact")
-    widths = (8, 20, 18, 20, 18, 24)
-    lines.append("".join(f"{text:>{w}}" for text, w in zip(head, widths, strict=True)))
-    ratios = {r["spp"]: r for r in result["ratios"]}
+    cells = [["spp", "exact: error", "seconds", "learned: error", "seconds", "learned / exact"]]
+    ratios = {r["spp"]: f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" for r in result["ratios"]}
+    points = {(p["version"], p["spp"]): p for p in result["points"]}
     for spp in result["counts"]:
-        cells = [f"{spp}"]
-        for name in VERSIONS:
-            point = next((p for p in result["points"] if (p["version"], p["spp"]) == (name, spp)), None)
-            cells += ["", ""] if point is None else [_error_cell(point), _seconds_cell(point)]
-        r = ratios.get(spp)
-        cells.append(f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" if r else "")
-        lines.append("".join(f"{text:>{w}}" for text, w in zip(cells, widths, strict=True)))
+        both = [points.get((name, spp)) for name in VERSIONS]
+        found = [text for p in both for text in ((_error_cell(p), _seconds_cell(p)) if p else ("", ""))]
+        cells.append([str(spp), *found, ratios.get(spp, "")])
+    lines += grid(cells)
     reference, bias, crossover = result["reference"], result["bias"], result["crossover"]
     lines += ["", f"reference   {reference['spp']} spp, its own noise {percent(reference['noise_rmse'])} (subtracted)"]
     psnr = f"PSNR {bias['psnr_db']:.1f} dB" if "psnr_db" in bias else f"PSNR {_psnr(bias['psnr_db_above'])}"
