@@ -29,13 +29,14 @@ INITIALISATIONS = ("ramp", "constant", "random")
 def fold(x):
     """
     The triangle wave that folds any real number into ``[0, 1)``: period 2, slope ±1, ``fold(x) = x`` on ``[0, 1)``,
-    ``fold(1) = 1 − 2⁻²³``, ``fold(−x) = fold(x)`` up to rounding.
+    ``fold(1) = 1 − 2⁻²³``, ``fold(−x) = fold(x)`` up to rounding. NaN and infinities become 0.
 
     It stays a hair below 1 so that a coordinate made of it never wraps around a ``"repeat"`` border. The slope at
     exactly 1 is −1, not 0: the last entry of a ramp can be trained.
     """
     t = x - 2 * dr.floor(x * 0.5)
-    return dr.select(t < 1, t, dr.maximum((2 - 2**-23) - t, 0))
+    down = (2 - 2**-23) - t
+    return dr.select(t < 1, t, dr.select(down > 0, down, 0))
 
 
 class DifferentiableArray(nn.Module):

@@ -387,16 +387,16 @@ class Disney(mi.BSDF):
 
     def _value(self, surface, effects, lobes, wi, wo, active):
         parameters, coefficients = surface
-        value = self.decoder.value(coefficients, effects, lobes, parameters, wi, wo, active)
+        value = self.decoder.value(coefficients, effects, lobes, parameters, wi, wo)
         value = mi.UnpolarizedSpectrum(value)
-        return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
+        return mi.depolarizer(mi.Spectrum(dr.select(active & _are_directions(wi, wo), value, 0)))
 
     def _density(self, surface, effects, rates, wi, wo, active):
         # Detached, see the manual page
         with dr.suspend_grad():
             probabilities = sampling.lobe_probabilities(surface[1], effects, wi.z, rates)
             pdf = sampling.density(surface[1], effects, probabilities, wi, wo)
-            return dr.detach(dr.select(active, mi.Float(pdf), 0))
+            return dr.detach(dr.select(active & _are_directions(wi, wo), mi.Float(pdf), 0))
 
     def eval(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(si, wo, active)
@@ -449,7 +449,7 @@ class Disney(mi.BSDF):
                 wo = dr.select(is_diffuse, mi.warp.square_to_cosine_hemisphere(sample2), wo)
             wo = dr.detach(wo)
 
-        bs.wo = wo
+        bs.wo = dr.select(dr.isfinite(wo.z), wo, mi.Vector3f(0, 0, 1))
         bs.eta = 1.0
         bs.sampled_component = component
         bs.sampled_type = dr.select(
@@ -474,6 +474,11 @@ class Disney(mi.BSDF):
             lines.append(f"preset = {report['preset']}, {report['table_bytes']} bytes as {report['storage']}")
         lines.append(f"effects = {', '.join(report['effects_in_use'])}")
         return f"{type(self).__name__}[\n  " + ",\n".join(lines).replace("\n", "\n  ") + "\n]"
+
+
+def _are_directions(wi, wo):
+    """Are these no NaN, and not far longer than directions are? From what values are computed from anyway."""
+    return model.geometry(wi, wo).h2 < 100
 
 
 class Parameters:

@@ -12,6 +12,7 @@ import numpy as np
 from drjit import nn
 
 from ...indirection import DifferentiableArray
+from ...lookup import clamp
 from ...tables import StoredArray, Table
 from .decoder import warp_roughness
 
@@ -62,6 +63,12 @@ class Arrays(nn.Module):
         arrays = {name: np.clip(getattr(self, name).numpy(), *self.RANGES[name]) for name in self.SHAPES}
         stored = {name: StoredArray(values.astype(np.float32)) for name, values in arrays.items()}
         return Table("disney", stored, self.PRESET)
+
+    def bounded(self, name: str, values: list) -> list:
+        """What was read from an array, limited to its range, NaN too: floats may have left it, bytes cannot."""
+        if getattr(self, name).storage == "uint8":
+            return values
+        return [clamp(v, *self.RANGES[name]) for v in values]
 
     def encode(self, material, active=True):
         """

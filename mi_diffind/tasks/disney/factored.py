@@ -8,7 +8,6 @@ array           size      channels read at                         holds
 ``alpha``       64        2        encoded roughness               ln √(α_x α_y) of GGX, and its rest
 ``aspect``      32        2        encoded anisotropy              ln √(α_y / α_x), and its rest
 ``masking``     32        1        c / (c + t)                     d / (c + t)
-``cosine``      64        2        a cosine                        (1 − c)^2.5, Schlick's root; coat's G₁
 ``coat``        32        4        clearcoat gloss                 α and normalisation of GTR1, and their rests
 =============== ========= ======== =============================== ===================================================
 
@@ -21,6 +20,9 @@ direction's cosine and ``t = √(α_x² x² + α_y² y²)`` its tangent, stretch
 ``d / (c + t)`` is a function of the ratio ``c / (c + t)`` alone: one axis instead of three (roughness, anisotropy,
 cosine), between 1 and 2, and of the same relative accuracy at the horizon as anywhere else. That is what the paper's
 layout lacks.
+
+What depends on one cosine alone, Schlick's (1 − c)^5 and the clearcoat's masking, is computed: four multiplications and
+a root take less time than any read, and with a table of them the whole was slower than Mitsuba's ``principled``.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from ...lookup import clamp, quantize
 from ...tables import StoredArray, Table
 from . import decoder, model
 from .arrays import Arrays
-from .model import ALPHA_MIN, TINY, positive
+from .model import ALPHA_MIN, TINY
 
 #: Where the tabulated α ends: below the floor that is applied to it, so that the kink is not in the table.
 LOWEST_ALPHA = 0.2 * ALPHA_MIN
@@ -53,7 +55,6 @@ class FactoredArrays(Arrays):
         "alpha": (64, 2),
         "aspect": (32, 2),
         "masking": (32, 1),
-        "cosine": (64, 2),
         "coat": (32, 4),
     }
 
@@ -63,7 +64,6 @@ class FactoredArrays(Arrays):
         "alpha": (-12.0, 2.0),
         "aspect": (-2.0, 0.5),
         "masking": (0.5, 4.0),
-        "cosine": (0.0, 2.0),
         "coat": (-0.05, 0.2),
     }
 
@@ -98,24 +98,22 @@ class FactoredArrays(Arrays):
         Tables of one coordinate are trained at uniform ones: those of random directions would hardly ever lie near the
         horizon, where errors matter as much.
         """
-        u, v = uniform
+        u, _ = uniform
         alpha = model.coat_alpha(m.clearcoat_gloss)
         return {
             "alpha": [dr.log(dr.maximum(dr.square(m.roughness), LOWEST_ALPHA))],
             "aspect": [0.5 * dr.log(1 - 0.9 * m.anisotropic)],
             "masking": [u + dr.sqrt(dr.square(u) + dr.square(1 - u))],
-            "cosine": [dr.sqrt(model.schlick(v)), model.coat_masking(v)],
             "coat": [alpha, (dr.square(alpha) - 1) / (2 * dr.pi * dr.log(alpha))],
         }
 
     def predict(self, m, wi, wo, uniform) -> dict[str, list]:
-        u, v = uniform
+        u, _ = uniform
         roughness, anisotropic = self.encode(m)
         return {
             "alpha": [sum(self.alpha([roughness]))],
             "aspect": [sum(self.aspect([anisotropic]))],
             "masking": self.masking([u]),
-            "cosine": self.cosine([v]),
             "coat": self.coat_values(m.clearcoat_gloss),
         }
 
@@ -131,8 +129,6 @@ class FactoredArrays(Arrays):
             entries = [0.5 * np.log(1 - 0.9 * u), np.zeros_like(u)]
         elif name == "masking":
             entries = [u + np.sqrt(u**2 + (1 - u) ** 2)]
-        elif name == "cosine":
-            entries = [(1 - u) ** 2.5, 2 * u / (u + np.sqrt(0.0625 + 0.9375 * u**2))]
         else:
             alpha = 0.1 - 0.099 * u
             entries = [alpha, (alpha**2 - 1) / (2 * np.pi * np.log(alpha)), np.zeros_like(u), np.zeros_like(u)]
@@ -142,10 +138,10 @@ class FactoredArrays(Arrays):
 class FactoredDecoder(decoder.Decoder):
     """
     Reads :class:`FactoredArrays` in place of the arithmetic of the factors named in ``read``: any of ``alpha``,
-    ``masking``, ``cosine`` and ``coat`` (fewer than all for measuring what a table gains).
+    ``masking`` and ``coat`` (fewer than all for measuring what a table gains).
     """
 
-    FACTORS = ("alpha", "masking", "cosine", "coat")
+    FACTORS = ("alpha", "masking", "coat")
 
     groups = {  # noqa: RUF012
         **decoder.GROUPS,
@@ -195,19 +191,9 @@ class FactoredDecoder(decoder.Decoder):
     def coat(self, c):
         return c["read_coat"] if "coat" in self.read else super().coat(c)
 
-    def fresnel(self, cosine, active=True):
-        if "cosine" not in self.read:
-            return super().fresnel(cosine, active)
-        return dr.square(self.arrays.cosine([cosine], active)[0])
-
     def masking(self, c, w, active=True):
         if "masking" not in self.read:
             return super().masking(c, w, active)
         total = w.z + dr.sqrt(decoder.stretched(self.ggx(c)["alpha2"], w) + TINY)
-        return total * clamp(self.arrays.masking([w.z / total], active)[0], *self.arrays.RANGES["masking"])
-
-    def coat_masking(self, cos_i, cos_o, active=True):
-        if "cosine" not in self.read:
-            return super().coat_masking(cos_i, cos_o, active)
-        found = [positive(self.arrays.cosine([cosine], active)[1]) for cosine in (cos_i, cos_o)]
-        return found[0] * found[1], 1
+        found = self.arrays.masking([w.z / total], active, inside=True)
+        return total * self.arrays.bounded("masking", found)[0]

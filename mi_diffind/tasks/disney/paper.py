@@ -58,16 +58,15 @@ class PaperArrays(Arrays):
 
     def ggx_coefficients(self, latent, active=True) -> list:
         """``q`` with ``D = 1 / (q_x h_x² + q_y h_y² + q_z h_z²)²`` for a unit half vector. Material only."""
-        return [dr.exp(clamp(v, *self.RANGES["ggx"])) for v in self.ggx(latent, active)]
+        return [dr.exp(v) for v in self.bounded("ggx", self.ggx(latent, active))]
 
     def coat_coefficients(self, gloss, active=True) -> list:
         """``k`` with ``GTR1 = 1 / (k_0 sin² + k_1 cos²)``. Material only."""
-        return [dr.exp(clamp(v, *self.RANGES["coat"])) for v in self.coat([gloss], active)]
+        return [dr.exp(v) for v in self.bounded("coat", self.coat([gloss], active))]
 
     def masking_root(self, latent_roughness, cos_product, active=True):
         """``√(d(wi) d(wo))`` from the encoded roughness and ``(n·l)(n·v)``; the specular term divides by its square."""
-        root = self.masking([latent_roughness, dr.sqrt(cos_product + TINY)], active)[0]
-        return clamp(root, *self.RANGES["masking"])
+        return self.bounded("masking", self.masking([latent_roughness, dr.sqrt(cos_product + TINY)], active))[0]
 
     def factors(self, material, wi, wo, active=True, encoded=None, lobes=LOBES) -> Factors:
         """
@@ -86,9 +85,11 @@ class PaperArrays(Arrays):
             quadric = qx * dr.square(g.h.x) + qy * dr.square(g.h.y) + qz * dr.square(g.h.z)
             specular = dr.square(g.h2 / (quadric * root + TINY)) * wo.z
 
-        metal_base, base, coat_fresnel, sheen = self.fresnel([g.cos_d, material.metallic], active)
+        found = self.bounded("fresnel", self.fresnel([g.cos_d, material.metallic], active))
+        metal_base, base, coat_fresnel, sheen = found
         if "diffuse" in lobes or "clearcoat" in lobes:
-            fresnel_sum, fresnel_product, cos_ratio, coat_masking = self.diffuse([wo.z, wi.z], active)
+            found = self.bounded("diffuse", self.diffuse([wo.z, wi.z], active))
+            fresnel_sum, fresnel_product, cos_ratio, coat_masking = found
         if "diffuse" in lobes:
             diffuse, flat = diffuse_factors(
                 material.roughness, dr.square(g.cos_d), fresnel_sum, fresnel_product, cos_ratio, wo.z
