@@ -31,17 +31,24 @@ def modules(package: str, ignored: tuple[str, ...] = ()) -> dict[str, str]:
     found = {n: f"{package}.{n}" for n in names if n not in ignored and not n.startswith("_")}
     for entry in sorted(importlib.metadata.entry_points(group=package), key=lambda e: e.name):
         if entry.name in found:
-            if found[entry.name] != entry.value:
-                _warn(f'"{entry.name}" ({entry.value}) is left out: {package} has {found[entry.name]} of that name')
+            if found[entry.name] != entry.module:
+                _warn(f'"{entry.name}" ({entry.module}) is left out: {package} has {found[entry.name]} of that name')
         else:
-            found[entry.name] = entry.value
+            found[entry.name] = entry.module
     return found
 
 
-def load(package: str, attribute: str, ignored: tuple[str, ...] = (), only: Iterable[str] | None = None) -> dict:
+def load(
+    package: str,
+    attribute: str,
+    ignored: tuple[str, ...] = (),
+    only: Iterable[str] | None = None,
+    kind: type = object,
+) -> dict:
     """
-    Name → what each of :func:`modules` (or ``only`` those of some names) calls ``attribute``. A module of somebody
-    else's that cannot be imported, or lacks it, is left out with a warning; one of ours that lacks it is no such thing.
+    Name → what each of :func:`modules` (or ``only`` those of some names) calls ``attribute``, an instance of ``kind``
+    of that ``name``. A module of somebody else's that cannot be imported, or lacks it, is left out with a warning; one
+    of ours that lacks it is no such thing.
     """
     found, known = {}, modules(package, ignored)
     for name in known if only is None else only:
@@ -50,7 +57,12 @@ def load(package: str, attribute: str, ignored: tuple[str, ...] = (), only: Iter
             module = importlib.import_module(known[name])
             if ours and not hasattr(module, attribute):
                 continue
-            found[name] = getattr(module, attribute)
+            declared = getattr(module, attribute)
+            if not isinstance(declared, kind):
+                raise TypeError(f"its {attribute} is a {type(declared).__name__}, a {kind.__name__} is needed")
+            if getattr(declared, "name", name) != name:
+                raise ValueError(f'its {attribute} is called "{declared.name}"')
+            found[name] = declared
         except Exception as e:
             if ours:
                 raise

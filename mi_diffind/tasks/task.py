@@ -265,7 +265,7 @@ def _open(task: Task, path: Path, stamp: tuple, dtype, storage: str) -> Model:
 @functools.lru_cache
 def tasks() -> dict[str, Task]:
     """All tasks by name: those of this package, then those that entry points add."""
-    return found.load(__package__, "TASK", ignored=("task", "sampling"))
+    return found.load(__package__, "TASK", ignored=("task", "sampling"), kind=Task)
 
 
 def task_of(table: Table) -> Task:
