@@ -21,6 +21,7 @@ import numpy as np
 from drjit.opt import Adam
 from tqdm import tqdm
 
+from . import compat
 from .files import replacing, writable_file
 from .indirection import unfolded
 from .interrupt import interruptible
@@ -204,7 +205,7 @@ def fit(
             best, best_measured, best_step = trainer.snapshot().parameters, measured, trainer.step
         bar.measured(loss, name, value)
 
-    with interruptible() as stop, _cores(settings.deterministic), _room_for_sums(), bar.shown:
+    with interruptible() as stop, _cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
             before, share_before = trainer.snapshot(), trainer.share
             loss = trainer.take_step(plateau.factor)
@@ -326,7 +327,7 @@ class _Trainer:
         self.share = 0.0  # of the training that is over
         self.optimizer = Adam(lr=settings.lr)
         self.optimizer.update(problem.net)
-        self.module = sys.modules[type(next(iter(self.optimizer.values()))).__module__]
+        self.module = compat.module_of(next(iter(self.optimizer.values())))
 
     def learning_rate(self, plateau: float) -> float:
         rate = self.settings.lr * self.lr_scale
@@ -366,20 +367,14 @@ class _Trainer:
 
     def snapshot(self) -> _State:
         parameters, moments = {}, {}
-        for key, (value, _, _, (t, m, v, _)) in self.optimizer.state.items():
-            parameters[key], moments[key] = dr.detach(value), (t, m, v)
+        for key, (value, *moment) in compat.adam_state(self.optimizer).items():
+            parameters[key], moments[key] = dr.detach(value), tuple(moment)
         return _State(self.step, self.lr_scale, parameters, moments)
 
     def restore(self, state: _State) -> None:
         self.step, self.lr_scale = state.step, state.lr_scale
-        for key, (value, promoted, lr, (t, m, v, v_max)) in list(self.optimizer.state.items()):
-            t_new, m_new, v_new = state.moments[key]
-            new = type(value)(state.parameters[key])
-            dr.make_opaque(new)
-            dr.enable_grad(new)
-            self.optimizer.state[key] = (
-                new, promoted, lr, (type(t)(t_new), type(m)(m_new), type(v)(v_new), v_max)
-            )  # fmt: skip
+        for key, value in state.parameters.items():
+            compat.set_adam_state(self.optimizer, key, value, *state.moments[key])
         self.problem.net.update(self.optimizer)
 
     def load_parameters(self, parameters: dict) -> None:
@@ -444,36 +439,18 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
     return state, {**meta, "best": best}
 
 
-#: Entries, of all cores together, that the copies of an array may have in which each core sums gradients on its own.
+#: Entries, of all cores together, that the copies of an array may have in which each core sums gradients on its own: 2
+#: to 3 times faster than together.
 LARGEST_SUMS = 2**28
-
-
-@contextlib.contextmanager
-def _room_for_sums():
-    """Let each core sum the gradients of larger arrays on its own, too: 2 to 3 times faster than together."""
-    before = dr.expand_threshold()
-    dr.set_expand_threshold(max(before, LARGEST_SUMS // dr.thread_count()))
-    try:
-        yield
-    finally:
-        dr.set_expand_threshold(before)
 
 
 @contextlib.contextmanager
 def _cores(deterministic: bool):
     before = dr.thread_count()
 
-    def use(cores: int) -> None:
-        # Sums that a kernel makes have a place for each thread there was when the kernel was launched: none may be
-        # under way while the number of threads changes, lest a new one writes beyond.
-        if cores != dr.thread_count():
-            dr.eval()
-            dr.sync_thread()
-            dr.set_thread_count(cores)
-
     if deterministic:
-        use(1)
+        compat.use_threads(1)
     try:
         yield
     finally:
-        use(before)
+        compat.use_threads(before)

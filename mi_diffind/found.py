@@ -10,7 +10,6 @@ What ships is found by its place, a module of a package (``mi_diffind.tasks``, `
 
 from __future__ import annotations
 
-import functools
 import importlib
 import importlib.metadata
 import pkgutil
@@ -18,7 +17,6 @@ import warnings
 from collections.abc import Iterable
 
 
-@functools.lru_cache
 def modules(package: str, ignored: tuple[str, ...] = ()) -> dict[str, str]:
     """
     Name → full name of the module, in alphabetical order, those of ``package`` first: its own modules and packages but

@@ -11,7 +11,6 @@ from __future__ import annotations
 import copy
 import functools
 import math
-import sys
 from collections.abc import Sequence
 
 import drjit as dr
@@ -19,6 +18,7 @@ import numpy as np
 from drjit import nn
 
 from . import lookup
+from .compat import module_of
 from .runtime import llvm_problem
 
 __all__ = ["DifferentiableArray", "Indirection", "fold"]
@@ -130,7 +130,7 @@ class DifferentiableArray(nn.Module):
         else:
             rng = rng if rng is not None else dr.rng(seed=0)
             low, high = self.value
-            drawn = rng.random(_module(dtype).Float, int(np.prod(shape)))
+            drawn = rng.random(module_of(dtype).Float, int(np.prod(shape)))
             values = low + (high - low) * drawn.numpy().reshape(shape)
         result = self._like()
         result.storage = "float16" if dr.is_half_v(dtype) else "float32"
@@ -176,7 +176,7 @@ class DifferentiableArray(nn.Module):
             raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
         if storage == self.storage:
             return self._like()
-        return self.from_numpy(self.numpy(), _module(self.data).TensorXf, self.border, storage)
+        return self.from_numpy(self.numpy(), module_of(self.data).TensorXf, self.border, storage)
 
     @classmethod
     def from_numpy(cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None, bits=8):
@@ -200,7 +200,7 @@ class DifferentiableArray(nn.Module):
                 codes, (scale, offset) = values, quantization
             result.scale, result.offset = tuple(map(float, scale)), tuple(map(float, offset))
             _require_backend(dtype)
-            UInt32 = _module(dtype).UInt32
+            UInt32 = module_of(dtype).UInt32
             result.bits = bits
             if bits < 8:
                 packed = lookup.pack_bits(codes, bits)
@@ -211,7 +211,7 @@ class DifferentiableArray(nn.Module):
             words[...] = packed
             result.data = UInt32(words)
         else:
-            tensor = _module(dtype).TensorXf16 if storage == "float16" else _module(dtype).TensorXf
+            tensor = module_of(dtype).TensorXf16 if storage == "float16" else module_of(dtype).TensorXf
             result.data = _tensor(tensor, values, result.resolution, result.channels)
         return result
 
@@ -248,7 +248,7 @@ class DifferentiableArray(nn.Module):
             raise ValueError("an array of 1 dimension has no coordinate to fix but its only one")
         if dr.width(x) != 1:
             raise ValueError(f"x: found {dr.width(x)} numbers, 1 is needed")
-        module, (*resolution, _) = _module(self.data), self.resolution
+        module, (*resolution, _) = module_of(self.data), self.resolution
         index = dr.arange(module.UInt32, math.prod(resolution))
         positions = []
         for n, border in reversed(list(zip(resolution, self.border, strict=False))):
@@ -312,7 +312,7 @@ class DifferentiableArray(nn.Module):
         all coordinates are known to lie in [0, 1], as those that bytes hold may be.
         """
         self._require_entries()
-        coordinates, is_coopvec = _coordinates(x, _module(self.data).Float)
+        coordinates, is_coopvec = _coordinates(x, module_of(self.data).Float)
         if len(coordinates) != self.dims:
             raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(coordinates)} coordinate(s)")
         if self.storage == "uint8":
@@ -463,11 +463,6 @@ def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.
     return np.stack([grids[k % len(grids)] for k in range(channels)], axis=-1)
 
 
-def _module(array):
-    """The module that holds the Dr.Jit types of the same backend, e.g. ``drjit.llvm.ad``."""
-    return sys.modules[(array if isinstance(array, type) else type(array)).__module__]
-
-
 def _require_backend(dtype) -> None:
     # Without LLVM, Dr.Jit takes the whole process down when it makes an array from NumPy's (SIGFPE).
     if not dr.has_backend(dr.backend_v(dtype)):
@@ -477,7 +472,7 @@ def _require_backend(dtype) -> None:
 def _tensor(dtype, values: np.ndarray, resolution, channels: int):
     _require_backend(dtype)
     half = dr.is_half_v(dtype)
-    dtype = _module(dtype).TensorXf16 if half else _module(dtype).TensorXf  # never double, also in such variants
+    dtype = module_of(dtype).TensorXf16 if half else module_of(dtype).TensorXf  # never double, also in such variants
     shape = (*resolution, lookup.padded_channels(channels))
     stored = _aligned(shape, np.float16 if half else np.float32)
     stored[..., :channels] = values

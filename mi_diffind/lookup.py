@@ -19,10 +19,11 @@ Everything works on any JIT backend of Dr.Jit; nothing here knows Mitsuba.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 
 import drjit as dr
+
+from .compat import module_of
 
 #: Storage forms: for training, for storing, for inference.
 STORAGES = ("float32", "float16", "uint8")
@@ -148,7 +149,7 @@ def read_float(
     stored = stored or padded_channels(channels)
     packet = _packet(stored)
     groups = stored // packet
-    module = sys.modules[Float.__module__]
+    module = module_of(Float)
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
     Packet = None if packet == 1 else getattr(module, f"Array{packet}{suffix}")
 
@@ -188,7 +189,7 @@ def read_packed(
     """
     Float = type(x[0])
     UInt32, Int32 = type(words), dr.int32_array_t(type(words))
-    module = sys.modules[Float.__module__]
+    module = module_of(Float)
     inner, stride, per_texel = packed_layout(resolution, channels)
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
     outer = len(resolution) - inner

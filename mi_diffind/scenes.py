@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import threading
 import time
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import plugins
+from . import compat, plugins
 from .errors import DiffindError
 from .files import replacing
 from .measure.operations import bsdf_operations
@@ -49,14 +48,12 @@ def load(
     infinite), and ``defines`` (name → value) the scene's ``<default>`` values. Raises :class:`SceneError`.
     """
     with scene_errors(path), _resolving(path):
-        config = mi.parser.ParserConfig(mi.variant())
-        state = _parse(config, path, defines)
+        config, state = _parse(path, defines)
         if exact:
             swap(state, against)
         if longest_path is not None:
             _path_integrator(state)["max_depth"] = longest_path
-        mi.parser.transform_all(config, state)
-        loaded = mi.parser.instantiate(config, state)
+        loaded = compat.instantiate(config, state)
         if not isinstance(loaded, mi.Scene):
             raise RuntimeError(f"{path}: holds a {type(loaded).__name__}, a scene is expected")
         return loaded
@@ -76,7 +73,7 @@ def swap(state, against: str = "exact") -> int:
 def _declared_nodes(state, against: str) -> list:
     """The properties of a parsed scene's nodes that are plugins of ours with such a counterpart, and the plugins."""
     declared = plugins.declared()
-    found = [(node.props, declared.get(node.props.plugin_name())) for node in state.nodes]
+    found = [(props, declared.get(props.plugin_name())) for props in compat.properties_of(state)]
     return [(props, plugin) for props, plugin in found if plugin and plugin.counterpart(against)]
 
 
@@ -87,7 +84,7 @@ def integrator_of(path: str | os.PathLike, defines: dict[str, str] | None = None
     Raises :class:`SceneError`, also if there is none of :data:`MAX_DEPTHS`, or more than one.
     """
     with scene_errors(path), _resolving(path):
-        props = _path_integrator(_parse(mi.parser.ParserConfig(mi.variant()), path, defines))
+        props = _path_integrator(_parse(path, defines)[1])
         name = props.plugin_name()
         return name, int(props.get("max_depth", MAX_DEPTHS[name]))
 
@@ -101,7 +98,7 @@ def learned_plugins(
     given. With ``against``, all plugins that have the counterpart of that name. Raises :class:`SceneError`.
     """
     with scene_errors(path), _resolving(path):
-        state = _parse(mi.parser.ParserConfig(mi.variant()), path, defines)
+        _, state = _parse(path, defines)
         return [plugin.described(props) for props, plugin in _declared_nodes(state, against)]
 
 
@@ -214,10 +211,10 @@ def files_of(path: str | os.PathLike, defines: dict[str, str] | None = None) -> 
     """The files that a scene consists of: itself, what it includes and what it names. Raises :class:`SceneError`."""
     folder = Path(path).resolve().parent
     with scene_errors(path), _resolving(path):
-        state = _parse(mi.parser.ParserConfig(mi.variant()), path, defines)
-    found = [Path(str(file)).resolve() for file in state.files]
-    for node in state.nodes:
-        texts = (node.props[k] for k in node.props if node.props.type(k) == mi.Properties.Type.String)
+        _, state = _parse(path, defines)
+    found = [Path(file).resolve() for file in compat.parsed_files(state)]
+    for props in compat.properties_of(state):
+        texts = (props[k] for k in props if compat.property_kind(props, k) == "text")
         for file in (folder / text for text in texts if text):
             with contextlib.suppress(OSError, ValueError):  # any text may be asked for, and few are names of files
                 if file.is_file():
@@ -225,14 +222,14 @@ def files_of(path: str | os.PathLike, defines: dict[str, str] | None = None) -> 
     return list(dict.fromkeys(found))
 
 
-def _parse(config, path, defines: dict[str, str] | None):
+def _parse(path, defines: dict[str, str] | None) -> tuple:
     if not Path(path).is_file():
         raise RuntimeError(f"{path}: no such scene file")
-    return mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in (defines or {}).items()})
+    return compat.parse_file(path, defines)
 
 
 def _path_integrator(state):
-    integrators = [node.props for node in state.nodes if node.type == mi.ObjectType.Integrator]
+    integrators = compat.properties_of(state, mi.ObjectType.Integrator)
     found = [props for props in integrators if props.plugin_name() in MAX_DEPTHS]
     if len(found) != 1:
         names = ", ".join(props.plugin_name() for props in integrators) or "none"
@@ -261,23 +258,7 @@ def scene_errors(path):
     except SceneError:
         raise
     except (RuntimeError, TypeError, ValueError, OSError) as e:
-        message = one_sentence(e)
+        message = compat.one_sentence(e)
         if path is not None and str(path) not in message:
             message = f"{path}: {message}"
         raise SceneError(message) from e
-
-
-def one_sentence(error: BaseException) -> str:
-    """
-    What went wrong, without the layers around it: Mitsuba prefixes source lines, embeds Python tracebacks, and hides
-    the cause of an error at render time behind ``drjit.custom(...) error``.
-    """
-    while error.__cause__ is not None:
-        error = error.__cause__
-    text = re.sub(r"\[[\w.]+:\d+\] ", "", str(error)).strip()
-    head, traceback, tail = text.partition("Traceback (most recent call last):")
-    if traceback:
-        last = [line for line in tail.splitlines() if re.match(r"[\w.]+: ", line)][-1]
-        location = re.sub(r"failed to instantiate.*", "", head.strip())
-        text = location + last.split(": ", 1)[1]
-    return " ".join(text.split())

@@ -9,17 +9,15 @@ the variant is set (:func:`install`): its classes keep the globals of their own 
 
 from __future__ import annotations
 
-import importlib
-import importlib.metadata
-import pkgutil
 import sys
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-#: The group of entry points by which other packages add plugins, each naming a module that has a ``PLUGIN``.
-GROUP = "mi_diffind.plugins"
+from mi_diffind import compat, found
+
+#: What lies beside the plugins and is none.
+IGNORED = ("support",)
 
 #: What a plugin may be → the class in ``mitsuba`` whose instances its factory returns.
 KINDS = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
@@ -69,6 +67,10 @@ class Plugin:
     exact: Counterpart | None = None
     others: tuple[Counterpart, ...] = ()
 
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise ValueError(f'the kind of "{self.name}" is "{self.kind}", allowed are {", ".join(KINDS)}')
+
     def counterpart(self, against: str = "exact") -> Counterpart | None:
         """The exact counterpart, or another one by its name; ``None`` if there is none."""
         return self.exact if against == "exact" else next((c for c in self.others if c.name == against), None)
@@ -104,7 +106,7 @@ def install() -> None:
     """Register the plugins with the variant that is set, if any, and with every one that will be set."""
     import mitsuba as mi
 
-    mi.detail.add_variant_callback(_on_variant_change)  # a set: the second time changes nothing
+    compat.on_variant_change(_on_variant_change)
     if mi.variant() is not None:
         register(mi.variant())
 
@@ -131,12 +133,9 @@ def register(variant: str) -> None:
 
     if variant in _declared:
         return
-    _declared[variant] = found = {}
+    _declared[variant] = known = {}
     for plugin in _load():
-        if plugin.name in found:
-            warnings.warn(f'there are two plugins called "{plugin.name}", the second one is ignored', stacklevel=2)
-            continue
-        found[plugin.name] = plugin
+        known[plugin.name] = plugin
         if supported(variant):
             make = _checked(plugin)
         elif plugin.kind != "volume":  # for scalar variants, Mitsuba cannot do without the type of what it loads
@@ -149,26 +148,9 @@ def register(variant: str) -> None:
 
 def _load() -> list[Plugin]:
     """Execute the modules of plugins afresh, and return what they declare."""
-    own = [f"{__name__}.{module.name}" for module in pkgutil.iter_modules(__path__) if not module.ispkg]
-    entries = importlib.metadata.entry_points(group=GROUP)
-    modules = {
-        **dict.fromkeys(own, "this package"),
-        **{entry.module: f'the entry point "{entry.name}"' for entry in entries},
-    }
-    for name in modules:  # all of them first, since one may build upon another
+    for name in found.modules(__name__, IGNORED).values():  # all of them first, since one may build upon another
         sys.modules.pop(name, None)
-    found = []
-    for name, source in modules.items():
-        try:
-            plugin = importlib.import_module(name).PLUGIN
-            if plugin.kind not in KINDS:
-                raise ValueError(f'the kind of "{plugin.name}" is "{plugin.kind}", allowed are {", ".join(KINDS)}')
-            found.append(plugin)
-        except Exception as e:
-            if name in own:
-                raise
-            warnings.warn(f"the plugin of {source} ({name}) cannot be used: {type(e).__name__}: {e}", stacklevel=3)
-    return found
+    return list(found.load(__name__, "PLUGIN", IGNORED, kind=Plugin).values())
 
 
 def _refusal(name: str, variant: str):

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import drjit as dr
 
+from .. import compat
+
 #: A function whose result, any tree of arrays, is evaluated to measure it.
 Query = Callable[[], object]
 
@@ -46,8 +48,7 @@ def timed(function: Query) -> Timed:
         dr.sync_thread()
         wall = time.perf_counter() - start
         history = dr.kernel_history()
-    compiled = any(not entry.get("cache_hit", True) or entry.get("cache_disk", False) for entry in history)
-    return Timed(value, sum(entry["execution_time"] for entry in history) / 1e3, wall, compiled)
+    return Timed(value, compat.kernel_seconds(history), wall, compat.was_compiled(history))
 
 
 def kernel_seconds(function: Query) -> float:
@@ -85,7 +86,7 @@ def machine(variant: str) -> dict:
         "cores": dr.thread_count(),
         "gpu": gpu,
         "variant": variant,
-        "llvm": ".".join(map(str, dr.detail.llvm_version())) if variant.startswith("llvm") else None,
+        "llvm": ".".join(map(str, compat.llvm_version())) if variant.startswith("llvm") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **{name: metadata.version(name) for name in ("mitsuba", "drjit", "numpy", "mi-diffind")},
@@ -104,6 +105,6 @@ def _target() -> str | None:
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         dr.eval(dr.arange(dr.llvm.Float, 64) + 0.5)
-        text = "".join(entry["ir"].getvalue() for entry in dr.kernel_history([dr.KernelType.JIT]))
-    name, width = re.search(r'"target-cpu"="([^"]+)"', text), re.search(r"<(\d+) x float>", text)
-    return f"{name[1]}, {width[1]} lanes a vector" if name and width else None
+        code = "".join(map(compat.kernel_code, dr.kernel_history([dr.KernelType.JIT])))
+    found = compat.llvm_target(code)
+    return f"{found[0]}, {found[1]} lanes a vector" if found else None

@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass, fields
 
 import drjit as dr
 
+from ..compat import is_ptx, kernel_code
 from .clock import Query, total
 
 #: Flops of an operation in the paper's accounting.
@@ -70,7 +71,7 @@ def count(function: Callable[[], object]) -> Operations:
         dr.kernel_history_clear()
         dr.eval(function())
         history = dr.kernel_history([dr.KernelType.JIT])
-    return sum((count_ir(entry["ir"].getvalue()) for entry in history), Operations())
+    return sum((count_ir(kernel_code(entry)) for entry in history), Operations())
 
 
 def count_query(function: Query) -> Operations:
@@ -90,7 +91,7 @@ def count_query(function: Query) -> Operations:
 def count_ir(text: str) -> Operations:
     """Count the operations of one kernel from its intermediate representation: LLVM's, or PTX (CUDA)."""
     counts = dict.fromkeys((f.name for f in fields(Operations)), 0)
-    found = _ptx(text) if text.lstrip().startswith(".version") else _llvm(text)
+    found = _ptx(text) if is_ptx(text) else _llvm(text)
     for names, size in found:
         counts["instructions"] += 1
         counts["bytes_gathered"] += size

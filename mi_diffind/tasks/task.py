@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from .. import found
 from ..arguments import Argument
+from ..compat import module_of
 from ..errors import UsageError
 from ..settings import FitSettings
 
@@ -95,7 +95,7 @@ class Model:
     @property
     def types(self) -> ModuleType:
         """The module of the Dr.Jit types to compute with."""
-        return sys.modules[self.dtype.__module__]
+        return module_of(self.dtype)
 
     def copy(self) -> Model:
         """A model of its own that shares the memory of this one's arrays."""

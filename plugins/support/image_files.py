@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.compressed import PRIMARIES, CompressedImage
@@ -18,7 +19,6 @@ from mi_diffind.tasks.image.source import SourceError, load_source
 from mi_diffind.tasks.task import stamp
 
 from .tables import exposed
-from .watched import has_gradient
 
 STORAGES = ("uint8", "float32")
 
@@ -54,11 +54,11 @@ class SharedImage:
 
     def unchanged(self, state: list) -> bool:
         """Do the arrays hold what they held then?"""
-        return [a.index for a in state] == [a.index for a in self.state()]
+        return [*map(compat.identity, state)] == [*map(compat.identity, self.state())]
 
     def as_loaded(self) -> bool:
         """Do the arrays hold what the file holds, and is nobody about to change that?"""
-        return self.unchanged(self._loaded) and not any(has_gradient(a.data) for a in self.tables.values())
+        return self.unchanged(self._loaded) and not any(compat.has_gradient(a.data) for a in self.tables.values())
 
     def transform(self, matrix: list):
         """

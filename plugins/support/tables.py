@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from mi_diffind import compat
 from mi_diffind.tasks.task import Model, Task
 
 from . import properties
-from .watched import has_gradient
 
 
 def open_tables(props: mi.Properties, task: Task, storage: str = "") -> Model:
@@ -47,4 +47,4 @@ def check_shapes(arrays: dict) -> None:
 
 def optimised(arrays: dict) -> bool:
     """Is a derivative with respect to any entry asked for?"""
-    return any(has_gradient(array.data) for array in arrays.values())
+    return any(compat.has_gradient(array.data) for array in arrays.values())

@@ -8,14 +8,13 @@ colours that are known only when they are needed, differentiable with respect to
 
 from __future__ import annotations
 
-import struct
 import threading
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
 from mi_diffind.indirection import DifferentiableArray
 from mi_diffind.lookup import clamp
 
@@ -33,14 +32,7 @@ def model():
 
 
 def _load():
-    path = mi.file_resolver().resolve("data/srgb.coeff")
-    content = Path(str(path)).read_bytes()
-    side = struct.unpack("<I", content[4:8])[0]
-    count = 3 * side**3
-    if content[:4] != b"SPEC" or len(content) < 8 + 4 * side + 12 * count:
-        raise RuntimeError(f"{path}: is not the table of coefficients that is expected of Mitsuba")
-    positions = np.frombuffer(content, "<f4", side, 8)
-    entries = np.frombuffer(content, "<f4", 3 * count, 8 + 4 * side).reshape(count, 3)
+    side, positions, entries = compat.srgb_coefficients()
     table = DifferentiableArray.from_numpy(entries, mi.TensorXf)  # pads and aligns them
     return side, mi.Float(positions.copy()), mi.Float(table.data.array)
 

@@ -8,6 +8,7 @@ import threading
 import drjit as dr
 import mitsuba as mi
 
+from mi_diffind import compat
 from mi_diffind.tasks.known import Known
 
 _waiting = threading.local()
@@ -28,21 +29,10 @@ def when_outermost(work) -> None:
     try:
         while _waiting.queue:
             # What was computed for other materials in the meantime came before, as far as Dr.Jit is concerned
-            dr.detail.new_scope(dr.backend_v(mi.Float))
+            compat.new_scope(mi.Float)
             _waiting.queue.pop(0)()
     finally:
         _waiting.queue = None
-
-
-#: Textures whose values are those of their parameters, wherever they are read. Others may call themselves constant and
-#: not be, as ``mesh_attribute`` does.
-_CONSTANTS = ("UniformSpectrum", "SRGBReflectanceSpectrum")
-_BITMAPS = "BitmapTextureImpl"
-
-
-def _kind(texture) -> str:
-    """Mitsuba's name of a texture's class; nothing for one written in Python, which may be of any name."""
-    return texture.class_name() if type(texture).__module__.startswith("mitsuba") else ""
 
 
 class Watched:
@@ -57,7 +47,7 @@ class Watched:
         if isinstance(texture, dr.ArrayBase):  # a parameter of the BSDF itself, assigned to in place
             self.constant, self._parameters = True, None
         else:
-            self.constant = _kind(texture) in _CONSTANTS and not (colour and mi.is_spectral)
+            self.constant = compat.is_constant_texture(texture) and not (colour and mi.is_spectral)
             self._parameters = mi.traverse(texture)
         self._arrays, self._found = None, Known()
 
@@ -70,13 +60,13 @@ class Watched:
 
     def optimised(self) -> bool:
         """Is a derivative with respect to it asked for? Also where derivatives are suspended at the moment."""
-        return any(map(has_gradient, self._values()))
+        return any(map(compat.has_gradient, self._values()))
 
     def changed(self) -> bool:
         """Is it not what it was when it was last looked at? A texture may be updated without anybody being told."""
         if self._arrays is None:
             return True
-        return [*map(_identity, self._arrays)] != [*map(_identity, self._values())]
+        return [*map(compat.identity, self._arrays)] != [*map(compat.identity, self._values())]
 
     def look(self) -> None:
         """Find out its bounds, if they are not known or it is not what it was."""
@@ -113,24 +103,6 @@ class WatchedChannel(Watched):
         pass
 
 
-def has_gradient(value) -> bool:
-    """Is a derivative with respect to this array asked for?"""
-    if dr.is_tensor_v(value):
-        return value.array.index_ad != 0
-    if dr.depth_v(value) > 1:
-        return any(has_gradient(v) for v in value)
-    return dr.is_diff_v(value) and value.index_ad != 0
-
-
-def _identity(value) -> tuple:
-    """What tells an array from another one that took its place."""
-    if dr.is_tensor_v(value):
-        return _identity(value.array)
-    if dr.depth_v(value) > 1:
-        return tuple(i for v in value for i in _identity(v))
-    return (value.index,) if dr.is_jit_v(value) else (value,)
-
-
 def bounds(texture, colour: bool = False) -> Known:
     """
     Bounds of what ``texture`` (or a number) gives: of its ``eval`` if ``colour``, else of its ``eval_1``. Constants and
@@ -138,14 +110,14 @@ def bounds(texture, colour: bool = False) -> Known:
     """
     if isinstance(texture, dr.ArrayBase):
         return _of([texture])
-    kind = _kind(texture)
-    if kind in _CONSTANTS and mi.is_spectral and colour:
+    constant = compat.is_constant_texture(texture)
+    if constant and mi.is_spectral and colour:
         # Smooth, and coefficients of a sigmoid: neither black nor without hue, unless it is uniform
-        return _of([mi.traverse(texture)["value"]]) if kind == "UniformSpectrum" else Known()
-    if kind in _CONSTANTS:
+        return _of([mi.traverse(texture)["value"]]) if compat.is_uniform_spectrum(texture) else Known()
+    if constant:
         si = dr.zeros(mi.SurfaceInteraction3f)
         return _of(list(texture.eval(si)) if colour else [texture.eval_1(si)])
-    if not kind.startswith(_BITMAPS):
+    if not compat.is_bitmap(texture):
         return Known()
     data = mi.traverse(texture)["data"]
     channels = data.shape[-1]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-
 import drjit as dr
 from drjit import nn
 
+from ...compat import module_of
 from ...indirection import DifferentiableArray, fold
 from ...measure.operations import Operations
 
@@ -33,7 +32,7 @@ class Network(nn.Module):
         result = Network(self.inputs, self.width, self.layers, self.grid, self.table_size)
         size = self.inputs
         if self.grid:
-            Float = sys.modules[dtype.__module__].Float
+            Float = module_of(dtype).Float
             result.encoding = nn.HashGridEncoding(Float, self.inputs, rng=rng, **self.grid)
             result.entries = dtype(result.encoding.params)
             size = self.grid["n_levels"] * self.grid["n_features_per_level"]

@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 from collections.abc import Sequence
 
 import drjit as dr
 import numpy as np
 
+from ...compat import module_of
 from ...indirection import DifferentiableArray, Indirection
 from ...tables import StoredArray, Table, TableError, load_table
 from .arrays import joined
@@ -63,7 +63,7 @@ class CompressedImage:
         width, height = width or layout.width, height or layout.height
         names = tuple(names or layout.names)
         found = {name: np.empty((height * width, layout[name].channels), np.float32) for name in names}
-        types = None if self.net is None else sys.modules[type(self.net.cascaded.data).__module__]
+        types = None if self.net is None else module_of(self.net.cascaded.data)
         for start in range(0, height * width, CHUNK):
             count = min(CHUNK, height * width - start)
             if types is None:
@@ -108,7 +108,7 @@ class CompressedImage:
         if self.net is None:
             return 0.0
         u, v = np.random.default_rng(2023).random((2, count), dtype=np.float32)
-        types = sys.modules[type(self.net.cascaded.data).__module__]
+        types = module_of(self.net.cascaded.data)
         read = self.read(types.Float(u), types.Float(v))
         border = self.net.primary[0].border
         rows, columns = (_taps(x, n, b) for x, n, b in ((v, source.height, border[0]), (u, source.width, border[1])))
