@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import BACKENDS
 
-from mi_diffind.fitting import FitSettings
+from mi_diffind.fitting import FitSettings, Problem
 from mi_diffind.indirection import DifferentiableArray
 from mi_diffind.measure.training import GAIN, Training
 from mi_diffind.runtime import array_module
@@ -18,14 +18,14 @@ from mi_diffind.runtime import array_module
 SETTINGS = FitSettings(steps=10, batch=64, lr=1e-2, schedule="constant", seed=3, deterministic=False)
 
 
-class Ramp:
+class Ramp(Problem):
     """Five numbers that are to become 1: Adam moves each by its rate a step, so 100 steps take them from 0 to there."""
 
     def __init__(self, log, target=1.0, interrupt=0):
         self.types = array_module(BACKENDS[0])
         self.net = DifferentiableArray((5,), 1, "constant", 0.0).alloc(self.types.TensorXf)
         self.weights, self.target, self.log, self.interrupt = {}, target, log, interrupt
-        self.about = {"target": target}
+        self.identity = {"target": target}
 
     def batch(self, rng, size):
         self.log.append("batch")
@@ -36,7 +36,7 @@ class Ramp:
     def predict(self, net, inputs):
         return {"y": net([inputs])}
 
-    def quality(self, net):
+    def measure(self, net):
         error = float(np.abs(net.numpy() - self.target).mean())
         return {"psnr_db": -20 * math.log10(max(error, 0.01))}
 

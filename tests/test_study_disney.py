@@ -33,7 +33,7 @@ def test_quick_run_writes_what_it_promises(disney):
     assert sorted(list(table[0])[len(report.COLUMNS) :]) == ERRORS
     names = {row["candidate"] for row in table}
     stored = {f"{q}{s}" for q in ("tables", "paper") for s in ("", ", float16", ", uint8")}
-    single = {f"only {factor} read" for factor in ("alpha", "masking", "cosine", "coat")}
+    single = {f"only {factor} read" for factor in ("alpha", "masking", "coat")}
     assert names == {"principled", "disney", "formulas", *stored, *single}
     assert {row["query"] for row in table} == {"eval", "sample", "pdf", "render", "render, with tracing"}
     assert {row["case"] for row in table} == {"constant, all lobes", "textured, diffuse + specular"}
@@ -52,7 +52,7 @@ def test_candidates_are_what_they_are_called(disney):
     _, found = disney
     accuracy = {name: c["errors"].get("psnr_db_training") for name, c in found["candidates"].items()}
     assert accuracy["disney"] > 100
-    single = [accuracy[f"only {factor} read"] for factor in ("masking", "cosine", "coat")]
+    single = [accuracy[f"only {factor} read"] for factor in ("masking", "coat")]
     assert accuracy["paper"] < accuracy["tables"] < min(single)
     assert abs(accuracy["only alpha read"] - accuracy["tables"]) < 3  # the table that limits the others
     assert accuracy["tables, uint8"] < accuracy["tables"]

@@ -15,7 +15,8 @@ from mi_diffind.fitting import FitSettings, fit
 from mi_diffind.runtime import array_module
 from mi_diffind.studies.baselines.networks import Network
 from mi_diffind.studies.ggx import candidates, conclusions
-from mi_diffind.tasks.ggx import Encoding, GGXProblem
+from mi_diffind.tasks.ggx.model import Encoding
+from mi_diffind.tasks.ggx.training import GGXProblem
 
 GRID = {**candidates.GRID, "hashmap_size": 64}
 
@@ -66,7 +67,7 @@ def test_all_parameters_are_trained(ad):
     problem = GGXProblem(net, ad, "tables", Encoding())
     before = {key: net[key].numpy().copy() for key in net}
     assert {"entries", "table.data", "mlp.layers.0.weights", "mlp.layers.0.bias"} <= set(before)
-    fit(problem, FitSettings(steps=20, batch=4096, lr=1e-2, quality_every=20), progress=False)
+    fit(problem, FitSettings(steps=20, batch=4096, lr=1e-2, measure_every=20), progress=False)
     for key, values in before.items():
         assert not np.array_equal(net[key].numpy(), values), key
 

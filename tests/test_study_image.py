@@ -2,6 +2,7 @@
 number of steps here, not of seconds: nothing depends on how fast the machine is."""
 
 import csv
+import dataclasses
 import json
 import math
 
@@ -14,6 +15,7 @@ from mi_diffind import fitting, metrics
 from mi_diffind.cli import main
 from mi_diffind.studies.baselines import codecs
 from mi_diffind.tasks.image import training
+from mi_diffind.tasks.image.presets import IMPROVEMENTS, replaced
 from mi_diffind.tasks.image.source import from_arrays
 
 #: Steps of a training.
@@ -32,9 +34,10 @@ def asked():
     """The seconds that trainings were asked to take; they take :data:`STEPS` steps."""
     seconds, fit_image = [], training.fit_image
 
-    def stepwise(source, size, recipe, **options):
-        seconds.append(options.pop("seconds"))
-        return fit_image(source, size, training.replaced(recipe, steps=STEPS, batch=2**12), **options)
+    def stepwise(source, size, recipe, request, **options):
+        seconds.append(request.seconds)
+        recipe = replaced(recipe, steps=STEPS, batch=2**12)
+        return fit_image(source, size, recipe, dataclasses.replace(request, seconds=None), **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "fit_image", stepwise)
@@ -128,7 +131,7 @@ def test_candidates_of_a_request(mi_rgb):
     request = candidates.Request((12.0, 6.0), (5.0, 2.0), (7.0,), (4, 3), ablation=True)
     names = [job.name for job in candidates._trainings(source, request)]
     assert names[:4] == ["ours 12x 2 s", "ours 12x 5 s", "paper 12x 7 s", "ours 2D→3D 12x 2 s"]
-    assert names[4:-1] == [f"ours without {name} 12x 2 s" for name in training.IMPROVEMENTS]
+    assert names[4:-1] == [f"ours without {name} 12x 2 s" for name in IMPROVEMENTS]
     assert names[-1] == "ours 6x 2 s"
     assert not any(c.in_picture for c in candidates.plan(source, "a", request).candidates if " without " in c.name)
 

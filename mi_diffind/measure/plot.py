@@ -33,6 +33,9 @@ RADII = (6, 9, 12, 18, 26, 36, 48, 62, 80)
 #: From so many points on, a thin line leads from an anchor to its label.
 _LEADER = 12
 
+#: Where around an anchor a label may be, in sixteenths of a turn from the angle that is best.
+_TURNS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6, -7, 7, -8)
+
 
 @dataclass(frozen=True)
 class Point:
@@ -250,26 +253,22 @@ def place(
         size = np.array([extent.width + 3 * scale, extent.height + 1.5 * scale])
         start = pixels(label.at)
         others = np.reshape([pixels(p) for p in points if tuple(p) != tuple(label.at)], (-1, 2))
-        best = None
-        for radius in label.radii:
-            for k in range(16):
-                turn = (k + 1) // 2
-                angle = label.angle + 2 * math.pi * turn * (-1) ** k / 16
-                offset = (radius * scale + size / 2) * [math.cos(angle), math.sin(angle)]
-                box = np.concatenate([start + offset - size / 2, start + offset + size / 2])
-                cost = 50 * (size.prod() - _overlap(box, inside)) + (radius + turn / 4) * scale
-                cost += 30 * (_overlap(box, hard) + _overlap(box, placed)) + 20 * _overlap(box, soft)
-                # Whose label it is has to be plain: no other point nearer, nothing across the line that leads to it
-                end = np.clip(start, box[:2], box[2:])
-                nearer = math.dist(start, end) + 4 * scale - _distances(others, box)
-                cost += 30 * np.maximum(nearer, 0).sum() / scale
-                if radius > _LEADER:
-                    way = start + np.linspace(0, 1, 21)[:, None] * (end - start)
-                    cost += 300 * sum((_distances(way, other) == 0).any() for other in placed)
-                    cost += 300 * sum((np.hypot(*(way - o).T) < 6 * scale).any() for o in others)
-                if best is None or cost < best[0]:
-                    best = (cost, offset, box, end, radius)
-        _, offset, box, end, radius = best
+        radius, turn = (v.ravel() for v in np.meshgrid(label.radii, _TURNS, indexing="ij"))
+        angle = label.angle + 2 * math.pi * turn / len(_TURNS)
+        offset = (radius[:, None] * scale + size / 2) * np.column_stack([np.cos(angle), np.sin(angle)])
+        box = np.hstack([start + offset - size / 2, start + offset + size / 2])
+        cost = 50 * (size.prod() - _overlap(box, inside)) + (radius + np.abs(turn) / 4) * scale
+        cost += 30 * (_overlap(box, hard) + _overlap(box, placed)) + 20 * _overlap(box, soft)
+        # Whose label it is has to be plain: no other point nearer, nothing across the line that leads to it
+        end = np.clip(start, box[:, :2], box[:, 2:])
+        to_others = others - np.clip(others, box[:, None, :2], box[:, None, 2:])
+        nearer = np.hypot(*(start - end).T)[:, None] + 4 * scale - np.hypot(*np.moveaxis(to_others, -1, 0))
+        cost += 30 * np.maximum(nearer, 0).sum(axis=1) / scale
+        way = (start + np.linspace(0, 1, 21)[:, None, None] * (end - start))[:, :, None]
+        across = ((way >= placed[:, :2]) & (way <= placed[:, 2:])).all(axis=-1).any(axis=0).sum(axis=1)
+        touched = (np.hypot(*np.moveaxis(way - others, -1, 0)) < 6 * scale).any(axis=0).sum(axis=1)
+        best = np.argmin(cost + 300 * (radius > _LEADER) * (across + touched))
+        radius, offset, box, end = radius[best], offset[best], box[best], end[best]
         note.set_position(offset / scale)
         if radius > _LEADER:
             ends = axes.transData.inverted().transform([start, end])
@@ -293,15 +292,10 @@ def _chain(line, scale: float):
                 yield np.tile(a + t * (b - a), 2) + scale * _OUT
 
 
-def _overlap(box: np.ndarray, boxes: np.ndarray) -> float:
-    """The area that a box shares with each of others, in sum."""
-    sides = np.minimum(box[2:], boxes[:, 2:]) - np.maximum(box[:2], boxes[:, :2])
-    return float(np.maximum(sides, 0).prod(axis=1).sum())
-
-
-def _distances(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """How far points are from a box."""
-    return np.hypot(*(points - np.clip(points, box[:2], box[2:])).T)
+def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The area that each of some boxes shares with each of others, in sum."""
+    sides = np.minimum(boxes[:, None, 2:], others[:, 2:]) - np.maximum(boxes[:, None, :2], others[:, :2])
+    return np.maximum(sides, 0).prod(axis=-1).sum(axis=1)
 
 
 # -- courses of trainings ---------------------------------------------------------------------------------------------
