@@ -14,7 +14,6 @@ import importlib
 import io
 import itertools
 import math
-import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -54,15 +53,12 @@ class CodecError(RuntimeError):
 class Encoded:
     """
     An image after ``codec`` (e.g. ``"ASTC 8x8"``): the ``nbytes`` stored (payload of blocks and samples, whole files),
-    the decoded ``image`` (float32 in [0, 1], shape of the input), whether a texel can be read without decoding all of
-    them, and the ``seconds`` of encoding.
+    the decoded ``image`` (float32 in [0, 1], shape of the input).
     """
 
     codec: str
     nbytes: int
     image: np.ndarray
-    random_access: bool
-    seconds: float
 
 
 def available() -> tuple[str, ...]:
@@ -115,11 +111,8 @@ def astc(
     stored, read = (("rrr1", [0]), ("rrrg", [0, 3]), ("rgb1", [0, 1, 2]), ("rgba", [0, 1, 2, 3]))[channels - 1]
 
     context = _context(block, float(quality), channels == 2)
-    start = time.perf_counter()
     source = package.ASTCImage(package.ASTCType.U8, width, height, 1, rgba.tobytes())
     payload = context.compress(source, package.ASTCSwizzle.from_str(stored))
-    seconds = time.perf_counter() - start
-
     target = package.ASTCImage(package.ASTCType.U8, width, height)
     target = context.decompress(payload, target, package.ASTCSwizzle.from_str("rgba"))
     decoded = np.frombuffer(target.data, np.uint8).reshape(height, width, 4)[..., read] / np.float32(255)
@@ -129,7 +122,7 @@ def astc(
         z = np.sqrt(np.maximum(0, 1 - np.sum((2 * decoded - 1) ** 2, -1, keepdims=True)))
         decoded = np.concatenate([decoded, (z + 1) / 2], -1)
     name = f"ASTC {block}{' xy' if normal else ''}{f' at 1/{reduce}' if reduce > 1 else ''}"
-    return Encoded(name, len(payload), np.ascontiguousarray(decoded, np.float32), True, seconds)
+    return Encoded(name, len(payload), np.ascontiguousarray(decoded, np.float32))
 
 
 @functools.lru_cache(maxsize=2 * len(ASTC_BLOCKS))
@@ -161,14 +154,11 @@ def bc7(image: np.ndarray) -> Encoded:
     rgba[..., 3] = 255
     rgba[..., : 3 if channels == 1 else channels] = padded
 
-    start = time.perf_counter()
     settings = encoder.BC7EncSettings.from_profile("alpha_slow" if channels == 4 else "slow")
     payload = encoder.compress_blocks_bc7(encoder.RGBASurface(rgba.tobytes(), w, h, 4 * w), settings)
-    seconds = time.perf_counter() - start
-
     bgra = np.frombuffer(decoder.decode_bc7(payload, w, h), np.uint8).reshape(h, w, 4)
     decoded = bgra[:height, :width, [2, 1, 0, 3][:channels]] / np.float32(255)
-    return Encoded("BC7", len(payload), np.ascontiguousarray(decoded), True, seconds)
+    return Encoded("BC7", len(payload), np.ascontiguousarray(decoded))
 
 
 def jpeg(image: np.ndarray, quality: int, subsampling: str = "4:4:4") -> Encoded:
@@ -195,7 +185,6 @@ def bicubic(image: np.ndarray, nbytes: int) -> Encoded:
     _modules("bicubic")
     samples = _texels(image) / np.float32(255)
     height, width, channels = samples.shape
-    start = time.perf_counter()
     scales = np.unique(np.concatenate([np.arange(1, n + 1) / n for n in (height, width)]))
     sizes = np.maximum(1, np.floor(np.outer(scales, (height, width)) + 1e-9)).astype(int)
     fitting = sizes[sizes.prod(1) * channels <= nbytes]
@@ -207,36 +196,22 @@ def bicubic(image: np.ndarray, nbytes: int) -> Encoded:
             found = _resized(small, height, width, "BICUBIC")
             if (error := _squared(samples, found)) < least:
                 best, least = found, error
-    return Encoded(f"bicubic {w}x{h}", h * w * channels, best, True, time.perf_counter() - start)
+    return Encoded(f"bicubic {w}x{h}", h * w * channels, best)
 
 
-def at_bytes(codec: str, image: np.ndarray, nbytes: int, **options) -> list[Encoded]:
+def at_bytes(codec: str, image: np.ndarray, nbytes: int) -> Encoded:
     """
-    ``image`` in ``nbytes``. ``astc``: the largest that fits and the smallest that does not, if there are both.
-    ``jpeg`` and ``webp``: the highest quality that fits, else the lowest (JPEG: with or without chroma subsampling,
-    whichever errs less). ``bicubic`` as it is, ``bc7`` at its only size. ``options`` go to the codec. Raises
-    ``ValueError`` for an unknown codec.
+    ``image`` in ``nbytes`` by one of the codecs ``jpeg`` and ``webp``: the highest quality that fits, else the lowest
+    (JPEG: with or without chroma subsampling, whichever errs less); ``bicubic`` as it is; ``bc7`` at its only size.
     """
-    if codec == "astc":
-        shape, reduce = _texels(image).shape, options.get("reduce", 1)
-        sizes = sorted(((astc_bytes(shape, b, reduce), i, b) for i, b in enumerate(ASTC_BLOCKS)), key=lambda s: s[:2])
-        below = [s for s in sizes if s[0] <= nbytes]
-        below = [next(s for s in below if s[0] == below[-1][0])] if below else []
-        chosen = below + [s for s in sizes if s[0] > nbytes][:1]
-        return [astc(image, block, **options) for _, _, block in chosen]
-    if codec in _FILES:
-        encode = {"jpeg": jpeg, "webp": webp}[codec]
-        _, _, qualities, tries = _FILES[codec]
-        given = [{**o, **options} for o in tries]
-        found = [_fitting(lambda q, o=o: encode(image, q, **o), qualities, nbytes) for o in given]
-        fitting = [e for e in found if e.nbytes <= nbytes] or [min(found, key=lambda e: e.nbytes)]
-        reference = _texels(image) / np.float32(255)
-        return [min(fitting, key=lambda e: _squared(reference, e.image))]
-    if codec == "bicubic":
-        return [bicubic(image, nbytes, **options)]
-    if codec == "bc7":
-        return [bc7(image, **options)]
-    raise ValueError(f'codec: found "{codec}", one of {", ".join(_PACKAGES)} is needed')
+    if codec not in _FILES:
+        return bc7(image) if codec == "bc7" else bicubic(image, nbytes)
+    encode = {"jpeg": jpeg, "webp": webp}[codec]
+    _, _, qualities, tries = _FILES[codec]
+    found = [_fitting(lambda q, o=o: encode(image, q, **o), qualities, nbytes) for o in tries]
+    fitting = [e for e in found if e.nbytes <= nbytes] or [min(found, key=lambda e: e.nbytes)]
+    reference = _texels(image) / np.float32(255)
+    return min(fitting, key=lambda e: _squared(reference, e.image))
 
 
 #: One way to store a map (its name, whether only x and y, block size, reduction), or several: bytes, squared error.
@@ -351,19 +326,17 @@ def _files(kind: str, image: np.ndarray, quality: int, **options) -> Encoded:
     if quality not in qualities:
         raise ValueError(f"quality: found {quality}, {qualities[0]} to {qualities[-1]} is needed")
     groups = {1: [[0]], 2: [[0], [1]], 3: [[0, 1, 2]], 4: [[0, 1, 2], [3]]}[channels]
-    decoded, nbytes, seconds = np.empty(texels.shape, np.float32), 0, 0.0
+    decoded, nbytes = np.empty(texels.shape, np.float32), 0
     for group in groups:
         mode = "L" if len(group) == 1 else "RGB"
         plane = texels[..., group[0]] if mode == "L" else texels[..., group]
         source = pillow.fromarray(np.ascontiguousarray(plane))
         file = io.BytesIO()
-        start = time.perf_counter()
         source.save(file, kind.upper(), quality=quality, **options)
-        seconds += time.perf_counter() - start
         nbytes += file.tell()
         with pillow.open(file) as opened:
             decoded[..., group] = np.asarray(opened.convert(mode)).reshape(height, width, -1) / np.float32(255)
-    return Encoded(f"{name} {quality}", nbytes, decoded, False, seconds)
+    return Encoded(f"{name} {quality}", nbytes, decoded)
 
 
 def _modules(codec: str) -> list:

@@ -65,12 +65,16 @@ SETTINGS = {
     "wide network": {"lr": 5e-3, "batch": 1024, "steps": 8000, "longest": 32000},
 }
 
+#: Those of the first run of a quick study, the longest takes twice as many.
+QUICK_STEPS = 100
+
 GRID = {
     "n_levels": 4, "n_features_per_level": 2, "hashmap_size": 2**12, "base_resolution": 4, "per_level_scale": 2,
     "align_corners": True, "init_scale": 1e-2,
 }  # fmt: skip
 
-_SHORT = {"float32": "", "float16": " f16", "uint8": " u8"}
+#: Storage form → its mark in labels, bytes of an entry.
+_STORED = {"float32": ("", 4), "float16": (" f16", 2), "uint8": (" u8", 1)}
 
 
 def plan(quick: bool = False) -> Plan:
@@ -130,20 +134,20 @@ class _Made:
     def name(label: str, inputs: str) -> str:
         return label if inputs == "plain" else f"{label}, log"
 
-    def train(self, name: str, net: Callable, how: str, inputs: str, output: str = "root") -> Training:
+    def train(self, label: str, net: Callable, how: str, encoding: Encoding) -> Training:
         """Register a training; ``how`` is a key of :data:`SETTINGS`."""
         options = dict(SETTINGS[how])
         longest = options.pop("longest")
         settings = FitSettings(seed=1, schedule="cosine", deterministic=False, **options)
         if self.quick:
-            settings, longest = dataclasses.replace(settings, steps=100), 200
-        encoding = Encoding(inputs, output)
-        samples = "tables" if inputs == "logarithmic" else "paper"
+            settings, longest = dataclasses.replace(settings, steps=QUICK_STEPS), 2 * QUICK_STEPS
+        samples = "tables" if encoding.inputs == "logarithmic" else "paper"
 
         def problem():
             return GGXProblem(net().alloc(self.types.TensorXf, 2, dr.rng(seed=1)), self.types, samples, encoding)
 
-        self.trainings.append(Training(name, problem, settings, longest, 4 if self.quick else 20))
+        name = self.name(label, encoding.inputs)
+        self.trainings.append(Training(name, problem, settings, longest, 2 if self.quick else 20))
         return self.trainings[-1]
 
     def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
@@ -193,41 +197,33 @@ def _add_tables(made: _Made, inputs: str) -> None:
     sizes, multiples = (SIZES, MULTIPLES) if plain else ((PRIMARY, 2 * PRIMARY), (1, 4))
     if made.quick:
         sizes, multiples = sizes[:2] if plain else sizes[:1], multiples[:2] if plain else multiples[:1]
-    encoding = Encoding(inputs, "root")
-    how = f"indirection, {inputs}"
+    encoding, own = Encoding(inputs, "root"), made.name(f"{PRIMARY}→{CASCADED}", inputs)
     for n in sizes:
-        label = f"{n}→{n // 2}"
-        training = made.train(made.name(label, inputs), lambda n=n: indirection(n, n // 2), how, inputs)
-        for storage in STORAGES:
-            size = (2 * n**2 + (n // 2) ** 2) * {"float32": 4, "float16": 2, "uint8": 1}[storage]
-            form = lambda net, s=storage: net.to(s)  # noqa: E731
-            made.add(label + _SHORT[storage], "indirection", storage, size, training, form, encoding)
-        if n == PRIMARY:
-            made.ratios += [(made.name(label + _SHORT[s], inputs), made.name(label, inputs)) for s in STORAGES[1:]]
+        _add_table(made, n, f"indirection, {inputs}", encoding, STORAGES)
+    made.ratios += [(made.name(f"{PRIMARY}→{CASCADED}{_STORED[s][0]}", inputs), own) for s in STORAGES[1:]]
     for multiple in multiples:
-        side = math.isqrt(ENTRIES * multiple)
-        label = f"{side}²"
-        net = lambda n=side: DifferentiableArray((n, n), 1, "constant", 0.5)  # noqa: E731
-        training = made.train(made.name(label, inputs), net, "single table", inputs)
-        for storage in STORAGES if multiple == 1 else STORAGES[:1]:
-            size = side**2 * {"float32": 4, "float16": 2, "uint8": 1}[storage]
-            form = lambda net, s=storage: net.to(s)  # noqa: E731
-            made.add(label + _SHORT[storage], "single table", storage, size, training, form, encoding)
-        if multiple == 1:
-            made.ratios.append((made.name(label, inputs), made.name(f"{PRIMARY}→{CASCADED}", inputs)))
-    if not plain or made.quick:
-        return
-    raw = Encoding("plain", "raw")
-    note = "learns D as it is, at the paper's learning rate"
-    side = math.isqrt(ENTRIES)
-    table = lambda: DifferentiableArray((side, side), 1, "constant", 0.5)  # noqa: E731
-    for label, representation, net in (
-        (f"{PRIMARY}→{CASCADED} raw", "indirection", lambda: indirection(PRIMARY, CASCADED)),
-        (f"{side}² raw", "single table", table),
-    ):
-        training = made.train(label, net, "raw", inputs, "raw")
-        size = 4 * (ENTRIES if representation == "indirection" else side**2)
-        made.add(label, representation, "float32", size, training, lambda net: net, raw, note=note)
+        forms = STORAGES if multiple == 1 else STORAGES[:1]
+        _add_table(made, math.isqrt(ENTRIES * multiple), "single table", encoding, forms)
+    made.ratios.append((made.name(f"{math.isqrt(ENTRIES)}²", inputs), own))
+    if plain and not made.quick:
+        for n, representation in ((PRIMARY, "indirection"), (math.isqrt(ENTRIES), "single table")):
+            _add_table(made, n, "raw", Encoding("plain", "raw"), STORAGES[:1], representation)
+
+
+def _add_table(made: _Made, n: int, how: str, encoding: Encoding, forms, representation: str = "") -> None:
+    """A training, and a candidate in each of ``forms``: indirection of a primary side ``n``, or a table of that side."""
+    representation = representation or how.split(",")[0]
+    if representation == "indirection":
+        label, entries, net = f"{n}→{n // 2}", 2 * n**2 + (n // 2) ** 2, lambda: indirection(n, n // 2)
+    else:
+        label, entries, net = f"{n}²", n**2, lambda: DifferentiableArray((n, n), 1, "constant", 0.5)
+    note = "learns D as it is, at the paper's learning rate" if how == "raw" else ""
+    label += " raw" * (how == "raw")
+    training = made.train(label, net, how, encoding)
+    for storage in forms:
+        mark, size = _STORED[storage]
+        form = lambda net, s=storage: net.to(s)  # noqa: E731
+        made.add(label + mark, representation, storage, size * entries, training, form, encoding, note=note)
 
 
 def _add_networks(made: _Made, inputs: str) -> None:
@@ -239,14 +235,15 @@ def _add_networks(made: _Made, inputs: str) -> None:
         kinds.append((f"MLP 8 + {PRIMARY}²", "network + table", Network(2, 8, 2, table=PRIMARY)))
     if made.quick:
         kinds = [kinds[0], *kinds[-2:]] if plain else []
+    encoding = Encoding(inputs, "root")
     for label, representation, network in kinds:
         how = "network" if network.width < 32 else "wide network"
-        training = made.train(made.name(label, inputs), lambda n=network: n, how, inputs)
+        training = made.train(label, lambda n=network: n, how, encoding)
         size = network.alloc(made.types.TensorXf, 2, dr.rng(seed=1)).nbytes
         for form, setting in ((Network.cooperative, "cooperative vectors"), (lambda net: net, "tensors")):
             shown = label if form is Network.cooperative else f"{label} tensor"
-            operations = _network_operations(made, training, Encoding(inputs, "root"))
-            made.add(shown, representation, setting, size, training, form, Encoding(inputs, "root"), operations)
+            operations = _network_operations(made, training, encoding)
+            made.add(shown, representation, setting, size, training, form, encoding, operations)
 
 
 def _network_operations(made: _Made, training: Training, encoding: Encoding) -> Callable[[str], Operations]:
@@ -279,10 +276,8 @@ def _conductors(made: _Made) -> list[Case]:
         plugins[name] = {"type": "neural_ggx", "storage": storage}
         model = TASK.open(made.types.TensorXf, storage=storage)
         made.candidates.append(
-            Candidate(
-                name, "indirection", storage, model.nbytes, None, model.measure, in_passes=False,
-            )
-        )  # fmt: skip
+            Candidate(name, "indirection", storage, model.nbytes, None, model.measure, in_passes=False)
+        )
         made.ratios.append((name, "roughconductor"))
     return [
         Case(

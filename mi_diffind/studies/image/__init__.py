@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import argparse
 
+from ...arguments import positive
 from ...measure.study import Plan, Study
 
-#: Option → what it is of, the values that are allowed.
+#: Option → what it is of, what kind of value it takes and which.
 _REPEATED = {
-    "--compression": ("12x (default)", None),
-    "--seconds": ("of each training by our preset (default: 60; --quick: 2)", None),
-    "--paper-seconds": ("of each by the paper's preset (default: the longest of --seconds)", None),
-    "--dims": ("dimensions of the cascaded array, 2, 3 or 4 (default: all)", (2, 3, 4)),
+    "--compression": ("12x (default)", str, None),
+    "--seconds": ("of each training by our preset (default: 60; --quick: 2)", positive, None),
+    "--paper-seconds": ("of each by the paper's preset (default: the longest of --seconds)", positive, None),
+    "--dims": ("dimensions of the cascaded array, 2, 3 or 4 (default: all)", int, (2, 3, 4)),
 }
 
 ASTC_PRESETS = ("fastest", "fast", "medium", "thorough", "verythorough", "exhaustive")
@@ -28,8 +29,7 @@ class ImageStudy(Study):
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("source", metavar="IMAGE|MATERIAL.json")
-        for option, (text, choices) in _REPEATED.items():
-            kind = str if option == "--compression" else int
+        for option, (text, kind, choices) in _REPEATED.items():
             parser.add_argument(option, action="append", default=[], type=kind, choices=choices, metavar="N",
                                 help=f"{text}; may be repeated")  # fmt: skip
         parser.add_argument("--astc", choices=ASTC_PRESETS, default="exhaustive",
@@ -42,10 +42,6 @@ class ImageStudy(Study):
         from ...tasks.image.sizing import parse_compression
         from ...tasks.image.source import load_source
 
-        for option in ("seconds", "paper_seconds"):
-            wrong = next((v for v in getattr(arguments, option) if v < 1), None)
-            if wrong is not None:
-                raise ValueError(f"--{option.replace('_', '-')}: found {wrong}, at least 1 is needed")
         arguments.compressions = tuple(map(parse_compression, arguments.compression)) or (12.0,)
         arguments.loaded = load_source(arguments.source)
 

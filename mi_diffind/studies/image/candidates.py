@@ -234,7 +234,7 @@ def _codecs(source: Source, request: Request) -> list[_Codec]:
 
         def maps(codec: str, nbytes=nbytes):
             shares = {name: int(nbytes * v.shape[-1] / source.channels) for name, v in values.items()}
-            parts = {name: codecs.at_bytes(codec, v, shares[name])[0] for name, v in values.items()}
+            parts = {name: codecs.at_bytes(codec, v, shares[name]) for name, v in values.items()}
             return parts, sum(p.nbytes for p in parts.values())
 
         def add(name: str, kind: str, encode, access=True, asked=compression):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 
+from ...arguments import natural, positive
 from ...measure.study import Study
 
 
@@ -20,14 +21,10 @@ class SceneStudy(Study):
     of_scene = True
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--spp", type=int, help="most samples per pixel (default: the scene's; --quick: at most 4)")
-        parser.add_argument("--seed", type=int, default=0, help="seed of the random numbers (default: 0)")
-
-    def check(self, arguments) -> None:
-        for name, least in (("spp", 1), ("seed", 0)):
-            value = getattr(arguments, name)
-            if value is not None and value < least:
-                raise ValueError(f"--{name}: found {value}, at least {least} is needed")
+        parser.add_argument(
+            "--spp", type=positive, help="most samples per pixel (default: the scene's; --quick: at most 4)"
+        )
+        parser.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
 
     def run(self, arguments) -> dict:
         from ...measure.report import publish

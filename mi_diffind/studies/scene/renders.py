@@ -56,17 +56,9 @@ class Settings:
     rounds: int = 5
     quick: bool = False
 
-    def __post_init__(self):
-        if self.spp is not None and self.spp < 1:
-            raise ValueError(f"spp: found {self.spp}, at least 1 is needed")
-        if self.step < 2 or self.step & (self.step - 1):
-            raise ValueError(f"step: found {self.step}, a power of two is needed")
-        if self.passes < LEAST:
-            raise ValueError(f"passes: found {self.passes}, at least {LEAST} are needed")
-
     @classmethod
     def choose(cls, quick: bool = False, spp: int | None = None) -> Settings:
-        """For a run of minutes, or a ``quick`` one. Raises ``ValueError`` if ``spp`` is given and below 1."""
+        """For a run of minutes, or a ``quick`` one."""
         return cls(spp, 2, 8, 3, True) if quick else cls(spp)
 
     def counts(self, own: int) -> list[int]:
