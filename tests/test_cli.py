@@ -473,7 +473,7 @@ def test_bad_tasks(capsys):
         (["fit", "disney", "-o", "t.npz", "--preset", "best"], "fit disney: error: argument --preset: invalid choice"),
         (["fit", "image", "a.png", "-o", "t.npz", "--storage", "uint8"], "unrecognized arguments: --storage uint8"),
         (["fit", "disney", "-o", "t.npz", "--steps", "5", "--seconds", "5"], "not allowed with argument --steps"),
-        (["tradeoff", "nothing"], "mi-diffind tradeoff: error: argument TASK: invalid choice: 'nothing'"),
+        (["tradeoff", "nothing"], "mi-diffind tradeoff: error: argument STUDY: invalid choice: 'nothing'"),
         (["fit"], "mi-diffind fit: error: the following arguments are required: TASK"),
         (["fit", "disney", "-o", "t.npz", "--primary", "8"], "unrecognized arguments: --primary 8"),
         (["tradeoff", "scene"], "mi-diffind tradeoff scene: error: the following arguments are required: SCENE.xml"),
