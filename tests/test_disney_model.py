@@ -257,8 +257,8 @@ def test_the_layout_of_a_file_is_that_of_its_preset(tmp_path):
     assert isinstance(load_model(path, ad.TensorXf).decoder, LAYOUTS["tables"][1])
     with pytest.raises(TableError, match='holds tables of the preset "tables", "paper" was asked for'):
         TASK.open(ad.TensorXf, path, "paper")
-    save_table(path, dataclasses.replace(table, arrays={n: a for n, a in table.arrays.items() if n != "cosine"}))
-    with pytest.raises(TableError, match=r'own\.npz: the array "cosine" is missing'):
+    save_table(path, dataclasses.replace(table, arrays={n: a for n, a in table.arrays.items() if n != "masking"}))
+    with pytest.raises(TableError, match=r'own\.npz: the array "masking" is missing'):
         TASK.load(path)
     save_table(path, dataclasses.replace(table, preset="best"))
     with pytest.raises(TableError, match=r'own\.npz: holds tables of the preset "best", allowed are tables, paper'):

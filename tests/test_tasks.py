@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mi_diffind
-from mi_diffind import DifferentiableArray, DiffindError, StoredArray, TableError, found, load_model, save_table
+from mi_diffind import DifferentiableArray, DiffindError, StoredArray, TableError, load_model, save_table
 from mi_diffind.arguments import Argument
 from mi_diffind.errors import UsageError, reason
 from mi_diffind.fitting import FitSettings, Problem
@@ -60,7 +60,6 @@ def install(tmp_path, monkeypatch):
         forget()
 
     def forget():
-        found.modules.cache_clear()
         tasks.cache_clear()
 
     yield make

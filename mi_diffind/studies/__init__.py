@@ -15,4 +15,4 @@ from ..measure.study import Study
 @functools.lru_cache
 def studies() -> dict[str, Study]:
     """All studies by name: those of this package, then those that entry points add."""
-    return found.load(__name__, "STUDY", ignored=("baselines",))
+    return found.load(__name__, "STUDY", ignored=("baselines",), kind=Study)

@@ -19,6 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ...errors import DiffindError
+
 #: The 2D block sizes of ASTC, width × height, from the finest on, and their bits per texel.
 ASTC_BLOCKS = {
     f"{w}x{h}": 128 / (w * h)
@@ -45,7 +47,7 @@ _FILES = {
 }
 
 
-class CodecError(RuntimeError):
+class CodecError(DiffindError, RuntimeError):
     """A codec is not installed or cannot store an image; the message is one sentence."""
 
 

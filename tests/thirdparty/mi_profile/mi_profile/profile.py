@@ -49,7 +49,7 @@ class Profile(mi.Texture):
         if not source:
             raise RuntimeError('parameter "source": not given, a file of angles and intensities is needed')
         try:
-            return exact(measurement.read(mi.file_resolver().resolve(source)), mi.TensorXf)
+            return exact(measurement.read(str(mi.file_resolver().resolve(source))), mi.TensorXf)
         except measurement.ProfileError as e:
             raise RuntimeError(f'parameter "source": {e}') from None
 

@@ -1,0 +1,183 @@
+"""The plan of the house: floors, on which imports point down only, without a circle, whatever a module is added."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Floors, from the lowest one up. A name is a module or a whole package; the longest that fits counts. What stands on
+#: the same floor may import one another; modules of one package as they like, without a circle.
+FLOORS = (
+    ("errors", "arguments", "settings", "found", "interrupt", "files", "compat", "metrics", "runtime"),
+    ("lookup",),
+    ("indirection",),
+    ("tables",),
+    ("fitting",),
+    ("tasks",),
+    ("plugins",),
+    ("scenes", "compare", "regress", "depth", "encode", "measure"),
+    ("studies",),
+    ("commands",),
+    ("cli",),
+)
+
+#: The face of the package, which asks for what lies below it by name, when it is asked.
+FACE = "mi_diffind"
+
+
+def modules() -> dict[str, Path]:
+    """Full name → file, of all modules of the library."""
+    found = {}
+    for folder, package in ((ROOT / "mi_diffind", "mi_diffind"), (ROOT / "plugins", "mi_diffind.plugins")):
+        for path in folder.rglob("*.py"):
+            parts = path.relative_to(folder).with_suffix("").parts
+            parts = parts[:-1] if parts[-1] == "__init__" else parts
+            found[".".join((package, *parts))] = path
+    return found
+
+
+def imports(name: str, path: Path, known: dict, deferred: bool) -> set[str]:
+    """The modules of the library that one imports; ``deferred``: also those of its functions, when they are called."""
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    found = set()
+
+    def visit(node: ast.AST) -> None:
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and not deferred:
+            return
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            return
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*base, *filter(None, [node.module])])
+            for alias in node.names:
+                inside = f"{base}.{alias.name}"
+                found.add(inside if inside in known else base)
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(ast.parse(path.read_text(encoding="utf-8")))
+    return {other for other in found if other in known and other != name}
+
+
+def floor(name: str) -> int:
+    """The number of the floor that a module stands on."""
+    relative = name.removeprefix("mi_diffind.")
+    places = [(len(entry), i) for i, entries in enumerate(FLOORS) for entry in entries
+              if relative == entry or relative.startswith(f"{entry}.")]  # fmt: skip
+    assert places, f"{name} stands on no floor: say in {Path(__file__).name} on which"
+    return max(places)[1]
+
+
+def graph(deferred: bool) -> dict[str, set[str]]:
+    known = modules()
+    found = {name: imports(name, path, known, deferred) for name, path in known.items() if name != FACE}
+    return {name: others - {FACE} for name, others in found.items()}
+
+
+def test_every_module_has_its_floor():
+    assert len(modules()) > 50
+    for name in modules():
+        assert name == FACE or floor(name) >= 0
+
+
+#: Below the plugins, who registers them: when Mitsuba is there, and called by name.
+REGISTRATION = ("mi_diffind.runtime", "mi_diffind.plugins")
+
+
+def test_imports_point_down():
+    """Those in functions, too: what is deferred for speed is no way around the plan."""
+    wrong = [
+        f"{name} imports {other}"
+        for name, others in graph(deferred=True).items()
+        for other in others
+        if floor(other) > floor(name) and (name, other) != REGISTRATION
+    ]
+    assert not wrong, "\n".join(sorted(wrong))
+
+
+def test_tasks_know_nothing_of_each_other():
+    """A task may use the tasks' common modules, no other task."""
+    known = graph(deferred=True)
+    folders = {name.split(".")[2] for name in known if name.startswith("mi_diffind.tasks.") and name.count(".") > 2}
+    wrong = [
+        f"{name} imports {other}"
+        for name, others in known.items()
+        for other in others
+        if name.startswith("mi_diffind.tasks.") and other.startswith("mi_diffind.tasks.")
+        and other.split(".")[2] in folders and name.split(".")[2] != other.split(".")[2]
+    ]  # fmt: skip
+    assert len(folders) >= 3 and not wrong, "\n".join(sorted(wrong))
+
+
+def test_general_rooms_know_no_task():
+    """Nothing outside of a task's folder, its plugins and its study names it: tasks are found."""
+    known = graph(deferred=True)
+    folders = {name.split(".")[2] for name in known if name.startswith("mi_diffind.tasks.") and name.count(".") > 2}
+    rooms = {"commands", "cli", "fitting", "tables", "found", "scenes", "compare", "regress", "depth", "measure"}
+    general = [name for name in known if name.split(".")[1] in rooms]
+    general += ["mi_diffind.tasks.task", "mi_diffind.tasks.sampling", "mi_diffind.plugins", "mi_diffind.studies"]
+    wrong = [
+        f"{name} imports {other}"
+        for name in general
+        for other in known[name]
+        if other.startswith("mi_diffind.tasks.") and other.split(".")[2] in folders
+    ]
+    assert len(general) > 20 and not wrong, "\n".join(sorted(wrong))
+
+
+def circle(known: dict[str, set[str]]) -> str:
+    """A circle in a graph, "" if there is none."""
+    done, path = set(), []
+
+    def visit(name: str) -> str:
+        if name in path:
+            return " → ".join([*path[path.index(name) :], name])
+        if name in done:
+            return ""
+        path.append(name)
+        found = next(filter(None, map(visit, sorted(known.get(name, ())))), "")
+        path.pop()
+        done.add(name)
+        return found
+
+    return next(filter(None, map(visit, sorted(known))), "")
+
+
+def room(name: str) -> str:
+    """The module or package on its floor that a module belongs to; each task is a room of its own."""
+    parts = name.split(".")
+    return ".".join(parts[: 3 if parts[1] in ("tasks", "studies") else 2])
+
+
+def test_no_circles():
+    """Among modules, as they are imported; among rooms, also by what functions import when they are called."""
+    assert circle(graph(deferred=False)) == ""
+    rooms: dict[str, set[str]] = {}
+    for name, others in graph(deferred=True).items():
+        others = {other for other in others if (name, other) != REGISTRATION}
+        rooms.setdefault(room(name), set()).update(map(room, others))
+    assert circle({name: others - {name} for name, others in rooms.items()}) == ""
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == "b → c → b" and circle({"a": {"b", "c"}, "b": {"c"}}) == ""
+
+
+def test_a_wrong_import_would_be_noticed(tmp_path):
+    """The reader of imports: relative and absolute ones, of modules and of names, in functions, for types only."""
+    known = {f"mi_diffind.{name}": tmp_path for name in ("tables", "lookup", "tasks", "tasks.ggx", "tasks.task", "cli")}
+    file = tmp_path / "file.py"
+    file.write_text(
+        "from __future__ import annotations\nfrom typing import TYPE_CHECKING\nimport numpy\n"
+        "from ..lookup import clamp\nfrom . import task\n"
+        "if TYPE_CHECKING:\n    from .ggx import GGX\n"
+        "def f():\n    from mi_diffind import tables\n    import mi_diffind.cli\n"
+    )
+    direct = {"mi_diffind.lookup", "mi_diffind.tasks.task"}
+    assert imports("mi_diffind.tasks.file", file, known, False) == direct
+    assert imports("mi_diffind.tasks.file", file, known, True) == direct | {"mi_diffind.tables", "mi_diffind.cli"}
+    package = tmp_path / "__init__.py"
+    package.write_text("from .task import Task\nfrom .. import lookup\n")
+    assert imports("mi_diffind.tasks", package, known, False) == direct
+    assert floor("mi_diffind.lookup") < floor("mi_diffind.tasks.ggx.model") < floor("mi_diffind.plugins.support.tables")
+    assert floor("mi_diffind.plugins.disney") < floor("mi_diffind.compare") < floor("mi_diffind.studies.ggx")
+    assert floor("mi_diffind.studies") < floor("mi_diffind.commands.fit") < floor("mi_diffind.cli")
