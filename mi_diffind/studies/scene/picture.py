@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from pathlib import Path
 
 import numpy as np
 
 from ...measure import plot
-from ...measure.bias import practical, seconds_of
+from ...measure.bias import seconds_of
 from ...measure.words import duration, percent, rounded
 
 #: Colour and marker of each version.
@@ -91,10 +92,13 @@ def _draw(axes, result: dict, curves: dict[str, list[dict]]) -> list[plot.Label]
             axes.axhspan(low, floor, color="#7a3b8f", alpha=0.08, linewidth=0, zorder=1.5)
             name = f"bias of the approximation: none found, below {percent(floor)}"
         axes.axhline(floor, color="#7a3b8f", linewidth=1.1, zorder=2)
-        axes.annotate(name + _decibel(bias), (0, floor), (5, -3), xycoords=axes.get_yaxis_transform(), va="top",
+        name = ", ".join(filter(None, [name, _decibel(bias)]))
+        axes.annotate(name, (0, floor), (5, -3), xycoords=axes.get_yaxis_transform(), va="top",
                       textcoords="offset points", fontsize=8, color="#5e2a70")  # fmt: skip
     else:
-        axes.annotate(_far(result), (0.012, 0.02), xycoords="axes fraction", fontsize=8, color="#5e2a70", va="bottom",
+        note = " ".join(filter(None, [result["verdict"], _decibel(bias)]))
+        note = "▼ " + "\n    ".join(textwrap.wrap(note, 100))
+        axes.annotate(note, (0.012, 0.02), xycoords="axes fraction", fontsize=8, color="#5e2a70", va="bottom",
                       linespacing=1.35)  # fmt: skip
     for name, curve in curves.items():
         if not curve:
@@ -159,29 +163,5 @@ def _continued(result: dict, name: str, curve: list[dict], end: float, crossover
 
 def _decibel(bias: dict) -> str:
     if "psnr_db" in bias:
-        return f" ({bias['psnr_db']:.1f} dB)"
-    return f" (above {bias['psnr_db_above']:.1f} dB)" if bias["psnr_db_above"] is not None else ""
-
-
-def _far(result: dict) -> str:
-    """Where the bias is, if it is too far below the points to be drawn."""
-    bias, crossover = result["bias"], result["crossover"]
-    if not bias["measured"]:
-        if not bias["rmse_below"]:
-            return "▼ learned and exact renders do not differ at all"
-        limit = (
-            f"up to {rounded(crossover['spp_above'])} spp at least" if practical(crossover) else "at any sample count"
-        )
-        return (
-            f"▼ bias of the approximation: none found, below {percent(bias['rmse_below'])}{_decibel(bias)};\n"
-            f"    noise dominates {limit}"
-        )
-    if bias["rounding_only"]:
-        return f"▼ learned and exact renders differ by rounding only: {percent(bias['rmse'])}{_decibel(bias)}"
-    last = min(p["rmse"] for p in result["points"] if p["version"] == "learned")
-    below = f"{rounded(last / bias['rmse'])} times below the last point"
-    where = "below what any practical number of samples would show"
-    if practical(crossover):
-        when = f", {duration(crossover['seconds'])}" if crossover["seconds"] is not None else ""
-        where = f"the noise would equal it at {rounded(crossover['spp'])} spp{when} (extrapolated)"
-    return f"▼ bias of the approximation: {percent(bias['rmse'])}{_decibel(bias)}, {below};\n    {where}"
+        return f"PSNR {bias['psnr_db']:.1f} dB"
+    return f"PSNR above {bias['psnr_db_above']:.1f} dB" if bias["psnr_db_above"] is not None else ""
