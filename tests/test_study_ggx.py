@@ -83,10 +83,12 @@ def test_operations_of_products(ad):
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
-    """Folder and result of a smoke run."""
+    """Folder and result of a smoke run, of few steps."""
     folder = tmp_path_factory.mktemp("ggx") / "out"
     report = folder.parent / "report.json"
-    assert main(["tradeoff", "ggx", "--quick", "--out", str(folder), "--json", str(report)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(candidates, "QUICK_STEPS", 10)
+        assert main(["tradeoff", "ggx", "--quick", "--out", str(folder), "--json", str(report)]) == 0
     return folder, json.loads(report.read_text(encoding="utf-8"))
 
 

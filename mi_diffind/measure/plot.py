@@ -121,7 +121,7 @@ def log_ticks(axis, low: float, high: float, shown: Callable[[float], str]) -> N
         fine = ticks if decades > limit else fine
     axis.set_ticks([m * 10.0**e for e in range(-12, 12) for m in fine if low <= m * 10.0**e <= high])
     axis.set_major_formatter(lambda value, _: shown(value))
-    axis.set_minor_formatter(lambda value, _: "")
+    axis.minorticks_off()
 
 
 def plain(value: float) -> str:
@@ -321,10 +321,9 @@ def draw_courses(title: str, records: dict[str, dict], caption: str):
         axes.set_title(f"{name}: {record['psnr_db']:.1f} dB\n{state}{gain}", fontsize=7.5,
                        color="0.1" if record["converged"] else "#b2182b")  # fmt: skip
         axes.set_xscale("log")
+        log_ticks(axes.xaxis, *(end(step for run in runs for step in run["curve_steps"]) for end in (min, max)), plain)
         top = max(v for run in runs for v in run["curve_psnr_db"])
         axes.set_ylim(top - 20, top + 2)
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.xaxis.set_minor_formatter(lambda value, _: "")
         axes.tick_params(labelsize=6.5)
         axes.grid(color="0.92", linewidth=0.5)
     return found

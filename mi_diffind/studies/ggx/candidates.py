@@ -147,7 +147,7 @@ class _Made:
             return GGXProblem(net().alloc(self.types.TensorXf, 2, dr.rng(seed=1)), self.types, samples, encoding)
 
         name = self.name(label, encoding.inputs)
-        self.trainings.append(Training(name, problem, settings, longest, 2 if self.quick else 20))
+        self.trainings.append(Training(name, problem, settings, longest, 4 if self.quick else 20))
         return self.trainings[-1]
 
     def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
