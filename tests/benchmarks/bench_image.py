@@ -20,15 +20,16 @@ import numpy as np
 import mi_diffind  # noqa: F401
 from mi_diffind.fitting import FitSettings, _Trainer
 from mi_diffind.runtime import array_module
-from mi_diffind.sizing import Size
 from mi_diffind.tasks.image import source, training
+from mi_diffind.tasks.image.presets import PRESETS, replaced
+from mi_diffind.tasks.image.sizing import Size
 
 PRIMARY, CASCADED, SAMPLES, SIDE = 496, 12, 2**20, 1024
 
 
 def drjit_step(image: np.ndarray):
     """A function that makes a step by the paper's recipe, and waits for it."""
-    recipe = training.replaced(training.RECIPES["paper"], batch=SAMPLES, deterministic=False)
+    recipe = replaced(PRESETS["paper"], batch=SAMPLES, deterministic=False)
     size = Size(PRIMARY, PRIMARY, CASCADED, 3)
     problem = training.problem_of(source.from_arrays({"albedo": image}), size, recipe, array_module("llvm"))
     trainer = _Trainer(problem, FitSettings(batch=SAMPLES, lr=1e-3, schedule="constant", loss="mae"))
@@ -108,13 +109,15 @@ def main() -> None:
     rounds = parser.parse_args().rounds
     random = np.random.default_rng(1)
     image = random.integers(0, 255, (SIDE // 8, SIDE // 8, 3)).repeat(8, 0).repeat(8, 1).astype(np.uint8)
-    steps = {"Dr.Jit": drjit_step(image), "PyTorch": torch_step(image, False)}
+    steps = {"Dr.Jit": drjit_step(image)}
     try:
+        steps["PyTorch"] = torch_step(image, False)
         compiled = torch_step(image, True)
         compiled()
         steps["PyTorch, compiled"] = compiled
     except Exception as e:
-        print(f"torch.compile does not work here ({type(e).__name__}): left out")
+        what = "torch.compile does not work" if "PyTorch" in steps else "PyTorch is not"
+        print(f"{what} here ({type(e).__name__}): left out")
     for step in steps.values():
         for _ in range(2):
             step()

@@ -1,7 +1,7 @@
 """
 What a table read costs in each storage form, and a training step: run it, it only measures.
 
-    python tests/benchmarks/bench_lookup.py [--json FILE] [--quick] [--backend llvm|cuda]
+    python tests/benchmarks/bench_lookup.py [--json FILE] [--quick] [--variant VARIANT]
 
 Every kernel loads its coordinates from memory, reads the table, and adds up all channels into one number per block of
 lanes, so that what it writes is little and the same for all. The *floor* is the same kernel without the read: the sum
@@ -21,7 +21,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from mi_diffind import DifferentiableArray
+from mi_diffind import DifferentiableArray, compat
 from mi_diffind.lookup import STORAGES
 from mi_diffind.runtime import array_module
 
@@ -146,12 +146,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE", help="also write the numbers to this file")
     parser.add_argument("--quick", action="store_true", help="fewer reads and repetitions: less exact")
-    parser.add_argument("--backend", choices=["llvm", "cuda"], default=None, help="default: the GPU if there is one")
+    parser.add_argument("--variant", help="its backend counts (default: the GPU if there is one)")
     options = parser.parse_args()
 
-    ad = array_module(options.backend)
+    ad = array_module(options.variant)
     count, repetitions = (2**20, 5) if options.quick else (2**22, 15)
-    llvm = ".".join(map(str, dr.detail.llvm_version())) if ad.__name__.startswith("drjit.llvm") else None
+    llvm = ".".join(map(str, compat.llvm_version())) if ad.__name__.startswith("drjit.llvm") else None
     machine = {
         "backend": ad.__name__, "llvm": llvm, "threads": dr.thread_count(), "drjit": dr.__version__,
         "machine": platform.machine(), "reads": count, "repetitions": repetitions,

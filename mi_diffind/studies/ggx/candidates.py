@@ -66,7 +66,7 @@ SETTINGS = {
 }
 
 #: Those of the first run of a quick study, the longest takes twice as many.
-QUICK_STEPS = 100
+QUICK_STEPS = 80
 
 GRID = {
     "n_levels": 4, "n_features_per_level": 2, "hashmap_size": 2**12, "base_resolution": 4, "per_level_scale": 2,

@@ -200,8 +200,8 @@ def _trainings(source: Source, request: Request) -> list[_Training]:
     for compression in request.compressions:
 
         def train(name: str, recipe, seconds: float, kind="indirection", compression=compression):
-            name = f"{name} {compression:g}x {seconds:g} s"
-            jobs.append(_Training(name, kind, compression, source, recipe=recipe, seconds=seconds))
+            full, preset = f"{name} {compression:g}x {seconds:g} s", name.split()[0]
+            jobs.append(_Training(full, kind, compression, source, recipe=recipe, preset=preset, seconds=seconds))
 
         first = compression == request.compressions[0]
         for seconds in sorted(request.seconds) if first else [shortest]:
