@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import textwrap
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -18,15 +19,18 @@ import walter
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 
-from mi_diffind import compare, scenes
+from mi_diffind import compare, compat, scenes
 from mi_diffind.measure.operations import bsdf_operations
-from mi_diffind.tables import save_table
-from mi_diffind.tasks import ggx
-from mi_diffind.tasks.disney.effects import Known
+from mi_diffind.tables import StoredArray, save_table
+from mi_diffind.tasks.disney import TASK as DISNEY
+from mi_diffind.tasks.ggx import TASK
+from mi_diffind.tasks.ggx.files import encoding_of
+from mi_diffind.tasks.ggx.model import ALPHA_FLOOR
+from mi_diffind.tasks.known import Known
 
 EXACT = {"type": "roughconductor", "distribution": "ggx"}
 
-#: The learned plugin in each quality and storage form.
+#: The learned plugin in each preset and storage form.
 FORMS = {
     "tables": {"type": "neural_ggx"},
     "tables float16": {"type": "neural_ggx", "storage": "float16"},
@@ -35,7 +39,7 @@ FORMS = {
     "paper uint8": {"type": "neural_ggx", "preset": "paper", "storage": "uint8"},
 }
 
-QUALITIES = ("tables", "paper")
+PRESETS = tuple(TASK.presets)
 
 
 def rgb(*value):
@@ -118,14 +122,18 @@ def uniform(mi, rng, n):
 def roughness_of(material):
     alpha = material.get("alpha", 0.1)
     value = alpha["value"] if isinstance(alpha, dict) else alpha
-    return max(float(np.mean(value)), ggx.ALPHA_FLOOR)
+    return max(float(np.mean(value)), ALPHA_FLOOR)
 
 
 def normals(form):
     """What the tables of a form say, read by NumPy and SciPy."""
-    form = FORMS[form]
-    table, encoding = ggx.load_ggx_table(ggx.SHIPPED[form.get("preset", "tables")])
-    return walter.learned(table.to(form.get("storage", "float32")), encoding.inputs, encoding.output)
+    table = shipped(FORMS[form].get("preset", "tables"))
+    encoding = encoding_of(table)
+    return walter.learned(table.to(FORMS[form].get("storage", table.storage)), encoding.inputs, encoding.output)
+
+
+def shipped(preset):
+    return TASK.load(TASK.file(preset=preset))
 
 
 def total(value):
@@ -278,15 +286,15 @@ def test_parameters_may_be_textures(mi_any, rng, name):
 # -- sampling ----------------------------------------------------------------------------------------------------------
 
 CHI2_ALPHAS, CHI2_ANGLES = (1e-3, 0.05, 0.2, 1.0), (0, 45, 85, 87, 89)
-CHI2_COUNT = len(QUALITIES) * len(CHI2_ALPHAS) * len(CHI2_ANGLES)
+CHI2_COUNT = len(PRESETS) * len(CHI2_ALPHAS) * len(CHI2_ANGLES)
 
 
 @pytest.mark.parametrize("alpha", CHI2_ALPHAS)
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_chi2(mi_rgb, alpha, quality, tmp_path, monkeypatch):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_chi2(mi_rgb, alpha, preset, tmp_path, monkeypatch):
     """``sample`` draws from ``pdf``, however wrong the table is."""
     monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
-    bsdf = mi_rgb.load_dict({**FORMS[quality], "alpha": alpha})
+    bsdf = mi_rgb.load_dict({**FORMS[preset], "alpha": alpha})
     for angle in CHI2_ANGLES:
         messages, valid = HalfVectorSampling(mi_rgb, bsdf, angle, alpha).faults(CHI2_COUNT)
         assert not messages, (angle, messages)
@@ -411,7 +419,7 @@ def test_nothing_is_gained_at_the_horizon(mi_rgb, rng, form, textured):
         si = interactions(mi, vectors(mi, wi), np.full(len(wi), i), len(alphas))
         bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), u)
         valid, cosine = bs.pdf.numpy() > 0, np.maximum(bs.wo.z.numpy().astype(np.float64), 1e-30)
-        expected = np.where(valid, walter.smith(cosine, max(np.float32(alpha), ggx.ALPHA_FLOOR)), 0)
+        expected = np.where(valid, walter.smith(cosine, max(np.float32(alpha), ALPHA_FLOOR)), 0)
         weight = weight.x.numpy().astype(np.float64)
         assert valid.mean() > 0.5
         assert (weight <= 1.1 * expected).all(), (alpha, np.max(weight[valid] / expected[valid]))
@@ -509,16 +517,16 @@ def all_finite(mi, bsdf, si, wo, u, what):
     return value, pdf, bs, weight
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("textured", [False, True])
-def test_tables_of_anything(mi_rgb, rng, quality, textured):
+def test_tables_of_anything(mi_rgb, rng, preset, textured):
     """Entries may be wrong, and nothing else becomes so; gradients are finite where the entries are."""
     mi, n = mi_rgb, 2000
     wi, wo = extreme_directions()
     lane = rng.integers(len(wi), size=n)
     si = interactions(mi, vectors(mi, wi[lane]), lane % 3, 3)
     wo, u = vectors(mi, wo[lane]), uniform(mi, rng, n)[1]
-    bsdf = mi.load_dict({**FORMS[quality], "alpha": texels(mi, [1e-4, 0.1, 1.0]) if textured else 0.1, "eta": 0.5})
+    bsdf = mi.load_dict({**FORMS[preset], "alpha": texels(mi, [1e-4, 0.1, 1.0]) if textured else 0.1, "eta": 0.5})
     params = mi.traverse(bsdf)
     alpha = "alpha.data" if textured else "alpha.value"
     for key in ("tables.primary", "tables.cascaded"):
@@ -542,7 +550,7 @@ def test_tables_of_anything(mi_rgb, rng, quality, textured):
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono_polarized"])
-@pytest.mark.parametrize("form", QUALITIES)
+@pytest.mark.parametrize("form", PRESETS)
 def test_directions_that_are_none(rng, form, variant):
     """NaN, infinities and lengths beyond all measure: nothing is reflected, and gradients know nothing of it."""
     import mitsuba as mi
@@ -577,8 +585,8 @@ def test_directions_that_are_none(rng, form, variant):
         assert np.isfinite(params[key].grad.numpy()).all()
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_textures_beyond_the_range_are_clamped(mi_rgb, rng, quality):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_textures_beyond_the_range_are_clamped(mi_rgb, rng, preset):
     """… and NaN is the smoothest roughness that there is: each texel by itself, whatever its neighbours are."""
     mi, n = mi_rgb, 1000
     given = [2.0, float("inf"), -1.0, 0.0, float("nan"), -float("inf"), 0.3]
@@ -587,7 +595,7 @@ def test_textures_beyond_the_range_are_clamped(mi_rgb, rng, quality):
     wo, u = vectors(mi, random_directions(rng, n)), uniform(mi, rng, n)
     results = []
     for values in (given, used):
-        bsdf = mi.load_dict({**FORMS[quality], "alpha": texels(mi, values)})
+        bsdf = mi.load_dict({**FORMS[preset], "alpha": texels(mi, values)})
         bs, weight = bsdf.sample(mi.BSDFContext(), si, *u)
         results.append([v.numpy() for v in (*bsdf.eval_pdf(mi.BSDFContext(), si, wo), bs.wo, bs.pdf, weight)])
     for a, b in zip(*results, strict=True):
@@ -642,26 +650,18 @@ def test_grazing_light_renders(mi_rgb, integrator):
 # -- gradients ---------------------------------------------------------------------------------------------------------
 
 
-def shifted_table(quality, name, index, step):
+def shifted_table(preset, name, index, step):
     """The shipped tables with one entry shifted, read by NumPy and SciPy."""
-    table, encoding = ggx.load_ggx_table(ggx.SHIPPED[quality])
-    entries = table.arrays[name].astype(np.float64)
-    entries[index] += step
-    arrays = {**{k: v.astype(np.float64) for k, v in table.arrays.items()}, name: entries}
-
-    class Shifted:
-        def __init__(self):
-            self.arrays = arrays
-
-        def values(self, name):
-            return arrays[name]
-
-    return walter.learned(Shifted(), encoding.inputs, encoding.output)
+    table = shipped(preset)
+    entries = {k: array.values.astype(np.float64) for k, array in table.arrays.items()}
+    entries[name][index] += step
+    encoding, arrays = encoding_of(table), {k: SimpleNamespace(values=v) for k, v in entries.items()}
+    return walter.learned(SimpleNamespace(arrays=arrays), encoding.inputs, encoding.output)
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("textured", [False, True])
-def test_gradients_equal_central_differences(mi_rgb, rng, quality, textured):
+def test_gradients_equal_central_differences(mi_rgb, rng, preset, textured):
     """
     Of value and weight, with respect to everything, against differences of Walter's formulas in double precision, with
     the table read by SciPy. The density is detached: the gradient of a weight is that of the value, over the density.
@@ -670,13 +670,13 @@ def test_gradients_equal_central_differences(mi_rgb, rng, quality, textured):
     wi, wo = directions(rng, n, alpha, 0.1)
     given = [texels(mi, [v] * 2) if textured else v for v in (alpha, eta, k, factor)]
     names = ("alpha", "eta", "k", "specular_reflectance")
-    bsdf = mi.load_dict({**FORMS[quality], **dict(zip(names, given, strict=True))})
+    bsdf = mi.load_dict({**FORMS[preset], **dict(zip(names, given, strict=True))})
     params = mi.traverse(bsdf)
     keys = [f"{name}.{'data' if textured else 'value'}" for name in names] + ["tables.primary", "tables.cascaded"]
     si = interactions(mi, vectors(mi, wi), np.arange(n) % 2, 2)
     sampled = bsdf.sample(mi.BSDFContext(), si, *uniform(mi, np.random.default_rng(1), n))[0]
     usable = sampled.pdf.numpy() > 0
-    parameters, table = {"alpha": alpha, "eta": eta, "k": k, "specular_reflectance": factor}, normals(quality)
+    parameters, table = {"alpha": alpha, "eta": eta, "k": k, "specular_reflectance": factor}, normals(preset)
     steps = {"alpha": 1e-6, "eta": 1e-4, "k": 1e-4, "specular_reflectance": 1e-3}
     for what, out in {"value": wo, "weight": sampled.wo.numpy().T}.items():
         for key in keys:
@@ -702,7 +702,7 @@ def test_gradients_equal_central_differences(mi_rgb, rng, quality, textured):
             gradient = params[f"tables.{name}"].grad.numpy()
             largest = np.argsort(-np.abs(gradient).ravel())[:4]
             for index in zip(*np.unravel_index(largest, gradient.shape), strict=True):
-                up, down = (reference(shifted_table(quality, name, index, sign * 1e-5)) for sign in (1, -1))
+                up, down = (reference(shifted_table(preset, name, index, sign * 1e-5)) for sign in (1, -1))
                 assert gradient[index] == pytest.approx((up - down) / 2e-5, rel=0.02), (what, name, index)
         for key in keys:
             dr.disable_grad(params[key])
@@ -748,11 +748,11 @@ def test_the_derivative_of_the_roughness_against_the_exact_one(mi_rgb, rng):
         assert error.mean() <= mean * size and related >= correlation
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_gradients_with_respect_to_directions(mi_rgb, rng, quality):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_gradients_with_respect_to_directions(mi_rgb, rng, preset):
     """As a moving light or shape asks for them: against differences along great circles, and finite at the extremes."""
     mi, n, alpha, step = mi_rgb, 10_000, 0.2371, 1e-6
-    bsdf = mi.load_dict({**FORMS[quality], "alpha": alpha, "eta": 0.6, "k": 2.3})
+    bsdf = mi.load_dict({**FORMS[preset], "alpha": alpha, "eta": 0.6, "k": 2.3})
 
     def gradients(wi, wo):
         attached = [vectors(mi, w) for w in (wi, wo)]
@@ -768,7 +768,7 @@ def test_gradients_with_respect_to_directions(mi_rgb, rng, quality):
         for sign in (1, 0, -1):
             moved = list(pair)
             moved[which] = math.cos(sign * step) * pair[which] + math.sin(sign * step) * tangent
-            values.append(walter.conductor(*moved, alpha, 0.6, 2.3, normals(quality)))
+            values.append(walter.conductor(*moved, alpha, 0.6, 2.3, normals(preset)))
         forward, backward = (values[0] - values[1]) / step, (values[1] - values[2]) / step
         expected, scale = (forward + backward) / 2, np.abs(gradient).max(axis=1) + 1e-2 * values[1].max()
         smooth = np.abs(forward - backward) <= 1e-3 * scale  # no edge of a cell in between
@@ -856,11 +856,11 @@ def test_the_roughness_is_recovered_from_an_image(mi_rgb, target, start):
     assert np.mean(found[-10:]) == pytest.approx(target, rel=0.05)
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_optimised_tables_stay_finite(mi_rgb, rng, quality):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_optimised_tables_stay_finite(mi_rgb, rng, preset):
     """300 steps with a learning rate that throws entries out of their range, in which the loss falls nevertheless."""
     mi, n = mi_rgb, 4096
-    bsdf = mi.load_dict({**FORMS[quality], "alpha": texels(mi, [1e-4, 1e-3, 0.05, 0.3, 1.0])})
+    bsdf = mi.load_dict({**FORMS[preset], "alpha": texels(mi, [1e-4, 1e-3, 0.05, 0.3, 1.0])})
     params = mi.traverse(bsdf)
     keys = ["tables.primary", "tables.cascaded"]
     params["tables.cascaded"] = params["tables.cascaded"] * 0 + 0.5
@@ -1050,17 +1050,16 @@ def test_own_tables(mi_rgb, rng, tmp_path):
     mi = mi_rgb
     wi, wo = directions(rng, 1000, 0.3)
     si, wo = interactions(mi, vectors(mi, wi)), vectors(mi, wo)
-    for quality in QUALITIES:
-        table, _ = ggx.load_ggx_table(ggx.SHIPPED[quality])
-        save_table(tmp_path / "own.npz", table.to("uint8"))
+    for preset in PRESETS:
+        save_table(tmp_path / "own.npz", shipped(preset).to("uint8"))
         (tmp_path / "m.xml").write_text(
             '<bsdf version="3.0.0" type="neural_ggx"><string name="filename" value="own.npz"/></bsdf>'
         )
         own = mi.load_file(str(tmp_path / "m.xml"))
-        assert f"preset = {quality}, 576 bytes as uint8" in str(own)
+        assert f"preset = {preset}, 576 bytes as uint8" in str(own)
         report = own.report()
-        assert (report["preset"], report["storage"], report["table_bytes"]) == (quality, "uint8", 576)
-        expected = mi.load_dict({**FORMS[quality], "storage": "uint8"}).eval(mi.BSDFContext(), si, wo).numpy()
+        assert (report["preset"], report["storage"], report["table_bytes"]) == (preset, "uint8", 576)
+        expected = mi.load_dict({**FORMS[preset], "storage": "uint8"}).eval(mi.BSDFContext(), si, wo).numpy()
         np.testing.assert_array_equal(own.eval(mi.BSDFContext(), si, wo).numpy(), expected)
 
 
@@ -1114,10 +1113,10 @@ def test_roughness_updated_inside_a_frozen_function(mi_rgb, no_garbage_collectio
 
 @pytest.mark.parametrize("integrator", ["path", "prb", "direct"])
 def test_several_materials_in_one_loop(mi_rgb, tmp_path, integrator):
-    """Each sphere looks as where all of them are alike: other roughness, storage, quality, tables, a texture."""
+    """Each sphere looks as where all of them are alike: other roughness, storage, preset, tables, a texture."""
     mi = mi_rgb
-    table, _ = ggx.load_ggx_table(ggx.SHIPPED["tables"])
-    table.arrays["cascaded"] = table.arrays["cascaded"] * np.float32(0.9)
+    table = shipped("tables")
+    table.arrays["cascaded"] = StoredArray(table.arrays["cascaded"].values * np.float32(0.9))
     save_table(tmp_path / "own.npz", table)
     bsdfs = [
         {**FORMS["tables"], "alpha": 0.1, "material": "Cu"},
@@ -1188,13 +1187,13 @@ def test_a_back_side_is_black_unless_it_is_twosided(mi_rgb):
 
 
 def test_two_hundred_materials(mi_rgb, rng):
-    """Presets, numbers, textures, qualities, storage forms: some of them against scenes in which they are alone."""
+    """Metals, numbers, textures, presets, storage forms: some of them against scenes in which they are alone."""
     mi, count, columns = mi_rgb, 200, 15
-    presets, forms = ("none", "Cu", "Au", "Al", "Ag"), list(FORMS.values())
+    metals, forms = ("none", "Cu", "Au", "Al", "Ag"), list(FORMS.values())
     bsdfs = []
     for _ in range(count):
         alpha = float(rng.uniform(0.1, 1)) if rng.random() < 0.7 else bitmap(mi, rng.uniform(0.1, 1, (2, 2)))
-        m = {"alpha": alpha, "material": presets[rng.integers(len(presets))]}
+        m = {"alpha": alpha, "material": metals[rng.integers(len(metals))]}
         if rng.random() < 0.5:
             m["specular_reflectance"] = rgb(*rng.random(3).tolist())
         bsdfs.append({**forms[rng.integers(len(forms))], **m})
@@ -1490,15 +1489,15 @@ def test_bad_parameters_are_refused(mi_rgb, parameters, sentence):
     with pytest.raises(RuntimeError) as caught:
         mi_rgb.load_dict({"type": "neural_ggx", **parameters})
     assert sentence in str(caught.value)
-    assert sentence in scenes.one_sentence(caught.value)
-    assert "\n" not in scenes.one_sentence(caught.value)
+    assert sentence in compat.one_sentence(caught.value)
+    assert "\n" not in compat.one_sentence(caught.value)
 
 
 def test_bad_files_are_refused(mi_rgb, tmp_path):
-    disney = ggx.SHIPPED["tables"].with_name("disney_tables.npz")
+    disney = DISNEY.file()
     with pytest.raises(RuntimeError, match=r'disney_tables\.npz: holds tables for the task "disney", expected "ggx"'):
         mi_rgb.load_dict({"type": "neural_ggx", "filename": str(disney)})
-    own = {"type": "neural_ggx", "filename": str(ggx.SHIPPED["paper"]), "preset": "tables"}
+    own = {"type": "neural_ggx", "filename": str(TASK.file(preset="paper")), "preset": "tables"}
     with pytest.raises(RuntimeError, match='holds tables of the preset "paper", "tables" was asked for'):
         mi_rgb.load_dict(own)
 

@@ -19,14 +19,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from mi_diffind import compare, scenes, sizing
+from mi_diffind import compare, compat, scenes
 from mi_diffind.measure.operations import bsdf_operations, count
-from mi_diffind.tables import Table, load_table, save_table
-from mi_diffind.tasks import ggx
-from mi_diffind.tasks.image import training
-from mi_diffind.tasks.image.compressed import CompressedImage, load_image_table
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import StoredArray, Table, load_table, save_table
+from mi_diffind.tasks.ggx import TASK as GGX
+from mi_diffind.tasks.image import TASK, sizing, training
+from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.image.layout import Layout, MapLayout
+from mi_diffind.tasks.image.presets import PRESETS, replaced
 from mi_diffind.tasks.image.source import from_arrays, load_source
+from mi_diffind.tasks.task import Request
 
 WIDTH, HEIGHT = 12, 10
 
@@ -58,7 +61,7 @@ WRAP_MODES = ("repeat", "mirror", "clamp")
 def make(path, layout=LAYOUT, border=("repeat", "clamp"), seed=1, shape=(8, 9), side=4, spread=(0, 255), coarse=False):
     """A file of random arrays, the primary of 6 bits; ``coarse``: one of its two channels is in an array of its own."""
     rng = np.random.default_rng(seed)
-    table = Table("image", {}, "uint8", settings={"layout": layout.to_json()}, seed=0)
+    table = Table("image", {}, settings={"layout": layout.to_json()})
     if layout.stored:
         arrays = {
             "primary": rng.integers(0, 63, (*shape, 2), np.uint8, endpoint=True),
@@ -68,12 +71,9 @@ def make(path, layout=LAYOUT, border=("repeat", "clamp"), seed=1, shape=(8, 9), 
             arrays["coarse"] = arrays["primary"][::2, ::2, 1:].copy()
             arrays["primary"] = arrays["primary"][..., :1].copy()
         for name, array in arrays.items():
-            steps, channels = 255 if name == "cascaded" else 63, array.shape[-1]
-            table.arrays[name] = array
-            table.quantization[name] = ((1 / steps,) * channels, (0.0,) * channels)
-            table.borders[name] = ("clamp", "clamp") if name == "cascaded" else border
-            if name != "cascaded":
-                table.bits[name] = 6
+            around, bits = (("clamp", "clamp"), 8) if name == "cascaded" else (border, 6)
+            affine = ((1 / (2**bits - 1),) * array.shape[-1], (0.0,) * array.shape[-1])
+            table.arrays[name] = StoredArray(array, around, *affine, bits)
     save_table(path, table)
     return str(path)
 
@@ -82,6 +82,17 @@ def single(kind, color_space="linear", channels=3):
     """A layout of one map."""
     one = MapLayout("image", kind, color_space, 1, tuple(range(channels)))
     return Layout(WIDTH, HEIGHT, (one,), (0.5,) * channels, ("image",) * channels)
+
+
+def trained(source, size, batch):
+    """The table of a short training."""
+    recipe = replaced(PRESETS["ours"], steps=60, batch=batch, measure_every=60)
+    request = Request("ours", recipe.settings, array_module("llvm"), progress=False)
+    return training.fit_image(source, size, recipe, request)[0]
+
+
+def layout_of(file):
+    return Layout.from_json(TASK.load(file).settings["layout"])
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +109,7 @@ def smooth(tmp_path_factory):
     image = np.rint(255 * np.stack(waves, axis=-1)).astype(np.uint8)
     source = from_arrays({"image": image})
     size = sizing.fit_bytes(10000, 3, 48, 64, 4, 4, 6)
-    recipe = training.replaced(training.RECIPES["ours"], steps=60, batch=2**11, quality_every=60)
-    table, _ = training.fit_image(source, size, recipe, backend="llvm", progress=False)
-    save_table(folder / "smooth.npz", table)
+    save_table(folder / "smooth.npz", trained(source, size, 2**11))
     return str(folder / "smooth.npz"), image
 
 
@@ -109,13 +118,12 @@ def plugin(file, channels="albedo", **more):
 
 
 def decoded(mi, file):
-    table, _ = load_image_table(file)
-    return CompressedImage.from_table(table, mi.TensorXf).decode()
+    return CompressedImage.of(TASK.load(file), mi.TensorXf).decode()
 
 
 def counterpart(mi, file, channels="albedo", **more):
     """``bitmap`` with the image that the file decodes to."""
-    _, layout = load_image_table(file)
+    layout = layout_of(file)
     bitmap = mi.Bitmap(np.ascontiguousarray(decoded(mi, file)[channels]))
     bitmap.set_srgb_gamma(layout[channels].color_space == "srgb")
     raw = {"raw": True} if channels in ("normal", "roughness", "metallic") else {}
@@ -148,7 +156,7 @@ def attempt(function, *args):
 
 
 def sentence(error):
-    text = scenes.one_sentence(error)
+    text = compat.one_sentence(error)
     assert "Traceback" not in text and len(text) < 350, text
     return text
 
@@ -188,7 +196,7 @@ def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng, name):
     assert ours.is_spatially_varying() == (name not in ("metallic", "flat"))
     assert clipped or abs(float(ours.mean()[0]) - float(theirs.mean()[0])) < 2e-5
     largest = dr.max(mi.traverse(mi.load_dict(counterpart(mi, file, name, raw=True)))["data"].array)[0]
-    if ours.raw or load_image_table(file)[1][name].color_space == "linear":
+    if ours.raw or layout_of(file)[name].color_space == "linear":
         assert ours.max() == pytest.approx(float(largest), rel=1e-5)
     else:
         assert ours.max() == pytest.approx(float(dr.srgb_to_linear(largest)), rel=1e-5)
@@ -251,18 +259,15 @@ def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, bord
     """Anywhere, by SciPy in double precision."""
     mi = mi_rgb
     path = make(tmp_path / "a.npz", border=border, seed=3)
-    table, _ = load_image_table(path)
+    arrays = TASK.load(path).arrays
     u, v = rng.random((2, 3000)).astype(np.float32).astype(np.float64)
-    x = [
-        t * (n if b == "repeat" else n - 1)
-        for t, n, b in zip((v, u), table.arrays["primary"].shape, border, strict=False)
-    ]
-    primary = table.arrays["primary"] / 63
+    x = [t * (n if b == "repeat" else n - 1) for t, n, b in zip((v, u), arrays["primary"].shape, border, strict=False)]
+    primary = arrays["primary"].entries / 63
     for axis, b in enumerate(border):
         if b == "repeat":
             primary = np.concatenate([primary, np.take(primary, [0], axis)], axis)
     pointer = [map_coordinates(primary[..., k], x, order=1) * 3 for k in range(2)]
-    stored = [map_coordinates(table.arrays["cascaded"][..., k] / 255, pointer, order=1) for k in range(7)]
+    stored = [map_coordinates(arrays["cascaded"].entries[..., k] / 255, pointer, order=1) for k in range(7)]
     si = interactions(mi, u, v)
     s = np.stack(stored[:3])
     albedo = np.where(s < 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
@@ -756,7 +761,7 @@ BAD = {
     "missing file": (lambda f: plugin("/nowhere/a.npz"), 'parameter "filename": /nowhere/a.npz: no such file'),
     "a folder": (lambda f: plugin(os.path.dirname(f)), "is a folder, a table file"),
     "not an archive": (lambda f: plugin(__file__), "not a table file"),
-    "another task": (lambda f: plugin(str(ggx.SHIPPED["tables"])), 'parameter "filename": '),
+    "another task": (lambda f: plugin(str(GGX.file())), 'parameter "filename": '),
     "unknown map": (lambda f: plugin(f, "depth"), 'parameter "channels": found "depth", the file holds albedo, normal'),
     "two channels": (lambda f: plugin(f, "pair"), '"pair" has 2 channels, a texture has 1 or 3'),
     "wrap mode": (lambda f: plugin(f, wrap_mode="tile"), 'parameter "wrap_mode": found "tile", allowed are repeat'),
@@ -833,9 +838,7 @@ def material(tmp_path_factory):
     maps = {"albedo": "albedo.png", "roughness": {"file": "orm.png", "channels": "g"}}
     (folder / "wall.json").write_text(json.dumps(maps))
     source = load_source(folder / "wall.json")
-    recipe = training.replaced(training.RECIPES["ours"], steps=60, batch=2**10, quality_every=60)
-    size = sizing.fit_bytes(2300, 4, 16, 16, 4, 4, 6)
-    table, _ = training.fit_image(source, size, recipe, backend="llvm", progress=False)
+    table = trained(source, sizing.fit_bytes(2300, 4, 16, 16, 4, 4, 6), 2**10)
     table.settings["source_path"] = "wall.json"
     save_table(folder / "wall.npz", table)
     textures = texture_xml("base_color", "wall.npz", channels="albedo") + texture_xml(

@@ -25,7 +25,7 @@ def test_scene_as_written_and_exact(mi_rgb, name):
     assert result.figures["psnr_db"] > 75
     assert result.figures["flip"] < 0.003
     assert result.figures["learned_plugins"] == (60 if name == "materials" else 9)
-    assert result.figures["table_bytes"] == 512
+    assert result.figures["table_bytes"] == 384
 
 
 #: Materials without ids, one of them inside another beside one that has an id, and a texture.
@@ -94,7 +94,7 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
     assert 0.96 < result.figures["brightness"] < 1 and result.figures["psnr_db"] > 30
     assert result.figures["replaced_plugins"] == 1 and result.figures["against"] == "principled"
     assert (result.figures["learned_plugins"], result.figures["table_bytes"]) == (
-        (0, 0) if name == "disney" else (1, 512)
+        (0, 0) if name == "disney" else (1, 384)
     )
     paths = compare.write(result, tmp_path)
     assert paths["principled"].endswith("principled.exr") and Path(paths["figure"]).is_file()
