@@ -3,6 +3,7 @@ The plugin ``neural_ggx`` inside Mitsuba: against its exact counterpart and an i
 hardest, and under what scenes do to a material.
 """
 
+import functools
 import gc
 import itertools
 import math
@@ -16,6 +17,7 @@ import drjit as dr
 import numpy as np
 import pytest
 import walter
+from conftest import VARIANTS, _set
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 
@@ -40,6 +42,8 @@ FORMS = {
 }
 
 PRESETS = tuple(TASK.presets)
+
+SLOW = pytest.mark.slow
 
 
 def rgb(*value):
@@ -155,20 +159,34 @@ def tile(image, i, columns, size):
 # -- values ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("material", list(MATERIALS))
-def test_the_exact_plugin_times_what_the_table_says(mi_any, rng, material):
+#: A colour in the place of a number, which would depend on the wavelength; and whether the variant is spectral.
+IMPOSSIBLE = ("a grey roughness", True)
+
+#: Each of these is a way of its own through colours and polarisation, the others are not.
+COLOURED = ("white", "copper", "a coloured index", "tinted", "a grey roughness")
+
+
+@pytest.mark.parametrize(
+    "variant, material",
+    [
+        (variant, material)
+        for variant in VARIANTS
+        for material in MATERIALS
+        if variant.endswith("ad_rgb") or (material in COLOURED and (material, "spectral" in variant) != IMPOSSIBLE)
+    ],
+)
+def test_the_exact_plugin_times_what_the_table_says(variant, rng, material):
     """
     Value and weight are those of ``roughconductor`` times D̂/D, which NumPy and SciPy read in the table file: everything
     but the distribution is equal up to rounding, Mueller matrices included. Samples and densities are equal.
     """
-    mi, m, n = mi_any, MATERIALS[material], 10_000
-    if material == "a grey roughness" and mi.is_spectral:
-        pytest.skip("a colour in the place of a number depends on the wavelength")
+    mi, m, n = _set(variant), MATERIALS[material], 10_000
     alpha = roughness_of(m)
     wi, wo = directions(rng, n, alpha)
     si, u = interactions(mi, vectors(mi, wi)), uniform(mi, rng, n)
     exact, learned = mi.load_dict({**EXACT, **m}), mi.load_dict({**FORMS["tables"], **m})
-    for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
+    modes = (mi.TransportMode.Radiance, mi.TransportMode.Importance)
+    for mode in modes if mi.is_polarized or material == "copper" else modes[:1]:
         ctx = mi.BSDFContext()
         ctx.mode = mode
         bs, weight = exact.sample(ctx, si, *u)
@@ -227,9 +245,12 @@ def test_the_independent_conductor(mi_rgb, rng, form, textured):
     assert error.max() < bound and np.quantile(error, 0.99) < bound / 2
 
 
-@pytest.mark.parametrize("form", list(FORMS))
-def test_eval_pdf_and_sample_agree_in_every_context(mi_any, rng, form):
-    mi, n = mi_any, 2000
+@pytest.mark.parametrize(
+    "variant, form", [(v, form) for v in VARIANTS for form in FORMS if v.endswith("ad_rgb") or form == "tables"]
+)
+def test_eval_pdf_and_sample_agree_in_every_context(variant, rng, form):
+    """What is read is a number in all variants: the forms differ in none that they do not differ in by RGB."""
+    mi, n = _set(variant), 2000
     wi, wo = random_directions(rng, n), random_directions(rng, n)
     wi[::50, 2] *= -1
     wo[::31, 2] *= -1
@@ -289,10 +310,16 @@ CHI2_ALPHAS, CHI2_ANGLES = (1e-3, 0.05, 0.2, 1.0), (0, 45, 85, 87, 89)
 CHI2_COUNT = len(PRESETS) * len(CHI2_ALPHAS) * len(CHI2_ANGLES)
 
 
-@pytest.mark.parametrize("alpha", CHI2_ALPHAS)
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(
+    "preset, alpha",
+    [
+        *(("tables", alpha) for alpha in CHI2_ALPHAS),
+        ("paper", 0.2),
+        *(pytest.param("paper", alpha, marks=SLOW) for alpha in CHI2_ALPHAS if alpha != 0.2),
+    ],
+)
 def test_chi2(mi_rgb, alpha, preset, tmp_path, monkeypatch):
-    """``sample`` draws from ``pdf``, however wrong the table is."""
+    """``sample`` draws from ``pdf``, however wrong the table is: neither reads it."""
     monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
     bsdf = mi_rgb.load_dict({**FORMS[preset], "alpha": alpha})
     for angle in CHI2_ANGLES:
@@ -328,11 +355,13 @@ def test_chi2_has_power(mi_rgb, alpha, angle, tmp_path, monkeypatch):
         assert right.faults(CHI2_COUNT, pdf)[0], what
 
 
-def half_vector_grid(mi, alphas, angles, side=128):
+@functools.lru_cache
+def half_vector_grid(alphas, angles, side=128):
     """
-    A grid of half vectors around the normal, for each roughness and angle of incidence: directions in and out, the
-    solid angle of ``wo`` that a point stands for, and the number of its roughness. The polar axis is that on which a
-    lobe of any width is smooth.
+    A grid of half vectors around the normal, for each roughness and angle of incidence: directions in and out (up where
+    there is none above the horizon), the solid angle of ``wo`` that a point stands for (then 0), the number of its
+    roughness, and value and density of the exact conductor. The polar axis is that on which a lobe of any width is
+    smooth.
     """
     t, phi = (np.arange(side) + 0.5) / side, 2 * np.pi * (np.arange(side) + 0.5) / side
     wi, wo, weight = [], [], []
@@ -348,27 +377,28 @@ def half_vector_grid(mi, alphas, angles, side=128):
         wo.append(2 * wi_h[:, None] * h - w)
         weight.append(np.where(wi_h > 0, 4 * wi_h * np.repeat(solid, side), 0))
     lane = np.repeat(np.arange(len(alphas)), len(angles) * side**2)
-    return np.concatenate(wi), np.concatenate(wo), np.concatenate(weight), lane
+    wi, wo, solid = (np.concatenate(v) for v in (wi, wo, weight))
+    above = (wo[:, 2] > 0) & (solid > 0)
+    wo, solid = np.where(above[:, None], wo, [0, 0, 1]), np.where(above, solid, 0)
+    exact = [f(wi, wo, np.array(alphas)[lane]) for f in (walter.conductor, walter.density)]
+    return wi, wo, solid, lane, *exact
 
 
 @pytest.mark.parametrize("form", ["tables", "tables float16", "tables uint8", "paper"])
 def test_energy(mi_rgb, rng, form):
     """
     By quadrature over half vectors, independent of sampling: the density integrates to what that of the exact conductor
-    does, and to the share of samples above the horizon; the value to the mean weight, which is within 0.02 of what is
-    reflected exactly, and no more than 1.03.
+    does, and to the share of samples above the horizon; the value to the mean weight, which is within 0.012 of what is
+    reflected exactly (of bytes 0.016), and no more than 1.015.
     """
     mi, n = mi_rgb, 2**14
-    alphas, angles = [0.001, 0.003, 0.01, 0.03, 0.07, 0.15, 0.3, 0.6, 1.0], (0, 30, 60, 75, 84, 88)
+    alphas, angles = (0.001, 0.003, 0.01, 0.03, 0.07, 0.15, 0.3, 0.6, 1.0), (0, 30, 60, 75, 84, 88)
     k, a = len(alphas), len(angles)
     bsdf = mi.load_dict({**FORMS[form], "alpha": texels(mi, alphas)})
-    wi, wo, solid, lane = half_vector_grid(mi, alphas, angles)
-    above = (wo[:, 2] > 0) & (solid > 0)
-    wo_ = np.where(above[:, None], wo, [0, 0, 1])
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interactions(mi, vectors(mi, wi), lane, k), vectors(mi, wo_))
-    exact = (f(wi, wo_, np.array(alphas)[lane]) for f in (walter.conductor, walter.density))
+    wi, wo, solid, lane, *exact = half_vector_grid(alphas, angles)
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interactions(mi, vectors(mi, wi), lane, k), vectors(mi, wo))
     albedo, area, expected, expected_area = (
-        np.sum(np.where(above, v * solid, 0).reshape(k, a, -1), axis=2)
+        np.sum((v * solid).reshape(k, a, -1), axis=2)
         for v in (value.numpy()[0].astype(np.float64), pdf.numpy().astype(np.float64), *exact)
     )
 
@@ -392,8 +422,8 @@ def test_energy(mi_rgb, rng, form):
         np.testing.assert_allclose(mean[-3:], albedo[-3:], atol=0.01)
     else:
         np.testing.assert_allclose(mean, albedo, atol=0.01)
-        assert error.max() <= (0.03 if form == "tables uint8" else 0.02)
-        assert max(albedo.max(), mean.max()) <= 1.03
+        assert error.max() <= (0.016 if form == "tables uint8" else 0.012)
+        assert max(albedo.max(), mean.max()) <= 1.015
         assert weight.numpy().max() < 5
 
 
@@ -454,7 +484,7 @@ def extreme_directions():
     [
         *((form, "llvm_ad_rgb") for form in FORMS),
         ("tables", "llvm_ad_mono_polarized"),
-        ("paper", "llvm_ad_mono_polarized"),
+        pytest.param("paper", "llvm_ad_mono_polarized", marks=SLOW),
     ],
 )
 def test_extreme_inputs(form, variant):
@@ -735,7 +765,7 @@ def test_the_derivative_of_the_roughness_against_the_exact_one(mi_rgb, rng):
 
     expected = elasticity(exact)
     found = elasticity(mi.load_dict({**FORMS["tables"], "alpha": texels(mi, alphas)}))
-    bars = {(0.001, 0.01): (0.2, 0.9), (0.01, 0.1): (0.12, 0.97), (0.1, 0.5): (0.08, 0.98), (0.5, 1.0): (0.15, 0.95)}
+    bars = {(0.001, 0.01): (0.15, 0.95), (0.01, 0.1): (0.1, 0.985), (0.1, 0.5): (0.05, 0.995), (0.5, 1.0): (0.12, 0.95)}
     for (low, high), (mean, correlation) in bars.items():
         band = (alphas[texel][used] >= low) & (alphas[texel][used] <= high)
         a, b = found[band], expected[band]
@@ -829,7 +859,9 @@ def test_gradients_through_render(mi_rgb, integrator):
         assert e < 0.3 * abs(y), (key, x, y, e)  # or the comparison would say nothing
 
 
-@pytest.mark.parametrize("target, start", [(0.25, 0.6), (0.6, 0.2), (0.1, 0.3)])
+@pytest.mark.parametrize(
+    "target, start", [(0.25, 0.6), pytest.param(0.6, 0.2, marks=SLOW), pytest.param(0.1, 0.3, marks=SLOW)]
+)
 def test_the_roughness_is_recovered_from_an_image(mi_rgb, target, start):
     """Within 5% in 60 steps, none of which compiles after the first few; the image is that of the exact plugin."""
     mi = mi_rgb
@@ -914,8 +946,15 @@ def test_tables_keep_their_gradients_where_the_roughness_is_constant(mi_rgb, rng
 # -- parameters that change --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", ["tables", "tables uint8", "paper"])
-@pytest.mark.parametrize("kind", ["number", "bitmap"])
+@pytest.mark.parametrize(
+    "kind, form",
+    [
+        ("number", "tables"),
+        ("number", "tables uint8"),
+        ("bitmap", "tables"),
+        *(pytest.param(*case, marks=SLOW) for case in (("number", "paper"), ("bitmap", "tables uint8"))),
+    ],
+)
 def test_updated_parameters_show_in_the_next_image(mi_rgb, form, kind):
     """Each image is that of a scene loaded so: also what was left out at 1, and a metal that was none."""
     mi = mi_rgb
@@ -1186,9 +1225,10 @@ def test_a_back_side_is_black_unless_it_is_twosided(mi_rgb):
         assert (image[4:12, 4:12].max() == 0) == black
 
 
-def test_two_hundred_materials(mi_rgb, rng):
+@pytest.mark.parametrize("count", [50, pytest.param(200, marks=SLOW)])
+def test_many_materials(mi_rgb, rng, count):
     """Metals, numbers, textures, presets, storage forms: some of them against scenes in which they are alone."""
-    mi, count, columns = mi_rgb, 200, 15
+    mi, columns = mi_rgb, math.ceil(math.sqrt(count))
     metals, forms = ("none", "Cu", "Au", "Al", "Ag"), list(FORMS.values())
     bsdfs = []
     for _ in range(count):
@@ -1204,7 +1244,7 @@ def test_two_hundred_materials(mi_rgb, rng):
     assert np.isfinite(image).all() and image.min() >= 0
     assert np.array_equal(image, mi.render(scene, spp=4).numpy())
     black = mi.load_dict({"type": "diffuse", "reflectance": 0.0})
-    for i in (0, 123, 199):
+    for i in (0, count // 2, count - 1):
         alone = [bsdfs[i] if j == i else black for j in range(count)]
         expected = mi.render(sphere_scene(mi, alone, "direct", size, columns), spp=4).numpy()
         assert equal_images(tile(image, i, columns, 4), tile(expected, i, columns, 4)), bsdfs[i]
@@ -1426,9 +1466,8 @@ def test_a_scene_and_its_exact_counterpart(mi_rgb, scene_file):
 
 def test_comparison(mi_rgb, scene_file):
     result = compare.compare(scene_file, spp=64, passes=2, progress=False)
-    print({k: v for k, v in result.figures.items() if k in ("psnr_db", "flip", "mae")})
-    assert result.figures["psnr_db"] >= 45
-    assert result.figures["flip"] < 0.02
+    assert result.figures["psnr_db"] >= 60  # 62.7 is reached
+    assert result.figures["flip"] < 0.007
     assert result.figures["learned_plugins"] == 3
     assert result.figures["table_bytes"] == 2304 + 576  # the same file in two forms
 
