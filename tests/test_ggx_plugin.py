@@ -3,6 +3,7 @@ The plugin ``neural_ggx`` inside Mitsuba: against its exact counterpart and an i
 hardest, and under what scenes do to a material.
 """
 
+import functools
 import gc
 import itertools
 import math
@@ -10,23 +11,28 @@ import re
 import subprocess
 import sys
 import textwrap
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
 import pytest
 import walter
+from conftest import VARIANTS, _set
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 
-from mi_diffind import compare, scenes
+from mi_diffind import compare, compat, scenes
 from mi_diffind.measure.operations import bsdf_operations
-from mi_diffind.tables import save_table
-from mi_diffind.tasks import ggx
-from mi_diffind.tasks.disney.effects import Known
+from mi_diffind.tables import StoredArray, save_table
+from mi_diffind.tasks.disney import TASK as DISNEY
+from mi_diffind.tasks.ggx import TASK
+from mi_diffind.tasks.ggx.files import encoding_of
+from mi_diffind.tasks.ggx.model import ALPHA_FLOOR
+from mi_diffind.tasks.known import Known
 
 EXACT = {"type": "roughconductor", "distribution": "ggx"}
 
-#: The learned plugin in each quality and storage form.
+#: The learned plugin in each preset and storage form.
 FORMS = {
     "tables": {"type": "neural_ggx"},
     "tables float16": {"type": "neural_ggx", "storage": "float16"},
@@ -35,7 +41,9 @@ FORMS = {
     "paper uint8": {"type": "neural_ggx", "preset": "paper", "storage": "uint8"},
 }
 
-QUALITIES = ("tables", "paper")
+PRESETS = tuple(TASK.presets)
+
+SLOW = pytest.mark.slow
 
 
 def rgb(*value):
@@ -118,14 +126,18 @@ def uniform(mi, rng, n):
 def roughness_of(material):
     alpha = material.get("alpha", 0.1)
     value = alpha["value"] if isinstance(alpha, dict) else alpha
-    return max(float(np.mean(value)), ggx.ALPHA_FLOOR)
+    return max(float(np.mean(value)), ALPHA_FLOOR)
 
 
 def normals(form):
     """What the tables of a form say, read by NumPy and SciPy."""
-    form = FORMS[form]
-    table, encoding = ggx.load_ggx_table(ggx.SHIPPED[form.get("preset", "tables")])
-    return walter.learned(table.to(form.get("storage", "float32")), encoding.inputs, encoding.output)
+    table = shipped(FORMS[form].get("preset", "tables"))
+    encoding = encoding_of(table)
+    return walter.learned(table.to(FORMS[form].get("storage", table.storage)), encoding.inputs, encoding.output)
+
+
+def shipped(preset):
+    return TASK.load(TASK.file(preset=preset))
 
 
 def total(value):
@@ -147,20 +159,34 @@ def tile(image, i, columns, size):
 # -- values ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("material", list(MATERIALS))
-def test_the_exact_plugin_times_what_the_table_says(mi_any, rng, material):
+#: A colour in the place of a number, which would depend on the wavelength; and whether the variant is spectral.
+IMPOSSIBLE = ("a grey roughness", True)
+
+#: Each of these is a way of its own through colours and polarisation, the others are not.
+COLOURED = ("white", "copper", "a coloured index", "tinted", "a grey roughness")
+
+
+@pytest.mark.parametrize(
+    "variant, material",
+    [
+        (variant, material)
+        for variant in VARIANTS
+        for material in MATERIALS
+        if variant.endswith("ad_rgb") or (material in COLOURED and (material, "spectral" in variant) != IMPOSSIBLE)
+    ],
+)
+def test_the_exact_plugin_times_what_the_table_says(variant, rng, material):
     """
     Value and weight are those of ``roughconductor`` times D̂/D, which NumPy and SciPy read in the table file: everything
     but the distribution is equal up to rounding, Mueller matrices included. Samples and densities are equal.
     """
-    mi, m, n = mi_any, MATERIALS[material], 10_000
-    if material == "a grey roughness" and mi.is_spectral:
-        pytest.skip("a colour in the place of a number depends on the wavelength")
+    mi, m, n = _set(variant), MATERIALS[material], 10_000
     alpha = roughness_of(m)
     wi, wo = directions(rng, n, alpha)
     si, u = interactions(mi, vectors(mi, wi)), uniform(mi, rng, n)
     exact, learned = mi.load_dict({**EXACT, **m}), mi.load_dict({**FORMS["tables"], **m})
-    for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
+    modes = (mi.TransportMode.Radiance, mi.TransportMode.Importance)
+    for mode in modes if mi.is_polarized or material == "copper" else modes[:1]:
         ctx = mi.BSDFContext()
         ctx.mode = mode
         bs, weight = exact.sample(ctx, si, *u)
@@ -219,9 +245,12 @@ def test_the_independent_conductor(mi_rgb, rng, form, textured):
     assert error.max() < bound and np.quantile(error, 0.99) < bound / 2
 
 
-@pytest.mark.parametrize("form", list(FORMS))
-def test_eval_pdf_and_sample_agree_in_every_context(mi_any, rng, form):
-    mi, n = mi_any, 2000
+@pytest.mark.parametrize(
+    "variant, form", [(v, form) for v in VARIANTS for form in FORMS if v.endswith("ad_rgb") or form == "tables"]
+)
+def test_eval_pdf_and_sample_agree_in_every_context(variant, rng, form):
+    """What is read is a number in all variants: the forms differ in none that they do not differ in by RGB."""
+    mi, n = _set(variant), 2000
     wi, wo = random_directions(rng, n), random_directions(rng, n)
     wi[::50, 2] *= -1
     wo[::31, 2] *= -1
@@ -278,15 +307,21 @@ def test_parameters_may_be_textures(mi_any, rng, name):
 # -- sampling ----------------------------------------------------------------------------------------------------------
 
 CHI2_ALPHAS, CHI2_ANGLES = (1e-3, 0.05, 0.2, 1.0), (0, 45, 85, 87, 89)
-CHI2_COUNT = len(QUALITIES) * len(CHI2_ALPHAS) * len(CHI2_ANGLES)
+CHI2_COUNT = len(PRESETS) * len(CHI2_ALPHAS) * len(CHI2_ANGLES)
 
 
-@pytest.mark.parametrize("alpha", CHI2_ALPHAS)
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_chi2(mi_rgb, alpha, quality, tmp_path, monkeypatch):
-    """``sample`` draws from ``pdf``, however wrong the table is."""
+@pytest.mark.parametrize(
+    "preset, alpha",
+    [
+        *(("tables", alpha) for alpha in CHI2_ALPHAS),
+        ("paper", 0.2),
+        *(pytest.param("paper", alpha, marks=SLOW) for alpha in CHI2_ALPHAS if alpha != 0.2),
+    ],
+)
+def test_chi2(mi_rgb, alpha, preset, tmp_path, monkeypatch):
+    """``sample`` draws from ``pdf``, however wrong the table is: neither reads it."""
     monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
-    bsdf = mi_rgb.load_dict({**FORMS[quality], "alpha": alpha})
+    bsdf = mi_rgb.load_dict({**FORMS[preset], "alpha": alpha})
     for angle in CHI2_ANGLES:
         messages, valid = HalfVectorSampling(mi_rgb, bsdf, angle, alpha).faults(CHI2_COUNT)
         assert not messages, (angle, messages)
@@ -320,11 +355,13 @@ def test_chi2_has_power(mi_rgb, alpha, angle, tmp_path, monkeypatch):
         assert right.faults(CHI2_COUNT, pdf)[0], what
 
 
-def half_vector_grid(mi, alphas, angles, side=128):
+@functools.lru_cache
+def half_vector_grid(alphas, angles, side=128):
     """
-    A grid of half vectors around the normal, for each roughness and angle of incidence: directions in and out, the
-    solid angle of ``wo`` that a point stands for, and the number of its roughness. The polar axis is that on which a
-    lobe of any width is smooth.
+    A grid of half vectors around the normal, for each roughness and angle of incidence: directions in and out (up where
+    there is none above the horizon), the solid angle of ``wo`` that a point stands for (then 0), the number of its
+    roughness, and value and density of the exact conductor. The polar axis is that on which a lobe of any width is
+    smooth.
     """
     t, phi = (np.arange(side) + 0.5) / side, 2 * np.pi * (np.arange(side) + 0.5) / side
     wi, wo, weight = [], [], []
@@ -340,27 +377,28 @@ def half_vector_grid(mi, alphas, angles, side=128):
         wo.append(2 * wi_h[:, None] * h - w)
         weight.append(np.where(wi_h > 0, 4 * wi_h * np.repeat(solid, side), 0))
     lane = np.repeat(np.arange(len(alphas)), len(angles) * side**2)
-    return np.concatenate(wi), np.concatenate(wo), np.concatenate(weight), lane
+    wi, wo, solid = (np.concatenate(v) for v in (wi, wo, weight))
+    above = (wo[:, 2] > 0) & (solid > 0)
+    wo, solid = np.where(above[:, None], wo, [0, 0, 1]), np.where(above, solid, 0)
+    exact = [f(wi, wo, np.array(alphas)[lane]) for f in (walter.conductor, walter.density)]
+    return wi, wo, solid, lane, *exact
 
 
 @pytest.mark.parametrize("form", ["tables", "tables float16", "tables uint8", "paper"])
 def test_energy(mi_rgb, rng, form):
     """
     By quadrature over half vectors, independent of sampling: the density integrates to what that of the exact conductor
-    does, and to the share of samples above the horizon; the value to the mean weight, which is within 0.02 of what is
-    reflected exactly, and no more than 1.03.
+    does, and to the share of samples above the horizon; the value to the mean weight, which is within 0.012 of what is
+    reflected exactly (of bytes 0.016), and no more than 1.015.
     """
     mi, n = mi_rgb, 2**14
-    alphas, angles = [0.001, 0.003, 0.01, 0.03, 0.07, 0.15, 0.3, 0.6, 1.0], (0, 30, 60, 75, 84, 88)
+    alphas, angles = (0.001, 0.003, 0.01, 0.03, 0.07, 0.15, 0.3, 0.6, 1.0), (0, 30, 60, 75, 84, 88)
     k, a = len(alphas), len(angles)
     bsdf = mi.load_dict({**FORMS[form], "alpha": texels(mi, alphas)})
-    wi, wo, solid, lane = half_vector_grid(mi, alphas, angles)
-    above = (wo[:, 2] > 0) & (solid > 0)
-    wo_ = np.where(above[:, None], wo, [0, 0, 1])
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interactions(mi, vectors(mi, wi), lane, k), vectors(mi, wo_))
-    exact = (f(wi, wo_, np.array(alphas)[lane]) for f in (walter.conductor, walter.density))
+    wi, wo, solid, lane, *exact = half_vector_grid(alphas, angles)
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interactions(mi, vectors(mi, wi), lane, k), vectors(mi, wo))
     albedo, area, expected, expected_area = (
-        np.sum(np.where(above, v * solid, 0).reshape(k, a, -1), axis=2)
+        np.sum((v * solid).reshape(k, a, -1), axis=2)
         for v in (value.numpy()[0].astype(np.float64), pdf.numpy().astype(np.float64), *exact)
     )
 
@@ -384,8 +422,8 @@ def test_energy(mi_rgb, rng, form):
         np.testing.assert_allclose(mean[-3:], albedo[-3:], atol=0.01)
     else:
         np.testing.assert_allclose(mean, albedo, atol=0.01)
-        assert error.max() <= (0.03 if form == "tables uint8" else 0.02)
-        assert max(albedo.max(), mean.max()) <= 1.03
+        assert error.max() <= (0.016 if form == "tables uint8" else 0.012)
+        assert max(albedo.max(), mean.max()) <= 1.015
         assert weight.numpy().max() < 5
 
 
@@ -411,7 +449,7 @@ def test_nothing_is_gained_at_the_horizon(mi_rgb, rng, form, textured):
         si = interactions(mi, vectors(mi, wi), np.full(len(wi), i), len(alphas))
         bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), u)
         valid, cosine = bs.pdf.numpy() > 0, np.maximum(bs.wo.z.numpy().astype(np.float64), 1e-30)
-        expected = np.where(valid, walter.smith(cosine, max(np.float32(alpha), ggx.ALPHA_FLOOR)), 0)
+        expected = np.where(valid, walter.smith(cosine, max(np.float32(alpha), ALPHA_FLOOR)), 0)
         weight = weight.x.numpy().astype(np.float64)
         assert valid.mean() > 0.5
         assert (weight <= 1.1 * expected).all(), (alpha, np.max(weight[valid] / expected[valid]))
@@ -446,7 +484,7 @@ def extreme_directions():
     [
         *((form, "llvm_ad_rgb") for form in FORMS),
         ("tables", "llvm_ad_mono_polarized"),
-        ("paper", "llvm_ad_mono_polarized"),
+        pytest.param("paper", "llvm_ad_mono_polarized", marks=SLOW),
     ],
 )
 def test_extreme_inputs(form, variant):
@@ -509,16 +547,16 @@ def all_finite(mi, bsdf, si, wo, u, what):
     return value, pdf, bs, weight
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("textured", [False, True])
-def test_tables_of_anything(mi_rgb, rng, quality, textured):
+def test_tables_of_anything(mi_rgb, rng, preset, textured):
     """Entries may be wrong, and nothing else becomes so; gradients are finite where the entries are."""
     mi, n = mi_rgb, 2000
     wi, wo = extreme_directions()
     lane = rng.integers(len(wi), size=n)
     si = interactions(mi, vectors(mi, wi[lane]), lane % 3, 3)
     wo, u = vectors(mi, wo[lane]), uniform(mi, rng, n)[1]
-    bsdf = mi.load_dict({**FORMS[quality], "alpha": texels(mi, [1e-4, 0.1, 1.0]) if textured else 0.1, "eta": 0.5})
+    bsdf = mi.load_dict({**FORMS[preset], "alpha": texels(mi, [1e-4, 0.1, 1.0]) if textured else 0.1, "eta": 0.5})
     params = mi.traverse(bsdf)
     alpha = "alpha.data" if textured else "alpha.value"
     for key in ("tables.primary", "tables.cascaded"):
@@ -542,7 +580,7 @@ def test_tables_of_anything(mi_rgb, rng, quality, textured):
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono_polarized"])
-@pytest.mark.parametrize("form", QUALITIES)
+@pytest.mark.parametrize("form", PRESETS)
 def test_directions_that_are_none(rng, form, variant):
     """NaN, infinities and lengths beyond all measure: nothing is reflected, and gradients know nothing of it."""
     import mitsuba as mi
@@ -577,8 +615,8 @@ def test_directions_that_are_none(rng, form, variant):
         assert np.isfinite(params[key].grad.numpy()).all()
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_textures_beyond_the_range_are_clamped(mi_rgb, rng, quality):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_textures_beyond_the_range_are_clamped(mi_rgb, rng, preset):
     """… and NaN is the smoothest roughness that there is: each texel by itself, whatever its neighbours are."""
     mi, n = mi_rgb, 1000
     given = [2.0, float("inf"), -1.0, 0.0, float("nan"), -float("inf"), 0.3]
@@ -587,7 +625,7 @@ def test_textures_beyond_the_range_are_clamped(mi_rgb, rng, quality):
     wo, u = vectors(mi, random_directions(rng, n)), uniform(mi, rng, n)
     results = []
     for values in (given, used):
-        bsdf = mi.load_dict({**FORMS[quality], "alpha": texels(mi, values)})
+        bsdf = mi.load_dict({**FORMS[preset], "alpha": texels(mi, values)})
         bs, weight = bsdf.sample(mi.BSDFContext(), si, *u)
         results.append([v.numpy() for v in (*bsdf.eval_pdf(mi.BSDFContext(), si, wo), bs.wo, bs.pdf, weight)])
     for a, b in zip(*results, strict=True):
@@ -642,26 +680,18 @@ def test_grazing_light_renders(mi_rgb, integrator):
 # -- gradients ---------------------------------------------------------------------------------------------------------
 
 
-def shifted_table(quality, name, index, step):
+def shifted_table(preset, name, index, step):
     """The shipped tables with one entry shifted, read by NumPy and SciPy."""
-    table, encoding = ggx.load_ggx_table(ggx.SHIPPED[quality])
-    entries = table.arrays[name].astype(np.float64)
-    entries[index] += step
-    arrays = {**{k: v.astype(np.float64) for k, v in table.arrays.items()}, name: entries}
-
-    class Shifted:
-        def __init__(self):
-            self.arrays = arrays
-
-        def values(self, name):
-            return arrays[name]
-
-    return walter.learned(Shifted(), encoding.inputs, encoding.output)
+    table = shipped(preset)
+    entries = {k: array.values.astype(np.float64) for k, array in table.arrays.items()}
+    entries[name][index] += step
+    encoding, arrays = encoding_of(table), {k: SimpleNamespace(values=v) for k, v in entries.items()}
+    return walter.learned(SimpleNamespace(arrays=arrays), encoding.inputs, encoding.output)
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("textured", [False, True])
-def test_gradients_equal_central_differences(mi_rgb, rng, quality, textured):
+def test_gradients_equal_central_differences(mi_rgb, rng, preset, textured):
     """
     Of value and weight, with respect to everything, against differences of Walter's formulas in double precision, with
     the table read by SciPy. The density is detached: the gradient of a weight is that of the value, over the density.
@@ -670,13 +700,13 @@ def test_gradients_equal_central_differences(mi_rgb, rng, quality, textured):
     wi, wo = directions(rng, n, alpha, 0.1)
     given = [texels(mi, [v] * 2) if textured else v for v in (alpha, eta, k, factor)]
     names = ("alpha", "eta", "k", "specular_reflectance")
-    bsdf = mi.load_dict({**FORMS[quality], **dict(zip(names, given, strict=True))})
+    bsdf = mi.load_dict({**FORMS[preset], **dict(zip(names, given, strict=True))})
     params = mi.traverse(bsdf)
     keys = [f"{name}.{'data' if textured else 'value'}" for name in names] + ["tables.primary", "tables.cascaded"]
     si = interactions(mi, vectors(mi, wi), np.arange(n) % 2, 2)
     sampled = bsdf.sample(mi.BSDFContext(), si, *uniform(mi, np.random.default_rng(1), n))[0]
     usable = sampled.pdf.numpy() > 0
-    parameters, table = {"alpha": alpha, "eta": eta, "k": k, "specular_reflectance": factor}, normals(quality)
+    parameters, table = {"alpha": alpha, "eta": eta, "k": k, "specular_reflectance": factor}, normals(preset)
     steps = {"alpha": 1e-6, "eta": 1e-4, "k": 1e-4, "specular_reflectance": 1e-3}
     for what, out in {"value": wo, "weight": sampled.wo.numpy().T}.items():
         for key in keys:
@@ -702,7 +732,7 @@ def test_gradients_equal_central_differences(mi_rgb, rng, quality, textured):
             gradient = params[f"tables.{name}"].grad.numpy()
             largest = np.argsort(-np.abs(gradient).ravel())[:4]
             for index in zip(*np.unravel_index(largest, gradient.shape), strict=True):
-                up, down = (reference(shifted_table(quality, name, index, sign * 1e-5)) for sign in (1, -1))
+                up, down = (reference(shifted_table(preset, name, index, sign * 1e-5)) for sign in (1, -1))
                 assert gradient[index] == pytest.approx((up - down) / 2e-5, rel=0.02), (what, name, index)
         for key in keys:
             dr.disable_grad(params[key])
@@ -735,7 +765,7 @@ def test_the_derivative_of_the_roughness_against_the_exact_one(mi_rgb, rng):
 
     expected = elasticity(exact)
     found = elasticity(mi.load_dict({**FORMS["tables"], "alpha": texels(mi, alphas)}))
-    bars = {(0.001, 0.01): (0.2, 0.9), (0.01, 0.1): (0.12, 0.97), (0.1, 0.5): (0.08, 0.98), (0.5, 1.0): (0.15, 0.95)}
+    bars = {(0.001, 0.01): (0.15, 0.95), (0.01, 0.1): (0.1, 0.985), (0.1, 0.5): (0.05, 0.995), (0.5, 1.0): (0.12, 0.95)}
     for (low, high), (mean, correlation) in bars.items():
         band = (alphas[texel][used] >= low) & (alphas[texel][used] <= high)
         a, b = found[band], expected[band]
@@ -748,11 +778,11 @@ def test_the_derivative_of_the_roughness_against_the_exact_one(mi_rgb, rng):
         assert error.mean() <= mean * size and related >= correlation
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_gradients_with_respect_to_directions(mi_rgb, rng, quality):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_gradients_with_respect_to_directions(mi_rgb, rng, preset):
     """As a moving light or shape asks for them: against differences along great circles, and finite at the extremes."""
     mi, n, alpha, step = mi_rgb, 10_000, 0.2371, 1e-6
-    bsdf = mi.load_dict({**FORMS[quality], "alpha": alpha, "eta": 0.6, "k": 2.3})
+    bsdf = mi.load_dict({**FORMS[preset], "alpha": alpha, "eta": 0.6, "k": 2.3})
 
     def gradients(wi, wo):
         attached = [vectors(mi, w) for w in (wi, wo)]
@@ -768,7 +798,7 @@ def test_gradients_with_respect_to_directions(mi_rgb, rng, quality):
         for sign in (1, 0, -1):
             moved = list(pair)
             moved[which] = math.cos(sign * step) * pair[which] + math.sin(sign * step) * tangent
-            values.append(walter.conductor(*moved, alpha, 0.6, 2.3, normals(quality)))
+            values.append(walter.conductor(*moved, alpha, 0.6, 2.3, normals(preset)))
         forward, backward = (values[0] - values[1]) / step, (values[1] - values[2]) / step
         expected, scale = (forward + backward) / 2, np.abs(gradient).max(axis=1) + 1e-2 * values[1].max()
         smooth = np.abs(forward - backward) <= 1e-3 * scale  # no edge of a cell in between
@@ -829,7 +859,9 @@ def test_gradients_through_render(mi_rgb, integrator):
         assert e < 0.3 * abs(y), (key, x, y, e)  # or the comparison would say nothing
 
 
-@pytest.mark.parametrize("target, start", [(0.25, 0.6), (0.6, 0.2), (0.1, 0.3)])
+@pytest.mark.parametrize(
+    "target, start", [(0.25, 0.6), pytest.param(0.6, 0.2, marks=SLOW), pytest.param(0.1, 0.3, marks=SLOW)]
+)
 def test_the_roughness_is_recovered_from_an_image(mi_rgb, target, start):
     """Within 5% in 60 steps, none of which compiles after the first few; the image is that of the exact plugin."""
     mi = mi_rgb
@@ -856,11 +888,11 @@ def test_the_roughness_is_recovered_from_an_image(mi_rgb, target, start):
     assert np.mean(found[-10:]) == pytest.approx(target, rel=0.05)
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_optimised_tables_stay_finite(mi_rgb, rng, quality):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_optimised_tables_stay_finite(mi_rgb, rng, preset):
     """300 steps with a learning rate that throws entries out of their range, in which the loss falls nevertheless."""
     mi, n = mi_rgb, 4096
-    bsdf = mi.load_dict({**FORMS[quality], "alpha": texels(mi, [1e-4, 1e-3, 0.05, 0.3, 1.0])})
+    bsdf = mi.load_dict({**FORMS[preset], "alpha": texels(mi, [1e-4, 1e-3, 0.05, 0.3, 1.0])})
     params = mi.traverse(bsdf)
     keys = ["tables.primary", "tables.cascaded"]
     params["tables.cascaded"] = params["tables.cascaded"] * 0 + 0.5
@@ -914,8 +946,15 @@ def test_tables_keep_their_gradients_where_the_roughness_is_constant(mi_rgb, rng
 # -- parameters that change --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", ["tables", "tables uint8", "paper"])
-@pytest.mark.parametrize("kind", ["number", "bitmap"])
+@pytest.mark.parametrize(
+    "kind, form",
+    [
+        ("number", "tables"),
+        ("number", "tables uint8"),
+        ("bitmap", "tables"),
+        *(pytest.param(*case, marks=SLOW) for case in (("number", "paper"), ("bitmap", "tables uint8"))),
+    ],
+)
 def test_updated_parameters_show_in_the_next_image(mi_rgb, form, kind):
     """Each image is that of a scene loaded so: also what was left out at 1, and a metal that was none."""
     mi = mi_rgb
@@ -1050,17 +1089,16 @@ def test_own_tables(mi_rgb, rng, tmp_path):
     mi = mi_rgb
     wi, wo = directions(rng, 1000, 0.3)
     si, wo = interactions(mi, vectors(mi, wi)), vectors(mi, wo)
-    for quality in QUALITIES:
-        table, _ = ggx.load_ggx_table(ggx.SHIPPED[quality])
-        save_table(tmp_path / "own.npz", table.to("uint8"))
+    for preset in PRESETS:
+        save_table(tmp_path / "own.npz", shipped(preset).to("uint8"))
         (tmp_path / "m.xml").write_text(
             '<bsdf version="3.0.0" type="neural_ggx"><string name="filename" value="own.npz"/></bsdf>'
         )
         own = mi.load_file(str(tmp_path / "m.xml"))
-        assert f"preset = {quality}, 576 bytes as uint8" in str(own)
+        assert f"preset = {preset}, 576 bytes as uint8" in str(own)
         report = own.report()
-        assert (report["preset"], report["storage"], report["table_bytes"]) == (quality, "uint8", 576)
-        expected = mi.load_dict({**FORMS[quality], "storage": "uint8"}).eval(mi.BSDFContext(), si, wo).numpy()
+        assert (report["preset"], report["storage"], report["table_bytes"]) == (preset, "uint8", 576)
+        expected = mi.load_dict({**FORMS[preset], "storage": "uint8"}).eval(mi.BSDFContext(), si, wo).numpy()
         np.testing.assert_array_equal(own.eval(mi.BSDFContext(), si, wo).numpy(), expected)
 
 
@@ -1114,10 +1152,10 @@ def test_roughness_updated_inside_a_frozen_function(mi_rgb, no_garbage_collectio
 
 @pytest.mark.parametrize("integrator", ["path", "prb", "direct"])
 def test_several_materials_in_one_loop(mi_rgb, tmp_path, integrator):
-    """Each sphere looks as where all of them are alike: other roughness, storage, quality, tables, a texture."""
+    """Each sphere looks as where all of them are alike: other roughness, storage, preset, tables, a texture."""
     mi = mi_rgb
-    table, _ = ggx.load_ggx_table(ggx.SHIPPED["tables"])
-    table.arrays["cascaded"] = table.arrays["cascaded"] * np.float32(0.9)
+    table = shipped("tables")
+    table.arrays["cascaded"] = StoredArray(table.arrays["cascaded"].values * np.float32(0.9))
     save_table(tmp_path / "own.npz", table)
     bsdfs = [
         {**FORMS["tables"], "alpha": 0.1, "material": "Cu"},
@@ -1187,14 +1225,15 @@ def test_a_back_side_is_black_unless_it_is_twosided(mi_rgb):
         assert (image[4:12, 4:12].max() == 0) == black
 
 
-def test_two_hundred_materials(mi_rgb, rng):
-    """Presets, numbers, textures, qualities, storage forms: some of them against scenes in which they are alone."""
-    mi, count, columns = mi_rgb, 200, 15
-    presets, forms = ("none", "Cu", "Au", "Al", "Ag"), list(FORMS.values())
+@pytest.mark.parametrize("count", [50, pytest.param(200, marks=SLOW)])
+def test_many_materials(mi_rgb, rng, count):
+    """Metals, numbers, textures, presets, storage forms: some of them against scenes in which they are alone."""
+    mi, columns = mi_rgb, math.ceil(math.sqrt(count))
+    metals, forms = ("none", "Cu", "Au", "Al", "Ag"), list(FORMS.values())
     bsdfs = []
     for _ in range(count):
         alpha = float(rng.uniform(0.1, 1)) if rng.random() < 0.7 else bitmap(mi, rng.uniform(0.1, 1, (2, 2)))
-        m = {"alpha": alpha, "material": presets[rng.integers(len(presets))]}
+        m = {"alpha": alpha, "material": metals[rng.integers(len(metals))]}
         if rng.random() < 0.5:
             m["specular_reflectance"] = rgb(*rng.random(3).tolist())
         bsdfs.append({**forms[rng.integers(len(forms))], **m})
@@ -1205,7 +1244,7 @@ def test_two_hundred_materials(mi_rgb, rng):
     assert np.isfinite(image).all() and image.min() >= 0
     assert np.array_equal(image, mi.render(scene, spp=4).numpy())
     black = mi.load_dict({"type": "diffuse", "reflectance": 0.0})
-    for i in (0, 123, 199):
+    for i in (0, count // 2, count - 1):
         alone = [bsdfs[i] if j == i else black for j in range(count)]
         expected = mi.render(sphere_scene(mi, alone, "direct", size, columns), spp=4).numpy()
         assert equal_images(tile(image, i, columns, 4), tile(expected, i, columns, 4)), bsdfs[i]
@@ -1427,9 +1466,8 @@ def test_a_scene_and_its_exact_counterpart(mi_rgb, scene_file):
 
 def test_comparison(mi_rgb, scene_file):
     result = compare.compare(scene_file, spp=64, passes=2, progress=False)
-    print({k: v for k, v in result.figures.items() if k in ("psnr_db", "flip", "mae")})
-    assert result.figures["psnr_db"] >= 45
-    assert result.figures["flip"] < 0.02
+    assert result.figures["psnr_db"] >= 60  # 62.7 is reached
+    assert result.figures["flip"] < 0.007
     assert result.figures["learned_plugins"] == 3
     assert result.figures["table_bytes"] == 2304 + 576  # the same file in two forms
 
@@ -1490,15 +1528,15 @@ def test_bad_parameters_are_refused(mi_rgb, parameters, sentence):
     with pytest.raises(RuntimeError) as caught:
         mi_rgb.load_dict({"type": "neural_ggx", **parameters})
     assert sentence in str(caught.value)
-    assert sentence in scenes.one_sentence(caught.value)
-    assert "\n" not in scenes.one_sentence(caught.value)
+    assert sentence in compat.one_sentence(caught.value)
+    assert "\n" not in compat.one_sentence(caught.value)
 
 
 def test_bad_files_are_refused(mi_rgb, tmp_path):
-    disney = ggx.SHIPPED["tables"].with_name("disney_tables.npz")
+    disney = DISNEY.file()
     with pytest.raises(RuntimeError, match=r'disney_tables\.npz: holds tables for the task "disney", expected "ggx"'):
         mi_rgb.load_dict({"type": "neural_ggx", "filename": str(disney)})
-    own = {"type": "neural_ggx", "filename": str(ggx.SHIPPED["paper"]), "preset": "tables"}
+    own = {"type": "neural_ggx", "filename": str(TASK.file(preset="paper")), "preset": "tables"}
     with pytest.raises(RuntimeError, match='holds tables of the preset "paper", "tables" was asked for'):
         mi_rgb.load_dict(own)
 

@@ -3,7 +3,9 @@ The texture ``neural_image`` inside Mitsuba: against ``bitmap`` with the image t
 implementation, and under what scenes do to a texture.
 """
 
+import functools
 import gc
+import itertools
 import json
 import math
 import os
@@ -17,16 +19,20 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
+from conftest import VARIANTS, _set
 from scipy.ndimage import map_coordinates
 
-from mi_diffind import compare, scenes, sizing
+from mi_diffind import compare, compat, scenes
 from mi_diffind.measure.operations import bsdf_operations, count
-from mi_diffind.tables import Table, load_table, save_table
-from mi_diffind.tasks import ggx
-from mi_diffind.tasks.image import training
-from mi_diffind.tasks.image.compressed import CompressedImage, load_image_table
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import StoredArray, Table, load_table, save_table
+from mi_diffind.tasks.ggx import TASK as GGX
+from mi_diffind.tasks.image import TASK, sizing, training
+from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.image.layout import Layout, MapLayout
+from mi_diffind.tasks.image.presets import PRESETS, replaced
 from mi_diffind.tasks.image.source import from_arrays, load_source
+from mi_diffind.tasks.task import Request
 
 WIDTH, HEIGHT = 12, 10
 
@@ -58,7 +64,7 @@ WRAP_MODES = ("repeat", "mirror", "clamp")
 def make(path, layout=LAYOUT, border=("repeat", "clamp"), seed=1, shape=(8, 9), side=4, spread=(0, 255), coarse=False):
     """A file of random arrays, the primary of 6 bits; ``coarse``: one of its two channels is in an array of its own."""
     rng = np.random.default_rng(seed)
-    table = Table("image", {}, "uint8", settings={"layout": layout.to_json()}, seed=0)
+    table = Table("image", {}, settings={"layout": layout.to_json()})
     if layout.stored:
         arrays = {
             "primary": rng.integers(0, 63, (*shape, 2), np.uint8, endpoint=True),
@@ -68,12 +74,9 @@ def make(path, layout=LAYOUT, border=("repeat", "clamp"), seed=1, shape=(8, 9), 
             arrays["coarse"] = arrays["primary"][::2, ::2, 1:].copy()
             arrays["primary"] = arrays["primary"][..., :1].copy()
         for name, array in arrays.items():
-            steps, channels = 255 if name == "cascaded" else 63, array.shape[-1]
-            table.arrays[name] = array
-            table.quantization[name] = ((1 / steps,) * channels, (0.0,) * channels)
-            table.borders[name] = ("clamp", "clamp") if name == "cascaded" else border
-            if name != "cascaded":
-                table.bits[name] = 6
+            around, bits = (("clamp", "clamp"), 8) if name == "cascaded" else (border, 6)
+            affine = ((1 / (2**bits - 1),) * array.shape[-1], (0.0,) * array.shape[-1])
+            table.arrays[name] = StoredArray(array, around, *affine, bits)
     save_table(path, table)
     return str(path)
 
@@ -82,6 +85,17 @@ def single(kind, color_space="linear", channels=3):
     """A layout of one map."""
     one = MapLayout("image", kind, color_space, 1, tuple(range(channels)))
     return Layout(WIDTH, HEIGHT, (one,), (0.5,) * channels, ("image",) * channels)
+
+
+def trained(source, size, batch):
+    """The table of a short training."""
+    recipe = replaced(PRESETS["ours"], steps=60, batch=batch, measure_every=60)
+    request = Request("ours", recipe.settings, array_module("llvm"), progress=False)
+    return training.fit_image(source, size, recipe, request)[0]
+
+
+def layout_of(file):
+    return Layout.from_json(TASK.load(file).settings["layout"])
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +112,7 @@ def smooth(tmp_path_factory):
     image = np.rint(255 * np.stack(waves, axis=-1)).astype(np.uint8)
     source = from_arrays({"image": image})
     size = sizing.fit_bytes(10000, 3, 48, 64, 4, 4, 6)
-    recipe = training.replaced(training.RECIPES["ours"], steps=60, batch=2**11, quality_every=60)
-    table, _ = training.fit_image(source, size, recipe, backend="llvm", progress=False)
-    save_table(folder / "smooth.npz", table)
+    save_table(folder / "smooth.npz", trained(source, size, 2**11))
     return str(folder / "smooth.npz"), image
 
 
@@ -108,15 +120,15 @@ def plugin(file, channels="albedo", **more):
     return {"type": "neural_image", "filename": file, "channels": channels, **more}
 
 
-def decoded(mi, file):
-    table, _ = load_image_table(file)
-    return CompressedImage.from_table(table, mi.TensorXf).decode()
+@functools.lru_cache
+def decoded(dtype, file, stamp):
+    return CompressedImage.of(TASK.load(file), dtype).decode()
 
 
 def counterpart(mi, file, channels="albedo", **more):
     """``bitmap`` with the image that the file decodes to."""
-    _, layout = load_image_table(file)
-    bitmap = mi.Bitmap(np.ascontiguousarray(decoded(mi, file)[channels]))
+    layout = layout_of(file)
+    bitmap = mi.Bitmap(np.ascontiguousarray(decoded(mi.TensorXf, file, os.stat(file).st_mtime_ns)[channels]))
     bitmap.set_srgb_gamma(layout[channels].color_space == "srgb")
     raw = {"raw": True} if channels in ("normal", "roughness", "metallic") else {}
     return {"type": "bitmap", "bitmap": bitmap, "format": "variant", **raw, **more}
@@ -148,7 +160,7 @@ def attempt(function, *args):
 
 
 def sentence(error):
-    text = scenes.one_sentence(error)
+    text = compat.one_sentence(error)
     assert "Traceback" not in text and len(text) < 350, text
     return text
 
@@ -188,7 +200,7 @@ def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng, name):
     assert ours.is_spatially_varying() == (name not in ("metallic", "flat"))
     assert clipped or abs(float(ours.mean()[0]) - float(theirs.mean()[0])) < 2e-5
     largest = dr.max(mi.traverse(mi.load_dict(counterpart(mi, file, name, raw=True)))["data"].array)[0]
-    if ours.raw or load_image_table(file)[1][name].color_space == "linear":
+    if ours.raw or layout_of(file)[name].color_space == "linear":
         assert ours.max() == pytest.approx(float(largest), rel=1e-5)
     else:
         assert ours.max() == pytest.approx(float(dr.srgb_to_linear(largest)), rel=1e-5)
@@ -251,18 +263,15 @@ def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, bord
     """Anywhere, by SciPy in double precision."""
     mi = mi_rgb
     path = make(tmp_path / "a.npz", border=border, seed=3)
-    table, _ = load_image_table(path)
+    arrays = TASK.load(path).arrays
     u, v = rng.random((2, 3000)).astype(np.float32).astype(np.float64)
-    x = [
-        t * (n if b == "repeat" else n - 1)
-        for t, n, b in zip((v, u), table.arrays["primary"].shape, border, strict=False)
-    ]
-    primary = table.arrays["primary"] / 63
+    x = [t * (n if b == "repeat" else n - 1) for t, n, b in zip((v, u), arrays["primary"].shape, border, strict=False)]
+    primary = arrays["primary"].entries / 63
     for axis, b in enumerate(border):
         if b == "repeat":
             primary = np.concatenate([primary, np.take(primary, [0], axis)], axis)
     pointer = [map_coordinates(primary[..., k], x, order=1) * 3 for k in range(2)]
-    stored = [map_coordinates(table.arrays["cascaded"][..., k] / 255, pointer, order=1) for k in range(7)]
+    stored = [map_coordinates(arrays["cascaded"].entries[..., k] / 255, pointer, order=1) for k in range(7)]
     si = interactions(mi, u, v)
     s = np.stack(stored[:3])
     albedo = np.where(s < 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
@@ -314,20 +323,85 @@ def test_to_uv_is_a_parameter(mi_rgb, file, rng):
     np.testing.assert_array_equal(ours.eval(si).numpy(), mi.load_dict(plugin(file)).eval(si).numpy())
 
 
-@pytest.mark.parametrize("storage", ["uint8", "float32"])
-@pytest.mark.parametrize("wrap_mode", WRAP_MODES)
-def test_any_coordinate_gives_a_finite_value(mi_any, file, wrap_mode, storage):
-    mi = mi_any
+@pytest.mark.parametrize(
+    "variant, wrap_mode", [(v, w) for v in VARIANTS for w in WRAP_MODES if v.endswith("ad_rgb") or w == "repeat"]
+)
+def test_any_coordinate_gives_a_finite_value(variant, file, wrap_mode):
+    mi = _set(variant)
     bad = [math.nan, math.inf, -math.inf, 3e38, -3e38, 1e20, 2**31, -(2**31), 2**24 + 1, 1e-45, -1e-45, 0, 1, -0.0]
     u, v = (x.ravel() for x in np.meshgrid(bad, bad))
     si = interactions(mi, u, v)
-    for name in ("albedo", "normal", "roughness", "glow"):
+    for name, storage in itertools.product(("albedo", "normal", "roughness", "glow"), ("uint8", "float32")):
         texture = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode, storage=storage))
         for method in ("eval", "eval_1", "eval_3", "eval_1_grad"):
             found = attempt(getattr(texture, method), si)
-            assert found is None or np.isfinite(found).all(), (name, method)
-    if not mi.is_spectral:
-        assert np.isfinite(texture.pdf_position(si.uv).numpy()).all()
+            assert found is None or np.isfinite(found).all(), (name, storage, method)
+        density = texture.pdf_position(si.uv).numpy()
+        assert np.isfinite(density).all() and density.min() >= 0, (name, storage)
+
+
+WRONG = (math.nan, math.inf, -math.inf, 1e30, -1e30)
+
+
+def test_tables_of_anything(mi_rgb, file, rng):
+    """What an optimiser leaves in the tables: values are finite, and between those that the map can have."""
+    mi = mi_rgb
+    si = interactions(mi, *rng.uniform(-1, 2, (2, 200)))
+    textures = {name: mi.load_dict(plugin(file, name, storage="float32")) for name in ("albedo", "normal", "glow")}
+    params = mi.traverse(textures["albedo"])  # which all of them share
+    loaded = scene(mi, {"type": "diffuse", "reflectance": textures["albedo"]}, size=4)
+    for key in ("tables.primary", "tables.cascaded"):
+        before = params[key].numpy()
+        for wrong, share in [(math.nan, 1), *((wrong, 0.3) for wrong in WRONG)]:
+            params[key] = mi.TensorXf(np.where(rng.random(before.shape) < share, np.float32(wrong), before))
+            params.update()
+            for name, texture in textures.items():
+                found = [texture.eval(si), texture.eval_1(si), texture.eval_1_grad(si), texture.mean()]
+                found = [v.numpy() for v in found] + [np.array(texture.max())]
+                assert all(np.isfinite(v).all() for v in found), (name, key, wrong, share)
+                low, high = (0, 1) if name != "glow" else (0, 9)
+                assert low <= found[0].min() and found[0].max() <= high + 1e-4, (name, key, wrong, share)
+            uv, pdf = textures["albedo"].sample_position(mi.Point2f(si.uv - dr.floor(si.uv)))
+            assert np.isfinite(uv.numpy()).all() and np.isfinite(pdf.numpy()).all() and pdf.numpy().min() > 0
+            image = mi.render(loaded, spp=1).numpy()
+            assert np.isfinite(image).all() and image.min() >= 0
+        params[key] = mi.TensorXf(before)
+        params.update()
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_gradients_of_wrong_tables_are_finite(mi_rgb, file, rng, wrong):
+    mi = mi_rgb
+    si = interactions(mi, *rng.random((2, 200)))
+    for name in ("albedo", "normal", "glow"):
+        texture = mi.load_dict(plugin(file, name, storage="float32"))
+        params = mi.traverse(texture)
+        keys = ("tables.primary", "tables.cascaded")
+        for key in keys:
+            entries = params[key].numpy()
+            params[key] = mi.TensorXf(np.where(rng.random(entries.shape) < 0.1, np.float32(wrong), entries))
+            dr.enable_grad(params[key])
+        params.update()
+        dr.backward(sum(dr.sum(channel) for channel in texture.eval_3(si)))
+        for key in keys:
+            assert np.isfinite(params[key].grad.numpy()).all(), (name, key)
+
+
+@pytest.mark.parametrize("wrap_mode", WRAP_MODES)
+@pytest.mark.parametrize("transformed", [False, True])
+def test_positions_of_samples_that_are_none(mi_rgb, file, wrap_mode, transformed):
+    """A position that is none would spread through a whole render."""
+    mi = mi_rgb
+    more = {"to_uv": TRANSFORMS["turn"](mi.ScalarTransform4f())} if transformed else {}
+    bad = [math.nan, math.inf, -math.inf, -1, -1e-9, 0, 1, 1 + 1e-6, 2, 1e30, 3e38, 1 - 2**-24]
+    u, v = (mi.Float(x.ravel().astype("f4")) for x in np.meshgrid(bad, bad))
+    for name in ("albedo", "roughness", "glow", "flat"):
+        texture = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode, **more))
+        uv, pdf = texture.sample_position(mi.Point2f(u, v))
+        pdf, again = np.broadcast_to(pdf.numpy(), len(bad) ** 2), texture.pdf_position(uv).numpy()
+        assert np.isfinite(pdf).all() and pdf.min() > 0 and np.isfinite(again).all(), name
+        if name != "flat":  # of one colour: the sample is the position
+            assert np.isfinite(uv.numpy()).all() and uv.numpy().min() >= 0 and uv.numpy().max() <= 1, name
 
 
 def test_storage_forms_agree(mi_any, file, rng):
@@ -368,7 +442,7 @@ def test_gradient_of_the_image(mi_rgb, file, rng):
 
 
 def test_spectra_between_texels(smooth):
-    """Of smooth colours, against ``bitmap`` with the original and with what the file decodes to."""
+    """Of smooth colours, against ``bitmap`` with what the file decodes to (51 dB) and with the original (48 dB)."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_spectral")
@@ -379,7 +453,7 @@ def test_spectra_between_texels(smooth):
     si.wavelengths = type(si.wavelengths)(*[mi.Float(w.astype("f4")) for w in rng.uniform(400, 700, (4, 20000))])
     more = {"wrap_mode": "clamp"}
     ours = mi.load_dict(plugin(path, "image", **more)).eval(si).numpy()
-    for bitmap, floor in ((mi.load_dict(counterpart(mi, path, "image", **more)), 45), (None, 30)):
+    for bitmap, floor in ((mi.load_dict(counterpart(mi, path, "image", **more)), 48), (None, 45)):
         theirs = bitmap or mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(image), **more})
         mse = np.mean((ours - theirs.eval(si).numpy()) ** 2, dtype=np.float64)
         assert -10 * math.log10(mse) > floor
@@ -515,19 +589,39 @@ def materials(t):
     }
 
 
-@pytest.mark.parametrize("name", list(materials(lambda name: name)))
-def test_renders_as_with_bitmaps(mi_any, tmp_path, name):
-    """Of arrays that are smooth enough for both to agree between texels."""
+def test_renders_as_with_bitmaps(mi_any, tmp_path):
+    """Of arrays that are smooth enough for both to agree between texels; all materials in one scene, side by side."""
     mi = mi_any
     path = make(tmp_path / "a.npz", spread=(110, 140))
-    images = []
+    names, images = list(materials(lambda m: m)), []
     for t in (lambda m: plugin(path, m), lambda m: counterpart(mi, path, m)):
-        loaded = scene(mi, materials(t)[name])
-        images.append(mi.render(loaded, spp=16).numpy())
-    a, b = images
-    assert np.isfinite(a).all() and b.mean() > 0.01
-    assert a.mean() == pytest.approx(b.mean(), rel=0.02)
-    assert np.abs(a - b).mean() < 0.05 * b.mean()
+        shapes = {
+            f"wall{i}": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([2 * i + 1 - len(names), 0, 0]),
+                "bsdf": bsdf,
+            }
+            for i, bsdf in enumerate(materials(t).values())
+        }
+        to_world = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, -1, 0])  # x goes right
+        film = {"type": "hdrfilm", "width": 12 * len(names), "height": 12, "rfilter": {"type": "box"}}
+        loaded = mi.load_dict({
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 3},
+            "sensor": {
+                "type": "orthographic", "film": {**film, "pixel_format": "rgb"},
+                "to_world": to_world @ mi.ScalarTransform4f().scale([len(names), len(names), 1]),
+            },
+            "sky": {"type": "constant"},
+            **shapes,
+        })  # fmt: skip
+        images.append(mi.render(loaded, spp=32).numpy().reshape(12, len(names), 12, -1))
+    for i, name in enumerate(names):
+        a, b = (image[:, i] for image in images)
+        assert np.isfinite(a).all() and b.mean() > 0.01, name
+        assert a.mean() == pytest.approx(b.mean(), rel=0.02), name
+        assert np.abs(a - b).mean() < 0.05 * b.mean(), name
+    assert not any(np.allclose(images[1][:, 0], images[1][:, i], rtol=0.05) for i in range(1, len(names)))
 
 
 def test_maps_of_one_file_are_decoded_once(mi_rgb, file):
@@ -639,18 +733,18 @@ def test_optimisation_recovers_a_colour(mi_rgb, tmp_path, integrator):
     params = mi.traverse(loaded)
     keys = [k for k in params.keys() if ".tables." in k]
     assert len(keys) == 2
-    opt = mi.ad.Adam(lr=0.03)
+    opt = mi.ad.Adam(lr=0.08)
     for key in keys:
         opt[key] = params[key]
     losses = []
-    for step in range(60):
+    for step in range(30):
         params.update(opt)
         image = mi.render(loaded, params, spp=4, seed=step)
         loss = dr.mean(dr.square(image - target), axis=None)
         dr.backward(loss)
         opt.step()
         losses.append(float(loss.array[0]))
-    assert losses[-1] < 0.05 * losses[0]
+    assert losses[-1] < 0.1 * losses[0]
 
 
 def test_textures_of_one_file_share_their_parameters(mi_rgb, file, rng):
@@ -756,7 +850,7 @@ BAD = {
     "missing file": (lambda f: plugin("/nowhere/a.npz"), 'parameter "filename": /nowhere/a.npz: no such file'),
     "a folder": (lambda f: plugin(os.path.dirname(f)), "is a folder, a table file"),
     "not an archive": (lambda f: plugin(__file__), "not a table file"),
-    "another task": (lambda f: plugin(str(ggx.SHIPPED["tables"])), 'parameter "filename": '),
+    "another task": (lambda f: plugin(str(GGX.file())), 'parameter "filename": '),
     "unknown map": (lambda f: plugin(f, "depth"), 'parameter "channels": found "depth", the file holds albedo, normal'),
     "two channels": (lambda f: plugin(f, "pair"), '"pair" has 2 channels, a texture has 1 or 3'),
     "wrap mode": (lambda f: plugin(f, wrap_mode="tile"), 'parameter "wrap_mode": found "tile", allowed are repeat'),
@@ -833,9 +927,7 @@ def material(tmp_path_factory):
     maps = {"albedo": "albedo.png", "roughness": {"file": "orm.png", "channels": "g"}}
     (folder / "wall.json").write_text(json.dumps(maps))
     source = load_source(folder / "wall.json")
-    recipe = training.replaced(training.RECIPES["ours"], steps=60, batch=2**10, quality_every=60)
-    size = sizing.fit_bytes(2300, 4, 16, 16, 4, 4, 6)
-    table, _ = training.fit_image(source, size, recipe, backend="llvm", progress=False)
+    table = trained(source, sizing.fit_bytes(2300, 4, 16, 16, 4, 4, 6), 2**10)
     table.settings["source_path"] = "wall.json"
     save_table(folder / "wall.npz", table)
     textures = texture_xml("base_color", "wall.npz", channels="albedo") + texture_xml(
@@ -859,9 +951,11 @@ def test_exact_counterpart(mi_any, material):
     (folder / "stock.xml").write_text(SCENE.format(bsdf="principled", textures=textures))
     stock = scenes.load(folder / "stock.xml")
     np.testing.assert_array_equal(mi.render(exact, spp=8).numpy(), mi.render(stock, spp=8).numpy())
+    if mi.is_polarized:
+        return
 
     comparison = compare.compare(folder / "scene.xml", spp=8, passes=1, progress=False)
-    assert comparison.figures["psnr_db"] > 25
+    assert comparison.figures["psnr_db"] > 40  # 43 to 47 dB are reached
     assert comparison.figures["learned_plugins"] == 2
     assert comparison.figures["table_bytes"] == load_table(folder / "wall.npz").nbytes
 

@@ -15,17 +15,17 @@ SMALL = {"width": 96, "height": 56}
 
 @pytest.mark.parametrize("name", ["materials", "still_life"])
 def test_scene_as_written_and_exact(mi_rgb, name):
-    """The bound on the approximation: measured here 86 and 87 dB."""
+    """The bound on the approximation: 77.8 and 77.2 dB are reached, FLIP of 0.0010 and 0.0014."""
     from mi_diffind import compare
 
-    result = compare.compare(SCENES / f"{name}.xml", spp=32, passes=2, progress=False, defines=SMALL)
+    result = compare.compare(SCENES / f"{name}.xml", spp=32, passes=1, progress=False, defines=SMALL)
     assert np.isfinite(result.written).all() and result.written.min() >= 0
     assert result.written.std() > 0.05
     assert not np.array_equal(result.written, result.reference)
     assert result.figures["psnr_db"] > 75
-    assert result.figures["flip"] < 0.003
+    assert result.figures["flip"] < 0.002
     assert result.figures["learned_plugins"] == (60 if name == "materials" else 9)
-    assert result.figures["table_bytes"] == 512
+    assert result.figures["table_bytes"] == 384
 
 
 #: Materials without ids, one of them inside another beside one that has an id, and a texture.
@@ -94,7 +94,7 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
     assert 0.96 < result.figures["brightness"] < 1 and result.figures["psnr_db"] > 30
     assert result.figures["replaced_plugins"] == 1 and result.figures["against"] == "principled"
     assert (result.figures["learned_plugins"], result.figures["table_bytes"]) == (
-        (0, 0) if name == "disney" else (1, 512)
+        (0, 0) if name == "disney" else (1, 384)
     )
     paths = compare.write(result, tmp_path)
     assert paths["principled"].endswith("principled.exr") and Path(paths["figure"]).is_file()
@@ -127,7 +127,8 @@ def test_times_of_a_comparison_do_not_contradict_each_other(mi_rgb):
     seconds = {"written": 3.0, "exact": 2.0}
     ratio = {"median": 1.25, "min": 1.0, "max": 2.0, "pairs": 4}
     figures = {"scene": "a.xml", "variant": "v", "width": 4, "height": 3, "spp": 5, "spp_requested": 5, "passes": 5}
-    figures |= {"learned_plugins": 1, "table_bytes": 9, "psnr_db": 50, "flip": 0, "mae": 0, "interrupted": False}
+    figures |= {"replaced_plugins": 1, "learned_plugins": 1, "table_bytes": 9, "interrupted": False}
+    figures |= {"psnr_db": 50, "flip": 0, "mae": 0, "against": "exact", "brightness": 1.0}
     lines = compare.summary({**figures, "seconds_per_pass": seconds, "time_ratio": ratio})
     assert lines[-2:] == [
         "time        1.25 times that of exact (2 s a pass)",

@@ -103,7 +103,8 @@ class Positions:
         return cls(distribution, weights.shape[::-1], wrap_mode == "repeat")
 
     def sample(self, sample, active):
-        """A position, and its density."""
+        """A position, and its density; samples are limited to [0, 1), NaN is 0."""
+        sample = mi.Point2f(*(clamp(x, 0.0, 1 - 2**-24) for x in sample))
         texel, _, sample = self.distribution.sample(sample, active)
         uv = (mi.Point2f(texel) + 0.5 + mi.warp.square_to_tent(sample)) / mi.Point2f(*self.size)
         if self.repeats:
