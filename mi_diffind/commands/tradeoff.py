@@ -57,4 +57,11 @@ def run(arguments) -> dict:
     if not plugins.supported(mi.variant()):
         usable = ", ".join(v for v in mi.variants() if plugins.supported(v))
         raise UsageError(f'the plugins do not run in the variant "{mi.variant()}"; use one of {usable}')
-    return study.run(arguments)
+    return study.run(arguments) or _measure(study.plan(arguments), arguments)
+
+
+def _measure(plan, arguments) -> dict:
+    from ..measure import frame, report
+
+    result = frame.measure(plan, frame.Settings.choose(plan.variant, arguments.quick), arguments.out)
+    return report.publish(result, report.write(result, arguments.out), report.summary(result, plan))

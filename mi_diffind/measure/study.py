@@ -42,16 +42,12 @@ class Study:
         """What is to be measured, in the variant that is set."""
         raise NotImplementedError(f'the study "{self.name}" has no plan')
 
-    def run(self, arguments) -> dict:
+    def run(self, arguments) -> dict | None:
         """
-        Measure, write the files, print what was found. Returns the result with its ``files``; after Ctrl-C, what there
-        is up to then, with ``interrupted``. Raises :class:`~mi_diffind.files.OutputError`.
+        Of a study that has no plan: measure, write the files, print what was found. Returns the result with its
+        ``files``; after Ctrl-C, what there is up to then, with ``interrupted``. ``None``: its plan is to be measured.
         """
-        from . import frame, report
-
-        plan = self.plan(arguments)
-        result = frame.measure(plan, frame.Settings.choose(plan.variant, arguments.quick), arguments.out)
-        return report.publish(result, report.write(result, arguments.out), report.summary(result, plan))
+        return None
 
 
 @dataclass
