@@ -16,13 +16,14 @@ import pytest
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 
-from mi_diffind.tasks.disney import training
+from mi_diffind import StoredArray
+from mi_diffind.tables import save_table
+from mi_diffind.tasks.disney import TASK, training
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import find_effects
-from mi_diffind.tasks.disney.library import SHIPPED, load_decoder, load_disney_table
 from mi_diffind.tasks.disney.model import Material
-from mi_diffind.tasks.distributions import EXPONENTIAL_RATE
 from mi_diffind.tasks.known import Known
+from mi_diffind.tasks.sampling import EXPONENTIAL_RATE
 
 PRESETS = ("tables", "paper")
 
@@ -1015,11 +1016,9 @@ def test_chained_wrappers(mi_rgb, form):
 
 def test_different_tables_in_one_scene(mi_rgb, tmp_path):
     """Each sphere looks as it does where it is the only one with such tables."""
-    from mi_diffind.tables import save_table
-
     mi = mi_rgb
-    table, _ = load_disney_table(SHIPPED["tables"])
-    table.arrays["masking"] = table.arrays["masking"] * np.float32(1.5)
+    table = TASK.load(TASK.file(preset="tables")).to("float32")
+    table.arrays["masking"] = StoredArray(1.5 * table.arrays["masking"].values)
     save_table(tmp_path / "own.npz", table)
     forms = [
         FORMS["tables"],
@@ -1214,7 +1213,7 @@ STORED = [("disney", ""), ("tables", "float32"), ("tables", "float16"), ("tables
 
 
 def decoder_for(types, form, storage):
-    return Decoder() if form == "disney" else load_decoder("", types.TensorXf, storage, form)
+    return Decoder() if form == "disney" else TASK.open(types.TensorXf, "", form, storage).decoder
 
 
 def check_grazing(name, found, expected):
@@ -1260,7 +1259,7 @@ def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where):
     for form, storage in STORED:
         decoder = decoder_for(types, form, storage)
         check_grazing(f"{where}, {distribution}, {form} {storage}", shaded(types, decoder, case) / cosine, expected)
-    paper = load_decoder("", types.TensorXf, "", "paper")
+    paper = decoder_for(types, "paper", "")
     found = shaded(types, paper, case) / cosine
     counts = expected > 1e-3
     ratio = found[counts] / expected[counts]
