@@ -823,7 +823,7 @@ def test_extreme_inputs(mi_rgb, rng, form):
     material = np.repeat(np.arange(N_MATERIALS), N_PAIRS)
     pair = np.tile(np.arange(N_PAIRS), N_MATERIALS)
     ctx = mi.BSDFContext()
-    for _ in range(8):
+    for _ in range(24):
         wi, wo = (w[pair] for w in extreme_directions(rng, N_PAIRS))
         parameters = drawn(rng, SPECIAL_VALUES, (len(SCALARS) + 3, N_MATERIALS)).astype(np.float32)
         u = drawn(rng, SPECIAL_UNIFORM, (3, N_PAIRS), 0, 1 - 2**-20).astype(np.float32)[:, pair]
@@ -853,7 +853,8 @@ def test_extreme_inputs(mi_rgb, rng, form):
         assert np.allclose(np.linalg.norm(bs.wo.numpy()[:, valid], axis=0), 1, atol=1e-4)
         assert (bs.wo.numpy()[2, valid] > 0).all()
 
-        dr.backward(dr.sum(value.x + value.y + value.z + weight.x + weight.y + weight.z))
+        # What follows in a chain of derivatives may be more than 1
+        dr.backward(100 * dr.sum(value.x + value.y + value.z + weight.x + weight.y + weight.z))
         for key in keys + tables:
             gradient = params[key].grad.numpy()
             texels = np.argwhere(~np.isfinite(gradient))

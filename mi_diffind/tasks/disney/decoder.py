@@ -181,8 +181,7 @@ class Decoder:
         masked, denominator = self.coat_masking(wi.z, wo.z, active)
         fresnel = dr.fma(1 - COAT_F0, s, COAT_F0)
         coat = self.coat(c)
-        # Two divisions: at the horizon, the inverse square of the product is infinite, and so would be derivatives
-        return coat["scale"] * (g.h2 / coat_quadric(coat["a2"], g)) * (fresnel * wo.z * (masked / denominator))
+        return coat["scale"] * g.h2 * fresnel * wo.z * masked / (coat_quadric(coat["a2"], g) * denominator)
 
     # -- what tables may replace ------------------------------------------------------------------------------------
 
