@@ -18,6 +18,10 @@ _DISCONTINUOUS = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
 #: Largest index of refraction whose reflectance the model is asked to express (``specular`` = 3.1).
 ETA_MAX = 3.0
 
+#: Samples of a smaller density count as failed. They are next to none, 10⁻¹¹ of all, at the very horizon, and the
+#: derivative of a value, multiplied by the density's inverse, would leave the range of floats.
+_SMALLEST_DENSITY = 1e-12
+
 
 class Disney(mi.BSDF):
     r"""
@@ -458,8 +462,9 @@ class Disney(mi.BSDF):
 
         active &= dr.isfinite(wo.z) & (wo.z > 0)
         safe = dr.select(active, wo, mi.Vector3f(0, 0, 1))
-        value, bs.pdf = self._eval_pdf(surface, effects, rates, wi, safe, active)
-        active &= bs.pdf > 0
+        value, pdf = self._eval_pdf(surface, effects, rates, wi, safe, active)
+        active &= pdf > _SMALLEST_DENSITY
+        bs.pdf = dr.select(active, pdf, 0)
         return bs, dr.select(active, value / dr.select(active, bs.pdf, 1), 0)
 
     def eval_diffuse_reflectance(self, si, active=True):

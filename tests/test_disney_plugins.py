@@ -5,6 +5,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from mi_diffind import StoredArray
+from mi_diffind.tables import save_table
+from mi_diffind.tasks.disney import TASK
+
 #: Every version of the model in Mitsuba.
 PLUGINS = {
     "disney": {"type": "disney"},
@@ -276,12 +280,9 @@ def test_disney_is_what_the_formulas_say(mi_rgb, rng):
 
 def test_own_tables(mi_rgb, rng, tmp_path):
     """``filename`` is read, relative to the scene, and two instances with different tables stay apart."""
-    from mi_diffind.tables import save_table
-    from mi_diffind.tasks.disney.library import SHIPPED, load_disney_table
-
     mi = mi_rgb
-    table, _ = load_disney_table(SHIPPED["paper"])
-    table.arrays["masking"] = table.arrays["masking"] * np.float32(2)  # a quarter of the specular reflection
+    table = TASK.load(TASK.file(preset="paper")).to("float32")
+    table.arrays["masking"] = StoredArray(2 * table.arrays["masking"].values)  # a quarter of the specular reflection
     save_table(tmp_path / "own.npz", table)
     (tmp_path / "m.xml").write_text(
         '<bsdf version="3.0.0" type="neural_disney"><string name="filename" value="own.npz"/>'
@@ -309,36 +310,30 @@ def test_assigning_tables_changes_one_instance_only(mi_rgb, rng):
 
 def test_tables_of_the_file_can_be_assigned(mi_rgb, rng):
     """Entries may have the file's shape as well as the padded one; any other is refused in a sentence."""
-    from mi_diffind.tables import load_table
-    from mi_diffind.tasks.disney.library import SHIPPED
-
     mi = mi_rgb
     bsdf = mi.load_dict({**PLUGINS["paper"], **RICH})
     si, wo = interactions(mi, directions(mi, rng, 1000)), directions(mi, rng, 1000)
     before = bsdf.eval(mi.BSDFContext(), si, wo).numpy()
-    params, table = mi.traverse(bsdf), load_table(SHIPPED["paper"])
+    params, table = mi.traverse(bsdf), TASK.load(TASK.file(preset="paper"))
     for name in ("ggx", "masking", "coat"):
-        params[f"tables.{name}"] = mi.TensorXf(table.values(name))
+        params[f"tables.{name}"] = mi.TensorXf(table.arrays[name].values)
     params.update()
     assert np.array_equal(bsdf.eval(mi.BSDFContext(), si, wo).numpy(), before)
-    params["tables.ggx"] = mi.TensorXf(table.values("ggx") + 0.1)  # once more: the parameter is still the table
+    params["tables.ggx"] = mi.TensorXf(table.arrays["ggx"].values + 0.1)  # once more: the parameter is still the table
     params.update()
     assert not np.allclose(bsdf.eval(mi.BSDFContext(), si, wo).numpy(), before)
     params["tables.ggx"] = mi.TensorXf(np.zeros((4, 4, 3), np.float32))
     with pytest.raises(RuntimeError, match=r'"tables.ggx": "data" has the shape \(4, 4, 3\), expected \(16, 16, 3\)'):
         params.update()
-    params["tables.ggx"] = mi.TensorXf(table.values("ggx"))
+    params["tables.ggx"] = mi.TensorXf(table.arrays["ggx"].values)
     params.update()
 
 
 def test_a_file_is_read_as_bytes_or_as_asked_for(mi_rgb, tmp_path):
-    from mi_diffind.tables import save_table
-    from mi_diffind.tasks.disney.library import SHIPPED, load_disney_table
-
-    save_table(tmp_path / "own.npz", load_disney_table(SHIPPED["tables"])[0])
+    save_table(tmp_path / "own.npz", TASK.load(TASK.file(preset="tables")))
     own = {"type": "neural_disney", "filename": str(tmp_path / "own.npz")}
-    assert "preset = tables, 512 bytes as uint8" in str(mi_rgb.load_dict(own))
-    assert "preset = tables, 2048 bytes as float32" in str(mi_rgb.load_dict({**own, "storage": "float32"}))
+    assert "preset = tables, 384 bytes as uint8" in str(mi_rgb.load_dict(own))
+    assert "preset = tables, 1536 bytes as float32" in str(mi_rgb.load_dict({**own, "storage": "float32"}))
 
 
 # -- parameters --------------------------------------------------------------------------------------------------------

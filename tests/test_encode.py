@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from mi_diffind.cli import main
+from mi_diffind.tables import save_table
+from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import Decoder
-from mi_diffind.tasks.disney.library import PRESETS, load_decoder
 
 NAMES = (
     "roughness", "anisotropic", "metallic", "specular", "spec_tint", "sheen", "sheen_tint", "flatness", "clearcoat",
@@ -48,11 +49,11 @@ def write_scene(folder, rng, names=NAMES, zero=(), transforms=()):
     return path
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", TASK.presets)
 def test_decode_inverts_encode(rng, preset):
     import drjit.llvm.ad as ad
 
-    decoder = load_decoder("", ad.TensorXf, "", preset)
+    decoder = TASK.open(ad.TensorXf, "", preset).decoder
     roughness, anisotropic = (ad.Float(rng.random(10_000).astype("f4")) for _ in range(2))
     latent = decoder.encode_roughness(roughness), decoder.encode_anisotropic(anisotropic)
     assert all(v.numpy().min() >= -1e-3 and v.numpy().max() <= 1.001 for v in latent)
@@ -62,7 +63,7 @@ def test_decode_inverts_encode(rng, preset):
         assert np.quantile(np.abs(a.numpy() - b.numpy())[visible], 0.99) < tolerance
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", TASK.presets)
 def test_encoded_materials_look_the_same(mi_rgb, rng, tmp_path, capsys, preset):
     from mi_diffind import scenes
     from mi_diffind.measure import operations
@@ -183,11 +184,9 @@ def test_materials_without_latents_are_refused(mi_rgb, tmp_path, capsys, plugin)
 def test_what_is_written_keeps_what_was_said(mi_rgb, rng, tmp_path):
     """One's own tables, their storage, constants, and the place of the textures."""
     from mi_diffind.encode import encode
-    from mi_diffind.tables import load_table, save_table
-    from mi_diffind.tasks.disney.library import SHIPPED
 
     scene = write_scene(tmp_path, rng, ("roughness",))
-    save_table(tmp_path / "own.npz", load_table(SHIPPED["paper"]))
+    save_table(tmp_path / "own.npz", TASK.load(TASK.file(preset="paper")))
     own = '<string name="filename" value="own.npz"/><string name="storage" value="float16"/>'
     own += '<float name="sheen" value="0.25"/><float name="eta" value="1.5"/>'
     scene.write_text(scene.read_text().replace('<string name="preset" value="$preset"/>', own))
