@@ -211,7 +211,7 @@ def _add_tables(made: _Made, inputs: str) -> None:
 
 
 def _add_table(made: _Made, n: int, how: str, encoding: Encoding, forms, representation: str = "") -> None:
-    """A training, and a candidate in each of ``forms``: indirection of a primary side ``n``, or a table of that side."""
+    """A training, and a candidate in each of ``forms``: indirection of a primary of side ``n``, or a table of it."""
     representation = representation or how.split(",")[0]
     if representation == "indirection":
         label, entries, net = f"{n}→{n // 2}", 2 * n**2 + (n // 2) ** 2, lambda: indirection(n, n // 2)

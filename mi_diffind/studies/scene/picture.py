@@ -92,12 +92,10 @@ def _draw(axes, result: dict, curves: dict[str, list[dict]]) -> list[plot.Label]
             axes.axhspan(low, floor, color="#7a3b8f", alpha=0.08, linewidth=0, zorder=1.5)
             name = f"bias of the approximation: none found, below {percent(floor)}"
         axes.axhline(floor, color="#7a3b8f", linewidth=1.1, zorder=2)
-        name = ", ".join(filter(None, [name, _decibel(bias)]))
-        axes.annotate(name, (0, floor), (5, -3), xycoords=axes.get_yaxis_transform(), va="top",
+        axes.annotate(f"{name}, {decibel(bias)}", (0, floor), (5, -3), xycoords=axes.get_yaxis_transform(), va="top",
                       textcoords="offset points", fontsize=8, color="#5e2a70")  # fmt: skip
     else:
-        note = " ".join(filter(None, [result["verdict"], _decibel(bias)]))
-        note = "▼ " + "\n    ".join(textwrap.wrap(note, 100))
+        note = "▼ " + "\n    ".join(textwrap.wrap(f"{result['verdict']} {decibel(bias)}", 100))
         axes.annotate(note, (0.012, 0.02), xycoords="axes fraction", fontsize=8, color="#5e2a70", va="bottom",
                       linespacing=1.35)  # fmt: skip
     for name, curve in curves.items():
@@ -161,7 +159,8 @@ def _continued(result: dict, name: str, curve: list[dict], end: float, crossover
     return xs, ys
 
 
-def _decibel(bias: dict) -> str:
+def decibel(bias: dict) -> str:
+    """The PSNR of a bias, or what it is above."""
     if "psnr_db" in bias:
         return f"PSNR {bias['psnr_db']:.1f} dB"
-    return f"PSNR above {bias['psnr_db_above']:.1f} dB" if bias["psnr_db_above"] is not None else ""
+    return "PSNR infinite" if bias["psnr_db_above"] is None else f"PSNR above {bias['psnr_db_above']:.1f} dB"
