@@ -11,6 +11,7 @@ recipe does. All of them are trained until that has converged (:mod:`~mi_diffind
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -153,13 +154,7 @@ class _Made:
     def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
         """Register a candidate; ``form(net)`` turns the trained module into what is read."""
         name = self.name(label, encoding.inputs)
-        cache = []
-
-        def reader():
-            if not cache:
-                cache.append(LearnedGGX(form(training.net), encoding, tail=False))
-            return cache[0]
-
+        reader = functools.cache(lambda: LearnedGGX(form(training.net), encoding, tail=False))
         self.candidates.append(
             Candidate(
                 name, representation, setting, size,

@@ -104,13 +104,11 @@ def _draw(axes, result: dict, curves: dict[str, list[dict]]) -> list[plot.Label]
         colour, marker = VERSIONS[name]
         xs, ys = [p["seconds"] for p in curve], [p["rmse"] for p in curve]
         roots = [[math.sqrt(max(p[k], 1e-30)) for p in curve] for k in ("mse_q1", "mse_q3")]
-        bars = {
-            "xerr": [np.subtract(xs, [p["seconds_q1"] for p in curve]),
-                     np.subtract([p["seconds_q3"] for p in curve], xs)],
-            "yerr": [np.subtract(ys, roots[0]), np.subtract(roots[1], ys)],
-        }  # fmt: skip
-        bars = {k: np.maximum(v, 0) for k, v in bars.items()}
-        axes.errorbar(xs, ys, **bars, fmt=f"{marker}-", color=colour, linewidth=1.1, elinewidth=0.9, capsize=2,
+        times = [[p[k] for p in curve] for k in ("seconds_q1", "seconds_q3")]
+        bars = [
+            np.maximum([np.subtract(v, low), np.subtract(high, v)], 0) for v, (low, high) in ((ys, roots), (xs, times))
+        ]
+        axes.errorbar(xs, ys, *bars, fmt=f"{marker}-", color=colour, linewidth=1.1, elinewidth=0.9, capsize=2,
                       markersize=5.5, markerfacecolor="white", markeredgewidth=1.3, zorder=3)  # fmt: skip
         axes.plot(*_continued(result, name, curve, axes.get_xlim()[1], crossover), color=colour, linewidth=0.9,
                   linestyle=_DASHES, alpha=0.75, zorder=2.5)  # fmt: skip
