@@ -150,7 +150,6 @@ def test_astc_quality():
     image = picture(96, 96)
     errors = [psnr(image, codecs.astc(image, "6x6", q).image) for q in ("fastest", "medium", "thorough")]
     assert errors[0] < errors[1] < errors[2]
-    assert np.array_equal(codecs.astc(image, "6x6", 60).image, codecs.astc(image, "6x6", "medium").image)
 
 
 @astc_only
@@ -173,21 +172,6 @@ def test_astc_normal(reduce):
     assert np.abs(codecs.astc(flat, "8x8", normal=True, **QUICK).image - flat).max() <= 1 / 255
 
 
-@astc_only
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        ({"block": "7x7"}, 'block: found "7x7", one of 4x4, '),
-        ({"quality": "best"}, 'quality: found "best", one of fastest, '),
-        ({"normal": True}, "found 2 channels, a normal map has 3"),
-        ({"reduce": 0}, "reduce: found 0"),
-    ],
-)
-def test_astc_refused(options, match):
-    with pytest.raises(ValueError, match=match):
-        codecs.astc(picture(8, 8, 2), **options)
-
-
 @every("bc7")
 @pytest.mark.parametrize("size", SIZES)
 def test_bc7_bytes(codec, size):
@@ -206,8 +190,6 @@ def test_files(codec):
     both = getattr(codecs, codec)(pair, 50)
     assert both.nbytes == sum(e.nbytes for e in single)
     assert np.array_equal(both.image, np.concatenate([e.image for e in single], -1))
-    with pytest.raises(ValueError, match="quality: found 101"):
-        getattr(codecs, codec)(image, 101)
 
 
 def test_too_long_for_webp():

@@ -154,8 +154,9 @@ def test_bias_is_that_of_converged_images(scene, whole, mi_rgb):
     images = [mi_rgb.render(s, spp=4096, seed=77).numpy().astype(np.float64) for s in (written, exact)]
     weights = bias.weights_of(images[1])
     rmse = math.sqrt(np.mean(weights * (images[0] - images[1]) ** 2))
-    assert found["rmse"] == pytest.approx(rmse, rel=0.2)
-    assert found["psnr_db"] == pytest.approx(metrics.psnr(*images), abs=1.5)
+    assert found["rmse"] == pytest.approx(rmse, abs=4 * found["rmse_standard_error"])
+    assert found["rmse_standard_error"] < 0.15 * rmse
+    assert found["psnr_db"] == pytest.approx(metrics.psnr(*images), abs=3)
 
 
 @pytest.mark.parametrize("stop_at", [3, PASSES + 3, RENDERS - 1])

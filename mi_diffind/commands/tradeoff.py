@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from ..errors import UsageError
 from ..files import writable_folder
 from ..studies import studies
 from .common import (
-    UsageError,
     alternative,
     alternatives,
     defines_of,

@@ -87,12 +87,11 @@ def measure(plan: Plan, settings: Settings, folder: str | os.PathLike | None = N
         "cases": [c.name for c in plan.cases],
     }
     store = Store(folder, plan.study, key, SECTIONS, progress)
-    interrupted = False
+    interrupted, cases = False, [plan.resolved(case) for case in plan.cases]
     with interruptible() as stop:
         steps = _Steps(plan, settings, store, stop, progress)
         try:
             steps.jobs()
-            cases = [plan.resolved(case, store.data["jobs"]) for case in plan.cases]
             with steps.bar(cases):
                 steps.errors()
                 for case in cases:
@@ -101,7 +100,6 @@ def measure(plan: Plan, settings: Settings, folder: str | os.PathLike | None = N
                         steps.passes(case)
         except Stopped:
             interrupted = True
-            cases = [plan.resolved(case, store.data["jobs"]) for case in plan.cases]
         finally:
             store.save()
     result = {

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from .. import metrics
-from ..files import replacing
+from . import plot
 
 #: What draws one cell: a function of a Matplotlib figure and of the axes of the cell.
 Cell = Callable[[object, object], None]
@@ -60,5 +59,4 @@ def write(path: str | os.PathLike, cells: Sequence[Cell], columns: int, shape: S
         axes.set_axis_off()
     for cell, axes in zip(cells, grid, strict=False):
         cell(sheet, axes)
-    with replacing(path) as temporary:
-        sheet.savefig(temporary, format=Path(path).suffix[1:])
+    plot.save(sheet, path)

@@ -19,6 +19,12 @@ def spread(values: Iterable[float]) -> dict[str, float]:
     return {"median": float(median), "q1": float(q1), "q3": float(q3)}
 
 
+def named(name: str, values: Iterable[float]) -> dict[str, float]:
+    """:func:`spread`, flat: the median as ``NAME``, the quartiles as ``NAME_q1`` and ``NAME_q3``."""
+    median, q1, q3 = spread(values).values()
+    return {name: median, f"{name}_q1": q1, f"{name}_q3": q3}
+
+
 def timing(values: Iterable[float], floor: float = 0.0) -> dict:
     """
     The time that rounds took, in their unit: ``time``, ``q1``, ``q3`` without the ``floor`` and not less than

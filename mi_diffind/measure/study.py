@@ -107,15 +107,15 @@ class Case:
     A situation. ``queries(lanes)`` maps the name of each query to the names of all candidates and :data:`FLOOR`, and
     these to functions; ``passes()``, if there are any, maps candidates (those with ``in_passes``) to functions of the
     number of the pass, which do one pass of a whole job. Both are called when they are needed. ``candidates`` are the
-    names of those that take part (default: all), or a function of the jobs' records that gives them; ``query_names``
-    those of its queries (default: the plan's); ``in_picture``: it has a panel. ``details`` are kept with it.
+    names of those that take part (default: all), ``query_names`` those of its queries (default: the plan's);
+    ``in_picture``: it has a panel. ``details`` are kept with it.
     """
 
     name: str
     queries: Callable[[int], dict[str, dict[str, Callable[[], object]]]]
     passes: Callable[[], dict[str, Callable[[int], object]]] | None = None
     details: dict = field(default_factory=dict)
-    candidates: tuple[str, ...] | Callable[[dict], tuple[str, ...]] | None = None
+    candidates: tuple[str, ...] | None = None
     query_names: tuple[str, ...] | None = None
     in_picture: bool = True
 
@@ -152,10 +152,9 @@ class Plan:
     table: Callable[[dict], list[str]] = lambda result: []
     conclusions: Callable[[dict], list[str]] = lambda result: []
 
-    def resolved(self, case: Case, records: dict) -> Case:
+    def resolved(self, case: Case) -> Case:
         """``case`` with the names of its candidates and queries."""
-        names = case.candidates(records) if callable(case.candidates) else case.candidates
-        known = tuple(c.name for c in self.candidates if names is None or c.name in names)
+        known = tuple(c.name for c in self.candidates if case.candidates is None or c.name in case.candidates)
         return dataclasses.replace(case, candidates=known, query_names=case.query_names or self.queries)
 
     def takers(self, case: Case, query: str) -> list[str]:

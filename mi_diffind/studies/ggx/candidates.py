@@ -11,6 +11,7 @@ recipe does. All of them are trained until that has converged (:mod:`~mi_diffind
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -153,13 +154,7 @@ class _Made:
     def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
         """Register a candidate; ``form(net)`` turns the trained module into what is read."""
         name = self.name(label, encoding.inputs)
-        cache = []
-
-        def reader():
-            if not cache:
-                cache.append(LearnedGGX(form(training.net), encoding, tail=False))
-            return cache[0]
-
+        reader = functools.cache(lambda: LearnedGGX(form(training.net), encoding, tail=False))
         self.candidates.append(
             Candidate(
                 name, representation, setting, size,
@@ -211,7 +206,7 @@ def _add_tables(made: _Made, inputs: str) -> None:
 
 
 def _add_table(made: _Made, n: int, how: str, encoding: Encoding, forms, representation: str = "") -> None:
-    """A training, and a candidate in each of ``forms``: indirection of primary side ``n``, or a table of that side."""
+    """A training, and a candidate in each of ``forms``: indirection of a primary of side ``n``, or a table of it."""
     representation = representation or how.split(",")[0]
     if representation == "indirection":
         label, entries, net = f"{n}→{n // 2}", 2 * n**2 + (n // 2) ** 2, lambda: indirection(n, n // 2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from ...lookup import STORAGES
+from ...measure.words import grid
 
 #: The reference of the equal-quality comparison: the paper's sizes.
 PRIMARY, CASCADED = 16, 8
@@ -68,15 +69,14 @@ def _equal_quality(result: dict, reference: str) -> list[str]:
     timings, candidates = measured["queries"]["read"], result["candidates"]
     own, goal = timings[reference], _accuracy(result, reference)
     flops, read = own["operations"]["flops"], own["operations"]["bytes_gathered"]
-    lines = [
+    head = (
         f"equal quality with indirection {reference} ({goal:.1f} dB; {flops} flops, {read} bytes read, "
         f"{candidates[reference]['bytes']:,} bytes, {own['time']:.2f} ns), plain inputs; the paper's own: "
-        f"{PAPER_FLOPS} flops, {PAPER_BYTES_READ} bytes read, {PAPER_BYTES:,} bytes",
-        f"  {'':20}{'':16}{'dB':>7}{'flops':>9}{'bytes read':>12}{'bytes':>9}{'time':>8}"
-        "   the paper's: flops, read, bytes",
-    ]
+        f"{PAPER_FLOPS} flops, {PAPER_BYTES_READ} bytes read, {PAPER_BYTES:,} bytes"
+    )
     if not candidates[reference]["converged"]:
-        return [*lines[:1], f"  {reference} has not converged: no statement is made"]
+        return [head, f"  {reference} has not converged: no statement is made"]
+    cells, notes = [["", "", "dB", "flops", "bytes read", "bytes", "time"]], ["   the paper's: flops, read, bytes"]
     for family, paper in {**PAPER, "hash grid + network": None}.items():
         members = [
             name for name in timings
@@ -92,14 +92,11 @@ def _equal_quality(result: dict, reference: str) -> list[str]:
             t["operations"]["flops"] / flops, t["operations"]["bytes_gathered"] / read,
             c["bytes"] / candidates[reference]["bytes"], t["time"] / own["time"],
         )  # fmt: skip
-        text = f"  {family:20}{name:16}{_accuracy(result, name):>7.1f}" + "".join(
-            f"{r:>{w - 1}.2f}x" for r, w in zip(ratios, (9, 12, 9, 8), strict=True)
-        )
-        if paper:
-            text += "   " + ", ".join(f"{r:g}x" for r in paper)
+        cells.append([family, name, f"{_accuracy(result, name):.1f}", *(f"{r:.2f}x" for r in ratios)])
+        text = "   " + ", ".join(f"{r:g}x" for r in paper) if paper else ""
         if not c["converged"]:
             text += "; has not converged: no statement about equal quality"
         elif not good:
             text += "; the best of its family, which does NOT reach it"
-        lines.append(text)
-    return lines
+        notes.append(text)
+    return [head, *(line + note for line, note in zip(grid(cells), notes, strict=True))]

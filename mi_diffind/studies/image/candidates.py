@@ -69,19 +69,14 @@ def plan(source: Source, name: str, request: Request) -> Plan:
         for label, eight in BITMAPS.items()
     ]
 
-    def timed(records: dict) -> tuple[str, ...]:
-        return (*_best_of_kinds(records, request.compressions[0]), *BITMAPS)
-
-    by_name = {job.name: job for job in jobs}
+    read = [j for j in jobs if isinstance(j, _Training) and j.compression == request.compressions[0]]
+    read = {job.name: job for job in read if job.candidate().in_picture}
     cases = [
         Case(
             f"{place} places",
-            lambda lanes, p=place: _reads(source, by_name, p, lanes),
-            None,
-            {},
-            timed,
-            None,
-            place == "random",
+            lambda lanes, p=place: _reads(source, read, p, lanes),
+            candidates=(*read, *BITMAPS),
+            in_picture=place == "random",
         )
         for place in ("random", "coherent")
     ]
@@ -305,18 +300,8 @@ def _picture(values: np.ndarray) -> np.ndarray:
 # -- time of a read ---------------------------------------------------------------------------------------------------
 
 
-def _best_of_kinds(records: dict, compression: float) -> list[str]:
-    """The trained files that are read: the best of each kind at the first compression."""
-    best: dict[tuple, str] = {}
-    for name, record in sorted(records.items(), key=lambda item: -item[1]["errors"]["psnr_db"]):
-        known = record["details"]
-        if known.get("file") and known["compression"] == compression:
-            best.setdefault((known["dims"], known["structure"], known["cascaded"]), name)
-    return list(best.values())
-
-
-def _reads(source: Source, jobs: dict[str, _Made], place: str, lanes: int) -> dict:
-    """All maps at a place, by each candidate that can be loaded."""
+def _reads(source: Source, jobs: dict[str, _Training], place: str, lanes: int) -> dict:
+    """All maps at a place, by each training's file and by bitmaps."""
     rng, index = dr.rng(seed=dr.opaque(mi.UInt64, 3)), dr.arange(mi.UInt32, lanes)
     si = dr.zeros(mi.SurfaceInteraction3f, lanes)
     if place == "random":
@@ -332,10 +317,8 @@ def _reads(source: Source, jobs: dict[str, _Made], place: str, lanes: int) -> di
     found = {FLOOR: lambda: [si.uv.x, si.uv.y]}
     found |= {name: read(_bitmaps(source, eight)) for name, eight in BITMAPS.items()}
     for name, job in jobs.items():
-        if getattr(job, "file", ""):
-            plugin = {"type": "neural_image", "filename": job.file, "raw": True}
-            textures = [(mi.load_dict({**plugin, "channels": m.name}), m.channels) for m in source.maps]
-            found[name] = read(textures)
+        plugin = {"type": "neural_image", "filename": job.file, "raw": True}
+        found[name] = read([(mi.load_dict({**plugin, "channels": m.name}), m.channels) for m in source.maps])
     return {"read": found}
 
 

@@ -92,12 +92,10 @@ def _draw(axes, result: dict, curves: dict[str, list[dict]]) -> list[plot.Label]
             axes.axhspan(low, floor, color="#7a3b8f", alpha=0.08, linewidth=0, zorder=1.5)
             name = f"bias of the approximation: none found, below {percent(floor)}"
         axes.axhline(floor, color="#7a3b8f", linewidth=1.1, zorder=2)
-        name = ", ".join(filter(None, [name, _decibel(bias)]))
-        axes.annotate(name, (0, floor), (5, -3), xycoords=axes.get_yaxis_transform(), va="top",
+        axes.annotate(f"{name}, {decibel(bias)}", (0, floor), (5, -3), xycoords=axes.get_yaxis_transform(), va="top",
                       textcoords="offset points", fontsize=8, color="#5e2a70")  # fmt: skip
     else:
-        note = " ".join(filter(None, [result["verdict"], _decibel(bias)]))
-        note = "▼ " + "\n    ".join(textwrap.wrap(note, 100))
+        note = "▼ " + "\n    ".join(textwrap.wrap(f"{result['verdict']} {decibel(bias)}", 100))
         axes.annotate(note, (0.012, 0.02), xycoords="axes fraction", fontsize=8, color="#5e2a70", va="bottom",
                       linespacing=1.35)  # fmt: skip
     for name, curve in curves.items():
@@ -106,13 +104,11 @@ def _draw(axes, result: dict, curves: dict[str, list[dict]]) -> list[plot.Label]
         colour, marker = VERSIONS[name]
         xs, ys = [p["seconds"] for p in curve], [p["rmse"] for p in curve]
         roots = [[math.sqrt(max(p[k], 1e-30)) for p in curve] for k in ("mse_q1", "mse_q3")]
-        bars = {
-            "xerr": [np.subtract(xs, [p["seconds_q1"] for p in curve]),
-                     np.subtract([p["seconds_q3"] for p in curve], xs)],
-            "yerr": [np.subtract(ys, roots[0]), np.subtract(roots[1], ys)],
-        }  # fmt: skip
-        bars = {k: np.maximum(v, 0) for k, v in bars.items()}
-        axes.errorbar(xs, ys, **bars, fmt=f"{marker}-", color=colour, linewidth=1.1, elinewidth=0.9, capsize=2,
+        times = [[p[k] for p in curve] for k in ("seconds_q1", "seconds_q3")]
+        bars = [
+            np.maximum([np.subtract(v, low), np.subtract(high, v)], 0) for v, (low, high) in ((ys, roots), (xs, times))
+        ]
+        axes.errorbar(xs, ys, *bars, fmt=f"{marker}-", color=colour, linewidth=1.1, elinewidth=0.9, capsize=2,
                       markersize=5.5, markerfacecolor="white", markeredgewidth=1.3, zorder=3)  # fmt: skip
         axes.plot(*_continued(result, name, curve, axes.get_xlim()[1], crossover), color=colour, linewidth=0.9,
                   linestyle=_DASHES, alpha=0.75, zorder=2.5)  # fmt: skip
@@ -161,7 +157,8 @@ def _continued(result: dict, name: str, curve: list[dict], end: float, crossover
     return xs, ys
 
 
-def _decibel(bias: dict) -> str:
+def decibel(bias: dict) -> str:
+    """The PSNR of a bias, or what it is above."""
     if "psnr_db" in bias:
         return f"PSNR {bias['psnr_db']:.1f} dB"
-    return f"PSNR above {bias['psnr_db_above']:.1f} dB" if bias["psnr_db_above"] is not None else ""
+    return "PSNR infinite" if bias["psnr_db_above"] is None else f"PSNR above {bias['psnr_db_above']:.1f} dB"

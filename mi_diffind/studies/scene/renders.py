@@ -25,7 +25,7 @@ from ...interrupt import interruptible
 from ...measure.bias import LEAST, crossover, describe, error, estimate, root, weights_of
 from ...measure.clock import machine, timed
 from ...measure.frame import Stopped
-from ...measure.statistics import finite, spread
+from ...measure.statistics import finite, named, spread
 from ...measure.store import Store, fingerprint, sources
 from .verdict import verdict
 
@@ -149,30 +149,24 @@ def measure(
     return result | {"verdict": verdict(result)}
 
 
+@dataclass
 class _Steps:
     """The steps of a run; each does what is missing, and raises :class:`Stopped` where it may be left off."""
 
-    def __init__(
-        self,
-        loaded: dict,
-        counts: list[int],
-        settings: Settings,
-        seed: int,
-        store: Store,
-        pixels: int,
-        bar: tqdm,
-        stop: threading.Event,
-    ):
-        self.loaded, self.counts, self.settings, self.seed = loaded, counts, settings, seed
-        self.store, self.bar, self.stop = store, bar, stop
-        self.launch = max(1, 1 << (max(_LAUNCH // pixels, 1).bit_length() - 1))  # samples of a pixel, a power of two
-        self.launches = max(1, counts[-1] // self.launch)  # at most, of an image
-        self.warm = False
+    loaded: dict
+    counts: list[int]
+    settings: Settings
+    seed: int
+    store: Store
+    pixels: int
+    bar: tqdm
+    stop: threading.Event
+    warm: bool = False
 
     def passes(self) -> None:
         """
         The exact pass that the brightness is made of, and the pairs of passes of the highest count, learned and exact
-        with the same seeds (even numbers).
+        with the same seeds.
         """
         top = self.counts[-1]
         store, done = self.store, self.store.data["passes"]
@@ -181,13 +175,13 @@ class _Steps:
             store.save()
         self.bar.update(top + len(VERSIONS) * top * len(done))
         for k in range(len(done), self.settings.passes):
-            images, times = self._pair(top, 2 * (k + 1) * self.launches, k % 2 == 1)
+            images, times = self._pair(top, 1 + k, k % 2 == 1)
             store.keep(str(k), **images)
             done[str(k)] = times
             store.save()
 
     def rounds(self) -> None:
-        """Rounds of the lower counts, learned and exact with the same seeds (odd numbers)."""
+        """Rounds of the lower counts, learned and exact with the same seeds, which are not those of the passes."""
         lower, done = self.counts[:-1], self.store.data["rounds"]
         self.bar.update(len(VERSIONS) * sum(spp * len(done.get(str(spp), [])) for spp in lower))
         exact = _images(self.store)["exact"]
@@ -199,14 +193,14 @@ class _Steps:
                 if len(done.get(str(spp), [])) > k:
                     continue
                 number = k * len(lower) + lower.index(spp)
-                images, found = self._pair(spp, 2 * number * self.launches + 1, (k + number) % 2 == 1)
+                images, found = self._pair(spp, 1 + self.settings.passes + number, (k + number) % 2 == 1)
                 for name in VERSIONS:
                     found[name] |= _errors(images[name], truth, weights, truth_noise)
                 done.setdefault(str(spp), []).append(found)
                 self.store.save()
 
     def _pair(self, spp: int, number: int, learned_first: bool) -> tuple[dict, dict]:
-        """Both images of ``spp`` samples, with seeds ``number``, ``number + 2``, …; and their times."""
+        """Both images of ``spp`` samples, of one ``number``, which stands for their seeds; and their times."""
         if not self.warm:
             for name in VERSIONS:
                 self._render(name, self.counts[0], 0)
@@ -221,19 +215,13 @@ class _Steps:
 
     def _render(self, name: str, spp: int, number: int) -> tuple[np.ndarray, dict]:
         """An image, float32, and ``seconds``, ``seconds_wall`` (``None`` if something was compiled), ``not_finite``."""
-        launch = min(spp, self.launch)
-        image, kernels, wall, compiled = 0.0, 0.0, 0.0, False
-        for i in range(spp // launch):
-            number_of_launch = (self.seed << 16) + number + 2 * i
-            part = timed(lambda n=number_of_launch: scenes.render_pass(self.loaded[name], launch, n))
-            image = image + part.value * (launch / spp)
-            kernels, wall = kernels + part.seconds, wall + part.seconds_wall
-            compiled |= part.compiled
-        image = image[..., : 3 if image.shape[-1] >= 3 else 1].astype(np.float32)
+        launches = 1 << ((spp * self.pixels - 1) // _LAUNCH).bit_length()
+        found = timed(lambda: scenes.render(self.loaded[name], spp, (self.seed << 8) + number, launches)[0])
+        image = found.value[..., : 3 if found.value.shape[-1] >= 3 else 1]
         bad = ~np.isfinite(image)
         return np.where(bad, np.float32(0), image), {
-            "seconds": None if compiled else kernels,
-            "seconds_wall": None if compiled else wall,
+            "seconds": None if found.compiled else found.seconds,
+            "seconds_wall": None if found.compiled else found.seconds_wall,
             "not_finite": int(bad.sum()),
         }
 
@@ -292,14 +280,17 @@ def _assemble(store: Store, counts: list[int]) -> dict:
 
 
 def _point(rounds: list[dict]) -> dict:
-    mse = spread(r["mse"] for r in rounds)
-    point = {"mse": mse["median"], "mse_q1": mse["q1"], "mse_q3": mse["q3"], "rmse": root(mse["median"])}
-    point |= {"psnr_db": float(np.median([r["psnr_db"] for r in rounds])), "images": len(rounds)}
     timed = [r for r in rounds if r["seconds"] is not None]
-    for kind in ("seconds", "seconds_wall"):
-        s = spread(r[kind] for r in timed)
-        point |= {kind: s["median"], f"{kind}_q1": s["q1"], f"{kind}_q3": s["q3"]}
-    return point | {"timed": len(timed)}
+    mse = named("mse", (r["mse"] for r in rounds))
+    return {
+        **mse,
+        "rmse": root(mse["mse"]),
+        "psnr_db": float(np.median([r["psnr_db"] for r in rounds])),
+        "images": len(rounds),
+        **named("seconds", (r["seconds"] for r in timed)),
+        **named("seconds_wall", (r["seconds_wall"] for r in timed)),
+        "timed": len(timed),
+    }
 
 
 def _ratio(rounds: list[dict]) -> dict | None:

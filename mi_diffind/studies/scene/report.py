@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 
 from ...measure import report
-from ...measure.bias import PRACTICAL, practical, root
-from ...measure.words import duration, enumeration, grid, machine_line, percent, rounded, state
+from ...measure.bias import practical, root
+from ...measure.words import enumeration, grid, machine_line, percent, rounded, state
 from . import picture
 from .renders import VERSIONS
 
@@ -83,33 +83,21 @@ def summary(result: dict) -> list[str]:
     lines += grid(cells)
     reference, bias, crossover = result["reference"], result["bias"], result["crossover"]
     lines += ["", f"reference   {reference['spp']} spp, its own noise {percent(reference['noise_rmse'])} (subtracted)"]
-    psnr = f"PSNR {bias['psnr_db']:.1f} dB" if "psnr_db" in bias else f"PSNR {_psnr(bias['psnr_db_above'])}"
-    if bias["measured"]:
-        lines.append(f"bias        {percent(bias['rmse'])} ± {percent(bias['rmse_standard_error'], 2)}, {psnr}")
-    else:
-        lines.append(f"bias        below {percent(bias['rmse_below'])}, {psnr}")
-    lines.append(f"crossover   {_crossover(crossover)}")
+    size = (
+        f"below {percent(bias['rmse_below'])}"
+        if not bias["measured"]
+        else (f"{percent(bias['rmse'])} ± {percent(bias['rmse_standard_error'], 2)}")
+    )
+    lines.append(f"bias        {size}, {picture.decibel(bias)}")
+    if "spp" in crossover and practical(crossover):
+        between = f"{rounded(crossover['spp_low'])} to {rounded(crossover['spp_high'])}"
+        how = ", extrapolated" * crossover["extrapolated"]
+        lines.append(f"crossover   {rounded(crossover['spp'])} spp ({between}){how}")
     if result["not_finite"]:
         lines.append(f"not finite  {result['not_finite']} values, counted as 0")
     if result["interrupted"]:
         lines.append("interrupted: the same command goes on from there")
     return [*lines, "", result["verdict"]]
-
-
-def _crossover(found: dict) -> str:
-    if "spp" not in found and found["spp_above"] is None:
-        return "none"
-    if not practical(found):
-        return f"at no practical number of samples (more than {rounded(PRACTICAL)} spp)"
-    if "spp" not in found:
-        return f"above {rounded(found['spp_above'])} spp"
-    seconds = f", {duration(found['seconds'])}" if found["seconds"] is not None else ""
-    between = f"{rounded(found['spp_low'])} to {rounded(found['spp_high'])}"
-    return f"{rounded(found['spp'])} spp ({between}){seconds}{', extrapolated' * found['extrapolated']}"
-
-
-def _psnr(db: float | None) -> str:
-    return "infinite" if db is None else f"above {db:.1f} dB"
 
 
 def _error_cell(point: dict) -> str:
