@@ -129,12 +129,15 @@ def test_sample_eval_and_pdf_agree(mi_rgb, rng, name, material):
     assert np.quantile(weight.numpy(), 0.999) < 8
 
 
-@pytest.mark.parametrize("name", list(PLUGINS))
-def test_finite_and_non_negative_over_ten_million_inputs(mi_rgb, rng, name):
-    """Random and adversarial directions × random and extreme materials: eval, pdf, sampling weight."""
+@pytest.mark.parametrize(
+    "name, n",
+    [(name, 20_000) for name in PLUGINS] + [pytest.param(n, 500_000, marks=pytest.mark.slow) for n in PLUGINS],
+)
+def test_finite_and_non_negative_over_many_inputs(mi_rgb, rng, name, n):
+    """Random and adversarial directions × random and extreme materials: eval, pdf, sampling weight; up to 10⁷."""
     mi = mi_rgb
     special = np.array([0, 1e-38, 1e-30, 1e-20, 1e-12, 1e-8, 1e-6, 1e-4, 1e-2, 0.5, 1 - 1e-7, 1])
-    n, rounds = 500_000, 20
+    rounds = 20
     params_rng = np.random.default_rng(7)
     bsdf = mi.load_dict({**PLUGINS[name], "base_color": {"type": "rgb", "value": 0.5}})
     params = mi.traverse(bsdf)
@@ -574,8 +577,18 @@ KEYS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", list(PLUGINS))
-@pytest.mark.parametrize("integrator", ["prb", "direct", "path"])
+#: Each plugin, and each integrator; all pairs of them in the slow run.
+RENDERED = {("prb", "disney"), ("prb", "tables"), ("direct", "paper"), ("path", "disney")}
+
+
+@pytest.mark.parametrize(
+    "integrator, name",
+    [
+        pytest.param(integrator, name, marks=() if (integrator, name) in RENDERED else pytest.mark.slow)
+        for integrator in ("prb", "direct", "path")
+        for name in PLUGINS
+    ],
+)
 def test_gradients_through_render(mi_rgb, integrator, name):
     """
     Reverse mode through each integrator against finite differences of a weighted mean of the image (the highlight once,

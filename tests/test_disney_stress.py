@@ -71,7 +71,7 @@ MATERIALS = {
 def plugin(mi, form, material, **more):
     """A BSDF, or its description, of constants; what the material does not say is left to the defaults."""
     described = dict(material)
-    if "base_color" in described:
+    if isinstance(described.get("base_color"), tuple):
         described["base_color"] = {"type": "rgb", "value": list(described["base_color"])}
     return {**(FORMS[form] if isinstance(form, str) else form), **described, **more}
 
@@ -88,7 +88,7 @@ def textured(mi, form, materials, **more):
     full = [{**PLAIN, **m} for m in materials]
     # Mitsuba wants two rows of texels
     textures = {name: bitmap(mi, [[m[name] for m in full]] * 2) for name in ("base_color", *SCALARS)}
-    return mi.load_dict({**FORMS[form], **textures, **more})
+    return mi.load_dict(plugin(mi, form, textures, **more))
 
 
 def interactions(mi, wi, material=None, count=1):
@@ -152,12 +152,18 @@ def smallest_alpha(material):
 CHI2_COUNT = len(MATERIALS) * len(ANGLES)
 
 
-@pytest.mark.parametrize("material", list(MATERIALS))
-@pytest.mark.parametrize("angle", ANGLES)
+def by_turns(first, second):
+    """All pairs, of which the first run always has half, all of ``first`` and all of ``second`` among them."""
+    for i, a in enumerate(first):
+        for j, b in enumerate(second):
+            yield pytest.param(a, b, marks=pytest.mark.slow if (i + j) % 2 else ())
+
+
+@pytest.mark.parametrize("material, angle", list(by_turns(MATERIALS, ANGLES)))
 def test_chi2(mi_rgb, material, angle, tmp_path, monkeypatch):
     """``sample`` draws from ``pdf``, in both plugins by turns: they share both methods, and what these are made of."""
     monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
-    form = ("disney", "tables")[(list(MATERIALS).index(material) + ANGLES.index(angle)) % 2]
+    form = ("disney", "tables")[list(MATERIALS).index(material) // 2 % 2]
     bsdf = mi_rgb.load_dict(plugin(mi_rgb, form, MATERIALS[material]))
     sampling = HalfVectorSampling(mi_rgb, bsdf, angle, smallest_alpha(MATERIALS[material]))
     messages, valid = sampling.faults(CHI2_COUNT)
@@ -263,8 +269,9 @@ def test_eval_pdf_and_sample_agree_in_every_context(mi_rgb, rng, form):
     assert close(parts["DiffuseReflection"] + parts["GlossyReflection"], parts["all"], 1e-4).all()
 
 
-@pytest.mark.parametrize("material", ["plain", "coat_only", "everything"])
-@pytest.mark.parametrize("effects", ["used", "all"])
+@pytest.mark.parametrize(
+    "material, effects", [("plain", "used"), ("coat_only", "used"), ("coat_only", "all"), ("everything", "used")]
+)
 def test_constant_materials_agree_in_every_context(mi_rgb, rng, material, effects):
     """As above where parts are left out, and where coefficients of constants are evaluated once."""
     mi, n = mi_rgb, 2000
@@ -373,17 +380,18 @@ def test_what_is_left_out_changes_nothing(mi_rgb, rng):
 
 @pytest.mark.parametrize("form", ["tables", "paper"])
 def test_what_is_left_out_changes_nothing_in_tables(mi_rgb, rng, form):
-    """A quarter of the sets, since what differs between presets is the factors and not what they are used for."""
+    """Some of the sets, since what differs between presets is the factors and not what they are used for."""
     found = list(distinct_effects().items())
-    chosen = [found[i] for i in rng.choice(len(found), 32, replace=False)]
+    chosen = [found[i] for i in rng.choice(len(found), 16, replace=False)]
     check_equal_to_unculled(mi_rgb, rng, form, [m for _, m in chosen], [e for e, _ in chosen])
 
 
-@pytest.mark.parametrize("form", list(FORMS))
-def test_images_are_equal_with_all_effects(mi_rgb, form):
+def test_images_are_equal_with_all_effects(mi_rgb):
     mi = mi_rgb
     images = [
-        mi.render(sphere_scene(mi, [plugin(mi, form, m, effects=effects) for m in MATERIALS.values()], size=24), spp=8)
+        mi.render(
+            sphere_scene(mi, [plugin(mi, "disney", m, effects=effects) for m in MATERIALS.values()], size=24), spp=8
+        )
         for effects in ("used", "all")
     ]
     a, b = (image.numpy() for image in images)
@@ -416,15 +424,17 @@ def equal_images(a, b):
     return (np.abs(a - b) <= 1e-4 * (np.abs(b) + 1e-2)).mean() > 0.99 and abs(a.mean() / b.mean() - 1) < 1e-3
 
 
-def switch_scene(mi, form, kind, on, **more):
-    """A sphere for each of :data:`SWITCHES`, with its parameter off or on; a number or a bitmap."""
+def switch_scene(mi, form, kind, on):
+    """
+    A sphere for each of :data:`SWITCHES`, with its parameter off or on; a number or a bitmap. No sphere lights another.
+    """
     bsdfs = []
     for name, (value, material) in SWITCHES.items():
         value = value if on else 0.0
         changed = value if kind == "number" else bitmap(mi, np.full((4, 4), value))
         material = {k: v for k, v in material.items() if k != name}
         bsdfs.append(plugin(mi, form, {"base_color": (0.6, 0.3, 0.2), **material}, **{name: changed}))
-    return sphere_scene(mi, bsdfs, size=24, columns=3, **more)
+    return sphere_scene(mi, bsdfs, size=24, columns=3, depth=2)
 
 
 def switch(mi, params, kind, on):
@@ -438,29 +448,20 @@ def switch(mi, params, kind, on):
     params.update()
 
 
-@pytest.mark.parametrize("kind", ["number", "bitmap"])
-@pytest.mark.parametrize("form", list(FORMS))
+@pytest.mark.parametrize("form, kind", [("disney", "number"), ("disney", "bitmap"), ("tables", "number")])
 def test_updated_parameters_show_in_the_next_image(mi_rgb, form, kind):
-    """Off, on, off: each image is that of a scene loaded so."""
+    """Off, on, off: each image is that of a scene loaded so, and on each sphere it is another."""
     mi = mi_rgb
     scene = switch_scene(mi, form, kind, False)
     params, images = mi.traverse(scene), {}
     for on in (False, True):
         images[on] = mi.render(switch_scene(mi, form, kind, on), spp=4).numpy()
-    assert images_differ(images[False], images[True])
+    for i, name in enumerate(SWITCHES):
+        where = np.s_[8 * (i // 3) : 8 * (i // 3) + 8, 8 * (i % 3) : 8 * (i % 3) + 8]
+        assert images_differ(images[False], images[True], where), name
     for on in (False, True, False):
         switch(mi, params, kind, on)
         assert equal_images(mi.render(scene, params, spp=4).numpy(), images[on]), on
-
-
-@pytest.mark.parametrize("form", list(FORMS))
-def test_each_updated_parameter_changes_its_sphere(mi_rgb, form):
-    """The test above would be satisfied by some of the spheres."""
-    mi = mi_rgb
-    off, on = (mi.render(switch_scene(mi, form, "number", v, depth=2), spp=16).numpy() for v in (False, True))
-    for i, name in enumerate(SWITCHES):
-        where = np.s_[8 * (i // 3) : 8 * (i // 3) + 8, 8 * (i % 3) : 8 * (i % 3) + 8]
-        assert images_differ(off, on, where), name
 
 
 def test_updated_parameters_show_in_frozen_renders(mi_rgb, no_garbage_collection):
@@ -609,13 +610,12 @@ def test_a_texture_updated_by_itself(mi_rgb):
         assert np.allclose(one_value(mi, bsdf, *TILTED), expected, rtol=1e-5), form
 
 
-@pytest.mark.parametrize("form", list(FORMS))
-def test_a_texture_shared_by_materials(mi_rgb, form):
+def test_a_texture_shared_by_materials(mi_rgb):
     """
     Mitsuba lists a shared texture once, and tells of its change only what it was found in: one of the materials, or, as
     here in the second part, the scene.
     """
-    mi = mi_rgb
+    mi, form = mi_rgb, "tables"
 
     def spheres(clearcoat):
         return [plugin(mi, form, {"roughness": r, "clearcoat_gloss": 0.3}, clearcoat=clearcoat) for r in (0.3, 0.6)]
@@ -630,7 +630,6 @@ def test_a_texture_shared_by_materials(mi_rgb, form):
 
     described = "".join(
         f'<shape type="sphere"><point name="center" x="{x}" y="0" z="0"/><bsdf type="{FORMS[form]["type"]}">'
-        f'{"" if form == "disney" else f"""<string name="preset" value="{form}"/>"""}'
         f'<float name="roughness" value="{r}"/><ref name="clearcoat" id="coat"/></bsdf></shape>'
         for x, r in ((-1.5, 0.3), (1.5, 0.6))
     )
@@ -730,11 +729,10 @@ def test_gradients_at_the_ends_against_finite_differences(mi_rgb, rng, form):
             assert found != 0, (name, m)
 
 
-@pytest.mark.parametrize("form", list(FORMS))
 @pytest.mark.parametrize("update", [False, True])
-def test_an_optimised_parameter_keeps_its_effect_at_zero(mi_rgb, form, update):
+def test_an_optimised_parameter_keeps_its_effect_at_zero(mi_rgb, update):
     """… through the renderer, and loses it again when it is not optimised any more."""
-    mi = mi_rgb
+    mi, form = mi_rgb, "tables"
     scene = sphere_scene(mi, plugin(mi, form, {"roughness": 0.3, "clearcoat_gloss": 0.3}), "prb", size=8)
     params = mi.traverse(scene)
     bsdf = scene.shapes()[0].bsdf()
@@ -862,8 +860,81 @@ def test_extreme_inputs(mi_rgb, rng, form):
         assert any(params[key].grad.numpy().any() for key in keys)
 
 
-@pytest.mark.parametrize("filter_type", ["nearest", "bilinear"])
-@pytest.mark.parametrize("form", list(FORMS))
+def check_finite(mi, bsdf, si, wo, u, what):
+    """Values, densities and weights are finite and not negative, and samples are directions."""
+    ctx = mi.BSDFContext()
+    both, bs_weight = bsdf.eval_pdf(ctx, si, wo), bsdf.sample(ctx, si, *u)
+    found = [bsdf.eval(ctx, si, wo), bsdf.pdf(ctx, si, wo), *both, bs_weight[0].pdf, bs_weight[1]]
+    dr.eval(found, bs_weight[0].wo)
+    for name, array in zip(("eval", "pdf", "value", "its pdf", "sampled pdf", "weight"), found, strict=True):
+        wrong = ~(np.isfinite(array.numpy()) & (array.numpy() >= 0))
+        assert not wrong.any(), (what, name, np.argwhere(wrong)[:3])
+    length = np.linalg.norm(bs_weight[0].wo.numpy()[:, found[4].numpy() > 0], axis=0)
+    assert np.allclose(length, 1, atol=1e-3), what
+    return found
+
+
+#: The exact plugin, and the learned one in every preset and storage.
+ALL_STORED = [FORMS["disney"]] + [
+    {"type": "neural_disney", "preset": p, "storage": s} for p in PRESETS for s in ("float32", "float16", "uint8")
+]
+
+
+@pytest.mark.parametrize("form", ALL_STORED, ids=lambda form: "-".join(form.values()))
+def test_what_is_no_direction_is_harmless(mi_rgb, rng, form):
+    """NaN, infinite and far too long vectors, in each component of one or in several of both, and samples of NaN."""
+    mi, n = mi_rgb, 6000
+    wrong = np.array([np.nan, np.inf, -np.inf, 1e20, -1e20, 1e30, 1e38])
+    w = np.concatenate([random_directions(rng, n), random_directions(rng, n)], axis=1)
+    one = np.arange(n) % 7
+    for i in range(6):  # and the last lanes stay as they are
+        w[one == i, i] = rng.choice(wrong, n)[one == i]
+    several = (rng.random((n, 6)) < 0.3) & (np.arange(n) < n // 2)[:, None]
+    w = np.where(several, rng.choice(wrong, (n, 6)), w).astype(np.float32)
+    u = np.where(rng.random((3, n)) < 0.2, np.nan, rng.random((3, n))).astype(np.float32)
+    index = rng.integers(0, len(MATERIALS), n)
+    si = interactions(mi, vectors(mi, w[:, :3]), index, len(MATERIALS))
+    uniform_numbers = mi.Float(u[0]), mi.Point2f(u[1], u[2])
+    bsdf = textured(mi, form, list(MATERIALS.values()))
+    value = check_finite(mi, bsdf, si, vectors(mi, w[:, 3:]), uniform_numbers, form)[0].numpy()
+    # Several that are wrong may cancel
+    assert not value[:, (one < 6) & ~several.any(axis=1)].any()
+    assert (value[:, (one == 6) & ~several.any(axis=1)] > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("constant", [False, True])
+def test_entries_of_any_value_are_harmless(mi_rgb, rng, preset, constant):
+    """Each table in turn, all of it and one entry in four: also where coefficients of constants are evaluated once."""
+    mi, n = mi_rgb, 4000
+    index, materials = rng.integers(0, len(MATERIALS), n), list(MATERIALS.values())
+    bsdf = mi.load_dict(plugin(mi, preset, RICH)) if constant else textured(mi, preset, materials)
+    cosines = np.where(rng.random((2, n)) < 0.3, rng.choice([0, 1e-30, 1e-8, 1], (2, n)), rng.random((2, n)))
+    wi, wo = (vectors(mi, with_cosines(rng, c)) for c in cosines)
+    si, u = interactions(mi, wi, index, len(materials)), uniform(mi, rng, n)
+    params = mi.traverse(bsdf)
+    tables = {key: params[key].numpy() for key in params.keys() if key.startswith("tables.")}
+    assert len(tables) >= 6
+    before = check_finite(mi, bsdf, si, wo, u, "as they ship")[0].numpy()
+    changed = set()
+    for key, entries in tables.items():
+        for value in (np.nan, 1e30, -1e30, np.inf, -np.inf):
+            for part in (1.0, 0.25):
+                poisoned = np.where(rng.random(entries.shape) < part, value, entries).astype(np.float32)
+                params[key] = mi.TensorXf(poisoned)
+                params.update()
+                found = check_finite(mi, bsdf, si, wo, u, (key, value, part))[0].numpy()
+                if not np.array_equal(found, before):
+                    changed.add(key)
+        params[key] = mi.TensorXf(entries)
+        params.update()
+    assert changed == set(tables)  # each of them was read
+    assert np.array_equal(bsdf.eval(mi.BSDFContext(), si, wo).numpy(), before)
+
+
+@pytest.mark.parametrize(
+    "form, filter_type", [("disney", "nearest"), ("disney", "bilinear"), ("tables", "bilinear"), ("paper", "nearest")]
+)
 def test_nan_texels_stay_where_they_are(mi_rgb, form, filter_type):
     """Only pixels that see a texel, or a bilinear mixture with it, notice that it is NaN."""
     mi = mi_rgb
@@ -887,7 +958,7 @@ def test_nan_texels_stay_where_they_are(mi_rgb, form, filter_type):
 
 # -- a long optimisation -----------------------------------------------------------------------------------------------
 
-STEPS, WARM_UP = 500, 25
+WARM_UP = 25
 
 
 def resident_bytes():
@@ -898,10 +969,8 @@ def resident_bytes():
 def optimise(mi, form, steps, start, target):
     """
     Recover roughness, albedo and clearcoat of ``target`` from its image. Returns what was found, and of each step its
-    seconds, its kernels, and the process's memory and Dr.Jit's largest, in bytes.
+    kernels, and the process's memory and Dr.Jit's largest, in bytes.
     """
-    import time
-
     lamps = {
         f"lamp{i}": {"type": "point", "position": position, "intensity": 15.0}
         for i, position in enumerate(([-3.0, 1.0, 3.0], [0.0, -3.0, 4.0]))
@@ -916,11 +985,10 @@ def optimise(mi, form, steps, start, target):
         opt[key] = params[key]
     opt.set_learning_rate({keys["clearcoat"]: 0.15})
     backend = dr.backend_v(mi.Float)
-    history, seconds, launched, resident, watermark = [], [], [], [], []
+    history, launched, resident, watermark = [], [], [], []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for step in range(steps):
-            began = time.perf_counter()
             dr.detail.malloc_clear_statistics()
             for key in keys.values():
                 opt[key] = dr.clip(opt[key], 0, 1)
@@ -932,7 +1000,6 @@ def optimise(mi, form, steps, start, target):
             opt.step()
             dr.eval([opt[key] for key in keys.values()])
             kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
-            seconds.append(time.perf_counter() - began)
             launched.append({entry["hash"] for entry in kernels})
             history.append(np.concatenate([opt[key].numpy().ravel() for key in keys.values()]))
             resident.append(resident_bytes())
@@ -940,28 +1007,30 @@ def optimise(mi, form, steps, start, target):
     # The noise of the images makes the parameters wander: their mean
     roughness, *albedo, coat = np.mean(history[len(history) * 3 // 5 :], axis=0)
     found = {"roughness": roughness, "base_color": np.array(albedo), "clearcoat": coat}
-    return found, np.array(seconds), launched, np.array(resident), np.array(watermark)
+    return found, launched, np.array(resident), np.array(watermark)
 
 
-@pytest.mark.parametrize("form, steps", [("disney", STEPS), ("tables", 60), ("paper", 60)])
+@pytest.mark.parametrize(
+    "form, steps", [("disney", 120), ("tables", 60), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
+)
 def test_a_long_optimisation(mi_rgb, form, steps):
     """
     500 steps from a coat of exactly 0 recover roughness and albedo within 0.03 and the coat, of which little is seen,
-    within 0.1, at constant cost: after the warm-up no new kernel appears and memory stays. Seconds are printed only.
+    within 0.1, and fewer come close, at constant cost: after the warm-up no new kernel appears and memory stays.
     """
     start = {"roughness": 0.3, "base_color": (0.5, 0.5, 0.5), "clearcoat": 0.0}
     target = {"roughness": 0.6, "base_color": (0.7, 0.2, 0.1), "clearcoat": 0.8}
-    found, seconds, launched, resident, watermark = optimise(mi_rgb, form, steps, start, target)
-    early, late = (np.median(part) * 1e3 for part in (seconds[5:WARM_UP], seconds[-WARM_UP:]))
+    found, launched, resident, watermark = optimise(mi_rgb, form, steps, start, target)
     grown = (resident[-1] - resident[WARM_UP]) / 2**20
-    print(f"{form}: {early:.1f} ms a step at first, {late:.1f} ms at last, memory {grown:+.2f} MiB, {found}")
+    print(f"{form}: memory {grown:+.2f} MiB, {found}")
     known = set().union(*launched[:WARM_UP])
     assert known and all(kernels <= known for kernels in launched[WARM_UP:])
     assert watermark[WARM_UP:].max() <= watermark[5:WARM_UP].max() * 1.05 + 2**16
     assert grown < 16
-    if steps == STEPS:
+    if steps >= 120:
         for name, expected in target.items():
-            assert np.allclose(found[name], expected, atol=0.1 if name == "clearcoat" else 0.03), (name, found[name])
+            tolerance = (0.03 if steps == 500 else 0.05) if name != "clearcoat" else 0.1 if steps == 500 else 0.25
+            assert np.allclose(found[name], expected, atol=tolerance), (name, found[name])
     else:
         assert found["clearcoat"] > 0.1  # on its way
 
@@ -969,10 +1038,9 @@ def test_a_long_optimisation(mi_rgb, form, steps):
 # -- materials together ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", list(FORMS))
-def test_chained_wrappers(mi_rgb, form):
+def test_chained_wrappers(mi_rgb):
     """Wrappers that do nothing, around each other, change nothing."""
-    mi = mi_rgb
+    mi, form = mi_rgb, "tables"
 
     def inner():
         return plugin(mi, form, RICH)
@@ -1025,15 +1093,14 @@ def test_different_tables_in_one_scene(mi_rgb, tmp_path):
         ).numpy()
 
     together = image(forms)
-    for i, form in enumerate(forms):
+    for i, form in list(enumerate(forms))[1:4]:
         where = np.s_[8 * (i // 3) : 8 * (i // 3) + 8, 8 * (i % 3) : 8 * (i % 3) + 8]
         assert equal_images(together[where], image([form] * len(forms))[where]), i
     assert images_differ(together[:8, :8], together[:8, 16:])  # one's own tables
 
 
-@pytest.mark.parametrize("form", ["disney", "tables"])
-def test_one_instance_on_many_shapes(mi_rgb, form):
-    mi = mi_rgb
+def test_one_instance_on_many_shapes(mi_rgb):
+    mi, form = mi_rgb, "tables"
     shared = mi.load_dict(plugin(mi, form, RICH))
     images = [
         mi.render(sphere_scene(mi, bsdfs), spp=4).numpy()
@@ -1048,13 +1115,12 @@ def test_one_instance_on_many_shapes(mi_rgb, form):
     assert equal_images(mi.render(scene, spp=4).numpy(), mi.render(fresh, spp=4).numpy())
 
 
-@pytest.mark.parametrize("form", list(FORMS))
-def test_many_materials_are_loaded_while_a_render_is_running(mi_rgb, form):
+def test_many_materials_are_loaded_while_a_render_is_running(mi_rgb):
     """
     Mitsuba constructs objects in parallel. A constructor that waits for a kernel lets its thread start on the next
     object in the meantime, one inside the other, until Python's stack is full.
     """
-    mi = mi_rgb
+    mi, form = mi_rgb, "tables"
     running = sphere_scene(mi, {"type": "diffuse"})
     mi.render(running, spp=16).numpy()
     image = mi.render(running, spp=20_000)
@@ -1072,11 +1138,13 @@ def test_many_materials_are_loaded_while_a_render_is_running(mi_rgb, form):
 def test_two_hundred_materials(mi_rgb, rng):
     """Materials of all forms with different effects: some of them against scenes in which they are alone."""
     mi, count, columns = mi_rgb, 200, 15
+    # Kinds, since each set of effects is code of its own: some of them analytic, some with tables
+    kinds = [(("disney", "disney", "tables", "paper")[i % 4], rng.random(len(SCALARS)) < 0.5) for i in range(20)]
     materials = []
-    for _ in range(count):
-        m = {name: float(rng.random()) if rng.random() < 0.5 else 0.0 for name in SCALARS}
+    for i in range(count):
+        form, on = kinds[i % len(kinds)]
+        m = {name: float(value) for name, value in zip(SCALARS, rng.random(len(SCALARS)) * on, strict=True)}
         m["roughness"] = 0.2 + 0.6 * float(rng.random())
-        form = ("disney", "tables", "paper")[rng.choice(3, p=(0.7, 0.2, 0.1))]
         materials.append((form, {**m, "base_color": tuple(map(float, rng.random(3)))}))
     size = 4 * columns
     bsdfs = [plugin(mi, *material) for material in materials]
@@ -1088,7 +1156,7 @@ def test_two_hundred_materials(mi_rgb, rng):
         mi.render(scene, spp=4, seed=1).numpy()
         assert {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT} <= kernels
     black = mi.load_dict({"type": "diffuse", "reflectance": 0.0})
-    for i in (0, 123, 199):
+    for i in (0, 122, 199):
         alone = [plugin(mi, *materials[i]) if j == i else black for j in range(count)]
         expected = mi.render(sphere_scene(mi, alone, "direct", size, columns), spp=4).numpy()
         where = np.s_[4 * (i // columns) : 4 * (i // columns) + 4, 4 * (i % columns) : 4 * (i % columns) + 4]
@@ -1130,7 +1198,7 @@ def test_directional_albedo(mi_rgb, rng, form):
     Reflected energy of 30 materials at 10 angles within 0.02 of the exact model's. Both are integrated over the same
     stratified samples of all lobes, so that what is compared is not the noise.
     """
-    mi, side = mi_rgb, 64
+    mi, side = mi_rgb, 40
     materials = furnace_materials(rng)
     k, a, n = len(materials), len(FURNACE_ANGLES), side * side
     cosines = np.cos(np.radians(FURNACE_ANGLES))
@@ -1197,6 +1265,9 @@ def shaded(types, decoder, case):
     return training.shade(decoder, material, *vectors).numpy().T.astype(np.float64)
 
 
+#: Numbers of samples.
+POPULATION = pytest.mark.parametrize("n", [200_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+
 #: Forms and storages that the tests below hold to the bars.
 STORED = [("disney", ""), ("tables", "float32"), ("tables", "float16"), ("tables", "uint8")]
 
@@ -1231,12 +1302,12 @@ def near_the_peak(rng, wi):
     return (wo / np.linalg.norm(wo, axis=1, keepdims=True)).astype(np.float32)
 
 
+@POPULATION
 @pytest.mark.parametrize("distribution", ["training", "uniform"])
 @pytest.mark.parametrize("where", ["horizon", "peak"])
-def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where):
+def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where, n):
     import drjit.llvm.ad as types
 
-    n = 1_000_000
     color, m, wi, wo = random_population(rng, n, distribution)
     if where == "horizon":
         wi, wo = near_the_horizon(rng, wi, wo)
@@ -1256,12 +1327,13 @@ def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where):
     assert np.isfinite(found).all() and found.min() >= 0
 
 
+@POPULATION
 @pytest.mark.parametrize("distribution", ["training", "uniform"])
-def test_accuracy_everywhere(mi_rgb, rng, distribution):
+def test_accuracy_everywhere(mi_rgb, rng, distribution, n):
     """Peak signal-to-noise ratio of BRDF · cosine, clipped to [0, 1], and the same for exchanged directions."""
     import drjit.llvm.ad as types
 
-    case = color, m, wi, wo = random_population(rng, 1_000_000, distribution)
+    case = color, m, wi, wo = random_population(rng, n, distribution)
     swapped = color, m, wo, wi
     expected = burley.brdf(*case) * wo[:, 2:3]
     for form, storage in STORED:
