@@ -2,6 +2,7 @@
 
 import sys
 import textwrap
+from importlib import metadata
 
 import drjit as dr
 import pytest
@@ -98,7 +99,7 @@ def package(tmp_path_factory):
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: toys\nVersion: 1.0\n")
     names = "".join(f"{name} = toys.{name}\n" for name in MODULES)
-    (info / "entry_points.txt").write_text(f"[{plugins.GROUP}]\n{names}broken = toys.missing\n")
+    (info / "entry_points.txt").write_text(f"[{plugins.__name__}]\n{names}broken = toys.missing\n")
     before = dict(plugins._declared)
     sys.path.insert(0, str(folder))
     plugins._declared.clear()
@@ -112,7 +113,7 @@ def package(tmp_path_factory):
 def mi_toys(request, package):
     import mitsuba as mi
 
-    with pytest.warns(UserWarning, match=r'entry point "broken" \(toys.missing\) cannot be used: ModuleNotFoundError'):
+    with pytest.warns(RuntimeWarning, match=r'"broken" \(toys.missing\) is left out: ModuleNotFoundError'):
         plugins._declared.pop(request.param, None)
         mi.set_variant("llvm_ad_mono")
         plugins._declared.pop(request.param, None)
@@ -220,9 +221,11 @@ def test_factories_that_return_something_else(mi_toys, name, found):
 
 
 def test_two_plugins_of_one_name(mi_rgb, monkeypatch):
-    variant, plugin = mi_rgb.variant(), plugins.declared()["disney"]
-    monkeypatch.setattr(plugins, "_load", lambda: [plugin, plugin])
+    """Ours stays."""
+    variant, theirs = mi_rgb.variant(), metadata.EntryPoint("disney", "theirs.disney", plugins.__name__)
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [theirs] if group == plugins.__name__ else [])
     monkeypatch.setitem(plugins._declared, variant, {})
     plugins._declared.pop(variant)
-    with pytest.warns(UserWarning, match='two plugins called "disney"'):
+    with pytest.warns(RuntimeWarning, match=r'"disney" \(theirs.disney\) is left out: .* mi_diffind.plugins.disney'):
         plugins.register(variant)
+    assert plugins.declared()["disney"].factory.__module__ == "mi_diffind.plugins.disney"
