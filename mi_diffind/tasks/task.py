@@ -63,7 +63,7 @@ class Request:
             problem, self.settings, self.checkpoint, self.resume, self.progress, title=title, seconds=self.seconds
         )
 
-    def about(self) -> dict:
+    def recorded(self) -> dict:
         """The settings, as a table file keeps them."""
         return {**asdict(self.settings), **({"seconds": self.seconds} if self.seconds is not None else {})}
 
@@ -191,7 +191,7 @@ class Task:
         result = request.train(problem)
         table = self.table(problem, request)
         table.preset, table.seed = request.preset, request.settings.seed
-        table.settings = {**request.about(), **table.settings}
+        table.settings = {**request.recorded(), **table.settings}
         if request.seconds is not None:
             table.settings["steps"] = result.steps
         table = table.to(request.storage) if request.storage else table

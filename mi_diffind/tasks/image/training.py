@@ -200,7 +200,7 @@ def fit_image(
     else:
         problem = problem_of(source, size, recipe, types, layout, border)
         result = request.train(problem, title)
-        settings = {**request.about(), **problem.identity, "ratio": size.ratio}
+        settings = {**request.recorded(), **problem.identity, "ratio": size.ratio}
         if request.seconds is not None:
             settings["steps"] = result.steps
         settings["structure"] = structure_of(source, recipe)
