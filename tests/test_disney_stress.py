@@ -302,7 +302,8 @@ def test_polarised_spectral_and_monochrome_agree(mi_any, rng):
         learned[form] = value.numpy()
     assert close(learned["disney"], exact[0].numpy(), 1e-4).all()
     assert np.isfinite(learned["tables"]).all() and np.isfinite(learned["paper"]).all()
-    assert np.quantile(np.abs(learned["tables"] - learned["disney"]) / (learned["disney"] + 1e-2), 0.99) < 0.05
+    error = np.abs(learned["tables"] - learned["disney"]) / (learned["disney"] + 1e-2)
+    assert np.quantile(error, 0.99) < 2e-4 and error.max() < 5e-4
 
 
 # -- nothing but time is saved by what is left out ---------------------------------------------------------------------
@@ -1011,7 +1012,7 @@ def optimise(mi, form, steps, start, target):
 
 
 @pytest.mark.parametrize(
-    "form, steps", [("disney", 120), ("tables", 60), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
+    "form, steps", [("disney", 120), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
 )
 def test_a_long_optimisation(mi_rgb, form, steps):
     """
@@ -1027,12 +1028,9 @@ def test_a_long_optimisation(mi_rgb, form, steps):
     assert known and all(kernels <= known for kernels in launched[WARM_UP:])
     assert watermark[WARM_UP:].max() <= watermark[5:WARM_UP].max() * 1.05 + 2**16
     assert grown < 16
-    if steps >= 120:
-        for name, expected in target.items():
-            tolerance = (0.03 if steps == 500 else 0.05) if name != "clearcoat" else 0.1 if steps == 500 else 0.25
-            assert np.allclose(found[name], expected, atol=tolerance), (name, found[name])
-    else:
-        assert found["clearcoat"] > 0.1  # on its way
+    for name, expected in target.items():
+        tolerance = (0.03 if steps == 500 else 0.05) if name != "clearcoat" else 0.1 if steps == 500 else 0.25
+        assert np.allclose(found[name], expected, atol=tolerance), (name, found[name])
 
 
 # -- materials together ------------------------------------------------------------------------------------------------
@@ -1195,7 +1193,7 @@ FURNACE_ANGLES = (0, 15, 30, 45, 60, 70, 78, 84, 87, 89)
 @pytest.mark.parametrize("form", list(FORMS))
 def test_directional_albedo(mi_rgb, rng, form):
     """
-    Reflected energy of 30 materials at 10 angles within 0.02 of the exact model's. Both are integrated over the same
+    Reflected energy of 30 materials at 10 angles against the exact model's. Both are integrated over the same
     stratified samples of all lobes, so that what is compared is not the noise.
     """
     mi, side = mi_rgb, 40
@@ -1223,8 +1221,9 @@ def test_directional_albedo(mi_rgb, rng, form):
     error = np.abs(found - expected)
     print(f"{form}: error of the directional albedo at most {error.max():.4f}, on average {error.mean():.5f}")
     assert np.isfinite(found).all() and found.min() >= 0
-    if form != "paper":
-        assert error.max() <= 0.02, [(materials[i], FURNACE_ANGLES[j]) for i, j, _ in np.argwhere(error > 0.02)[:3]]
+    # The paper's layout gains energy at the horizon
+    bar = {"disney": 3e-5, "tables": 0.002, "paper": 2.5}[form]
+    assert error.max() <= bar, [(materials[i], FURNACE_ANGLES[j]) for i, j, _ in np.argwhere(error > bar)[:3]]
 
 
 def test_directional_albedo_by_quadrature(mi_rgb, rng):
@@ -1242,11 +1241,11 @@ def test_directional_albedo_by_quadrature(mi_rgb, rng):
             found = bsdf.eval(mi.BSDFContext(), interactions(mi, vectors(mi, wi)), vectors(mi, wo)).numpy().T
             expected = burley_of(materials, index, wi, wo) * wo[:, 2:3]
             albedos = [2 * np.pi * v.mean(axis=0, dtype=np.float64) for v in (found, expected)]
-            assert np.abs(albedos[0] - albedos[1]).max() <= 0.02, (form, angle)
+            assert np.abs(albedos[0] - albedos[1]).max() <= (1e-6 if form == "disney" else 2e-5), (form, angle)
             u = [mi.Float(rng.random(2**17).astype("f4")) for _ in range(3)]
             si = interactions(mi, vectors(mi, wi[: 2**17]))
             weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))[1].numpy()
-            assert np.allclose(weight.mean(axis=1, dtype=np.float64), albedos[0], atol=0.01), (form, angle)
+            assert np.allclose(weight.mean(axis=1, dtype=np.float64), albedos[0], atol=0.004), (form, angle)
 
 
 def random_population(rng, n, distribution):
@@ -1268,23 +1267,24 @@ def shaded(types, decoder, case):
 #: Numbers of samples.
 POPULATION = pytest.mark.parametrize("n", [200_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 
-#: Forms and storages that the tests below hold to the bars.
-STORED = [("disney", ""), ("tables", "float32"), ("tables", "float16"), ("tables", "uint8")]
+#: Form and storage → a decibel or two less than is reached.
+REACHED = {("disney", ""): 127, ("tables", "float32"): 87, ("tables", "float16"): 82.5, ("tables", "uint8"): 80.5}
 
 
 def decoder_for(types, form, storage):
     return Decoder() if form == "disney" else TASK.open(types.TensorXf, "", form, storage).decoder
 
 
-def check_grazing(name, found, expected):
-    """99 of 100 within a quarter, none more than twice the exact value, where that is not next to nothing."""
+def check_grazing(form, name, found, expected):
+    """99 of 100 within a hundredth, and none much higher than the exact value, where that is not next to nothing."""
     counts = expected > 1e-3
     relative = np.abs(found - expected)[counts] / expected[counts]
     ratio = (found[counts] / expected[counts]).max()
-    print(f"{name}: 99th percentile of the relative error {np.quantile(relative, 0.99):.4f}, largest ratio {ratio:.3f}")
+    print(f"{name}: 99th percentile of the relative error {np.quantile(relative, 0.99):.2g}, largest ratio {ratio:.3f}")
     assert np.isfinite(found).all() and found.min() >= 0
-    assert np.quantile(relative, 0.99) <= 0.25, name
-    assert ratio <= 2, name
+    percentile, largest = (5e-5, 1.03) if form == "disney" else (0.008, 1.06)
+    assert np.quantile(relative, 0.99) <= percentile, name
+    assert ratio <= largest, name
 
 
 def near_the_horizon(rng, wi, wo):
@@ -1316,9 +1316,11 @@ def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where, 
     case = color, m, wi, wo
     expected = burley.brdf(*case)
     cosine = wo[:, 2:3].astype(np.float64)
-    for form, storage in STORED:
+    for form, storage in REACHED:
         decoder = decoder_for(types, form, storage)
-        check_grazing(f"{where}, {distribution}, {form} {storage}", shaded(types, decoder, case) / cosine, expected)
+        check_grazing(
+            form, f"{where}, {distribution}, {form} {storage}", shaded(types, decoder, case) / cosine, expected
+        )
     paper = decoder_for(types, "paper", "")
     found = shaded(types, paper, case) / cosine
     counts = expected > 1e-3
@@ -1336,7 +1338,7 @@ def test_accuracy_everywhere(mi_rgb, rng, distribution, n):
     case = color, m, wi, wo = random_population(rng, n, distribution)
     swapped = color, m, wo, wi
     expected = burley.brdf(*case) * wo[:, 2:3]
-    for form, storage in STORED:
+    for form, storage in REACHED:
         decoder = decoder_for(types, form, storage)
         found, other = shaded(types, decoder, case), shaded(types, decoder, swapped)
         mse = np.mean(np.square(np.clip(found, 0, 1) - np.clip(expected, 0, 1)))
@@ -1348,5 +1350,5 @@ def test_accuracy_everywhere(mi_rgb, rng, distribution, n):
             f"{distribution}, {form} {storage}: {-10 * np.log10(mse):.1f} dB, "
             f"reciprocal within {np.quantile(unequal, 0.9999):.2e} (largest {unequal.max():.2e})"
         )
-        assert -10 * np.log10(mse) >= 48, (form, storage)
-        assert unequal.max() <= 0.01, (form, storage)
+        assert -10 * np.log10(mse) >= REACHED[form, storage], (form, storage)
+        assert unequal.max() <= 1e-6, (form, storage)
