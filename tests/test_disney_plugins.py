@@ -104,7 +104,7 @@ def test_disney_is_burley(mi_rgb, rng):
     found = bsdf.eval(mi_rgb.BSDFContext(), texel_interactions(mi_rgb, wi), wo_).numpy().T
     reference = burley.brdf(color, m, wi.astype("f4"), wo.astype("f4")) * wo[:, 2:3]
     error = np.abs(found - reference) / (reference + 1e-2)
-    assert np.quantile(error, 0.99) < 1e-3
+    assert np.quantile(error, 0.99) < 1e-5 and error.max() < 2e-4
 
 
 @pytest.mark.parametrize("name", list(PLUGINS))
@@ -239,8 +239,8 @@ def test_nan_textures_do_not_spread(mi_rgb, rng):
 @pytest.mark.parametrize(
     "name, storage, decibels",
     [
-        *(("tables", storage, 75) for storage in ("float32", "float16", "uint8", None)),
-        *(("paper", storage, 33) for storage in ("float32", "float16", "uint8")),
+        *(("tables", storage, bar) for storage, bar in (("float32", 86), ("float16", 82), ("uint8", 80), (None, 80))),
+        *(("paper", storage, 34) for storage in ("float32", "float16", "uint8")),
     ],
 )
 def test_learned_and_exact_plugins_agree(mi_rgb, rng, name, storage, decibels):
@@ -273,12 +273,12 @@ def test_disney_is_what_the_formulas_say(mi_rgb, rng):
     color, m = color.astype("f4"), {k: v.astype("f4") for k, v in m.items()}
     si, wo = texel_interactions(mi, wi), mi.Vector3f(wo.T.astype("f4"))
     found = textured(mi, "disney", color, m).eval(ctx, si, wo).numpy()
-    assert decibels(found, formulas(color.T, m, si.wi, wo)) >= 140
+    assert decibels(found, formulas(color.T, m, si.wi, wo)) >= 150
     for material in MATERIALS.values():
         full = {**dict.fromkeys(burley.NAMES, 0.0), "roughness": 0.5, "specular": 0.5, **material}
         albedo = 3 * [full.pop("base_color", 0.5)]
         found = mi.load_dict({"type": "disney", **material}).eval(ctx, si, wo).numpy()
-        assert decibels(found, formulas(albedo, full, si.wi, wo)) >= 140, material
+        assert decibels(found, formulas(albedo, full, si.wi, wo)) >= 150, material
 
 
 def test_own_tables(mi_rgb, rng, tmp_path):
@@ -578,7 +578,7 @@ KEYS = {
 
 
 #: Each plugin, and each integrator; all pairs of them in the slow run.
-RENDERED = {("prb", "disney"), ("prb", "tables"), ("direct", "paper"), ("path", "disney")}
+RENDERED = {("prb", "tables"), ("direct", "paper"), ("path", "disney")}
 
 
 @pytest.mark.parametrize(

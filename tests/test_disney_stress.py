@@ -1,142 +1,39 @@
 """
-The Disney plugins under stress: sampling against density, extreme inputs, what is left out because a material does not
-use it, parameters that change, long optimisations, many materials, and the accuracy where it is hardest to keep.
+The Disney plugins under stress: sampling against density, what is left out because a material does not use it,
+parameters that change, long optimisations, and many materials.
 """
 
 import itertools
 import math
 
-import burley
 import drjit as dr
 import numpy as np
 import pytest
+from disney_materials import (
+    FORMS,
+    MATERIALS,
+    PLAIN,
+    PRESETS,
+    RICH,
+    SCALARS,
+    bitmap,
+    close,
+    contexts,
+    interactions,
+    plugin,
+    random_directions,
+    textured,
+    uniform,
+    vectors,
+)
 from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 
 from mi_diffind import StoredArray
 from mi_diffind.tables import save_table
-from mi_diffind.tasks.disney import TASK, training
-from mi_diffind.tasks.disney.decoder import Decoder
+from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.effects import find_effects
-from mi_diffind.tasks.disney.model import Material
 from mi_diffind.tasks.known import Known
-from mi_diffind.tasks.sampling import EXPONENTIAL_RATE
-
-PRESETS = ("tables", "paper")
-
-#: The exact plugin, and the learned one in each preset, with entries that can be optimised.
-FORMS = {
-    "disney": {"type": "disney"},
-    **{p: {"type": "neural_disney", "preset": p, "storage": "float32"} for p in PRESETS},
-}
-
-SCALARS = burley.NAMES
-
-#: Everything on, nothing at a limit or at a texel of the tables, where their slope changes.
-RICH = {
-    "base_color": (0.7, 0.4, 0.2), "roughness": 0.43, "anisotropic": 0.5, "metallic": 0.3, "specular": 0.6,
-    "spec_tint": 0.4, "sheen": 0.5, "sheen_tint": 0.6, "flatness": 0.3, "clearcoat": 0.7, "clearcoat_gloss": 0.63,
-}  # fmt: skip
-
-#: What is not said is as in the plugins' defaults.
-PLAIN = {**dict.fromkeys(SCALARS, 0.0), "base_color": (0.5, 0.5, 0.5), "roughness": 0.5, "specular": 0.5}
-
-BLACK = {"base_color": (0.0, 0.0, 0.0), "specular": 0.0}
-
-MATERIALS = {
-    "rich": RICH,
-    "plain": {},
-    "diffuse": {"roughness": 1.0, "specular": 0.0},
-    "flat": {"flatness": 1.0, "roughness": 0.8, "base_color": (0.9, 0.1, 0.1)},
-    "sheen_only": {**BLACK, "sheen": 1.0, "roughness": 1.0},
-    "tinted_sheen": {"base_color": (0.3, 0.1, 0.6), "sheen": 1.0, "sheen_tint": 1.0},
-    "coat_only": {**BLACK, "roughness": 1.0, "clearcoat": 1.0, "clearcoat_gloss": 0.3},
-    "glossy_coat": {**BLACK, "roughness": 1.0, "clearcoat": 1.0, "clearcoat_gloss": 1.0},
-    "metal": {"metallic": 1.0, "roughness": 0.3},
-    "half_metal": {"metallic": 0.5, "base_color": (0.9, 0.6, 0.2), "roughness": 0.25, "clearcoat": 0.5},
-    "smooth_metal": {"metallic": 1.0, "roughness": 0.2},
-    "mirror": {"metallic": 1.0, "roughness": 0.05},
-    "smoothest": {"metallic": 1.0, "roughness": 0.0},
-    "smooth_plastic": {"roughness": 0.05, "base_color": (0.2, 0.2, 0.7), "spec_tint": 1.0},
-    "anisotropic": {"metallic": 1.0, "roughness": 0.5, "anisotropic": 1.0},
-    "brushed_mirror": {"metallic": 1.0, "roughness": 0.05, "anisotropic": 1.0},
-    "rough_metal": {"metallic": 1.0, "roughness": 1.0},
-    "everything": {**dict.fromkeys(SCALARS, 1.0), "metallic": 0.5, "roughness": 0.3, "base_color": (1.0, 1.0, 1.0)},
-}
-
-
-# -- helpers -----------------------------------------------------------------------------------------------------------
-
-
-def plugin(mi, form, material, **more):
-    """A BSDF, or its description, of constants; what the material does not say is left to the defaults."""
-    described = dict(material)
-    if isinstance(described.get("base_color"), tuple):
-        described["base_color"] = {"type": "rgb", "value": list(described["base_color"])}
-    return {**(FORMS[form] if isinstance(form, str) else form), **described, **more}
-
-
-def bitmap(mi, values, **more):
-    """A texture of ``values``, (height, width[, channels]), read as they are."""
-    values = np.asarray(values, np.float32)
-    data = mi.TensorXf(np.ascontiguousarray(values.reshape(*values.shape[:2], -1)))
-    return {"type": "bitmap", "data": data, "raw": True, "filter_type": "nearest", "format": "variant", **more}
-
-
-def textured(mi, form, materials, **more):
-    """One BSDF with a texel for each material, read at ``uv`` by :func:`interactions`: nothing about it is constant."""
-    full = [{**PLAIN, **m} for m in materials]
-    # Mitsuba wants two rows of texels
-    textures = {name: bitmap(mi, [[m[name] for m in full]] * 2) for name in ("base_color", *SCALARS)}
-    return mi.load_dict(plugin(mi, form, textures, **more))
-
-
-def interactions(mi, wi, material=None, count=1):
-    """Interactions that see ``wi``, at the texels of :func:`textured` with the numbers ``material`` (of ``count``)."""
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
-    si.wi = wi
-    if material is not None:
-        si.uv = mi.Point2f(mi.Float(((np.asarray(material) + 0.5) / count).astype("f4")), 0.5)
-    if mi.is_spectral:
-        si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 580, 650)
-    return si
-
-
-def random_directions(rng, n, low=0.0, high=1.0):
-    """(n, 3), uniform over the part of the hemisphere with cosines in [low, high]."""
-    z = low + (high - low) * rng.random(n)
-    phi, r = 2 * np.pi * rng.random(n), np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1).astype(np.float32)
-
-
-def vectors(mi, w):
-    return mi.Vector3f(np.ascontiguousarray(w.T, dtype=np.float32))
-
-
-def uniform(mi, rng, n):
-    u = [mi.Float(rng.random(n).astype("f4")) for _ in range(3)]
-    return u[0], mi.Point2f(u[1], u[2])
-
-
-def contexts(mi):
-    """Name → a context, and the components that it turns on."""
-    found = {"all": (mi.BSDFContext(), (0, 1, 2))}
-    for component in range(3):
-        ctx = mi.BSDFContext()
-        ctx.component = component
-        found[f"component {component}"] = ctx, (component,)
-    for flag, components in (("DiffuseReflection", (0,)), ("GlossyReflection", (1, 2)), ("DeltaReflection", ())):
-        ctx = mi.BSDFContext()
-        ctx.type_mask = getattr(mi.BSDFFlags, flag)
-        found[flag] = ctx, components
-    return found
-
-
-def close(a, b, rtol=1e-5, scale=1e-5):
-    """Equal up to rounding, relative to the value and to the largest value in its row."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    return np.abs(a - b) <= rtol * np.maximum(np.abs(a), np.abs(b)) + rtol * scale * np.abs(b).max(initial=1e-3)
-
 
 # -- sampling against density ------------------------------------------------------------------------------------------
 
@@ -302,7 +199,8 @@ def test_polarised_spectral_and_monochrome_agree(mi_any, rng):
         learned[form] = value.numpy()
     assert close(learned["disney"], exact[0].numpy(), 1e-4).all()
     assert np.isfinite(learned["tables"]).all() and np.isfinite(learned["paper"]).all()
-    assert np.quantile(np.abs(learned["tables"] - learned["disney"]) / (learned["disney"] + 1e-2), 0.99) < 0.05
+    error = np.abs(learned["tables"] - learned["disney"]) / (learned["disney"] + 1e-2)
+    assert np.quantile(error, 0.99) < 2e-4 and error.max() < 5e-4
 
 
 # -- nothing but time is saved by what is left out ---------------------------------------------------------------------
@@ -372,10 +270,11 @@ def check_equal_to_unculled(mi, rng, form, materials, effects=None):
                 assert near.mean() > 0.998, (what, materials[i])  # but for rounding of directions next to a peak
 
 
-def test_what_is_left_out_changes_nothing(mi_rgb, rng):
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_what_is_left_out_changes_nothing(mi_rgb, rng, every):
     found = distinct_effects()
     assert len(found) > 200
-    check_equal_to_unculled(mi_rgb, rng, "disney", list(found.values()), list(found))
+    check_equal_to_unculled(mi_rgb, rng, "disney", list(found.values())[::every], list(found)[::every])
 
 
 @pytest.mark.parametrize("form", ["tables", "paper"])
@@ -680,15 +579,18 @@ def gradient_cases():
     return cases
 
 
-@pytest.mark.parametrize("form", list(FORMS))
-def test_gradients_at_the_ends_against_finite_differences(mi_rgb, rng, form):
+@pytest.mark.parametrize(
+    "form, every",
+    [("disney", 1), ("tables", 3), ("paper", 3), *(pytest.param(p, 1, marks=pytest.mark.slow) for p in PRESETS)],
+)
+def test_gradients_at_the_ends_against_finite_differences(mi_rgb, rng, form, every):
     """
     One-sided differences of second order, from texels, so that nothing is left out of them; the gradient from a
     material of constants in which only the gradient that is asked for keeps the effect in use. Each second one has its
     gradient enabled without an update afterwards.
     """
     mi, n, step = mi_rgb, 500, 4e-3
-    cases = gradient_cases()
+    cases = gradient_cases()[::every]
     wi, wo = random_directions(rng, n, 0.1), random_directions(rng, n, 0.1)
     shifted = []
     for name, m, sign in cases:
@@ -779,183 +681,6 @@ def test_tables_keep_their_gradients_where_material_is_constant(mi_rgb, rng, for
             assert np.allclose(found, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max()), key
 
 
-# -- extreme inputs ----------------------------------------------------------------------------------------------------
-
-SPECIAL_VALUES = (0.0, 1.0, 0.5, 1e-40, 1e-8, 1 - 2**-24, float("nan"), float("inf"), -float("inf"), -1.0, 2.0)
-SPECIAL_COSINES = (0.0, 1e-40, 1e-30, 1e-8, 1e-4, 0.5, 1 - 2**-24, 1.0, -1e-8, -0.5)
-SPECIAL_AZIMUTHS = (0.0, math.pi / 2, math.pi, 1.0)
-SPECIAL_UNIFORM = (0.0, 0.5, 1 - 2**-24)
-
-#: Materials and pairs of directions in a round; every material meets every pair.
-N_MATERIALS, N_PAIRS = 64, 256
-
-
-def drawn(rng, special, shape, low=0.0, high=1.0):
-    """Half of them uniform between ``low`` and ``high``, half of them one of ``special``."""
-    uniform = low + (high - low) * rng.random(shape)
-    return np.where(rng.random(shape) < 0.5, rng.choice(np.array(special), shape), uniform)
-
-
-def extreme_directions(rng, n):
-    """Pairs of unit vectors, (n, 3) each, some of them equal, opposite, mirrored, or nearly so, and what they are."""
-    cosines = drawn(rng, SPECIAL_COSINES, (2, n))
-    tiny = rng.random((2, n)) < 0.2
-    cosines = np.where(tiny, 10.0 ** rng.uniform(-44, 0, (2, n)), cosines)
-    azimuths = drawn(rng, SPECIAL_AZIMUTHS, (2, n), 0, 6)
-    sine = np.sqrt(1 - np.minimum(np.square(cosines), 1))
-    w = np.stack([sine * np.cos(azimuths), sine * np.sin(azimuths), cosines], axis=-1)
-    mirrored = w[0] * [-1, -1, 1]
-    choices = (w[1], w[0], -w[0], mirrored, mirrored + 1e-6, w[0] + [1e-7, 0, 0])
-    kind = rng.integers(0, len(choices), n)
-    return w[0].astype(np.float32), np.select([(kind == k)[:, None] for k in range(6)], choices).astype(np.float32)
-
-
-@pytest.mark.parametrize("form", list(FORMS))
-def test_extreme_inputs(mi_rgb, rng, form):
-    """Values, densities, samples and gradients are finite for everything, and values not negative."""
-    mi = mi_rgb
-    bsdf = textured(mi, form, [{}] * N_MATERIALS)
-    params = mi.traverse(bsdf)
-    keys = [f"{name}.data" for name in ("base_color", *SCALARS)]
-    tables = [k for k in params.keys() if k.startswith("tables.")]
-    material = np.repeat(np.arange(N_MATERIALS), N_PAIRS)
-    pair = np.tile(np.arange(N_PAIRS), N_MATERIALS)
-    ctx = mi.BSDFContext()
-    for _ in range(24):
-        wi, wo = (w[pair] for w in extreme_directions(rng, N_PAIRS))
-        parameters = drawn(rng, SPECIAL_VALUES, (len(SCALARS) + 3, N_MATERIALS)).astype(np.float32)
-        u = drawn(rng, SPECIAL_UNIFORM, (3, N_PAIRS), 0, 1 - 2**-20).astype(np.float32)[:, pair]
-        params["base_color.data"] = mi.TensorXf(np.ascontiguousarray(np.stack([parameters[:3].T] * 2)))
-        for name, row in zip(SCALARS, parameters[3:], strict=True):
-            params[f"{name}.data"] = mi.TensorXf(np.ascontiguousarray(np.stack([row[:, None]] * 2)))
-        for key in tables:
-            params[key] = dr.detach(params[key])  # or gradients would add up
-        for key in keys + tables:
-            dr.enable_grad(params[key])
-        params.update()
-        si, wo_ = interactions(mi, vectors(mi, wi), material, N_MATERIALS), vectors(mi, wo)
-        u_ = [mi.Float(np.ascontiguousarray(row)) for row in u]
-
-        value, pdf = bsdf.eval_pdf(ctx, si, wo_)
-        bs, weight = bsdf.sample(ctx, si, u_[0], mi.Point2f(u_[1], u_[2]))
-        seen = {"value": value, "pdf": pdf, "sampled pdf": bs.pdf, "weight": weight}
-        dr.eval(seen, bs.wo)
-        found = {what: array.numpy() for what, array in seen.items()}
-        for what, array in found.items():
-            wrong = ~(np.isfinite(array) & (array >= 0)).reshape(-1, len(pair)).all(axis=0)
-            i = int(np.argmax(wrong))
-            assert not wrong.any(), (what, array[..., i], parameters[:, material[i]], wi[i], wo[i], u[:, i])
-        below = (wi[:, 2] <= 0) | (wo[:, 2] <= 0)
-        assert not found["value"][:, below].any() and not found["pdf"][below].any()
-        valid = found["sampled pdf"] > 0
-        assert np.allclose(np.linalg.norm(bs.wo.numpy()[:, valid], axis=0), 1, atol=1e-4)
-        assert (bs.wo.numpy()[2, valid] > 0).all()
-
-        # What follows in a chain of derivatives may be more than 1
-        dr.backward(100 * dr.sum(value.x + value.y + value.z + weight.x + weight.y + weight.z))
-        for key in keys + tables:
-            gradient = params[key].grad.numpy()
-            texels = np.argwhere(~np.isfinite(gradient))
-            assert not len(texels), (key, texels[:3], parameters[:, texels[0][1]] if key in keys else "")
-        assert any(params[key].grad.numpy().any() for key in keys)
-
-
-def check_finite(mi, bsdf, si, wo, u, what):
-    """Values, densities and weights are finite and not negative, and samples are directions."""
-    ctx = mi.BSDFContext()
-    both, bs_weight = bsdf.eval_pdf(ctx, si, wo), bsdf.sample(ctx, si, *u)
-    found = [bsdf.eval(ctx, si, wo), bsdf.pdf(ctx, si, wo), *both, bs_weight[0].pdf, bs_weight[1]]
-    dr.eval(found, bs_weight[0].wo)
-    for name, array in zip(("eval", "pdf", "value", "its pdf", "sampled pdf", "weight"), found, strict=True):
-        wrong = ~(np.isfinite(array.numpy()) & (array.numpy() >= 0))
-        assert not wrong.any(), (what, name, np.argwhere(wrong)[:3])
-    length = np.linalg.norm(bs_weight[0].wo.numpy()[:, found[4].numpy() > 0], axis=0)
-    assert np.allclose(length, 1, atol=1e-3), what
-    return found
-
-
-#: The exact plugin, and the learned one in every preset and storage.
-ALL_STORED = [FORMS["disney"]] + [
-    {"type": "neural_disney", "preset": p, "storage": s} for p in PRESETS for s in ("float32", "float16", "uint8")
-]
-
-
-@pytest.mark.parametrize("form", ALL_STORED, ids=lambda form: "-".join(form.values()))
-def test_what_is_no_direction_is_harmless(mi_rgb, rng, form):
-    """NaN, infinite and far too long vectors, in each component of one or in several of both, and samples of NaN."""
-    mi, n = mi_rgb, 6000
-    wrong = np.array([np.nan, np.inf, -np.inf, 1e20, -1e20, 1e30, 1e38])
-    w = np.concatenate([random_directions(rng, n), random_directions(rng, n)], axis=1)
-    one = np.arange(n) % 7
-    for i in range(6):  # and the last lanes stay as they are
-        w[one == i, i] = rng.choice(wrong, n)[one == i]
-    several = (rng.random((n, 6)) < 0.3) & (np.arange(n) < n // 2)[:, None]
-    w = np.where(several, rng.choice(wrong, (n, 6)), w).astype(np.float32)
-    u = np.where(rng.random((3, n)) < 0.2, np.nan, rng.random((3, n))).astype(np.float32)
-    index = rng.integers(0, len(MATERIALS), n)
-    si = interactions(mi, vectors(mi, w[:, :3]), index, len(MATERIALS))
-    uniform_numbers = mi.Float(u[0]), mi.Point2f(u[1], u[2])
-    bsdf = textured(mi, form, list(MATERIALS.values()))
-    value = check_finite(mi, bsdf, si, vectors(mi, w[:, 3:]), uniform_numbers, form)[0].numpy()
-    # Several that are wrong may cancel
-    assert not value[:, (one < 6) & ~several.any(axis=1)].any()
-    assert (value[:, (one == 6) & ~several.any(axis=1)] > 0).mean() > 0.9
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("constant", [False, True])
-def test_entries_of_any_value_are_harmless(mi_rgb, rng, preset, constant):
-    """Each table in turn, all of it and one entry in four: also where coefficients of constants are evaluated once."""
-    mi, n = mi_rgb, 4000
-    index, materials = rng.integers(0, len(MATERIALS), n), list(MATERIALS.values())
-    bsdf = mi.load_dict(plugin(mi, preset, RICH)) if constant else textured(mi, preset, materials)
-    cosines = np.where(rng.random((2, n)) < 0.3, rng.choice([0, 1e-30, 1e-8, 1], (2, n)), rng.random((2, n)))
-    wi, wo = (vectors(mi, with_cosines(rng, c)) for c in cosines)
-    si, u = interactions(mi, wi, index, len(materials)), uniform(mi, rng, n)
-    params = mi.traverse(bsdf)
-    tables = {key: params[key].numpy() for key in params.keys() if key.startswith("tables.")}
-    assert len(tables) >= 6
-    before = check_finite(mi, bsdf, si, wo, u, "as they ship")[0].numpy()
-    changed = set()
-    for key, entries in tables.items():
-        for value in (np.nan, 1e30, -1e30, np.inf, -np.inf):
-            for part in (1.0, 0.25):
-                poisoned = np.where(rng.random(entries.shape) < part, value, entries).astype(np.float32)
-                params[key] = mi.TensorXf(poisoned)
-                params.update()
-                found = check_finite(mi, bsdf, si, wo, u, (key, value, part))[0].numpy()
-                if not np.array_equal(found, before):
-                    changed.add(key)
-        params[key] = mi.TensorXf(entries)
-        params.update()
-    assert changed == set(tables)  # each of them was read
-    assert np.array_equal(bsdf.eval(mi.BSDFContext(), si, wo).numpy(), before)
-
-
-@pytest.mark.parametrize(
-    "form, filter_type", [("disney", "nearest"), ("disney", "bilinear"), ("tables", "bilinear"), ("paper", "nearest")]
-)
-def test_nan_texels_stay_where_they_are(mi_rgb, form, filter_type):
-    """Only pixels that see a texel, or a bilinear mixture with it, notice that it is NaN."""
-    mi = mi_rgb
-
-    def image(value):
-        data = np.full((8, 8), 0.3, np.float32)
-        data[2, 3] = data[6, 6] = value
-        texture = {"filter_type": filter_type, "wrap_mode": "clamp"}
-        names = ("roughness", "metallic", "clearcoat", "sheen", "anisotropic")
-        textures = {name: bitmap(mi, data, **texture) for name in names}
-        textures["base_color"] = bitmap(mi, np.stack([data] * 3, axis=-1), **texture)
-        wall = {"type": "rectangle", "bsdf": {**FORMS[form], **textures}}
-        return mi.render(sphere_scene(mi, [], "direct", 32, columns=1, wall=wall), spp=16).numpy()
-
-    without, other, with_nan = image(0.3), image(0.9), image(float("nan"))
-    assert np.isfinite(with_nan).all() and with_nan.min() >= 0
-    seen, poisoned = (np.abs(found - without).max(axis=-1) > 1e-6 for found in (other, with_nan))
-    assert 0 < seen.mean() < 0.2
-    assert poisoned.any() and not poisoned[~seen].any()
-
-
 # -- a long optimisation -----------------------------------------------------------------------------------------------
 
 WARM_UP = 25
@@ -1011,7 +736,7 @@ def optimise(mi, form, steps, start, target):
 
 
 @pytest.mark.parametrize(
-    "form, steps", [("disney", 120), ("tables", 60), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
+    "form, steps", [("disney", 120), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
 )
 def test_a_long_optimisation(mi_rgb, form, steps):
     """
@@ -1027,12 +752,9 @@ def test_a_long_optimisation(mi_rgb, form, steps):
     assert known and all(kernels <= known for kernels in launched[WARM_UP:])
     assert watermark[WARM_UP:].max() <= watermark[5:WARM_UP].max() * 1.05 + 2**16
     assert grown < 16
-    if steps >= 120:
-        for name, expected in target.items():
-            tolerance = (0.03 if steps == 500 else 0.05) if name != "clearcoat" else 0.1 if steps == 500 else 0.25
-            assert np.allclose(found[name], expected, atol=tolerance), (name, found[name])
-    else:
-        assert found["clearcoat"] > 0.1  # on its way
+    for name, expected in target.items():
+        tolerance = (0.03 if steps == 500 else 0.05) if name != "clearcoat" else 0.1 if steps == 500 else 0.25
+        assert np.allclose(found[name], expected, atol=tolerance), (name, found[name])
 
 
 # -- materials together ------------------------------------------------------------------------------------------------
@@ -1156,197 +878,9 @@ def test_two_hundred_materials(mi_rgb, rng):
         mi.render(scene, spp=4, seed=1).numpy()
         assert {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT} <= kernels
     black = mi.load_dict({"type": "diffuse", "reflectance": 0.0})
-    for i in (0, 122, 199):
+    for i in (2, 199):
         alone = [plugin(mi, *materials[i]) if j == i else black for j in range(count)]
         expected = mi.render(sphere_scene(mi, alone, "direct", size, columns), spp=4).numpy()
         where = np.s_[4 * (i // columns) : 4 * (i // columns) + 4, 4 * (i % columns) : 4 * (i % columns) + 4]
         assert equal_images(image[where], expected[where]), materials[i]
         assert expected[where].max() > 0
-
-
-# -- energy, reciprocity, grazing angles -------------------------------------------------------------------------------
-
-
-def furnace_materials(rng, count=30):
-    found = [{**PLAIN, **m} for m in MATERIALS.values()]
-    while len(found) < count:
-        m = {name: float(rng.random()) for name in SCALARS}
-        found.append({**m, "base_color": tuple(map(float, rng.random(3)))})
-    return found[:count]
-
-
-def burley_of(materials, index, wi, wo):
-    """The reference for float32 directions; materials as they are, but for the roundings of float32."""
-    arrays = {name: np.array([m[name] for m in materials], np.float32)[index] for name in SCALARS}
-    color = np.array([m["base_color"] for m in materials], np.float32)[index]
-    return burley.brdf(color, arrays, wi, wo)
-
-
-def with_cosines(rng, cosines):
-    """Directions with given cosines, (n, 3) in float32, as exactly unit vectors as that allows."""
-    phi = 2 * np.pi * rng.random(len(cosines))
-    r = np.sqrt(1 - np.square(cosines))
-    return np.stack([r * np.cos(phi), r * np.sin(phi), cosines], axis=1).astype(np.float32)
-
-
-FURNACE_ANGLES = (0, 15, 30, 45, 60, 70, 78, 84, 87, 89)
-
-
-@pytest.mark.parametrize("form", list(FORMS))
-def test_directional_albedo(mi_rgb, rng, form):
-    """
-    Reflected energy of 30 materials at 10 angles within 0.02 of the exact model's. Both are integrated over the same
-    stratified samples of all lobes, so that what is compared is not the noise.
-    """
-    mi, side = mi_rgb, 40
-    materials = furnace_materials(rng)
-    k, a, n = len(materials), len(FURNACE_ANGLES), side * side
-    cosines = np.cos(np.radians(FURNACE_ANGLES))
-    wi = np.repeat(with_cosines(rng, cosines), n, axis=0)
-    wi = np.tile(wi, (k, 1))
-    index = np.repeat(np.arange(k), a * n)
-    # Strata of the two numbers that choose the direction, a shuffled stratum for the one that chooses the lobe
-    x, y = np.meshgrid(np.arange(side), np.arange(side))
-    u = [(v.ravel() + rng.random((k * a, n))) / side for v in (x, y)]
-    lobe = (np.array([rng.permutation(n) for _ in range(k * a)]) + rng.random((k * a, n))) / n
-    u1, u2, u3 = (mi.Float(np.minimum(v.ravel(), 1 - 2**-24).astype("f4")) for v in (lobe, *u))
-
-    bsdf, si, ctx = textured(mi, form, materials), interactions(mi, vectors(mi, wi), index, k), mi.BSDFContext()
-    bs, weight = bsdf.sample(ctx, si, u1, mi.Point2f(u2, u3))
-    dr.eval(bs, weight)
-    valid = bs.pdf.numpy() > 0
-    found, pdf, wo = weight.numpy().T.astype(np.float64), bs.pdf.numpy(), bs.wo.numpy().T
-    expected = np.zeros_like(found)
-    reference = burley_of(materials, index[valid], wi[valid], wo[valid]) * wo[valid, 2:3]
-    expected[valid] = reference / pdf[valid, None]
-    found, expected = (v.reshape(k, a, n, 3).mean(axis=2) for v in (found, expected))
-    error = np.abs(found - expected)
-    print(f"{form}: error of the directional albedo at most {error.max():.4f}, on average {error.mean():.5f}")
-    assert np.isfinite(found).all() and found.min() >= 0
-    if form != "paper":
-        assert error.max() <= 0.02, [(materials[i], FURNACE_ANGLES[j]) for i, j, _ in np.argwhere(error > 0.02)[:3]]
-
-
-def test_directional_albedo_by_quadrature(mi_rgb, rng):
-    """The integrals above do not depend on the plugin's own sampling: a rough material over a grid of directions."""
-    mi, side = mi_rgb, 512
-    materials = [{**RICH, "roughness": 0.8, "clearcoat_gloss": 0.0, "anisotropic": 0.3}]
-    z, phi = (np.arange(side) + 0.5) / side, 2 * np.pi * (np.arange(side) + 0.5) / side
-    r = np.sqrt(1 - z * z)[:, None]
-    wo = np.stack([r * np.cos(phi), r * np.sin(phi), z[:, None] + 0 * phi], axis=-1).reshape(-1, 3).astype(np.float32)
-    index = np.zeros(len(wo), int)
-    for form in ("disney", "tables"):
-        bsdf = mi.load_dict(plugin(mi, form, materials[0]))
-        for angle in (0, 60, 85):
-            wi = np.repeat(with_cosines(rng, np.cos(np.radians([angle]))), len(wo), axis=0)
-            found = bsdf.eval(mi.BSDFContext(), interactions(mi, vectors(mi, wi)), vectors(mi, wo)).numpy().T
-            expected = burley_of(materials, index, wi, wo) * wo[:, 2:3]
-            albedos = [2 * np.pi * v.mean(axis=0, dtype=np.float64) for v in (found, expected)]
-            assert np.abs(albedos[0] - albedos[1]).max() <= 0.02, (form, angle)
-            u = [mi.Float(rng.random(2**17).astype("f4")) for _ in range(3)]
-            si = interactions(mi, vectors(mi, wi[: 2**17]))
-            weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))[1].numpy()
-            assert np.allclose(weight.mean(axis=1, dtype=np.float64), albedos[0], atol=0.01), (form, angle)
-
-
-def random_population(rng, n, distribution):
-    """Materials as they are drawn for training, or uniform."""
-    color, m, wi, wo = burley.random_case(rng, n, low_cosine=1e-5)
-    if distribution == "training":
-        for name in ("metallic", "roughness"):  # inverse of the exponential-like distribution's CDF
-            m[name] = -np.log(1 - m[name] * (1 - np.exp(-EXPONENTIAL_RATE))) / EXPONENTIAL_RATE
-    return color.astype("f4"), {k: v.astype("f4") for k, v in m.items()}, wi.astype("f4"), wo.astype("f4")
-
-
-def shaded(types, decoder, case):
-    color, m, wi, wo = case
-    material = Material(**{name: types.Float(m[name]) for name in SCALARS})
-    vectors = [types.Array3f(np.ascontiguousarray(v.T)) for v in (color, wi, wo)]
-    return training.shade(decoder, material, *vectors).numpy().T.astype(np.float64)
-
-
-#: Numbers of samples.
-POPULATION = pytest.mark.parametrize("n", [200_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
-
-#: Forms and storages that the tests below hold to the bars.
-STORED = [("disney", ""), ("tables", "float32"), ("tables", "float16"), ("tables", "uint8")]
-
-
-def decoder_for(types, form, storage):
-    return Decoder() if form == "disney" else TASK.open(types.TensorXf, "", form, storage).decoder
-
-
-def check_grazing(name, found, expected):
-    """99 of 100 within a quarter, none more than twice the exact value, where that is not next to nothing."""
-    counts = expected > 1e-3
-    relative = np.abs(found - expected)[counts] / expected[counts]
-    ratio = (found[counts] / expected[counts]).max()
-    print(f"{name}: 99th percentile of the relative error {np.quantile(relative, 0.99):.4f}, largest ratio {ratio:.3f}")
-    assert np.isfinite(found).all() and found.min() >= 0
-    assert np.quantile(relative, 0.99) <= 0.25, name
-    assert ratio <= 2, name
-
-
-def near_the_horizon(rng, wi, wo):
-    """One of the directions, or both, with a cosine below 0.02."""
-    kind = rng.integers(0, 3, len(wi))
-    low = [with_cosines(rng, np.maximum(0.02 * rng.random(len(wi)) ** 2, 1e-6)) for _ in range(2)]
-    return np.where((kind != 1)[:, None], low[0], wi), np.where((kind != 0)[:, None], low[1], wo)
-
-
-def near_the_peak(rng, wi):
-    """Directions whose half vector is within 10⁻⁴ of the normal."""
-    h = with_cosines(rng, 1 - 1e-4 * rng.random(len(wi)) ** 2).astype(np.float64)
-    wo = 2 * np.sum(wi * h, axis=1, keepdims=True) * h - wi
-    wo[:, 2] = np.maximum(wo[:, 2], 1e-6)
-    return (wo / np.linalg.norm(wo, axis=1, keepdims=True)).astype(np.float32)
-
-
-@POPULATION
-@pytest.mark.parametrize("distribution", ["training", "uniform"])
-@pytest.mark.parametrize("where", ["horizon", "peak"])
-def test_accuracy_where_it_is_hardest_to_keep(mi_rgb, rng, distribution, where, n):
-    import drjit.llvm.ad as types
-
-    color, m, wi, wo = random_population(rng, n, distribution)
-    if where == "horizon":
-        wi, wo = near_the_horizon(rng, wi, wo)
-    else:
-        wo = near_the_peak(rng, wi)
-    case = color, m, wi, wo
-    expected = burley.brdf(*case)
-    cosine = wo[:, 2:3].astype(np.float64)
-    for form, storage in STORED:
-        decoder = decoder_for(types, form, storage)
-        check_grazing(f"{where}, {distribution}, {form} {storage}", shaded(types, decoder, case) / cosine, expected)
-    paper = decoder_for(types, "paper", "")
-    found = shaded(types, paper, case) / cosine
-    counts = expected > 1e-3
-    ratio = found[counts] / expected[counts]
-    print(f"{where}, {distribution}, paper: ratios from {ratio.min():.3g} to {ratio.max():.3g}")
-    assert np.isfinite(found).all() and found.min() >= 0
-
-
-@POPULATION
-@pytest.mark.parametrize("distribution", ["training", "uniform"])
-def test_accuracy_everywhere(mi_rgb, rng, distribution, n):
-    """Peak signal-to-noise ratio of BRDF · cosine, clipped to [0, 1], and the same for exchanged directions."""
-    import drjit.llvm.ad as types
-
-    case = color, m, wi, wo = random_population(rng, n, distribution)
-    swapped = color, m, wo, wi
-    expected = burley.brdf(*case) * wo[:, 2:3]
-    for form, storage in STORED:
-        decoder = decoder_for(types, form, storage)
-        found, other = shaded(types, decoder, case), shaded(types, decoder, swapped)
-        mse = np.mean(np.square(np.clip(found, 0, 1) - np.clip(expected, 0, 1)))
-        # Reciprocity, beyond what single precision costs
-        counts = expected[:, 0] > 1e-3
-        a, b, exact = found[:, 0] / wo[:, 2], other[:, 0] / wi[:, 2], expected[:, 0] / wo[:, 2].astype(np.float64)
-        unequal = np.abs(a - b)[counts] / exact[counts]
-        print(
-            f"{distribution}, {form} {storage}: {-10 * np.log10(mse):.1f} dB, "
-            f"reciprocal within {np.quantile(unequal, 0.9999):.2e} (largest {unequal.max():.2e})"
-        )
-        assert -10 * np.log10(mse) >= 48, (form, storage)
-        assert unequal.max() <= 0.01, (form, storage)

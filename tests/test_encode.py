@@ -49,6 +49,15 @@ def write_scene(folder, rng, names=NAMES, zero=(), transforms=()):
     return path
 
 
+@pytest.fixture(autouse=True)
+def few_samples(monkeypatch):
+    """What is lost and gained is measured at fewer places, and less often, than for a user."""
+    from mi_diffind import encode
+
+    _, _, seed = encode.measure.__defaults__
+    monkeypatch.setattr(encode.measure, "__defaults__", (2**16, 2, seed))
+
+
 @pytest.mark.parametrize("preset", TASK.presets)
 def test_decode_inverts_encode(rng, preset):
     import drjit.llvm.ad as ad
@@ -59,7 +68,8 @@ def test_decode_inverts_encode(rng, preset):
     assert all(v.numpy().min() >= -1e-3 and v.numpy().max() <= 1.001 for v in latent)
     found = decoder.decode(latent)
     visible = roughness.numpy() > 0.05  # below, α has a floor
-    for a, b, tolerance in zip(found, (roughness, anisotropic), (0.005, 0.05), strict=True):
+    tolerances = {"tables": (6e-5, 0.0025), "paper": (0.0012, 0.012)}[preset]
+    for a, b, tolerance in zip(found, (roughness, anisotropic), tolerances, strict=True):
         assert np.quantile(np.abs(a.numpy() - b.numpy())[visible], 0.99) < tolerance
 
 
@@ -76,7 +86,7 @@ def test_encoded_materials_look_the_same(mi_rgb, rng, tmp_path, capsys, preset):
     assert "latents_0   roughness, anisotropic, metallic" in capsys.readouterr().out
     assert sorted(found["layout"]) == sorted(NAMES) and found["preset"] == preset
     assert found["bytes"] == found["bytes_before"] == 13 * 32 * 32
-    assert found["psnr_db"] > 48  # few texels: interpolating coordinates is not interpolating roughness
+    assert found["psnr_db"] > 50  # few texels: interpolating coordinates is not interpolating roughness
 
     before = scenes.learned_instances(scenes.load(scene, defines={"preset": preset}))[0]
     after = mi.load_file(str(out / "material.xml"))
