@@ -107,8 +107,11 @@ def test_disney_is_burley(mi_rgb, rng):
     assert np.quantile(error, 0.99) < 1e-5 and error.max() < 2e-4
 
 
-@pytest.mark.parametrize("name", list(PLUGINS))
-@pytest.mark.parametrize("material", list(MATERIALS))
+#: What differs between plugins is the value, not what sampling does with it: not all pairs.
+SAMPLED = [(name, m) for m in MATERIALS for name in PLUGINS if name == "disney" or m in ("rich", "coat_only", "metal")]
+
+
+@pytest.mark.parametrize("name, material", SAMPLED)
 def test_sample_eval_and_pdf_agree(mi_rgb, rng, name, material):
     bsdf = mi_rgb.load_dict({**PLUGINS[name], **MATERIALS[material]})
     ctx, n = mi_rgb.BSDFContext(), 20_000
@@ -130,14 +133,13 @@ def test_sample_eval_and_pdf_agree(mi_rgb, rng, name, material):
 
 
 @pytest.mark.parametrize(
-    "name, n",
-    [(name, 20_000) for name in PLUGINS] + [pytest.param(n, 500_000, marks=pytest.mark.slow) for n in PLUGINS],
+    "name, n, rounds",
+    [(n, 50_000, 8) for n in PLUGINS] + [pytest.param(n, 500_000, 20, marks=pytest.mark.slow) for n in PLUGINS],
 )
-def test_finite_and_non_negative_over_many_inputs(mi_rgb, rng, name, n):
+def test_finite_and_non_negative_over_many_inputs(mi_rgb, rng, name, n, rounds):
     """Random and adversarial directions × random and extreme materials: eval, pdf, sampling weight; up to 10⁷."""
     mi = mi_rgb
     special = np.array([0, 1e-38, 1e-30, 1e-20, 1e-12, 1e-8, 1e-6, 1e-4, 1e-2, 0.5, 1 - 1e-7, 1])
-    rounds = 20
     params_rng = np.random.default_rng(7)
     bsdf = mi.load_dict({**PLUGINS[name], "base_color": {"type": "rgb", "value": 0.5}})
     params = mi.traverse(bsdf)
@@ -513,9 +515,8 @@ def test_white_is_white_in_every_colour_mode(kind):
     assert np.allclose(means[0], means[1], rtol=0.03), means
 
 
-@pytest.mark.parametrize("name", list(PLUGINS))
-def test_wrappers(mi_rgb, name):
-    mi = mi_rgb
+def test_wrappers(mi_rgb):
+    mi, name = mi_rgb, "disney"
     inner = {**PLUGINS[name], **RICH}
     flat = mi.TensorXf(np.tile(np.array([0.5, 0.5, 1.0], "f4"), (4, 4, 1)))
     plain = mi.render(sphere_scene(mi, inner), spp=32).numpy()

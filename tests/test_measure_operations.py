@@ -198,14 +198,14 @@ def test_effects_that_are_not_in_use_cost_nothing(mi_rgb):
         assert metal[method].flops < used[method].flops  # no diffuse lobe
 
 
-@pytest.mark.parametrize("quality", ["tables", "paper"])
-def test_reads_of_tables(mi_rgb, quality):
-    found = bsdf_operations(load(mi_rgb, type="neural_disney", preset=quality, storage="float32"))
+@pytest.mark.parametrize("preset", ["tables", "paper"])
+def test_reads_of_tables(mi_rgb, preset):
+    found = bsdf_operations(load(mi_rgb, type="neural_disney", preset=preset, storage="float32"))
     assert found["eval"].gathers > 0
     assert found["pdf"].gathers == 0  # analytic
     assert found["sample"].gathers == found["eval"].gathers
-    if quality == "tables":
-        small = bsdf_operations(load(mi_rgb, type="neural_disney", preset=quality, storage="uint8"), methods=("eval",))
+    if preset == "tables":
+        small = bsdf_operations(load(mi_rgb, type="neural_disney", preset=preset, storage="uint8"), methods=("eval",))
         assert list(small) == ["eval"]
         assert small["eval"].bytes_gathered < found["eval"].bytes_gathered
 
