@@ -15,7 +15,7 @@ from .disney import PRINCIPLED, Disney, Parameters, refuse_latents
 from .support import properties, tables
 from .support.watched import WatchedChannel
 
-#: The fastest form to read; 79 dB from the formulas.
+#: The fastest form to read; 82 dB or more from the formulas.
 STORAGE = "uint8"
 
 
@@ -30,7 +30,7 @@ class NeuralDisney(Disney):
 
      * - preset
        - |string|
-       - ``tables``: tables of together 512 bytes, in a factorisation that stays accurate at the horizon (79 dB from the
+       - ``tables``: tables of together 384 bytes, in a factorisation that stays accurate at the horizon (85 dB from the
          formulas); ``paper``: the layout of the paper's Table 1, for comparison (39 dB). (Default: that of the file, if
          ``filename`` is given, else ``tables``)
        - --
@@ -59,7 +59,7 @@ class NeuralDisney(Disney):
        - Textures of three channels each, with values in [0, 1]; of one channel if it holds the last parameter alone.
        - |exposed|, |differentiable|
 
-     * - tables.alpha, tables.masking, tables.cosine, tables.coat, tables.encoder_roughness,
+     * - tables.alpha, tables.aspect, tables.masking, tables.coat, tables.encoder_roughness,
          tables.encoder_anisotropic; or tables.ggx, tables.masking, tables.diffuse, tables.fresnel, … (``paper``)
        - |tensor|
        - With ``storage`` ``float32``: the entries of the tables, in the file's shapes, or with channels padded to 1, 2
