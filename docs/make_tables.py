@@ -102,10 +102,7 @@ def written() -> dict[Path, str]:
     for path in sorted(DOCS.glob("*.md")):
         text = pages.get(path) or path.read_text(encoding="utf-8")
         pages[path] = re.sub(
-            r"(<!-- table (\w+) -->\n).*?(\n<!-- end -->)",
-            lambda m: m[1] + TABLES[m[2]]() + m[3],
-            text,
-            flags=re.DOTALL,
+            r"(<!-- table (\w+) -->\n)(?:\|.*\n)*(<!-- end -->)", lambda m: f"{m[1]}{TABLES[m[2]]()}\n{m[3]}", text
         )
     return pages
 

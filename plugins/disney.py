@@ -119,7 +119,7 @@ class Disney(mi.BSDF):
     are clamped.
 
     **It is another model than** :monosp:`principled`: Schlick's Fresnel term in place of the dielectric one, with which
-    images are 0.5% to 1% darker, up to 4% in places; no transmission; and ``eta`` between 1 and 3. ``mi-diffind compare
+    images are 0.1% to 1% darker, up to 4% in places; no transmission; and ``eta`` between 1 and 3. ``mi-diffind compare
     --against principled`` shows a scene with both.
 
     **Only the effects in use.** A part of the model that the parameters make zero (``clearcoat`` 0, ``metallic`` 1, a
