@@ -46,4 +46,4 @@ def __dir__():
     return sorted({*globals(), *__all__})
 
 
-_runtime.install()
+_runtime.install(lambda: _importlib.import_module(".plugins", __name__).install())

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import glob
 import importlib.abc
 import importlib.metadata
@@ -25,6 +26,7 @@ import os
 import re
 import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -152,10 +154,11 @@ def llvm_problem() -> str | None:
     return _problem
 
 
-def install() -> None:
+def install(register_plugins: Callable[[], None]) -> None:
     """
-    See to it that Dr.Jit starts with a usable LLVM and that Mitsuba knows the plugins, whether these two have been
-    imported already or will be. Called by ``import mi_diffind``, which imports neither of them itself.
+    See to it that Dr.Jit starts with a usable LLVM and that Mitsuba knows the plugins (``register_plugins`` is called
+    once Mitsuba is there), whether these two have been imported already or will be. Called by ``import mi_diffind``,
+    which imports neither of them itself.
     """
     hooks = {}
     if "drjit" in sys.modules:
@@ -163,9 +166,9 @@ def install() -> None:
     else:
         hooks["drjit"] = _starting_drjit
     if "mitsuba" in sys.modules:
-        _register_plugins()
+        register_plugins()
     else:
-        hooks["mitsuba"] = _starting_mitsuba
+        hooks["mitsuba"] = functools.partial(_followed_by, register_plugins)
     if hooks:
         sys.meta_path.insert(0, _Hook(hooks))
 
@@ -198,15 +201,9 @@ class _Hook(importlib.abc.MetaPathFinder):
 
 
 @contextlib.contextmanager
-def _starting_mitsuba():
+def _followed_by(action: Callable[[], None]):
     yield
-    _register_plugins()
-
-
-def _register_plugins() -> None:
-    from . import plugins
-
-    plugins.install()
+    action()
 
 
 @contextlib.contextmanager

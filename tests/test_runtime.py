@@ -212,7 +212,8 @@ chosen = []
 original = mi_diffind.runtime.choose_llvm
 mi_diffind.runtime.choose_llvm = lambda *a: chosen.append(a) or original(*a)
 registered = []
-mi_diffind.runtime._register_plugins = lambda: registered.append(1)
+sys.modules["mi_diffind.plugins"] = plugins = type(sys)("mi_diffind.plugins")
+plugins.install = lambda: registered.append(1)
 try:
     import no_such_module_anywhere
 except ModuleNotFoundError:
