@@ -73,7 +73,7 @@ def test_decode_inverts_encode(rng, preset):
         assert np.quantile(np.abs(a.numpy() - b.numpy())[visible], 0.99) < tolerance
 
 
-@pytest.mark.parametrize("preset", TASK.presets)
+@pytest.mark.parametrize("preset", ["tables", pytest.param("paper", marks=pytest.mark.slow)])
 def test_encoded_materials_look_the_same(mi_rgb, rng, tmp_path, capsys, preset):
     from mi_diffind import scenes
     from mi_diffind.measure import operations

@@ -13,7 +13,7 @@ SCENES = Path(__file__).resolve().parents[1] / "scenes"
 SMALL = {"width": 96, "height": 56}
 
 
-@pytest.mark.parametrize("name", ["materials", "still_life"])
+@pytest.mark.parametrize("name", [pytest.param("materials", marks=pytest.mark.slow), "still_life"])
 def test_scene_as_written_and_exact(mi_rgb, name):
     """The bound on the approximation: 77.8 and 77.2 dB are reached, FLIP of 0.0010 and 0.0014."""
     from mi_diffind import compare

@@ -47,7 +47,7 @@ PRESETS = ("tables", "paper")
 
 def plan(quick: bool = False) -> Plan:
     """What is measured in the variant that is set; ``quick``: fewer cases, fewer and smaller pictures."""
-    candidates, plugins = _candidates()
+    candidates, plugins = _candidates(quick)
     lobes = {"all lobes": ALL_LOBES, "diffuse + specular": DIFFUSE_SPECULAR}
     combinations = [(m, l) for m in ("constant", "textured") for l in lobes]
     if quick:
@@ -97,8 +97,11 @@ def plan(quick: bool = False) -> Plan:
 # -- candidates -------------------------------------------------------------------------------------------------------
 
 
-def _candidates() -> tuple[list[Candidate], dict]:
-    """The candidates, and for each plugin a function that makes its BSDF of parameters (as for ``mi.load_dict``)."""
+def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
+    """
+    The candidates (``quick``: without half precision), and for each plugin a function that makes its BSDF of parameters
+    (as for ``mi.load_dict``).
+    """
     types = runtime.array_module(mi.variant())
 
     def errors(decoder):
@@ -142,7 +145,7 @@ def _candidates() -> tuple[list[Candidate], dict]:
     ]
     plugins = {"principled": loaded(type="principled"), "disney": loaded(type="disney")}
     for preset in PRESETS:
-        for storage in STORAGES:
+        for storage in ("float32", "uint8") if quick else STORAGES:
             name = preset if storage == "float32" else f"{preset}, {storage}"
             model = TASK.open(types.TensorXf, preset=preset, storage=storage)
             candidates.append(Candidate(name, preset, storage, model.nbytes, None, errors(model.decoder)))
