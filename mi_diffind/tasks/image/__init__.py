@@ -1,7 +1,8 @@
 """
 Task 3: images and materials as one primary and one cascaded array.
 
-- :mod:`.source`: the image, or the maps of a material; :mod:`.layout`: which of its channels are stored;
+Sources, and which of their channels are stored: :mod:`mi_diffind.maps`.
+
 - :mod:`.arrays`: initial values; :mod:`.sizing`, :mod:`.search`: how large they are;
 - :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and what ``fit image`` does;
 - :mod:`.compressed`, :mod:`.model`: the result, as an image and as a file.
@@ -12,11 +13,11 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
+from ... import sizes
 from ...arguments import Argument, positive
+from ...maps.source import NONFINITE
 from ..task import Request, Task
-from . import sizing
 from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, without
-from .source import NONFINITE
 
 
 def _checked(parse):
@@ -43,9 +44,9 @@ def _decibels(text: str) -> float:
 
 
 _SIZES = (
-    ("compression", sizing.parse_compression, "how many times smaller than the source, uncompressed (default: 12x)"),
-    ("bytes", sizing.parse_bytes, "size of the arrays, as in 256k or 1.5M"),
-    ("bpp", sizing.parse_bpp, "bits a texel of the image, all channels together"),
+    ("compression", sizes.parse_compression, "how many times smaller than the source, uncompressed (default: 12x)"),
+    ("bytes", sizes.parse_bytes, "size of the arrays, as in 256k or 1.5M"),
+    ("bpp", sizes.parse_bpp, "bits a texel of the image, all channels together"),
     ("psnr", _decibels, "the smallest file that reaches so many dB (several trainings)"),
 )
 

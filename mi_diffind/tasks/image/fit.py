@@ -6,13 +6,14 @@ import dataclasses
 import os
 from pathlib import Path
 
+from ... import sizes
 from ...errors import UsageError
+from ...maps.source import Source, load_source
 from ...settings import FittingError
 from ...tables import MAX_BYTES
 from ..task import Fitted, Request
 from . import search, sizing, training
 from .presets import PRESETS, STRUCTURES, Recipe, without
-from .source import Source, load_source
 
 
 def recipe_of(preset: str, settings, options) -> Recipe:
@@ -46,7 +47,7 @@ def check(request: Request) -> None:
 
 def fit(request: Request) -> Fitted:
     """
-    Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`.source.SourceError` and
+    Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
     :class:`~mi_diffind.fitting.FittingError`.
     """
     options = request.options
@@ -82,7 +83,7 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
     if not any(given.values()):
         given["compression"] = 12
     try:
-        asked = sizing.parse_size(source.nbytes, source.texels, **given)
+        asked = sizes.parse_size(source.nbytes, source.texels, **given)
     except ValueError as e:
         raise UsageError(str(e)) from None
     tried, lines = [], []

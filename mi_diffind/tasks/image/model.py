@@ -9,11 +9,11 @@ import numpy as np
 from ... import metrics
 from ...errors import UsageError
 from ...files import replacing
+from ...maps.layout import Layout
+from ...maps.source import Source, load_source
 from ...tables import TableError
 from ..task import Model
 from .compressed import CompressedImage, joined_of
-from .layout import Layout
-from .source import Source, load_source
 
 
 class ImageModel(Model):
