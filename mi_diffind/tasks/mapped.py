@@ -1,4 +1,4 @@
-"""What files of tasks that store maps stand for: maps that are read, measured against their source, written as images."""
+"""What files of tasks that store maps stand for: maps that are read, measured against their source, decoded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .task import Model
 
 
 class MapsModel(Model):
-    """The maps in a file: ``image``, which :meth:`build` makes (:class:`~mi_diffind.maps.compressed.CompressedMaps`)."""
+    """The maps in a file: ``image`` (:class:`~mi_diffind.maps.compressed.CompressedMaps`)."""
 
     image: CompressedMaps
 
