@@ -18,6 +18,7 @@ Everything works on any JIT backend of Dr.Jit; nothing here knows Mitsuba.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -116,7 +117,7 @@ def _corners(axes, resolution):
     return result
 
 
-def _weighted_sum(terms):
+def weighted_sum(terms):
     """Σ weight · value for each channel."""
     total = None
     for weight, values in terms:
@@ -145,25 +146,25 @@ def read_float(
     precision) type. Differentiable with respect to ``data`` and ``x``. ``transform`` is applied to each entry that was
     fetched.
     """
-    Float = type(x[0])
-    stored = stored or padded_channels(channels)
+    Float, stored = type(x[0]), stored or padded_channels(channels)
+    fetch = functools.partial(fetch_float, data, channels, stored, active, transform, Float)
+    axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
+    return weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
+
+
+def fetch_float(data, channels: int, stored: int, active, transform, Float, index) -> list:
+    """The channels of an entry of a flat array of floats that holds ``stored`` numbers an entry, as ``Float``."""
     packet = _packet(stored)
     groups = stored // packet
-    module = module_of(Float)
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
-    Packet = None if packet == 1 else getattr(module, f"Array{packet}{suffix}")
-
-    def fetch(index):
-        values = []
-        for group in range(groups):
-            where = index if groups == 1 else dr.fma(index, groups, group)
-            found = dr.gather(Packet or type(data), data, where, active)
-            values += [Float(v) for v in (found if Packet else [found])]
-        values = values[:channels]
-        return values if transform is None else [transform(v) for v in values]
-
-    axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
-    return _weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
+    Packet = None if packet == 1 else getattr(module_of(Float), f"Array{packet}{suffix}")
+    values = []
+    for group in range(groups):
+        where = index if groups == 1 else dr.fma(index, groups, group)
+        found = dr.gather(Packet or type(data), data, where, active)
+        values += [Float(v) for v in (found if Packet else [found])]
+    values = values[:channels]
+    return values if transform is None else [transform(v) for v in values]
 
 
 def read_packed(
@@ -230,13 +231,13 @@ def read_packed(
         found = fetch(index)
         corners = [[byte(found, k * stride + channel) for channel in range(channels)] for k in range(2**inner)]
         if channels > 2:  # weights that all channels share are less work than a step along each axis for each
-            corners = [_weighted_sum(zip(inner_weights, corners, strict=True))] if inner else corners
+            corners = [weighted_sum(zip(inner_weights, corners, strict=True))] if inner else corners
         else:
             for _, _, w in reversed(axes[outer:]):
                 pairs = zip(corners[::2], corners[1::2], strict=True)
                 corners = [[dr.fma(w, b - a, a) for a, b in zip(*pair, strict=True)] for pair in pairs]
         terms.append((weight, corners[0]))
-    sums = terms[0][1] if terms[0][0] is None else _weighted_sum(terms)
+    sums = terms[0][1] if terms[0][0] is None else weighted_sum(terms)
     values = []
     for k, s in enumerate(sums):
         step = scale[k] / 128 if k % 2 and convert else (65536 if k % 2 else 256) * scale[k]
@@ -269,32 +270,33 @@ def read_bits(
     word more): it takes no more memory than that. One gather a corner if an entry is a half, a quarter … of a word, two
     if it may begin in one and end in the next. Otherwise as :func:`read_packed`.
     """
-    Float, UInt32 = type(x[0]), type(words)
-    Int32, width = dr.int32_array_t(type(words)), channels * bits
-    count = channels_words(channels, bits)
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
-
-    def fetch(index) -> list:
-        start = index * width
-        first, shift = start >> 5, start & 31
-        found = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
-        if count > 1:  # what is left of a word, and what the next one adds above it
-            pairs = zip(found, [*found[1:], UInt32(0)], strict=True)
-            found = [(low >> shift) | ((high << (31 - shift)) << 1) for low, high in pairs]
-        else:
-            found = [found[0] >> shift]
-        values = []
-        for k in range(channels):
-            word, at = divmod(k * bits, 32)
-            value = found[word] >> at
-            if at + bits > 32:
-                value |= found[word + 1] << (32 - at)
-            values.append(Float(Int32(value & (2**bits - 1))))
-        return values
-
-    sums = _weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
+    fetch = functools.partial(fetch_bits, words, channels, bits, active, type(x[0]))
+    sums = weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
     values = [dr.fma(s, scale[k], offset[k]) for k, s in enumerate(sums)]
     return values if active is True else [dr.select(active, v, 0) for v in values]
+
+
+def fetch_bits(words, channels: int, bits: int, active, Float, index) -> list:
+    """The numbers that :func:`pack_bits` packed for an entry, as ``Float``."""
+    UInt32, width = type(words), channels * bits
+    Int32, count = dr.int32_array_t(UInt32), channels_words(channels, bits)
+    start = index * width
+    first, shift = start >> 5, start & 31
+    found = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
+    if count > 1:  # what is left of a word, and what the next one adds above it
+        pairs = zip(found, [*found[1:], UInt32(0)], strict=True)
+        found = [(low >> shift) | ((high << (31 - shift)) << 1) for low, high in pairs]
+    else:
+        found = [found[0] >> shift]
+    values = []
+    for k in range(channels):
+        word, at = divmod(k * bits, 32)
+        value = found[word] >> at
+        if at + bits > 32:
+            value |= found[word + 1] << (32 - at)
+        values.append(Float(Int32(value & (2**bits - 1))))
+    return values
 
 
 def pack_bits(codes, bits: int):

@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     ("errors", "arguments", "settings", "found", "interrupt", "files", "compat", "metrics", "runtime"),
     ("lookup",),
-    ("indirection",),
+    ("indirection", "pages"),
     ("tables",),
     ("fitting",),
     ("tasks",),
