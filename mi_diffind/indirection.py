@@ -167,6 +167,30 @@ class DifferentiableArray(nn.Module):
         result.folded = False
         return result
 
+    def rounded(self, bits: int) -> DifferentiableArray:
+        """
+        A copy whose entries, numbers in [0, 1] after the fold, are rounded as :meth:`quantised` stores them, with the
+        gradients of the entries as they are (straight-through estimation): training takes rounding into account.
+        """
+        steps = 2**bits - 1
+
+        def change(entries):
+            exact = dr.detach(entries)
+            return entries + dr.detach(dr.round(exact * steps) / steps - exact)
+
+        return self.unfolded(change)
+
+    def quantised(self, bits: int) -> DifferentiableArray:
+        """
+        A copy in ``"uint8"`` storage, of entries that are numbers in [0, 1] after the fold: each is stored in ``bits``
+        bits, 1 to 8, which stand for multiples of ``1 / (2^bits − 1)``. Nothing of the range is given to what is not
+        used, and :attr:`is_pointer` holds.
+        """
+        steps = 2**bits - 1
+        codes = np.rint(self.numpy().astype(np.float64) * steps).astype(np.uint8)
+        affine = ((1 / steps,) * self.channels, (0.0,) * self.channels)
+        return self.from_numpy(codes, type(self.data), self.border, "uint8", False, affine, bits)
+
     def to(self, storage: str) -> DifferentiableArray:
         """
         A copy in another storage form. Leaving ``"float32"`` applies the fold for good: quantised entries are

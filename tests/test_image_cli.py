@@ -14,10 +14,10 @@ import pytest
 
 from mi_diffind import StoredArray, load_model
 from mi_diffind.cli import main
+from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import Table, load_table, save_table
 from mi_diffind.tasks.image import search, training
-from mi_diffind.tasks.image.layout import Layout, MapLayout
 from mi_diffind.tasks.image.presets import STRUCTURES
 from mi_diffind.tasks.task import tasks
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from conftest import BACKENDS
 
+from mi_diffind.maps.compressed import root
+from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout
+from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
-from mi_diffind.tasks.image.compressed import _root
-from mi_diffind.tasks.image.layout import NORMAL_FLOOR_DB, Layout, MapLayout
-from mi_diffind.tasks.image.source import from_arrays
 
 
 @pytest.fixture(params=BACKENDS)
@@ -267,7 +267,7 @@ def test_dr_jit_decodes_as_numpy(ad):
     stored[:, :2] = 0, 1  # corners, where x² + y² is beyond 1
     for name in LAYOUT.names:
         expected = LAYOUT.decode(name, list(stored))
-        found = LAYOUT.decode(name, [ad.Float(v.copy()) for v in stored], dr.exp2, _root)
+        found = LAYOUT.decode(name, [ad.Float(v.copy()) for v in stored], dr.exp2, root)
         assert len(found) == len(expected) == LAYOUT[name].channels
         for a, b in zip(found, expected, strict=True):
             if isinstance(b, float):
@@ -285,7 +285,7 @@ def test_a_normal_is_of_unit_length_or_flat(ad):
     point = [ad.Float(x), ad.Float(y)]
     dr.enable_grad(point)
     stored = [None, None, None, *point]  # what a map does not need may be missing
-    found = LAYOUT.decode("normal", stored, dr.exp2, _root)
+    found = LAYOUT.decode("normal", stored, dr.exp2, root)
     normal = np.stack([2 * v.numpy() - 1 for v in found])
     dr.backward(found[2])
     inside = (2 * x - 1) ** 2 + (2 * y - 1) ** 2 < 0.999

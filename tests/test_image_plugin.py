@@ -23,15 +23,15 @@ from conftest import VARIANTS, _set
 from scipy.ndimage import map_coordinates
 
 from mi_diffind import compare, compat, scenes
+from mi_diffind.maps.layout import Layout, MapLayout
+from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.operations import bsdf_operations, count
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, Table, load_table, save_table
 from mi_diffind.tasks.ggx import TASK as GGX
 from mi_diffind.tasks.image import TASK, sizing, training
 from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.image.layout import Layout, MapLayout
 from mi_diffind.tasks.image.presets import PRESETS, replaced
-from mi_diffind.tasks.image.source import from_arrays, load_source
 from mi_diffind.tasks.task import Request
 
 WIDTH, HEIGHT = 12, 10

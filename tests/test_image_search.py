@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from mi_diffind.fitting import FitResult
+from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
 from mi_diffind.tasks.image import presets, search, sizing, training
 from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.image.presets import PRESETS
 from mi_diffind.tasks.image.sizing import Size
-from mi_diffind.tasks.image.source import from_arrays
 from mi_diffind.tasks.task import Request
 
 OURS, PAPER = PRESETS["ours"], PRESETS["paper"]

@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from mi_diffind.tasks.image.source import SourceError, from_arrays, kind_of, load_source
+from mi_diffind.maps.source import SourceError, from_arrays, kind_of, load_source
 
 
 def pattern(height, width, channels, dtype=np.uint8, seed=0):
@@ -182,7 +182,7 @@ def test_no_variant_is_set_or_changed(tmp_path, mi_rgb):
     digest = load_source(path).digest
     assert mi_rgb.variant() == before
     code = (
-        "import sys; from mi_diffind.tasks.image import source\n"
+        "import sys; from mi_diffind.maps import source\n"
         "print(source.load_source(sys.argv[1]).digest); import mitsuba; assert mitsuba.variant() is None"
     )
     run = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)

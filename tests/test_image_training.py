@@ -11,13 +11,14 @@ from scipy.ndimage import map_coordinates
 
 from mi_diffind import DifferentiableArray, Indirection, fitting, save_table
 from mi_diffind.fitting import fit
+from mi_diffind.maps import components
+from mi_diffind.maps.layout import Layout
+from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
 from mi_diffind.tasks.image import TASK, arrays, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.image.layout import Layout
 from mi_diffind.tasks.image.presets import IMPROVEMENTS, PRESETS, STRUCTURES, replaced, without
 from mi_diffind.tasks.image.sizing import Coarse, Size
-from mi_diffind.tasks.image.source import from_arrays
 from mi_diffind.tasks.task import Request
 
 OURS = PRESETS["ours"]
@@ -81,14 +82,15 @@ def test_borders_of_what_tiles_and_what_does_not():
     tile = waves()
     y, x = np.mgrid[0:24, 0:24] / 24
     slope = np.stack([x, 0.2 + 0 * x], axis=-1)
-    assert arrays.borders(tile) == ("repeat", "repeat")
-    assert arrays.borders(slope) == ("repeat", "clamp")  # constant along v
-    assert arrays.borders(slope.transpose(1, 0, 2)) == ("clamp", "repeat")
-    assert arrays.borders(slope + y[..., None]) == ("clamp", "clamp")
-    assert arrays.borders(tile[:13]) == ("clamp", "repeat")  # half a period
-    assert arrays.borders(tile[:, :13]) == ("repeat", "clamp")
-    assert arrays.borders(tile[:1]) == ("repeat", "repeat") and arrays.borders(tile[:1, :1]) == ("repeat", "repeat")
-    assert arrays.borders(np.random.default_rng(0).random((9, 8, 2))) == ("repeat", "repeat")
+    assert components.borders(tile) == ("repeat", "repeat")
+    assert components.borders(slope) == ("repeat", "clamp")  # constant along v
+    assert components.borders(slope.transpose(1, 0, 2)) == ("clamp", "repeat")
+    assert components.borders(slope + y[..., None]) == ("clamp", "clamp")
+    assert components.borders(tile[:13]) == ("clamp", "repeat")  # half a period
+    assert components.borders(tile[:, :13]) == ("repeat", "clamp")
+    assert components.borders(tile[:1]) == ("repeat", "repeat")
+    assert components.borders(tile[:1, :1]) == ("repeat", "repeat")
+    assert components.borders(np.random.default_rng(0).random((9, 8, 2))) == ("repeat", "repeat")
 
 
 @pytest.mark.parametrize("border", [("clamp", "clamp"), ("repeat", "clamp"), ("clamp", "repeat"), ("repeat", "repeat")])
@@ -114,7 +116,7 @@ def test_downscaling_is_a_tent(rows, columns, border):
         for j in range(columns):
             w = np.outer(weights(i, rows, height, border[0]), weights(j, columns, width, border[1]))
             expected[i, j] = np.einsum("yx,yxc->c", w, values)
-    found = arrays.downscale(values, rows, columns, border)
+    found = components.downscale(values, rows, columns, border)
     assert found.dtype == np.float32 and found.shape == (rows, columns, 2)
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
@@ -196,12 +198,13 @@ def test_detail():
         for j in range(1, 6)
         for c in range(2)
     ]
-    assert arrays.smoothness(values) == pytest.approx(-10 * np.log10(np.mean(np.square(errors))), abs=1e-3)
-    assert arrays.smoothness(waves(32, 32)) > arrays.smoothness(waves(32, 32, periods=4)) > arrays.smoothness(values)
+    assert components.smoothness(values) == pytest.approx(-10 * np.log10(np.mean(np.square(errors))), abs=1e-3)
+    several = [components.smoothness(v) for v in (values, waves(32, 32, periods=4), waves(32, 32))]
+    assert several[0] < several[1] < several[2]
     y, x = np.mgrid[0:8, 0:8].astype(np.float32)
-    assert arrays.smoothness((y + 2 * x)[..., None] / 30) == 120  # a plane has none
+    assert components.smoothness((y + 2 * x)[..., None] / 30) == 120  # a plane has none
     for few in (values[:1], values[:, :2], values[:1, :1]):
-        assert np.isfinite(arrays.smoothness(few))
+        assert np.isfinite(components.smoothness(few))
 
 
 def test_the_ramp_is_the_supplements(ad):
@@ -548,7 +551,6 @@ def test_every_structure_makes_a_file(ad, tmp_path, structure):
 
 def test_decoding_reads_texel_centres(ad, monkeypatch):
     """In pieces or at once, at its own size or another one, some maps or all."""
-    from mi_diffind.tasks.image import compressed
 
     source = from_arrays({"albedo": waves(9, 11), "height": waves(9, 11, 1) * 0.9})
     recipe = short(steps=2, dims=3)
@@ -560,7 +562,7 @@ def test_decoding_reads_texel_centres(ad, monkeypatch):
     for name, channels in read.items():
         np.testing.assert_allclose(whole[name], numpy_of(channels).reshape(9, 11, -1), atol=1e-6)
         assert whole[name].dtype == np.float32
-    monkeypatch.setattr(compressed, "CHUNK", 17)
+    monkeypatch.setattr("mi_diffind.maps.compressed.CHUNK", 17)
     for name, values in image.decode().items():
         np.testing.assert_array_equal(values, whole[name])
     larger = image.decode(["height"], width=33, height=27)

@@ -5,8 +5,10 @@ import math
 
 import pytest
 
+from mi_diffind import sizes
+from mi_diffind.sizes import parse_size
 from mi_diffind.tasks.image import sizing
-from mi_diffind.tasks.image.sizing import Size, explain, fit_bytes, image_bytes, paper_search, parse_size, search
+from mi_diffind.tasks.image.sizing import Size, explain, fit_bytes, image_bytes, paper_search, search
 
 IMAGES = [(1, 1), (1, 4096), (4096, 1), (7, 5), (64, 64), (100, 100), (333, 1000), (1024, 1024), (4096, 4096)]
 
@@ -131,7 +133,7 @@ def test_fit_of_exactly_the_image():
 
 @pytest.mark.parametrize("text, value", [("12x", 12), ("12", 12), (" 7.5X ", 7.5), ("1e2×", 100), (".5x", 0.5), (3, 3)])
 def test_compressions(text, value):
-    assert sizing.parse_compression(text) == value
+    assert sizes.parse_compression(text) == value
 
 
 @pytest.mark.parametrize(
@@ -140,15 +142,15 @@ def test_compressions(text, value):
      ("1G", 2**30), (1000, 1000)],
 )  # fmt: skip
 def test_bytes(text, value):
-    assert sizing.parse_bytes(text) == value
+    assert sizes.parse_bytes(text) == value
 
 
 @pytest.mark.parametrize("text, value", [("2", 2), ("0.5", 0.5), (1.25, 1.25)])
 def test_bits_per_texel(text, value):
-    assert sizing.parse_bpp(text) == value
+    assert sizes.parse_bpp(text) == value
 
 
-@pytest.mark.parametrize("parse", [sizing.parse_compression, sizing.parse_bytes, sizing.parse_bpp])
+@pytest.mark.parametrize("parse", [sizes.parse_compression, sizes.parse_bytes, sizes.parse_bpp])
 @pytest.mark.parametrize(
     "text", ["0", "-1", "nan", "inf", "1e999", "", "x", "twelve", "1_000", "1,5", "12 x 3", "٣", "0x10", math.nan, None]
 )
@@ -161,7 +163,7 @@ def test_nonsense_is_one_sentence(parse, text):
 @pytest.mark.parametrize("text", ["0.5", "1e18G"])
 def test_bytes_out_of_range(text):
     with pytest.raises(ValueError, match="allowed are 1 to 2"):
-        sizing.parse_bytes(text)
+        sizes.parse_bytes(text)
 
 
 def test_a_size_is_asked_for_in_one_way():

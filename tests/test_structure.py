@@ -8,10 +8,11 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Floors, from the lowest one up. A name is a module or a whole package; the longest that fits counts. What stands on
 #: the same floor may import one another; modules of one package as they like, without a circle.
 FLOORS = (
-    ("errors", "arguments", "settings", "found", "interrupt", "files", "compat", "metrics", "runtime"),
+    ("errors", "arguments", "settings", "found", "interrupt", "files", "compat", "metrics", "runtime", "sizes"),
     ("lookup",),
     ("indirection", "pages"),
     ("tables",),
+    ("maps",),
     ("fitting",),
     ("tasks",),
     ("plugins",),

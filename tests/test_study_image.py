@@ -13,11 +13,11 @@ from scipy.ndimage import gaussian_filter
 
 from mi_diffind import fitting, metrics
 from mi_diffind.cli import main
+from mi_diffind.maps.source import from_arrays
 from mi_diffind.studies.baselines import codecs
 from mi_diffind.tasks.image import training
 from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.image.presets import IMPROVEMENTS, replaced
-from mi_diffind.tasks.image.source import from_arrays
 
 #: Steps of a training.
 STEPS = 8

@@ -38,7 +38,7 @@ def run(arguments) -> dict:
     """
     Measure and write table and plot. Returns the result with its ``files``; after Ctrl-C, what there is up to then.
     Raises :class:`UsageError`, :class:`~mi_diffind.files.OutputError`, and what the study's own input may raise
-    (:class:`~mi_diffind.tasks.image.source.SourceError`, :class:`~mi_diffind.scenes.SceneError`).
+    (:class:`~mi_diffind.maps.source.SourceError`, :class:`~mi_diffind.scenes.SceneError`).
     """
     study = studies()[arguments.study]
     if study.of_scene:

@@ -35,6 +35,9 @@ STORAGES = ("float32", "float16", "uint8")
 #: The folder of the tables that ship.
 DATA = Path(__file__).resolve().parents[1] / "data"
 
+#: What several tasks use, beside them.
+COMMON = ("task", "sampling", "known", "mapped", "map_arguments")
+
 
 @dataclass
 class Request:
@@ -265,7 +268,7 @@ def _open(task: Task, path: Path, stamp: tuple, dtype, storage: str) -> Model:
 @functools.lru_cache
 def tasks() -> dict[str, Task]:
     """All tasks by name: those of this package, then those that entry points add."""
-    return found.load(__package__, "TASK", ignored=("task", "sampling"), kind=Task)
+    return found.load(__package__, "TASK", ignored=COMMON, kind=Task)
 
 
 def task_of(table: Table) -> Task:

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import compat
+from mi_diffind.maps.layout import Layout, MapLayout
+from mi_diffind.maps.source import SourceError, load_source
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.compressed import PRIMARIES, CompressedImage
-from mi_diffind.tasks.image.layout import Layout, MapLayout
-from mi_diffind.tasks.image.source import SourceError, load_source
 from mi_diffind.tasks.task import stamp
 
 from .tables import exposed

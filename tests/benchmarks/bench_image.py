@@ -19,8 +19,9 @@ import numpy as np
 
 import mi_diffind  # noqa: F401
 from mi_diffind.fitting import FitSettings, _Trainer
+from mi_diffind.maps import source
 from mi_diffind.runtime import array_module
-from mi_diffind.tasks.image import source, training
+from mi_diffind.tasks.image import training
 from mi_diffind.tasks.image.presets import PRESETS, replaced
 from mi_diffind.tasks.image.sizing import Size
 

@@ -39,8 +39,8 @@ class ImageStudy(Study):
 
     def check(self, arguments) -> None:
         """Also reads the source, before anything is made of it; raises what :func:`.load_source` does."""
-        from ...tasks.image.sizing import parse_compression
-        from ...tasks.image.source import load_source
+        from ...maps.source import load_source
+        from ...sizes import parse_compression
 
         arguments.compressions = tuple(map(parse_compression, arguments.compression)) or (12.0,)
         arguments.loaded = load_source(arguments.source)

@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from ... import metrics
+from ...maps.source import Source
 from ...measure.store import file_name
 from ...measure.study import FLOOR, Candidate, Case, Job, Plan
 from ...runtime import array_module
@@ -34,7 +35,6 @@ from ...tasks import task
 from ...tasks.image import search, training
 from ...tasks.image.compressed import CompressedImage
 from ...tasks.image.presets import IMPROVEMENTS, PRESETS, Recipe, replaced, without
-from ...tasks.image.source import Source
 from ..baselines import codecs
 from .conclusions import conclusions, table
 

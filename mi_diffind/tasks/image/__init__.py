@@ -1,7 +1,8 @@
 """
 Task 3: images and materials as one primary and one cascaded array.
 
-- :mod:`.source`: the image, or the maps of a material; :mod:`.layout`: which of its channels are stored;
+Sources, and which of their channels are stored: :mod:`mi_diffind.maps`.
+
 - :mod:`.arrays`: initial values; :mod:`.sizing`, :mod:`.search`: how large they are;
 - :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and what ``fit image`` does;
 - :mod:`.compressed`, :mod:`.model`: the result, as an image and as a file.
@@ -9,45 +10,12 @@ Task 3: images and materials as one primary and one cascaded array.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 
 from ...arguments import Argument, positive
+from ..map_arguments import DECODED, SIZES, SOURCE, SOURCES
 from ..task import Request, Task
-from . import sizing
 from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, without
-from .source import NONFINITE
-
-
-def _checked(parse):
-    """A parser of ours as a type of ``argparse``, which shows the message of its own exception only."""
-
-    def parsed(text: str):
-        try:
-            parse(text)
-        except ValueError as e:
-            raise argparse.ArgumentTypeError(str(e)) from None
-        return text
-
-    return parsed
-
-
-def _decibels(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < 120:
-        raise ValueError(f"{text!r} is no PSNR, allowed are numbers of dB between 0 and 120")
-    return value
-
-
-_SIZES = (
-    ("compression", sizing.parse_compression, "how many times smaller than the source, uncompressed (default: 12x)"),
-    ("bytes", sizing.parse_bytes, "size of the arrays, as in 256k or 1.5M"),
-    ("bpp", sizing.parse_bpp, "bits a texel of the image, all channels together"),
-    ("psnr", _decibels, "the smallest file that reaches so many dB (several trainings)"),
-)
 
 
 class Image(Task):
@@ -59,11 +27,8 @@ class Image(Task):
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
     arguments = (
-        Argument("source", metavar="IMAGE|MATERIAL.json", help="an image, or a manifest of the maps of a material"),
-        *(
-            Argument(f"--{name}", group="size", type=_checked(kind), metavar="N", help=text)
-            for name, kind, text in _SIZES
-        ),
+        SOURCE,
+        *SIZES,
         Argument(
             "--ratio-search", action="store_true",
             help="find sides, bits and dimensions of the arrays by short trainings",
@@ -80,20 +45,9 @@ class Image(Task):
         Argument(
             "--cascaded", type=positive, metavar="N", help="entries along each side of the cascaded array"
         ),
-        Argument(
-            "--border", choices=["auto", "repeat", "clamp"], default="auto",
-            help="does the image go on at its other side? (default: auto, along u and v each)",
-        ),
-        Argument(
-            "--nonfinite", choices=NONFINITE, default="error",
-            help="NaN and infinity in the source: refuse (default), or replace by 0 and the largest value",
-        ),
+        *SOURCES,
     )  # fmt: skip
-    decode_arguments = (
-        Argument("--map", action="append", metavar="NAME", help="only this map; may be repeated (default: all)"),
-        Argument("--width", type=positive, help="width in texels (default: that of the source)"),
-        Argument("--height", type=positive, help="height in texels (default: that of the source)"),
-    )
+    decode_arguments = DECODED
 
     def settings(self, preset, given, options):
         own = without(PRESETS[preset], options["without"]).settings

@@ -7,12 +7,13 @@ import os
 from pathlib import Path
 
 from ...errors import UsageError
+from ...maps.source import Source, load_source
 from ...settings import FittingError
 from ...tables import MAX_BYTES
+from ..map_arguments import asked_bytes
 from ..task import Fitted, Request
 from . import search, sizing, training
 from .presets import PRESETS, STRUCTURES, Recipe, without
-from .source import Source, load_source
 
 
 def recipe_of(preset: str, settings, options) -> Recipe:
@@ -46,7 +47,7 @@ def check(request: Request) -> None:
 
 def fit(request: Request) -> Fitted:
     """
-    Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`.source.SourceError` and
+    Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
     :class:`~mi_diffind.fitting.FittingError`.
     """
     options = request.options
@@ -77,14 +78,7 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
         return Fitted(*training.fit_image(source, None, recipe, request, border), figures={"tried": []}), None
     if options["psnr"] is not None:
         return _for_psnr(request, source, recipe, border), None
-    given = {k: options[k] for k in ("compression", "bytes", "bpp")}
-    given["nbytes"] = given.pop("bytes")
-    if not any(given.values()):
-        given["compression"] = 12
-    try:
-        asked = sizing.parse_size(source.nbytes, source.texels, **given)
-    except ValueError as e:
-        raise UsageError(str(e)) from None
+    asked = asked_bytes(options, source)
     tried, lines = [], []
     if options["ratio_search"]:
         short = dataclasses.replace(request, checkpoint=None)

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from ...fitting import FitResult
+from ...maps.source import Source
 from ...tables import Table
 from ..task import Request
 from . import sizing
 from .presets import STRUCTURES, Recipe, replaced
 from .sizing import Coarse, Size
-from .source import Source
 from .training import fit_image, layout_of, structure_of
 
 #: A candidate of a search is trained for this share of the steps.

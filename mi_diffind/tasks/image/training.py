@@ -18,17 +18,18 @@ import numpy as np
 
 from ... import lookup
 from ...fitting import FitResult, Problem
-from ...indirection import DifferentiableArray, Indirection
+from ...indirection import Indirection
+from ...maps import components
+from ...maps.layout import Layout
+from ...maps.source import Source
 from ...tables import Table
 from ..task import Request
 from . import arrays
 from .compressed import CompressedImage, to_table
-from .layout import Layout
 from .presets import Recipe
 from .sizing import Size
-from .source import Source
 
-#: dB of :func:`.arrays.smoothness` from which on an image is smooth enough for one primary.
+#: dB of :func:`~mi_diffind.maps.components.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
 
 
@@ -36,7 +37,7 @@ def structure_of(source: Source, recipe: Recipe) -> str:
     """The structure of a recipe; for ``"auto"`` what suits the image."""
     if recipe.structure != "auto":
         return recipe.structure
-    smooth = recipe.dims < 3 or arrays.smoothness(layout_of(source, recipe).encode(source)) >= SMOOTH_DB
+    smooth = recipe.dims < 3 or components.smoothness(layout_of(source, recipe).encode(source)) >= SMOOTH_DB
     return "6 bits" if smooth else "2 + 6 bits"
 
 
@@ -148,31 +149,13 @@ class ImageProblem(Problem):
         return {"psnr_db": -10 * math.log10(max(total, 1e-12))}
 
 
-def rounded(net: Indirection, bits: Sequence[int]) -> Indirection:
-    """
-    A copy of ``net`` whose entries are rounded as they will be stored, with the gradients of the entries as they are
-    (straight-through estimation). ``bits`` are those of each primary.
-    """
-    primary = [array.unfolded(_rounding(width)) for array, width in zip(net.primary, bits, strict=True)]
-    return Indirection(primary, net.cascaded.unfolded(_rounding(8)), net.inputs)
-
-
-def _rounding(bits: int):
-    steps = 2**bits - 1
-
-    def change(entries):
-        return entries + dr.detach(dr.round(dr.detach(entries) * steps) / steps - dr.detach(entries))
-
-    return change
-
-
 def problem_of(
     source: Source, size: Size, recipe: Recipe, types, layout: Layout | None = None, border=None
 ) -> ImageProblem:
     """The problem of training ``source`` at a size by a recipe, its arrays at their initial values."""
     layout = layout or layout_of(source, recipe)
     values = layout.encode(source)
-    border = border or arrays.borders(values)
+    border = border or components.borders(values)
     net = arrays.from_components(values, size, border) if recipe.components else arrays.from_ramp(layout, size, border)
     bits = [bits for *_, bits in size.primaries]
     return ImageProblem(net.alloc(types.TensorXf), bits, layout, values, border, recipe, types, source.digest)
@@ -213,10 +196,11 @@ def fit_image(
 
 def stored_form(net: Indirection, bits: Sequence[int]) -> Indirection:
     """The arrays as they are stored: the entries of each primary rounded to its ``bits``, the cascaded array's to 8."""
-    found = []
-    for array, width in zip((*net.primary, net.cascaded), (*bits, 8), strict=True):
-        steps, dtype = 2**width - 1, type(array.data)
-        codes = np.rint(array.numpy().astype(np.float64) * steps).astype(np.uint8)
-        affine = ((1 / steps,) * array.channels, (0.0,) * array.channels)
-        found.append(DifferentiableArray.from_numpy(codes, dtype, array.border, "uint8", False, affine, width))
-    return arrays.joined(found[:-1], found[-1])
+    primary = [array.quantised(width) for array, width in zip(net.primary, bits, strict=True)]
+    return Indirection(primary, net.cascaded.quantised(8), net.inputs)
+
+
+def rounded(net: Indirection, bits: Sequence[int]) -> Indirection:
+    """A copy of ``net`` as training sees it that takes rounding into account (:meth:`.DifferentiableArray.rounded`)."""
+    primary = [array.rounded(width) for array, width in zip(net.primary, bits, strict=True)]
+    return Indirection(primary, net.cascaded.rounded(8), net.inputs)

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DiffindError, reason
+from ..errors import DiffindError, reason
 
 #: The largest number of channels of all maps together.
 MAX_CHANNELS = 16

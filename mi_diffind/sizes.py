@@ -1,0 +1,65 @@
+"""What users ask for: sizes in bytes, compression ratios, bits per texel."""
+
+from __future__ import annotations
+
+import math
+import re
+
+_NUMBER = r"(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
+_UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
+
+
+def parse_compression(text: str | float) -> float:
+    """A compression ratio such as ``12x`` or ``12``. Raises ``ValueError``."""
+    match = re.fullmatch(rf"(?P<number>{_NUMBER})\s*[x×]?", str(text).strip(), re.IGNORECASE | re.ASCII)
+    return _positive(match, text, "a compression ratio", "12x or 7.5")
+
+
+def parse_bpp(text: str | float) -> float:
+    """Bits per texel of the image, all its channels together, such as ``2``. Raises ``ValueError``."""
+    match = re.fullmatch(rf"(?P<number>{_NUMBER})", str(text).strip(), re.IGNORECASE | re.ASCII)
+    return _positive(match, text, "a number of bits per texel", "2 or 0.5")
+
+
+def parse_bytes(text: str | float) -> int:
+    """
+    A number of bytes such as ``262144``, ``256k`` or ``1.5M`` (k = 1024, M = 1024², G = 1024³, in either case and with
+    or without ``B`` or ``iB``). Raises ``ValueError``.
+    """
+    pattern = rf"(?P<number>{_NUMBER})\s*(?P<unit>[kmg]?)(i?b)?"
+    match = re.fullmatch(pattern, str(text).strip(), re.IGNORECASE | re.ASCII)
+    unit = _UNITS[match["unit"].lower()] if match else 1
+    value = _positive(match, text, "a number of bytes", "262144, 256k or 1.5M") * unit
+    if not 1 <= value < 2**63:
+        raise ValueError(f"{text!r} is {value:.3g} bytes, allowed are 1 to 2⁶³")
+    return round(value)
+
+
+def parse_size(
+    uncompressed_bytes: int,
+    texels: int,
+    compression: str | float | None = None,
+    nbytes: str | float | None = None,
+    bpp: str | float | None = None,
+) -> int:
+    """
+    The bytes that are asked for (at least 1), from exactly one of a ``compression`` ratio of ``uncompressed_bytes``, a
+    number of bytes and bits for each of ``texels``. Raises ``ValueError``.
+    """
+    given = {"compression": compression, "bytes": nbytes, "bpp": bpp}
+    given = {name: value for name, value in given.items() if value is not None}
+    if len(given) != 1:
+        raise ValueError(f"size: found {', '.join(given) or 'nothing'}, give exactly one of compression, bytes and bpp")
+    if nbytes is not None:
+        return parse_bytes(nbytes)
+    wanted = parse_bpp(bpp) * texels / 8 if bpp is not None else uncompressed_bytes / parse_compression(compression)
+    if not math.isfinite(wanted):
+        raise ValueError(f"size: {next(iter(given))} {next(iter(given.values()))} is out of range")
+    return max(1, round(wanted))
+
+
+def _positive(match: re.Match | None, text, what: str, example: str) -> float:
+    value = float(match["number"]) if match else math.nan
+    if not (value > 0 and math.isfinite(value)):
+        raise ValueError(f"{text!r} is not {what}, allowed are finite numbers > 0 such as {example}")
+    return value

@@ -1,0 +1,78 @@
+"""The arguments of tasks that store maps: what is compressed, to which size, and what is decoded."""
+
+from __future__ import annotations
+
+import argparse
+
+from .. import sizes
+from ..arguments import Argument, positive
+from ..errors import UsageError
+from ..maps.source import NONFINITE, Source
+
+
+def _checked(parse):
+    """A parser of ours as a type of ``argparse``, which shows the message of its own exception only."""
+
+    def parsed(text: str):
+        try:
+            parse(text)
+        except ValueError as e:
+            raise argparse.ArgumentTypeError(str(e)) from None
+        return text
+
+    return parsed
+
+
+def _decibels(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 120:
+        raise ValueError(f"{text!r} is no PSNR, allowed are numbers of dB between 0 and 120")
+    return value
+
+
+_SIZES = (
+    ("compression", sizes.parse_compression, "how many times smaller than the source, uncompressed (default: 12x)"),
+    ("bytes", sizes.parse_bytes, "size of the arrays, as in 256k or 1.5M"),
+    ("bpp", sizes.parse_bpp, "bits a texel of the image, all channels together"),
+    ("psnr", _decibels, "the smallest file that reaches so many dB (several trainings)"),
+)
+
+SOURCE = Argument("source", metavar="IMAGE|MATERIAL.json", help="an image, or a manifest of the maps of a material")
+
+#: The size of the arrays, in one way or another.
+SIZES = tuple(
+    Argument(f"--{name}", group="size", type=_checked(kind), metavar="N", help=text) for name, kind, text in _SIZES
+)
+
+#: How a source is read.
+SOURCES = (
+    Argument(
+        "--border", choices=["auto", "repeat", "clamp"], default="auto",
+        help="does the image go on at its other side? (default: auto, along u and v each)",
+    ),
+    Argument(
+        "--nonfinite", choices=NONFINITE, default="error",
+        help="NaN and infinity in the source: refuse (default), or replace by 0 and the largest value",
+    ),
+)  # fmt: skip
+
+#: What is decoded.
+DECODED = (
+    Argument("--map", action="append", metavar="NAME", help="only this map; may be repeated (default: all)"),
+    Argument("--width", type=positive, help="width in texels (default: that of the source)"),
+    Argument("--height", type=positive, help="height in texels (default: that of the source)"),
+)
+
+
+def asked_bytes(options, source: Source) -> int:
+    """The bytes that the options (:data:`SIZES`) ask for; a twelfth of the source's by default. Raises UsageError."""
+    given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
+    if not any(given.values()):
+        given["compression"] = 12
+    try:
+        return sizes.parse_size(source.nbytes, source.texels, **given)
+    except ValueError as e:
+        raise UsageError(str(e)) from None
