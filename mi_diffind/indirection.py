@@ -189,7 +189,7 @@ class DifferentiableArray(nn.Module):
         steps = 2**bits - 1
         codes = np.rint(self.numpy().astype(np.float64) * steps).astype(np.uint8)
         affine = ((1 / steps,) * self.channels, (0.0,) * self.channels)
-        return self.from_numpy(codes, type(self.data), self.border, "uint8", False, affine, bits)
+        return self.from_numpy(codes, type(self.data), self.border, "uint8", False, affine, bits, **self._form())
 
     def to(self, storage: str) -> DifferentiableArray:
         """
@@ -200,7 +200,11 @@ class DifferentiableArray(nn.Module):
             raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
         if storage == self.storage:
             return self._like()
-        return self.from_numpy(self.numpy(), module_of(self.data).TensorXf, self.border, storage)
+        return self.from_numpy(self.numpy(), module_of(self.data).TensorXf, self.border, storage, **self._form())
+
+    def _form(self) -> dict:
+        """What :meth:`from_numpy` has to know of an array beside its entries."""
+        return {}
 
     @classmethod
     def from_numpy(cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None, bits=8):

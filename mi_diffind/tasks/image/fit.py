@@ -13,7 +13,7 @@ from ...tables import MAX_BYTES
 from ..map_arguments import asked_bytes
 from ..task import Fitted, Request
 from . import search, sizing, training
-from .presets import PRESETS, STRUCTURES, Recipe, without
+from .presets import PAGED, PRESETS, STRUCTURES, Recipe, without
 
 
 def recipe_of(preset: str, settings, options) -> Recipe:
@@ -23,6 +23,8 @@ def recipe_of(preset: str, settings, options) -> Recipe:
     recipe = dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
     if STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
         raise UsageError(f'--structure "{recipe.structure}" has two primary arrays and needs --dims 3 or 4')
+    if recipe.structure in PAGED and not recipe.components:
+        raise UsageError(f'--structure "{recipe.structure}" starts from components: leave out what switches them off')
     return recipe
 
 

@@ -15,7 +15,7 @@ from ...maps.source import Source
 from ...tables import Table
 from ..task import Request
 from . import sizing
-from .presets import STRUCTURES, Recipe, replaced
+from .presets import PAGED, STRUCTURES, Recipe, replaced
 from .sizing import Coarse, Size
 from .training import fit_image, layout_of, structure_of
 
@@ -26,7 +26,7 @@ SHORT = 1 / 8
 SIDES = {1: (64, 256), 2: (16, 32, 64), 3: (8, 16, 32), 4: (4, 8, 12, 16)}
 
 #: Structures of the primary to try.
-TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits")
+TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits", "pages", "pages of 2 + 6 bits")
 
 #: A search by quality ends when the file is at most this much larger than one that is known to be too small.
 NEAR = 1.06
@@ -51,7 +51,7 @@ def default_size(source: Source, nbytes: float, recipe: Recipe) -> Size:
     The size of a recipe for so many bytes: the supplement's search, or with ``components`` a cascaded array of
     :func:`.sizing.cascaded_side` and whatever primary fits beside it.
     """
-    stored, (bits, coarse) = max(1, layout_of(source, recipe).stored), STRUCTURES[structure_of(source, recipe)]
+    stored, (bits, coarse) = max(1, layout_of(source, recipe).stored), STRUCTURES[structure_of(source, recipe, nbytes)]
     if recipe.components or coarse:
         return sized(source, nbytes, recipe, sizing.cascaded_side(nbytes, stored, recipe.dims))
     compression = source.nbytes / nbytes
@@ -60,8 +60,10 @@ def default_size(source: Source, nbytes: float, recipe: Recipe) -> Size:
 
 def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
     """The size for so many bytes, with a cascaded array of a given side."""
-    stored, (bits, coarse) = max(1, layout_of(source, recipe).stored), STRUCTURES[structure_of(source, recipe)]
-    return sizing.fit_bytes(nbytes, stored, source.height, source.width, cascaded, recipe.dims, bits, coarse)
+    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    bits, coarse = STRUCTURES[structure]
+    size = sizing.fit_bytes(nbytes, stored, source.height, source.width, cascaded, recipe.dims, bits, coarse)
+    return dataclasses.replace(size, paged=structure in PAGED)
 
 
 def _steps(recipe: Recipe, share: float) -> Recipe:
@@ -82,7 +84,7 @@ def ratio_search(
     def attempt(recipe: Recipe, side: int) -> bool:
         """Train a candidate; was that interrupted?"""
         size = sized(source, nbytes, recipe, side)
-        structure = structure_of(source, recipe)
+        structure = structure_of(source, recipe, nbytes)
         known = [t for t in tried if (t["dims"], t["structure"], t["cascaded"]) == (recipe.dims, structure, side)]
         if known or size.nbytes > nbytes * (1 + sizing.TOLERANCE):
             return False
@@ -100,7 +102,7 @@ def ratio_search(
         return max(tried, key=_merit, default=None)
 
     start, interrupted = default_size(source, nbytes, recipe), False
-    for stage in _stages(recipe, structure_of(source, recipe), start.cascaded, free, best):
+    for stage in _stages(recipe, structure_of(source, recipe, nbytes), start.cascaded, free, best):
         interrupted = any(attempt(candidate, side) for candidate, side in stage)
         if interrupted:
             break

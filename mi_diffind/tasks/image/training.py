@@ -22,23 +22,49 @@ from ...indirection import Indirection
 from ...maps import components
 from ...maps.layout import Layout
 from ...maps.source import Source
+from ...pages import page_counts
 from ...tables import Table
 from ..task import Request
-from . import arrays
+from . import arrays, sizing
 from .compressed import CompressedImage, to_table
-from .presets import Recipe
+from .presets import PAGED, STRUCTURES, Recipe
 from .sizing import Size
 
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
 
+#: dB that pages have to gain before training, and dB that they have to have, for entries of 6 bits and not fewer.
+GAIN_DB, FINE_DB = 0.5, 29.0
 
-def structure_of(source: Source, recipe: Recipe) -> str:
-    """The structure of a recipe; for ``"auto"`` what suits the image."""
+#: Entries for each page that there have to be.
+ENTRIES = 3
+
+_structures: dict[tuple, str] = {}  # what was found for a source, by its digest: looking takes a second
+
+
+def structure_of(source: Source, recipe: Recipe, nbytes: float | None = None) -> str:
+    """The structure of a recipe; for ``"auto"`` what suits the image in so many bytes (default: at 12x)."""
     if recipe.structure != "auto":
         return recipe.structure
-    smooth = recipe.dims < 3 or components.smoothness(layout_of(source, recipe).encode(source)) >= SMOOTH_DB
-    return "6 bits" if smooth else "2 + 6 bits"
+    nbytes = source.nbytes / 12 if nbytes is None else nbytes
+    key = (source.digest, recipe.once, recipe.normals, recipe.components, recipe.dims, nbytes)
+    if key not in _structures:
+        _structures[key] = _suitable(layout_of(source, recipe).encode(source), recipe, nbytes)
+    return _structures[key]
+
+
+def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
+    """The structure that suits an image, ``(height, width, k)``, in so many bytes."""
+    height, width, k = values.shape
+    one = recipe.dims < 3
+    if recipe.components and k:
+        side = sizing.cascaded_side(nbytes, k, recipe.dims)
+        size = sizing.fit_bytes(nbytes, k, height, width, side, recipe.dims, STRUCTURES["pages"][0])
+        if arrays.page_budget(size, values.shape) >= ENTRIES * math.prod(page_counts((height, width))):
+            gain, psnr = arrays.gain_of_pages(values, size, components.borders(values))
+            if gain >= GAIN_DB:
+                return "pages" if one or psnr >= FINE_DB else "pages of 2 + 6 bits"
+    return "6 bits" if one or components.smoothness(values) >= SMOOTH_DB else "2 + 6 bits"
 
 
 def layout_of(source: Source, recipe: Recipe) -> Layout:
@@ -152,7 +178,12 @@ class ImageProblem(Problem):
 def problem_of(
     source: Source, size: Size, recipe: Recipe, types, layout: Layout | None = None, border=None
 ) -> ImageProblem:
-    """The problem of training ``source`` at a size by a recipe, its arrays at their initial values."""
+    """
+    The problem of training ``source`` at a size by a recipe, its arrays at their initial values. Raises ``ValueError``
+    for pages without components, by which they are chosen.
+    """
+    if size.paged and not recipe.components:
+        raise ValueError("size: found one of pages, which needs a recipe with components")
     layout = layout or layout_of(source, recipe)
     values = layout.encode(source)
     border = border or components.borders(values)
@@ -186,12 +217,18 @@ def fit_image(
         settings = {**request.recorded(), **problem.identity, "ratio": size.ratio}
         if request.seconds is not None:
             settings["steps"] = result.steps
-        settings["structure"] = structure_of(source, recipe)
+        settings["structure"] = recipe.structure if recipe.structure != "auto" else _name_of(size)
         table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
     found = CompressedImage.of(table, types.TensorXf).measure(source)
     table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
     return table, result
+
+
+def _name_of(size: Size) -> str:
+    """The structure of a size, "" if it is none of those that are known."""
+    known = (name for name, s in STRUCTURES.items() if s == (size.bits, size.coarse) and size.paged == (name in PAGED))
+    return next(known, "")
 
 
 def stored_form(net: Indirection, bits: Sequence[int]) -> Indirection:
