@@ -33,7 +33,8 @@ from .sizing import Size
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
 
-#: dB that pages have to gain before training, and dB that they have to have, for entries of 6 bits and not fewer.
+#: dB that pages have to gain, before training; and dB that they have to have, where an image is not smooth, for entries
+#: of 6 bits.
 GAIN_DB, FINE_DB = 0.5, 29.0
 
 #: Entries for each page that there have to be.
@@ -53,18 +54,29 @@ def structure_of(source: Source, recipe: Recipe, nbytes: float | None = None) ->
     return _structures[key]
 
 
+def dims_of(recipe: Recipe, structure: str, stored: int) -> int:
+    """
+    Dimensions of the cascaded array. Those of a single primary of pages are no more than there are channels ``stored``:
+    entries are of more use to it, and read better between texels.
+    """
+    single = structure in PAGED and STRUCTURES[structure][1] is None
+    return min(recipe.dims, stored) if single else recipe.dims
+
+
 def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
     """The structure that suits an image, ``(height, width, k)``, in so many bytes."""
     height, width, k = values.shape
-    one = recipe.dims < 3
+    smooth = recipe.dims < 3 or components.smoothness(values) >= SMOOTH_DB
     if recipe.components and k:
-        side = sizing.cascaded_side(nbytes, k, recipe.dims)
-        size = sizing.fit_bytes(nbytes, k, height, width, side, recipe.dims, STRUCTURES["pages"][0])
+        dims = dims_of(recipe, "pages", k)
+        size = sizing.fit_bytes(
+            nbytes, k, height, width, sizing.cascaded_side(nbytes, k, dims), dims, STRUCTURES["pages"][0]
+        )
         if arrays.page_budget(size, values.shape) >= ENTRIES * math.prod(page_counts((height, width))):
             gain, psnr = arrays.gain_of_pages(values, size, components.borders(values))
             if gain >= GAIN_DB:
-                return "pages" if one or psnr >= FINE_DB else "pages of 2 + 6 bits"
-    return "6 bits" if one or components.smoothness(values) >= SMOOTH_DB else "2 + 6 bits"
+                return "pages" if smooth or psnr >= FINE_DB else "pages of 2 + 6 bits"
+    return "6 bits" if smooth else "2 + 6 bits"
 
 
 def layout_of(source: Source, recipe: Recipe) -> Layout:
