@@ -23,7 +23,7 @@ import numpy as np
 from .errors import DiffindError, reason
 from .files import replacing
 from .indirection import DifferentiableArray
-from .lookup import BORDERS, STORAGES, pack_bits, quantize, unpack_bits
+from .lookup import BORDERS, STORAGES, channels_words, gathers, pack_bits, quantize, unpack_bits
 from .pages import SIDE_BITS, PagedArray
 
 #: Version of the format that is written. A file with another version is refused.
@@ -158,6 +158,19 @@ def page_sides(pages: StoredArray) -> np.ndarray:
     if pages.shape[-1] != dims or pages.storage != "uint8" or (pages.scale, pages.offset) != (ones, ones):
         raise ValueError(f"an array of the shape {pages.shape} and type {pages.storage} holds no sizes of pages")
     return pages.entries.astype(np.int64) + 1
+
+
+def gathers_of(table: Table, name: str) -> int:
+    """Number of gather instructions that one read takes of an array of a table; of the sizes of pages, one."""
+    array = table.arrays[name]
+    if name.endswith(PAGES) and name.removesuffix(PAGES) in table.arrays:
+        return 1
+    pages = table.arrays.get(name + PAGES)
+    if pages is not None:
+        channels, as_bytes = array.shape[-1], array.storage == "uint8"
+        corner = channels_words(channels, array.bits) if as_bytes else gathers((), channels, array.storage)
+        return corner * 2 ** (pages.entries.ndim - 1)
+    return gathers(array.shape[:-1], array.shape[-1], array.storage, array.bits)
 
 
 @dataclass

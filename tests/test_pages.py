@@ -12,7 +12,7 @@ from mi_diffind.indirection import DifferentiableArray, Indirection, unfolded
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
 from mi_diffind.runtime import array_module
-from mi_diffind.tables import PAGES, TableError, load_table, save_table
+from mi_diffind.tables import PAGES, TableError, gathers_of, load_table, save_table
 from mi_diffind.tasks.image import TASK, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.task import Request
@@ -290,10 +290,15 @@ def test_pages_are_chosen_and_win(ad):
 
 @pytest.mark.parametrize("structure", presets.PAGED)
 def test_a_file_reads_as_it_was_trained(ad, tmp_path, structure):
-    table = trained(ad, short(structure, steps=4))
+    recipe = short(structure, steps=4)
+    table = trained(ad, recipe)
     save_table(tmp_path / "t.npz", table)
     loaded = TASK.load(tmp_path / "t.npz")
     assert loaded.nbytes == table.nbytes <= 1500
+    fine, coarse = presets.STRUCTURES[structure]
+    width = fine * (3 if coarse is None else recipe.dims - coarse.dims)
+    assert gathers_of(loaded, "primary") == 4 * (1 if 32 % width == 0 else 2)
+    assert gathers_of(loaded, "primary" + PAGES) == 1
     image = CompressedImage.of(loaded, ad.TensorXf)
     assert isinstance(image.net.primary[0], PagedArray) and image.net.nbytes == table.nbytes
     decoded, source = image.decode()["albedo"], np.rint(255 * half_empty()) / 255
