@@ -298,15 +298,21 @@ def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest:
 def _allocated(errors: np.ndarray, entries: float) -> np.ndarray:
     """
     Which of the options each page takes. Lagrange: the one that minimises ``error + λ · entries``, with the smallest λ
-    that leads to no more entries than there may be.
+    that leads to no more entries than there may be. Where many pages want more at once, since they are equal, the first
+    of them get it.
     """
     cost = _OPTIONS.prod(axis=1)
+
+    def best(exponent: float) -> np.ndarray:
+        return np.argmin(errors + math.exp(exponent) * cost, axis=1)
+
     low, high = -40.0, 40.0
     for _ in range(60):
         middle = 0.5 * (low + high)
-        total = cost[np.argmin(errors + math.exp(middle) * cost, axis=1)].sum()
-        low, high = (middle, high) if total > entries else (low, middle)
-    return np.argmin(errors + math.exp(high) * cost, axis=1)
+        low, high = (middle, high) if cost[best(middle)].sum() > entries else (low, middle)
+    few, many = best(high), best(low)
+    further = np.cumsum(np.maximum(cost[many] - cost[few], 0))
+    return np.where(further <= entries - cost[few].sum(), many, few)
 
 
 def page_entries(values: np.ndarray, border: tuple[str, str], sizes: np.ndarray) -> np.ndarray:

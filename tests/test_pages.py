@@ -237,6 +237,14 @@ def test_empty_pages_have_one_entry():
         assert sizes[:2, :2].prod(axis=2).sum() > 0.55 * entries
 
 
+def test_equal_pages_share_what_there_is():
+    """No resolution fits all of them: some get the next one."""
+    tile = np.random.default_rng(0).random((16, 16, 1))
+    for entries in (4000, 5200, 6400):
+        sizes = page_sizes(np.tile(tile, (8, 8, 1)).astype(np.float32), ("repeat", "repeat"), entries)
+        assert 0.9 * entries <= sizes.prod(axis=2).sum() <= entries
+
+
 def test_resolution_follows_direction():
     """Stripes along u need no entries along it."""
     values = np.repeat(np.random.default_rng(0).random((64, 1, 1)), 64, axis=1).astype(np.float32)

@@ -104,6 +104,10 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
         size = search.default_size(source, asked, recipe)
     table, result = training.fit_image(source, size, recipe, request, border)
     _, sentence = sizing.explain(size, source.nbytes, asked)
+    if size.paged and table.nbytes < (1 - sizing.TOLERANCE) * asked:
+        sentence = (
+            f"{round(asked):,} bytes were asked for, but at {table.nbytes:,} bytes the pages are as fine as the image"
+        )
     return Fitted(table, result, [*lines, *([sentence] if sentence else [])], {"tried": tried}), asked
 
 
