@@ -78,9 +78,9 @@ class PagedArray(DifferentiableArray):
             raise ValueError(f"shift: found {shift}, allowed are numbers from 0 to 1")
         super().__init__(sizes.shape[:-1], channels, "constant", None, fold, border)
         self.sizes, self.shift, self.index = sizes.astype(np.int64), shift, ()
-        largest = 2 ** (32 - dims * SIDE_BITS[dims - 1])
-        if self.entries > largest:
-            raise ValueError(f"sizes: found {self.entries} entries in all pages together, allowed are {largest}")
+        if self.entries > most_entries(dims):
+            found = f"{self.entries:,} entries in all pages together"
+            raise ValueError(f"sizes: found {found}, allowed are {most_entries(dims):,}")
         if np.shape(init) not in ((), (self.entries, self.channels)):
             raise ValueError(f"init: found shape {np.shape(init)}, expected {(self.entries, self.channels)}")
         self.init = np.asarray(init, np.float32)
@@ -257,6 +257,11 @@ class PagedArray(DifferentiableArray):
         return corners
 
 
+def most_entries(dims: int) -> int:
+    """Entries that all pages of an array may have together."""
+    return 2 ** (32 - dims * SIDE_BITS[dims - 1])
+
+
 # -- which resolution, which entries ----------------------------------------------------------------------------------
 
 
@@ -282,7 +287,7 @@ def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest:
     that. Errors are those of all channels together. An estimate from 1024 pages at most, which needs no training.
     """
     windows = _windows(values, border)
-    some = windows[:: math.ceil(len(windows) / ESTIMATED)]
+    some = windows[np.random.default_rng(0).permutation(len(windows))[:ESTIMATED]]
     errors, share = _errors(some), len(some) / len(windows)
     texels = len(some) * SAMPLES**2
     paged = errors[np.arange(len(some)), _allocated(errors, share * entries)].sum() / texels + rest

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ...errors import UsageError
 from ...maps.source import Source, load_source
+from ...pages import most_entries
 from ...settings import FittingError
 from ...tables import MAX_BYTES
 from ..map_arguments import asked_bytes
@@ -102,6 +103,11 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
             )
     else:
         size = search.default_size(source, asked, recipe)
+    if size.paged and size.primaries[0][0] * size.primaries[0][1] > most_entries(2):
+        raise UsageError(
+            f'--structure "{recipe.structure}": {source.width} x {source.height} texels in {asked:,} bytes have more than '
+            f"{most_entries(2):,} entries, which is what pages can hold: take another one or fewer bytes"
+        )
     table, result = training.fit_image(source, size, recipe, request, border)
     _, sentence = sizing.explain(size, source.nbytes, asked)
     if size.paged and table.nbytes < (1 - sizing.TOLERANCE) * asked:

@@ -22,7 +22,7 @@ from ...indirection import Indirection
 from ...maps import components
 from ...maps.layout import Layout
 from ...maps.source import Source
-from ...pages import page_counts
+from ...pages import most_entries, page_counts
 from ...tables import Table
 from ..task import Request
 from . import arrays, sizing
@@ -72,7 +72,8 @@ def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
         size = sizing.fit_bytes(
             nbytes, k, height, width, sizing.cascaded_side(nbytes, k, dims), dims, STRUCTURES["pages"][0]
         )
-        if arrays.page_budget(size, values.shape) >= ENTRIES * math.prod(page_counts((height, width))):
+        fewest = ENTRIES * math.prod(page_counts((height, width)))
+        if fewest <= arrays.page_budget(size, values.shape) <= most_entries(2):
             gain, psnr = arrays.gain_of_pages(values, size, components.borders(values))
             if gain >= GAIN_DB:
                 return "pages" if smooth or psnr >= FINE_DB else "pages of 2 + 6 bits"
