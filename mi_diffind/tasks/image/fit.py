@@ -105,8 +105,8 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
         size = search.default_size(source, asked, recipe)
     if size.paged and size.primaries[0][0] * size.primaries[0][1] > most_entries(2):
         raise UsageError(
-            f'--structure "{recipe.structure}": found more than {most_entries(2):,} entries for {round(asked):,} bytes, '
-            f"which is what pages can hold: ask for fewer bytes or take another one"
+            f'--structure "{recipe.structure}": {round(asked):,} bytes are more than {most_entries(2):,} entries, '
+            f"which is what pages can hold: ask for fewer or take another one"
         )
     table, result = training.fit_image(source, size, recipe, request, border)
     _, sentence = sizing.explain(size, source.nbytes, asked)
