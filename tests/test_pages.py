@@ -338,7 +338,7 @@ def _in_two_dimensions(table):
 
 @pytest.mark.parametrize("damage", [_without_a_page, _larger, _of_no_sizes, _in_two_dimensions])
 def test_damaged_pages_are_refused(ad, tmp_path, damage):
-    table = trained(ad, short("pages", steps=1))
+    table = trained(ad, short("pages of 5 bits", steps=1))
     damage(table)
     save_table(tmp_path / "t.npz", table)
     load_table(tmp_path / "t.npz", "image")

@@ -110,7 +110,7 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
         )
     table, result = training.fit_image(source, size, recipe, request, border)
     _, sentence = sizing.explain(size, source.nbytes, asked)
-    if size.paged and table.nbytes < (1 - sizing.TOLERANCE) * asked:
+    if sentence is None and size.paged and table.nbytes < (1 - sizing.TOLERANCE) * asked:
         sentence = (
             f"{round(asked):,} bytes were asked for, but at {table.nbytes:,} bytes the pages are as fine as the image"
         )

@@ -9,18 +9,19 @@ from ...settings import FitSettings
 from .sizing import Coarse
 
 #: How the primary is stored: bits of an entry, and a second primary or none. The fewer bits, the more entries fit.
-#: The resolution of "pages" follows the image.
+#: The resolution of pages follows the image.
 STRUCTURES: dict[str, tuple[int, Coarse | None]] = {
     **{f"{bits} bits": (bits, None) for bits in (8, 7, 6, 5, 4, 3)},
     "4 + 8 bits": (4, Coarse(2, 8, 0.5)),
     "3 + 6 bits": (3, Coarse(2, 6, 0.4)),
     "2 + 6 bits": (2, Coarse(2, 6, 0.35)),
-    "pages": (6, None),
+    "pages of 5 bits": (5, None),
+    "pages of 6 bits": (6, None),
     "pages of 2 + 6 bits": (2, Coarse(2, 6, 0.35)),
 }
 
 #: Structures whose first primary consists of pages (:class:`mi_diffind.pages.PagedArray`).
-PAGED = ("pages", "pages of 2 + 6 bits")
+PAGED = ("pages of 5 bits", "pages of 6 bits", "pages of 2 + 6 bits")
 
 
 @dataclass(frozen=True)

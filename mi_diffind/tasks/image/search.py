@@ -26,7 +26,7 @@ SHORT = 1 / 8
 SIDES = {1: (64, 256), 2: (16, 32, 64), 3: (8, 16, 32), 4: (4, 8, 12, 16)}
 
 #: Structures of the primary to try.
-TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits", "pages", "pages of 2 + 6 bits")
+TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits", *PAGED)
 
 #: A search by quality ends when the file is at most this much larger than one that is known to be too small.
 NEAR = 1.06

@@ -33,8 +33,8 @@ from .sizing import Size
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
 
-#: dB that pages have to gain, before training; and dB that they have to have, where an image is not smooth, for entries
-#: of 6 bits.
+#: dB that pages have to gain, before training, and that a single primary of them has to have, before training, where an
+#: image is not smooth.
 GAIN_DB, FINE_DB = 0.5, 29.0
 
 #: Entries for each page that there have to be.
@@ -68,15 +68,16 @@ def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
     height, width, k = values.shape
     smooth = recipe.dims < 3 or components.smoothness(values) >= SMOOTH_DB
     if recipe.components and k:
-        dims = dims_of(recipe, "pages", k)
-        size = sizing.fit_bytes(
-            nbytes, k, height, width, sizing.cascaded_side(nbytes, k, dims), dims, STRUCTURES["pages"][0]
-        )
+        # What the cascaded array adds to more channels than it has dimensions needs more precise pointers
+        pages = "pages of 6 bits" if k > recipe.dims else "pages of 5 bits"
+        dims = dims_of(recipe, pages, k)
+        side = sizing.cascaded_side(nbytes, k, dims)
+        size = sizing.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
         fewest = ENTRIES * math.prod(page_counts((height, width)))
         if fewest <= arrays.page_budget(size, values.shape) <= most_entries(2):
             gain, psnr = arrays.gain_of_pages(values, size, components.borders(values))
             if gain >= GAIN_DB:
-                return "pages" if smooth or psnr >= FINE_DB else "pages of 2 + 6 bits"
+                return pages if smooth or psnr >= FINE_DB else "pages of 2 + 6 bits"
     return "6 bits" if smooth else "2 + 6 bits"
 
 
