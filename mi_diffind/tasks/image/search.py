@@ -62,8 +62,8 @@ def default_size(source: Source, nbytes: float, recipe: Recipe) -> Size:
 
 def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
     """
-    The size for so many bytes, with a cascaded array of a given side. A single primary of pages has no more channels
-    than are stored: entries are of more use to it.
+    The size for so many bytes, with a cascaded array of a given side. A single primary of pages may have fewer
+    channels than the recipe says (:func:`.dims_of`).
     """
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
     (bits, coarse), paged = STRUCTURES[structure], structure in PAGED

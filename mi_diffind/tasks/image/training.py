@@ -56,11 +56,11 @@ def structure_of(source: Source, recipe: Recipe, nbytes: float | None = None) ->
 
 def dims_of(recipe: Recipe, structure: str, stored: int) -> int:
     """
-    Dimensions of the cascaded array. Those of a single primary of pages are no more than there are channels ``stored``:
-    entries are of more use to it, and read better between texels.
+    Dimensions of the cascaded array. Those of a single primary of pages are no more than there are channels ``stored``,
+    but 2: more entries are of more use to it, and read better between texels.
     """
     single = structure in PAGED and STRUCTURES[structure][1] is None
-    return min(recipe.dims, stored) if single else recipe.dims
+    return min(recipe.dims, max(stored, 2)) if single else recipe.dims
 
 
 def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
