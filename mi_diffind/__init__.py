@@ -23,6 +23,7 @@ if not (_here / "plugins").is_dir():  # a checkout has the folder `plugins` besi
 _NAMES = {
     "DifferentiableArray": "indirection",
     "Indirection": "indirection",
+    "PagedArray": "pages",
     "fold": "indirection",
     "StoredArray": "tables",
     "Table": "tables",

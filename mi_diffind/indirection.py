@@ -134,7 +134,7 @@ class DifferentiableArray(nn.Module):
             values = low + (high - low) * drawn.numpy().reshape(shape)
         result = self._like()
         result.storage = "float16" if dr.is_half_v(dtype) else "float32"
-        result.data = _tensor(dtype, values, self.resolution, self.channels)
+        result.data = padded_tensor(dtype, values, self.resolution, self.channels)
         return result, self.channels
 
     def _require_entries(self) -> None:
@@ -189,7 +189,7 @@ class DifferentiableArray(nn.Module):
         steps = 2**bits - 1
         codes = np.rint(self.numpy().astype(np.float64) * steps).astype(np.uint8)
         affine = ((1 / steps,) * self.channels, (0.0,) * self.channels)
-        return self.from_numpy(codes, type(self.data), self.border, "uint8", False, affine, bits)
+        return self.from_numpy(codes, type(self.data), self.border, "uint8", False, affine, bits, **self._form())
 
     def to(self, storage: str) -> DifferentiableArray:
         """
@@ -200,7 +200,11 @@ class DifferentiableArray(nn.Module):
             raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
         if storage == self.storage:
             return self._like()
-        return self.from_numpy(self.numpy(), module_of(self.data).TensorXf, self.border, storage)
+        return self.from_numpy(self.numpy(), module_of(self.data).TensorXf, self.border, storage, **self._form())
+
+    def _form(self) -> dict:
+        """What :meth:`from_numpy` has to know of an array beside its entries."""
+        return {}
 
     @classmethod
     def from_numpy(cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None, bits=8):
@@ -223,7 +227,7 @@ class DifferentiableArray(nn.Module):
             else:
                 codes, (scale, offset) = values, quantization
             result.scale, result.offset = tuple(map(float, scale)), tuple(map(float, offset))
-            _require_backend(dtype)
+            require_backend(dtype)
             UInt32 = module_of(dtype).UInt32
             result.bits = bits
             if bits < 8:
@@ -231,12 +235,12 @@ class DifferentiableArray(nn.Module):
                 packed = np.pad(packed, (0, 4 + -len(packed) % 4)).view(np.uint32)
             else:
                 packed = lookup.pack(codes, result.border)
-            words = _aligned(packed.shape, np.uint32)
+            words = aligned(packed.shape, np.uint32)
             words[...] = packed
             result.data = UInt32(words)
         else:
             tensor = module_of(dtype).TensorXf16 if storage == "float16" else module_of(dtype).TensorXf
-            result.data = _tensor(tensor, values, result.resolution, result.channels)
+            result.data = padded_tensor(tensor, values, result.resolution, result.channels)
         return result
 
     def numpy(self) -> np.ndarray:
@@ -302,7 +306,8 @@ class DifferentiableArray(nn.Module):
         entries, transform = self.data.array, fold if self.folded else None
         if self.folded and not dr.flag(dr.JitFlag.SymbolicScope):
             entries, transform = fold(entries), None
-        return lookup.entry_float(entries, self.channels, index, active, transform, self.data.shape[-1])
+        Float = module_of(self.data).Float
+        return lookup.fetch_float(entries, self.channels, self.data.shape[-1], active, transform, Float, index)
 
     # -- properties -------------------------------------------------------------------------------------------------
 
@@ -352,7 +357,7 @@ class DifferentiableArray(nn.Module):
         all coordinates are known to lie in [0, 1], as those that bytes hold may be.
         """
         self._require_entries()
-        coordinates, is_coopvec = _coordinates(x, module_of(self.data).Float)
+        coordinates, is_coopvec = coordinates_of(x, module_of(self.data).Float)
         if len(coordinates) != self.dims:
             raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(coordinates)} coordinate(s)")
         if self.storage == "uint8":
@@ -453,7 +458,7 @@ class Indirection(nn.Module):
 
     def pointer(self, x, active=True) -> list:
         """The coordinate at which the cascaded array is read for the inputs ``x``."""
-        x, _ = _coordinates(x)
+        x, _ = coordinates_of(x)
         if len(x) != self.dims:
             raise ValueError(f"an indirection of {self.dims} input(s) was read at {len(x)} coordinate(s)")
         result = []
@@ -503,24 +508,24 @@ def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.
     return np.stack([grids[k % len(grids)] for k in range(channels)], axis=-1)
 
 
-def _require_backend(dtype) -> None:
+def require_backend(dtype) -> None:
     # Without LLVM, Dr.Jit takes the whole process down when it makes an array from NumPy's (SIGFPE).
     if not dr.has_backend(dr.backend_v(dtype)):
         raise RuntimeError(llvm_problem() or f"the Dr.Jit backend of {dtype.__module__} cannot run here")
 
 
-def _tensor(dtype, values: np.ndarray, resolution, channels: int):
-    _require_backend(dtype)
+def padded_tensor(dtype, values: np.ndarray, resolution, channels: int):
+    require_backend(dtype)
     half = dr.is_half_v(dtype)
     dtype = module_of(dtype).TensorXf16 if half else module_of(dtype).TensorXf  # never double, also in such variants
     shape = (*resolution, lookup.padded_channels(channels))
-    stored = _aligned(shape, np.float16 if half else np.float32)
+    stored = aligned(shape, np.float16 if half else np.float32)
     stored[..., :channels] = values
     stored[..., channels:] = 0
     return dtype(stored)
 
 
-def _aligned(shape, dtype) -> np.ndarray:
+def aligned(shape, dtype) -> np.ndarray:
     """
     An uninitialised array that starts at a multiple of 64 bytes. On the CPU, Dr.Jit uses NumPy's memory as it is, and
     from memory that is aligned less it gathers number by number instead of packet by packet: half the speed in single
@@ -532,7 +537,7 @@ def _aligned(shape, dtype) -> np.ndarray:
     return memory[start : start + count * size].view(dtype).reshape(shape)
 
 
-def _coordinates(x, default=None):
+def coordinates_of(x, default=None):
     """
     A list of single-precision arrays from whatever the caller passed, and whether it was a cooperative vector.
     Numbers become arrays like the others, or like ``default``.

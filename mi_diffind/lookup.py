@@ -18,6 +18,7 @@ Everything works on any JIT backend of Dr.Jit; nothing here knows Mitsuba.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -127,7 +128,7 @@ def _is_zero(weight) -> bool:
     return weight.state == dr.VarState.Literal and not dr.grad_enabled(weight) and weight[0] == 0
 
 
-def _weighted_sum(terms):
+def weighted_sum(terms):
     """Σ weight · value for each channel."""
     total = None
     for weight, values in terms:
@@ -156,26 +157,23 @@ def read_float(
     precision) type. Differentiable with respect to ``data`` and ``x``. ``transform`` is applied to each entry that was
     fetched.
     """
+    Float, stored = type(x[0]), stored or padded_channels(channels)
+    fetch = functools.partial(fetch_float, data, channels, stored, active, transform, Float)
     axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
-    return _weighted_sum(
-        (weight, entry_float(data, channels, index, active, transform, stored))
-        for index, weight in _corners(axes, resolution)
-    )
+    return weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
 
 
-def entry_float(data, channels: int, index, active=True, transform=None, stored: int | None = None) -> list:
-    """The channels of the entries ``index`` of a table of floats, as in :func:`read_float`."""
-    stored = stored or padded_channels(channels)
+def fetch_float(data, channels: int, stored: int, active, transform, Float, index) -> list:
+    """The channels of an entry of a flat array of floats that holds ``stored`` numbers an entry, as ``Float``."""
     packet = _packet(stored)
     groups = stored // packet
-    module = module_of(type(data))
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
-    Packet = None if packet == 1 else getattr(module, f"Array{packet}{suffix}")
+    Packet = None if packet == 1 else getattr(module_of(Float), f"Array{packet}{suffix}")
     values = []
     for group in range(groups):
         where = index if groups == 1 else dr.fma(index, groups, group)
         found = dr.gather(Packet or type(data), data, where, active)
-        values += [module.Float(v) for v in (found if Packet else [found])]
+        values += [Float(v) for v in (found if Packet else [found])]
     values = values[:channels]
     return values if transform is None else [transform(v) for v in values]
 
@@ -244,13 +242,13 @@ def read_packed(
         found = fetch(index)
         corners = [[byte(found, k * stride + channel) for channel in range(channels)] for k in range(2**inner)]
         if channels > 2:  # weights that all channels share are less work than a step along each axis for each
-            corners = [_weighted_sum(zip(inner_weights, corners, strict=True))] if inner else corners
+            corners = [weighted_sum(zip(inner_weights, corners, strict=True))] if inner else corners
         else:
             for _, _, w in reversed(axes[outer:]):
                 pairs = zip(corners[::2], corners[1::2], strict=True)
                 corners = [[dr.fma(w, b - a, a) for a, b in zip(*pair, strict=True)] for pair in pairs]
         terms.append((weight, corners[0]))
-    sums = terms[0][1] if terms[0][0] is None else _weighted_sum(terms)
+    sums = terms[0][1] if terms[0][0] is None else weighted_sum(terms)
     values = []
     for k, s in enumerate(sums):
         step = scale[k] / 128 if k % 2 and convert else (65536 if k % 2 else 256) * scale[k]
@@ -284,19 +282,17 @@ def read_bits(
     if it may begin in one and end in the next. Otherwise as :func:`read_packed`.
     """
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
-    sums = _weighted_sum(
-        (weight, _bits(words, channels, bits, index, active)) for index, weight in _corners(axes, resolution)
-    )
+    fetch = functools.partial(fetch_bits, words, channels, bits, active, type(x[0]))
+    sums = weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
     values = [dr.fma(s, scale[k], offset[k]) for k, s in enumerate(sums)]
     return values if active is True else [dr.select(active, v, 0) for v in values]
 
 
-def _bits(words, channels: int, bits: int, index, active) -> list:
-    """The channels of the entries ``index`` of a table of fewer than 8 bits a channel, as numbers from 0 on."""
-    UInt32, Int32 = type(words), dr.int32_array_t(type(words))
-    Float = dr.float32_array_t(UInt32)
-    count = channels_words(channels, bits)
-    start = index * (channels * bits)
+def fetch_bits(words, channels: int, bits: int, active, Float, index) -> list:
+    """The numbers that :func:`pack_bits` packed for an entry, as ``Float``."""
+    UInt32, width = type(words), channels * bits
+    Int32, count = dr.int32_array_t(UInt32), channels_words(channels, bits)
+    start = index * width
     first, shift = start >> 5, start & 31
     found = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
     if count > 1:  # what is left of a word, and what the next one adds above it
@@ -321,7 +317,7 @@ def entry_packed(
     UInt32, Int32 = type(words), dr.int32_array_t(type(words))
     Float = dr.float32_array_t(UInt32)
     if bits < 8:
-        codes = _bits(words, channels, bits, index, active)
+        codes = fetch_bits(words, channels, bits, active, Float, index)
     else:
         _, _, per_texel = packed_layout(resolution, channels)
         codes = []

@@ -23,7 +23,8 @@ import numpy as np
 from .errors import DiffindError, reason
 from .files import replacing
 from .indirection import DifferentiableArray
-from .lookup import BORDERS, STORAGES, pack_bits, quantize, unpack_bits
+from .lookup import BORDERS, STORAGES, channels_words, gathers, pack_bits, quantize, unpack_bits
+from .pages import SIDE_BITS, PagedArray
 
 #: Version of the format that is written. A file with another version is refused.
 FORMAT_VERSION = 2
@@ -114,6 +115,62 @@ class StoredArray:
         steps = 2**self.bits - 1
         pairs = zip(self.scale, self.offset, strict=True)
         return all(o >= 0 and s >= 0 and o + steps * s <= 1 + 1e-6 for s, o in pairs)
+
+
+#: What is behind the name of an array of pages in that of the array of their sizes.
+PAGES = "_pages"
+
+
+def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArray]:
+    """
+    What has to be stored of an allocated array, by name: one array; or of pages the entries, one after the other, and
+    as ``NAME_pages`` the sizes of pages, ``(A, …, d)``, with the borders.
+    """
+    if not isinstance(array, PagedArray):
+        return {name: StoredArray.of(array)}
+    entries = array.codes() if array.storage == "uint8" else array.numpy().astype(_DTYPES[array.storage])
+    ones, bits = (1.0,) * array.dims, SIDE_BITS[array.dims - 1]
+    return {
+        name: StoredArray(entries, ("clamp",), array.scale, array.offset, array.bits),
+        name + PAGES: StoredArray((array.sizes - 1).astype(np.uint8), array.border, ones, ones, bits),
+    }
+
+
+def allocate_pages(
+    entries: StoredArray, pages: StoredArray, dtype, shift=0.0, storage: str = "", fold: bool = False
+) -> PagedArray:
+    """
+    The pages whose ``entries`` and sizes are stored (:func:`stored_arrays`); the rest as in
+    :meth:`.StoredArray.allocate`. Raises ``ValueError`` if they do not go together.
+    """
+    form = entries.to(storage or entries.storage)
+    affine = (form.scale, form.offset) if form.storage == "uint8" else None
+    fold = fold and form.storage == "float32"
+    return PagedArray.from_numpy(
+        form.entries, dtype, pages.border, form.storage, fold, affine, form.bits, sizes=page_sides(pages), shift=shift
+    )
+
+
+def page_sides(pages: StoredArray) -> np.ndarray:
+    """The sizes of pages. Raises ``ValueError`` for an array that holds none."""
+    dims = pages.entries.ndim - 1
+    ones = (1.0,) * dims
+    if pages.shape[-1] != dims or pages.storage != "uint8" or (pages.scale, pages.offset) != (ones, ones):
+        raise ValueError(f"an array of the shape {pages.shape} and type {pages.storage} holds no sizes of pages")
+    return pages.entries.astype(np.int64) + 1
+
+
+def gathers_of(table: Table, name: str) -> int:
+    """Number of gather instructions that one read takes of an array of a table; of the sizes of pages, one."""
+    array = table.arrays[name]
+    if name.endswith(PAGES) and name.removesuffix(PAGES) in table.arrays:
+        return 1
+    pages = table.arrays.get(name + PAGES)
+    if pages is not None:
+        channels, as_bytes = array.shape[-1], array.storage == "uint8"
+        corner = channels_words(channels, array.bits) if as_bytes else gathers((), channels, array.storage)
+        return corner * 2 ** (pages.entries.ndim - 1)
+    return gathers(array.shape[:-1], array.shape[-1], array.storage, array.bits)
 
 
 @dataclass

@@ -61,6 +61,9 @@ def nbytes_of(size, channels):
 STRUCTURES = [pytest.param(dataclasses.replace(OURS, structure=name), id=name) for name in presets.STRUCTURES]
 
 
+SINGLE = [name for name in presets.PAGED if presets.STRUCTURES[name][1] is None]
+
+
 @pytest.mark.parametrize("recipe", [*STRUCTURES, pytest.param(PAPER, id="paper")])
 @pytest.mark.parametrize("height, width", [(128, 128), (1024, 1024), (300, 700), (513, 200), (1, 8192), (4, 8192)])
 def test_default_size_is_what_was_asked_for(height, width, recipe, monkeypatch):
@@ -75,7 +78,9 @@ def test_default_size_is_what_was_asked_for(height, width, recipe, monkeypatch):
             asked = source.nbytes / compression
             size = search.default_size(source, asked, recipe)
             assert size.nbytes == nbytes_of(size, channels)
-            assert (size.channels, size.dims) == (channels, recipe.dims)
+            dims = min(recipe.dims, max(2, channels)) if recipe.structure in SINGLE else recipe.dims
+            assert (size.channels, size.dims) == (channels, dims)
+            assert size.paged == (recipe.structure in presets.PAGED)
             assert (size.bits, size.coarse) == presets.STRUCTURES[recipe.structure]
             assert 1 <= size.rows <= height and 1 <= size.columns <= width and size.cascaded % 4 == 0
             if size.full:
@@ -171,8 +176,8 @@ def test_ratio_search_finds_a_peak(monkeypatch):
     base = dataclasses.replace(short(), structure="6 bits", dims=4)
 
     def peak(size, recipe):
-        two = size.coarse is not None
-        return 40 - abs(size.bits - 4) - 5 * two - 3 * abs(size.dims - 3) - abs(math.log2(size.cascaded / 16))
+        other = size.coarse is not None or size.paged
+        return 40 - abs(size.bits - 4) - 5 * other - 3 * abs(size.dims - 3) - abs(math.log2(size.cascaded / 16))
 
     pretended(peak, monkeypatch)
     found = search.ratio_search(source, 20_000, base, ASKED)

@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     ("errors", "arguments", "settings", "found", "interrupt", "files", "compat", "metrics", "runtime", "sizes"),
     ("lookup",),
-    ("indirection",),
+    ("indirection", "pages"),
     ("tables",),
     ("maps",),
     ("fitting",),

@@ -35,8 +35,7 @@ def run(arguments) -> dict:
 
 
 def _inspect_table(arguments) -> dict:
-    from ..lookup import gathers
-    from ..tables import load_table
+    from ..tables import gathers_of, load_table
 
     task = task_of(load_table(arguments.file))
     table = task.load(arguments.file)
@@ -53,7 +52,7 @@ def _inspect_table(arguments) -> dict:
             "storage": array.storage,
             "bytes": array.nbytes,
             "bits": 8 * array.entries.itemsize if array.bits == 8 else array.bits,
-            "gathers_per_read": gathers(resolution, channels, array.storage, array.bits),
+            "gathers_per_read": gathers_of(table, name),
             "min": float(values.min()),
             "max": float(values.max()),
         }

@@ -168,7 +168,7 @@ class _Training(_Made):
         course = [(h["step"] * result.seconds / result.steps, h["psnr_db"]) for h in result.history]
         return self.record(
             table.nbytes, result.seconds, image.decode(), table.measured["psnr_between_db"], file=self.file,
-            seconds_asked=self.seconds, steps=result.steps, structure=training.structure_of(source, own),
+            seconds_asked=self.seconds, steps=result.steps, structure=table.settings["structure"],
             dims=size.dims, rows=size.rows, cascaded=size.cascaded, course=course,
             memory_bytes=sum(a.memory_nbytes for a in (*image.net.primary, image.net.cascaded)),
         )  # fmt: skip

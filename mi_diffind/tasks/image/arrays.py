@@ -9,6 +9,7 @@ smaller picture of fewer channels, and what is left to learn is what a smaller l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from ...indirection import DifferentiableArray, Indirection, ramp
 from ...maps import components
 from ...maps.layout import Layout
+from ...pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
 from .sizing import Size
 
 #: Room between the components' range and the ends of [0, 1], and the share of texels beyond the range at either end.
@@ -55,8 +57,14 @@ def from_components(values: np.ndarray, size: Size, border: tuple[str, str]) -> 
         # Of what does not vary, any direction is as good, but none that an earlier array has already
         directions = components.strongest(left @ covariance @ left + 1e-9 * left, used)
         left = left - directions.T @ directions
-        found = (components.downscale(values, rows, columns, border) - mean) @ directions.T
-        unit = np.zeros((rows, columns, 0))
+        paged = size.paged and i == 0
+        if paged:
+            exact = ((values - mean) @ directions.T).astype(np.float32)
+            sizes, shift = page_sizes(exact, border, page_budget(size, values.shape)), page_shift(values.shape[:2])
+            found = page_entries(exact, border, sizes)
+        else:
+            found = (components.downscale(values, rows, columns, border) - mean) @ directions.T
+        unit = np.zeros((*found.shape[:-1], 0))
         if used:
             low, high = np.quantile(found.reshape(-1, used), [OUTSIDE, 1 - OUTSIDE], axis=0)
             high = np.maximum(high, low + 1e-3)
@@ -68,9 +76,37 @@ def from_components(values: np.ndarray, size: Size, border: tuple[str, str]) -> 
             )
             back = back + along[..., None] * directions[j]
         if dims > used:
-            unit = np.concatenate([unit, ramp((rows, columns), dims - used, border)], axis=-1)
-        primaries.append(DifferentiableArray((rows, columns), dims, unit.astype(np.float32), fold=True, border=border))
+            further = range(dims - used)
+            if paged:
+                positions = page_positions(sizes, shift)[:, [j % 2 for j in further]]
+            else:
+                positions = ramp((rows, columns), len(further), border)
+            unit = np.concatenate([unit, positions], axis=-1)
+        unit = unit.astype(np.float32)
+        if paged:
+            primaries.append(PagedArray(sizes, dims, unit, shift, fold=True, border=border))
+        else:
+            primaries.append(DifferentiableArray((rows, columns), dims, unit, fold=True, border=border))
         axis += dims
     shape = (size.cascaded,) * size.dims
     back = np.clip(np.broadcast_to(back, (*shape, k)), 1e-3, 1 - 1e-3)
     return joined(primaries, DifferentiableArray(shape, k, back.astype(np.float32), fold=True))
+
+
+def gain_of_pages(values: np.ndarray, size: Size, border: tuple[str, str]) -> tuple[float, float]:
+    """:func:`~mi_diffind.pages.page_gain` of the components of an image at a size of one primary."""
+    k = values.shape[-1]
+    mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
+    covariance = components.covariance(values, mean)
+    directions = components.strongest(covariance, min(size.dims, k))
+    rest = np.trace(covariance) - np.trace(directions @ covariance @ directions.T)
+    exact = ((values - mean) @ directions.T).astype(np.float32)
+    gain, psnr = page_gain(exact, border, page_budget(size, values.shape), max(float(rest), 0.0))
+    return gain, psnr + 10 * math.log10(k)
+
+
+def page_budget(size: Size, shape: Sequence[int]) -> float:
+    """Entries of all pages of the first primary together, for an image of ``shape``: less what the index takes."""
+    rows, columns, dims, bits = size.primaries[0]
+    index = PagedArray(np.ones((*page_counts(shape[:2]), 2), int)).index_nbytes
+    return rows * columns - 8 * index / (dims * bits)

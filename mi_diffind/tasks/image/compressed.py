@@ -10,11 +10,13 @@ from ...compat import module_of
 from ...indirection import DifferentiableArray, Indirection
 from ...maps.compressed import CompressedMaps
 from ...maps.layout import Layout
-from ...tables import StoredArray, Table, TableError, load_table
+from ...pages import SIDE_BITS, page_counts, page_shift
+from ...tables import PAGES, Table, TableError, allocate_pages, load_table, page_sides, stored_arrays
 from .arrays import joined
 
-#: Names of the primary arrays: the second is of lower resolution, and not always there.
+#: Names of the primary arrays: the second is of lower resolution, and not always there. The first may have pages.
 PRIMARIES = ("primary", "coarse")
+PRIMARY_PAGES = PRIMARIES[0] + PAGES
 
 
 class CompressedImage(CompressedMaps):
@@ -49,7 +51,13 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     """
     as_bytes = storage != "float32" and table.storage == "uint8"
     form = "uint8" if as_bytes else "float32"
-    return {name: array.allocate(dtype, form, fold=True) for name, array in table.arrays.items()}
+    stored, found = dict(table.arrays), {}
+    pages = stored.pop(PRIMARY_PAGES, None)
+    if pages is not None:
+        layout = Layout.from_json(table.settings["layout"])
+        shift = page_shift((layout.height, layout.width))
+        found["primary"] = allocate_pages(stored.pop("primary"), pages, dtype, shift, form, fold=True)
+    return {**found, **{name: array.allocate(dtype, form, fold=True) for name, array in stored.items()}}
 
 
 def joined_of(found: dict[str, DifferentiableArray]) -> Indirection | None:
@@ -62,7 +70,9 @@ def to_table(image: CompressedImage, settings: dict) -> Table:
     named = []
     if image.net is not None:
         named = [*zip(PRIMARIES, image.net.primary, strict=False), ("cascaded", image.net.cascaded)]
-    stored = {name: StoredArray.of(array) for name, array in named}
+    stored = {}
+    for name, array in named:
+        stored |= stored_arrays(name, array)
     return Table("image", stored, settings={**settings, "layout": image.layout.to_json()})
 
 
@@ -73,14 +83,16 @@ def load(path: str | os.PathLike) -> Table:
         layout = Layout.from_json(table.settings["layout"])
     except (KeyError, TypeError, ValueError, OverflowError) as e:
         raise TableError(f"{path}: its settings describe no image ({e})") from None
-    found = set(table.arrays)
+    found = set(table.arrays) - {PRIMARY_PAGES}
     expected = [{"primary", "cascaded"}, {*PRIMARIES, "cascaded"}] if layout.stored else [set()]
     if found not in expected:
         names = " or ".join(", ".join(sorted(e)) or "none" for e in expected)
         raise TableError(f"{path}: holds the arrays {', '.join(sorted(found)) or 'none'}, expected {names}")
     if not layout.stored:
         return table
-    shapes = {name: array.shape for name, array in table.arrays.items()}
+    shapes = {name: array.shape for name, array in table.arrays.items() if name != PRIMARY_PAGES}
+    if PRIMARY_PAGES in table.arrays:
+        shapes["primary"] = _paged_shape(table, layout)
     cascaded = shapes.pop("cascaded")
     pointers = sum(shape[-1] for shape in shapes.values())
     if any(len(s) != 3 for s in shapes.values()) or len(cascaded) != pointers + 1 or cascaded[-1] != layout.stored:
@@ -89,6 +101,21 @@ def load(path: str | os.PathLike) -> Table:
             f"{cascaded} make no image of {layout.stored} stored channel(s)"
         )
     for name, array in table.arrays.items():
-        if not array.is_pointer:
+        if name != PRIMARY_PAGES and not array.is_pointer:
             raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
     return table
+
+
+def _paged_shape(table: Table, layout: Layout) -> tuple:
+    """The shape that the primary would have if each of its pages were an entry, after they were checked."""
+    entries, pages = table.arrays["primary"], table.arrays[PRIMARY_PAGES]
+    counts = page_counts((layout.height, layout.width))
+    try:
+        sides = page_sides(pages)
+    except ValueError as e:
+        raise TableError(f'{table.path}: array "{PRIMARY_PAGES}": {e}') from None
+    if sides.shape != (*counts, 2) or sides.max() > 2 ** SIDE_BITS[1]:
+        raise TableError(f"{table.path}: has {sides.shape} pages, an image of this size has {counts}")
+    if len(entries.shape) != 2 or sides.prod(axis=2).sum() != entries.shape[0]:
+        raise TableError(f"{table.path}: its pages do not have the {entries.shape[0]} entries that it holds")
+    return (*counts, entries.shape[-1])

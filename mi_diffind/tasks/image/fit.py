@@ -8,12 +8,13 @@ from pathlib import Path
 
 from ...errors import UsageError
 from ...maps.source import Source, load_source
+from ...pages import most_entries
 from ...settings import FittingError
 from ...tables import MAX_BYTES
 from ..map_arguments import asked_bytes
 from ..task import Fitted, Request
 from . import search, sizing, training
-from .presets import PRESETS, STRUCTURES, Recipe, without
+from .presets import PAGED, PRESETS, STRUCTURES, Recipe, without
 
 
 def recipe_of(preset: str, settings, options) -> Recipe:
@@ -23,6 +24,8 @@ def recipe_of(preset: str, settings, options) -> Recipe:
     recipe = dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
     if STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
         raise UsageError(f'--structure "{recipe.structure}" has two primary arrays and needs --dims 3 or 4')
+    if recipe.structure in PAGED and not recipe.components:
+        raise UsageError(f'--structure "{recipe.structure}" starts from components: leave out what switches them off')
     return recipe
 
 
@@ -100,8 +103,17 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
             )
     else:
         size = search.default_size(source, asked, recipe)
+    if size.paged and size.primaries[0][0] * size.primaries[0][1] > most_entries(2):
+        raise UsageError(
+            f'--structure "{recipe.structure}": {round(asked):,} bytes are more than {most_entries(2):,} entries, '
+            f"which is what pages can hold: ask for fewer or take another one"
+        )
     table, result = training.fit_image(source, size, recipe, request, border)
     _, sentence = sizing.explain(size, source.nbytes, asked)
+    if sentence is None and size.paged and table.nbytes < (1 - sizing.TOLERANCE) * asked:
+        sentence = (
+            f"{round(asked):,} bytes were asked for, but at {table.nbytes:,} bytes the pages are as fine as the image"
+        )
     return Fitted(table, result, [*lines, *([sentence] if sentence else [])], {"tried": tried}), asked
 
 

@@ -9,12 +9,19 @@ from ...settings import FitSettings
 from .sizing import Coarse
 
 #: How the primary is stored: bits of an entry, and a second primary or none. The fewer bits, the more entries fit.
+#: The resolution of pages follows the image.
 STRUCTURES: dict[str, tuple[int, Coarse | None]] = {
     **{f"{bits} bits": (bits, None) for bits in (8, 7, 6, 5, 4, 3)},
     "4 + 8 bits": (4, Coarse(2, 8, 0.5)),
     "3 + 6 bits": (3, Coarse(2, 6, 0.4)),
     "2 + 6 bits": (2, Coarse(2, 6, 0.35)),
+    "pages of 5 bits": (5, None),
+    "pages of 6 bits": (6, None),
+    "pages of 2 + 6 bits": (2, Coarse(2, 6, 0.35)),
 }
+
+#: Structures whose first primary consists of pages (:class:`mi_diffind.pages.PagedArray`).
+PAGED = ("pages of 5 bits", "pages of 6 bits", "pages of 2 + 6 bits")
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,7 @@ IMPROVEMENTS = {
     "components": "arrays start from principal components",
     "jitter": "half of the samples at texel centres",
     "rounded": "training sees rounded entries",
-    "structure": "fewer bits an entry of the primary array, a second one for noisy images",
+    "structure": "pages, fewer bits an entry of the primary array, a second one for noisy images",
     "loss": "squared errors",
     "rate": "a higher rate that falls to zero",
     "batch": "steps of 262,144 samples",

@@ -15,9 +15,9 @@ from ...maps.source import Source
 from ...tables import Table
 from ..task import Request
 from . import sizing
-from .presets import STRUCTURES, Recipe, replaced
+from .presets import PAGED, STRUCTURES, Recipe, replaced
 from .sizing import Coarse, Size
-from .training import fit_image, layout_of, structure_of
+from .training import dims_of, fit_image, layout_of, structure_of
 
 #: A candidate of a search is trained for this share of the steps.
 SHORT = 1 / 8
@@ -26,7 +26,7 @@ SHORT = 1 / 8
 SIDES = {1: (64, 256), 2: (16, 32, 64), 3: (8, 16, 32), 4: (4, 8, 12, 16)}
 
 #: Structures of the primary to try.
-TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits")
+TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits", *PAGED)
 
 #: A search by quality ends when the file is at most this much larger than one that is known to be too small.
 NEAR = 1.06
@@ -51,17 +51,25 @@ def default_size(source: Source, nbytes: float, recipe: Recipe) -> Size:
     The size of a recipe for so many bytes: the supplement's search, or with ``components`` a cascaded array of
     :func:`.sizing.cascaded_side` and whatever primary fits beside it.
     """
-    stored, (bits, coarse) = max(1, layout_of(source, recipe).stored), STRUCTURES[structure_of(source, recipe)]
+    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    bits, coarse = STRUCTURES[structure]
     if recipe.components or coarse:
-        return sized(source, nbytes, recipe, sizing.cascaded_side(nbytes, stored, recipe.dims))
+        dims = dims_of(recipe, structure, stored)
+        return sized(source, nbytes, recipe, sizing.cascaded_side(nbytes, stored, dims))
     compression = source.nbytes / nbytes
     return sizing.search(source.nbytes, compression, stored, source.height, source.width, recipe.dims, bits)
 
 
 def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
-    """The size for so many bytes, with a cascaded array of a given side."""
-    stored, (bits, coarse) = max(1, layout_of(source, recipe).stored), STRUCTURES[structure_of(source, recipe)]
-    return sizing.fit_bytes(nbytes, stored, source.height, source.width, cascaded, recipe.dims, bits, coarse)
+    """
+    The size for so many bytes, with a cascaded array of a given side. A single primary of pages may have fewer
+    channels than the recipe says (:func:`.dims_of`).
+    """
+    stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
+    (bits, coarse), paged = STRUCTURES[structure], structure in PAGED
+    dims = dims_of(recipe, structure, stored)
+    size = sizing.fit_bytes(nbytes, stored, source.height, source.width, cascaded, dims, bits, coarse)
+    return dataclasses.replace(size, paged=paged)
 
 
 def _steps(recipe: Recipe, share: float) -> Recipe:
@@ -82,7 +90,7 @@ def ratio_search(
     def attempt(recipe: Recipe, side: int) -> bool:
         """Train a candidate; was that interrupted?"""
         size = sized(source, nbytes, recipe, side)
-        structure = structure_of(source, recipe)
+        structure, recipe = structure_of(source, recipe, nbytes), dataclasses.replace(recipe, dims=size.dims)
         known = [t for t in tried if (t["dims"], t["structure"], t["cascaded"]) == (recipe.dims, structure, side)]
         if known or size.nbytes > nbytes * (1 + sizing.TOLERANCE):
             return False
@@ -100,7 +108,8 @@ def ratio_search(
         return max(tried, key=_merit, default=None)
 
     start, interrupted = default_size(source, nbytes, recipe), False
-    for stage in _stages(recipe, structure_of(source, recipe), start.cascaded, free, best):
+    structure, recipe = structure_of(source, recipe, nbytes), dataclasses.replace(recipe, dims=start.dims)
+    for stage in _stages(recipe, structure, start.cascaded, free, best):
         interrupted = any(attempt(candidate, side) for candidate, side in stage)
         if interrupted:
             break
@@ -131,7 +140,7 @@ def _stages(recipe: Recipe, structure: str, side: int, free: bool, best: Callabl
     tried = [s for s, (_, coarse) in STRUCTURES.items() if s in TRIED and s != structure and (several or not coarse)]
     yield [(dataclasses.replace(recipe, structure=s), found["cascaded"]) for s in tried]
     found = best()
-    recipe = dataclasses.replace(recipe, structure=found["structure"])
+    recipe = dataclasses.replace(recipe, structure=found["structure"], dims=found["dims"])
     yield [(recipe, s) for s in SIDES[recipe.dims] if abs(math.log2(s / found["cascaded"])) <= 1]
     if STRUCTURES[found["structure"]][1] is None:
         other = [d for d in (2, 3, 4) if d != recipe.dims]

@@ -86,6 +86,9 @@ class Size:
     ``channels``, the ``dims`` of the pointer and the ``bits`` of each of its coordinates. With ``coarse``, so many of
     the ``dims`` are in a second primary.
 
+    ``paged``: the first primary consists of pages, whose entries and index together take the bytes of so many rows and
+    columns; where they are, the image decides.
+
     ``full`` says that the primary is as large as the image, or as the search lets it be; sizes compare without it.
     """
 
@@ -97,6 +100,7 @@ class Size:
     bits: int = 8
     full: bool = field(default=False, compare=False)
     coarse: Coarse | None = None
+    paged: bool = False
 
     def __post_init__(self):
         if self.coarse is not None and self.coarse.dims >= self.dims:

@@ -22,22 +22,62 @@ from ...indirection import Indirection
 from ...maps import components
 from ...maps.layout import Layout
 from ...maps.source import Source
+from ...pages import most_entries, page_counts
 from ...tables import Table
 from ..task import Request
-from . import arrays
+from . import arrays, sizing
 from .compressed import CompressedImage, to_table
-from .presets import Recipe
+from .presets import PAGED, STRUCTURES, Recipe
 from .sizing import Size
 
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
 
+#: dB that pages have to gain, before training, and that a single primary of them has to have, before training, where an
+#: image is not smooth.
+GAIN_DB, FINE_DB = 0.5, 29.0
 
-def structure_of(source: Source, recipe: Recipe) -> str:
-    """The structure of a recipe; for ``"auto"`` what suits the image."""
+#: Entries for each page that there have to be.
+ENTRIES = 3
+
+_structures: dict[tuple, str] = {}  # what was found for a source, by its digest: looking takes a second
+
+
+def structure_of(source: Source, recipe: Recipe, nbytes: float | None = None) -> str:
+    """The structure of a recipe; for ``"auto"`` what suits the image in so many bytes (default: at 12x)."""
     if recipe.structure != "auto":
         return recipe.structure
-    smooth = recipe.dims < 3 or components.smoothness(layout_of(source, recipe).encode(source)) >= SMOOTH_DB
+    nbytes = source.nbytes / 12 if nbytes is None else nbytes
+    key = (source.digest, recipe.once, recipe.normals, recipe.components, recipe.dims, nbytes)
+    if key not in _structures:
+        _structures[key] = _suitable(layout_of(source, recipe).encode(source), recipe, nbytes)
+    return _structures[key]
+
+
+def dims_of(recipe: Recipe, structure: str, stored: int) -> int:
+    """
+    Dimensions of the cascaded array. Those of a single primary of pages are no more than there are channels ``stored``,
+    but 2: more entries are of more use to it, and read better between texels.
+    """
+    single = structure in PAGED and STRUCTURES[structure][1] is None
+    return min(recipe.dims, max(stored, 2)) if single else recipe.dims
+
+
+def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
+    """The structure that suits an image, ``(height, width, k)``, in so many bytes."""
+    height, width, k = values.shape
+    smooth = recipe.dims < 3 or components.smoothness(values) >= SMOOTH_DB
+    if recipe.components and k:
+        # What the cascaded array adds to more channels than it has dimensions needs more precise pointers
+        pages = "pages of 6 bits" if k > recipe.dims else "pages of 5 bits"
+        dims = dims_of(recipe, pages, k)
+        side = sizing.cascaded_side(nbytes, k, dims)
+        size = sizing.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
+        fewest = ENTRIES * math.prod(page_counts((height, width)))
+        if fewest <= arrays.page_budget(size, values.shape) <= most_entries(2):
+            gain, psnr = arrays.gain_of_pages(values, size, components.borders(values))
+            if gain >= GAIN_DB:
+                return pages if smooth or psnr >= FINE_DB else "pages of 2 + 6 bits"
     return "6 bits" if smooth else "2 + 6 bits"
 
 
@@ -152,7 +192,12 @@ class ImageProblem(Problem):
 def problem_of(
     source: Source, size: Size, recipe: Recipe, types, layout: Layout | None = None, border=None
 ) -> ImageProblem:
-    """The problem of training ``source`` at a size by a recipe, its arrays at their initial values."""
+    """
+    The problem of training ``source`` at a size by a recipe, its arrays at their initial values. Raises ``ValueError``
+    for pages without components, by which they are chosen.
+    """
+    if size.paged and not recipe.components:
+        raise ValueError("size: found one of pages, which needs a recipe with components")
     layout = layout or layout_of(source, recipe)
     values = layout.encode(source)
     border = border or components.borders(values)
@@ -186,12 +231,18 @@ def fit_image(
         settings = {**request.recorded(), **problem.identity, "ratio": size.ratio}
         if request.seconds is not None:
             settings["steps"] = result.steps
-        settings["structure"] = structure_of(source, recipe)
+        settings["structure"] = recipe.structure if recipe.structure != "auto" else _name_of(size)
         table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
     found = CompressedImage.of(table, types.TensorXf).measure(source)
     table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
     return table, result
+
+
+def _name_of(size: Size) -> str:
+    """The structure of a size, "" if it is none of those that are known."""
+    known = (name for name, s in STRUCTURES.items() if s == (size.bits, size.coarse) and size.paged == (name in PAGED))
+    return next(known, "")
 
 
 def stored_form(net: Indirection, bits: Sequence[int]) -> Indirection:

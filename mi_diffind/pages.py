@@ -1,0 +1,403 @@
+"""
+An array whose resolution follows its content: pages of different resolutions behind a small index.
+
+The domain is divided into ``A × B × …`` pages. Each has a grid of entries of its own, which includes the borders of the
+page: one entry makes it constant, and what lies on the border of two pages is held by both, so that they join where
+their entries agree. A word for each page says where its entries begin and how many it has; a read gathers it first.
+
+:func:`page_sizes` chooses the resolutions for data on a grid, :func:`page_entries` the entries.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+
+import drjit as dr
+import numpy as np
+from drjit import nn
+
+from . import lookup
+from .compat import module_of
+from .indirection import DifferentiableArray, aligned, coordinates_of, fold, padded_tensor, require_backend
+
+__all__ = ["PagedArray", "page_counts", "page_entries", "page_gain", "page_positions", "page_shift", "page_sizes"]
+
+#: Bits of an index word for the entries along a side of a page, by the number of dimensions; the rest counts entries.
+SIDE_BITS = (8, 5, 4)
+
+#: A page is at most so many texels wide: its resolution is chosen by the texels of its data and, behind them, the next.
+SAMPLES = 16
+
+#: Entries along a side of a page that :func:`page_sizes` chooses from.
+SIDES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 15, SAMPLES + 1)
+_OPTIONS = np.array([(rows, columns) for rows in SIDES for columns in SIDES])
+
+#: Pages that are looked at together, and in all for an estimate.
+PART, ESTIMATED = 4096, 1024
+
+
+class PagedArray(DifferentiableArray):
+    """
+    A :class:`.DifferentiableArray` of 1 to 3 dimensions that consists of pages of different resolutions.
+
+    Parameters:
+        sizes: entries along each side of each page, whole numbers of shape ``(A, B, …, d)``, at most 256, 32 or 16 in
+            1, 2 or 3 dimensions.
+        channels: values per entry.
+        init: the entries, ``(entries, channels)``: those of one page after the other, the last axis fastest; or a
+            number for all.
+        shift: where the first page begins along each axis, in units of a page, from 0 to 1. Half a texel, if entries
+            are to lie at texel centres. What lies before it belongs, with a ``"repeat"`` border, to the last page,
+            which then ends behind 1; with ``"clamp"`` it reads as the page's border.
+        fold, border: as for :class:`.DifferentiableArray`.
+
+    ``resolution`` are the numbers of pages, ``data`` has the shape ``(entries, padded)``, ``index`` holds the words.
+    Everything else is as there: how it is read, trained and converted. :meth:`at` is not defined. Raises
+    ``ValueError`` for impossible settings.
+    """
+
+    DRJIT_STRUCT = {  # noqa: RUF012
+        **DifferentiableArray.DRJIT_STRUCT,
+        "sizes": object,
+        "shift": tuple,
+        "index": tuple,  # in a tuple, it is no parameter
+    }
+
+    def __init__(self, sizes=((1,),), channels=1, init=0.5, shift=0.0, fold=False, border="clamp"):
+        sizes = np.asarray(sizes)
+        dims = sizes.shape[-1] if sizes.ndim else 0
+        if not 1 <= dims <= len(SIDE_BITS) or sizes.ndim != dims + 1 or sizes.size == 0:
+            raise ValueError(f"sizes: found the shape {sizes.shape}, allowed are (A, 1), (A, B, 2) and (A, B, C, 3)")
+        if sizes.dtype.kind not in "iu" or sizes.min() < 1 or sizes.max() > 2 ** SIDE_BITS[dims - 1]:
+            found = f"{sizes.min()} to {sizes.max()} of type {sizes.dtype}"
+            raise ValueError(f"sizes: found {found}, allowed are whole numbers from 1 to {2 ** SIDE_BITS[dims - 1]}")
+        shift = tuple(map(float, np.broadcast_to(shift, (dims,))))
+        if not all(0 <= s <= 1 for s in shift):
+            raise ValueError(f"shift: found {shift}, allowed are numbers from 0 to 1")
+        super().__init__(sizes.shape[:-1], channels, "constant", None, fold, border)
+        self.sizes, self.shift, self.index = sizes.astype(np.int64), shift, ()
+        if self.entries > most_entries(dims):
+            found = f"{self.entries:,} entries in all pages together"
+            raise ValueError(f"sizes: found {found}, allowed are {most_entries(dims):,}")
+        if np.shape(init) not in ((), (self.entries, self.channels)):
+            raise ValueError(f"init: found shape {np.shape(init)}, expected {(self.entries, self.channels)}")
+        self.init = np.asarray(init, np.float32)
+
+    @property
+    def entries(self) -> int:
+        """Entries of all pages together."""
+        return int(self.sizes.prod(axis=-1).sum())
+
+    # -- allocation and storage forms -------------------------------------------------------------------------------
+
+    def _alloc(self, dtype, size=-1, rng=None):
+        if size not in (-1, self.dims):
+            raise ValueError(f"an array of {self.dims} dimension(s) was given {size} input(s)")
+        values = np.broadcast_to(self.init, (self.entries, self.channels))
+        result = self._like()
+        result.storage = "float16" if dr.is_half_v(dtype) else "float32"
+        result.data = padded_tensor(dtype, values, (self.entries,), self.channels)
+        result.index = (self._words(dtype),)
+        return result, self.channels
+
+    def _words(self, dtype):
+        """The index: for each page, its first entry and, in the lower bits, its sides less one, the last one lowest."""
+        flat, bits = self.sizes.reshape(-1, self.dims), SIDE_BITS[self.dims - 1]
+        found = np.cumsum(flat.prod(axis=1)) - flat.prod(axis=1)
+        for axis in range(self.dims):
+            found = found << bits | (flat[:, axis] - 1)
+        words = aligned(found.shape, np.uint32)
+        words[...] = found
+        return module_of(dtype).UInt32(words)
+
+    def _form(self) -> dict:
+        return {"sizes": self.sizes, "shift": self.shift}
+
+    @classmethod
+    def from_numpy(
+        cls,
+        values,
+        dtype,
+        border="clamp",
+        storage="float32",
+        fold=False,
+        quantization=None,
+        bits=8,
+        *,
+        sizes=None,
+        shift=0.0,
+    ):
+        """
+        An allocated array of pages of ``sizes`` that holds ``values``, ``(entries, channels)``; the rest as in
+        :meth:`.DifferentiableArray.from_numpy`. Bytes are never held several times.
+        """
+        values = np.asarray(values)
+        if storage not in lookup.STORAGES:
+            raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
+        if values.ndim != 2:
+            raise ValueError(f"values: found shape {values.shape}, expected (entries, channels)")
+        result = cls(sizes, values.shape[1], 0.0, shift, fold, border)
+        if len(values) != result.entries:
+            raise ValueError(f"values: found {len(values)} entries, the pages have {result.entries}")
+        require_backend(dtype)
+        module, result.storage = module_of(dtype), storage
+        result.index = (result._words(dtype),)
+        if storage != "uint8":
+            form = module.TensorXf16 if storage == "float16" else module.TensorXf
+            result.data = padded_tensor(form, values, (result.entries,), result.channels)
+            return result
+        codes, affine = values, quantization
+        if quantization is None:
+            codes, *affine = lookup.quantize(values, result.channels)
+        result.scale, result.offset = (tuple(map(float, numbers)) for numbers in affine)
+        result.bits = bits
+        packed = lookup.pack_bits(codes, bits)
+        packed = np.pad(packed, (0, 4 + -len(packed) % 4)).view(np.uint32)
+        words = aligned(packed.shape, np.uint32)
+        words[...] = packed
+        result.data = module.UInt32(words)
+        return result
+
+    def codes(self) -> np.ndarray:
+        """The bytes of an array in ``"uint8"`` storage, ``(entries, channels)``."""
+        if self.storage != "uint8":
+            raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
+        packed = self.data.numpy().view(np.uint8)
+        return lookup.unpack_bits(packed, self.entries * self.channels, self.bits).reshape(-1, self.channels)
+
+    def at(self, x):
+        raise NotImplementedError("an array of pages cannot be reduced by a dimension")
+
+    # -- properties -------------------------------------------------------------------------------------------------
+
+    def check_shape(self) -> None:
+        allowed = [(self.entries, n) for n in (self.channels, lookup.padded_channels(self.channels))]
+        if self.data.shape not in allowed:
+            raise ValueError(f'"data" has the shape {self.data.shape}, expected {allowed[0]}')
+
+    @property
+    def index_nbytes(self) -> int:
+        """Bytes of the index: what a file has to hold."""
+        return (self.sizes.size * SIDE_BITS[self.dims - 1] + 7) // 8
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the entries in their storage form, without padding, and of the index."""
+        bits = {"float32": 32, "float16": 16, "uint8": self.bits}[self.storage]
+        return (self.entries * self.channels * bits + 7) // 8 + self.index_nbytes
+
+    @property
+    def memory_nbytes(self) -> int:
+        """Bytes in memory, with padded channels; the index has a word a page."""
+        return super().memory_nbytes + 4 * dr.width(self.index[0])
+
+    def __repr__(self) -> str:
+        pages = "x".join(map(str, self.resolution))
+        return (
+            f"PagedArray({pages} pages, {self.entries} entries, channels={self.channels}, storage={self.storage}, "
+            f"fold={self.folded})"
+        )
+
+    # -- reading ----------------------------------------------------------------------------------------------------
+
+    def __call__(self, x, active=True, inside=False):
+        self._require_entries()
+        x, is_coopvec = coordinates_of(x, module_of(self.data).Float)
+        if len(x) != self.dims:
+            raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(x)} coordinate(s)")
+        corners = self._corners(x, active, inside)
+        if self.storage == "uint8":
+            fetch = functools.partial(lookup.fetch_bits, self.data, self.channels, self.bits, active, type(x[0]))
+        else:
+            self.check_shape()
+            entries, transform = self.data.array, None
+            if self.folded and dr.flag(dr.JitFlag.SymbolicScope):  # as in DifferentiableArray
+                transform = fold
+            elif self.folded:
+                entries = fold(entries)
+            stored = self.data.shape[-1]
+            fetch = functools.partial(lookup.fetch_float, entries, self.channels, stored, active, transform, type(x[0]))
+        values = lookup.weighted_sum((weight, fetch(index)) for index, weight in corners)
+        if self.storage == "uint8":
+            values = [dr.fma(v, self.scale[k], self.offset[k]) for k, v in enumerate(values)]
+            values = values if active is True else [dr.select(active, v, 0) for v in values]
+        return nn.CoopVec(*values) if is_coopvec else values
+
+    def _corners(self, x: Sequence, active, inside: bool) -> list:
+        """The ``2^d`` pairs (entry, weight) of a cell."""
+        Float, UInt32 = type(x[0]), type(self.index[0])
+        page, places = None, []
+        for along, n, shift, border in zip(x, self.resolution, self.shift, self.border, strict=True):
+            if border == "repeat" and not inside:
+                along = along - dr.floor(along)
+            t = along * n if shift == 0 else dr.fma(along, n, -shift)
+            if border == "repeat" and shift != 0:
+                t = dr.select(t < 0, t + n, t)
+            t = lookup.clamp(t, 0.0, float(n))
+            i = dr.minimum(UInt32(t), n - 1)
+            page = i if page is None else dr.fma(page, n, i)
+            places.append(t - Float(i))
+        word, bits = dr.gather(UInt32, self.index[0], page, active), SIDE_BITS[self.dims - 1]
+        sides = [(word >> bits * (self.dims - 1 - axis)) & (2**bits - 1) for axis in range(self.dims)]  # less one
+        corners, stride = [(word >> bits * self.dims, None)], None
+        for place, side in zip(reversed(places), reversed(sides), strict=True):
+            position = place * Float(side)
+            lower = dr.minimum(UInt32(position), dr.maximum(side, 1) - 1)
+            weight = position - Float(lower)
+            # A side of one entry has no next one: its own again
+            step = dr.minimum(side, 1) if stride is None else dr.select(side > 0, stride, 0)
+            ahead = lower if stride is None else lower * stride
+            grown = []
+            for offset, v in ((ahead, 1 - weight), (ahead + step, weight)):
+                grown += [(index + offset, v if w is None else v * w) for index, w in corners]
+            corners = grown
+            stride = side + 1 if stride is None else stride * (side + 1)
+        return corners
+
+
+def most_entries(dims: int) -> int:
+    """Entries that all pages of an array may have together."""
+    return 2 ** (32 - dims * SIDE_BITS[dims - 1])
+
+
+# -- which resolution, which entries ----------------------------------------------------------------------------------
+
+
+def page_counts(shape: Sequence[int]) -> tuple[int, ...]:
+    """Pages along each axis of data of so many texels, each at most :data:`SAMPLES` wide."""
+    return tuple(math.ceil(n / SAMPLES) for n in shape)
+
+
+def page_sizes(values: np.ndarray, border: tuple[str, str], entries: float) -> np.ndarray:
+    """
+    Resolutions, ``(A, B, 2)``, of the pages of an image ``values``, ``(height, width, k)``, for at most so many
+    ``entries`` together, but at least one a page: those with the smallest squared error of all channels together, if
+    entries are fitted to the image and read linearly.
+    """
+    chosen = _allocated(np.concatenate([_errors(part) for part in _parts(_windows(values, border))]), entries)
+    return _OPTIONS[chosen].reshape(*page_counts(values.shape[:2]), 2)
+
+
+def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest: float = 0.0) -> tuple[float, float]:
+    """
+    What pages gain over one grid of as many ``entries``, in dB, and the PSNR they have, both if entries are fitted to
+    an image ``values``, ``(height, width, k)``, and read linearly. ``rest``: mean squared error that both have beside
+    that. Errors are those of all channels together. An estimate from 1024 pages at most, which needs no training.
+    """
+    windows = _windows(values, border)
+    some = windows[np.random.default_rng(0).permutation(len(windows))[:ESTIMATED]]
+    errors, share = _errors(some), len(some) / len(windows)
+    texels = len(some) * SAMPLES**2
+    paged = errors[np.arange(len(some)), _allocated(errors, share * entries)].sum() / texels + rest
+    # The grid has as many cells a page wherever it is; what a page of its own does better at its border is little
+    cells = SAMPLES * math.sqrt(entries / math.prod(values.shape[:2]))
+    square = [i for i, (rows, columns) in enumerate(_OPTIONS) if rows == columns > 1]
+    uniform = np.maximum(errors[:, square].sum(axis=0) / texels + rest, 1e-12)
+    grid = np.interp(math.log(cells), np.log(_OPTIONS[square, 0] - 1), np.log(uniform))
+    paged = math.log(max(paged, 1e-12))
+    return 10 / math.log(10) * (float(grid) - paged), -10 / math.log(10) * paged
+
+
+def _allocated(errors: np.ndarray, entries: float) -> np.ndarray:
+    """
+    Which of the options each page takes. Lagrange: the one that minimises ``error + λ · entries``, with the smallest λ
+    that leads to no more entries than there may be. Where many pages want more at once, since they are equal, the first
+    of them get it.
+    """
+    cost = _OPTIONS.prod(axis=1)
+
+    def best(exponent: float) -> np.ndarray:
+        return np.argmin(errors + math.exp(exponent) * cost, axis=1)
+
+    low, high = -40.0, 40.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if cost[best(middle)].sum() > entries else (low, middle)
+    few, many = best(high), best(low)
+    further = np.cumsum(np.maximum(cost[many] - cost[few], 0))
+    return np.where(further <= entries - cost[few].sum(), many, few)
+
+
+def page_entries(values: np.ndarray, border: tuple[str, str], sizes: np.ndarray) -> np.ndarray:
+    """
+    The entries of pages of ``sizes``, ``(A, B, 2)``, that reproduce ``values``, ``(height, width, k)``, with the
+    smallest squared error: ``(entries, k)``, to be read with a ``shift`` of half a texel (:func:`page_shift`).
+    """
+    windows, flat = _windows(values, border), np.asarray(sizes).reshape(-1, 2)
+    ends = np.cumsum(flat.prod(axis=1))
+    found = np.empty((ends[-1], values.shape[2]), np.float32)
+    inverse = {n: np.linalg.pinv(_ENDS[:, None] * _tents(n)) * _ENDS for n in SIDES}
+    for rows, columns in np.unique(flat, axis=0):
+        which = np.flatnonzero((flat == (rows, columns)).all(axis=1))
+        fitted = inverse[rows] @ windows[which].astype(np.float64) @ inverse[columns].T
+        where = (ends[which] - rows * columns)[:, None] + np.arange(rows * columns)
+        found[where] = fitted.transpose(0, 2, 3, 1).reshape(len(which), rows * columns, -1)
+    return found
+
+
+def page_shift(shape: Sequence[int]) -> tuple[float, ...]:
+    """Where the first page has to begin so that it begins at a texel's centre: half a texel, in units of a page."""
+    return tuple(0.5 * pages / n for pages, n in zip(page_counts(shape), shape, strict=True))
+
+
+def page_positions(sizes: np.ndarray, shift: Sequence[float]) -> np.ndarray:
+    """Where the entries of pages of ``sizes``, ``(A, …, d)``, lie: ``(entries, d)``, from 0 to 1 but for the shift."""
+    *counts, _ = np.shape(sizes)
+    found = []
+    for page in np.ndindex(*counts):
+        sides = [
+            (i + shift[axis] + (np.linspace(0, 1, n) if n > 1 else np.array([0.5]))) / counts[axis]
+            for axis, (i, n) in enumerate(zip(page, sizes[page], strict=True))
+        ]
+        found.append(np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, len(sides)))
+    return np.concatenate(found)
+
+
+#: A page shares what lies on its border with its neighbours: half the weight, here its root.
+_ENDS = np.sqrt(np.r_[0.5, np.ones(SAMPLES - 1), 0.5])
+
+
+def _tents(n: int) -> np.ndarray:
+    """What the ``n`` entries along a side contribute to the samples of a page, ``(SAMPLES + 1, n)``."""
+    if n == 1:
+        return np.ones((SAMPLES + 1, 1))
+    positions = np.arange(SAMPLES + 1) / SAMPLES * (n - 1)
+    return np.maximum(1 - np.abs(positions[:, None] - np.arange(n)), 0)
+
+
+def _windows(values: np.ndarray, border: tuple[str, str]) -> np.ndarray:
+    """
+    The samples of each page, those of its border included, ``(pages, k, SAMPLES + 1, SAMPLES + 1)``: texels, or if
+    pages are no whole number of texels wide, what lies between them.
+    """
+    for axis, pages in enumerate(page_counts(values.shape[:2])):
+        n = values.shape[axis]
+        at = np.arange(pages * SAMPLES + 1) * (n / (pages * SAMPLES))
+        lower = np.floor(at).astype(np.int64)
+        weight = np.reshape((at - lower).astype(np.float32), [-1 if a == axis else 1 for a in range(3)])
+        both = (i % n if border[axis] == "repeat" else np.minimum(i, n - 1) for i in (lower, lower + 1))
+        one, two = (np.take(values, i, axis=axis) for i in both)
+        values = one + weight * (two - one)
+    side = SAMPLES + 1
+    found = np.lib.stride_tricks.sliding_window_view(values, (side, side), axis=(0, 1))[::SAMPLES, ::SAMPLES]
+    return found.reshape(-1, values.shape[2], side, side)
+
+
+def _parts(windows: np.ndarray):
+    return (windows[i : i + PART] for i in range(0, len(windows), PART))
+
+
+def _errors(windows: np.ndarray) -> np.ndarray:
+    """Squared errors, ``(pages, options)``, of all resolutions: what is left of the data beside their projections."""
+    weighted = (windows * np.outer(_ENDS, _ENDS)).astype(np.float32)
+    whole = np.einsum("pkij,pkij->p", weighted, weighted, dtype=np.float64)
+    bases = [np.linalg.qr(_ENDS[:, None] * _tents(n))[0].astype(np.float32) for n in SIDES]
+    found = []
+    for rows in bases:
+        half = rows.T @ weighted
+        for columns in bases:
+            projected = half @ columns
+            found.append(whole - np.einsum("pkij,pkij->p", projected, projected, dtype=np.float64))
+    return np.maximum(np.stack(found, axis=1), 0)
