@@ -22,7 +22,16 @@ from . import lookup
 from .compat import module_of
 from .indirection import DifferentiableArray, aligned, coordinates_of, fold, padded_tensor, require_backend
 
-__all__ = ["PagedArray", "page_counts", "page_entries", "page_gain", "page_positions", "page_shift", "page_sizes"]
+__all__ = [
+    "PagedArray",
+    "page_counts",
+    "page_entries",
+    "page_gain",
+    "page_positions",
+    "page_shift",
+    "page_sizes",
+    "page_sizes_of",
+]
 
 #: Bits of an index word for the entries along a side of a page, by the number of dimensions; the rest counts entries.
 SIDE_BITS = (8, 5, 4)
@@ -276,8 +285,21 @@ def page_sizes(values: np.ndarray, border: tuple[str, str], entries: float) -> n
     ``entries`` together, but at least one a page: those with the smallest squared error of all channels together, if
     entries are fitted to the image and read linearly.
     """
-    chosen = _allocated(np.concatenate([_errors(part) for part in _parts(_windows(values, border))]), entries)
-    return _OPTIONS[chosen].reshape(*page_counts(values.shape[:2]), 2)
+    return page_sizes_of([values], border, entries)[0]
+
+
+def page_sizes_of(images: Sequence[np.ndarray], border: tuple[str, str], entries: float) -> list[np.ndarray]:
+    """
+    The same of several images that share the ``entries``: those with the smallest sum of the mean squared errors of
+    each.
+    """
+    errors = []
+    for values in images:
+        found = np.concatenate([_errors(part) for part in _parts(_windows(values, border))])
+        errors.append(found / math.prod(values.shape[:2]))
+    chosen = _OPTIONS[_allocated(np.concatenate(errors), entries)]
+    parts = np.split(chosen, np.cumsum([len(e) for e in errors])[:-1])
+    return [part.reshape(*page_counts(i.shape[:2]), 2) for part, i in zip(parts, images, strict=True)]
 
 
 def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest: float = 0.0) -> tuple[float, float]:

@@ -24,7 +24,7 @@ def _structure(text: str) -> str:
     from .sizing import parse_structure
 
     try:
-        if text != "auto":
+        if text not in ("auto", "pages"):
             parse_structure(text)
     except ValueError as e:
         raise argparse.ArgumentTypeError(str(e)) from None
@@ -50,7 +50,7 @@ class Texture(Task):
         *(size for size in SIZES if size.name != "psnr"),
         Argument(
             "--structure", type=_structure, metavar="L:C:B,…",
-            help="level, channels and bits of each fine array, as in 0:1:2,1:2:4 (default: auto)",
+            help="pages, or level, channels and bits of each fine array, as in 0:1:2,1:2:4 (default: auto)",
         ),
         Argument(
             "--skip", type=_whole, metavar="LEVEL",

@@ -14,6 +14,7 @@ from ...indirection import DifferentiableArray
 from ...maps import components
 from ...maps.compressed import taps
 from ...maps.layout import Layout
+from ...pages import PagedArray, page_entries, page_gain, page_positions, page_shift, page_sizes_of
 from .nets import Layer, LayeredForm, LayeredNet, PaperForm, PaperNet
 from .sizing import PaperSize, Size
 
@@ -108,7 +109,7 @@ def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str,
         for level in values
     ]
     reached, level = pointers[size.skip], size.skip
-    layers, fine = [], []
+    layers, fine = _pages(pointers, found, size, border)
     for i in reversed(range(len(size.fine))):
         wanted = size.fine[i]
         rows, columns = values[wanted.level].shape[:2]
@@ -134,6 +135,36 @@ def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str,
     cascaded = DifferentiableArray(shape, size.channels, cascaded, fold=True)
     form = LayeredForm(size.height, size.width, tuple(layers), size.skip, size.bits)
     return LayeredNet(fine, coarse, cascaded, form, border)
+
+
+def _pages(pointers: list, found: Components, size: Size, border) -> tuple[list, list]:
+    """The layers of pages, and their arrays."""
+    if not size.pages:
+        return [], []
+    used = found.dims
+    weighted = [(pointers[level][..., :used] * (found.high - found.low)).astype(np.float32) for level in size.pages]
+    layers, fine = [], []
+    ends = [*size.pages[1:], size.skip]
+    sides = page_sizes_of(weighted, border, size.page_entries)
+    for level, end, sizes in zip(size.pages, ends, sides, strict=True):
+        values = pointers[level]
+        shift = page_shift(values.shape[:2])
+        entries = np.clip(page_entries(values[..., :used].astype(np.float32), border, sizes), 0, 1)
+        further = page_positions(sizes, shift)[:, [j % 2 for j in range(size.dims - used)]]
+        entries = np.concatenate([entries, further], axis=-1).astype(np.float32)
+        layers.append(Layer(level, end - 1, size.page_bits, (1.0,) * size.dims, True))
+        fine.append(PagedArray(sizes, size.dims, entries, shift, fold=True, border=border))
+    return layers, fine
+
+
+def gain_of_pages(values: Sequence[np.ndarray], size: Size, border: tuple[str, str]) -> float:
+    """What pages gain over one grid of as many bytes at level 0, in dB: :func:`~mi_diffind.pages.page_gain`."""
+    found = Components.of(values[0], size.dims)
+    flat = values[0].reshape(-1, values[0].shape[-1]) - found.mean
+    exact = flat @ found.directions.T
+    rest = float(np.mean(flat**2, axis=0).sum() - np.mean(exact**2, axis=0).sum())
+    exact = exact.reshape(*values[0].shape[:2], -1).astype(np.float32)
+    return page_gain(exact, border, size.page_entries, max(rest, 0.0))[0]
 
 
 def _ramps(rows: int, columns: int, count: int) -> np.ndarray:

@@ -16,7 +16,8 @@ from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
-from ...tables import StoredArray, Table, TableError, load_table
+from ...pages import page_counts, page_shift
+from ...tables import PAGES, Table, TableError, allocate_pages, load_table, page_sides, stored_arrays
 from .nets import Layer, LayeredForm, LayeredNet, PaperForm, PaperNet, coarse_texels, types_of
 from .sampling import AXES
 
@@ -118,7 +119,17 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     only; with the ``storage`` ``"float32"``, as floats that pass through the fold, which can be optimised.
     """
     form = "uint8" if storage != "float32" and table.storage == "uint8" else "float32"
-    return {name: array.allocate(dtype, form, fold=True) for name, array in table.arrays.items()}
+    found = {}
+    for name, array in table.arrays.items():
+        pages = table.arrays.get(name + PAGES)
+        if pages is not None:
+            layout = Layout.from_json(table.settings["layout"])
+            sizes = level_sizes(layout.height, layout.width)
+            shift = page_shift(sizes[int(name.removeprefix("level"))])
+            found[name] = allocate_pages(array, pages, dtype, shift, form, fold=True)
+        elif not name.endswith(PAGES):
+            found[name] = array.allocate(dtype, form, fold=True)
+    return found
 
 
 def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedTexture:
@@ -139,14 +150,19 @@ PAPER = ("primary0", "primary1", "cascaded")
 
 def to_table(texture: CompressedTexture, settings: dict) -> Table:
     """The table file of a texture."""
-    stored = {name: StoredArray.of(array) for name, array in texture.arrays.items()}
+    stored = {}
+    for name, array in texture.arrays.items():
+        stored |= stored_arrays(name, array)
     settings = {**settings, "layout": texture.layout.to_json()}
     if texture.net is not None:
         form = texture.net.form
         if isinstance(form, PaperForm):
             settings["arrays"] = {"kind": "paper", "axis": form.axis}
         else:
-            layers = [{"level": x.level, "until": x.until, "bits": x.bits, "scale": list(x.scale)} for x in form.layers]
+            layers = [
+                {"level": x.level, "until": x.until, "bits": x.bits, "scale": list(x.scale), "paged": x.paged}
+                for x in form.layers
+            ]
             settings["arrays"] = {
                 "kind": "layers", "skip": form.skip, "bits": form.bits, "border": list(texture.border),
                 "layers": layers,
@@ -171,7 +187,8 @@ def form_of(settings: dict, layout: Layout):
         raise ValueError("the level that is skipped to, the bits or the borders are damaged")
     layers, last = [], -1
     for entry in found["layers"]:
-        layer = Layer(int(entry["level"]), int(entry["until"]), int(entry["bits"]), tuple(map(float, entry["scale"])))
+        scale, paged = tuple(map(float, entry["scale"])), bool(entry["paged"])
+        layer = Layer(int(entry["level"]), int(entry["until"]), int(entry["bits"]), scale, paged)
         if not last < layer.level <= layer.until < skip or not 1 <= layer.bits <= 8:
             raise ValueError("the fine arrays are of no levels that there are")
         if not layer.scale or not all(math.isfinite(s) and 0 < s <= 4 for s in layer.scale):
@@ -191,12 +208,13 @@ def load(path: str | os.PathLike) -> Table:
             form, border = form_of(table.settings, layout)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
         raise TableError(f"{path}: its settings describe no texture ({e})") from None
-    shapes = {name: array.shape for name, array in table.arrays.items()}
+    pages = [] if not isinstance(form, LayeredForm) else [f"level{x.level}{PAGES}" for x in form.layers if x.paged]
+    shapes = {name: array.shape for name, array in table.arrays.items() if name not in pages}
     fine = [] if form is None or isinstance(form, PaperForm) else [f"level{layer.level}" for layer in form.layers]
     expected = [] if form is None else PAPER if isinstance(form, PaperForm) else [*fine, "coarse", "cascaded"]
-    if set(shapes) != set(expected):
-        found = ", ".join(sorted(shapes)) or "none"
-        raise TableError(f"{path}: holds the arrays {found}, expected {', '.join(sorted(expected)) or 'none'}")
+    if set(table.arrays) != {*expected, *pages}:
+        found, wanted = (", ".join(sorted(names)) or "none" for names in (table.arrays, {*expected, *pages}))
+        raise TableError(f"{path}: holds the arrays {found}, expected {wanted}")
     if form is None:
         return table
     if isinstance(form, PaperForm):
@@ -205,12 +223,17 @@ def load(path: str | os.PathLike) -> Table:
         dims = shapes["coarse"][-1]
         axes = len(shapes["cascaded"]) - 1
         wanted = {
-            **{n: (*form.sizes[x.level], x.channels) for n, x in zip(fine, form.layers, strict=True)},
+            **{
+                n: (_entries(table, n, form.sizes[x.level], border), x.channels)
+                if x.paged
+                else (*form.sizes[x.level], x.channels)
+                for n, x in zip(fine, form.layers, strict=True)
+            },
             "coarse": (coarse_texels(form), max([1, *(x.channels for x in form.layers)]) if dims < 1 else dims),
             "cascaded": (form.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,),
         }
-        if any(layer.channels > dims for layer in form.layers):
-            raise TableError(f"{path}: has a fine array with more channels than the {dims} of its pointers")
+        if any(layer.channels > dims or (layer.paged and layer.channels != dims) for layer in form.layers):
+            raise TableError(f"{path}: has a fine array with other channels than the {dims} of its pointers")
     for name, shape in wanted.items():
         found = shapes[name]
         if len(found) != len(shape) or any(w not in (None, f) for f, w in zip(found, shape, strict=True)):
@@ -219,8 +242,23 @@ def load(path: str | os.PathLike) -> Table:
         array = table.arrays[name]
         if not array.is_pointer:
             raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
-        if name in fine and array.border != border:
+        if name in fine and name + PAGES not in pages and array.border != border:
             raise TableError(f'{path}: array "{name}" has the borders {array.border}, expected {border}')
         if name in fine and array.storage == "uint8" and array.bits != form.layers[fine.index(name)].bits:
             raise TableError(f'{path}: array "{name}" has {array.bits} bits an entry, which its settings deny')
     return table
+
+
+def _entries(table: Table, name: str, size: tuple[int, int], border) -> int:
+    """The number of entries of an array of pages on a level of ``size``. Raises :class:`TableError`."""
+    pages, counts = table.arrays[name + PAGES], page_counts(size)
+    try:
+        sides = page_sides(pages)
+    except ValueError as e:
+        raise TableError(f'{table.path}: array "{name}{PAGES}": {e}') from None
+    if sides.shape != (*counts, 2) or pages.border != border:
+        raise TableError(
+            f'{table.path}: array "{name}{PAGES}" has the shape {sides.shape} and the borders {pages.border}, expected '
+            f"{(*counts, 2)} and {border}"
+        )
+    return int(sides.prod(axis=2).sum())

@@ -12,7 +12,7 @@ from ...maps.source import Source, load_source
 from ...tables import MAX_BYTES
 from ..map_arguments import asked_bytes
 from ..task import Fitted, Request
-from . import sizing, training
+from . import arrays, sizing, training
 from .presets import PRESETS, Recipe
 
 
@@ -36,7 +36,9 @@ def check(request: Request) -> None:
             raise UsageError("--footprint-samples: the preset paper draws footprints, power or exponential")
     elif options["axis"] is not None:
         raise UsageError("--axis is for the preset paper: our arrays are read at levels of detail, not at footprints")
-    if options["structure"] not in (None, "auto") and options["skip"] is None:
+    if options["structure"] == "pages" and options["skip"] is not None:
+        raise UsageError(f"--skip is for other structures than pages, which start from level {sizing.PAGES_SKIP}")
+    if options["structure"] not in (None, "auto", "pages") and options["skip"] is None:
         fine = sizing.parse_structure(options["structure"])
         options["skip"] = fine[-1].level + 1
 
@@ -79,7 +81,16 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, opt
     if not recipe.layered:
         return sizing.paper_size(nbytes, source.nbytes, layout.stored, layout.height, layout.width)
     fine, skip, levels = None, options["skip"], pyramid.levels
-    if options["structure"] not in (None, "auto"):
+    if options["structure"] in (None, "auto", "pages") and skip is None:
+        size = sizing.paged(layout.height, layout.width, layout.stored, nbytes, options["cascaded"])
+        if options["structure"] == "pages" and size is None:
+            raise UsageError('--structure "pages": the texture or its bytes are too small, or too large, for pages')
+        if size is not None and (
+            options["structure"] == "pages"
+            or arrays.gain_of_pages(pyramid.values, size, pyramid.border) >= training.GAIN_DB
+        ):
+            return size
+    if options["structure"] not in (None, "auto", "pages"):
         fine = sizing.parse_structure(options["structure"])
         lowest = fine[-1].level + 1
         if skip < lowest:

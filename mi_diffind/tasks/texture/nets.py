@@ -84,13 +84,15 @@ class Layer:
     """
     A fine array of ours: it has the size of the level of detail ``level``, and what is read of it, less
     :attr:`zero`, times the ``scale`` of each channel, is added to the pointer from the levels below ``until``, and less
-    and less from there to ``until + 1``. ``bits`` are those of an entry.
+    and less from there to ``until + 1``. ``bits`` are those of an entry. One that is ``paged`` consists of pages, whose
+    resolution follows the content, and *is* the pointer there.
     """
 
     level: int
     until: int
     bits: int
     scale: tuple[float, ...]
+    paged: bool = False
 
     @property
     def channels(self) -> int:
@@ -169,15 +171,18 @@ class LayeredNet(nn.Module):
         pointer = self._coarse(u, v, index, active)
         upper = self._coarse(u, v, dr.minimum(index + 1, len(form.sizes) - 1), active)
         pointer = [dr.fma(weight, b - a, a) for a, b in zip(pointer, upper, strict=True)]
-        for x, array in zip(form.layers, self.fine, strict=True):
+        for x, array in reversed([*zip(form.layers, self.fine, strict=True)]):
             share = 1 - lookup.clamp(level - x.until, 0.0, 1.0)
             self._add(pointer, x, array, u, v, share, active)
         return self._answer(pointer, level, active)
 
     def stored(self, u, v, active=True) -> list:
         """The same at level 0."""
+        layers = [*zip(self.form.layers, self.fine, strict=True)]
+        if layers and layers[0][0].paged:
+            return self._answer(layers[0][1]([v, u], active), type(u)(0), active)
         pointer = self._coarse(u, v, None, active)
-        for x, array in zip(self.form.layers, self.fine, strict=True):
+        for x, array in layers:
             self._add(pointer, x, array, u, v, None, active)
         return self._answer(pointer, type(u)(0), active)
 
@@ -187,7 +192,11 @@ class LayeredNet(nn.Module):
         return self.cascaded(pointer, active)
 
     def _add(self, pointer: list, layer: Layer, array: DifferentiableArray, u, v, share, active) -> None:
-        """Add what a layer says to a pointer, times ``share`` (``None``: 1)."""
+        """Add what a layer says to a pointer, times ``share`` (``None``: 1); pages take its place instead."""
+        if layer.paged:
+            for k, value in enumerate(array([v, u], active)):
+                pointer[k] = value if share is None else dr.fma(share, value - pointer[k], pointer[k])
+            return
         place = []
         for x, n, border in zip((v, u), array.resolution, self.along, strict=True):
             # Entries sit at texel centres of the level

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...maps.pyramid import level_sizes
+from ...pages import SIDE_BITS, most_entries, page_counts
 
 #: Best resolution ratio for compression ratios of textures at 4K (the supplement's table 4): RGB, and materials.
 RATIOS = {3: 80, 6: 64, 12: 64, 24: 48}
@@ -125,7 +126,8 @@ class Size:
     """
     Resolutions of our arrays: the ``fine`` ones, the finest first; the level ``skip`` from which on all levels have
     pointers of their own, with ``dims`` coordinates of ``bits``; and the side of the ``cascaded`` array, of
-    ``channels`` and with ``knots`` entries along the level of detail (1: none).
+    ``channels`` and with ``knots`` entries along the level of detail (1: none). With ``pages``, the levels that have
+    arrays of pages, these share ``page_bytes``.
     """
 
     height: int
@@ -137,6 +139,9 @@ class Size:
     cascaded: int
     knots: int = 1
     bits: int = 8
+    pages: tuple[int, ...] = ()
+    page_bytes: int = 0
+    page_bits: int = 5
 
     def __post_init__(self):
         levels = [f.level for f in self.fine]
@@ -155,7 +160,14 @@ class Size:
         sizes = level_sizes(self.height, self.width)
         fine = sum(math.ceil(math.prod(sizes[f.level]) * f.channels * f.bits / 8) for f in self.fine)
         coarse = math.ceil(sum(map(math.prod, sizes[self.skip :])) * self.dims * self.bits / 8)
-        return fine + coarse + self.knots * self.cascaded**self.dims * self.channels
+        return fine + coarse + self.knots * self.cascaded**self.dims * self.channels + self.page_bytes
+
+    @property
+    def page_entries(self) -> int:
+        """Entries that the pages have room for, beside their indices."""
+        sizes = level_sizes(self.height, self.width)
+        index = sum(math.ceil(2 * SIDE_BITS[1] * math.prod(page_counts(sizes[level])) / 8) for level in self.pages)
+        return int((self.page_bytes - index) * 8 / (self.page_bits * self.dims))
 
 
 def parse_structure(text: str) -> tuple[Fine, ...]:
@@ -227,6 +239,32 @@ def choose(
         if fine is not None and dims <= max(f.channels for f in fine):
             break
     return smallest
+
+
+#: Levels that have pages, the level from which on all have pointers of their own, and entries for each page that there
+#: have to be.
+PAGES, PAGES_SKIP, FEWEST = (0, 2), 4, 3
+
+#: Share of the bytes of a cascaded array behind pages, and its largest side.
+PAGES_CASCADED, PAGES_SIDE = 0.06, 12
+
+
+def paged(height: int, width: int, channels: int, nbytes: float, cascaded: int | None = None) -> Size | None:
+    """
+    A size whose fine arrays consist of pages, for so many bytes; ``None`` if the texture is too small, or the bytes are
+    too few or too many for that.
+    """
+    sizes = level_sizes(height, width)
+    if len(sizes) <= PAGES_SKIP:
+        return None
+    dims, knots = min(3, max(2, channels)), PAGES_SKIP + 1
+    side = int((PAGES_CASCADED * nbytes / (channels * knots)) ** (1 / dims) + 1e-9)
+    side = cascaded or min(max(4, side), PAGES_SIDE)
+    bits = 6 if channels > dims else 5
+    size = Size(height, width, channels, (), PAGES_SKIP, dims, side, knots, 8, PAGES, 0, bits)
+    size = replace(size, page_bytes=max(0, int(nbytes) - size.nbytes))
+    fewest = FEWEST * sum(math.prod(page_counts(sizes[level])) for level in PAGES)
+    return size if fewest <= size.page_entries <= most_entries(2) else None
 
 
 def _structures(levels: int, dims: int):

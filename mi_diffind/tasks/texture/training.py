@@ -30,6 +30,9 @@ from .presets import Recipe
 from .sampling import footprints, level_of
 from .sizing import PaperSize, Size
 
+#: dB that pages have to gain, before training, over one grid of as many bytes.
+GAIN_DB = 0.5
+
 
 def layout_of(source: Source, recipe: Recipe) -> Layout:
     """What of ``source`` is stored by a recipe."""
