@@ -164,8 +164,8 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
                 for x in form.layers
             ]
             settings["arrays"] = {
-                "kind": "layers", "skip": form.skip, "bits": form.bits, "border": list(texture.border),
-                "layers": layers,
+                "kind": "layers", "skip": form.skip, "bits": form.bits, "base": form.base,
+                "border": list(texture.border), "layers": layers,
             }  # fmt: skip
     return Table("texture", stored, settings=settings)
 
@@ -195,7 +195,10 @@ def form_of(settings: dict, layout: Layout):
             raise ValueError("the scales of the fine arrays are damaged")
         last = layer.level
         layers.append(layer)
-    return LayeredForm(layout.height, layout.width, tuple(layers), skip, bits), border
+    base = bool(found["base"])
+    if base and not layers:
+        raise ValueError("there is no fine array that could hold pointers")
+    return LayeredForm(layout.height, layout.width, tuple(layers), skip, bits, base), border
 
 
 def load(path: str | os.PathLike) -> Table:
@@ -229,11 +232,14 @@ def load(path: str | os.PathLike) -> Table:
                 else (*form.sizes[x.level], x.channels)
                 for n, x in zip(fine, form.layers, strict=True)
             },
-            "coarse": (coarse_texels(form), max([1, *(x.channels for x in form.layers)]) if dims < 1 else dims),
+            "coarse": (coarse_texels(form), dims),
             "cascaded": (form.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,),
         }
-        if any(layer.channels > dims or (layer.paged and layer.channels != dims) for layer in form.layers):
-            raise TableError(f"{path}: has a fine array with other channels than the {dims} of its pointers")
+        for x in form.layers:
+            if x.channels != dims and form.is_pointer(x):
+                raise TableError(f"{path}: has a fine array that holds pointers of {x.channels} of {dims} coordinates")
+            if x.channels > dims:
+                raise TableError(f"{path}: has a fine array with more channels than the {dims} of its pointers")
     for name, shape in wanted.items():
         found = shapes[name]
         if len(found) != len(shape) or any(w not in (None, f) for f, w in zip(found, shape, strict=True)):

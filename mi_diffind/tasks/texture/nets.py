@@ -17,6 +17,7 @@ from ... import lookup
 from ...compat import module_of
 from ...indirection import DifferentiableArray
 from ...maps.pyramid import around, level_sizes
+from ...pages import PagedArray
 from .sampling import footprint_of
 
 
@@ -85,7 +86,8 @@ class Layer:
     A fine array of ours: it has the size of the level of detail ``level``, and what is read of it, less
     :attr:`zero`, times the ``scale`` of each channel, is added to the pointer from the levels below ``until``, and less
     and less from there to ``until + 1``. ``bits`` are those of an entry. One that is ``paged`` consists of pages, whose
-    resolution follows the content, and *is* the pointer there.
+    resolution follows the content, and holds pointers themselves. (Of these, see also :class:`LayeredForm`, ``scale``
+    is 1 and there is no zero.)
     """
 
     level: int
@@ -108,7 +110,8 @@ class Layer:
 class LayeredForm:
     """
     What our arrays do not say themselves: the size of the texture, the fine ``layers``, the finest first, the level of
-    detail ``skip`` from which on each has its own pointers, and the ``bits`` of these.
+    detail ``skip`` from which on each has its own pointers, and the ``bits`` of these. ``base``: the coarsest of the
+    layers holds pointers, not differences, so that finer levels need not read those from ``skip`` on.
     """
 
     height: int
@@ -116,18 +119,23 @@ class LayeredForm:
     layers: tuple[Layer, ...]
     skip: int
     bits: int = 8
+    base: bool = False
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
         """Rows and columns of all levels."""
         return level_sizes(self.height, self.width)
 
+    def is_pointer(self, layer: Layer) -> bool:
+        """Does a layer hold pointers, not differences?"""
+        return layer.paged or (self.base and layer == self.layers[-1])
+
 
 class LayeredNet(nn.Module):
     """
     Our arrays. ``coarse`` holds pointers for all texels of the levels from ``form.skip`` on, one level after the other,
     read trilinearly; ``fine`` what the pointers of finer levels differ by, each array on the grid of its level, in few
-    bits and not of all channels; ``cascaded`` is read at their sum. Its first axis is the level of detail, one entry a
+    bits and not of all channels, or, of pages, the pointers; ``cascaded`` is read at their sum. Its first axis is the level of detail, one entry a
     level up to ``form.skip``, if it has one dimension more than ``coarse`` has channels.
     """
 
@@ -179,9 +187,14 @@ class LayeredNet(nn.Module):
     def stored(self, u, v, active=True) -> list:
         """The same at level 0."""
         layers = [*zip(self.form.layers, self.fine, strict=True)]
-        if layers and layers[0][0].paged:
-            return self._answer(layers[0][1]([v, u], active), type(u)(0), active)
-        pointer = self._coarse(u, v, None, active)
+        # What is finer than the finest array that holds pointers, and this one
+        last = next((i for i, (x, _) in enumerate(layers) if self.form.is_pointer(x)), None)
+        if last is None:
+            pointer = self._coarse(u, v, None, active)
+        else:
+            _, array = layers[last]
+            pointer = array(self._place(array, u, v), active)
+            layers = layers[:last]
         for x, array in layers:
             self._add(pointer, x, array, u, v, None, active)
         return self._answer(pointer, type(u)(0), active)
@@ -192,18 +205,24 @@ class LayeredNet(nn.Module):
         return self.cascaded(pointer, active)
 
     def _add(self, pointer: list, layer: Layer, array: DifferentiableArray, u, v, share, active) -> None:
-        """Add what a layer says to a pointer, times ``share`` (``None``: 1); pages take its place instead."""
-        if layer.paged:
-            for k, value in enumerate(array([v, u], active)):
+        """Add what a layer says to a pointer, times ``share`` (``None``: 1); one of pointers takes its place instead."""
+        found = array(self._place(array, u, v), active)
+        if self.form.is_pointer(layer):
+            for k, value in enumerate(found):
                 pointer[k] = value if share is None else dr.fma(share, value - pointer[k], pointer[k])
             return
-        place = []
-        for x, n, border in zip((v, u), array.resolution, self.along, strict=True):
-            # Entries sit at texel centres of the level
-            place.append(x - 0.5 / n if border == "repeat" else (x * n - 0.5) * (1 / max(1, n - 1)))
-        for k, value in enumerate(array(place, active)):
+        for k, value in enumerate(found):
             value = (value - layer.zero) * layer.scale[k]
             pointer[k] = pointer[k] + value if share is None else dr.fma(share, value, pointer[k])
+
+    def _place(self, array: DifferentiableArray, u, v) -> list:
+        """Where a fine array is read for (u, v): its entries sit at texel centres, and pages are where they are."""
+        if isinstance(array, PagedArray):
+            return [v, u]
+        place = []
+        for x, n, border in zip((v, u), array.resolution, self.along, strict=True):
+            place.append(x - 0.5 / n if border == "repeat" else (x * n - 0.5) * (1 / max(1, n - 1)))
+        return place
 
     def _coarse(self, u, v, level, active) -> list:
         """The pointer that ``coarse`` has at (u, v) of a level, a whole number for each place; ``None``: the finest."""
