@@ -75,7 +75,8 @@ class NeuralImage(mi.Texture):
 
      * - tables.primary, tables.coarse, tables.cascaded
        - |tensor|
-       - The entries of the arrays, with ``storage`` ``float32``; of the second, coarser primary, if there is one.
+       - The entries of the arrays, with ``storage`` ``float32``: of the primary, of its pages one after the other if it
+         has pages; of the second, coarser primary, if there is one.
        - |exposed|, |differentiable|
 
     An image that is stored as a pair of small arrays and read by *differentiable indirection* (Datta et al., *Efficient
