@@ -1,9 +1,10 @@
-"""Files of compressed images as textures share them, and the originals that they were made from."""
+"""Files of maps as textures share them, and the originals that compressed ones were made from."""
 
 from __future__ import annotations
 
 import threading
 import weakref
+from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -11,13 +12,13 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import compat
+from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.source import SourceError, load_source
 from mi_diffind.tables import TableError
-from mi_diffind.tasks.image import TASK
-from mi_diffind.tasks.image.compressed import PRIMARIES, CompressedImage
-from mi_diffind.tasks.task import stamp
+from mi_diffind.tasks.task import Task, stamp
 
+from . import properties
 from .tables import exposed
 
 STORAGES = ("uint8", "float32")
@@ -29,19 +30,16 @@ _cache: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
 _lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
 
 
-class SharedImage:
-    """A file's arrays, the same Dr.Jit variables for all textures that read them, and what else these share."""
+class SharedMaps:
+    """
+    Maps and the arrays that hold them (name → ``DifferentiableArray``), the same Dr.Jit variables for all textures that
+    read them, and what else these share.
+    """
 
-    def __init__(self, image: CompressedImage, preset: str):
-        self.image, self.preset = image, preset
+    def __init__(self, image: CompressedMaps, arrays: dict, preset: str):
+        self.image, self.arrays, self.preset = image, arrays, preset
         self._loaded = self.state()
         self._transforms = {}
-
-    @property
-    def arrays(self) -> dict:
-        """All arrays by name."""
-        net = self.image.net
-        return {} if net is None else {**dict(zip(PRIMARIES, net.primary, strict=False)), "cascaded": net.cascaded}
 
     @property
     def tables(self) -> dict:
@@ -74,19 +72,40 @@ class SharedImage:
             return self._transforms[key]
 
 
-def open_image(path: str | Path, storage: str) -> SharedImage:
+def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
     """
-    The arrays in a file, shared with everybody who has them open, unless they have been changed since. Raises
-    ``TableError``.
+    The maps in a file of a task whose models have an ``image``, shared with everybody who has them open, unless they
+    have been changed since. Raises ``TableError``.
     """
     path = Path(path)
+
+    def load():
+        model = task.model(task.load(path), mi.TensorXf, storage)
+        return SharedMaps(model.image, model.arrays, model.table.preset)
+
+    return shared((task.name, str(path.resolve()), *stamp(path), storage, mi.TensorXf), load)
+
+
+def shared(key: tuple, load: Callable[[], SharedMaps]) -> SharedMaps:
+    """What ``load()`` made for this ``key``, as long as somebody has it and has not changed it."""
     with _lock:
-        key = (str(path.resolve()), *stamp(path), storage, mi.TensorXf)
         found = _cache.get(key)
         if found is None or not found.as_loaded():
-            model = TASK.model(TASK.load(path), mi.TensorXf, storage)
-            found = _cache[key] = SharedImage(model.image, model.table.preset)
+            found = _cache[key] = load()
         return found
+
+
+def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
+    """The maps that the properties ``filename`` and ``storage`` of a texture name, and the path of the file."""
+    path = properties.filename(props)
+    if not path:
+        raise RuntimeError('parameter "filename": not given, a compressed image (.npz) is needed')
+    storage = properties.one_of(props, "storage", STORAGES)
+    props.get("source", "")  # of use to the exact counterpart only
+    try:
+        return open_file(task, path, storage), path
+    except TableError as e:
+        raise RuntimeError(f'parameter "filename": {e}') from None
 
 
 def map_of(layout: Layout, channels: str) -> MapLayout:
@@ -116,21 +135,29 @@ def is_data(layout: MapLayout) -> bool:
 # -- the exact counterpart ---------------------------------------------------------------------------------------------
 
 
-def to_bitmap(props) -> None:
-    """Give the properties of a ``neural_image`` what a ``bitmap`` needs to show the original of its map."""
-    path = Path(str(mi.file_resolver().resolve(str(props.get("filename", "")))))
+def to_bitmap(task: Task, props: mi.Properties) -> None:
+    """Give the properties of a texture of a task's file what a ``bitmap`` needs to show the original of its map."""
+    original, found = original_of(task, props)
     try:
-        table = TASK.load(path)
-        found = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
-        original = _original(props, path, table.settings)
         values = _values(original, found)
-    except (TableError, SourceError) as e:
+    except SourceError as e:
         raise RuntimeError(str(e)) from None
     # A byte is what it was; of half precision, which "bitmap" would make of 16 bits, the texture knows nothing
     bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if found.depth == 1 else np.ascontiguousarray(values))
     bitmap.set_srgb_gamma(found.color_space == "srgb")
     props["bitmap"] = bitmap
     props["raw"] = bool(props.get("raw", is_data(found)))
+
+
+def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
+    """The image or manifest that a task's file was made from, and the map of it that the properties mean."""
+    path = Path(properties.filename(props))
+    try:
+        table = task.load(path)
+    except TableError as e:
+        raise RuntimeError(str(e)) from None
+    found = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
+    return _original(props, path, table.settings), found
 
 
 def _original(props, path: Path, settings: dict) -> Path:
