@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 import weakref
 from collections.abc import Callable
@@ -12,9 +13,11 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import compat
+from mi_diffind.compat import module_of
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.maps.source import SourceError, load_source
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.task import Task, stamp
 
@@ -25,6 +28,9 @@ STORAGES = ("uint8", "float32")
 
 #: Kinds of maps that hold data, not colours.
 DATA_KINDS = ("normal", "roughness", "ao", "metallic")
+
+#: Pyramids that a texture may name: name → :class:`~mi_diffind.maps.pyramid.Pyramid`. (No property can hold one.)
+PYRAMIDS: dict[str, Pyramid] = {}
 
 _cache: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
 _lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
@@ -108,6 +114,54 @@ def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
         raise RuntimeError(f'parameter "filename": {e}') from None
 
 
+def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps, str]:
+    """
+    The mip pyramid of what the property ``filename`` names, an image or a manifest, of the object ``bitmap``, or that
+    one of :data:`PYRAMIDS` that ``pyramid`` names; and the path of the file, "" without. With ``raw``, nothing is taken
+    for sRGB.
+    """
+    given = [name for name in ("filename", "bitmap", "pyramid") if name in props]
+    if len(given) != 1:
+        found = " and ".join(f'"{name}"' for name in given) or "none"
+        raise RuntimeError(f'parameters "filename", "bitmap" and "pyramid": found {found}, one of them is needed')
+    raw = props.get("raw", False) is True
+    types, border = module_of(mi.TensorXf), ("repeat" if wrap_mode == "repeat" else "clamp",) * 2
+    if given == ["pyramid"]:
+        name = str(props["pyramid"])
+        if name not in PYRAMIDS:
+            known = ", ".join(f'"{n}"' for n in PYRAMIDS) or "none"
+            raise RuntimeError(f'parameter "pyramid": found "{name}", there are {known} (support.image_files.PYRAMIDS)')
+        pyramid = PYRAMIDS[name]
+        if pyramid.types is not types:
+            pyramid = Pyramid.from_levels(pyramid.layout, pyramid.values, types, pyramid.border)
+        return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {}, "")), ""
+
+    def load() -> SharedMaps:
+        source = load_source(path, nonfinite="clean") if path else _source_of(props["bitmap"])
+        if raw:
+            maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
+            source = dataclasses.replace(source, maps=maps)
+        return SharedMaps(Pyramid.of(source, types=types, border=border), {}, "")
+
+    path = properties.filename(props)
+    try:
+        if not path:
+            return load(), ""
+        return shared((str(Path(path).resolve()), *stamp(Path(path)), raw, border, mi.TensorXf), load), path
+    except SourceError as e:
+        raise RuntimeError(f'parameter "{given[0]}": {e}') from None
+
+
+def _source_of(bitmap) -> Source:
+    """A ``mi.Bitmap`` as a source of one map, ``image``."""
+    if not isinstance(bitmap, mi.Bitmap):
+        raise RuntimeError(f'parameter "bitmap": found a {type(bitmap).__name__}, a Bitmap is needed')
+    values = np.array(bitmap)
+    values = values.reshape(*values.shape[:2], -1)
+    values = values[..., : 3 if values.shape[2] > 3 else 1 if values.shape[2] == 2 else None]  # without alpha
+    return from_arrays({"image": values}, {"image": "srgb" if bitmap.srgb_gamma() else "linear"}, nonfinite="clean")
+
+
 def map_of(layout: Layout, channels: str) -> MapLayout:
     """The map called ``channels``; if that is empty, the only one, or the only one that holds colours."""
     if channels and channels not in layout.names:
@@ -147,6 +201,18 @@ def to_bitmap(task: Task, props: mi.Properties) -> None:
     bitmap.set_srgb_gamma(found.color_space == "srgb")
     props["bitmap"] = bitmap
     props["raw"] = bool(props.get("raw", is_data(found)))
+
+
+def to_mipmap(task: Task, props: mi.Properties) -> None:
+    """Give the properties of a texture of a task's file what a ``mipmap`` of the original of its map needs."""
+    original, found = original_of(task, props)
+    props["filename"] = str(original)
+    if original.suffix.lower() == ".json":
+        props["channels"] = found.name
+    elif "channels" in props:
+        del props["channels"]
+    if "raw" not in props and is_data(found):
+        props["raw"] = True
 
 
 def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
