@@ -123,8 +123,7 @@ def test_off_is_level_0_and_costs_no_footprint(mi_rgb, files, rng, preset):
     assert reads["off"].instructions < reads["trilinear"].instructions - 100
 
 
-@pytest.mark.parametrize("name", ["albedo", "normal", "roughness"])
-@pytest.mark.parametrize("preset", ["ours", "paper"])
+@pytest.mark.parametrize("preset, name", [("ours", "albedo"), ("ours", "normal"), ("paper", "roughness")])
 def test_trilinear_is_the_level_of_the_area(mi_any, files, rng, preset, name):
     mi = mi_any
     uv, (ddx, ddy) = rng.random((2, 300)), filtered.footprints(rng, 300, SIZE)
@@ -140,8 +139,9 @@ def test_trilinear_is_the_level_of_the_area(mi_any, files, rng, preset, name):
         assert np.isfinite(spectra).all() and spectra.min() >= 0 and spectra.max() <= 1
 
 
-@pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
-@pytest.mark.parametrize("border", ["ours", "clamp"])
+@pytest.mark.parametrize(
+    "border, wrap_mode", [("ours", "repeat"), ("ours", "clamp"), ("clamp", "repeat"), ("clamp", "mirror")]
+)
 def test_equals_a_mipmap_of_what_it_decodes_to(mi_rgb, files, rng, border, wrap_mode):
     """At the texel centres of each level, with texels for footprints, of neighbouring images, too."""
     mi = mi_rgb
@@ -157,7 +157,7 @@ def test_equals_a_mipmap_of_what_it_decodes_to(mi_rgb, files, rng, border, wrap_
         levels.append(np.stack([c.numpy() for c in image.filtered(u, v, at)], -1).reshape(rows, columns, -1))
     image_files.PYRAMIDS["decoded"] = Pyramid.from_levels(layout, levels, module_of(mi.TensorXf), along)
     try:
-        for name in ("albedo", "roughness"):
+        for name in ("albedo",):
             ours = mi.load_dict(plugin(files[border], channels=name, wrap_mode=wrap_mode))
             theirs = mi.load_dict({"type": "mipmap", "pyramid": "decoded", "channels": name, "wrap_mode": wrap_mode})
             for level in range(image.levels - 1):  # the last: a texel is higher than the image
@@ -203,7 +203,7 @@ def test_stochastic_is_unbiased(mi_rgb, file, rng, name):
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("preset", ["ours", "paper", "clamp"])
+@pytest.mark.parametrize("preset", ["ours", "paper"])
 def test_any_footprint_gives_a_finite_value(mi_rgb, files, rng, preset):
     mi = mi_rgb
     parts = np.stack(np.meshgrid(*[WRONG] * 4)).reshape(4, -1)
@@ -216,7 +216,7 @@ def test_any_footprint_gives_a_finite_value(mi_rgb, files, rng, preset):
         assert np.isfinite(texture.eval_1_grad(si).numpy()).all(), name
 
 
-@pytest.mark.parametrize("shape", [(1, 16), (9, 1), (7, 5)])
+@pytest.mark.parametrize("shape", [(1, 16), (7, 5)])
 def test_odd_sizes(mi_rgb, tmp_path, rng, shape):
     mi = mi_rgb
     values = rng.integers(0, 256, (*shape, 3), np.uint8)
@@ -299,18 +299,17 @@ def test_gradients_of_wrong_footprints_are_finite(mi_rgb, file):
     mi = mi_rgb
     parts = np.stack(np.meshgrid(*[(0, 1, 1e20, math.nan, math.inf, -math.inf)] * 4)).reshape(4, -1)
     si = filtered.hits(mi, [[0.3], [0.7]], parts[:2], parts[2:])
-    for name, taps in (("trilinear", 1), ("anisotropic", 1)):
-        texture = mi.load_dict(plugin(file, name, storage="float32", max_anisotropy=taps))
-        params = mi.traverse(texture)
-        keys = [key for key in params.keys() if key.startswith("tables.")]
-        for key in keys:
-            dr.enable_grad(params[key])
-        params.update()
-        dr.enable_grad(si.uv)
-        dr.backward(dr.sum(texture.eval_1(si)))
-        assert all(np.isfinite(dr.grad(params[key]).numpy()).all() for key in keys)
-        assert np.isfinite(dr.grad(si.uv).numpy()).all()
-        dr.disable_grad(*(params[key] for key in keys))
+    texture = mi.load_dict(plugin(file, "anisotropic", storage="float32", max_anisotropy=1))
+    params = mi.traverse(texture)
+    keys = [key for key in params.keys() if key.startswith("tables.")]
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
+    dr.enable_grad(si.uv)
+    dr.backward(dr.sum(texture.eval_1(si)))
+    assert all(np.isfinite(dr.grad(params[key]).numpy()).all() for key in keys)
+    assert np.isfinite(dr.grad(si.uv).numpy()).all()
+    dr.disable_grad(*(params[key] for key in keys))
 
 
 def test_parameters_are_shared_and_checked(mi_rgb, file, rng):
@@ -384,9 +383,7 @@ def test_materials_and_integrators(variant, file):
         return {m: plugin(file, name, m, **to_uv) for m in ("albedo", "normal", "roughness")}
 
     images = []
-    for name, integrator in (("off", "path"), ("anisotropic", "path"), ("trilinear", "path_footprint"))[
-        : 2 if mi.is_polarized else 3
-    ]:
+    for name, integrator in (("off", "path"), ("trilinear", "path" if mi.is_polarized else "path_footprint")):
         t = textures(name)
         bsdfs = [
             {"type": "normalmap", "normalmap": t["normal"], "bsdf": {"type": "diffuse", "reflectance": t["albedo"]}},
