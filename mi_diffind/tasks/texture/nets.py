@@ -135,8 +135,9 @@ class LayeredNet(nn.Module):
     """
     Our arrays. ``coarse`` holds pointers for all texels of the levels from ``form.skip`` on, one level after the other,
     read trilinearly; ``fine`` what the pointers of finer levels differ by, each array on the grid of its level, in few
-    bits and not of all channels, or, of pages, the pointers; ``cascaded`` is read at their sum. Its first axis is the level of detail, one entry a
-    level up to ``form.skip``, if it has one dimension more than ``coarse`` has channels.
+    bits and not of all channels, or, where it consists of pages, pointers; ``cascaded`` is read at what that makes. Its
+    first axis is the level of detail, one entry a level up to ``form.skip``, if it has one dimension more than
+    ``coarse`` has channels.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -205,7 +206,7 @@ class LayeredNet(nn.Module):
         return self.cascaded(pointer, active)
 
     def _add(self, pointer: list, layer: Layer, array: DifferentiableArray, u, v, share, active) -> None:
-        """Add what a layer says to a pointer, times ``share`` (``None``: 1); one of pointers takes its place instead."""
+        """Add what a layer says to a pointer, times ``share`` (``None``: 1); pointers take its place."""
         found = array(self._place(array, u, v), active)
         if self.form.is_pointer(layer):
             for k, value in enumerate(found):
