@@ -42,7 +42,7 @@ class Texture(Task):
 
     name = "texture"
     title = "a texture or the maps of a material at every level of detail"
-    section = "supplemental, Neural Texture sampling"
+    section = "supplemental 1.4"
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
     arguments = (
