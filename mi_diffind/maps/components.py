@@ -16,6 +16,8 @@ def borders(values: np.ndarray) -> tuple[str, str]:
     row follows its last as a row follows the next.
     """
     found = []
+    if not values.size:
+        return ("repeat", "repeat")
     for axis in (0, 1):
         inside = np.abs(np.diff(values, axis=axis)).mean() if values.shape[axis] > 1 else 0.0
         first, last = np.take(values, 0, axis), np.take(values, -1, axis)

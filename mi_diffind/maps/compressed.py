@@ -9,6 +9,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from .. import lookup
 from .layout import Layout
 from .source import Source
 
@@ -49,8 +50,11 @@ class CompressedMaps:
         The maps as images, float32, ``(height, width, channels)``, in the color space of each: their values at texel
         centres of an image of that size (default: the source's).
         """
+        return self._decoded(self.stored, names, width or self.layout.width, height or self.layout.height)
+
+    def _decoded(self, stored, names: Sequence[str] | None, width: int, height: int) -> dict[str, np.ndarray]:
+        """:meth:`decode` of what the function ``stored`` says at (u, v)."""
         layout = self.layout
-        width, height = width or layout.width, height or layout.height
         names = tuple(names or layout.names)
         found = {name: np.empty((height * width, layout[name].channels), np.float32) for name in names}
         types = self.types
@@ -62,7 +66,7 @@ class CompressedMaps:
                 index = dr.arange(types.UInt32, count) + dr.opaque(types.UInt32, start)
                 u = (types.Float(index % width) + 0.5) / width
                 v = (types.Float(index // width) + 0.5) / height
-                values = self.read(u, v, names)
+                values = self.maps(stored(u, v), names)
             for name, channels in values.items():
                 for c, value in enumerate(channels):
                     found[name][start : start + count, c] = value if isinstance(value, float) else value.numpy()
@@ -113,6 +117,40 @@ class CompressedMaps:
                 total += float(np.mean((layout.encode(got) - expected) ** 2, dtype=np.float64))
                 channels += 1
         return total / channels
+
+
+class FilteredMaps(CompressedMaps):
+    """
+    Maps that can be read at any level of detail; the base class. There are ``levels``, each half as large as the one
+    before it: level 0 is the source, ``levels - 1`` one texel.
+    """
+
+    levels: int
+
+    def filtered(self, u, v, level, active=True) -> list:
+        """
+        The stored channels at (u, v) in [0, 1]² and the level of detail ``level``, a real number for each place: linear
+        between levels. Numbers beyond the levels mean the nearest, NaN means 0.
+        """
+        raise NotImplementedError
+
+    def clamped(self, level, Float):
+        """A level of detail within those that there are, as an array."""
+        return lookup.clamp(Float(level), 0.0, float(self.levels - 1))
+
+    def level_size(self, level: int) -> tuple[int, int]:
+        """Rows and columns of a level."""
+        return max(1, self.layout.height >> level), max(1, self.layout.width >> level)
+
+    def decode(
+        self, names: Sequence[str] | None = None, width: int = 0, height: int = 0, level: float = 0
+    ) -> dict[str, np.ndarray]:
+        """
+        The maps as images, as in the base class, at a level of detail; their size is by default that of the level.
+        """
+        rows, columns = self.level_size(int(level))
+        stored = self.stored if level == 0 else lambda u, v: self.filtered(u, v, dr.opaque(type(u), level))
+        return self._decoded(stored, names, width or columns, height or rows)
 
 
 def taps(x: np.ndarray, n: int, border: str) -> list:

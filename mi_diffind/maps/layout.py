@@ -82,29 +82,36 @@ class Layout:
     groups: tuple[str, ...]
 
     @staticmethod
-    def of(source: Source, once: bool = True, two_channel_normals: bool | None = None) -> Layout:
+    def of(
+        source: Source, once: bool = True, two_channel_normals: bool | None = None, filtered: bool = False
+    ) -> Layout:
         """
         The layout of ``source``. ``once``: equal channels are stored once, constant ones as a number.
         ``two_channel_normals``: leave out the third component of normal maps; ``None``: where it follows from the other
-        two to :data:`NORMAL_FLOOR_DB`.
+        two to :data:`NORMAL_FLOOR_DB`. ``filtered``: channels have to be equal, or constant, at every level of detail
+        (:mod:`.pyramid`), so only those are stored once that are averaged alike.
         """
-        maps, stored, initial, groups = [], [], [], []
+        maps, stored, initial, groups, averaged = [], [], [], [], []
         for m in source.maps:
             shell = _range(m)
             where = []
+            vectors = filtered and m.kind == "normal" and m.channels == 3
+            keep = vectors and not all(m.values[..., c].min() == m.values[..., c].max() for c in range(3))
+            kind = (m.color_space, shell.knee, shell.low, shell.high, m.name if vectors else "") if filtered else ()
             for c in range(m.values.shape[-1]):
                 values = shell.encode(m.values[..., c])
                 low = float(values.min())
-                if once and low == values.max():
+                if once and low == values.max() and not keep:
                     where.append(("constant", float(m.values[0, 0, c])))
                     continue
                 if c == 2 and _drops_z(m, where, two_channel_normals):
                     where.append(FROM_NORMAL)
                     continue
-                same = [i for i, v in enumerate(stored) if once and np.array_equal(v, values)]
+                same = [i for i, v in enumerate(stored) if once and averaged[i] == kind and np.array_equal(v, values)]
                 if not same:
                     same = [len(stored)]
                     stored.append(values)
+                    averaged.append(kind)
                     initial.append(_initial(m.kind, c))
                     groups.append(m.name)
                 where.append(same[0])

@@ -1,0 +1,244 @@
+"""
+The maps of a material at every level of detail, as graphics hardware filters them: a mip pyramid, read trilinearly.
+
+- **Levels.** Level 0 is the source; each further one has max(1, n // 2) of the n texels along each axis, down to one
+  texel. A texel is the mean of the rectangle that it covers: of two by two texels of the level below, and along an axis
+  with an odd number of them of three, of which the outer two count in part (the "polyphase" box).
+- **What is averaged.** Colours that are sRGB-encoded: their linear values, encoded again. High dynamic range: the
+  values, not the logarithms that stand for them. Normals: the mean of the vectors, brought to the length that the
+  vectors have on average, so that unit vectors stay unit vectors (a layout that leaves out the third component relies
+  on that) and others keep theirs; it is always the mean of all texels of level 0 that is brought to a length, not one
+  of vectors that were already. Everything else: plain means.
+- **Between texels and levels** what hardware interpolates is interpolated: linear values of what is sRGB, everything
+  else as it is stored; bilinearly in two levels, linearly between them. The result is encoded again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from .. import lookup, metrics
+from . import components
+from .compressed import FilteredMaps
+from .layout import Layout, MapLayout
+from .source import Source
+
+
+def level_sizes(height: int, width: int) -> list[tuple[int, int]]:
+    """Rows and columns of all levels of an image, down to a single texel."""
+    count = max(height, width).bit_length()
+    return [(max(1, height >> level), max(1, width >> level)) for level in range(count)]
+
+
+def halved(values: np.ndarray) -> np.ndarray:
+    """The next level of ``values``, ``(height, width, k)``: means of what its texels cover."""
+    for axis in (0, 1):
+        n = values.shape[axis]
+        if n == 1:
+            continue
+        half, rest = n // 2, values.swapaxes(0, axis)
+        if n % 2 == 0:
+            rest = 0.5 * (rest[0::2] + rest[1::2])
+        else:
+            i = np.arange(half, dtype=values.dtype).reshape(-1, *[1] * (values.ndim - 1))
+            rest = ((half - i) * rest[0:-1:2] + half * rest[1::2] + (i + 1) * rest[2::2]) / n
+        values = rest.swapaxes(0, axis)
+    return values
+
+
+class Pyramid(FilteredMaps):
+    """
+    The truth: all levels of the stored channels of a ``layout``, uncompressed. ``values`` are the levels, float32,
+    ``(height, width, stored)``, each channel in [0, 1] as :meth:`.Layout.encode` has it.
+    """
+
+    def __init__(self, layout: Layout, values: Sequence[np.ndarray], types: ModuleType | None, border):
+        self.layout, self.types, self.border = layout, types, tuple(border)
+        self.values = [np.asarray(level, np.float32) for level in values]
+        sizes = level_sizes(layout.height, layout.width)
+        expected = [(*size, layout.stored) for size in sizes]
+        if [level.shape for level in self.values] != expected:
+            raise ValueError(f"levels: found {[level.shape for level in self.values]}, expected {expected}")
+        self._owners = [_owner(layout, channel) for channel in range(layout.stored)]
+        if types is None or not layout.stored:
+            return
+        offsets = np.cumsum([0] + [rows * columns for rows, columns in sizes])
+        padded = np.zeros((int(offsets[-1]), lookup.padded_channels(layout.stored)), np.float32)
+        for level, start, end in zip(self.values, offsets, offsets[1:], strict=False):
+            flat = level.reshape(-1, layout.stored)
+            for channel, owner in enumerate(self._owners):
+                padded[start:end, channel] = _interpolated(flat[:, channel], owner)
+        self._padded = padded.shape[-1]
+        self._texels, self._offsets = types.TensorXf(padded).array, types.UInt32(offsets[:-1].astype(np.uint32))
+
+    @staticmethod
+    def of(source: Source, layout: Layout | None = None, types: ModuleType | None = None, border=None) -> Pyramid:
+        """
+        The pyramid of a source. ``layout`` (default: ``Layout.of(source, filtered=True)``) may be any of this source;
+        where one stored channel serves two maps that are averaged differently, it is averaged as in the first.
+        ``border`` along v and u is found out unless given.
+        """
+        layout = layout or Layout.of(source, filtered=True)
+        sizes = level_sizes(source.height, source.width)
+        values = [np.zeros((*size, layout.stored), np.float32) for size in sizes]
+        values[0] = layout.encode(source)
+        for m, own in zip(source.maps, layout.maps, strict=True):
+            channels = [(c, w) for c, w in enumerate(own.where) if isinstance(w, int) and _owner(layout, w) is own]
+            if not channels:
+                continue
+            vectors = m.kind == "normal" and m.channels == 3
+            signed = m.values.min() < 0
+            if vectors:
+                level = m.values if signed else 2 * m.values - 1
+                level = np.concatenate([level, np.linalg.norm(level, axis=-1, keepdims=True)], axis=-1)
+            else:
+                level = metrics.linear(m.values) if m.color_space == "srgb" else m.values
+                level = level.astype(np.float32)
+            for found in values[1:]:
+                level = halved(level)
+                if vectors:
+                    length = np.linalg.norm(level[..., :3], axis=-1, keepdims=True)
+                    mean = np.where(length > 1e-6, level[..., :3] / np.maximum(length, 1e-6), [0, 0, 1])
+                    mean = mean * level[..., 3:]
+                    mean = mean if signed else 0.5 + 0.5 * mean
+                else:
+                    mean = srgb(level) if m.color_space == "srgb" else level
+                for c, where in channels:
+                    found[..., where] = own.encode(mean[..., c])
+        border = border or components.borders(values[0])
+        return Pyramid(layout, values, types, border)
+
+    @staticmethod
+    def from_levels(layout: Layout, levels: Sequence[np.ndarray], types, border) -> Pyramid:
+        """
+        The pyramid of levels that are given, such as those that a codec decoded: ``(height, width, stored)``, encoded
+        as :meth:`.Layout.encode` has them. Raises ``ValueError`` for other shapes.
+        """
+        return Pyramid(layout, levels, types, border)
+
+    @property
+    def levels(self) -> int:
+        return len(self.values)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all levels of the maps, uncompressed, each channel at its depth in the source."""
+        depth = sum(m.channels * m.depth for m in self.layout.maps)
+        return depth * sum(rows * columns for rows, columns, _ in (level.shape for level in self.values))
+
+    # -- reading ----------------------------------------------------------------------------------------------------
+
+    def stored(self, u, v, active=True) -> list:
+        """The stored channels at (u, v) in level 0, bilinear."""
+        if not self.layout.stored:
+            return []
+        return self._encoded(self._bilinear(u, v, type(u)(0), active))
+
+    def filtered(self, u, v, level, active=True) -> list:
+        """The stored channels at (u, v) and a level of detail, trilinear."""
+        if not self.layout.stored:
+            return []
+        level = self.clamped(level, type(u))
+        lower = dr.floor(level)
+        weight = level - dr.detach(lower)
+        below = self._bilinear(u, v, lower, active)
+        above = self._bilinear(u, v, dr.minimum(lower + 1, self.levels - 1), active)
+        return self._encoded([dr.fma(weight, b - a, a) for a, b in zip(below, above, strict=True)])
+
+    def texels(self, index) -> list:
+        """
+        The stored channels of texels, at the ``index`` of each in a list of all, level by level and row by row; what
+        a bilinear read finds exactly there.
+        """
+        return self._encoded(self._fetch(index, True))
+
+    def _bilinear(self, u, v, level, active) -> list:
+        """What is interpolated, in one level (a whole number) for each place."""
+        UInt32 = dr.uint32_array_t(type(u))
+        level = UInt32(level)
+        corners = []
+        for x, n, border in ((v, self.layout.height, self.border[0]), (u, self.layout.width, self.border[1])):
+            corners.append(_around(x, dr.maximum(UInt32(n) >> level, 1), border))
+        columns = dr.maximum(UInt32(self.layout.width) >> level, 1)
+        offset = dr.gather(UInt32, self._offsets, level, active)
+        total = None
+        for row, a in corners[0]:
+            for column, b in corners[1]:
+                found = self._fetch(offset + row * columns + column, active)
+                weight = a * b
+                total = (
+                    [weight * f for f in found]
+                    if total is None
+                    else [dr.fma(weight, f, t) for f, t in zip(found, total, strict=True)]
+                )
+        return total
+
+    def _fetch(self, index, active) -> list:
+        types, width = self.types, self._padded
+        if width <= 2:
+            found = [dr.gather(types.Float, self._texels, index * width + i, active) for i in range(width)]
+        else:
+            groups = width // 4
+            found = []
+            for group in range(groups):
+                found += list(dr.gather(types.Array4f, self._texels, index * groups + group, active))
+        return found[: self.layout.stored]
+
+    def _encoded(self, values: list) -> list:
+        """The stored channels in [0, 1], from what was interpolated."""
+        found = []
+        for value, owner in zip(values, self._owners, strict=True):
+            if owner.color_space == "srgb":
+                value = _srgb(value)
+            if owner.knee > 0:
+                scale = 1 / np.log2(1 + owner.high / owner.knee)
+                value = dr.log2(1 + dr.maximum(value, 0) / owner.knee) * float(scale)
+            elif owner.color_space == "srgb" and (owner.low, owner.high) != (0, 1):
+                value = (value - owner.low) / (owner.high - owner.low)
+            found.append(value)
+        return found
+
+
+def srgb(values: np.ndarray) -> np.ndarray:
+    """Linear values with the sRGB transfer function, beyond [0, 1], too: the inverse of ``metrics.linear``."""
+    root = np.power(np.maximum(values, 0.0031308), 1 / 2.4)
+    return np.where(values <= 0.0031308, 12.92 * values, 1.055 * root - 0.055)
+
+
+def _srgb(value):
+    """The same of Dr.Jit's arrays."""
+    root = dr.power(dr.maximum(value, 0.0031308), 1 / 2.4)
+    return dr.select(value <= 0.0031308, 12.92 * value, dr.fma(1.055, root, -0.055))
+
+
+def _owner(layout: Layout, channel: int) -> MapLayout:
+    """The first map that a stored channel serves."""
+    return next(m for m in layout.maps if channel in m.where)
+
+
+def _interpolated(stored: np.ndarray, owner: MapLayout) -> np.ndarray:
+    """What hardware would interpolate in place of a stored channel."""
+    if owner.color_space == "srgb":
+        return metrics.linear(owner.decode(stored))
+    return owner.decode(stored) if owner.knee > 0 else stored
+
+
+def _around(x, n, border: str) -> list:
+    """The two texels around ``x`` in [0, 1] of ``n`` along an axis, which may differ by lane, and their weights."""
+    Float, Int32 = type(x), dr.int32_array_t(type(x))
+    size = Float(n)
+    x = lookup.clamp(x - dr.floor(x), 0.0, 1.0) if border == "repeat" else lookup.clamp(x, 0.0, 1.0)
+    position = dr.fma(x, size, -0.5)
+    lower = dr.floor(position)
+    weight = position - dr.detach(lower)
+    lower, n = Int32(lower), Int32(n)
+    if border == "repeat":
+        both = [dr.select(lower < 0, n - 1, lower), dr.select(lower + 1 >= n, 0, lower + 1)]
+    else:
+        both = [dr.clip(lower, 0, n - 1), dr.clip(lower + 1, 0, n - 1)]
+    UInt32 = dr.uint32_array_t(Float)
+    return [(UInt32(both[0]), 1 - weight), (UInt32(both[1]), weight)]
