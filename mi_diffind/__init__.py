@@ -30,6 +30,7 @@ _NAMES = {
     "load_table": "tables",
     "save_table": "tables",
     "fit": "tasks.task",
+    "load_file": "scenes",
     "load_model": "tasks.task",
 }
 

@@ -20,11 +20,12 @@ from . import compat, plugins
 from .errors import DiffindError
 from .files import replacing
 from .measure.operations import bsdf_operations
+from .plugins.support import footprint
 from .tasks.task import tasks
 
 #: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
 MAX_DEPTHS = {
-    **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer"), -1),
+    **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer", "path_footprint"), -1),
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
 }
 
@@ -41,8 +42,8 @@ def load(
     against: str = "exact",
 ):
     """
-    Load a scene as ``mi.load_file`` does; with ``exact``, every learned plugin is replaced by its exact counterpart, or
-    by the one that ``against`` names (:func:`swap`).
+    Load a scene as :func:`load_file` does; with ``exact``, every learned plugin is replaced by its exact counterpart,
+    or by the one that ``against`` names (:func:`swap`).
 
     ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
     infinite), and ``defines`` (name → value) the scene's ``<default>`` values. Raises :class:`SceneError`.
@@ -56,7 +57,21 @@ def load(
         loaded = compat.instantiate(config, state)
         if not isinstance(loaded, mi.Scene):
             raise RuntimeError(f"{path}: holds a {type(loaded).__name__}, a scene is expected")
+        footprint.attach(loaded)
         return loaded
+
+
+def load_file(path: str | os.PathLike, **defines):
+    """
+    Load a scene file as ``mi.load_file`` does, which this calls, with ``defines`` for its ``<default>`` values (and
+    ``optimize`` and ``parallel``, which are Mitsuba's own); and tell textures that filter themselves which sensor sees
+    them, the first one of the scene, at the samples of its sampler: ``mi.load_file`` itself does not
+    (:func:`.plugins.support.footprint.attach`). Raises what ``mi.load_file`` raises.
+    """
+    loaded = mi.load_file(str(path), **defines)
+    if isinstance(loaded, mi.Scene):
+        footprint.attach(loaded)
+    return loaded
 
 
 def swap(state, against: str = "exact") -> int:

@@ -1,0 +1,314 @@
+"""
+The footprint of a pixel where a ray hits a surface: two full conjugate diameters of an ellipse in the surface's uv,
+``ddx`` and ``ddy`` (``mi.Vector2f``), the columns of what the next Mitsuba calls ``si.footprint``. :func:`area`,
+|det|, is |ddx(uv) × ddy(uv)| of Datta et al., *Efficient Graphics Representation with Differentiable Indirection*,
+SIGGRAPH Asia 2023, task 4.
+
+A texture gets to see the hit alone. Where no integrator says how large the pixel is there, a :class:`Cone` of the
+sensor does, which :func:`attach` hands to all textures of a scene that have a method ``set_cone(cone)``.
+
+Functions here neither evaluate nor differentiate: footprints are detached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Components of a footprint are limited to ± this, in uv: beyond any texture, and its fourth power is finite.
+LARGEST = 2.0**20
+
+#: Of a surface whose dp_du and dp_dv enclose an angle with a sine below this, uv says nothing.
+PARALLEL = 1e-6
+
+#: Sensors whose pixels are known, by what their rays do.
+KINDS = ("perspective", "thinlens", "orthographic")
+
+#: A ray deviates by less from the line to the sensor if it comes from there, rad: a normal map's frame is not exact.
+STRAIGHT = 2e-2
+
+
+@dataclass(eq=False)  # which is where functions that are frozen look for arrays
+class Cone:
+    """
+    What a texture has to know of a sensor, in world space, as opaque arrays: another sensor compiles nothing anew.
+
+    ``origin``, of a perspective its centre, of a thin lens the centre of the lens. ``axis``, the unit vector of
+    viewing. ``dx``, ``dy``: what a step of one pixel to the right, or down, adds to the place that is seen: at depth
+    1 along the axis, or of an orthographic sensor at any. ``scale``, by which the footprint of a sample is smaller than
+    that of a pixel (:func:`scale_of`). ``reach``: of all pixels the least √(cos³) of the angle to the axis, 1 if
+    orthographic. ``lens``, the radius of the lens, 0 without. ``kind``, one of :data:`KINDS`.
+    """
+
+    kind: str
+    origin: mi.Point3f
+    axis: mi.Vector3f
+    dx: mi.Vector3f
+    dy: mi.Vector3f
+    scale: mi.Float
+    reach: mi.Float
+    lens: mi.Float
+
+    @classmethod
+    def of(cls, sensor: mi.Sensor, spp: int | None = None) -> Cone:
+        """
+        Of a loaded sensor, at ``spp`` samples a pixel (default: its sampler's). It is told by its rays: all through one
+        point or one lens, or all parallel, and pixels that are parallelograms. Raises ``RuntimeError`` for others
+        (``distant``, ``irradiancemeter``, ``radiancemeter``, ``batch``, …).
+        """
+        film, to_world = sensor.film(), np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+        places = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5], [0.5, 0.5]])
+        lens = np.array([[0.5, 0.5]] * 5 + [[1, 0.5]])
+        with dr.suspend_grad():
+            ray, _ = sensor.sample_ray(
+                sensor.shutter_open(), 0.5, mi.Point2f(places.T.tolist()), mi.Point2f(lens.T.tolist())
+            )
+            o, d = (np.array(v, np.float64).T * np.ones((len(places), 1)) for v in (ray.o, ray.d))
+        origin, axis = to_world[:3, 3], to_world[:3, 2] / (np.linalg.norm(to_world[:3, 2]) or 1)
+        cosine = d @ axis
+        size = np.array(film.crop_size(), np.float64)
+
+        radius = 0.0
+        if np.abs(d - d[0]).max() < 1e-6:
+            kind, seen, origin = "orthographic", o, o[4]
+        elif (cosine > 0).all():
+            kind, seen = "perspective", d / np.maximum(cosine, 1e-9)[:, None]
+            if sensor.needs_aperture_sample():
+                kind = "thinlens"
+                on_lens = o[5] - seen[5] * ((o[5] - origin) @ axis)  # rays start at the near clipping plane
+                radius = float(np.linalg.norm(on_lens - origin))
+            away = np.cross(o[:5] - origin, d[:5])
+            if np.abs(away).max() > 1e-4 * (1 + np.abs(origin).max()):
+                kind = ""
+        else:
+            kind = ""
+        if kind:
+            dx, dy = seen[1] - seen[0], seen[2] - seen[0]
+            error = max(np.abs(seen[0] + dx + dy - seen[3]).max(), np.abs(seen[0] + (dx + dy) / 2 - seen[4]).max())
+            span = max(np.abs(dx).max(), np.abs(dy).max())
+        if not kind or span == 0 or error > 1e-2 * span:
+            raise RuntimeError(
+                f'the sensor "{sensor.id()}" ({sensor.class_name()}) has no pixels whose footprint is known, supported '
+                f"are {', '.join(KINDS)}"
+            )
+        spp = sensor.sampler().sample_count() if spp is None else spp
+        reach = 1.0 if kind == "orthographic" else float((cosine[:4] ** 1.5).min())
+        return cls._opaque(kind, origin, axis, dx / size[0], dy / size[1], spp, reach, radius)
+
+    @classmethod
+    def from_properties(cls, props: mi.Properties) -> Cone | None:
+        """
+        Of a perspective, from a texture's properties ``sensor_to_world`` (a transformation without scale), ``fov`` (in
+        degrees, along x), ``resolution`` (pixels along x, which are square) and ``spp`` (default 1): for plain Mitsuba,
+        where nobody calls :func:`attach`. ``None`` if none of them is given. Raises ``RuntimeError``.
+        """
+        names = ("sensor_to_world", "fov", "resolution", "spp")
+        given = [name for name in names if name in props]
+        if not given:
+            return None
+        for name in names[:3]:
+            if name not in given:
+                raise RuntimeError(f'parameter "{name}": not given, it is needed beside "{given[0]}"')
+        to_world = props["sensor_to_world"]
+        matrix = np.array(getattr(to_world, "matrix", np.nan), np.float64)
+        if matrix.shape != (4, 4) or not np.allclose(matrix[:3, :3].T @ matrix[:3, :3], np.eye(3), atol=1e-3):
+            raise RuntimeError(
+                'parameter "sensor_to_world": found a scale, or no transformation, allowed are rotation and translation'
+            )
+        fov, resolution, spp = (_number(props, name, 1.0) for name in names[1:])
+        for name, value, low, high in (("fov", fov, 0, 180), ("resolution", resolution, 0, 1e9), ("spp", spp, 0, 1e9)):
+            if not low < value < high:  # NaN, too
+                raise RuntimeError(f'parameter "{name}": found {value:g}, allowed is more than {low}, below {high:g}')
+        half = np.tan(np.radians(fov) / 2)
+        step, reach = 2 * half / resolution, (1 + 2 * half**2) ** -0.75
+        right, down, axis, origin = (matrix[:3, i] for i in range(4))
+        return cls._opaque("perspective", origin, axis, -step * right, -step * down, spp, reach, 0.0)
+
+    @classmethod
+    def _opaque(cls, kind, origin, axis, dx, dy, spp, reach, lens) -> Cone:
+        vectors = (dr.opaque(mi.Vector3f, [float(x) for x in v]) for v in (axis, dx, dy))
+        numbers = (dr.opaque(mi.Float, float(x)) for x in (scale_of(spp), reach, lens))
+        return cls(kind, dr.opaque(mi.Point3f, [float(x) for x in origin]), *vectors, *numbers)
+
+    @property
+    def spread(self) -> mi.Float:
+        """
+        How wide a pixel is, along x: at depth 1, which is 2·tan(fov/2)/pixels, or anywhere if orthographic. Of a pixel,
+        not a sample.
+        """
+        return dr.norm(self.dx)
+
+    def differentials(self, ray: mi.Ray3f) -> tuple:
+        """
+        Of a ray of the sensor, what a step of one sample's width (``scale``) in x or y adds to its origin and to its
+        direction: ``dox, ddx, doy, ddy``, all ``mi.Vector3f``.
+        """
+        steps = (self.dx * self.scale, self.dy * self.scale)
+        if self.kind == "orthographic":
+            return steps[0], mi.Vector3f(0), steps[1], mi.Vector3f(0)
+        cosine = dr.dot(ray.d, self.axis)
+        depth = dr.dot(ray.o - self.origin, self.axis)  # rays start at the near clipping plane
+        turned = [cosine * (s - ray.d * dr.dot(ray.d, s)) for s in steps]
+        moved = [depth * s for s in steps]
+        return moved[0], turned[0], moved[1], turned[1]
+
+
+def scale_of(spp: float) -> float:
+    """The width of a sample's footprint relative to the pixel's: max(1/8, 1/√spp), as in pbrt-v4; 1 for one sample."""
+    return float(max(1 / 8, 1 / np.sqrt(max(spp, 1))))
+
+
+def _number(props: mi.Properties, name: str, default: float) -> float:
+    try:
+        return float(props.get(name, default))
+    except (TypeError, ValueError):
+        raise RuntimeError(f'parameter "{name}": found {props[name]}, a number is needed') from None
+
+
+# -- at a hit ----------------------------------------------------------------------------------------------------------
+
+
+def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi.Vector2f, mi.Vector2f]:
+    """
+    The footprint at a hit: ``ddx, ddy`` in the surface's uv, before any ``to_uv``.
+
+    It is taken from the first of these that knows: ``si.footprint``, which the next Mitsuba has; the partials
+    ``si.duv_dx`` and ``si.duv_dy``, if an integrator filled them; the ``cone`` (:func:`seen_by`). Lane by lane, one
+    that is zero or not finite hands over to the next. If none knows, what is infinite is limited to :data:`LARGEST`,
+    NaN is 0, and no source at all is 0: the sharpest. What is returned is finite, always.
+    """
+    sources = []
+    if hasattr(si, "footprint"):
+        m = si.footprint
+        sources.append((mi.Vector2f(m[0, 0], m[1, 0]), mi.Vector2f(m[0, 1], m[1, 1])))
+    sources.append((si.duv_dx, si.duv_dy))
+    ddx, ddy = (mi.Vector2f(0), mi.Vector2f(0)) if cone is None else seen_by(cone, si)
+    for x, y in reversed(sources):
+        x, y = dr.detach(x), dr.detach(y)
+        size = _size(x, y)
+        known = (size > 0) & (size < dr.inf)  # NaN: false
+        known |= _size(ddx, ddy) == 0
+        ddx, ddy = dr.select(known, _finite(x), ddx), dr.select(known, _finite(y), ddy)
+    return ddx, ddy
+
+
+def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Vector2f]:
+    """
+    The footprint of a sample of a sensor, from its place alone: the steps of a pixel, projected along the line of sight
+    onto the plane of dp_du and dp_dv. With t the distance, z the cosine of the line to the sensor's axis, θ its angle
+    to the normal, the area is (spread · t)² z³ / (|dp_du × dp_dv| cos θ), exactly.
+
+    A hit that is not seen directly, since ``si.wi`` points elsewhere than to the sensor, is taken as a piece of surface
+    that faces the sensor at the film's corner, from this distance: as pbrt-v4's ``Camera::Approximate_dp_dxy``, but
+    never oblique. The way by flat mirrors is longer and rough bounces widen: never blurrier than the truth but after
+    hollow mirrors and lenses. Where dp_du and dp_dv are parallel or zero: zero.
+    """
+    p, du, dv = dr.detach(si.p), dr.detach(si.dp_du), dr.detach(si.dp_dv)
+    normal = dr.cross(du, dv)
+    size2 = dr.squared_norm(normal)
+    defined = size2 > PARALLEL**2 * dr.squared_norm(du) * dr.squared_norm(dv)  # NaN and underflow: false
+    unit = normal * dr.rsqrt(size2)
+    if cone.kind == "orthographic":
+        to, distance, depth = cone.axis, mi.Float(1), mi.Float(1)
+        tolerance = mi.Float(STRAIGHT)
+    else:
+        to = p - cone.origin
+        distance, depth = dr.norm(to), dr.dot(to, cone.axis)
+        to = to * dr.rcp(distance)
+        tolerance = STRAIGHT + cone.lens * dr.rcp(distance)
+    # A material with two sides may have reflected si.wi at the surface: the sign of z says nothing
+    local, wi = dr.detach(si.sh_frame).to_local(to), dr.detach(si.wi)
+    away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
+    direct = (dr.squared_norm(away) < dr.square(tolerance)) & (depth > 0)
+
+    along = dr.select(direct, to, unit)
+    frame = mi.Frame3f(unit)
+    facing = distance * cone.reach * cone.scale * cone.spread
+    x = dr.select(direct, depth * cone.scale * cone.dx, facing * frame.s)
+    y = dr.select(direct, depth * cone.scale * cone.dy, facing * frame.t)
+    # x + λ·along = u·dp_du + v·dp_dv, by Cramer's rule
+    volume = dr.dot(normal, along)
+    inverse = dr.rcp(dr.select(dr.abs(volume) < 1e-30, 1e-30, volume))
+    to_u, to_v = dr.cross(dv, along), dr.cross(along, du)
+    ddx = mi.Vector2f(dr.dot(x, to_u), dr.dot(x, to_v)) * inverse
+    ddy = mi.Vector2f(dr.dot(y, to_u), dr.dot(y, to_v)) * inverse
+    return dr.select(defined, _finite(ddx), 0), dr.select(defined, _finite(ddy), 0)
+
+
+def _size(ddx, ddy):
+    """The largest component of both, infinite or NaN if one is."""
+    return dr.maximum(dr.maximum(dr.abs(ddx.x), dr.abs(ddx.y)), dr.maximum(dr.abs(ddy.x), dr.abs(ddy.y)))
+
+
+def _finite(v: mi.Vector2f) -> mi.Vector2f:
+    """Limited to ± :data:`LARGEST`; NaN is 0."""
+    return dr.select(dr.isnan(v), 0, dr.clip(v, -LARGEST, LARGEST))
+
+
+# -- what it means -----------------------------------------------------------------------------------------------------
+
+
+def transformed(ddx: mi.Vector2f, ddy: mi.Vector2f, matrix) -> tuple[mi.Vector2f, mi.Vector2f]:
+    """A footprint in uv that went through ``to_uv``, whose ``matrix``, 3 × 3, is given as a list of its rows."""
+    (a, b), (c, d) = (tuple(row)[:2] for row in tuple(matrix)[:2])
+    return tuple(mi.Vector2f(dr.fma(a, v.x, b * v.y), dr.fma(c, v.x, d * v.y)) for v in (ddx, ddy))
+
+
+def area(ddx: mi.Vector2f, ddy: mi.Vector2f) -> mi.Float:
+    """|det|, in uv²: of the parallelogram, 4/π times that of the ellipse. Its root is the side of a square pixel."""
+    ddx, ddy = _finite(ddx), _finite(ddy)
+    return dr.abs(ddx.x * ddy.y - ddx.y * ddy.x)
+
+
+def axes(ddx: mi.Vector2f, ddy: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Vector2f]:
+    """
+    Of the ellipse with these conjugate diameters: the length of its major and of its minor axis in uv, both full and
+    ≥ 0, and the unit vector of the major one, (1, 0) for a circle. Finite, always; major · minor is :func:`area`.
+    """
+    ddx, ddy = _finite(ddx), _finite(ddy)
+    p, r = dr.fma(ddx.x, ddx.x, dr.square(ddy.x)), dr.fma(ddx.y, ddx.y, dr.square(ddy.y))
+    q = dr.fma(ddx.x, ddx.y, ddy.x * ddy.y)
+    half = 0.5 * (p - r)
+    root = dr.sqrt(dr.fma(half, half, q * q))
+    major = dr.sqrt(0.5 * (p + r) + root)
+    minor = dr.select(major > 0, dr.minimum(area(ddx, ddy) / major, major), 0)
+    wide = half >= 0
+    x, y = dr.select(wide, half + root, q), dr.select(wide, q, root - half)
+    length2 = dr.fma(x, x, y * y)
+    found = length2 > 0
+    inverse = dr.rsqrt(dr.select(found, length2, 1))
+    return major, minor, mi.Vector2f(dr.select(found, x * inverse, 1), dr.select(found, y * inverse, 0))
+
+
+# -- scenes ------------------------------------------------------------------------------------------------------------
+
+
+def textures(scene: mi.Scene) -> list:
+    """The textures of a loaded scene that ask for a sensor: they have a method ``set_cone(cone)``; each once."""
+    return list({id(node): node for node in mi.traverse(scene).hierarchy if hasattr(node, "set_cone")}.values())
+
+
+def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None) -> int:
+    """
+    Tell the textures of a loaded scene that ask for it (:func:`textures`) which sensor sees them, at ``spp`` samples a
+    pixel (default: its sampler's); returns how many there are. To be called again after the sensor moved, for another
+    one, or for other samples. A scene without sensors, or one whose pixels are not known (:meth:`Cone.of`), which is
+    warned of, tells them that there is none.
+    """
+    found = textures(scene)
+    if not found:
+        return 0
+    cone = None
+    try:
+        if not isinstance(sensor, int):
+            cone = Cone.of(sensor, spp)
+        elif scene.sensors():
+            cone = Cone.of(scene.sensors()[sensor], spp)
+    except RuntimeError as e:
+        mi.Log(mi.LogLevel.Warn, f"textures are not filtered: {e}")
+    for texture in found:
+        texture.set_cone(cone)
+    return len(found)
