@@ -231,7 +231,7 @@ class DifferentiableArray(nn.Module):
                 packed = np.pad(packed, (0, 4 + -len(packed) % 4)).view(np.uint32)
             else:
                 packed = lookup.pack(codes, result.border)
-            words = _aligned(packed.shape, np.uint32)
+            words = aligned(packed.shape, np.uint32)
             words[...] = packed
             result.data = UInt32(words)
         else:
@@ -498,13 +498,13 @@ def _tensor(dtype, values: np.ndarray, resolution, channels: int):
     half = dr.is_half_v(dtype)
     dtype = module_of(dtype).TensorXf16 if half else module_of(dtype).TensorXf  # never double, also in such variants
     shape = (*resolution, lookup.padded_channels(channels))
-    stored = _aligned(shape, np.float16 if half else np.float32)
+    stored = aligned(shape, np.float16 if half else np.float32)
     stored[..., :channels] = values
     stored[..., channels:] = 0
     return dtype(stored)
 
 
-def _aligned(shape, dtype) -> np.ndarray:
+def aligned(shape, dtype) -> np.ndarray:
     """
     An uninitialised array that starts at a multiple of 64 bytes. On the CPU, Dr.Jit uses NumPy's memory as it is, and
     from memory that is aligned less it gathers number by number instead of packet by packet: half the speed in single

@@ -22,6 +22,7 @@ import drjit as dr
 import numpy as np
 
 from .. import lookup, metrics
+from ..indirection import aligned
 from . import components
 from .compressed import FilteredMaps
 from .layout import Layout, MapLayout
@@ -64,10 +65,12 @@ class Pyramid(FilteredMaps):
         if [level.shape for level in self.values] != expected:
             raise ValueError(f"levels: found {[level.shape for level in self.values]}, expected {expected}")
         self._owners = [_owner(layout, channel) for channel in range(layout.stored)]
+        self._texels = self._offsets = None
         if types is None or not layout.stored:
             return
         offsets = np.cumsum([0] + [rows * columns for rows, columns in sizes])
-        padded = np.zeros((int(offsets[-1]), lookup.padded_channels(layout.stored)), np.float32)
+        padded = aligned((int(offsets[-1]), lookup.padded_channels(layout.stored)), np.float32)
+        padded[:, layout.stored :] = 0
         for level, start, end in zip(self.values, offsets, offsets[1:], strict=False):
             flat = level.reshape(-1, layout.stored)
             for channel, owner in enumerate(self._owners):
@@ -130,31 +133,58 @@ class Pyramid(FilteredMaps):
         depth = sum(m.channels * m.depth for m in self.layout.maps)
         return depth * sum(rows * columns for rows, columns, _ in (level.shape for level in self.values))
 
+    @property
+    def arrays(self) -> dict:
+        """The Dr.Jit arrays that are read, by name."""
+        return {} if self._texels is None else {"texels": self._texels, "offsets": self._offsets}
+
+    @property
+    def memory_nbytes(self) -> int:
+        """Bytes in memory, in single precision and with padding."""
+        return 4 * sum(map(dr.width, self.arrays.values()))
+
+    def is_linear(self, name: str) -> bool:
+        """Is what is interpolated of a map, sRGB-encoded in its source, the linear values of its channels?"""
+        m = self.layout[name]
+        channels = [self._owners[w] for w in m.where if isinstance(w, int)]
+        return all((o.color_space, o.low, o.high, o.knee) == ("srgb", 0, 1, 0) for o in (m, *channels))
+
     # -- reading ----------------------------------------------------------------------------------------------------
 
     def stored(self, u, v, active=True) -> list:
         """The stored channels at (u, v) in level 0, bilinear."""
         if not self.layout.stored:
             return []
-        return self._encoded(self._bilinear(u, v, type(u)(0), active))
+        return self.encoded(self.interpolated(u, v, type(u)(0), active, whole=True))
 
     def filtered(self, u, v, level, active=True) -> list:
         """The stored channels at (u, v) and a level of detail, trilinear."""
         if not self.layout.stored:
             return []
+        return self.encoded(self.interpolated(u, v, level, active))
+
+    def interpolated(self, u, v, level, active=True, whole: bool = False) -> list:
+        """
+        What is interpolated in place of the stored channels, and can be averaged further: linear values of what is
+        sRGB or of high dynamic range. ``whole``: levels are whole numbers, which is half of the reads.
+        """
+        if not self.layout.stored:
+            return []
         level = self.clamped(level, type(u))
+        if whole:
+            return self._bilinear(u, v, level, active)
         lower = dr.floor(level)
         weight = level - dr.detach(lower)
         below = self._bilinear(u, v, lower, active)
         above = self._bilinear(u, v, dr.minimum(lower + 1, self.levels - 1), active)
-        return self._encoded([dr.fma(weight, b - a, a) for a, b in zip(below, above, strict=True)])
+        return [dr.fma(weight, b - a, a) for a, b in zip(below, above, strict=True)]
 
     def texels(self, index) -> list:
         """
         The stored channels of texels, at the ``index`` of each in a list of all, level by level and row by row; what
         a bilinear read finds exactly there.
         """
-        return self._encoded(self._fetch(index, True))
+        return self.encoded(self._fetch(index, True))
 
     def _bilinear(self, u, v, level, active) -> list:
         """What is interpolated, in one level (a whole number) for each place."""
@@ -188,10 +218,13 @@ class Pyramid(FilteredMaps):
                 found += list(dr.gather(types.Array4f, self._texels, index * groups + group, active))
         return found[: self.layout.stored]
 
-    def _encoded(self, values: list) -> list:
-        """The stored channels in [0, 1], from what was interpolated."""
+    def encoded(self, values: list) -> list:
+        """The stored channels in [0, 1], from what was interpolated (``None`` where a channel is not wanted)."""
         found = []
         for value, owner in zip(values, self._owners, strict=True):
+            if value is None:
+                found.append(None)
+                continue
             if owner.color_space == "srgb":
                 value = _srgb(value)
             if owner.knee > 0:

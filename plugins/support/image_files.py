@@ -1,9 +1,11 @@
-"""Files of compressed images as textures share them, and the originals that they were made from."""
+"""Files of maps as textures share them, and the originals that compressed ones were made from."""
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 import weakref
+from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -11,13 +13,15 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import compat
+from mi_diffind.compat import module_of
+from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.maps.source import SourceError, load_source
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 from mi_diffind.tables import TableError
-from mi_diffind.tasks.image import TASK
-from mi_diffind.tasks.image.compressed import PRIMARIES, CompressedImage
-from mi_diffind.tasks.task import stamp
+from mi_diffind.tasks.task import Task, stamp
 
+from . import properties
 from .tables import exposed
 
 STORAGES = ("uint8", "float32")
@@ -25,23 +29,23 @@ STORAGES = ("uint8", "float32")
 #: Kinds of maps that hold data, not colours.
 DATA_KINDS = ("normal", "roughness", "ao", "metallic")
 
+#: Pyramids that a texture may name: name → :class:`~mi_diffind.maps.pyramid.Pyramid`. (No property can hold one.)
+PYRAMIDS: dict[str, Pyramid] = {}
+
 _cache: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
 _lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
 
 
-class SharedImage:
-    """A file's arrays, the same Dr.Jit variables for all textures that read them, and what else these share."""
+class SharedMaps:
+    """
+    Maps and the arrays that hold them (name → ``DifferentiableArray``), the same Dr.Jit variables for all textures that
+    read them, and what else these share.
+    """
 
-    def __init__(self, image: CompressedImage, preset: str):
-        self.image, self.preset = image, preset
+    def __init__(self, image: CompressedMaps, arrays: dict, preset: str):
+        self.image, self.arrays, self.preset = image, arrays, preset
         self._loaded = self.state()
         self._transforms = {}
-
-    @property
-    def arrays(self) -> dict:
-        """All arrays by name."""
-        net = self.image.net
-        return {} if net is None else {**dict(zip(PRIMARIES, net.primary, strict=False)), "cascaded": net.cascaded}
 
     @property
     def tables(self) -> dict:
@@ -74,19 +78,88 @@ class SharedImage:
             return self._transforms[key]
 
 
-def open_image(path: str | Path, storage: str) -> SharedImage:
+def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
     """
-    The arrays in a file, shared with everybody who has them open, unless they have been changed since. Raises
-    ``TableError``.
+    The maps in a file of a task whose models have an ``image``, shared with everybody who has them open, unless they
+    have been changed since. Raises ``TableError``.
     """
     path = Path(path)
+
+    def load():
+        model = task.model(task.load(path), mi.TensorXf, storage)
+        return SharedMaps(model.image, model.arrays, model.table.preset)
+
+    return shared((task.name, str(path.resolve()), *stamp(path), storage, mi.TensorXf), load)
+
+
+def shared(key: tuple, load: Callable[[], SharedMaps]) -> SharedMaps:
+    """What ``load()`` made for this ``key``, as long as somebody has it and has not changed it."""
     with _lock:
-        key = (str(path.resolve()), *stamp(path), storage, mi.TensorXf)
         found = _cache.get(key)
         if found is None or not found.as_loaded():
-            model = TASK.model(TASK.load(path), mi.TensorXf, storage)
-            found = _cache[key] = SharedImage(model.image, model.table.preset)
+            found = _cache[key] = load()
         return found
+
+
+def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
+    """The maps that the properties ``filename`` and ``storage`` of a texture name, and the path of the file."""
+    path = properties.filename(props)
+    if not path:
+        raise RuntimeError('parameter "filename": not given, a compressed image (.npz) is needed')
+    storage = properties.one_of(props, "storage", STORAGES)
+    props.get("source", "")  # of use to the exact counterpart only
+    try:
+        return open_file(task, path, storage), path
+    except TableError as e:
+        raise RuntimeError(f'parameter "filename": {e}') from None
+
+
+def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps, str]:
+    """
+    The mip pyramid of what the property ``filename`` names, an image or a manifest, of the object ``bitmap``, or that
+    one of :data:`PYRAMIDS` that ``pyramid`` names; and the path of the file, "" without. With ``raw``, nothing is taken
+    for sRGB.
+    """
+    given = [name for name in ("filename", "bitmap", "pyramid") if name in props]
+    if len(given) != 1:
+        found = " and ".join(f'"{name}"' for name in given) or "none"
+        raise RuntimeError(f'parameters "filename", "bitmap" and "pyramid": found {found}, one of them is needed')
+    raw = props.get("raw", False) is True
+    types, border = module_of(mi.TensorXf), ("repeat" if wrap_mode == "repeat" else "clamp",) * 2
+    if given == ["pyramid"]:
+        name = str(props["pyramid"])
+        if name not in PYRAMIDS:
+            known = ", ".join(f'"{n}"' for n in PYRAMIDS) or "none"
+            raise RuntimeError(f'parameter "pyramid": found "{name}", there are {known} (support.image_files.PYRAMIDS)')
+        pyramid = PYRAMIDS[name]
+        if pyramid.types is not types:
+            pyramid = Pyramid.from_levels(pyramid.layout, pyramid.values, types, pyramid.border)
+        return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {}, "")), ""
+
+    def load() -> SharedMaps:
+        source = load_source(path, nonfinite="clean") if path else _source_of(props["bitmap"])
+        if raw:
+            maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
+            source = dataclasses.replace(source, maps=maps)
+        return SharedMaps(Pyramid.of(source, types=types, border=border), {}, "")
+
+    path = properties.filename(props)
+    try:
+        if not path:
+            return load(), ""
+        return shared((str(Path(path).resolve()), *stamp(Path(path)), raw, border, mi.TensorXf), load), path
+    except SourceError as e:
+        raise RuntimeError(f'parameter "{given[0]}": {e}') from None
+
+
+def _source_of(bitmap) -> Source:
+    """A ``mi.Bitmap`` as a source of one map, ``image``."""
+    if not isinstance(bitmap, mi.Bitmap):
+        raise RuntimeError(f'parameter "bitmap": found a {type(bitmap).__name__}, a Bitmap is needed')
+    values = np.array(bitmap)
+    values = values.reshape(*values.shape[:2], -1)
+    values = values[..., : 3 if values.shape[2] > 3 else 1 if values.shape[2] == 2 else None]  # without alpha
+    return from_arrays({"image": values}, {"image": "srgb" if bitmap.srgb_gamma() else "linear"}, nonfinite="clean")
 
 
 def map_of(layout: Layout, channels: str) -> MapLayout:
@@ -116,21 +189,41 @@ def is_data(layout: MapLayout) -> bool:
 # -- the exact counterpart ---------------------------------------------------------------------------------------------
 
 
-def to_bitmap(props) -> None:
-    """Give the properties of a ``neural_image`` what a ``bitmap`` needs to show the original of its map."""
-    path = Path(str(mi.file_resolver().resolve(str(props.get("filename", "")))))
+def to_bitmap(task: Task, props: mi.Properties) -> None:
+    """Give the properties of a texture of a task's file what a ``bitmap`` needs to show the original of its map."""
+    original, found = original_of(task, props)
     try:
-        table = TASK.load(path)
-        found = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
-        original = _original(props, path, table.settings)
         values = _values(original, found)
-    except (TableError, SourceError) as e:
+    except SourceError as e:
         raise RuntimeError(str(e)) from None
     # A byte is what it was; of half precision, which "bitmap" would make of 16 bits, the texture knows nothing
     bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if found.depth == 1 else np.ascontiguousarray(values))
     bitmap.set_srgb_gamma(found.color_space == "srgb")
     props["bitmap"] = bitmap
     props["raw"] = bool(props.get("raw", is_data(found)))
+
+
+def to_mipmap(task: Task, props: mi.Properties) -> None:
+    """Give the properties of a texture of a task's file what a ``mipmap`` of the original of its map needs."""
+    original, found = original_of(task, props)
+    props["filename"] = str(original)
+    if original.suffix.lower() == ".json":
+        props["channels"] = found.name
+    elif "channels" in props:
+        del props["channels"]
+    if "raw" not in props and is_data(found):
+        props["raw"] = True
+
+
+def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
+    """The image or manifest that a task's file was made from, and the map of it that the properties mean."""
+    path = Path(properties.filename(props))
+    try:
+        table = task.load(path)
+    except TableError as e:
+        raise RuntimeError(str(e)) from None
+    found = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
+    return _original(props, path, table.settings), found
 
 
 def _original(props, path: Path, settings: dict) -> Path:
