@@ -205,7 +205,7 @@ def summary(result: dict, plan: Plan | None = None) -> list[str]:
         cells = [["", *queries, "flops", "reads", *([f"ms {PASS}"] if passes else []), "bytes", "accuracy", ""]]
         for name, t in queries[query].items():
             c, operations = result["candidates"][name], t["operations"]
-            accuracy = c["errors"].get(result["accuracy"])
+            accuracy = c["errors"].get(measured.get("accuracy") or result["accuracy"])
             shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
             cells.append([
                 name, *(time_cell(timings.get(name)) for timings in queries.values()),

@@ -1,10 +1,10 @@
 """
 What the study of filtered textures compares, and how.
 
-A map of a material is on a surface, in a light without noise (:mod:`.stages`). The truth is ``bitmap`` at many stratified
-samples. Beside it stand ``bitmap`` at 1 to 64 samples a pixel, with independent and with multijittered samples; ``mipmap``,
+A map of a material is on a surface, in a light without noise (:mod:`.stages`). The truth is ``bitmap`` at many
+multijittered samples. Beside it stand ``bitmap`` at 1 to 64 samples a pixel, independent or multijittered; ``mipmap``,
 the uncompressed pyramid; ``neural_texture`` at several sizes; and what ASTC makes of all levels in the same bytes, read
-as ``mipmap`` does. Those that filter take one sample a pixel: at a random place of it, or *centred*. Trilinear filtering
+as ``mipmap`` does. Those that filter take one sample a pixel: at a random place, or *centred*. Trilinear filtering
 takes one tap of the texture, anisotropic filtering at most four.
 
 *Errors* are those of displayed values in pixels that are seen entirely; a stage counts those that are minified, or
@@ -14,7 +14,6 @@ magnified. *Levels*: the error of each level of detail at its texel centres, of 
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import time
 from collections.abc import Callable, Sequence
@@ -26,12 +25,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import metrics
 from ...files import replacing
 from ...maps.pyramid import Pyramid
 from ...maps.source import Map, Source
 from ...measure.store import file_name, fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Job, Plan
+from ...plugins.support.image_files import PYRAMIDS
 from ...runtime import array_module
 from ...scenes import footprint
 from ...tables import Table, save_table
@@ -66,9 +65,10 @@ _TRUTH = 1 << 20
 @dataclass(frozen=True)
 class Request:
     """
-    What is asked for: the name of the ``map`` that is rendered, ``compressions`` to train for ``seconds`` each; ``astc``
-    and ``astc_choice``, presets of its encoder as in the study of images; ``film`` and ``zoom_film``, sizes of the
-    images (width, height); ``frames`` of the zoom; ``truth_spp``, a square; ``seeds``, renders that errors are the mean of.
+    What is asked for: the name of the ``map`` that is rendered, ``compressions`` to train for ``seconds`` each;
+    ``astc`` and ``astc_choice``, presets of its encoder as in the study of images; ``film`` and ``zoom_film``, sizes of
+    the images (width, height); ``frames`` of the zoom; ``truth_spp``, a square; ``seeds``, renders that errors are the
+    mean of.
     """
 
     map: str
@@ -164,7 +164,8 @@ class Setting:
 
     @cached_property
     def pyramid(self) -> Pyramid:
-        return Pyramid.of(self.source, types=array_module(mi.variant()))
+        """Uncompressed; it is repeated as bitmaps are."""
+        return Pyramid.of(self.source, types=array_module(mi.variant()), border=("repeat", "repeat"))
 
     @cached_property
     def truth_levels(self) -> dict[str, list[np.ndarray]]:
@@ -192,9 +193,8 @@ class Setting:
             each = [stages.errors(truth, self.render(reader, stage, k), counted) for k in range(self.request.seeds)]
             found[f"psnr_{name}_db"] = decibel(float(np.mean([e["mse"] for e in each])))
             found[f"flip_{name}"] = float(np.mean([e["flip"] for e in each]))
-        frames = self.zoom.aligned(self.zoom.render(reader))
-        found["flicker"] = flicker(frames)
-        found["flicker_error"] = flicker(frames - self.truths["zoom"])
+        frames, truth = (self.zoom.aligned(f) for f in (self.zoom.render(reader), self.truths["zoom"]))
+        found["flicker"], found["flicker_error"] = flicker(frames), flicker(frames - truth)
         return found
 
     # -- readers ------------------------------------------------------------------------------------------------------
@@ -217,7 +217,9 @@ class Setting:
 
     def uncompressed(self, pyramid: Pyramid, how: str, centred: bool) -> Reader:
         """``mipmap`` of a pyramid."""
-        return self.filtered({"type": "mipmap", "pyramid": pyramid, **FILTERS[how]}, centred)
+        name = f"study {id(pyramid)}"
+        PYRAMIDS[name] = pyramid
+        return self.filtered({"type": "mipmap", "pyramid": name, **FILTERS[how]}, centred)
 
 
 # -- jobs -------------------------------------------------------------------------------------------------------------
@@ -351,8 +353,7 @@ def _candidates(setting: Setting, tables: Sequence[Table]) -> tuple[list[Job], l
         _Truth(f"truth, {name}", setting, name, lambda reader, s=stage: setting.render(reader, s, _TRUTH))
         for name, stage in setting.stages.items()
     ]
-    jobs.append(_Truth("truth, zoom", setting, "zoom",
-                       lambda reader: setting.zoom.aligned(setting.zoom.render(reader, _TRUTH >> 12))))  # fmt: skip
+    jobs.append(_Truth("truth, zoom", setting, "zoom", lambda reader: setting.zoom.render(reader, _TRUTH >> 12)))
     found = []
 
     def add(name: str, kind: str, reader: Callable[[], Reader], **more) -> None:
@@ -384,7 +385,8 @@ def _candidates(setting: Setting, tables: Sequence[Table]) -> tuple[list[Job], l
          bytes=pyramid_bytes)  # fmt: skip
 
     trained = [
-        _Table(f"ours {source.nbytes / t.nbytes:.3g}x", "ours", source.nbytes / t.nbytes, setting, table=t) for t in tables
+        _Table(f"ours {ratio:.3g}x", "ours", ratio, setting, table=t)
+        for t, ratio in ((t, source.nbytes / t.nbytes) for t in tables)
     ]
     for compression in request.compressions:
         trained.append(_Table(f"ours {compression:g}x", "ours", compression, setting, seconds=request.seconds))
@@ -401,7 +403,8 @@ def _candidates(setting: Setting, tables: Sequence[Table]) -> tuple[list[Job], l
         more = (("stochastic", False), ("off", False)) if i == 0 else ()
         both(job.name, job.kind, job.reader, (*ways, *more), **known)
         if "astc" in codecs.available():
-            blocks = _Blocks(f"ASTC{job.name[4:]}", "ASTC with mip maps", job.compression, setting, like=job, cache=cache)
+            name = job.name.replace("ours", "ASTC")
+            blocks = _Blocks(name, "ASTC with mip maps", job.compression, setting, like=job, cache=cache)
             jobs.append(blocks)
             both(blocks.name, blocks.kind, blocks.reader, ways[::3], job=blocks.name, training_seconds=None,
                  in_picture=i == 0)  # fmt: skip
@@ -442,6 +445,6 @@ def _case(setting: Setting, stage: Stage, candidates: list[Candidate], readers: 
         return found
 
     return Case(
-        stage.name, reads, passes, accuracy=f"psnr_{stage.name}_db", of_passes=True,
+        stage.name, reads, passes, accuracy=f"psnr_{stage.name}_db", of_passes=True, in_picture=not stage.magnified,
         details={"repeats": stage.repeats(setting.request.film, setting.size), "magnified": stage.magnified},
     )  # fmt: skip

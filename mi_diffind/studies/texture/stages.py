@@ -145,8 +145,8 @@ def stages() -> dict[str, Stage]:
 
 
 def zoom_stage() -> Stage:
-    """The stage of the moving camera: a plane at a slant, its first frame; 16 texels a pixel in the middle."""
-    return Stage("zoom", _plane(1000.0), (1.0, 1.0), (0.0, 2.0, 2.0), (0.0, 0.0, 0.0), 40.0, (0.0, 1.0, 0.0), 16.0)
+    """The stage of the moving camera: a plane at a slant, its first frame; 100 texels a pixel in the middle."""
+    return Stage("zoom", _plane(1000.0), (1.0, 1.0), (0.0, 2.0, 2.0), (0.0, 0.0, 0.0), 40.0, (0.0, 1.0, 0.0), 100.0)
 
 
 # -- what is seen -----------------------------------------------------------------------------------------------------

@@ -58,8 +58,8 @@ class Zoom:
         x, y = np.meshgrid(*[np.linspace(0.06, 0.94, GRID)] * 2)
         axes = np.array(self.stage.look(last).matrix, float)[:3, :3].T  # rows: right to left, up, forward
         tangent = np.tan(np.radians(self.stage.fov) / 2)
-        way = np.stack([(1 - 2 * x) * tangent, (1 - 2 * y) * tangent * self.film[1] / self.film[0], np.ones_like(x)], -1)
-        way = way.reshape(-1, 3) @ axes
+        width, height = tangent, tangent * self.film[1] / self.film[0]
+        way = np.stack([(1 - 2 * x) * width, (1 - 2 * y) * height, np.ones_like(x)], -1).reshape(-1, 3) @ axes
         return last + way * (-last[1] / way[:, 1:2])  # the plane is y = 0
 
     def places(self, frame: int) -> np.ndarray:

@@ -1,0 +1,106 @@
+"""Pictures of the study of filtered textures: crops of the stills, and a strip of the zoom with its slice of time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from ...measure import plot
+from ...measure.words import machine_line, state
+from .zoom import GRID, flicker
+
+#: Frames of a strip.
+FRAMES = 5
+
+
+def shown(candidates: Iterable) -> list[str]:
+    """The names of the candidates that pictures show: bitmaps, uncompressed, ours and ASTC at the first size."""
+    names = [c.name for c in candidates]
+    first = [next((n for n in names if n.startswith(s) and n.endswith("anisotropic, centred")), "")
+             for s in ("mipmap", "ours", "ASTC")]  # fmt: skip
+    return [n for n in ("bitmap, 1 spp", "bitmap, 64 spp", *first) if n in names]
+
+
+def of(setting, readers: dict[str, Callable]) -> dict[str, Callable[[dict], object]]:
+    """The pictures of a plan: ``crops`` and ``zoom``."""
+    return {kind: lambda result, draw=draw: draw(setting, readers, result) for kind, draw in _KINDS.items()}
+
+
+def crops(setting, readers: dict, result: dict):
+    """A part of each stage, enlarged, by each of the readers and as it truly is."""
+    names = list(setting.stages)
+    columns = [*readers, "truth"]
+    width, height = setting.request.film
+    side = max(8, height * 2 // 5)
+    title = f"{result['title']}: parts of the stills"
+    found = plot.sheet(title, _caption(result), 2.3 * len(columns), 2.5 * len(names))
+    for i, (name, stage) in enumerate(setting.stages.items()):
+        counted = setting.counted(stage)
+        top, left = _busiest(np.where(counted[..., None], setting.truths[name], np.nan), side)
+        for k, column in enumerate(columns):
+            if column == "truth":
+                image, title = setting.truths[name], f"truth\n{setting.request.truth_spp} spp, multijittered"
+            else:
+                image = setting.render(readers[column](), stage, 0)
+                title = f"{column}\n{result['candidates'][column]['errors'][f'psnr_{name}_db']:.1f} dB"
+            axes = found.add_subplot(len(names), len(columns), i * len(columns) + k + 1)
+            axes.imshow(image[top : top + side, left : left + side], vmin=0, vmax=1, interpolation="nearest")
+            axes.set_title(title, fontsize=8)
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if k == 0:
+                axes.set_ylabel(name, fontsize=9)
+    return found
+
+
+def zoom(setting, readers: dict, result: dict):
+    """Frames of the zoom by each of the readers, and on the right the same line of the plane in all frames."""
+    motion = setting.zoom
+    strips = {name: motion.render(reader()) for name, reader in readers.items()} | {"truth": setting.truths["zoom"]}
+    frames = np.unique(np.linspace(0, motion.frames - 1, FRAMES).round().astype(int))
+    rows, columns = len(strips), len(frames) + 1
+    title = f"{result['title']}: a zoom of {motion.frames} frames"
+    found = plot.sheet(title, _caption(result), 2.2 * columns, 1.55 * rows)
+    grid = found.add_gridspec(rows, columns)
+    line = slice(GRID * (GRID // 2), GRID * (GRID // 2) + GRID)
+    for i, (name, strip) in enumerate(strips.items()):
+        aligned = motion.aligned(strip)
+        text = f"{name}\nflicker {flicker(aligned):.1e}".replace(", anisotropic", ",\nanisotropic")
+        for k, frame in enumerate(frames):
+            axes = found.add_subplot(grid[i, k])
+            axes.imshow(strip[frame], vmin=0, vmax=1, interpolation="nearest")
+            _bare(axes, text if k == 0 else "")
+            if i == 0:
+                axes.set_title(f"frame {frame + 1}", fontsize=8)
+        axes = found.add_subplot(grid[i, columns - 1])
+        axes.imshow(aligned[:, line].clip(0, 1), interpolation="nearest", aspect="auto")
+        _bare(axes, "")
+        if i == 0:
+            axes.set_title("the middle line, frames downwards", fontsize=8)
+    return found
+
+
+def _busiest(image: np.ndarray, side: int) -> tuple[int, int]:
+    """Row and column of the square with the most variance, of those within the image (NaN: outside)."""
+    best, place = -1.0, (0, 0)
+    for top in range(0, image.shape[0] - side + 1, max(1, side // 8)):
+        for left in range(0, image.shape[1] - side + 1, max(1, side // 8)):
+            part = image[top : top + side, left : left + side]
+            spread = float(np.nan_to_num(part.var(axis=(0, 1)).sum(), nan=-1))
+            if spread > best:
+                best, place = spread, (top, left)
+    return place
+
+
+_KINDS = {"crops": crops, "zoom": zoom}
+
+
+def _bare(axes, label: str) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_ylabel(label, fontsize=7)
+
+
+def _caption(result: dict) -> str:
+    return f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
