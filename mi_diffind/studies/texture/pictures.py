@@ -31,7 +31,7 @@ def crops(setting, readers: dict, result: dict):
     """A part of each stage, enlarged, by each of the readers and as it truly is."""
     names = list(setting.stages)
     columns = [*readers, "truth"]
-    width, height = setting.request.film
+    height = setting.request.film[1]
     side = max(8, height * 2 // 5)
     title = f"{result['title']}: parts of the stills"
     found = plot.sheet(title, _caption(result), 2.3 * len(columns), 2.5 * len(names))
