@@ -9,9 +9,9 @@ from pathlib import Path
 
 from scene_xml import element, head, lying, plugin, transform, write
 
-ABOUT = """Tiles to the horizon: textures that filter themselves. Written by make_horizon.py: change that file, not this one.
+ABOUT = """Tiles to the horizon, with textures that filter themselves. Written by make_horizon.py: change that file.
 
-With spp=1, and "bitmap" in place of "neural_texture", one sees what for."""
+With one sample a pixel, and "bitmap" in place of "neural_texture", one sees what for."""
 
 #: Half of the width of the floor, and of a repetition of the texture (4 × 4 tiles).
 FLOOR, TILES = 400.0, 1.0
