@@ -41,16 +41,16 @@ class FilteredTexture(MapTexture):
         uv, (ddx, ddy) = self._uv(si), self._footprint(si)
         if self.filter.name == "trilinear":
             return self._used_of(self._filtered(uv, isotropic(ddx, ddy)))
-        level, extent = anisotropic(ddx, ddy, self.filter.taps)
-        extent = extent / mi.Vector2f(*self._size)
+        level, axis = anisotropic(ddx, ddy, self.filter.taps)
+        axis = axis / mi.Vector2f(*self._size)
         if self.filter.name == "anisotropic":
-            found = [self._filtered(dr.fma(extent, x, uv), level) for x in offsets(self.filter.taps)]
+            found = [self._filtered(dr.fma(axis, x, uv), level) for x in offsets(self.filter.taps)]
             scale = 1 / len(found)
             return self._used_of([sum(channel[1:], channel[0]) * scale for channel in zip(*found, strict=True)])
         choice, rounding = random(si)
         taps = self.filter.taps
         if taps > 1:
-            uv = dr.fma(extent, dr.floor(choice * taps) * (1 / (taps - 1)) - 0.5, uv)
+            uv = dr.fma(axis, (dr.floor(choice * taps) + 0.5) * (1 / taps) - 0.5, uv)
         return self._used_of(self._rounded(uv, level, rounding))
 
     def _footprint(self, si) -> tuple:
@@ -89,9 +89,7 @@ class FilteredTexture(MapTexture):
         if self.wrap_mode == "repeat" or not any(repeats):
             return found
         half = [dr.minimum(0.5 * dr.exp2(dr.ceil(level)) / n, 0.5) for n in self._size]
-        return [
-            clamp(x, h, 1 - h) if own else x for x, h, own in zip(found, half, repeats, strict=True)
-        ]
+        return [clamp(x, h, 1 - h) if own else x for x, h, own in zip(found, half, repeats, strict=True)]
 
     def eval_1_grad(self, si, active=True):
         if self.filter.name == "off":
