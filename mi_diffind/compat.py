@@ -274,6 +274,36 @@ def srgb_coefficients() -> tuple:
     return side, positions, np.frombuffer(content, "<f4", 3 * count, 8 + 4 * side).reshape(count, 3)
 
 
+def normal_edges(pi, si, ray, active) -> tuple:
+    """
+    Two vectors in space, ``mi.Vector3f``: along them the shading normal changes by ``si.dn_du`` and ``si.dn_dv``, if
+    ``si`` is of ``pi.compute_surface_interaction(ray)`` with ``RayFlags.dNSdUV``. These are ``dp_du`` and ``dp_dv``,
+    but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in barycentric coordinates.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    mesh = active & si.is_valid() & si.shape.is_mesh()
+    edges = []
+    for step, otherwise in (((1, 0), si.dp_du), ((0, 1), si.dp_dv)):
+        moved = mi.PreliminaryIntersection3f(pi)
+        moved.prim_uv = pi.prim_uv + mi.Point2f(*step)
+        place = moved.compute_surface_interaction(ray, mi.RayFlags.Minimal, mesh).p
+        edges.append(dr.detach(dr.select(mesh, place - si.p, otherwise)))
+    return tuple(edges)
+
+
+def replay_integrator() -> type:
+    """
+    The base class of integrators that replay paths for derivatives, ``RBIntegrator``, of the variant that is set, which
+    Mitsuba loads anew *after* it called what :func:`on_variant_change` set. Its place is not promised; what is used of
+    it, ``sample_rays`` and the interface of ``sample``, is only described in its code.
+    """
+    import mitsuba as mi
+
+    return mi.ad.integrators.common.RBIntegrator
+
+
 # -- Mitsuba: scenes ---------------------------------------------------------------------------------------------------
 
 

@@ -13,6 +13,7 @@ Functions here neither evaluate nor differentiate: footprints are detached.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import drjit as dr
 import mitsuba as mi
@@ -141,20 +142,6 @@ class Cone:
         """
         return dr.norm(self.dx)
 
-    def differentials(self, ray: mi.Ray3f) -> tuple:
-        """
-        Of a ray of the sensor, what a step of one sample's width (``scale``) in x or y adds to its origin and to its
-        direction: ``dox, ddx, doy, ddy``, all ``mi.Vector3f``.
-        """
-        steps = (self.dx * self.scale, self.dy * self.scale)
-        if self.kind == "orthographic":
-            return steps[0], mi.Vector3f(0), steps[1], mi.Vector3f(0)
-        cosine = dr.dot(ray.d, self.axis)
-        depth = dr.dot(ray.o - self.origin, self.axis)  # rays start at the near clipping plane
-        turned = [cosine * (s - ray.d * dr.dot(ray.d, s)) for s in steps]
-        moved = [depth * s for s in steps]
-        return moved[0], turned[0], moved[1], turned[1]
-
 
 def scale_of(spp: float) -> float:
     """The width of a sample's footprint relative to the pixel's: max(1/8, 1/√spp), as in pbrt-v4; 1 for one sample."""
@@ -207,10 +194,7 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     hollow mirrors and lenses. Where dp_du and dp_dv are parallel or zero: zero.
     """
     p, du, dv = dr.detach(si.p), dr.detach(si.dp_du), dr.detach(si.dp_dv)
-    normal = dr.cross(du, dv)
-    size2 = dr.squared_norm(normal)
-    defined = size2 > PARALLEL**2 * dr.squared_norm(du) * dr.squared_norm(dv)  # NaN and underflow: false
-    unit = normal * dr.rsqrt(size2)
+    unit = dr.normalize(dr.cross(du, dv))
     if cone.kind == "orthographic":
         to, distance, depth = cone.axis, mi.Float(1), mi.Float(1)
         tolerance = mi.Float(STRAIGHT)
@@ -229,13 +213,22 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     facing = distance * cone.reach * cone.scale * cone.spread
     x = dr.select(direct, depth * cone.scale * cone.dx, facing * frame.s)
     y = dr.select(direct, depth * cone.scale * cone.dy, facing * frame.t)
-    # x + λ·along = u·dp_du + v·dp_dv, by Cramer's rule
+    return in_uv(x, y, along, du, dv)
+
+
+def in_uv(x, y, along, du, dv) -> tuple[mi.Vector2f, mi.Vector2f]:
+    """
+    Vectors in space, ``x`` and ``y``, projected along a direction onto the plane of ``du`` and ``dv``, and expressed in
+    these. Limited to ± :data:`LARGEST`; zero where du and dv are parallel or zero, or something is NaN.
+    """
+    normal = dr.cross(du, dv)
+    defined = dr.squared_norm(normal) > PARALLEL**2 * dr.squared_norm(du) * dr.squared_norm(dv)  # NaN, underflow: false
+    # x + λ·along = u·du + v·dv, by Cramer's rule
     volume = dr.dot(normal, along)
     inverse = dr.rcp(dr.select(dr.abs(volume) < 1e-30, 1e-30, volume))
     to_u, to_v = dr.cross(dv, along), dr.cross(along, du)
-    ddx = mi.Vector2f(dr.dot(x, to_u), dr.dot(x, to_v)) * inverse
-    ddy = mi.Vector2f(dr.dot(y, to_u), dr.dot(y, to_v)) * inverse
-    return dr.select(defined, _finite(ddx), 0), dr.select(defined, _finite(ddy), 0)
+    found = (mi.Vector2f(dr.dot(v, to_u), dr.dot(v, to_v)) * inverse for v in (x, y))
+    return tuple(dr.select(defined, _finite(v), 0) for v in found)
 
 
 def _size(ddx, ddy):
@@ -269,18 +262,38 @@ def axes(ddx: mi.Vector2f, ddy: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Vec
     ≥ 0, and the unit vector of the major one, (1, 0) for a circle. Finite, always; major · minor is :func:`area`.
     """
     ddx, ddy = _finite(ddx), _finite(ddy)
-    p, r = dr.fma(ddx.x, ddx.x, dr.square(ddy.x)), dr.fma(ddx.y, ddx.y, dr.square(ddy.y))
-    q = dr.fma(ddx.x, ddx.y, ddy.x * ddy.y)
+    major, direction = _major(*_moments(ddx, ddy))
+    return major, dr.select(major > 0, dr.minimum(area(ddx, ddy) / major, major), 0), direction
+
+
+def joined(ddx: mi.Vector2f, ddy: mi.Vector2f, s: mi.Vector2f, t: mi.Vector2f) -> tuple[mi.Vector2f, mi.Vector2f]:
+    """Two footprints, one blurred by the other: the moments add up. Its axes, the major one first."""
+    ddx, ddy, s, t = (_finite(v) for v in (ddx, ddy, s, t))
+    p, q, r = (a + b for a, b in zip(_moments(ddx, ddy), _moments(s, t), strict=True))
+    major, direction = _major(p, q, r)
+    # The determinant by Cauchy and Binet, without cancellation
+    det2 = sum(dr.square(a.x * b.y - a.y * b.x) for a, b in combinations((ddx, ddy, s, t), 2))
+    minor = dr.select(major > 0, dr.minimum(dr.sqrt(det2) / major, major), 0)
+    return major * direction, minor * mi.Vector2f(-direction.y, direction.x)
+
+
+def _moments(ddx, ddy) -> tuple:
+    """The second moments uu, uv and vv of both diameters."""
+    uu, vv = dr.fma(ddx.x, ddx.x, dr.square(ddy.x)), dr.fma(ddx.y, ddx.y, dr.square(ddy.y))
+    return uu, dr.fma(ddx.x, ddx.y, ddy.x * ddy.y), vv
+
+
+def _major(p, q, r) -> tuple:
+    """The length of the major axis of the ellipse with these moments, and its unit vector, (1, 0) for a circle."""
     half = 0.5 * (p - r)
     root = dr.sqrt(dr.fma(half, half, q * q))
-    major = dr.sqrt(0.5 * (p + r) + root)
-    minor = dr.select(major > 0, dr.minimum(area(ddx, ddy) / major, major), 0)
     wide = half >= 0
     x, y = dr.select(wide, half + root, q), dr.select(wide, q, root - half)
     length2 = dr.fma(x, x, y * y)
     found = length2 > 0
     inverse = dr.rsqrt(dr.select(found, length2, 1))
-    return major, minor, mi.Vector2f(dr.select(found, x * inverse, 1), dr.select(found, y * inverse, 0))
+    direction = mi.Vector2f(dr.select(found, x * inverse, 1), dr.select(found, y * inverse, 0))
+    return dr.sqrt(0.5 * (p + r) + root), direction
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,261 @@
+from __future__ import annotations  # Delayed parsing of type annotations
+
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_diffind import compat
+
+from . import Plugin
+from .support import footprint
+from .support.differentials import Differentials
+
+#: ``max_depth`` where there is no limit.
+INFINITE = 0xFFFFFFFF
+
+MANUAL = r"""
+.. _integrator-path_footprint:
+
+Path tracer with footprints (:monosp:`path_footprint`)
+------------------------------------------------------
+
+.. pluginparameters::
+
+ * - max_depth
+   - |int|
+   - Longest path: 1 shows emitters only, 2 direct light, and so on; -1 is infinite. (Default: -1)
+   - --
+
+ * - rr_depth
+   - |int|
+   - Depth from which on Russian roulette may end a path. (Default: 5)
+   - --
+
+ * - hide_emitters
+   - |bool|
+   - Hide directly visible emitters. (Default: false)
+   - --
+
+ * - jitter
+   - |bool|
+   - Spread samples over the pixel. If false, all go through its centre, which is for one sample a pixel and
+     textures that filter themselves. (Default: true)
+   - --
+
+The estimator of :monosp:`path`: emitters and BSDFs are sampled, and both are weighted by the power heuristic.
+Along each path it carries *ray differentials* (Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999), from which
+textures that filter themselves learn how large the pixel is where they are read: in the fields ``si.duv_dx`` and
+``si.duv_dy``, two conjugate diameters of its footprint in uv. Mirrors and smooth boundaries, plane and curved,
+bend them as they bend the ray, with both curvatures of the surface. For :math:`n` samples a pixel they are
+:math:`\max(1/8, 1/\sqrt n)` of the pixel's, as in pbrt-v4.
+
+**At rough bounces** a cone is opened around the ray, whose angle is the root of the solid angle of a share of the
+lobe, that scale divided by the root of the density of the sampled direction, at most 0.5 rad. It grows
+linearly, other surfaces leave its angle as it is, and its disc and the parallelogram of the differentials add up
+as their second moments do. The direction itself is taken as that of a mirror whose normal is half-way.
+
+**Only if a texture of the scene asks for footprints** is any of this computed, that is, has a method
+``set_cone(cone)``, which is not called here. Shapes that do not tell how their normals change, :monosp:`sdfgrid`
+among them, count as flat, and so do the details of normal and bump maps.
+
+**Derivatives** are computed by path replay (Vicini et al., *Path Replay Backpropagation*, SIGGRAPH 2021) with
+respect to materials, textures and emitters; those that are smooth mirrors, too, as far as they do not decide what
+is sampled. Footprints are constants to them, and the geometry is: for shapes there is :monosp:`prb_projective`. Not
+for polarised variants.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: path_footprint
+
+        <integrator type="path_footprint">
+            <integer name="max_depth" value="8"/>
+        </integrator>
+
+    .. code-tab:: python
+
+        'type': 'path_footprint',
+        'max_depth': 8
+"""
+
+
+class Centred:
+    """A sampler of which the first pair of numbers, the place in a pixel, is the centre; the others are as they are."""
+
+    def __init__(self, sampler: mi.Sampler):
+        self._sampler, self._first = sampler, True
+
+    def next_2d(self, active=True):
+        sample = self._sampler.next_2d(active)
+        first, self._first = self._first, False
+        return mi.Point2f(0.5) if first else sample
+
+    def __getattr__(self, name: str):
+        return getattr(self._sampler, name)
+
+
+def power_heuristic(a, b):
+    """The weight of a sample whose density is ``a``, where another technique would have had ``b``."""
+    return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)
+
+
+def relative(value):
+    """1 with the derivative of the logarithm of ``value``; 0 where it is 0."""
+    found = dr.detach(value)
+    nonzero = found != 0
+    return dr.select(nonzero, value / dr.select(nonzero, found, 1), 0)
+
+
+@cache
+def integrator() -> type:
+    """The class, in the variant that is set: of what Mitsuba's integrators build upon it knows only after this file."""
+
+    class PathFootprint(compat.replay_integrator()):
+        __doc__ = MANUAL
+
+        def __init__(self, props: mi.Properties):
+            for name, low in (("max_depth", -1), ("rr_depth", 1)):
+                if name in props and (props.type(name) != mi.Properties.Type.Integer or props[name] < low):
+                    raise RuntimeError(
+                        f'parameter "{name}": found {props[name]}, allowed are whole numbers from {low} on'
+                    )
+            if mi.is_polarized:
+                raise RuntimeError("path_footprint: does not run in polarised variants, where volpath does")
+            super().__init__(props)
+            if "max_depth" not in props:
+                self.max_depth = INFINITE
+            self.jitter = props.get("jitter", True)
+            if not isinstance(self.jitter, bool):
+                raise RuntimeError(f'parameter "jitter": found {self.jitter}, allowed are true and false')
+
+        def to_string(self) -> str:
+            depth = -1 if self.max_depth == INFINITE else self.max_depth
+            return (
+                f"PathFootprint[\n  max_depth = {depth},\n  rr_depth = {self.rr_depth},\n"
+                f"  jitter = {str(self.jitter).lower()}\n]"
+            )
+
+        def sample_rays(self, scene, sensor, sampler):
+            """As in Mitsuba, but with differentials of samples, not of pixels."""
+            ray, weight, place = super().sample_rays(scene, sensor, sampler if self.jitter else Centred(sampler))
+            if not footprint.textures(scene):
+                return ray, weight, place
+            scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
+            axis = sensor.world_transform() @ mi.Vector3f(0, 0, 1)
+            # Rays start at the near clipping plane, and Mitsuba lets their neighbours start at the same point of it
+            start = sensor.near_clip() / dr.dot(ray.d, dr.normalize(axis)) if hasattr(sensor, "near_clip") else 0
+            for x in "xy":
+                turn = (getattr(ray, f"d_{x}") - ray.d) * scale
+                setattr(ray, f"o_{x}", ray.o + (getattr(ray, f"o_{x}") - ray.o) * scale + start * turn)
+                setattr(ray, f"d_{x}", ray.d + turn)
+            return ray, weight, place
+
+        @dr.syntax
+        def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
+            """
+            See ``ADIntegrator.sample``. In the differential phases ``L`` is what is still to come at the current
+            vertex, which starts as the whole (``state_in``).
+            """
+            primal = mode == dr.ADMode.Primal
+            carried = len(footprint.textures(scene)) > 0
+            environment = scene.environment() is not None and not self.hide_emitters
+            flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if carried else mi.RayFlags.All
+            context = mi.BSDFContext()
+            scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
+
+            differentials = Differentials.of(ray if carried else None)
+            ray = mi.Ray3f(dr.detach(ray))
+            active = mi.Bool(active)
+            valid = mi.Bool(environment)
+            depth = mi.UInt32(0)
+            L = mi.Spectrum(0 if primal else state_in)
+            δL = mi.Spectrum(0 if δL is None else δL)
+            throughput = mi.Spectrum(1)
+            eta = mi.Float(1)
+            before = dr.zeros(mi.SurfaceInteraction3f)
+            density = mi.Float(1)
+            delta = mi.Bool(True)
+
+            pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+            if dr.hint(self.hide_emitters, mode="scalar"):
+                hidden = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
+                at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
+                pi[hidden] = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
+
+            while dr.hint(active, max_iterations=self.max_depth, label=f"path_footprint ({mode.name})"):
+                si = pi.compute_surface_interaction(ray, ray_flags=flags, active=active)
+                if dr.hint(carried, mode="scalar"):
+                    differentials = differentials.at(ray, si)
+                    si.duv_dx, si.duv_dy = differentials.footprint(ray, si)
+                bsdf = si.bsdf(ray)
+
+                # Emission, weighted against having sampled the emitter at the vertex before
+                shown = active
+                if dr.hint(self.hide_emitters, mode="scalar"):
+                    shown &= (depth > 0) | si.is_valid()
+                ds = mi.DirectionSample3f(scene, si, before)
+                weight = power_heuristic(density, scene.pdf_emitter_direction(before, ds, shown & ~delta))
+                with dr.resume_grad(when=not primal):
+                    emitted = throughput * weight * ds.emitter.eval(si, shown)
+
+                # Light from an emitter
+                going = active & si.is_valid() & (depth + 1 < self.max_depth)
+                lit = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                ds, emitter_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
+                lit &= ds.pdf != 0
+                wo = si.to_local(ds.d)
+                with dr.resume_grad(when=not primal):
+                    if dr.hint(not primal, mode="scalar"):
+                        value = scene.eval_emitter_direction(si, ds, lit) * dr.select(lit, dr.rcp(ds.pdf), 0)
+                        emitter_weight = dr.replace_grad(emitter_weight, value)
+                    bsdf_value, bsdf_pdf = bsdf.eval_pdf(context, si, wo, lit)
+                    weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
+                    direct = dr.select(lit, throughput * weight * bsdf_value * emitter_weight, 0)
+
+                # Where to go on
+                with dr.resume_grad(when=not primal):
+                    bs, bsdf_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), going)
+                bs = dr.detach(bs)
+                delta_next = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+                L = L + emitted + direct if primal else L - dr.detach(emitted + direct)
+
+                if dr.hint(not primal, mode="scalar"):
+                    with dr.resume_grad():
+                        # A smooth mirror cannot be evaluated: there, the weight itself is differentiated
+                        smooth = bsdf.eval(context, si, bs.wo, going & ~delta_next)
+                        reflected = L * dr.select(delta_next, relative(bsdf_weight), relative(smooth))
+                        contribution = emitted + direct + dr.select(going, reflected, 0)
+                        if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
+                            dr.backward_from(δL * contribution)
+                        else:
+                            δL += dr.forward_to(contribution)
+
+                out = si.to_world(bs.wo)
+                if dr.hint(carried, mode="scalar"):
+                    edges = compat.normal_edges(pi, si, ray, going)
+                    differentials = differentials.bounced(ray, si, out, bs.eta, bs.pdf, delta_next, scale, edges)
+                valid |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+                ray = si.spawn_ray(out)
+                before = dr.detach(si)
+                throughput *= dr.detach(bsdf_weight)
+                eta *= bs.eta
+                density = bs.pdf
+                delta = delta_next
+
+                # Whether to go on: radiance changes by η² at a boundary, which is undone for this
+                largest = dr.max(throughput)
+                survival = dr.minimum(largest * dr.square(eta), 0.95)
+                roulette = depth >= self.rr_depth
+                survives = sampler.next_1d() < survival
+                throughput[roulette] *= dr.rcp(survival)
+                active = going & (largest != 0) & (~roulette | survives)
+                depth[going] += 1
+                pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+
+            shown = dr.select(valid, L, 0) if primal else δL
+            return shown, valid, [], L
+
+    return PathFootprint
+
+
+PLUGIN = Plugin("path_footprint", "integrator", lambda props: integrator()(props))
