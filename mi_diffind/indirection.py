@@ -288,6 +288,22 @@ class DifferentiableArray(nn.Module):
         result.data = module.TensorXf(flat, (*resolution, stored))
         return result
 
+    def entry(self, index, active=True) -> list:
+        """
+        The channels of entries by their number in a list of all, the last axis fastest, which has to be one that there
+        is; without interpolation, folded. Differentiable with respect to the entries of float storage.
+        """
+        self._require_entries()
+        if self.storage == "uint8":
+            return lookup.entry_packed(
+                self.data, self.scale, self.offset, self.resolution, self.channels, index, active, self.bits
+            )
+        self.check_shape()
+        entries, transform = self.data.array, fold if self.folded else None
+        if self.folded and not dr.flag(dr.JitFlag.SymbolicScope):
+            entries, transform = fold(entries), None
+        return lookup.entry_float(entries, self.channels, index, active, transform, self.data.shape[-1])
+
     # -- properties -------------------------------------------------------------------------------------------------
 
     @property

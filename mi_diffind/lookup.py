@@ -105,15 +105,26 @@ def _axis(x, n: int, border: str, inside: bool = False):
 
 
 def _corners(axes, resolution):
-    """All ``2^d`` pairs (texel index, weight) of a cell, built axis by axis so that products are shared."""
+    """
+    All ``2^d`` pairs (texel index, weight) of a cell, built axis by axis so that products are shared; along an axis
+    whose coordinate is a number that Dr.Jit knows, such as 0, only those that weigh anything.
+    """
     result = [(None, None)]
     for (lower, upper, w), n in zip(axes, resolution, strict=True):
+        ends = [(lower, 1 - w), (upper, w)]
+        if _is_zero(w):
+            ends = [(lower, 1 - w)]
         grown = []
         for index, weight in result:
-            for i, v in ((lower, 1 - w), (upper, w)):
+            for i, v in ends:
                 grown.append((i if index is None else dr.fma(index, n, i), v if weight is None else weight * v))
         result = grown
     return result
+
+
+def _is_zero(weight) -> bool:
+    """Is this a constant of the code, and zero? Without evaluating anything."""
+    return weight.state == dr.VarState.Literal and not dr.grad_enabled(weight) and weight[0] == 0
 
 
 def _weighted_sum(terms):
@@ -145,25 +156,28 @@ def read_float(
     precision) type. Differentiable with respect to ``data`` and ``x``. ``transform`` is applied to each entry that was
     fetched.
     """
-    Float = type(x[0])
+    axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
+    return _weighted_sum(
+        (weight, entry_float(data, channels, index, active, transform, stored))
+        for index, weight in _corners(axes, resolution)
+    )
+
+
+def entry_float(data, channels: int, index, active=True, transform=None, stored: int | None = None) -> list:
+    """The channels of the entries ``index`` of a table of floats, as in :func:`read_float`."""
     stored = stored or padded_channels(channels)
     packet = _packet(stored)
     groups = stored // packet
-    module = module_of(Float)
+    module = module_of(type(data))
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
     Packet = None if packet == 1 else getattr(module, f"Array{packet}{suffix}")
-
-    def fetch(index):
-        values = []
-        for group in range(groups):
-            where = index if groups == 1 else dr.fma(index, groups, group)
-            found = dr.gather(Packet or type(data), data, where, active)
-            values += [Float(v) for v in (found if Packet else [found])]
-        values = values[:channels]
-        return values if transform is None else [transform(v) for v in values]
-
-    axes = [_axis(v, n, b) for v, n, b in zip(x, resolution, border, strict=True)]
-    return _weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
+    values = []
+    for group in range(groups):
+        where = index if groups == 1 else dr.fma(index, groups, group)
+        found = dr.gather(Packet or type(data), data, where, active)
+        values += [module.Float(v) for v in (found if Packet else [found])]
+    values = values[:channels]
+    return values if transform is None else [transform(v) for v in values]
 
 
 def read_packed(
@@ -269,31 +283,53 @@ def read_bits(
     word more): it takes no more memory than that. One gather a corner if an entry is a half, a quarter … of a word, two
     if it may begin in one and end in the next. Otherwise as :func:`read_packed`.
     """
-    Float, UInt32 = type(x[0]), type(words)
-    Int32, width = dr.int32_array_t(type(words)), channels * bits
-    count = channels_words(channels, bits)
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
-
-    def fetch(index) -> list:
-        start = index * width
-        first, shift = start >> 5, start & 31
-        found = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
-        if count > 1:  # what is left of a word, and what the next one adds above it
-            pairs = zip(found, [*found[1:], UInt32(0)], strict=True)
-            found = [(low >> shift) | ((high << (31 - shift)) << 1) for low, high in pairs]
-        else:
-            found = [found[0] >> shift]
-        values = []
-        for k in range(channels):
-            word, at = divmod(k * bits, 32)
-            value = found[word] >> at
-            if at + bits > 32:
-                value |= found[word + 1] << (32 - at)
-            values.append(Float(Int32(value & (2**bits - 1))))
-        return values
-
-    sums = _weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
+    sums = _weighted_sum(
+        (weight, _bits(words, channels, bits, index, active)) for index, weight in _corners(axes, resolution)
+    )
     values = [dr.fma(s, scale[k], offset[k]) for k, s in enumerate(sums)]
+    return values if active is True else [dr.select(active, v, 0) for v in values]
+
+
+def _bits(words, channels: int, bits: int, index, active) -> list:
+    """The channels of the entries ``index`` of a table of fewer than 8 bits a channel, as numbers from 0 on."""
+    UInt32, Int32 = type(words), dr.int32_array_t(type(words))
+    Float = dr.float32_array_t(UInt32)
+    count = channels_words(channels, bits)
+    start = index * (channels * bits)
+    first, shift = start >> 5, start & 31
+    found = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
+    if count > 1:  # what is left of a word, and what the next one adds above it
+        pairs = zip(found, [*found[1:], UInt32(0)], strict=True)
+        found = [(low >> shift) | ((high << (31 - shift)) << 1) for low, high in pairs]
+    else:
+        found = [found[0] >> shift]
+    values = []
+    for k in range(channels):
+        word, at = divmod(k * bits, 32)
+        value = found[word] >> at
+        if at + bits > 32:
+            value |= found[word + 1] << (32 - at)
+        values.append(Float(Int32(value & (2**bits - 1))))
+    return values
+
+
+def entry_packed(
+    words, scale, offset, resolution: Sequence[int], channels: int, index, active=True, bits: int = 8
+) -> list:
+    """The channels of the entries ``index`` of a table of bytes (:func:`pack`) or of fewer ``bits``."""
+    UInt32, Int32 = type(words), dr.int32_array_t(type(words))
+    Float = dr.float32_array_t(UInt32)
+    if bits < 8:
+        codes = _bits(words, channels, bits, index, active)
+    else:
+        _, _, per_texel = packed_layout(resolution, channels)
+        codes = []
+        for word in range((channels + 3) // 4):
+            found = dr.gather(UInt32, words, index if per_texel == 1 else index * per_texel + word, active)
+            for rotated in (found, (found << 16) | (found >> 16)):
+                codes += [Float(Int32((rotated >> shift) & 0xFF)) for shift in (15, 7)]
+    values = [dr.fma(c, scale[k], offset[k]) for k, c in enumerate(codes[:channels])]
     return values if active is True else [dr.select(active, v, 0) for v in values]
 
 

@@ -192,7 +192,7 @@ class Pyramid(FilteredMaps):
         level = UInt32(level)
         corners = []
         for x, n, border in ((v, self.layout.height, self.border[0]), (u, self.layout.width, self.border[1])):
-            corners.append(_around(x, dr.maximum(UInt32(n) >> level, 1), border))
+            corners.append(around(x, dr.maximum(UInt32(n) >> level, 1), border))
         columns = dr.maximum(UInt32(self.layout.width) >> level, 1)
         offset = dr.gather(UInt32, self._offsets, level, active)
         total = None
@@ -260,7 +260,7 @@ def _interpolated(stored: np.ndarray, owner: MapLayout) -> np.ndarray:
     return owner.decode(stored) if owner.knee > 0 else stored
 
 
-def _around(x, n, border: str) -> list:
+def around(x, n, border: str) -> list:
     """The two texels around ``x`` in [0, 1] of ``n`` along an axis, which may differ by lane, and their weights."""
     Float, Int32 = type(x), dr.int32_array_t(type(x))
     size = Float(n)

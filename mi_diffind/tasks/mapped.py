@@ -53,10 +53,18 @@ class MapsModel(Model):
                 raise TableError(f"{self.table.path}: its source {path} has changed since it was compressed")
         return self.image.measure(source)
 
-    def decode(self, output: Path, map: list[str] | None = None, width: int | None = None, height: int | None = None):
+    def decode(
+        self,
+        output: Path,
+        map: list[str] | None = None,
+        width: int | None = None,
+        height: int | None = None,
+        **reading,
+    ):
         """
         Write the maps (``map``: only those named) in ``width`` × ``height`` texels, those of the source unless given:
         ``.png``, 8 bits a channel, encoded as they are; ``.exr`` linear, in half precision unless numbers are beyond.
+        ``reading``: what the maps have to be told beside.
         """
         layout, file = self.image.layout, self.table.path
         if output.suffix.lower() not in (".png", ".exr"):
@@ -71,7 +79,7 @@ class MapsModel(Model):
         try:
             if width * height >= 2**32:
                 raise MemoryError
-            decoded = self.image.decode(names, width, height)
+            decoded = self.image.decode(names, width, height, **reading)
         except MemoryError:
             raise UsageError(f"{file}: {width} x {height} texels are more than fit into memory") from None
         files = []

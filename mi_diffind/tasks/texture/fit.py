@@ -1,0 +1,92 @@
+"""``fit texture``: from what was asked for to sizes and a training."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+from ...errors import UsageError
+from ...maps.pyramid import Pyramid
+from ...maps.source import Source, load_source
+from ...tables import MAX_BYTES
+from ..map_arguments import asked_bytes
+from ..task import Fitted, Request
+from . import sizing, training
+from .presets import PRESETS, Recipe
+
+
+def recipe_of(preset: str, settings, options) -> Recipe:
+    """The recipe of a preset with what the options change."""
+    recipe = dataclasses.replace(PRESETS[preset], settings=settings or PRESETS[preset].settings)
+    given = {"samples": options["footprint_samples"], "axis": options["axis"]}
+    return dataclasses.replace(recipe, **{k: v for k, v in given.items() if v is not None})
+
+
+def check(request: Request) -> None:
+    """Raise :class:`UsageError` for options that do not go together."""
+    options = request.options
+    if options["source"] is None:
+        raise UsageError("source: not given, an image or a manifest of the maps of a material is needed")
+    if request.preset == "paper":
+        for name in ("structure", "skip", "cascaded"):
+            if options[name] is not None:
+                raise UsageError(f"--{name} is for our arrays, those of the preset paper follow from its tables")
+        if options["footprint_samples"] == "levels":
+            raise UsageError("--footprint-samples: the preset paper draws footprints, power or exponential")
+    elif options["axis"] is not None:
+        raise UsageError("--axis is for the preset paper: our arrays are read at levels of detail, not at footprints")
+    if options["structure"] not in (None, "auto") and options["skip"] is None:
+        fine = sizing.parse_structure(options["structure"])
+        options["skip"] = fine[-1].level + 1
+
+
+def fit(request: Request) -> Fitted:
+    """
+    Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
+    :class:`~mi_diffind.fitting.FittingError`.
+    """
+    options = request.options
+    source = load_source(options["source"], nonfinite=options["nonfinite"])
+    recipe = recipe_of(request.preset, request.settings, options)
+    border = None if options["border"] == "auto" else (options["border"],) * 2
+    pyramid = Pyramid.of(source, training.layout_of(source, recipe), request.types, border)
+    asked, size = asked_bytes(options, source), None
+    if pyramid.layout.stored:
+        size = size_of(source, pyramid, asked, recipe, options)
+        if size.nbytes > MAX_BYTES:
+            raise UsageError(f"the arrays would take {size.nbytes:,} bytes, allowed are {MAX_BYTES:,}")
+    table, result = training.fit_texture(source, size, recipe, request, pyramid)
+    folder = (request.output or Path("x")).resolve().parent
+    table.settings["source_path"] = os.path.relpath(Path(options["source"]).resolve(), folder)
+    achieved = source.nbytes / table.nbytes if table.nbytes else None
+    lines = [f"{achieved:.2f}x ({source.nbytes / asked:.2f}x asked for)" if achieved else "of one colour"]
+    if size is not None and abs(size.nbytes / asked - 1) > sizing.TOLERANCE:
+        lines.append(f"{asked:,} bytes were asked for, but {size.nbytes:,} are the nearest that its arrays allow")
+    figures = {
+        "source_bytes": source.nbytes,
+        "compression": achieved,
+        "compression_asked": source.nbytes / asked,
+        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
+        "bits": {name: a.bits for name, a in table.arrays.items()},
+    }
+    return Fitted(table, result, lines, figures)
+
+
+def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, options):
+    """The size of the arrays for so many bytes. Raises :class:`UsageError`."""
+    layout = pyramid.layout
+    if not recipe.layered:
+        return sizing.paper_size(nbytes, source.nbytes, layout.stored, layout.height, layout.width)
+    fine, skip, levels = None, options["skip"], pyramid.levels
+    if options["structure"] not in (None, "auto"):
+        fine = sizing.parse_structure(options["structure"])
+        lowest = fine[-1].level + 1
+        if skip < lowest:
+            raise UsageError(f"--skip: found {skip}, the structure has a fine array on level {lowest - 1}")
+    if skip is not None and not 0 <= skip < levels:
+        raise UsageError(f"--skip: found {skip}, the texture has levels 0 to {levels - 1}")
+    try:
+        return sizing.choose(pyramid.values, nbytes, pyramid.border, skip, fine, options["cascaded"])
+    except ValueError as e:
+        raise UsageError(f"--structure: {e}") from None

@@ -1,0 +1,230 @@
+"""
+How arrays are read at a place and a level of detail: the paper's layout, and ours.
+
+Both answer ``filtered(u, v, level)`` and ``stored(u, v)``, which is level 0 and reads no more than that needs. Levels
+are those of a mip pyramid: 0 is the source, each further one half as large.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+from drjit import nn
+
+from ... import lookup
+from ...compat import module_of
+from ...indirection import DifferentiableArray
+from ...maps.pyramid import around, level_sizes
+from .sampling import footprint_of
+
+
+@dataclass(frozen=True)
+class PaperForm:
+    """What the paper's arrays do not say themselves: the ``levels`` of the texture, and what footprints measure."""
+
+    levels: int
+    axis: str
+
+
+class PaperNet(nn.Module):
+    """
+    The paper's arrays (the supplement's table 3): ``primary0``, read at (v, u), 3 channels, and ``primary1``, read at
+    the footprint, 1 channel, point into ``cascaded``, ``N_lod × N_c³``.
+    """
+
+    DRJIT_STRUCT = {  # noqa: RUF012
+        "primary0": DifferentiableArray,
+        "primary1": DifferentiableArray,
+        "cascaded": DifferentiableArray,
+        "form": object,
+    }
+
+    def __init__(self, primary0=None, primary1=None, cascaded=None, form: PaperForm | None = None):
+        self.primary0, self.primary1, self.cascaded, self.form = primary0, primary1, cascaded, form
+
+    @property
+    def arrays(self) -> dict[str, DifferentiableArray]:
+        """The arrays by name, in the order of a file."""
+        return {"primary0": self.primary0, "primary1": self.primary1, "cascaded": self.cascaded}
+
+    @property
+    def border(self) -> tuple[str, str]:
+        """The border of the texture along v and u."""
+        return self.primary0.border
+
+    def changed(self, change) -> PaperNet:
+        """A copy with ``change(array, bits)`` in place of each array."""
+        return PaperNet(*(change(a, 8) for a in self.arrays.values()), self.form)
+
+    def at_footprint(self, u, v, x, active=True) -> list:
+        """The channels at (u, v) for a footprint in [0, 1]."""
+        inside = self.primary0.is_pointer and self.primary1.is_pointer
+        return self.cascaded([*self.primary1([x], active), *self.primary0([v, u], active)], active, inside)
+
+    def filtered(self, u, v, level, active=True) -> list:
+        """The channels at (u, v) and a level of detail within those that there are."""
+        return self.at_footprint(u, v, footprint_of(level, self.form.axis, self.form.levels), active)
+
+    def stored(self, u, v, active=True) -> list:
+        """The same at level 0. The footprint's array is not read: it says one number, known when bytes are stored."""
+        array, x = self.primary1, float(footprint_of(0.0, self.form.axis, self.form.levels))
+        if array.storage == "uint8":
+            entries, at = array.numpy()[:, 0], x * (array.resolution[0] - 1)
+            lower = min(int(at), len(entries) - 2)
+            lod = type(u)(float(entries[lower] + (at - lower) * (entries[lower + 1] - entries[lower])))
+        else:
+            (lod,) = array([type(u)(x)])
+        return self.cascaded([lod, *self.primary0([v, u], active)], active, self.primary0.is_pointer)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """
+    A fine array of ours: it has the size of the level of detail ``level``, and what is read of it, less
+    :attr:`zero`, times the ``scale`` of each channel, is added to the pointer from the levels below ``until``, and less
+    and less from there to ``until + 1``. ``bits`` are those of an entry.
+    """
+
+    level: int
+    until: int
+    bits: int
+    scale: tuple[float, ...]
+
+    @property
+    def channels(self) -> int:
+        return len(self.scale)
+
+    @property
+    def zero(self) -> float:
+        """The entry, a multiple of 1 / (2^bits − 1) if there are several bits, that stands for no difference."""
+        return 0.5 if self.bits == 1 else 2 ** (self.bits - 1) / (2**self.bits - 1)
+
+
+@dataclass(frozen=True)
+class LayeredForm:
+    """
+    What our arrays do not say themselves: the size of the texture, the fine ``layers``, the finest first, the level of
+    detail ``skip`` from which on each has its own pointers, and the ``bits`` of these.
+    """
+
+    height: int
+    width: int
+    layers: tuple[Layer, ...]
+    skip: int
+    bits: int = 8
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Rows and columns of all levels."""
+        return level_sizes(self.height, self.width)
+
+
+class LayeredNet(nn.Module):
+    """
+    Our arrays. ``coarse`` holds pointers for all texels of the levels from ``form.skip`` on, one level after the other,
+    read trilinearly; ``fine`` what the pointers of finer levels differ by, each array on the grid of its level, in few
+    bits and not of all channels; ``cascaded`` is read at their sum. Its first axis is the level of detail, one entry a
+    level up to ``form.skip``, if it has one dimension more than ``coarse`` has channels.
+    """
+
+    DRJIT_STRUCT = {  # noqa: RUF012
+        "fine": tuple,
+        "coarse": DifferentiableArray,
+        "cascaded": DifferentiableArray,
+        "form": object,
+        "along": tuple,
+    }
+
+    def __init__(self, fine=(), coarse=None, cascaded=None, form: LayeredForm | None = None, border=("clamp", "clamp")):
+        self.fine, self.coarse, self.cascaded, self.form = tuple(fine), coarse, cascaded, form
+        self.along = tuple(border)
+
+    @property
+    def arrays(self) -> dict[str, DifferentiableArray]:
+        """The arrays by name, in the order of a file."""
+        fine = {f"level{x.level}": a for x, a in zip(self.form.layers, self.fine, strict=True)}
+        return {**fine, "coarse": self.coarse, "cascaded": self.cascaded}
+
+    @property
+    def border(self) -> tuple[str, str]:
+        """The border of the texture along v and u."""
+        return self.along
+
+    def changed(self, change) -> LayeredNet:
+        """A copy with ``change(array, bits)`` in place of each array."""
+        form = self.form
+        fine = [change(a, x.bits) for a, x in zip(self.fine, form.layers, strict=True)]
+        return LayeredNet(fine, change(self.coarse, form.bits), change(self.cascaded, 8), form, self.along)
+
+    def filtered(self, u, v, level, active=True) -> list:
+        """The channels at (u, v) and a level of detail within those that there are."""
+        form, Float = self.form, type(u)
+        UInt32 = dr.uint32_array_t(Float)
+        above = dr.maximum(level - form.skip, 0)
+        lower = dr.floor(above)
+        weight = above - dr.detach(lower)
+        index = UInt32(lower) + form.skip
+        pointer = self._coarse(u, v, index, active)
+        upper = self._coarse(u, v, dr.minimum(index + 1, len(form.sizes) - 1), active)
+        pointer = [dr.fma(weight, b - a, a) for a, b in zip(pointer, upper, strict=True)]
+        for x, array in zip(form.layers, self.fine, strict=True):
+            share = 1 - lookup.clamp(level - x.until, 0.0, 1.0)
+            self._add(pointer, x, array, u, v, share, active)
+        return self._answer(pointer, level, active)
+
+    def stored(self, u, v, active=True) -> list:
+        """The same at level 0."""
+        pointer = self._coarse(u, v, None, active)
+        for x, array in zip(self.form.layers, self.fine, strict=True):
+            self._add(pointer, x, array, u, v, None, active)
+        return self._answer(pointer, type(u)(0), active)
+
+    def _answer(self, pointer: list, level, active) -> list:
+        if self.cascaded.dims > len(pointer):
+            pointer = [lookup.clamp(level * (1 / max(1, self.form.skip)), 0.0, 1.0), *pointer]
+        return self.cascaded(pointer, active)
+
+    def _add(self, pointer: list, layer: Layer, array: DifferentiableArray, u, v, share, active) -> None:
+        """Add what a layer says to a pointer, times ``share`` (``None``: 1)."""
+        place = []
+        for x, n, border in zip((v, u), array.resolution, self.along, strict=True):
+            # Entries sit at texel centres of the level
+            place.append(x - 0.5 / n if border == "repeat" else (x * n - 0.5) * (1 / max(1, n - 1)))
+        for k, value in enumerate(array(place, active)):
+            value = (value - layer.zero) * layer.scale[k]
+            pointer[k] = pointer[k] + value if share is None else dr.fma(share, value, pointer[k])
+
+    def _coarse(self, u, v, level, active) -> list:
+        """The pointer that ``coarse`` has at (u, v) of a level, a whole number for each place; ``None``: the finest."""
+        form, UInt32 = self.form, dr.uint32_array_t(type(u))
+        sizes = form.sizes[form.skip :]
+        if level is None or len(sizes) == 1:
+            (rows, columns), offset = (UInt32(n) for n in sizes[0]), UInt32(0)
+        else:
+            rows, columns = (dr.maximum(UInt32(n) >> level, 1) for n in (form.height, form.width))
+            offset, start = UInt32(0), 0
+            for i, size in enumerate(sizes[:-1]):
+                start += math.prod(size)
+                offset = dr.select(level > form.skip + i, start, offset)
+        total = None
+        for row, a in around(v, rows, self.along[0]):
+            for column, b in around(u, columns, self.along[1]):
+                found, weight = self.coarse.entry(offset + row * columns + column, active), a * b
+                total = (
+                    [weight * f for f in found]
+                    if total is None
+                    else [dr.fma(weight, f, t) for f, t in zip(found, total, strict=True)]
+                )
+        return total
+
+
+def coarse_texels(form: LayeredForm) -> int:
+    """Texels of all levels from ``form.skip`` on."""
+    return sum(math.prod(size) for size in form.sizes[form.skip :])
+
+
+def types_of(net) -> object:
+    """The module of the Dr.Jit types that a net is read with."""
+    return module_of(net.cascaded.data)

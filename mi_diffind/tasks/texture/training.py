@@ -1,0 +1,200 @@
+"""
+Training of task 4: its samples, its targets and its steps (what they are made of: :mod:`.presets`).
+
+The truth is a mip pyramid that is read trilinearly (:mod:`mi_diffind.maps.pyramid`). Our recipe draws a texel of a
+level for each sample, stratified; half of the steps read it at its centre, where the truth is the texel itself, half at
+a place and a level of detail that are jittered. The supplement's draws a place for each texel of the source and a
+footprint, all jittered.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import drjit as dr
+import numpy as np
+
+from ... import lookup
+from ...fitting import FitResult, Problem
+from ...indirection import unfolded
+from ...maps.layout import Layout
+from ...maps.pyramid import Pyramid
+from ...maps.source import Source
+from ...tables import Table
+from ..task import Request
+from . import arrays
+from .compressed import CompressedTexture, to_table
+from .nets import PaperNet
+from .presets import Recipe
+from .sampling import footprints, level_of
+from .sizing import PaperSize, Size
+
+
+def layout_of(source: Source, recipe: Recipe) -> Layout:
+    """What of ``source`` is stored by a recipe."""
+    return Layout.of(source, recipe.once, None if recipe.normals else False, filtered=True)
+
+
+def shares(levels: int) -> np.ndarray:
+    """Shares of the samples on each level: one half, one quarter, …; of the coarsest together at least a fiftieth."""
+    found = 0.5 ** np.arange(1, levels + 1)
+    return np.maximum(found, 0.02 / levels) / np.maximum(found, 0.02 / levels).sum()
+
+
+class TextureProblem(Problem):
+    """
+    The training problem of :mod:`mi_diffind.fitting`. ``net`` reads the stored channels (:mod:`.nets`), ``pyramid`` is
+    the truth.
+    """
+
+    tolerance = 0.02
+
+    def __init__(self, net, pyramid: Pyramid, recipe: Recipe, digest: str = ""):
+        self.net, self.pyramid, self.recipe, self.types = net, pyramid, recipe, pyramid.types
+        layout = pyramid.layout
+        self.groups = {}
+        for i, name in enumerate(layout.groups):
+            self.groups.setdefault(name, []).append(i)
+        self.weights = {name: len(found) / layout.stored for name, found in self.groups.items()}
+        self.sizes = [level.shape[:2] for level in pyramid.values]
+        self.starts = np.cumsum([0] + [rows * columns for rows, columns in self.sizes])
+        form = dataclasses.asdict(net.form)
+        self.identity = {
+            "source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"},
+            "form": form, "border": list(net.border),
+        }  # fmt: skip
+        self.jittered = False
+        self._stretches = {}  # size of a batch → of each sample: level, first texel and number of texels, …
+
+    def begin(self, step: int, share: float) -> str:
+        """Called before each step: are its samples jittered? Says so."""
+        jitter = self.recipe.jitter
+        self.jittered = int((step + 1) * jitter) > int(step * jitter)
+        return f"jittered: {self.jittered}"
+
+    def _stretch(self, size: int) -> tuple:
+        """
+        For each of ``size`` samples its level, the first of the texels of that level that it may be in, how many these
+        are, the columns and rows of the level and where it starts.
+        """
+        if size not in self._stretches:
+            share = shares(len(self.sizes)) if self.recipe.samples == "levels" else np.array([1.0])
+            counts = np.floor(share * size).astype(np.int64)
+            counts[0] += size - counts.sum()
+            found = [[] for _ in range(6)]
+            for level, count in enumerate(counts):
+                rows, columns = self.sizes[level]
+                edges = np.arange(count + 1, dtype=np.uint64) * np.uint64(rows * columns) // np.uint64(max(1, count))
+                ones = np.ones(count, np.uint32)
+                for part, values in zip(
+                    found,
+                    (
+                        level * ones, edges[:-1], np.maximum(np.diff(edges), 1), columns * ones, rows * ones,
+                        int(self.starts[level]) * ones,
+                    ),
+                    strict=True,
+                ):  # fmt: skip
+                    part.append(values.astype(np.uint32))
+            self._stretches = {size: tuple(self.types.UInt32(np.concatenate(part)) for part in found)}
+            dr.eval(self._stretches)
+        return self._stretches[size]
+
+    def batch(self, rng, size: int):
+        Float, UInt32 = self.types.Float, self.types.UInt32
+        level, first, count, columns, rows, start = self._stretch(size)
+        index = first + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
+        x, y = Float(index % columns) + 0.5, Float(index // columns) + 0.5
+        if self.recipe.samples != "levels":
+            x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
+            layout = self.pyramid.layout
+            # Uniform numbers are in [0, 1), the powers want (0, 1]
+            base, samples = max(layout.height, layout.width), self.recipe.samples
+            footprint = footprints(1 - rng.random(Float, size), samples, base)
+            level = level_of(footprint, self.recipe.axis, len(self.sizes))
+            u, v = x / layout.width, y / layout.height
+            return [u, v, level, footprint], self._grouped(self.pyramid.filtered(u, v, level))
+        level = Float(level)
+        if not self.jittered:
+            target = self.pyramid.texels(start + index)
+            return [x / Float(columns), y / Float(rows), level, None], self._grouped(target)
+        x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
+        level = lookup.clamp(level + rng.random(Float, size) - 0.5, 0.0, float(len(self.sizes) - 1))
+        u, v = x / Float(columns), y / Float(rows)
+        return [u, v, level, None], self._grouped(self.pyramid.filtered(u, v, level))
+
+    def _grouped(self, stored: list) -> dict[str, list]:
+        return {name: [stored[i] for i in channels] for name, channels in self.groups.items()}
+
+    def predict(self, net, inputs) -> dict[str, list]:
+        u, v, level, footprint = inputs
+        net = rounded(net) if self.recipe.rounded else net
+        if isinstance(net, PaperNet) and footprint is not None:
+            return self._grouped(net.at_footprint(u, v, footprint))
+        return self._grouped(net.filtered(u, v, level))
+
+    def measure(self, net) -> dict[str, float]:
+        """PSNR of the stored channels at the centres of at most 2¹⁶ texels of each level, entries rounded."""
+        types, found = self.types, []
+        net = rounded(unfolded(net))
+        with dr.suspend_grad():
+            for level, (rows, columns) in enumerate(self.sizes):
+                texels = rows * columns
+                count = min(texels, 2**16)
+                index = np.random.default_rng(level).choice(texels, count, replace=False) if count < texels else None
+                index = types.UInt32(np.arange(texels, dtype=np.uint32) if index is None else index.astype(np.uint32))
+                u = (types.Float(index % columns) + 0.5) / columns
+                v = (types.Float(index // columns) + 0.5) / rows
+                got = net.filtered(u, v, dr.full(types.Float, level, count))
+                expected = self.pyramid.texels(index + int(self.starts[level]))
+                errors = [dr.mean(dr.square(a - b)) for a, b in zip(got, expected, strict=True)]
+                found.append(sum(float(e[0]) for e in errors) / len(errors))
+        decibels = [-10 * math.log10(max(e, 1e-12)) for e in found]
+        return {"psnr_db": decibels[0], "psnr_worst_db": min(decibels)}
+
+
+def problem_of(source: Source, size: Size | PaperSize, recipe: Recipe, pyramid: Pyramid) -> TextureProblem:
+    """The problem of training ``source`` at a size by a recipe, its arrays at their initial values."""
+    if isinstance(size, PaperSize):
+        net = arrays.from_ramps(pyramid.layout, size, pyramid.border, pyramid.levels, recipe.axis)
+    else:
+        net = arrays.from_components(pyramid.values, size, pyramid.border)
+    net = net.changed(lambda array, bits: array.alloc(pyramid.types.TensorXf))
+    return TextureProblem(net, pyramid, recipe, source.digest)
+
+
+def fit_texture(
+    source: Source, size: Size | PaperSize | None, recipe: Recipe, request: Request, pyramid: Pyramid
+) -> tuple[Table, FitResult]:
+    """
+    Train the arrays of ``source`` and return them as they are stored, with their errors
+    (:meth:`.CompressedTexture.measure`), and the run's record. ``size`` may be ``None`` for a texture of one colour,
+    which needs no arrays. ``request`` says where to train, for how long and with which checkpoint; its settings are
+    those of the ``recipe``.
+    """
+    request = dataclasses.replace(request, settings=recipe.settings)
+    if size is None:
+        table = to_table(CompressedTexture(pyramid.layout, None), {"source": source.digest})
+        result = FitResult({}, 0, 0, 0.0, False, 0)
+    else:
+        problem = problem_of(source, size, recipe, pyramid)
+        result = request.train(problem)
+        identity = {k: v for k, v in problem.identity.items() if k not in ("form", "border")}
+        settings = {**request.recorded(), **identity}
+        if request.seconds is not None:
+            settings["steps"] = result.steps
+        table = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net)), settings)
+    table.preset, table.seed = request.preset, recipe.settings.seed
+    found = CompressedTexture.of(table, request.types.TensorXf).measure(source)
+    table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
+    return table, result
+
+
+def stored_form(net):
+    """The arrays as they are stored, each entry rounded to its bits."""
+    return net.changed(lambda array, bits: array.quantised(bits))
+
+
+def rounded(net):
+    """A copy of ``net`` as training sees it that takes rounding into account (:meth:`.DifferentiableArray.rounded`)."""
+    return net.changed(lambda array, bits: array.rounded(bits))
