@@ -37,7 +37,10 @@ def crops(setting, readers: dict, result: dict):
     found = plot.sheet(title, _caption(result), 2.3 * len(columns), 2.5 * len(names))
     for i, (name, stage) in enumerate(setting.stages.items()):
         counted = setting.counted(stage)
-        top, left = _busiest(np.where(counted[..., None], setting.truths[name], np.nan), side)
+        part = np.where(counted[..., None], setting.truths[name], np.nan)
+        if not i:  # where the plane ends
+            part[int(np.argmax(counted.any(axis=1))) + side * 5 // 4 :] = np.nan
+        top, left = _busiest(part, side)
         for k, column in enumerate(columns):
             if column == "truth":
                 image, title = setting.truths[name], f"truth\n{setting.request.truth_spp} spp, multijittered"
@@ -63,7 +66,8 @@ def zoom(setting, readers: dict, result: dict):
     title = f"{result['title']}: a zoom of {motion.frames} frames"
     found = plot.sheet(title, _caption(result), 2.2 * columns, 1.55 * rows)
     grid = found.add_gridspec(rows, columns)
-    line = slice(GRID * (GRID // 2), GRID * (GRID // 2) + GRID)
+    truth = motion.aligned(strips["truth"]).reshape(motion.frames, GRID, GRID, 3)
+    row = int(np.argmax(truth[0].var(axis=1).sum(axis=-1)))  # where there is most to see
     for i, (name, strip) in enumerate(strips.items()):
         aligned = motion.aligned(strip)
         text = f"{name}\nflicker {flicker(aligned):.1e}".replace(", anisotropic", ",\nanisotropic")
@@ -74,10 +78,11 @@ def zoom(setting, readers: dict, result: dict):
             if i == 0:
                 axes.set_title(f"frame {frame + 1}", fontsize=8)
         axes = found.add_subplot(grid[i, columns - 1])
-        axes.imshow(aligned[:, line].clip(0, 1), interpolation="nearest", aspect="auto")
+        slices = aligned.reshape(motion.frames, GRID, GRID, 3)[:, row]
+        axes.imshow(slices.clip(0, 1), interpolation="nearest", aspect="auto")
         _bare(axes, "")
         if i == 0:
-            axes.set_title("the middle line, frames downwards", fontsize=8)
+            axes.set_title("a line of the plane, frames downwards", fontsize=8)
     return found
 
 
