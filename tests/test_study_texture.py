@@ -1,14 +1,21 @@
 """``tradeoff texture``: what is seen, how errors, levels and flicker are measured, what is written and said."""
 
+import csv
+import dataclasses
+import json
 import math
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from mi_diffind.cli import main
 from mi_diffind.studies.baselines import codecs
 
 FILM = (24, 16)
+
+#: Steps of a training.
+STEPS = 6
 
 
 def smooth(height, width, channels, seed=0):
@@ -210,3 +217,79 @@ def test_crops_show_what_differs():
     assert top <= 20 and top + 16 >= 28 and left <= 40 and left + 16 >= 48
     image[:, 30:] = np.nan
     assert _busiest(image, 16)[1] <= 14
+
+
+@pytest.fixture
+def small(tmp_path, monkeypatch):
+    """A material, and a study of one stage and one filter whose trainings take :data:`STEPS` steps each."""
+    import mitsuba as mi
+
+    from mi_diffind.studies.texture import candidates, stages
+    from mi_diffind.tasks.texture import training
+
+    mi.set_variant("llvm_ad_rgb")
+    maps = {"albedo": smooth(32, 32, 3, 1), "roughness": smooth(32, 32, 1, 2)}
+    for name, values in maps.items():
+        mi.Bitmap(values if values.shape[-1] > 1 else values[..., 0]).write(str(tmp_path / f"{name}.png"))
+    (tmp_path / "m.json").write_text(json.dumps({name: f"{name}.png" for name in maps}))
+    plane, fit_texture, asked = {"plane": stages.stages()["plane"]}, training.fit_texture, []
+
+    def stepwise(source, size, recipe, request, pyramid=None, **options):
+        asked.append((request.preset, request.seconds))
+        settings = dataclasses.replace(recipe.settings, steps=STEPS, batch=2**12)
+        recipe = dataclasses.replace(recipe, settings=settings)
+        request = dataclasses.replace(request, seconds=None, settings=settings)
+        return fit_texture(source, size, recipe, request, pyramid, **options)
+
+    monkeypatch.setattr(training, "fit_texture", stepwise)
+    monkeypatch.setattr(stages, "stages", lambda: plane)
+    monkeypatch.setattr(candidates, "WAYS", candidates.WAYS[:1])
+    monkeypatch.setattr(candidates, "MORE", ())
+    return tmp_path, asked
+
+
+def test_what_is_written(small, capsys):
+    folder, asked = small
+    command = ["tradeoff", "texture", str(folder / "m.json"), "--quick", "--width", "24", "--frames", "2"]
+    command += ["--out", str(folder / "out"), "--json", str(folder / "r.json"), "--seconds", "3"]
+    assert main(command) == 0
+    assert asked == [("ours", 3), ("paper", 3)]
+    result = json.loads((folder / "r.json").read_text())
+    made = result["candidates"]
+    blocks = ["ASTC 12x, trilinear"] * ("astc" in codecs.available())
+    filtered = ["mipmap, trilinear", "ours 12x, trilinear", "paper 12x, trilinear", *blocks]
+    bitmaps = [f"bitmap, {n} spp" for n in (1, 4, 16, 64)] + [f"bitmap, {n} spp, multijittered" for n in (4, 16, 64)]
+    assert set(made) == {*filtered, *bitmaps}
+    assert made["mipmap, trilinear"]["bytes"] == 4 * sum(4**i for i in range(6))
+    assert made["bitmap, 1 spp"]["bytes"] == 4 * 32 * 32
+    for name in blocks:
+        assert 0 < made[name]["bytes"] <= made["ours 12x, trilinear"]["bytes"]
+    order = [made[f"bitmap, {n} spp"]["errors"]["psnr_plane_db"] for n in (1, 4, 16, 64)]
+    assert order == sorted(order) and order[-1] - order[0] == pytest.approx(10 * math.log10(64), abs=5)
+    flicker = [made[f"bitmap, {n} spp"]["errors"]["flicker_error"] for n in (1, 4, 16, 64)]
+    assert flicker == sorted(flicker, reverse=True)
+    assert made["mipmap, trilinear"]["errors"]["psnr_plane_db"] > order[0] + 1
+    case = result["cases"]["plane"]
+    assert set(case["passes"]["render"]) == set(made)
+    assert set(case["queries"]["read"]) == {"bitmap, 1 spp", *filtered}
+    for name in ("ours 12x", "paper 12x"):
+        found = result["jobs"][name]["details"]["levels"]
+        assert len(found["all"]) == len(found["albedo"]) == 6 and result["jobs"][name]["details"]["steps"] == STEPS
+    with open(folder / "out" / "tradeoff_texture.csv", encoding="utf-8") as stream:
+        table = list(csv.DictReader(stream))
+    assert {(r["candidate"], r["query"]) for r in table} >= {(n, "render") for n in made}
+    for kind in ("", "_crops", "_zoom", "_levels"):
+        assert (folder / "out" / f"tradeoff_texture{kind}.png").stat().st_size > 10_000
+    assert not list((folder / "out").glob("*.partial*"))
+    out = capsys.readouterr().out
+    assert "PSNR by level" in out and "plane, ours 12x, trilinear:" in out
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [(["--compression", "0"], "0"), (["--map", "roughness"], "roughness"), (["--table", "missing.npz"], "missing.npz")],
+)
+def test_bad_options(small, options, message, capsys):
+    folder, asked = small
+    assert main(["tradeoff", "texture", str(folder / "m.json"), "--out", str(folder / "out"), *options]) == 2
+    assert message in capsys.readouterr().err and not asked

@@ -36,6 +36,11 @@ class TextureStudy(Study):
                             help="of each training (default: 60; --quick: 2)")  # fmt: skip
         parser.add_argument("--astc", choices=ASTC_PRESETS, default="exhaustive",
                             help="preset of the ASTC encoder (default: exhaustive)")  # fmt: skip
+        parser.add_argument(
+            "--footprints",
+            action="store_true",
+            help="also train with each distribution of footprints, and draw levels beside them",
+        )
         parser.add_argument("--frames", type=positive, metavar="N", help="of the zoom (default: 60; --quick: 6)")
         parser.add_argument("--width", type=positive, metavar="N",
                             help="of the stills, the height is two thirds (default: 480; --quick: 96)")  # fmt: skip
@@ -69,6 +74,7 @@ class TextureStudy(Study):
             arguments.frames or (6 if quick else 60),
             64 if quick else 256,
             1 if quick else 4,
+            arguments.footprints,
         )
         return plan(arguments.loaded, arguments.source, request, arguments.tables)
 

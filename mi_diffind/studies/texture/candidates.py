@@ -52,8 +52,16 @@ FILTERS = {
     "off": {"filter": "off"},
 }
 
+#: Filters, and whether samples are centred; and those that only our first table has.
+WAYS = tuple(itertools.product(("trilinear", "anisotropic"), (False, True)))
+MORE = (("stochastic", False), ("off", False))
+
 #: The integrator whose samples are at the centres of pixels.
 CENTRED = {"type": "path_footprint", "jitter": False}
+
+#: Presets, and distributions of footprints that they are trained with beside their own (ours: by level; the paper's:
+#: powers).
+SAMPLES = (("ours", "power"), ("ours", "exponential"), ("paper", "exponential"))
 
 #: The candidate whose time others are compared with.
 BASE = "bitmap, 1 spp"
@@ -68,7 +76,7 @@ class Request:
     What is asked for: the name of the ``map`` that is rendered, ``compressions`` to train for ``seconds`` each;
     ``astc`` and ``astc_choice``, presets of its encoder as in the study of images; ``film`` and ``zoom_film``, sizes of
     the images (width, height); ``frames`` of the zoom; ``truth_spp``, a square; ``seeds``, renders that errors are the
-    mean of.
+    mean of; with ``footprints``, both presets are also trained with the other distributions of footprints.
     """
 
     map: str
@@ -81,6 +89,7 @@ class Request:
     frames: int = 60
     truth_spp: int = 256
     seeds: int = 4
+    footprints: bool = False
 
 
 def colour_map(source: Source, name: str = "") -> str:
@@ -277,6 +286,7 @@ class _Table(_Made):
     seconds: float = 0.0
     table: Table | None = None
     file: str = ""
+    samples: str | None = None
 
     def known(self, folder: Path | None, record: dict | None) -> dict | None:
         self.file = str(self.table.path) if self.table else str(folder / f"{file_name(self.name)}.npz")
@@ -287,7 +297,8 @@ class _Table(_Made):
         if self.table is None:
             fitted = task.fit(
                 "texture", self.preset, mi.variant(), seconds=self.seconds, progress=progress,
-                source=self.setting.name, compression=self.compression, deterministic=False,
+                source=self.setting.name, compression=self.compression, deterministic=False, output=self.file,
+                footprint_samples=self.samples,
             )  # fmt: skip
             if fitted.result.interrupted:
                 return None
@@ -373,9 +384,8 @@ def _candidates(setting: Setting, tables: Sequence[Table]) -> tuple[list[Job], l
         add(f"bitmap, {spp} spp, multijittered", "bitmap, multijittered",
             lambda n=spp: setting.bitmap(n, "multijitter"), bytes=source.nbytes, setting=f"{spp} spp",
             queries=())  # fmt: skip
-    ways = tuple(itertools.product(("trilinear", "anisotropic"), (False, True)))
 
-    def both(name: str, kind: str, reader: Callable[[str, bool], Reader], ways=ways, **more) -> None:
+    def both(name: str, kind: str, reader: Callable[[str, bool], Reader], ways=WAYS, **more) -> None:
         for how, centred in ways:
             add(f"{name}, {how}{', centred' * centred}", kind, lambda h=how, c=centred: reader(h, c), setting=how,
                 queries=() if centred else None, **more)  # fmt: skip
@@ -398,16 +408,21 @@ def _candidates(setting: Setting, tables: Sequence[Table]) -> tuple[list[Job], l
         jobs.append(job)
         known = {"job": job.name, "training_seconds": None, "in_picture": i == 0 or job.kind == "ours"}
         if job.kind != "ours":
-            both(job.name, job.kind, job.reader, ways[:1], **known)
+            both(job.name, job.kind, job.reader, WAYS[:1], **known)
             continue
-        more = (("stochastic", False), ("off", False)) if i == 0 else ()
-        both(job.name, job.kind, job.reader, (*ways, *more), **known)
+        both(job.name, job.kind, job.reader, (*WAYS, *(MORE if i == 0 else ())), **known)
         if "astc" in codecs.available():
             name = job.name.replace("ours", "ASTC")
             blocks = _Blocks(name, "ASTC with mip maps", job.compression, setting, like=job, cache=cache)
             jobs.append(blocks)
-            both(blocks.name, blocks.kind, blocks.reader, ways[::3], job=blocks.name, training_seconds=None,
+            both(blocks.name, blocks.kind, blocks.reader, WAYS[::3], job=blocks.name, training_seconds=None,
                  in_picture=i == 0)  # fmt: skip
+    if request.footprints and request.compressions:
+        compression = request.compressions[0]
+        for preset, samples in SAMPLES:
+            name = f"{preset} {compression:g}x, {samples} footprints"
+            preset = "paper" if preset == "paper" else ""
+            jobs.append(_Table(name, "footprints", compression, setting, preset, request.seconds, samples=samples))
     for candidate, _ in found:
         candidate.in_picture &= not candidate.name.endswith((", off", ", stochastic"))
     return jobs, found

@@ -23,7 +23,7 @@ def shown(candidates: Iterable) -> list[str]:
 
 
 def of(setting, readers: dict[str, Callable]) -> dict[str, Callable[[dict], object]]:
-    """The pictures of a plan: ``crops`` and ``zoom``."""
+    """The pictures of a plan: ``crops``, ``zoom``, ``levels``."""
     return {kind: lambda result, draw=draw: draw(setting, readers, result) for kind, draw in _KINDS.items()}
 
 
@@ -86,6 +86,48 @@ def zoom(setting, readers: dict, result: dict):
     return found
 
 
+def levels(setting, readers: dict, result: dict):
+    """
+    The quality of each level of all that was made; where distributions of footprints were compared, also the share of
+    their samples on each level.
+    """
+    known = {n: r["details"] for n, r in result["jobs"].items() if "levels" in r.get("details", {})}
+    compared = setting.request.footprints
+    title = f"{result['title']}: levels of detail"
+    found = plot.sheet(title, _caption(result), 6.4 * (1 + compared), 4.6)
+    if compared:
+        axes = found.add_subplot(1, 2, 1)
+        count = setting.pyramid.levels
+        for i, (kind, shares) in enumerate(histograms(count).items()):
+            axes.bar(np.arange(count) + 0.27 * (i - 1), 100 * shares, 0.25, label=kind, color=plot.STYLES[i][0])
+        _levels(axes, "nearest level of detail", "% of the samples of a training")
+    axes = found.add_subplot(1, 1 + compared, 1 + compared)
+    for i, (name, details) in enumerate(known.items()):
+        colour, marker = plot.STYLES[i % len(plot.STYLES)]
+        line = {"ASTC with mip maps": ":", "ours": "-"}.get(details["kind"], "--")
+        values = details["levels"]["all"]
+        axes.plot(values, color=colour, marker=marker, markersize=4, linestyle=line, linewidth=1.1, label=name)
+    _levels(axes, "level of detail", "PSNR of all maps at texel centres, dB")
+    return found
+
+
+def histograms(count: int) -> dict[str, np.ndarray]:
+    """Distributions of footprints: the share of their samples that is nearest to each of ``count`` levels."""
+    from ...tasks.texture import sampling, training
+
+    own = {"by level (ours)": training.shares(count)}
+    return own | {kind: sampling.footprint_histogram(kind, count) for kind in sampling.FOOTPRINTS}
+
+
+def _levels(axes, x_label: str, y_label: str) -> None:
+    axes.set_xlabel(x_label, fontsize=9)
+    axes.set_ylabel(y_label, fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.grid(color="0.92", linewidth=0.5)
+    axes.set_axisbelow(True)
+    axes.legend(fontsize=7.5)
+
+
 def _busiest(image: np.ndarray, side: int) -> tuple[int, int]:
     """Row and column of the square with the most variance, of those within the image (NaN: outside)."""
     best, place = -1.0, (0, 0)
@@ -98,7 +140,7 @@ def _busiest(image: np.ndarray, side: int) -> tuple[int, int]:
     return place
 
 
-_KINDS = {"crops": crops, "zoom": zoom}
+_KINDS = {"crops": crops, "zoom": zoom, "levels": levels}
 
 
 def _bare(axes, label: str) -> None:
