@@ -6,13 +6,16 @@ principal components of the texture's levels, so that at step 0 they are smaller
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...indirection import DifferentiableArray
+from ...maps import components
+from ...maps.compressed import taps
 from ...maps.layout import Layout
 from .nets import Layer, LayeredForm, LayeredNet, PaperForm, PaperNet
-from .sizing import Components, PaperSize, Size, enlarged
+from .sizing import PaperSize, Size
 
 #: Of the differences of two levels, by bits of an entry (8: and more): the share that lies within its range.
 WITHIN = {1: 0.7, 2: 0.97, 3: 0.99, 4: 0.998, 5: 0.998, 6: 0.998, 7: 0.998, 8: 0.998}
@@ -30,6 +33,68 @@ def from_ramps(layout: Layout, size: PaperSize, border: tuple[str, str], levels:
     return PaperNet(primary0, primary1, cascaded, PaperForm(levels, axis))
 
 
+@dataclass(frozen=True)
+class Components:
+    """
+    The principal components of a texture, as pointers of its texels: ``mean`` (``(k,)``) and ``directions`` (``(dims,
+    k)``) of the channels, those with the most differences between neighbours first, and ``low`` and ``high``, the range
+    of each component, of which a little room at the ends of [0, 1] is left.
+    """
+
+    mean: np.ndarray
+    directions: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    #: Room between the components' range and the ends of [0, 1], and the share of texels beyond it at either end.
+    MARGIN, OUTSIDE = 0.02, 1e-3
+
+    @staticmethod
+    def of(values: np.ndarray, dims: int) -> Components:
+        """Of level 0, ``(height, width, k)``: ``dims`` of them, if there are so many."""
+        k = values.shape[-1]
+        mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
+        covariance = components.covariance(values, mean)
+        directions = components.strongest(covariance, min(dims, k))
+        # Axes of the same space, those with the most detail first: fine arrays have the first ones only
+        detail = directions @ components.differences(values) @ directions.T
+        directions = components.strongest(detail, len(directions)) @ directions
+        found = (values.reshape(-1, k) - mean) @ directions.T
+        low, high = np.quantile(found, [Components.OUTSIDE, 1 - Components.OUTSIDE], axis=0)
+        return Components(mean, directions, low, np.maximum(high, low + 1e-3))
+
+    @property
+    def dims(self) -> int:
+        return len(self.directions)
+
+    def pointers(self, values: np.ndarray) -> np.ndarray:
+        """The pointers of texels, ``(height, width, dims)`` in [0, 1], float32."""
+        found = ((values - self.mean) @ self.directions.T - self.low) / (self.high - self.low)
+        return np.clip(self.MARGIN + (1 - 2 * self.MARGIN) * found, 0, 1).astype(np.float32)
+
+    def back(self, side: int) -> np.ndarray:
+        """The channels at the entries of a cascaded array, ``(side, …, k)``: the linear map back from pointers."""
+        grid = (np.linspace(0, 1, side) - self.MARGIN) / (1 - 2 * self.MARGIN) if side > 1 else np.array([0.5])
+        found = self.mean
+        for d in range(self.dims):
+            shape = [-1 if axis == d else 1 for axis in range(self.dims)] + [1]
+            along = np.reshape(self.low[d] + grid * (self.high[d] - self.low[d]), shape)
+            found = found + along * self.directions[d]
+        return np.clip(found, 1e-3, 1 - 1e-3).astype(np.float32)
+
+
+def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
+    """A level, ``(height, width, k)``, read bilinearly at the texel centres of ``rows`` × ``columns``. float32."""
+    for axis, (n, along) in enumerate(zip((rows, columns), border, strict=True)):
+        places = (np.arange(n) + 0.5) / n
+        total = 0
+        for index, weight in taps(places, values.shape[axis], along):
+            shape = [-1 if a == axis else 1 for a in range(3)]
+            total = total + np.take(values, index, axis) * weight.reshape(shape)
+        values = total
+    return values.astype(np.float32)
+
+
 def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str, str]) -> LayeredNet:
     """
     Initial values from the levels ``values`` of a texture, each ``(height, width, k)`` in [0, 1]; not allocated. From
@@ -37,9 +102,11 @@ def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str,
     say of them.
     """
     found = Components.of(values[0], size.dims)
-    pointers = [found.pointers(level) for level in values]
-    # A texture has no more components than channels
-    pointers = [np.pad(p, [(0, 0), (0, 0), (0, size.dims - found.dims)], constant_values=0.5) for p in pointers]
+    # A texture has no more components than channels: further coordinates start as ramps along u or v
+    pointers = [
+        np.concatenate([found.pointers(level), _ramps(*level.shape[:2], size.dims - found.dims)], axis=-1)
+        for level in values
+    ]
     reached, level = pointers[size.skip], size.skip
     layers, fine = [], []
     for i in reversed(range(len(size.fine))):
@@ -67,3 +134,9 @@ def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str,
     cascaded = DifferentiableArray(shape, size.channels, cascaded, fold=True)
     form = LayeredForm(size.height, size.width, tuple(layers), size.skip, size.bits)
     return LayeredNet(fine, coarse, cascaded, form, border)
+
+
+def _ramps(rows: int, columns: int, count: int) -> np.ndarray:
+    """The positions of texel centres, ``(rows, columns, count)``: along u and v in turn."""
+    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+    return np.concatenate([np.zeros((rows, columns, 0)), *[(u, v)[i % 2][..., None] for i in range(count)]], axis=-1)

@@ -87,6 +87,6 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, opt
     if skip is not None and not 0 <= skip < levels:
         raise UsageError(f"--skip: found {skip}, the texture has levels 0 to {levels - 1}")
     try:
-        return sizing.choose(pyramid.values, nbytes, pyramid.border, skip, fine, options["cascaded"])
+        return sizing.choose(layout.height, layout.width, layout.stored, nbytes, skip, fine, options["cascaded"])
     except ValueError as e:
         raise UsageError(f"--structure: {e}") from None

@@ -3,21 +3,17 @@ Bytes and resolutions: how large the arrays of task 4 are for a wanted size.
 
 The paper's are equation 2 of the supplement, ``bytes = 3 N_p0² + N_p1 + k N_c³ N_lod``, a table of ratios
 ``ρ = N_p0 / N_c`` and a linear search (:func:`paper_size`). Ours are all on the grids of levels of detail, so only
-channels and bits of the fine arrays are to be chosen; :func:`choose` tries all of them on a model of the error.
+channels and bits of the fine arrays are to be chosen (:func:`choose`).
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ...maps import components
-from ...maps.compressed import taps
 from ...maps.pyramid import level_sizes
 
 #: Best resolution ratio for compression ratios of textures at 4K (the supplement's table 4): RGB, and materials.
@@ -175,130 +171,77 @@ def parse_structure(text: str) -> tuple[Fine, ...]:
     return fine
 
 
-#: What is left of the variance of a channel's differences between levels after so many bits for it, trained: 0 to 8.
-LEFT = (1, 0.5, 0.24, 0.1, 0.03, 0.009, 0.0025, 0.0007, 0.0002)
+#: Structures for more and more bytes: the fine arrays and the level that all have pointers of their own from. Found by
+#: trainings: from one to the next level a quarter of the entries has room for four times the bits, and a channel or two
+#: are enough for the finest.
+LADDER: tuple[tuple[str, int], ...] = (
+    ("0:1:2,2:2:4", 3),
+    ("0:1:2,1:1:4,2:2:4", 3),
+    ("0:1:2,1:2:4,2:2:4", 3),
+    ("0:1:2,1:2:4,2:3:6", 3),
+    ("0:1:3,1:2:4,2:3:6", 3),
+    ("0:1:4,1:1:4", 2),
+    ("0:1:4,1:2:4", 2),
+    ("0:2:3,1:2:4", 2),
+    ("0:2:3,1:3:4", 2),
+    ("0:2:4,1:3:4", 2),
+    ("0:3:4,1:3:4", 2),
+    ("0:3:5,1:3:5", 2),
+    ("0:3:6,1:3:6", 2),
+    ("0:3:8,1:3:8", 2),
+)
 
 #: Largest sides of a cascaded array of 1 to 4 dimensions that are chosen.
 CASCADED_LIMITS = (128, 32, 16, 8)
 
 #: A cascaded array takes at least this share of the bytes, unless its side is this already.
-CASCADED_SHARE, CASCADED_SIDE = 0.07, 12
-
-#: dB. As many coordinates, up to three, as leave no more than this of the error of a linear model.
-DIMS_DB = 45.0
-
-
-@dataclass(frozen=True)
-class Components:
-    """
-    The principal components of a texture, as pointers of its texels: ``mean`` (``(k,)``) and ``directions`` (``(dims,
-    k)``) of the channels, and ``low`` and ``high``, the range of each component, of which a little room at the ends of
-    [0, 1] is left.
-    """
-
-    mean: np.ndarray
-    directions: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    #: Room between the components' range and the ends of [0, 1], and the share of texels beyond it at either end.
-    MARGIN, OUTSIDE = 0.02, 1e-3
-
-    @staticmethod
-    def of(values: np.ndarray, dims: int | None = None) -> Components:
-        """Of level 0, ``(height, width, k)``; ``dims``: as many as are needed, unless given."""
-        k = values.shape[-1]
-        mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
-        covariance = components.covariance(values, mean)
-        energies = np.linalg.eigvalsh(covariance)[::-1]
-        if dims is None:
-            left = [max(0.0, float(energies[d:].sum())) / k for d in range(1, 4)]
-            dims = next((d for d, e in enumerate(left, 1) if e <= 10 ** (-DIMS_DB / 10)), 3)
-        directions = components.strongest(covariance, min(dims, k))
-        found = (values.reshape(-1, k) - mean) @ directions.T
-        low, high = np.quantile(found, [Components.OUTSIDE, 1 - Components.OUTSIDE], axis=0)
-        return Components(mean, directions, low, np.maximum(high, low + 1e-3))
-
-    @property
-    def dims(self) -> int:
-        return len(self.directions)
-
-    def pointers(self, values: np.ndarray) -> np.ndarray:
-        """The pointers of texels, ``(height, width, dims)`` in [0, 1], float32."""
-        found = ((values - self.mean) @ self.directions.T - self.low) / (self.high - self.low)
-        return np.clip(self.MARGIN + (1 - 2 * self.MARGIN) * found, 0, 1).astype(np.float32)
-
-    def back(self, side: int) -> np.ndarray:
-        """The channels at the entries of a cascaded array, ``(side, …, k)``: the linear map back from pointers."""
-        grid = (np.linspace(0, 1, side) - self.MARGIN) / (1 - 2 * self.MARGIN) if side > 1 else np.array([0.5])
-        found = self.mean
-        for d in range(self.dims):
-            shape = [-1 if axis == d else 1 for axis in range(self.dims)] + [1]
-            along = np.reshape(self.low[d] + grid * (self.high[d] - self.low[d]), shape)
-            found = found + along * self.directions[d]
-        return np.clip(found, 1e-3, 1 - 1e-3).astype(np.float32)
-
-
-def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
-    """A level, ``(height, width, k)``, read bilinearly at the texel centres of ``rows`` × ``columns``. float32."""
-    for axis, (n, along) in enumerate(zip((rows, columns), border, strict=True)):
-        places = (np.arange(n) + 0.5) / n
-        total = 0
-        for index, weight in taps(places, values.shape[axis], along):
-            shape = [-1 if a == axis else 1 for a in range(3)]
-            total = total + np.take(values, index, axis) * weight.reshape(shape)
-        values = total
-    return values.astype(np.float32)
+CASCADED_SHARE, CASCADED_SIDE = 0.05, 12
 
 
 def choose(
-    values: Sequence[np.ndarray],
+    height: int,
+    width: int,
+    channels: int,
     nbytes: float,
-    border: Sequence[str],
     skip: int | None = None,
     fine: tuple[Fine, ...] | None = None,
     cascaded: int | None = None,
 ) -> Size:
     """
-    Our size for the levels ``values`` of a texture and so many bytes, some of it given unless ``None``.
-
-    All combinations of up to three fine arrays are tried on a model: a component's error at a level is that of the
-    level above it and the variance of what they differ by, of which :data:`LEFT` remains if it has bits; what counts
-    is the sum over levels, each half as much as the finer one. What is left of the bytes goes to the cascaded array.
+    Our size for a texture of so many stored channels and so many bytes, some of it given unless ``None``: the structure
+    of :data:`LADDER` with the most bytes that fit, on coarser levels for fewer bytes; what is left goes to the cascaded
+    array. Pointers have three coordinates, and fewer where even the smallest arrays of three are too large.
     """
-    found = Components.of(values[0])
-    height, width, channels = values[0].shape
-    sizes = [level.shape[:2] for level in values]
-    pointers = [(level - found.mean) @ found.directions.T for level in values]
-    count = min(len(values) - 1, MAX_SKIP + MAX_FINE)
-    variances = [
-        ((pointers[i] - enlarged(pointers[i + 1], *sizes[i], border)) ** 2).mean(axis=(0, 1), dtype=np.float64)
-        for i in range(count)
-    ]
-    best = None
-    for where in range(count + 1) if skip is None else [skip]:
-        levels = range(max(0, where - MAX_FINE), where)
-        menu = [None, *((c, b) for c in range(1, found.dims + 1) for b in BITS)]
-        area = [math.prod(sizes[i]) / 8 for i in levels]
-        tried = itertools.product(*[menu] * len(levels)) if fine is None else [fine]
-        for combination in tried:
-            arrays = combination
-            if fine is None:
-                if sum(a * e[0] * e[1] for a, e in zip(area, combination, strict=True) if e) > nbytes:
-                    continue
-                arrays = tuple(Fine(i, *e) for i, e in zip(levels, combination, strict=True) if e)
-            size = _sized(nbytes, height, width, channels, arrays, where, found.dims, cascaded)
-            rank = (max(0, size.nbytes - nbytes), _error(variances, arrays, where, found.dims))
-            if best is None or rank < best[0]:
-                best = rank, size
-    return best[1]
+    levels = len(level_sizes(height, width))
+    for dims in (3, 2, 1):
+        found = []
+        for arrays, start in _structures(levels, dims) if fine is None else [(fine, skip)]:
+            if skip is None or start == skip or fine is not None:
+                found.append(_sized(nbytes, height, width, channels, arrays, start, dims, cascaded))
+        if skip is not None and fine is None:
+            found.append(_sized(nbytes, height, width, channels, (), skip, dims, cascaded))
+        fitting = [size for size in found if size.nbytes <= nbytes]
+        if fitting:
+            return max(fitting, key=lambda size: (_without(size, channels), -len(size.fine)))
+        smallest = min(found, key=lambda size: size.nbytes)
+        if fine is not None and dims <= max(f.channels for f in fine):
+            break
+    return smallest
 
 
-#: Fine arrays that are chosen, at most, and the coarsest level that may be the first to have pointers of its own.
-MAX_FINE, MAX_SKIP = 3, 6
+def _structures(levels: int, dims: int):
+    """The structures of the ladder, on all levels that there are; the fine arrays and where the others start."""
+    for shift in range(levels):
+        for text, skip in LADDER:
+            arrays = [Fine(f.level + shift, min(f.channels, dims), f.bits) for f in parse_structure(text)]
+            start = min(skip + shift, levels - 1)
+            yield tuple(f for f in arrays if f.level < start), start
+    yield (), levels - 1
 
-#: Bits that are chosen for them.
-BITS = (1, 2, 3, 4, 5, 6, 8)
+
+def _without(size: Size, channels: int) -> int:
+    """Bytes of all but the cascaded array."""
+    return size.nbytes - channels * size.knots * size.cascaded**size.dims
 
 
 def _sized(nbytes, height, width, channels, fine, skip, dims, cascaded) -> Size:
@@ -313,18 +256,5 @@ def _sized(nbytes, height, width, channels, fine, skip, dims, cascaded) -> Size:
     def side(rest: float) -> int:
         return int((max(rest, 0) / (channels * (skip + 1))) ** (1 / dims) + 1e-9)
 
-    least = min(max(2, side(CASCADED_SHARE * nbytes)), CASCADED_SIDE)
+    least = min(max(2 + (dims > 1), side(CASCADED_SHARE * nbytes)), CASCADED_SIDE)
     return sized(min(max(side(nbytes - sized(0).nbytes), least), CASCADED_LIMITS[dims - 1]))
-
-
-def _error(variances: Sequence[np.ndarray], fine: Sequence[Fine], skip: int, dims: int) -> float:
-    """The model of :func:`choose`."""
-    by_level = {f.level: f for f in fine}
-    error, total = np.full(dims, 1e-6), 0.0
-    for level in reversed(range(skip)):
-        error = error + variances[level]
-        f = by_level.get(level)
-        if f is not None:
-            error = np.where(np.arange(dims) < f.channels, LEFT[f.bits] * error, error)
-        total += float(error.sum()) * 0.5 ** (level + 1)
-    return total

@@ -104,6 +104,8 @@ class TextureProblem(Problem):
         Float, UInt32 = self.types.Float, self.types.UInt32
         level, first, count, columns, rows, start = self._stretch(size)
         index = first + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
+        # Lanes of a packet beyond the last sample hold zeros, and an integer division by zero ends the process
+        columns, rows = dr.maximum(columns, 1), dr.maximum(rows, 1)
         x, y = Float(index % columns) + 0.5, Float(index // columns) + 0.5
         if self.recipe.samples != "levels":
             x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
