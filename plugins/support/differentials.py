@@ -50,7 +50,7 @@ class Differentials:
         At a hit: what the steps add to the place on the tangent plane is now in ``ox``, ``oy``, and ``width`` is that
         of the cone there, across the ray.
         """
-        n, d, t = dr.detach(si.n), dr.detach(ray.d), dr.select(si.is_valid(), dr.detach(si.t), 0)
+        n, d, t = mi.Vector3f(dr.detach(si.n)), dr.detach(ray.d), dr.select(si.is_valid(), dr.detach(si.t), 0)
         cosine = _away_from_zero(dr.dot(n, d))
 
         def moved(o, v):
@@ -85,7 +85,7 @@ class Differentials:
         ``spread`` s grows to √(s² + a²) with a² = scale² / pdf, the solid angle of a share of the lobe, limited to
         :data:`WIDEST`; ``scale`` as that of the samples.
         """
-        d, wo, outward = dr.detach(ray.d), dr.detach(wo), dr.detach(si.sh_frame.n)
+        d, wo, outward = dr.detach(ray.d), dr.detach(wo), mi.Vector3f(dr.detach(si.sh_frame.n))
         ratio = dr.select(eta > 0, dr.rcp(eta), 1)
         # ratio · d − wo is parallel to the normal; zero where the ray just goes on, and any normal will do
         normal = ratio * d - wo

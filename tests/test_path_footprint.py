@@ -1,0 +1,268 @@
+"""The path tracer with footprints: the light is that of Mitsuba's, the footprints those of finite differences."""
+
+import drjit as dr
+import footprints as fp
+import numpy as np
+import pytest
+
+GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0, "specular_reflectance": 0.0}
+MIRROR = {"type": "conductor", "material": "none"}
+SIZE = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}}
+
+
+def scaled(mi, *scale):
+    return mi.ScalarTransform4f().scale(list(scale) if len(scale) > 1 else scale[0])
+
+
+def mesh(mi, name: str, **more) -> dict:
+    """One of the scenes' meshes, within a ball of radius 1.5."""
+    shape = {"type": "ply", "filename": str(fp.ASSETS / f"{name}.ply")}
+    box = mi.load_dict(shape).bbox()
+    move = (-np.array(box.center())).tolist()
+    radius = float(np.linalg.norm(np.array(box.extents()))) / 2
+    return {**shape, "to_world": scaled(mi, 1.5 / radius) @ mi.ScalarTransform4f().translate(move), **more}
+
+
+def shown(mi, shapes: dict, **sensor) -> tuple:
+    """The scene in a room that emits the footprints on its walls, and what is seen of them."""
+    room = {"type": "cube", "flip_normals": True, "to_world": scaled(mi, 6)}
+    room["emitter"] = {"type": "area", "radiance": {"type": "probe"}}
+    camera = fp.sensor(**{"to_world": fp.look_at([0.5, 2.5, 4], [0, 0, 0]), "fov": 40, **sensor})
+    scene = mi.load_dict({"type": "scene", "room": room, "sensor": camera, **shapes}, parallel=False)
+    integrator = mi.load_dict({"type": "path_footprint", "jitter": False, "max_depth": 6})
+    image = np.array(mi.render(scene, spp=1, integrator=integrator)).reshape(-1, 3)
+    return scene, image[:, :2] / np.maximum(image[:, 2:], 1e-9), image[:, 2] > 0
+
+
+def check(mi, shapes: dict, chain: tuple, median: float, worst: float, **sensor):
+    """Of side and major axis, the errors are within these (median, 90th percentile)."""
+    fp.register_probe()
+    scene, found, seen = shown(mi, shapes, **sensor)
+    si, ddx, ddy, where = fp.truth(scene, chain)
+    ray = fp.rays(scene.sensors()[0], 0, 0)
+    for follow in chain:  # all of it belongs to the mirrors
+        at = scene.ray_intersect(ray)
+        where &= ~np.array(at.shape.is_emitter())
+        ray = follow(at)
+    where &= np.array(si.shape.is_emitter()) & seen
+    assert where.sum() > 40
+    errors = fp.errors(found, ddx, ddy, where)
+    assert (errors[:, 0] < median).all() and (errors[:, 1] < worst).all(), errors
+
+
+def test_directly_seen_from_a_far_near_plane_and_in_a_crop(mi_rgb):
+    check(mi_rgb, {}, (), 0.005, 0.01, near_clip=1.0)
+    check(mi_rgb, {}, (), 0.005, 0.01, kind="thinlens", aperture_radius=1e-3)
+    crop = {"crop_width": fp.WIDTH, "crop_height": fp.HEIGHT, "crop_offset_x": 20, "crop_offset_y": 5}
+    film = {"type": "hdrfilm", "width": 3 * fp.WIDTH, "height": 2 * fp.HEIGHT, "rfilter": {"type": "box"}, **crop}
+    check(mi_rgb, {}, (), 0.005, 0.01, film=film)
+
+
+@pytest.mark.parametrize("kind", ["plane", "ball", "cylinder", "vase", "knot", "mirrored", "instance"])
+def test_through_mirrors(mi_rgb, kind):
+    mi = mi_rgb
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], -60) @ scaled(mi, 2)
+    vase = mesh(mi, "vase", bsdf=MIRROR) if kind in ("vase", "mirrored", "instance") else None
+    shapes = {
+        "plane": lambda: {"m": {"type": "rectangle", "to_world": turn, "bsdf": MIRROR}},
+        "ball": lambda: {"m": {"type": "sphere", "to_world": scaled(mi, 1.4), "bsdf": MIRROR}},
+        "cylinder": lambda: {"m": {"type": "cylinder", "p0": [0, -2, 0], "p1": [0, 2, 0], "bsdf": MIRROR}},
+        "vase": lambda: {"m": vase},
+        "knot": lambda: {"m": mesh(mi, "knot", bsdf=MIRROR)},
+        "mirrored": lambda: {
+            "m": {
+                **vase,
+                "to_world": scaled(mi, -1, 1, 1) @ vase["to_world"],
+                "bsdf": {"type": "twosided", "bsdf": MIRROR},
+            }
+        },
+        "instance": lambda: {
+            "group": {"type": "shapegroup", "m": {k: v for k, v in vase.items() if k != "to_world"}},
+            "m": {"type": "instance", "to_world": vase["to_world"], "group": {"type": "ref", "id": "group"}},
+        },
+    }[kind]()
+    # Of meshes, a pixel spans several triangles, over which differences are not derivatives
+    median, worst = (0.01, 0.05) if kind in ("plane", "ball", "cylinder") else (0.1, 1.5)
+    check(mi, shapes, (fp.mirrored,), median, worst)
+
+
+def test_through_hollow_mirrors_and_glass(mi_rgb):
+    mi = mi_rgb
+    lamp = {"type": "area", "radiance": {"type": "probe"}}
+    place = mi.ScalarTransform4f().translate([0.5, 2.0, 1.5]) @ scaled(mi, 1.2)
+    hollow = {"type": "sphere", "to_world": scaled(mi, 7), "flip_normals": True, "bsdf": MIRROR}
+    check(mi, {"m": hollow, "room": {"type": "sphere", "to_world": place, "emitter": lamp}}, (fp.mirrored,), 0.02, 0.1)
+    follow = fp.refracted(1.5)
+    check(mi, {"m": {"type": "sphere", "bsdf": GLASS}}, (follow, follow), 0.02, 0.1)
+    slab = mi.ScalarTransform4f().rotate([0, 1, 0], 30) @ scaled(mi, 2, 2, 0.4)
+    check(mi, {"m": {"type": "cube", "to_world": slab, "bsdf": GLASS}}, (follow, follow), 0.01, 0.05)
+
+
+def test_rough_bounces_widen_and_samples_share(mi_rgb):
+    """The rougher, the larger; of many samples, each covers less; straight on through a mask, nothing changes."""
+    mi = mi_rgb
+    fp.register_probe()
+
+    def side(bsdf, spp=1):
+        mirror = {"type": "rectangle", "to_world": scaled(mi, 2), "bsdf": bsdf}
+        wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3]) @ scaled(mi, 9, 9, -1)}
+        wall["emitter"] = {"type": "area", "radiance": {"type": "probe"}}
+        camera = fp.sensor(to_world=fp.look_at([0, 0.3, 2], [0, 0, 0]), fov=30, film=SIZE)
+        scene = mi.load_dict({"type": "scene", "m": mirror, "w": wall, "s": camera})
+        image = np.array(mi.render(scene, spp=spp, integrator=mi.load_dict({"type": "path_footprint", "max_depth": 2})))
+        return np.median(image[..., 0] / image[..., 2])
+
+    rough = [side({"type": "roughconductor", "material": "none", "alpha": a}) for a in (0.01, 0.03, 0.1)]
+    smooth = side(MIRROR)
+    assert smooth < rough[0] < rough[1] < rough[2]
+    # 3 away, a lobe of solid angle 4π α² (GGX at its peak) on a wall 18 wide
+    assert 0.5 < rough[1] / (3 * np.sqrt(4 * np.pi) * 0.03 / 18) < 3
+    assert side(MIRROR, 16) == pytest.approx(smooth / 4, rel=0.02)
+    assert side(MIRROR, 256) == pytest.approx(smooth / 8, rel=0.02)
+
+
+def lit(mi, bsdf: dict, **more) -> dict:
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1]) @ scaled(mi, 3)}
+    light = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 4]) @ scaled(mi, 1, 1, -1)}
+    texels = np.random.default_rng(1).uniform(0.2, 0.8, (4, 4, 1 if mi.is_spectral else 3)).astype(np.float32)
+    floor["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", "id": "texels", "raw": True}}
+    floor["bsdf"]["reflectance"].update(data=mi.TensorXf(texels), filter_type="bilinear")
+    return {
+        "type": "scene",
+        "floor": floor,
+        "light": {**light, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}}},
+        "ball": {"type": "sphere", "bsdf": bsdf},
+        "sky": {"type": "constant", "radiance": 0.3},
+        "sensor": fp.sensor(to_world=fp.look_at([0, -5, 2.5], [0, 0, 0], [0, 0, 1]), fov=45, film=SIZE),
+        **more,
+    }
+
+
+BSDFS = {
+    "diffuse": {"type": "diffuse"},
+    "mirror": {"type": "conductor"},
+    "glass": {"type": "dielectric"},
+    "rough": {"type": "roughconductor", "alpha": 0.2},
+    "mask": {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse"}},
+}
+
+
+@pytest.mark.parametrize("name", BSDFS)
+@pytest.mark.parametrize("asked", [False, True], ids=["plain", "asked"])
+def test_light_and_derivatives_are_those_of_prb(mi_rgb, name, asked):
+    """The same random numbers lead to the same paths: images agree sample by sample, asked for footprints or not."""
+    mi = mi_rgb
+    fp.register_probe()
+    if asked and name not in ("rough", "glass"):
+        pytest.skip("two of them are enough")
+    dark = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 40]), "bsdf": {"type": "diffuse"}}
+    dark["bsdf"]["reflectance"] = {"type": "probe"}
+    scene = mi.load_dict(lit(mi, BSDFS[name], **({"dark": dark} if asked else {})))
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("texels.data") or k.endswith("reflectance.data"))
+    images, gradients = [], []
+    for plugin in ("prb", "path_footprint"):
+        integrator = mi.load_dict({"type": plugin, "max_depth": 5, "rr_depth": 3})
+        params[key] = type(params[key])(dr.detach(params[key]))
+        dr.enable_grad(params[key])
+        params.update()
+        image = mi.render(scene, params, spp=16, seed=3, integrator=integrator)
+        dr.backward(dr.mean(dr.square(image), axis=None))
+        images.append(np.array(dr.detach(image)))
+        gradients.append(np.array(dr.grad(params[key])))
+    assert np.isclose(*images, rtol=1e-3, atol=1e-5).mean() > 0.99
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=1e-3) and np.abs(gradients[0]).max() > 0
+    np.testing.assert_allclose(*gradients, rtol=2e-2, atol=1e-3 * np.abs(gradients[0]).max())
+
+
+@pytest.mark.parametrize("forward", [False, True], ids=["backward", "forward"])
+def test_derivatives_are_those_of_finite_differences(mi_rgb, forward):
+    """Also of what is seen in a mirror, and of the mirror itself."""
+    mi = mi_rgb
+    scene = mi.load_dict(lit(mi, {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": 0.7}}))
+    params = mi.traverse(scene)
+    integrator = mi.load_dict({"type": "path_footprint", "max_depth": 4})
+
+    def mean():
+        return float(dr.mean(mi.render(scene, spp=64, seed=5, integrator=integrator), axis=None).array[0])
+
+    for key in (
+        "ball.bsdf.specular_reflectance.value",
+        next(k for k in params.keys() if k.endswith("reflectance.data")),
+    ):
+        before, step = type(params[key])(params[key]), 1e-2
+        sides = []
+        for sign in (1, -1):
+            params[key] = before + sign * step
+            params.update()
+            sides.append(mean())
+        expected = (sides[0] - sides[1]) / (2 * step)
+        value = mi.Float(0)
+        dr.enable_grad(value)
+        params[key] = before + value
+        params.update()
+        image = mi.render(scene, params, spp=64, seed=4, seed_grad=5, integrator=integrator)
+        if forward:
+            dr.forward(value)
+            found = float(dr.mean(dr.grad(image), axis=None).array[0])
+        else:
+            dr.backward(dr.mean(image, axis=None))
+            found = float(dr.grad(value)[0])
+        params[key] = before
+        params.update()
+        assert found == pytest.approx(expected, rel=0.005) and expected > 1e-3
+
+
+def test_light_is_that_of_path(mi_rgb):
+    """Also what ``prb`` does differently: alpha, hidden emitters, environments, surfaces that are not there."""
+    mi = mi_rgb
+    rough, mask = BSDFS["rough"], {"type": "mask", "opacity": 0.0, "nested": {"type": "diffuse"}}
+    for bsdf, more, given in (
+        (rough, {}, {"max_depth": 3}),
+        (BSDFS["mask"], {}, {"hide_emitters": True}),
+        (mask, {"sky": {"type": "point", "position": [1, -3, 3], "intensity": 9.0}}, {"max_depth": 3}),
+        (rough, {}, {"max_depth": 1}),
+    ):
+        scene = lit(mi, bsdf, **more)
+        scene["sensor"]["film"] = {**SIZE, "pixel_format": "rgba"}
+        scene = mi.load_dict(scene)
+        passes = []
+        for seed, plugin in enumerate(("path", "path_footprint")):
+            integrator = mi.load_dict({"type": plugin, **given})
+            passes.append(
+                [np.array(mi.render(scene, spp=64, seed=9 * seed + i, integrator=integrator)) for i in range(8)]
+            )
+        a, b = (np.array([image.mean((0, 1)) for image in images]) for images in passes)
+        error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / 8)
+        assert (np.abs(a.mean(0) - b.mean(0)) < 5 * error + 1e-6).all(), (bsdf, given, a.mean(0), b.mean(0), error)
+
+
+def test_centres_of_pixels_and_parameters(mi_rgb):
+    mi = mi_rgb
+    scene = mi.load_dict(lit(mi, BSDFS["diffuse"]))
+    centred = mi.load_dict({"type": "path_footprint", "jitter": False, "max_depth": 1})
+    images = [np.array(mi.render(scene, spp=1, seed=s, integrator=centred)) for s in (0, 1)]
+    assert (images[0] == images[1]).all()
+    assert "jitter = false" in str(centred) and "max_depth = 1" in str(centred)
+    assert "max_depth = -1" in str(mi.load_dict({"type": "path_footprint"}))
+    for name, value in (("max_depth", -2), ("rr_depth", 0), ("jitter", 3), ("max_depth", 2.5)):
+        with pytest.raises(RuntimeError, match=f'parameter "{name}": found {value}, allowed'):
+            mi.load_dict({"type": "path_footprint", name: value})
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+def test_other_variants(variant):
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    fp.register_probe()
+    if "polarized" in variant:
+        with pytest.raises(RuntimeError, match="does not run in polarised variants"):
+            mi.load_dict({"type": "path_footprint"})
+        return
+    scene = mi.load_dict(lit(mi, BSDFS["rough"]))
+    a, b = (
+        np.array(mi.render(scene, spp=256, seed=s, integrator=mi.load_dict({"type": plugin, "max_depth": 3}))).mean()
+        for s, plugin in enumerate(("path", "path_footprint"))
+    )
+    assert a == pytest.approx(b, rel=0.03)
