@@ -9,7 +9,7 @@ from mi_diffind.lookup import clamp
 
 from .map_texture import MapTexture
 from .support import footprint
-from .support.filtering import Filter, anisotropic, in_texels, isotropic, offsets, random
+from .support.filtering import Filter, anisotropic, cone_of, in_texels, isotropic, offsets, random
 from .support.footprint import Cone
 from .support.textures import luminance
 
@@ -25,7 +25,7 @@ class FilteredTexture(MapTexture):
 
     def __init__(self, props: mi.Properties):
         self.filter = Filter.from_properties(props)
-        self._given = Cone.from_properties(props)
+        self._given = cone_of(props)
         self.cone = self._given
         super().__init__(props)
 

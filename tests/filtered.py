@@ -23,6 +23,19 @@ def hits(mi, uv, ddx=(0, 0), ddy=(0, 0), p=None):
     return si
 
 
+def seen(mi, n):
+    """Hits on the plane of :func:`plane`, whose footprints only its sensor knows."""
+    rng = np.random.default_rng(4)
+    uv = rng.random((2, n))
+    si = hits(mi, uv, p=np.stack([*(12 * uv - 6), np.zeros(n)]))
+    si.dp_du, si.dp_dv, si.n = mi.Vector3f(12, 0, 0), mi.Vector3f(0, 12, 0), mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, 1))
+    si.wi = dr.normalize(mi.Point3f(0, -2.5, 0.5) - si.p)
+    si.duv_dx, si.duv_dy = mi.Vector2f(0), mi.Vector2f(0)
+    dr.make_opaque(si.wi, si.dp_du, si.dp_dv, si.sh_frame)
+    return si
+
+
 def footprints(rng, n, size, largest=5.0):
     """Footprints in uv, from a fraction of a texel of ``size`` (width, height) to ``2^largest`` of them."""
     scale = 2 ** rng.uniform(-1, largest, n)

@@ -7,10 +7,13 @@ texture (:mod:`.footprint`). A level of detail is a number ≥ 0; level l has te
 
 from __future__ import annotations
 
+import threading
+import weakref
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from . import footprint, properties
 
@@ -62,6 +65,24 @@ class Filter:
     def reads(self) -> int:
         """Places that are read for one footprint."""
         return self.taps if self.name == "anisotropic" else 1
+
+
+def cone_of(props: mi.Properties) -> footprint.Cone | None:
+    """
+    :meth:`.Cone.from_properties`: one and the same for equal properties, so that the reads of several textures are
+    recognised as one.
+    """
+    found = footprint.Cone.from_properties(props)
+    if found is None:
+        return None
+    matrix = tuple(np.array(props["sensor_to_world"].matrix).ravel().tolist())
+    key = (mi.variant(), matrix, *(float(props.get(name, 1)) for name in ("fov", "resolution", "spp")))
+    with _lock:
+        return _cones.setdefault(key, found)
+
+
+_cones: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
+_lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
 
 
 def in_texels(ddx: mi.Vector2f, ddy: mi.Vector2f, size: tuple[int, int]) -> tuple[mi.Vector2f, mi.Vector2f]:
