@@ -64,8 +64,10 @@ class CompressedMaps:
                 values = self.maps([], names)
             else:
                 index = dr.arange(types.UInt32, count) + dr.opaque(types.UInt32, start)
-                u = (types.Float(index % width) + 0.5) / width
-                v = (types.Float(index // width) + 0.5) / height
+                # Opaque, so that images of all sizes are read by one kernel
+                columns, rows = dr.opaque(types.UInt32, width), dr.opaque(types.UInt32, height)
+                u = (types.Float(index % columns) + 0.5) / types.Float(columns)
+                v = (types.Float(index // columns) + 0.5) / types.Float(rows)
                 values = self.maps(stored(u, v), names)
             for name, channels in values.items():
                 for c, value in enumerate(channels):

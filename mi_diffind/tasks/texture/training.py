@@ -145,10 +145,12 @@ class TextureProblem(Problem):
                 count = min(texels, 2**16)
                 index = np.random.default_rng(level).choice(texels, count, replace=False) if count < texels else None
                 index = types.UInt32(np.arange(texels, dtype=np.uint32) if index is None else index.astype(np.uint32))
-                u = (types.Float(index % columns) + 0.5) / columns
-                v = (types.Float(index // columns) + 0.5) / rows
-                got = net.filtered(u, v, dr.full(types.Float, level, count))
-                expected = self.pyramid.texels(index + int(self.starts[level]))
+                # Opaque, so that all levels are read by one kernel
+                start, rows, columns = (dr.opaque(types.UInt32, int(n)) for n in (self.starts[level], rows, columns))
+                u = (types.Float(index % columns) + 0.5) / types.Float(columns)
+                v = (types.Float(index // columns) + 0.5) / types.Float(rows)
+                got = net.filtered(u, v, dr.opaque(types.Float, level, count))
+                expected = self.pyramid.texels(index + start)
                 errors = [dr.mean(dr.square(a - b)) for a, b in zip(got, expected, strict=True)]
                 found.append(sum(float(e[0]) for e in errors) / len(errors))
         decibels = [-10 * math.log10(max(e, 1e-12)) for e in found]
