@@ -138,7 +138,8 @@ def integrator() -> type:
         def sample_rays(self, scene, sensor, sampler):
             """As in Mitsuba, but with differentials of samples, not of pixels."""
             ray, weight, place = super().sample_rays(scene, sensor, sampler if self.jitter else Centred(sampler))
-            if not footprint.textures(scene):
+            ray.has_differentials = len(footprint.textures(scene)) > 0
+            if not ray.has_differentials:
                 return ray, weight, place
             scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
             axis = sensor.world_transform() @ mi.Vector3f(0, 0, 1)
@@ -157,13 +158,13 @@ def integrator() -> type:
             vertex, which starts as the whole (``state_in``).
             """
             primal = mode == dr.ADMode.Primal
-            carried = len(footprint.textures(scene)) > 0
+            carried = bool(getattr(ray, "has_differentials", False))
             environment = scene.environment() is not None and not self.hide_emitters
             flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if carried else mi.RayFlags.All
             context = mi.BSDFContext()
             scale = dr.opaque(mi.Float, footprint.scale_of(sampler.sample_count()))
 
-            differentials = Differentials.of(ray if carried else None)
+            differentials = Differentials.of(ray)
             ray = mi.Ray3f(dr.detach(ray))
             active = mi.Bool(active)
             valid = mi.Bool(environment)

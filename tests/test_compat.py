@@ -291,3 +291,54 @@ def test_errors_in_one_sentence(mi_rgb, tmp_path):
         with pytest.raises(Exception) as caught:
             mi_rgb.render(scene, integrator=Failing(mi_rgb.Properties()), spp=1)
         assert compat.one_sentence(caught.value) == "the lamp is broken"
+
+
+def test_edges_of_shading_normals(mi_rgb):
+    """What normals change by, of a mesh and of a sphere, is told in units of these; neighbouring rays agree."""
+    mesh = {"type": "ply", "filename": str(Path(__file__).resolve().parents[1] / "scenes" / "assets" / "vase.ply")}
+    vase = mi_rgb.load_dict({"type": "scene", "mesh": mesh})
+    box = vase.bbox()
+    centre, size = np.array(box.center()), np.array(box.extents())
+    for scene, middle, radius in (
+        (vase, centre, size.max() / 2),
+        (mi_rgb.load_dict({"type": "scene", "ball": {"type": "sphere"}}), np.zeros(3), 1.0),
+    ):
+        found = []
+        for step in (0, 1e-3):
+            x = mi_rgb.Float(np.linspace(-0.5, 0.5, 200, dtype=np.float32)) * float(radius)
+            o = mi_rgb.Point3f(middle.tolist()) + mi_rgb.Vector3f(x + step * float(radius), 0.3 * x, 0)
+            ray = mi_rgb.Ray3f(o + mi_rgb.Vector3f(0, 0, 3 * float(radius)), mi_rgb.Vector3f(0, 0, -1))
+            pi = scene.ray_intersect_preliminary(ray)
+            found.append((pi, pi.compute_surface_interaction(ray, mi_rgb.RayFlags.All | mi_rgb.RayFlags.dNSdUV), ray))
+        (pi, si, ray), (other, moved, _) = found
+        edges = compat.normal_edges(pi, si, ray, mi_rgb.Bool(True))
+        basis = np.stack([np.array(v).T for v in edges], axis=-1)
+        uv = np.linalg.pinv(basis) @ np.array(moved.p - si.p).T[:, :, None]
+        expected = np.array(moved.sh_frame.n - si.sh_frame.n).T
+        predicted = np.array(si.dn_du).T * uv[:, 0] + np.array(si.dn_dv).T * uv[:, 1]
+        same = np.array(si.is_valid() & moved.is_valid() & (pi.prim_index == other.prim_index))
+        error = np.linalg.norm(predicted - expected, axis=1) / np.linalg.norm(expected, axis=1).clip(1e-9)
+        assert same.sum() > 20 and np.median(error[same]) < 0.02
+
+
+def test_base_of_integrators(mi_any):
+    """It is of the variant that is set, takes rays with differentials, and draws the place in a pixel first."""
+    base = compat.replay_integrator()
+    assert issubclass(base, mi_any.CppADIntegrator) and hasattr(base, "skip_area_emitters")
+    scene = mi_any.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    drawn = []
+
+    class Sampler:
+        def sample_count(self):
+            return 1
+
+        def next_1d(self, active=True):
+            drawn.append(1)
+            return mi_any.Float(0.5)
+
+        def next_2d(self, active=True):
+            drawn.append(2)
+            return mi_any.Point2f(0.5)
+
+    ray, _, _ = base(mi_any.Properties()).sample_rays(scene, scene.sensors()[0], Sampler())
+    assert ray.has_differentials and drawn[0] == 2

@@ -180,7 +180,7 @@ def test_sources_hand_over_to_the_next_one(mi_rgb):
 
     # The next Mitsuba's, of which the columns are the diameters
     si = hit(mi, **given)
-    names = ("p", "n", "wi", "dp_du", "dp_dv", "sh_frame", "duv_dx", "duv_dy")
+    names = ("p", "n", "t", "wi", "dp_du", "dp_dv", "sh_frame", "duv_dx", "duv_dy")
     for matrix, expected in (
         (mi.Matrix2f([[1, 2], [3, 4]]), [[1, 2], [3, 4]]),
         (mi.Matrix2f(0), [[0.1, -0.3], [0.2, 0]]),

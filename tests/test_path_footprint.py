@@ -51,14 +51,12 @@ def check(mi, shapes: dict, chain: tuple, median: float, worst: float, **sensor)
 
 
 def test_directly_seen_from_a_far_near_plane_and_in_a_crop(mi_rgb):
-    check(mi_rgb, {}, (), 0.005, 0.01, near_clip=1.0)
-    check(mi_rgb, {}, (), 0.005, 0.01, kind="thinlens", aperture_radius=1e-3)
     crop = {"crop_width": fp.WIDTH, "crop_height": fp.HEIGHT, "crop_offset_x": 20, "crop_offset_y": 5}
     film = {"type": "hdrfilm", "width": 3 * fp.WIDTH, "height": 2 * fp.HEIGHT, "rfilter": {"type": "box"}, **crop}
-    check(mi_rgb, {}, (), 0.005, 0.01, film=film)
+    check(mi_rgb, {}, (), 0.005, 0.01, near_clip=1.0, film=film)
 
 
-@pytest.mark.parametrize("kind", ["plane", "ball", "cylinder", "vase", "knot", "mirrored", "instance"])
+@pytest.mark.parametrize("kind", ["plane", "ball", "knot", "vase", "mirrored", "instance"])
 def test_through_mirrors(mi_rgb, kind):
     mi = mi_rgb
     turn = mi.ScalarTransform4f().rotate([1, 0, 0], -60) @ scaled(mi, 2)
@@ -66,7 +64,6 @@ def test_through_mirrors(mi_rgb, kind):
     shapes = {
         "plane": lambda: {"m": {"type": "rectangle", "to_world": turn, "bsdf": MIRROR}},
         "ball": lambda: {"m": {"type": "sphere", "to_world": scaled(mi, 1.4), "bsdf": MIRROR}},
-        "cylinder": lambda: {"m": {"type": "cylinder", "p0": [0, -2, 0], "p1": [0, 2, 0], "bsdf": MIRROR}},
         "vase": lambda: {"m": vase},
         "knot": lambda: {"m": mesh(mi, "knot", bsdf=MIRROR)},
         "mirrored": lambda: {
@@ -82,7 +79,7 @@ def test_through_mirrors(mi_rgb, kind):
         },
     }[kind]()
     # Of meshes, a pixel spans several triangles, over which differences are not derivatives
-    median, worst = (0.01, 0.05) if kind in ("plane", "ball", "cylinder") else (0.1, 1.5)
+    median, worst = (0.01, 0.05) if kind in ("plane", "ball") else (0.1, 1.5)
     check(mi, shapes, (fp.mirrored,), median, worst)
 
 
@@ -94,8 +91,6 @@ def test_through_hollow_mirrors_and_glass(mi_rgb):
     check(mi, {"m": hollow, "room": {"type": "sphere", "to_world": place, "emitter": lamp}}, (fp.mirrored,), 0.02, 0.1)
     follow = fp.refracted(1.5)
     check(mi, {"m": {"type": "sphere", "bsdf": GLASS}}, (follow, follow), 0.02, 0.1)
-    slab = mi.ScalarTransform4f().rotate([0, 1, 0], 30) @ scaled(mi, 2, 2, 0.4)
-    check(mi, {"m": {"type": "cube", "to_world": slab, "bsdf": GLASS}}, (follow, follow), 0.01, 0.05)
 
 
 def test_rough_bounces_widen_and_samples_share(mi_rgb):
@@ -139,22 +134,17 @@ def lit(mi, bsdf: dict, **more) -> dict:
 
 
 BSDFS = {
-    "diffuse": {"type": "diffuse"},
-    "mirror": {"type": "conductor"},
     "glass": {"type": "dielectric"},
     "rough": {"type": "roughconductor", "alpha": 0.2},
     "mask": {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse"}},
 }
 
 
-@pytest.mark.parametrize("name", BSDFS)
-@pytest.mark.parametrize("asked", [False, True], ids=["plain", "asked"])
+@pytest.mark.parametrize("name, asked", [("rough", False), ("mask", False), ("glass", True)])
 def test_light_and_derivatives_are_those_of_prb(mi_rgb, name, asked):
     """The same random numbers lead to the same paths: images agree sample by sample, asked for footprints or not."""
     mi = mi_rgb
     fp.register_probe()
-    if asked and name not in ("rough", "glass"):
-        pytest.skip("two of them are enough")
     dark = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 40]), "bsdf": {"type": "diffuse"}}
     dark["bsdf"]["reflectance"] = {"type": "probe"}
     scene = mi.load_dict(lit(mi, BSDFS[name], **({"dark": dark} if asked else {})))
@@ -239,7 +229,7 @@ def test_light_is_that_of_path(mi_rgb):
 
 def test_centres_of_pixels_and_parameters(mi_rgb):
     mi = mi_rgb
-    scene = mi.load_dict(lit(mi, BSDFS["diffuse"]))
+    scene = mi.load_dict(lit(mi, {"type": "diffuse"}))
     centred = mi.load_dict({"type": "path_footprint", "jitter": False, "max_depth": 1})
     images = [np.array(mi.render(scene, spp=1, seed=s, integrator=centred)) for s in (0, 1)]
     assert (images[0] == images[1]).all()

@@ -194,10 +194,12 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     onto the plane of dp_du and dp_dv. With t the distance, z the cosine of the line to the sensor's axis, θ its angle
     to the normal, the area is (spread · t)² z³ / (|dp_du × dp_dv| cos θ), exactly.
 
-    A hit that is not seen directly, since ``si.wi`` points elsewhere than to the sensor, is taken as a piece of surface
-    that faces the sensor at the film's corner, from this distance: as pbrt-v4's ``Camera::Approximate_dp_dxy``, but
-    never oblique. The way by flat mirrors is longer and rough bounces widen: never blurrier than the truth but after
-    hollow mirrors and lenses. Where dp_du and dp_dv are parallel or zero: zero.
+    A hit that is not seen directly, since ``si.wi`` points elsewhere than to the sensor, is taken for what it is at
+    least: the larger one of two, both as wide as the pixel at the film's corner. One comes along ``si.wi`` from as far
+    as ``si.t``, the last segment of the way; the other from as far as the sensor, onto a surface that faces it, which
+    is pbrt-v4's ``Camera::Approximate_dp_dxy`` but never oblique. The way by flat mirrors is longer than either, and
+    round mirrors and rough bounces widen: never blurrier than the truth but after hollow mirrors and lenses. Where
+    dp_du and dp_dv are parallel or zero: zero.
     """
     p, du, dv = dr.detach(si.p), dr.detach(si.dp_du), dr.detach(si.dp_dv)
     unit = dr.normalize(dr.cross(du, dv))
@@ -214,9 +216,14 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
     direct = (dr.squared_norm(away) < dr.square(tolerance)) & (depth > 0)
 
-    along = dr.select(direct, to, unit)
-    frame = mi.Frame3f(unit)
-    facing = distance * cone.reach * cone.scale * cone.spread
+    last, incident = dr.detach(si.t), dr.detach(si.sh_frame).to_world(wi)
+    oblique = dr.abs(dr.dot(incident, unit))
+    by_last = dr.square(last) > dr.square(distance) * oblique
+    if cone.kind == "orthographic":  # a pixel is as wide at any distance
+        by_last, last = mi.Bool(True), distance
+    along = dr.select(direct, to, dr.select(by_last, incident, unit))
+    frame = mi.Frame3f(along)
+    facing = dr.select(by_last, last, distance) * cone.reach * cone.scale * cone.spread
     x = dr.select(direct, depth * cone.scale * cone.dx, facing * frame.s)
     y = dr.select(direct, depth * cone.scale * cone.dy, facing * frame.t)
     return in_uv(x, y, along, du, dv)
