@@ -412,22 +412,20 @@ def test_materials(variant, file):
 
 
 def test_frozen_renders(mi_rgb, file, no_garbage_collection):
-    """The sensor may change in between: its cone is made of arrays."""
+    """With the sensor that there was when a function was frozen."""
     mi = mi_rgb
     from mi_diffind.plugins.support import footprint
 
     loaded = filtered.plane(mi, plugin(file, to_uv=mi.ScalarTransform4f().scale(8)), size=16)
 
-    @dr.freeze
-    def frozen(loaded, seed):
-        return mi.render(loaded, spp=1, seed=seed)
-
     images = []
-    for step, spp in enumerate((1, 1, 64, 64)):
+    for spp in (1, 64):
+        frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
         footprint.attach(loaded, spp=spp)
-        images.append(frozen(loaded, mi.UInt32(step)).numpy())
-        np.testing.assert_allclose(images[-1], mi.render(loaded, spp=1, seed=step).numpy(), atol=1e-5)
-    assert np.abs(images[0] - images[2]).max() > 0.05
+        for seed in range(5):
+            images.append(frozen(loaded, mi.UInt32(seed)).numpy())
+            np.testing.assert_allclose(images[-1], mi.render(loaded, spp=1, seed=seed).numpy(), atol=1e-5)
+    assert np.abs(images[0] - images[5]).max() > 0.05
 
 
 def test_textures_of_one_file_are_read_once(mi_rgb, file, rng):
