@@ -15,7 +15,7 @@ from mi_diffind.studies.baselines import codecs
 FILM = (24, 16)
 
 #: Steps of a training.
-STEPS = 6
+STEPS = 2
 
 
 def smooth(height, width, channels, seed=0):
