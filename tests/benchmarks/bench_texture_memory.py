@@ -42,9 +42,11 @@ def child(kind: str, folder: Path) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    import mi_diffind
+    import mi_diffind  # noqa: F401
 
     mi.set_variant("llvm_ad_rgb")
+    from mi_diffind.scenes import footprint
+
     quads = {}
     for i in range(COUNT):
         texture = {k: str(folder / v.format(i=i)) if k == "filename" else v for k, v in KINDS[kind].items()}
@@ -65,7 +67,7 @@ def child(kind: str, folder: Path) -> None:
         },
         **quads,
     })  # fmt: skip
-    mi_diffind.scenes.footprint.attach(scene)
+    footprint.attach(scene)
     image = mi.render(scene, spp=1)
     dr.eval(image)
     dr.sync_thread()

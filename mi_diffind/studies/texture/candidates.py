@@ -66,7 +66,7 @@ SAMPLES = (("ours", "power"), ("ours", "exponential"), ("paper", "exponential"))
 #: The candidate whose time others are compared with.
 BASE = "bitmap, 1 spp"
 
-#: Multijittered samples a pixel of the zoom's truth: their error is 0.1% of the flicker of the best.
+#: Multijittered samples a pixel of the zoom's truth: what they add is below 1% of any flicker that filtering leaves.
 ZOOM_SPP = 64
 
 #: The seed of the truth, far from those of candidates.
