@@ -37,14 +37,13 @@ def waves(height=16, width=16, channels=3, periods=1):
     return np.stack([0.5 + 0.4 * found[i % 4] for i in range(channels)], axis=-1).astype(np.float32)
 
 
-def material(height=32, width=32, seed=0):
-    """A small one: colours with noise, normals, roughness that follows the colours."""
+def material(height=32, width=24, seed=0):
+    """A small one, of four stored channels: grey with noise, normals, roughness that follows the grey."""
     rng = np.random.default_rng(seed)
-    base = waves(height, width, 3, 2)
-    albedo = np.clip(base + 0.08 * rng.standard_normal((height, width, 1)), 0, 1)
+    albedo = np.clip(waves(height, width, 1, 2) + 0.08 * rng.standard_normal((height, width, 1)), 0, 1)
     xy = 0.5 * (waves(height, width, 2, 3) - 0.5)
     normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
-    maps = {"albedo": albedo, "normal": normal, "roughness": 1 - albedo[..., :1]}
+    maps = {"albedo": albedo, "normal": normal, "roughness": 1 - albedo}
     return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
 
 
@@ -57,7 +56,9 @@ def quick(recipe=OURS, **settings):
 
 def trained(source, size, recipe, **request):
     types = array_module("llvm")
-    pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, request.pop("border", None))
+    # Of one size and one border, mostly: what differs has to be compiled anew
+    border = request.pop("border", ("repeat", "clamp"))
+    pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, border)
     request = Request("ours" if recipe.layered else "paper", recipe.settings, types, progress=False, **request)
     return training.fit_texture(source, size, recipe, request, pyramid)
 
@@ -194,8 +195,8 @@ def test_structures():
 @pytest.fixture(scope="module")
 def made():
     """A material, its texture as bytes and as floats, and the table."""
-    source = from_arrays(material(32, 24))
-    texture, table = texture_of(source, steps=8, border=("repeat", "clamp"))
+    source = from_arrays(material())
+    texture, table = texture_of(source, steps=8)
     return source, texture, CompressedTexture.of(table, array_module("llvm").TensorXf, "float32"), table
 
 
@@ -220,7 +221,12 @@ def reference(texture, u, v, level):
     at = max(level, form.skip)
     below, above = math.floor(at), min(math.floor(at) + 1, len(form.sizes) - 1)
     pointer = (1 - at % 1) * bilinear(levels[below], u, v) + at % 1 * bilinear(levels[above], u, v)
-    for layer, array in zip(form.layers, net.fine, strict=True):
+    layers = list(zip(form.layers, net.fine, strict=True))
+    if form.base:
+        layer, array = layers.pop()
+        share = min(max(layer.until + 1 - level, 0), 1)
+        pointer = (1 - share) * pointer + share * bilinear(array.numpy().astype(np.float64), u, v)
+    for layer, array in layers:
         share = min(max(layer.until + 1 - level, 0), 1)
         found = (bilinear(array.numpy().astype(np.float64), u, v) - layer.zero) * layer.scale
         pointer[: layer.channels] += share * found
@@ -237,7 +243,10 @@ def reference(texture, u, v, level):
 
 
 def test_reading_against_numpy(made, rng):
-    for texture in made[1:3]:
+    """Where the coarsest fine array holds differences, and where it holds pointers."""
+    based, _ = texture_of(made[0], steps=1, fine="0:1:2,1:3:6")
+    assert based.net.form.base and not made[1].net.form.base
+    for texture in (*made[1:3], based):
         u, v = rng.random((2, 60))
         level = np.concatenate([np.arange(texture.levels), rng.uniform(0, texture.levels - 1, 60 - texture.levels)])
         expected = [reference(texture, *place) for place in zip(u, v, level, strict=True)]
@@ -354,7 +363,7 @@ def test_reported_qualities(made):
 
 
 def test_training_improves_every_level():
-    source = from_arrays(material(32, 32))
+    source = from_arrays(material())
     before, after = (
         trained(source, sized(source), quick(steps=steps, lr=lr))[0].measured for steps, lr in ((1, 1e-9), (60, 3e-2))
     )
@@ -364,31 +373,28 @@ def test_training_improves_every_level():
 
 
 def test_better_than_the_paper():
-    """At equal bytes and samples: level 0 by 5 dB, the worst by 10."""
-    source = from_arrays(material(64, 64))
-    nbytes = source.nbytes / 8
-    stored = training.layout_of(source, PAPER).stored
-    paper = paper_size(nbytes, source.nbytes, stored, 64, 64)
-    theirs = trained(source, paper, quick(PAPER, steps=150, batch=8192, lr=1e-3))[0]
-    ours = trained(
-        source, choose(64, 64, training.layout_of(source, OURS).stored, nbytes), quick(steps=150, batch=8192)
-    )[0]
+    """At no more bytes and samples: level 0 by 5 dB, the worst by 10."""
+    source = from_arrays(material(64, 48))
+    nbytes = source.nbytes / 4
+    paper = paper_size(nbytes, source.nbytes, training.layout_of(source, PAPER).stored, 64, 48)
+    theirs = trained(source, paper, quick(PAPER, steps=120))[0]
+    ours = trained(source, choose(64, 48, training.layout_of(source, OURS).stored, nbytes), quick(steps=120))[0]
     assert theirs.nbytes == pytest.approx(nbytes, rel=0.1) and ours.nbytes <= nbytes
     assert ours.measured["psnr_db"] > theirs.measured["psnr_db"] + 5
     assert ours.measured["psnr_worst_db"] > theirs.measured["psnr_worst_db"] + 10
 
 
-@pytest.mark.parametrize("axis", sampling.AXES)
+@pytest.mark.parametrize("axis", ["side", "level"])
 def test_the_papers_arrays(axis, tmp_path, ad, rng):
     import dataclasses
 
-    source = from_arrays(material(16, 24))
-    size = paper_size(source.nbytes / 3, source.nbytes, 7, 16, 24)
+    source = from_arrays(material(64, 48))
+    size = paper_size(source.nbytes / 4, source.nbytes, 5, 64, 48)
     samples = "exponential" if axis == "level" else "power"
-    recipe = dataclasses.replace(quick(PAPER, steps=3, batch=512), axis=axis, samples=samples)
+    recipe = dataclasses.replace(quick(PAPER, steps=3), axis=axis, samples=samples)
     table, _ = trained(source, size, recipe)
     assert table.arrays["primary0"].shape[-1] == 3 and table.arrays["primary1"].shape == (4 * size.lods, 1)
-    assert table.arrays["cascaded"].shape == (size.lods, *[size.cascaded] * 3, 7) and table.nbytes == size.nbytes
+    assert table.arrays["cascaded"].shape == (size.lods, *[size.cascaded] * 3, 5) and table.nbytes == size.nbytes
     save_table(tmp_path / "t.npz", table)
     u, v = (ad.Float(x) for x in rng.random((2, 100), dtype=np.float32))
     for storage in ("", "float32"):
@@ -399,7 +405,7 @@ def test_the_papers_arrays(axis, tmp_path, ad, rng):
         assert np.isfinite(read(texture, 0.3, 0.4, np.float32([np.nan, np.inf, -np.inf, 77]))).all()
 
 
-@pytest.mark.parametrize("shape", [(1, 9, 3), (13, 1, 1), (7, 5, 2), (33, 20, 3), (2, 2, 4), (1, 2, 1)])
+@pytest.mark.parametrize("shape", [(1, 9, 1), (13, 1, 1), (7, 5, 2), (2, 2, 1)])
 def test_odd_sizes(shape, ad, rng):
     source = from_arrays({"data": rng.integers(0, 256, shape, dtype=np.uint8)})
     layout = training.layout_of(source, OURS)
@@ -427,9 +433,11 @@ def test_one_colour_needs_no_arrays(tmp_path, ad):
 
 
 def test_high_dynamic_range(ad):
-    values = (10 ** (4 * waves(16, 16) - 1)).astype(np.float32)
-    table, _ = trained(from_arrays({"image": values}), sized(from_arrays({"image": values})), quick(steps=30))
-    decoded = CompressedTexture.of(table, ad.TensorXf).decode(level=4)["image"]
+    values = (10 ** (4 * waves(8, 8, 1) - 1)).astype(np.float32)
+    table, _ = trained(
+        from_arrays({"image": values}), sized(from_arrays({"image": values})), quick(steps=30, batch=256)
+    )
+    decoded = CompressedTexture.of(table, ad.TensorXf).decode(level=3)["image"]
     np.testing.assert_allclose(decoded[0, 0], values.mean(axis=(0, 1)), rtol=0.1)
 
 
@@ -442,8 +450,8 @@ def file_bytes(table, path):
 
 
 def test_the_same_seed_gives_the_same_file(tmp_path):
-    source = from_arrays(material(16, 16))
-    made = [trained(source, sized(source), quick(steps=5, batch=300, seed=seed))[0] for seed in (3, 3, 4)]
+    source = from_arrays(material())
+    made = [trained(source, sized(source), quick(steps=5, seed=seed))[0] for seed in (3, 3, 4)]
     first, again, other = (file_bytes(table, tmp_path / "t.npz") for table in made)
     assert first == again != other and made[0].seed == 3
 
@@ -452,8 +460,8 @@ def test_a_resumed_training_is_the_same(tmp_path, monkeypatch):
     """Stopped after its first measurement and gone on with, to the last byte."""
     from mi_diffind import fitting
 
-    source, checkpoint = from_arrays(material(16, 16)), tmp_path / "c.npz"
-    recipe = quick(steps=8, batch=300, measure_every=4)
+    source, checkpoint = from_arrays(material()), tmp_path / "c.npz"
+    recipe = quick(steps=8)
     whole = file_bytes(trained(source, sized(source), recipe)[0], tmp_path / "a.npz")
     step = fitting._Trainer.take_step
 
@@ -553,23 +561,23 @@ def test_fit_inspect_decode(tmp_path, monkeypatch, capsys):
     import mitsuba as mi
 
     monkeypatch.chdir(tmp_path)
-    for name, values in material(20, 16).items():
+    for name, values in material().items():
         write(f"{name}.png", values if values.shape[2] > 1 else values[..., 0])
     (tmp_path / "m.json").write_text(json.dumps({name: f"{name}.png" for name in ("albedo", "normal", "roughness")}))
-    short = ["--steps", "3", "--batch", "256", "--variant", "llvm_ad_rgb"]
+    short = ["--steps", "3", "--batch", "2048", "--border", "clamp", "--variant", "llvm_ad_rgb"]
     assert main(["fit", "texture", "m.json", "-o", "m.npz", "--compression", "4x", *short]) == 0
     table = load_table("m.npz")
     assert table.task == "texture" and table.preset == "ours" and table.settings["source_path"] == "m.json"
-    assert table.nbytes <= 20 * 16 * 7 / 4
+    assert table.nbytes <= 32 * 24 * 5 / 4
     capsys.readouterr()
     assert main(["inspect", "m.npz", "--measure", "--variant", "llvm_ad_rgb"]) == 0
     shown = capsys.readouterr().out
-    assert "5 levels of detail" in shown and "psnr_worst_db" in shown
+    assert "6 levels of detail" in shown and "psnr_worst_db" in shown
     assert main(["decode", "m.npz", "-o", "d.png", "--map", "albedo", "--level", "2", "--variant", "llvm_ad_rgb"]) == 0
-    assert np.array(mi.Bitmap("d.png")).shape == (5, 4, 3)
+    assert np.array(mi.Bitmap("d.png")).shape == (8, 6)
     capsys.readouterr()
-    assert main(["decode", "m.npz", "-o", "d.png", "--level", "5", "--variant", "llvm_ad_rgb"]) == 2
-    assert "--level: found 5, the file has levels 0 to 4" in capsys.readouterr().err
+    assert main(["decode", "m.npz", "-o", "d.png", "--level", "6", "--variant", "llvm_ad_rgb"]) == 2
+    assert "--level: found 6, the file has levels 0 to 5" in capsys.readouterr().err
 
 
 def test_options_that_do_not_go_together(tmp_path):

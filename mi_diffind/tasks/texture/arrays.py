@@ -115,10 +115,15 @@ def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str,
         while level > wanted.level:
             level -= 1
             reached = enlarged(reached, *values[level].shape[:2], border)
+        until = (size.fine[i + 1].level if i + 1 < len(size.fine) else size.skip) - 1
+        if size.base and i + 1 == len(size.fine):
+            reached = np.clip(pointers[level], 1e-3, 1 - 1e-3)
+            layers.insert(0, Layer(level, until, wanted.bits, (1.0,) * wanted.channels))
+            fine.insert(0, DifferentiableArray((rows, columns), size.dims, reached, fold=True, border=border))
+            continue
         rest = (pointers[level] - reached)[..., : wanted.channels]
         within = np.quantile(np.abs(rest).reshape(-1, wanted.channels), WITHIN[wanted.bits], axis=0)
         scale = np.maximum(2 * within, SMALLEST)
-        until = (size.fine[i + 1].level if i + 1 < len(size.fine) else size.skip) - 1
         layer = Layer(level, until, wanted.bits, tuple(float(f"{s:.6g}") for s in scale))
         entries = np.clip(rest / np.array(layer.scale) + layer.zero, 0, 1).astype(np.float32)
         layers.insert(0, layer)
@@ -132,7 +137,7 @@ def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str,
     back = back.reshape(*back.shape[:-1], *[1] * (size.dims - found.dims), back.shape[-1])
     cascaded = np.broadcast_to(back, (*shape, size.channels)).astype(np.float32)
     cascaded = DifferentiableArray(shape, size.channels, cascaded, fold=True)
-    form = LayeredForm(size.height, size.width, tuple(layers), size.skip, size.bits)
+    form = LayeredForm(size.height, size.width, tuple(layers), size.skip, size.bits, size.base)
     return LayeredNet(fine, coarse, cascaded, form, border)
 
 

@@ -148,8 +148,8 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
         else:
             layers = [{"level": x.level, "until": x.until, "bits": x.bits, "scale": list(x.scale)} for x in form.layers]
             settings["arrays"] = {
-                "kind": "layers", "skip": form.skip, "bits": form.bits, "border": list(texture.border),
-                "layers": layers,
+                "kind": "layers", "skip": form.skip, "bits": form.bits, "base": form.base,
+                "border": list(texture.border), "layers": layers,
             }  # fmt: skip
     return Table("texture", stored, settings=settings)
 
@@ -178,7 +178,10 @@ def form_of(settings: dict, layout: Layout):
             raise ValueError("the scales of the fine arrays are damaged")
         last = layer.level
         layers.append(layer)
-    return LayeredForm(layout.height, layout.width, tuple(layers), skip, bits), border
+    base = bool(found["base"])
+    if base and not layers:
+        raise ValueError("there is no fine array that could hold pointers")
+    return LayeredForm(layout.height, layout.width, tuple(layers), skip, bits, base), border
 
 
 def load(path: str | os.PathLike) -> Table:
@@ -206,9 +209,13 @@ def load(path: str | os.PathLike) -> Table:
         axes = len(shapes["cascaded"]) - 1
         wanted = {
             **{n: (*form.sizes[x.level], x.channels) for n, x in zip(fine, form.layers, strict=True)},
-            "coarse": (coarse_texels(form), max([1, *(x.channels for x in form.layers)]) if dims < 1 else dims),
+            "coarse": (coarse_texels(form), dims),
             "cascaded": (form.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,),
         }
+        if form.base and form.layers[-1].channels != dims:
+            raise TableError(
+                f"{path}: has a fine array that holds pointers of {form.layers[-1].channels} of {dims} coordinates"
+            )
         if any(layer.channels > dims for layer in form.layers):
             raise TableError(f"{path}: has a fine array with more channels than the {dims} of its pointers")
     for name, shape in wanted.items():

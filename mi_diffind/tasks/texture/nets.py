@@ -84,7 +84,8 @@ class Layer:
     """
     A fine array of ours: it has the size of the level of detail ``level``, and what is read of it, less
     :attr:`zero`, times the ``scale`` of each channel, is added to the pointer from the levels below ``until``, and less
-    and less from there to ``until + 1``. ``bits`` are those of an entry.
+    and less from there to ``until + 1``. ``bits`` are those of an entry. (Of pointers themselves, see
+    :class:`LayeredForm`, ``scale`` is 1 and there is no zero.)
     """
 
     level: int
@@ -106,7 +107,8 @@ class Layer:
 class LayeredForm:
     """
     What our arrays do not say themselves: the size of the texture, the fine ``layers``, the finest first, the level of
-    detail ``skip`` from which on each has its own pointers, and the ``bits`` of these.
+    detail ``skip`` from which on each has its own pointers, and the ``bits`` of these. ``base``: the coarsest of the
+    layers holds pointers, not differences, so that finer levels need not read those from ``skip`` on.
     """
 
     height: int
@@ -114,6 +116,7 @@ class LayeredForm:
     layers: tuple[Layer, ...]
     skip: int
     bits: int = 8
+    base: bool = False
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -169,15 +172,26 @@ class LayeredNet(nn.Module):
         pointer = self._coarse(u, v, index, active)
         upper = self._coarse(u, v, dr.minimum(index + 1, len(form.sizes) - 1), active)
         pointer = [dr.fma(weight, b - a, a) for a, b in zip(pointer, upper, strict=True)]
-        for x, array in zip(form.layers, self.fine, strict=True):
+        layers = list(zip(form.layers, self.fine, strict=True))
+        if form.base:
+            x, array = layers.pop()
+            share = 1 - lookup.clamp(level - x.until, 0.0, 1.0)
+            found = array(self._place(array, u, v), active)
+            pointer = [dr.fma(share, b - a, a) for a, b in zip(pointer, found, strict=True)]
+        for x, array in layers:
             share = 1 - lookup.clamp(level - x.until, 0.0, 1.0)
             self._add(pointer, x, array, u, v, share, active)
         return self._answer(pointer, level, active)
 
     def stored(self, u, v, active=True) -> list:
         """The same at level 0."""
-        pointer = self._coarse(u, v, None, active)
-        for x, array in zip(self.form.layers, self.fine, strict=True):
+        layers = list(zip(self.form.layers, self.fine, strict=True))
+        if self.form.base:
+            _, array = layers.pop()
+            pointer = array(self._place(array, u, v), active)
+        else:
+            pointer = self._coarse(u, v, None, active)
+        for x, array in layers:
             self._add(pointer, x, array, u, v, None, active)
         return self._answer(pointer, type(u)(0), active)
 
@@ -188,13 +202,16 @@ class LayeredNet(nn.Module):
 
     def _add(self, pointer: list, layer: Layer, array: DifferentiableArray, u, v, share, active) -> None:
         """Add what a layer says to a pointer, times ``share`` (``None``: 1)."""
-        place = []
-        for x, n, border in zip((v, u), array.resolution, self.along, strict=True):
-            # Entries sit at texel centres of the level
-            place.append(x - 0.5 / n if border == "repeat" else (x * n - 0.5) * (1 / max(1, n - 1)))
-        for k, value in enumerate(array(place, active)):
+        for k, value in enumerate(array(self._place(array, u, v), active)):
             value = (value - layer.zero) * layer.scale[k]
             pointer[k] = pointer[k] + value if share is None else dr.fma(share, value, pointer[k])
+
+    def _place(self, array: DifferentiableArray, u, v) -> list:
+        """Where a fine array is read for (u, v): its entries sit at texel centres."""
+        place = []
+        for x, n, border in zip((v, u), array.resolution, self.along, strict=True):
+            place.append(x - 0.5 / n if border == "repeat" else (x * n - 0.5) * (1 / max(1, n - 1)))
+        return place
 
     def _coarse(self, u, v, level, active) -> list:
         """The pointer that ``coarse`` has at (u, v) of a level, a whole number for each place; ``None``: the finest."""

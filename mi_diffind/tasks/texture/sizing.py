@@ -150,6 +150,11 @@ class Size:
             raise ValueError(f"fine arrays have at most as many channels as pointers have coordinates, {self.dims}")
 
     @property
+    def base(self) -> bool:
+        """Does the coarsest fine array hold pointers? It does if it has all coordinates, in bits enough."""
+        return bool(self.fine) and self.fine[-1].channels == self.dims and self.fine[-1].bits >= BASE_BITS
+
+    @property
     def nbytes(self) -> int:
         """Bytes of all arrays, each a whole number of them."""
         sizes = level_sizes(self.height, self.width)
@@ -171,22 +176,23 @@ def parse_structure(text: str) -> tuple[Fine, ...]:
     return fine
 
 
+#: Bits from which on the coarsest fine array holds pointers, if it has all their coordinates.
+BASE_BITS = 5
+
 #: Structures for more and more bytes: the fine arrays and the level that all have pointers of their own from. Found by
 #: trainings: from one to the next level a quarter of the entries has room for four times the bits, and a channel or two
 #: are enough for the finest.
 LADDER: tuple[tuple[str, int], ...] = (
     ("0:1:2,2:2:4", 3),
-    ("0:1:2,1:1:4,2:2:4", 3),
-    ("0:1:2,1:2:4,2:2:4", 3),
+    ("0:1:2,1:1:4,2:3:6", 3),
     ("0:1:2,1:2:4,2:3:6", 3),
     ("0:1:3,1:2:4,2:3:6", 3),
-    ("0:1:4,1:1:4", 2),
-    ("0:1:4,1:2:4", 2),
-    ("0:2:3,1:2:4", 2),
-    ("0:2:3,1:3:4", 2),
-    ("0:2:4,1:3:4", 2),
-    ("0:3:4,1:3:4", 2),
-    ("0:3:5,1:3:5", 2),
+    ("0:1:4,1:2:4,2:3:6", 3),
+    ("0:2:3,1:2:4,2:3:6", 3),
+    ("0:2:3,1:3:4,2:3:6", 3),
+    ("0:2:4,1:3:6", 2),
+    ("0:3:4,1:3:6", 2),
+    ("0:3:5,1:3:6", 2),
     ("0:3:6,1:3:6", 2),
     ("0:3:8,1:3:8", 2),
 )
@@ -209,34 +215,40 @@ def choose(
 ) -> Size:
     """
     Our size for a texture of so many stored channels and so many bytes, some of it given unless ``None``: the structure
-    of :data:`LADDER` with the most bytes that fit, on coarser levels for fewer bytes; what is left goes to the cascaded
+    of :data:`LADDER` with the most bytes that fit, on coarser levels if none does; what is left goes to the cascaded
     array. Pointers have three coordinates, and fewer where even the smallest arrays of three are too large.
     """
-    levels = len(level_sizes(height, width))
     for dims in (3, 2, 1):
         found = []
-        for arrays, start in _structures(levels, dims) if fine is None else [(fine, skip)]:
-            if skip is None or start == skip or fine is not None:
-                found.append(_sized(nbytes, height, width, channels, arrays, start, dims, cascaded))
-        if skip is not None and fine is None:
-            found.append(_sized(nbytes, height, width, channels, (), skip, dims, cascaded))
-        fitting = [size for size in found if size.nbytes <= nbytes]
-        if fitting:
-            return max(fitting, key=lambda size: (_without(size, channels), -len(size.fine)))
-        smallest = min(found, key=lambda size: size.nbytes)
+        for group in _structures(height, width, dims, skip, fine):
+            sizes = [_sized(nbytes, height, width, channels, *where, dims, cascaded) for where in group]
+            fitting = [size for size in sizes if size.nbytes <= nbytes]
+            if fitting:
+                return max(fitting, key=lambda size: _without(size, channels))
+            found += sizes
         if fine is not None and dims <= max(f.channels for f in fine):
             break
-    return smallest
+    return min(found, key=lambda size: size.nbytes)
 
 
-def _structures(levels: int, dims: int):
-    """The structures of the ladder, on all levels that there are; the fine arrays and where the others start."""
-    for shift in range(levels):
-        for text, skip in LADDER:
+def _structures(height: int, width: int, dims: int, skip: int | None, fine: tuple[Fine, ...] | None):
+    """
+    What is tried, the first choice first: groups of structures, each the fine arrays and the level from which on the
+    others are. The ladder on the levels themselves, then on coarser ones.
+    """
+    last = len(level_sizes(height, width)) - 1
+    if fine is not None:
+        yield [(fine, skip)]
+        return
+    for shift in range(last):
+        group = []
+        for text, start in LADDER:
+            start = min(start + shift, last)
             arrays = [Fine(f.level + shift, min(f.channels, dims), f.bits) for f in parse_structure(text)]
-            start = min(skip + shift, levels - 1)
-            yield tuple(f for f in arrays if f.level < start), start
-    yield (), levels - 1
+            if skip in (None, start):
+                group.append((tuple(f for f in arrays if f.level < start), start))
+        yield group
+    yield [((), last if skip is None else skip)]
 
 
 def _without(size: Size, channels: int) -> int:
