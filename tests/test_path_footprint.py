@@ -208,7 +208,6 @@ def test_light_is_that_of_path(mi_rgb):
     mi = mi_rgb
     rough, mask = BSDFS["rough"], {"type": "mask", "opacity": 0.0, "nested": {"type": "diffuse"}}
     for bsdf, more, given in (
-        (rough, {}, {"max_depth": 3}),
         (BSDFS["mask"], {}, {"hide_emitters": True}),
         (mask, {"sky": {"type": "point", "position": [1, -3, 3], "intensity": 9.0}}, {"max_depth": 3}),
         (rough, {}, {"max_depth": 1}),
