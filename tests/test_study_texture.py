@@ -1,7 +1,6 @@
 """``tradeoff texture``: what is seen, how errors, levels and flicker are measured, what is written and said."""
 
 import csv
-import dataclasses
 import json
 import math
 
@@ -10,6 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from mi_diffind.cli import main
+from mi_diffind.measure.report import panels
 from mi_diffind.studies.baselines import codecs
 
 FILM = (24, 16)
@@ -221,27 +221,26 @@ def test_crops_show_what_differs():
 
 @pytest.fixture
 def small(tmp_path, monkeypatch):
-    """A material, and a study of one stage and one filter whose trainings take :data:`STEPS` steps each."""
+    """A material, and a study of one stage and one filter, all of whose trainings are one of :data:`STEPS` steps."""
     import mitsuba as mi
 
     from mi_diffind.studies.texture import candidates, stages
-    from mi_diffind.tasks.texture import training
 
     mi.set_variant("llvm_ad_rgb")
     maps = {"albedo": smooth(32, 32, 3, 1), "roughness": smooth(32, 32, 1, 2)}
     for name, values in maps.items():
         mi.Bitmap(values if values.shape[-1] > 1 else values[..., 0]).write(str(tmp_path / f"{name}.png"))
     (tmp_path / "m.json").write_text(json.dumps({name: f"{name}.png" for name in maps}))
-    plane, fit_texture, asked = {"plane": stages.stages()["plane"]}, training.fit_texture, []
+    plane, fit, asked, made = {"plane": stages.stages()["plane"]}, candidates.task.fit, [], []
 
-    def stepwise(source, size, recipe, request, pyramid=None, **options):
-        asked.append((request.preset, request.seconds))
-        settings = dataclasses.replace(recipe.settings, steps=STEPS, batch=2**12)
-        recipe = dataclasses.replace(recipe, settings=settings)
-        request = dataclasses.replace(request, seconds=None, settings=settings)
-        return fit_texture(source, size, recipe, request, pyramid, **options)
+    def once(name, preset="", variant=None, seconds=None, **options):
+        asked.append((name, preset, seconds))
+        options.pop("footprint_samples")
+        if not made:
+            made.append(fit(name, "", variant, steps=STEPS, batch=2**12, **options))
+        return made[0]
 
-    monkeypatch.setattr(training, "fit_texture", stepwise)
+    monkeypatch.setattr(candidates.task, "fit", once)
     monkeypatch.setattr(stages, "stages", lambda: plane)
     monkeypatch.setattr(candidates, "WAYS", candidates.WAYS[:1])
     monkeypatch.setattr(candidates, "MORE", ())
@@ -253,7 +252,7 @@ def test_what_is_written(small, capsys):
     command = ["tradeoff", "texture", str(folder / "m.json"), "--quick", "--width", "24", "--frames", "2"]
     command += ["--out", str(folder / "out"), "--json", str(folder / "r.json"), "--seconds", "3"]
     assert main(command) == 0
-    assert asked == [("ours", 3), ("paper", 3)]
+    assert asked == [("texture", "", 3), ("texture", "paper", 3)]
     result = json.loads((folder / "r.json").read_text())
     made = result["candidates"]
     blocks = ["ASTC 12x, trilinear"] * ("astc" in codecs.available())
@@ -275,6 +274,13 @@ def test_what_is_written(small, capsys):
     for name in ("ours 12x", "paper 12x"):
         found = result["jobs"][name]["details"]["levels"]
         assert len(found["all"]) == len(found["albedo"]) == 6 and result["jobs"][name]["details"]["steps"] == STEPS
+    (panel,) = [p for p in panels(result) if p.title == "plane"]
+    assert panel.x_label == "time of one render, ms" and not panel.lines
+    assert {p.name: p.accuracy for p in panel.points} == {
+        n: c["errors"]["psnr_plane_db"] for n, c in made.items() if c["in_picture"]
+    }
+    fronts = {n: t["on_front"] for n, t in case["passes"]["render"].items() if made[n]["in_picture"]}
+    assert {p.name: p.on_front for p in panel.points} == fronts and any(fronts.values())
     with open(folder / "out" / "tradeoff_texture.csv", encoding="utf-8") as stream:
         table = list(csv.DictReader(stream))
     assert {(r["candidate"], r["query"]) for r in table} >= {(n, "render") for n in made}
