@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from ...errors import UsageError
+from ...maps import components
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from ...tables import MAX_BYTES
@@ -14,6 +15,9 @@ from ..map_arguments import asked_bytes
 from ..task import Fitted, Request
 from . import sizing, training
 from .presets import PRESETS, Recipe
+
+#: dB of :func:`~mi_diffind.maps.components.smoothness` from which on a texture is smooth.
+SMOOTH_DB = 30.0
 
 
 def recipe_of(preset: str, settings, options) -> Recipe:
@@ -87,6 +91,9 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, opt
     if skip is not None and not 0 <= skip < levels:
         raise UsageError(f"--skip: found {skip}, the texture has levels 0 to {levels - 1}")
     try:
-        return sizing.choose(layout.height, layout.width, layout.stored, nbytes, skip, fine, options["cascaded"])
+        smooth = components.smoothness(pyramid.values[0]) >= SMOOTH_DB
+        return sizing.choose(
+            layout.height, layout.width, layout.stored, nbytes, skip, fine, options["cascaded"], smooth
+        )
     except ValueError as e:
         raise UsageError(f"--structure: {e}") from None

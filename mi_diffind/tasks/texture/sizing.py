@@ -197,6 +197,15 @@ LADDER: tuple[tuple[str, int], ...] = (
     ("0:3:8,1:3:8", 2),
 )
 
+#: The same for smooth textures, whose finest level is not worth an array of its own before bytes are plenty.
+SMOOTH_LADDER: tuple[tuple[str, int], ...] = (
+    ("1:2:4,2:3:6", 3),
+    ("1:3:4,2:3:6", 3),
+    ("1:3:6,2:3:6", 3),
+    ("1:3:8,2:3:8", 3),
+    *LADDER[5:],
+)
+
 #: Largest sides of a cascaded array of 1 to 4 dimensions that are chosen.
 CASCADED_LIMITS = (128, 32, 16, 8)
 
@@ -212,15 +221,17 @@ def choose(
     skip: int | None = None,
     fine: tuple[Fine, ...] | None = None,
     cascaded: int | None = None,
+    smooth: bool = False,
 ) -> Size:
     """
     Our size for a texture of so many stored channels and so many bytes, some of it given unless ``None``: the structure
-    of :data:`LADDER` with the most bytes that fit, on coarser levels if none does; what is left goes to the cascaded
-    array. Pointers have three coordinates, and fewer where even the smallest arrays of three are too large.
+    of :data:`LADDER` (for a ``smooth`` texture of :data:`SMOOTH_LADDER`) with the most bytes that fit, on coarser
+    levels if none does; what is left goes to the cascaded array. Pointers have three coordinates, and fewer where even
+    the smallest arrays of three are too large.
     """
     for dims in (3, 2, 1):
         found = []
-        for group in _structures(height, width, dims, skip, fine):
+        for group in _structures(height, width, dims, skip, fine, SMOOTH_LADDER if smooth else LADDER):
             sizes = [_sized(nbytes, height, width, channels, *where, dims, cascaded) for where in group]
             fitting = [size for size in sizes if size.nbytes <= nbytes]
             if fitting:
@@ -231,7 +242,7 @@ def choose(
     return min(found, key=lambda size: size.nbytes)
 
 
-def _structures(height: int, width: int, dims: int, skip: int | None, fine: tuple[Fine, ...] | None):
+def _structures(height: int, width: int, dims: int, skip: int | None, fine: tuple[Fine, ...] | None, ladder):
     """
     What is tried, the first choice first: groups of structures, each the fine arrays and the level from which on the
     others are. The ladder on the levels themselves, then on coarser ones.
@@ -242,7 +253,7 @@ def _structures(height: int, width: int, dims: int, skip: int | None, fine: tupl
         return
     for shift in range(last):
         group = []
-        for text, start in LADDER:
+        for text, start in ladder:
             start = min(start + shift, last)
             arrays = [Fine(f.level + shift, min(f.channels, dims), f.bits) for f in parse_structure(text)]
             if skip in (None, start):
