@@ -112,6 +112,7 @@ def measure(plan: Plan, settings: Settings, folder: str | os.PathLike | None = N
         "settings": asdict(settings),
         **{name: getattr(plan, name) for name in ("accuracy", "accuracy_label", "panels", "bytes_by_case", "details")},
         "notes": list(plan.notes),
+        "sampled": plan.sampled,
         **_assemble(plan, cases, settings, store.data),
     }
     result["conclusions"] = plan.conclusions(result)

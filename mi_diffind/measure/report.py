@@ -183,6 +183,7 @@ def caption(result: dict) -> str:
     """What the figures were measured on and how, as one paragraph."""
     s, made = result["settings"], result["jobs"]
     sampled = any(c["errors"] and "errors" not in made.get(c["job"], {}) for c in result["candidates"].values())
+    sampled &= result.get("sampled", True)
     errors = f"; errors from {s['samples']:,} samples" if sampled else ""
     return " ".join([
         *result["notes"],

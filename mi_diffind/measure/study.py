@@ -134,7 +134,8 @@ class Plan:
     ``jobs`` come first; ``jobs_fingerprint`` is that of the models they keep. ``panels``: what accuracy is drawn
     against, for all candidates (``"bytes"``, ``"training_seconds"``); ``bytes_by_case``: also against bytes, for those
     of each case. ``table(result)`` are lines to print before the times, ``conclusions(result)`` after them.
-    ``pictures`` are further ones: kind → a function of the result that draws a Matplotlib figure.
+    ``pictures`` are further ones: kind → a function of the result that draws a Matplotlib figure. ``sampled``: errors
+    are those of so many samples as the settings say.
     """
 
     study: str
@@ -154,6 +155,7 @@ class Plan:
     panels: tuple[str, ...] = ()
     bytes_by_case: bool = False
     pictures: dict[str, Callable[[dict], object]] = field(default_factory=dict)
+    sampled: bool = True
     table: Callable[[dict], list[str]] = lambda result: []
     conclusions: Callable[[dict], list[str]] = lambda result: []
 

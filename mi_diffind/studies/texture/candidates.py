@@ -149,6 +149,7 @@ def plan(source: Source, name: str, request: Request, tables: Sequence[Table] = 
         jobs=jobs,
         jobs_fingerprint=f"{source.digest} {request_details} {digests}",
         pictures=pictures.of(setting, {n: readers[n] for n in pictures.shown(candidates)}),
+        sampled=False,
         table=table,
         conclusions=conclusions,
     )  # fmt: skip

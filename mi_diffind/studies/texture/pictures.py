@@ -39,7 +39,7 @@ def crops(setting, readers: dict, result: dict):
         counted = setting.counted(stage)
         part = np.where(counted[..., None], setting.truths[name], np.nan)
         if not i:  # where the plane ends
-            part[int(np.argmax(counted.any(axis=1))) + side * 5 // 4 :] = np.nan
+            part[int(np.argmax(counted.any(axis=1))) + side :] = np.nan
         top, left = _busiest(part, side)
         for k, column in enumerate(columns):
             if column == "truth":
