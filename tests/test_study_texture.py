@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mi_diffind.cli import main
 from mi_diffind.measure.report import panels
 from mi_diffind.studies.baselines import codecs
 
+ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
 FILM = (24, 16)
 
 #: Steps of a training.
@@ -291,9 +293,32 @@ def test_what_is_written(small, capsys):
     assert "PSNR by level" in out and "plane, ours 12x, trilinear:" in out
 
 
+def test_a_table_in_place_of_a_training(mi_rgb):
+    from mi_diffind.maps.source import load_source
+    from mi_diffind.studies.texture import candidates
+
+    path = ASSETS / "tiles.json"
+    source = load_source(path)
+    tables = candidates.tables_of([str(ASSETS / "tiles_filtered.npz")], source)
+    request = candidates.Request("albedo", (), film=FILM, zoom_film=FILM, frames=2)
+    plan = candidates.plan(source, str(path), request, tables)
+    mark = f"ours {source.nbytes / tables[0].nbytes:.3g}x"
+    assert [job.name for job in plan.jobs if "truth" not in job.name and "ASTC" not in job.name] == [mark]
+    names = [c.name for c in plan.candidates if c.job == mark]
+    ways = ("trilinear", "trilinear, centred", "anisotropic", "anisotropic, centred", "stochastic", "off")
+    assert names == [f"{mark}, {way}" for way in ways]
+    assert [c.name for c in plan.candidates if c.job == mark and not c.in_picture] == names[4:]
+    assert {c.name for c in plan.candidates if c.queries == ()} >= {"bitmap, 4 spp", f"{mark}, trilinear, centred"}
+
+
 @pytest.mark.parametrize(
     "options, message",
-    [(["--compression", "0"], "0"), (["--map", "roughness"], "roughness"), (["--table", "missing.npz"], "missing.npz")],
+    [
+        (["--compression", "0"], "0"),
+        (["--map", "roughness"], "roughness"),
+        (["--table", "missing.npz"], "missing.npz"),
+        (["--table", str(ASSETS / "tiles_filtered.npz")], "not trained on this source"),
+    ],
 )
 def test_bad_options(small, options, message, capsys):
     folder, asked = small

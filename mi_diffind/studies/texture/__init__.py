@@ -56,7 +56,7 @@ class TextureStudy(Study):
         arguments.compressions = given or default
         arguments.loaded = load_source(arguments.source)
         arguments.map = colour_map(arguments.loaded, arguments.map)
-        arguments.tables = tables_of(arguments.table)
+        arguments.tables = tables_of(arguments.table, arguments.loaded)
 
     def plan(self, arguments) -> Plan:
         from .candidates import Request, plan

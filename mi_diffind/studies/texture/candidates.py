@@ -52,6 +52,9 @@ FILTERS = {
     "off": {"filter": "off"},
 }
 
+#: What presets are called in legends; others are ours.
+KINDS = {"paper": "paper's preset"}
+
 #: Filters, and whether samples are centred; and those that only our first table has.
 WAYS = tuple(itertools.product(("trilinear", "anisotropic"), (False, True)))
 MORE = (("stochastic", False), ("off", False))
@@ -106,9 +109,13 @@ def colour_map(source: Source, name: str = "") -> str:
     return name or fitting[0]
 
 
-def tables_of(paths: Sequence[str]) -> list[Table]:
-    """Tables that were trained already. Raises :class:`~mi_diffind.tables.TableError`."""
-    return [task.tasks()["texture"].load(path) for path in paths]
+def tables_of(paths: Sequence[str], source: Source) -> list[Table]:
+    """Tables that were trained already. Raises :class:`~mi_diffind.tables.TableError` and ``ValueError``."""
+    found = [task.tasks()["texture"].load(path) for path in paths]
+    for trained in found:
+        if trained.settings.get("source") != source.digest:
+            raise ValueError(f"--table: {trained.path} was not trained on this source")
+    return found
 
 
 def plan(source: Source, name: str, request: Request, tables: Sequence[Table] = ()) -> Plan:
@@ -410,14 +417,14 @@ def _candidates(setting: Setting, tables: Sequence[Table]) -> tuple[list[Job], l
          bytes=pyramid_bytes)  # fmt: skip
 
     trained = [
-        _Table(f"ours {ratio:.3g}x", "ours", ratio, setting, table=t)
+        _Table(f"{t.preset} {ratio:.3g}x", KINDS.get(t.preset, "ours"), ratio, setting, table=t)
         for t, ratio in ((t, source.nbytes / t.nbytes) for t in tables)
     ]
     for compression in request.compressions:
         trained.append(_Table(f"ours {compression:g}x", "ours", compression, setting, seconds=request.seconds))
         if compression == request.compressions[0]:
             paper = f"paper {compression:g}x"
-            trained.append(_Table(paper, "paper's preset", compression, setting, "paper", request.seconds))
+            trained.append(_Table(paper, KINDS["paper"], compression, setting, "paper", request.seconds))
     cache: dict = {}
     for i, job in enumerate(trained):
         jobs.append(job)
