@@ -30,8 +30,8 @@ class TextureStudy(Study):
                             help="3x, 6x, 12x and 24x by default, the first that is named is shown most; may be "
                             "repeated (--quick: 12x)")  # fmt: skip
         parser.add_argument("--table", action="append", default=[], metavar="FILE.npz",
-                            help="a table of the source that was trained already, in place of a training; may be "
-                            "repeated; nothing is trained unless --compression is given, too")  # fmt: skip
+                            help="a table of the source that was trained already (with --border repeat, as renders "
+                            "repeat it), in place of a training; may be repeated; nothing is trained unless --compression is given, too")  # fmt: skip
         parser.add_argument("--seconds", type=positive, metavar="N",
                             help="of each training (default: 60; --quick: 2)")  # fmt: skip
         parser.add_argument("--astc", choices=ASTC_PRESETS, default="exhaustive",

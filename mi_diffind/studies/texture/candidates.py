@@ -310,7 +310,7 @@ class _Table(_Made):
             fitted = task.fit(
                 "texture", self.preset, mi.variant(), seconds=self.seconds, progress=progress,
                 source=self.setting.name, compression=self.compression, deterministic=False, output=self.file,
-                footprint_samples=self.samples,
+                footprint_samples=self.samples, border="repeat",  # as the stages repeat it
             )  # fmt: skip
             if fitted.result.interrupted:
                 return None
