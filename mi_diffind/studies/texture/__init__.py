@@ -31,7 +31,8 @@ class TextureStudy(Study):
                             "repeated (--quick: 12x)")  # fmt: skip
         parser.add_argument("--table", action="append", default=[], metavar="FILE.npz",
                             help="a table of the source that was trained already (with --border repeat, as renders "
-                            "repeat it), in place of a training; may be repeated; nothing is trained unless --compression is given, too")  # fmt: skip
+                            "repeat it), in place of a training; may be repeated; nothing is trained unless "
+                            "--compression is given, too")  # fmt: skip
         parser.add_argument("--seconds", type=positive, metavar="N",
                             help="of each training (default: 60; --quick: 2)")  # fmt: skip
         parser.add_argument("--astc", choices=ASTC_PRESETS, default="exhaustive",
