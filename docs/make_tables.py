@@ -93,7 +93,69 @@ def comparisons() -> str:
     return table(["scene", "against", "PSNR, dB", "FLIP", "time of a pass over that of the other"], rows)
 
 
-TABLES = {"disney_forms": disney_forms, "comparisons": comparisons}
+def texture_renders() -> str:
+    """Errors, flicker and times of renders with filtered textures."""
+    study = measured("tradeoff_texture")
+    stages, base, steady = list(study["details"]["counted"]), "bitmap, 1 spp", "bitmap, 4 spp"
+    flicker = study["candidates"][steady]["errors"]["flicker_error"]
+    rows = []
+    for name, c in study["candidates"].items():
+        if "flicker" not in c["errors"]:
+            continue
+        e = c["errors"]
+        times = [study["cases"][s]["ratios"]["render"].get(f"{name} / {base}", {"median": 1})["median"] for s in stages]
+        rows.append([
+            f"`{name}`", f"{c['bytes']:,}", *(f"{e[f'psnr_{s}_db']:.1f} / {e[f'flip_{s}']:.4f}" for s in stages),
+            f"{e['flicker_error'] / flicker:.2f}", " / ".join(f"{t:.2f}" for t in times),
+        ])  # fmt: skip
+    head = ["", "bytes", *(f"{s}: PSNR, dB / FLIP" for s in stages), "flicker", f"time: {' / '.join(stages)}"]
+    return table(head, rows)
+
+
+def texture_factors() -> str:
+    """How many times as long a bitmap takes for the same error."""
+    from mi_diffind.studies.texture.conclusions import speed
+
+    study = measured("tradeoff_texture")
+    stages, rows = [s for s, c in study["cases"].items() if c["in_picture"]], []
+    for name, c in study["candidates"].items():
+        if c["representation"].startswith("bitmap") or not c["errors"]:
+            continue
+        cells = []
+        for stage in stages:
+            found = [speed(study, stage, name, against) for against in ("bitmap", "bitmap, multijittered")]
+            cells.append(" / ".join(f"{'> ' * more}{value:.1f}" for value, more in found))
+        rows.append([f"`{name}`", *cells])
+    return table(["", *(f"{s}: independent / multijittered" for s in stages)], rows)
+
+
+def texture_levels() -> str:
+    """PSNR of each level of detail."""
+    from mi_diffind.studies.texture.conclusions import levels
+
+    study = measured("tradeoff_texture")
+    found = levels(study)
+    count = max(len(v["all"]) for v in found.values())
+    rows = [
+        [name, f"{study['jobs'][name]['details']['ratio']:.1f}x", *(f"{v:.1f}" for v in values["all"])]
+        for name, values in found.items()
+    ]
+    return table(["", "ratio", *(f"L{i}" for i in range(count))], rows)
+
+
+def texture_memory() -> str:
+    """Resident memory of a scene with many textures."""
+    found = measured("texture_memory")
+    rows = [
+        [f"`{name}`", f"{row['bytes'] / 2**20:.1f}", f"{row['times_less']:.1f}"]
+        for name, row in found["textures"].items()
+    ]
+    return table([f"{found['count']} textures of {found['side']}²", "MiB", "times less"], rows)
+
+
+TABLES = {
+    f.__name__: f for f in (disney_forms, comparisons, texture_renders, texture_factors, texture_levels, texture_memory)
+}
 
 
 def written() -> dict[Path, str]:

@@ -18,7 +18,8 @@ class FilteredTexture(MapTexture):
     """
     One map of a :class:`~mi_diffind.maps.compressed.FilteredMaps`, read at the level of detail of the footprint at a
     hit (:func:`.footprint.footprint`); no gradient passes through that. ``cone`` is the sensor that sees it
-    (:class:`.footprint.Cone`), ``None`` if it is not known.
+    (:class:`.footprint.Cone`), ``None`` if it is not known. A sample that is the only one of its pixel is read at the
+    pixel's centre (:func:`.footprint.to_centre`).
 
     Places are averaged as they are used, after sRGB has been decoded, and data as they are stored.
     """
@@ -39,6 +40,7 @@ class FilteredTexture(MapTexture):
         if self.filter.name == "off" or not self.is_spatially_varying():
             return super()._values(si)
         uv, (ddx, ddy) = self._uv(si), self._footprint(si)
+        uv = uv + dr.detach(footprint.to_centre(self.cone, si, ddx, ddy)) / mi.Vector2f(*self._size)
         if self.filter.name == "trilinear":
             return self._used_of(self._filtered(uv, isotropic(ddx, ddy)))
         level, axis = anisotropic(ddx, ddy, self.filter.taps)

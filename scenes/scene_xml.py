@@ -1,5 +1,5 @@
 """
-Writing scene files for people to read: what ``make_materials.py`` and ``make_metals.py`` share.
+Writing scene files for people to read: what ``make_materials.py``, ``make_metals.py`` and ``make_horizon.py`` share.
 
 Mitsuba's own writer (``mi.parser.write_file``, of a parsed dictionary) is made for converting scenes, and loses what
 these files are for: it knows no ``<default>`` but the width of the film, writes no comments, turns a ``lookat`` into

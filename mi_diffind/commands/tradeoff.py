@@ -64,4 +64,4 @@ def _measure(plan, arguments) -> dict:
     from ..measure import frame, report
 
     result = frame.measure(plan, frame.Settings.choose(plan.variant, arguments.quick), arguments.out)
-    return report.publish(result, report.write(result, arguments.out), report.summary(result, plan))
+    return report.publish(result, report.write(result, arguments.out, plan), report.summary(result, plan))

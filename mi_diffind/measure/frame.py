@@ -112,6 +112,7 @@ def measure(plan: Plan, settings: Settings, folder: str | os.PathLike | None = N
         "settings": asdict(settings),
         **{name: getattr(plan, name) for name in ("accuracy", "accuracy_label", "panels", "bytes_by_case", "details")},
         "notes": list(plan.notes),
+        "sampled": plan.sampled,
         **_assemble(plan, cases, settings, store.data),
     }
     result["conclusions"] = plan.conclusions(result)
@@ -253,7 +254,9 @@ def _assemble(plan: Plan, cases: list[Case], settings: Settings, data: dict) -> 
         rounds, passes = data["queries"].get(case.name, []), data["passes"].get(case.name, [])
         if not rounds:
             continue
-        found = {"details": case.details, "in_picture": case.in_picture, "queries": {}, "passes": {}, "ratios": {}}
+        accuracy = case.accuracy or plan.accuracy
+        found = {"details": case.details, "in_picture": case.in_picture, "accuracy": accuracy,
+                 "of_passes": case.of_passes, "queries": {}, "passes": {}, "ratios": {}}  # fmt: skip
         for query in case.query_names:
             ns = _by_name(rounds, query, 1e9 / settings.lanes)
             floor = spread(ns.pop(FLOOR))["median"]
@@ -261,11 +264,13 @@ def _assemble(plan: Plan, cases: list[Case], settings: Settings, data: dict) -> 
             found["queries"][query] = {
                 name: timing(values, floor) | {"operations": counted[name]} for name, values in ns.items()
             }
-            _mark_front(found["queries"][query], candidates, plan.accuracy)
+            _mark_front(found["queries"][query], candidates, accuracy)
             found["ratios"][query] = _ratios(plan.ratios, ns, floor)
         for kind in (PASS, PASS_WALL) if passes else ():
             ms = _by_name(passes, kind, 1e3)
             found["passes"][kind] = {name: timing(values) for name, values in ms.items()}
+            if case.of_passes:
+                _mark_front(found["passes"][kind], candidates, accuracy)
             found["ratios"][kind] = _ratios(plan.ratios, ms, 0.0)
         found_cases[case.name] = found
     return {"candidates": candidates, "cases": found_cases, "jobs": records}

@@ -70,10 +70,10 @@ def publish(result: dict, paths: dict[str, str], lines: list[str]) -> dict:
     return {**finite(result), "files": paths}
 
 
-def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
+def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> dict[str, str]:
     """
     :func:`write_files` of a result of :func:`.frame.measure`: the table (:func:`rows`), the picture, if there is
-    anything to draw, and the courses of trainings, if there were any.
+    anything to draw, the courses of trainings, if there were any, and the pictures of a ``plan`` that is complete.
     """
     table, pictures = rows(result), {}
     courses = {name: record for name, record in result["jobs"].items() if "runs" in record}
@@ -83,6 +83,8 @@ def write(result: dict, folder: str | os.PathLike) -> dict[str, str]:
     if courses:
         title = f"{result['title']}: training"
         pictures["training"] = lambda: plot.draw_courses(title, courses, machine_line(result))
+    if plan is not None and not result["interrupted"]:
+        pictures |= {kind: (lambda draw=draw: draw(result)) for kind, draw in plan.pictures.items()}
     names = dict.fromkeys(name for row in table for name in row if name not in COLUMNS)
     return write_files(result["task"], folder, result, table, (*COLUMNS, *names), pictures)
 
@@ -128,31 +130,35 @@ def _candidate_cells(result: dict, name: str) -> dict:
 
 def panels(result: dict) -> list[plot.Panel]:
     """
-    Accuracy against the quantities asked for, of all candidates, then against time of the first query, one panel a
-    case: candidates labelled, quartiles as bars, the Pareto front drawn, references as vertical lines.
+    Accuracy against the quantities asked for, of all candidates, then against time of the first query or of a pass, one
+    panel a case: candidates labelled, quartiles as bars, the Pareto front drawn, references as vertical lines.
     """
     candidates = list(result["candidates"].values())
     found = [_against(quantity, candidates, result, QUANTITIES[quantity][1]) for quantity in result["panels"]]
     for case, measured in result["cases"].items():
         if not measured["in_picture"]:
             continue
-        query, timings = next(iter(measured["queries"].items()))
+        of_passes, accuracy = bool(measured.get("of_passes")), measured.get("accuracy") or result["accuracy"]
+        kind = "passes" if of_passes else "queries"
+        query, timings = next(iter(measured[kind].items()), ("", {}))
         points, lines = [], []
         for name, t in timings.items():
             c = result["candidates"][name]
+            if of_passes and not c["in_picture"]:
+                continue
             if c["is_truth"] or c["is_reference"]:
                 label = f"{c['label']}, below {t['time']:.2g} ns" if t["hidden"] else c["label"]
                 lines.append(plot.Line(label, t["time"], c["is_truth"]))
-            elif result["accuracy"] in c["errors"]:
-                points.append(_point(c, result, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
-        found.append(plot.Panel(case, f"time of one {query}, ns", points, lines))
+            elif accuracy in c["errors"]:
+                points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
+        found.append(plot.Panel(case, f"time of one {query}, {'ms' if of_passes else 'ns'}", points, lines))
         if result["bytes_by_case"]:
             found.append(_against("bytes", [result["candidates"][name] for name in timings], result, case))
     return [panel for panel in found if panel.points or panel.lines]
 
 
-def _point(c: dict, result: dict, x: float, low: float, high: float, on_front: bool) -> plot.Point:
-    return plot.Point(c["label"], x, low, high, c["errors"][result["accuracy"]], c["representation"], on_front)
+def _point(c: dict, accuracy: str, x: float, low: float, high: float, on_front: bool) -> plot.Point:
+    return plot.Point(c["label"], x, low, high, c["errors"][accuracy], c["representation"], on_front)
 
 
 def _against(quantity: str, candidates: list[dict], result: dict, title: str) -> plot.Panel:
@@ -167,7 +173,7 @@ def _against(quantity: str, candidates: list[dict], result: dict, title: str) ->
         for c in distinct.values()
     ]
     points = [
-        _point(c, result, *[c[quantity]] * 3, on_front)
+        _point(c, result["accuracy"], *[c[quantity]] * 3, on_front)
         for c, on_front in zip(distinct.values(), pareto(values), strict=True)
     ]
     return plot.Panel(title, QUANTITIES[quantity][0], points, [])
@@ -177,6 +183,7 @@ def caption(result: dict) -> str:
     """What the figures were measured on and how, as one paragraph."""
     s, made = result["settings"], result["jobs"]
     sampled = any(c["errors"] and "errors" not in made.get(c["job"], {}) for c in result["candidates"].values())
+    sampled &= result.get("sampled", True)
     errors = f"; errors from {s['samples']:,} samples" if sampled else ""
     return " ".join([
         *result["notes"],
@@ -199,7 +206,7 @@ def summary(result: dict, plan: Plan | None = None) -> list[str]:
         cells = [["", *queries, "flops", "reads", *([f"ms {PASS}"] if passes else []), "bytes", "accuracy", ""]]
         for name, t in queries[query].items():
             c, operations = result["candidates"][name], t["operations"]
-            accuracy = c["errors"].get(result["accuracy"])
+            accuracy = c["errors"].get(measured.get("accuracy") or result["accuracy"])
             shown = "exact" if c["is_truth"] else "-" if accuracy is None else f"{accuracy:.1f} dB"
             cells.append([
                 name, *(time_cell(timings.get(name)) for timings in queries.values()),

@@ -108,7 +108,8 @@ class Case:
     these to functions; ``passes()``, if there are any, maps candidates (those with ``in_passes``) to functions of the
     number of the pass, which do one pass of a whole job. Both are called when they are needed. ``candidates`` are the
     names of those that take part (default: all), ``query_names`` those of its queries (default: the plan's);
-    ``in_picture``: it has a panel. ``details`` are kept with it.
+    ``in_picture``: it has a panel, which shows the error ``accuracy`` (default: the plan's) against the time of its
+    first query, or if it is ``of_passes`` of a pass; so does the Pareto front. ``details`` are kept with it.
     """
 
     name: str
@@ -118,6 +119,8 @@ class Case:
     candidates: tuple[str, ...] | None = None
     query_names: tuple[str, ...] | None = None
     in_picture: bool = True
+    accuracy: str = ""
+    of_passes: bool = False
 
 
 @dataclass
@@ -131,6 +134,8 @@ class Plan:
     ``jobs`` come first; ``jobs_fingerprint`` is that of the models they keep. ``panels``: what accuracy is drawn
     against, for all candidates (``"bytes"``, ``"training_seconds"``); ``bytes_by_case``: also against bytes, for those
     of each case. ``table(result)`` are lines to print before the times, ``conclusions(result)`` after them.
+    ``pictures`` are further ones: kind → a function of the result that draws a Matplotlib figure. ``sampled``: errors
+    are those of so many samples as the settings say.
     """
 
     study: str
@@ -149,6 +154,8 @@ class Plan:
     jobs_fingerprint: str = ""
     panels: tuple[str, ...] = ()
     bytes_by_case: bool = False
+    pictures: dict[str, Callable[[dict], object]] = field(default_factory=dict)
+    sampled: bool = True
     table: Callable[[dict], list[str]] = lambda result: []
     conclusions: Callable[[dict], list[str]] = lambda result: []
 

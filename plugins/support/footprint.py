@@ -41,7 +41,8 @@ class Cone:
     viewing. ``dx``, ``dy``: what a step of one pixel to the right, or down, adds to the place that is seen: at depth
     1 along the axis, or of an orthographic sensor at any. ``scale``, by which the footprint of a sample is smaller than
     that of a pixel (:func:`scale_of`). ``reach``: of all pixels the least √(cos³) of the angle to the axis, 1 if
-    orthographic. ``lens``, the radius of the lens, 0 without. ``kind``, one of :data:`KINDS`.
+    orthographic. ``lens``, the radius of the lens, 0 without. ``kind``, one of :data:`KINDS`. ``corner``: what is seen
+    at the film's corner, from ``origin``, as ``dx``; ``None`` with a lens or more than one sample a pixel.
     """
 
     kind: str
@@ -52,6 +53,7 @@ class Cone:
     scale: mi.Float
     reach: mi.Float
     lens: mi.Float
+    corner: mi.Vector3f | None = None
 
     @classmethod
     def of(cls, sensor: mi.Sensor, spp: int | None = None) -> Cone:
@@ -97,7 +99,11 @@ class Cone:
             )
         spp = sensor.sampler().sample_count() if spp is None else spp
         reach = 1.0 if kind == "orthographic" else float((cosine[:4] ** 1.5).min())
-        return cls._opaque(kind, origin, axis, dx / size[0], dy / size[1], spp, reach, radius)
+        found = cls._opaque(kind, origin, axis, dx / size[0], dy / size[1], spp, reach, radius)
+        if kind != "thinlens" and spp == 1:
+            corner = seen[0] - (origin if kind == "orthographic" else 0)
+            found.corner = dr.opaque(mi.Vector3f, [float(x) for x in corner])
+        return found
 
     @classmethod
     def from_properties(cls, props: mi.Properties) -> Cone | None:
@@ -221,6 +227,25 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     x = dr.select(direct, depth * cone.scale * cone.dx, facing * frame.s)
     y = dr.select(direct, depth * cone.scale * cone.dy, facing * frame.t)
     return in_uv(x, y, along, du, dv)
+
+
+def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Vector2f:
+    """
+    From a hit to what is seen at the centre of its pixel, in uv: undoes the jitter of a sample that is the only one of
+    its pixel. Zero where the sensor does not see the hit directly, or takes more samples, or has a lens.
+    """
+    if cone is None or cone.corner is None:
+        return mi.Vector2f(0)
+    to = dr.detach(si.p) - cone.origin
+    depth = mi.Float(1) if cone.kind == "orthographic" else dr.dot(to, cone.axis)
+    way = cone.axis if cone.kind == "orthographic" else dr.normalize(to)
+    local, wi = dr.detach(si.sh_frame).to_local(way), dr.detach(si.wi)
+    away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
+    direct = (dr.squared_norm(away) < STRAIGHT**2) & (depth > 0)
+    place = to * dr.rcp(depth) - cone.corner
+    steps = (dr.dot(place, v) * dr.rcp(dr.squared_norm(v)) for v in (cone.dx, cone.dy))
+    x, y = (0.5 - (v - dr.floor(v)) for v in steps)
+    return dr.select(direct, ddx * x + ddy * y, 0)
 
 
 def in_uv(x, y, along, du, dv) -> tuple[mi.Vector2f, mi.Vector2f]:

@@ -14,7 +14,7 @@ import importlib
 import io
 import itertools
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -260,6 +260,70 @@ def astc_material(
         raise CodecError(f"ASTC cannot store {', '.join(maps)} in {nbytes:,} bytes")
     result = {part[0]: cached(_encode, *part, quality) for part in min(found, key=lambda way: way[1])[2]}
     return result, sum(e.nbytes for e in result.values())
+
+
+@dataclass
+class EncodedLevels:
+    """
+    A map and its mip maps after ``codec``: the ``nbytes`` stored, and all ``levels`` decoded, as :class:`Encoded` has
+    an image.
+    """
+
+    codec: str
+    nbytes: int
+    levels: list[np.ndarray]
+
+
+def astc_levels(
+    maps: Mapping[str, Sequence[np.ndarray]],
+    nbytes: int,
+    quality: str = "exhaustive",
+    normals: Collection[str] = ("normal",),
+    choose: str = "medium",
+    cache: dict | None = None,
+    dropped: Iterable[int] = (0, 1, 2),
+) -> tuple[dict[str, EncodedLevels], int]:
+    """
+    The ``maps`` of a material with their mip maps, name → all levels from the finest on, in ``nbytes`` together: each
+    map at its own block size, with or without its finest levels (so many may be ``dropped``; they are read from the
+    first that is stored with bicubic filtering), such that the squared errors of the finest levels are least. Otherwise
+    as :func:`astc_material`.
+    """
+    _modules("astc")
+    cache = {} if cache is None else cache
+    rounded = {name: [_texels(level) / np.float32(255) for level in levels] for name, levels in maps.items()}
+
+    def coded(name: str, level: int, normal: bool, block: str, quality: str) -> Encoded:
+        key = ("level", name, level, normal, block, quality)
+        if key not in cache:
+            cache[key] = _encode(rounded[name][level], normal, block, 1, quality)
+        return cache[key]
+
+    def finest(name: str, normal: bool, block: str, drop: int, quality: str) -> np.ndarray:
+        image, (height, width) = coded(name, drop, normal, block, quality).image, rounded[name][0].shape[:2]
+        return _resized(image, height, width, "BICUBIC") if drop else image
+
+    front: list[_Way] = [(0, 0.0, ())]
+    for name, levels in rounded.items():
+        ways = []
+        both = (False, True) if name in normals and levels[0].shape[2] == 3 else (False,)
+        for normal, block, drop in itertools.product(both, ASTC_BLOCKS, dropped):
+            size = sum(astc_bytes(level.shape, block) for level in levels[drop:])
+            if drop < len(levels) and size <= nbytes:
+                error = _squared(levels[0], finest(name, normal, block, drop, choose))
+                ways.append((size, error, ((name, normal, block, drop),)))
+        front = _front(itertools.product(front, ways), nbytes)
+    if not front:
+        raise CodecError(f"ASTC cannot store {', '.join(maps)} with mip maps in {nbytes:,} bytes")
+    found = {}
+    for name, normal, block, drop in min(front, key=lambda way: way[1])[2]:
+        parts = [coded(name, i, normal, block, quality) for i in range(drop, len(rounded[name]))]
+        above = []
+        for level in rounded[name][:drop]:
+            above.append(_resized(parts[0].image, *level.shape[:2], "BICUBIC"))
+        codec = f"{parts[0].codec}{f' from level {drop} on' if drop else ''}"
+        found[name] = EncodedLevels(codec, sum(p.nbytes for p in parts), [*above, *(p.image for p in parts)])
+    return found, sum(e.nbytes for e in found.values())
 
 
 def _encode(image: np.ndarray, normal: bool, block: str, reduce: int, quality) -> Encoded:
