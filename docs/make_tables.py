@@ -93,9 +93,8 @@ def comparisons() -> str:
     return table(["scene", "against", "PSNR, dB", "FLIP", "time of a pass over that of the other"], rows)
 
 
-def texture_renders() -> str:
+def texture_renders(study: dict) -> str:
     """Errors, flicker and times of renders with filtered textures."""
-    study = measured("tradeoff_texture")
     stages, base, steady = list(study["details"]["counted"]), "bitmap, 1 spp", "bitmap, 4 spp"
     flicker = study["candidates"][steady]["errors"]["flicker_error"]
     rows = []
@@ -112,11 +111,10 @@ def texture_renders() -> str:
     return table(head, rows)
 
 
-def texture_factors() -> str:
+def texture_factors(study: dict) -> str:
     """How many times as long a bitmap takes for the same error."""
     from mi_diffind.studies.texture.conclusions import speed
 
-    study = measured("tradeoff_texture")
     stages, rows = [s for s, c in study["cases"].items() if c["in_picture"]], []
     for name, c in study["candidates"].items():
         if c["representation"].startswith("bitmap") or not c["errors"]:
@@ -129,11 +127,10 @@ def texture_factors() -> str:
     return table(["", *(f"{s}: independent / multijittered" for s in stages)], rows)
 
 
-def texture_levels() -> str:
+def texture_levels(study: dict) -> str:
     """PSNR of each level of detail."""
     from mi_diffind.studies.texture.conclusions import levels
 
-    study = measured("tradeoff_texture")
     found = levels(study)
     count = max(len(v["all"]) for v in found.values())
     rows = [
@@ -153,9 +150,10 @@ def texture_memory() -> str:
     return table([f"{found['count']} textures of {found['side']}²", "MiB", "times less"], rows)
 
 
-TABLES = {
-    f.__name__: f for f in (disney_forms, comparisons, texture_renders, texture_factors, texture_levels, texture_memory)
-}
+TABLES = {f.__name__: f for f in (disney_forms, comparisons, texture_memory)}
+for name in ("tradeoff_texture", "tradeoff_texture_boombox"):
+    for make in (texture_renders, texture_factors, texture_levels):
+        TABLES[make.__name__ + name.removeprefix("tradeoff_texture")] = lambda make=make, name=name: make(measured(name))
 
 
 def written() -> dict[Path, str]:
