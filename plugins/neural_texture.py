@@ -107,10 +107,13 @@ class NeuralTexture(FilteredTexture):
     passes through it.
 
     ``anisotropic`` reads at ``max_anisotropy`` places, evenly over the major axis, always, and half a level finer than
-    a place's share of the footprint is wide; that is 1.4 to 3 dB nearer to the mean over the footprint than a full
+    a place's share of the footprint is wide; that is 1.4 to 3.6 dB nearer to the mean over the footprint than a full
     level is. ``stochastic`` chooses one of the places by numbers made from the bits of the hit's position and uv: on
     average what ``anisotropic`` gives, with the noise of one sample, and the same at every read of a path. Samples that
     go through one point of a pixel get one choice.
+
+    **Frozen functions** (``dr.freeze``) that render keep the entries that they were recorded with, here and in
+    :monosp:`neural_image`: record them again after an optimiser has changed ``tables.NAME``.
 
     The gradient that :monosp:`bumpmap` asks for is, with ``off``, that of :monosp:`bitmap`; with any other filter, the
     difference over the width of a texel of the trilinear level (its footprint's area), also if it is anisotropic.
