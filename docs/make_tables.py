@@ -93,6 +93,17 @@ def comparisons() -> str:
     return table(["scene", "against", "PSNR, dB", "FLIP", "time of a pass over that of the other"], rows)
 
 
+def image_pages() -> str:
+    """Images and materials as one grid and as pages, in equal bytes and seconds."""
+    rows = []
+    for source in ("boombox", "tiles", "wood_color", "vase_color", "hammered_normal"):
+        grid, pages = (measured(f"fit_image_{source}_{kind}") for kind in ("grid", "auto"))
+        cells = [f"{f['measured']['psnr_db']:.1f} / {f['measured']['psnr_between_db']:.1f}" for f in (grid, pages)]
+        chosen = [f["settings"]["structure"] for f in (grid, pages)]
+        rows.append([source, *(f"{c} ({n})" for c, n in zip(cells, chosen, strict=True))])
+    return table(["source", "one grid, the better of two", "what auto chooses"], rows)
+
+
 def texture_renders(study: dict) -> str:
     """Errors, flicker and times of renders with filtered textures."""
     stages, base, steady = list(study["details"]["counted"]), "bitmap, 1 spp", "bitmap, 4 spp"
@@ -150,10 +161,10 @@ def texture_memory() -> str:
     return table([f"{found['count']} textures of {found['side']}²", "MiB", "times less"], rows)
 
 
-TABLES = {f.__name__: f for f in (disney_forms, comparisons, texture_memory)}
-for name in ("tradeoff_texture", "tradeoff_texture_boombox"):
+TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_pages, texture_memory)}
+for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors, texture_levels):
-        TABLES[make.__name__ + name.removeprefix("tradeoff_texture")] = lambda make=make, name=name: make(measured(name))
+        TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
 
 
 def written() -> dict[Path, str]:
