@@ -60,7 +60,9 @@ def fitted(manifest: Path, steps=2, fine="0:2:4", skip=2, cascaded=5, batch=2048
     return output
 
 
-def scene_file(file: Path, names=("albedo", "normal", "roughness"), light="directional", film=24, depth=2, more="") -> Path:
+def scene_file(
+    file: Path, names=("albedo", "normal", "roughness"), light="directional", film=24, depth=2, more=""
+) -> Path:
     """A scene beside a table file: a rectangle with its maps, seen from above at an angle; z is up."""
 
     def texture(parameter, name):
@@ -91,7 +93,7 @@ def scene_file(file: Path, names=("albedo", "normal", "roughness"), light="direc
             <string name="pixel_format" value="rgb"/><rfilter type="box"/>
         </film>
     </sensor>
-    {lights[light]}{more}
+    {lights[light]}
     <shape type="rectangle">{bsdf}</shape>
 </scene>
 """)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tempfile
 from pathlib import Path
 
 import mitsuba as mi
@@ -22,7 +21,7 @@ from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from ...settings import FitSettings
-from ...tables import PAGES, Table, TableError, save_table
+from ...tables import PAGES, Table, TableError
 from ..task import Request
 from ..texture.compressed import CompressedTexture, form_of, load, to_table
 from ..texture.nets import PaperForm
@@ -61,12 +60,10 @@ def fit_scene(
     source_path = original_of(table, file, given)
     source = load_source(source_path, nonfinite="clean")
     texture = texture_problem(table, source)
-    with tempfile.TemporaryDirectory() as folder:
-        start = None
-        if recipe.start == "untrained":
-            texture, start = untrained(table, source, texture), Path(folder) / file.name
-            save_table(start, to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {}))
-        scene = TrainedScene(path, file, views, recipe.spp, start, defines)
+    if recipe.start == "untrained":
+        texture = problem_of(source, size_of(table), texture.recipe, texture.pyramid)
+        table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
+    scene = TrainedScene(path, file, views, recipe.spp, table, defines)
     rendered = References(
         path, views, recipe.reference_spp, references, defines, recipe.against, (source.digest,), request.progress
     )
@@ -121,11 +118,6 @@ def recipe_of(table: Table) -> Recipe:
     names = [f.name for f in dataclasses.fields(Recipe) if f.name != "settings"]
     settings = FitSettings(loss=table.settings.get("loss", "mse"))
     return Recipe(**{n: table.settings[n] for n in names if n in table.settings}, settings=settings)
-
-
-def untrained(table: Table, source: Source, texture: TextureProblem) -> TextureProblem:
-    """The same problem from arrays of the same size that are not trained."""
-    return problem_of(source, size_of(table), texture.recipe, texture.pyramid)
 
 
 def size_of(table: Table) -> Size | PaperSize:

@@ -57,7 +57,9 @@ class References:
 
     def _digest(self) -> str:
         """Of all that the images of all views have in common."""
-        tables = {Path(f).resolve() for f, _ in scenes.tables_of(self.scene, scenes.learned_plugins(self.scene, self.defines))}
+        tables = {
+            Path(f).resolve() for f, _ in scenes.tables_of(self.scene, scenes.learned_plugins(self.scene, self.defines))
+        }
         common = {
             "defines": dict(sorted((self.defines or {}).items())), "against": self.against, "inputs": list(self.inputs),
             "spp": self.spp, "target": self.views.target, "up": self.views.up, "variant": mi.variant(),

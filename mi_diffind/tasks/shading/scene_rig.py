@@ -130,7 +130,7 @@ class _Movable:
 
 def _rotation(axis: np.ndarray, degrees: float) -> np.ndarray:
     """About a unit vector, 4×4 (Rodrigues)."""
-    k = np.cross(np.eye(3), -axis)
+    k = np.cross(np.eye(3), axis)
     angle, found = np.radians(degrees), np.eye(4)
     found[:3, :3] += np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
     return found

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 
 from ... import compat, plugins, scenes
 from ...errors import UsageError
 from ...plugins.support import footprint
+from ...tables import Table, save_table
 from .scene_recipe import View, Views
 from .scene_rig import Rig
-
-#: The largest number below 1: the fold of what the scene's texture reads leaves it as it is, with a slope of 1.
-BELOW_ONE = 1 - 2**-23
 
 #: The plugin whose arrays are trained.
 PLUGIN = "neural_texture"
@@ -46,8 +44,7 @@ def texture_file(path: str | os.PathLike, file: str | os.PathLike | None = None,
 
 class TrainedScene:
     """
-    The scene of a file with the arrays of the texture ``file`` as parameters, at the initial values that the file
-    ``start`` holds (default: its own).
+    The scene of a file in which the textures that read ``file`` read the arrays of ``table`` instead, which can be set.
 
     All maps of a file read the same arrays, whose parameters have a name for each map; one name of each array is set,
     which sets it for all. Renders are those of the integrator ``prb`` in place of ``path``, the same estimator: paths
@@ -56,33 +53,38 @@ class TrainedScene:
     values: a lobe's sampling does, but the density divides it out. Footprints are those of ``spp`` samples a pixel.
     """
 
-    def __init__(self, path, file: Path, views: Views, spp: int, start: Path | None = None, defines=None):
-        start = file if start is None else Path(start).resolve()
+    def __init__(self, path, file: Path, views: Views, spp: int, table: Table, defines=None):
         folder = Path(path).resolve().parent
+        with tempfile.TemporaryDirectory() as temporary:
+            # A name of its own, so that no other scene reads the same arrays
+            own = Path(temporary).resolve() / file.name
+            save_table(own, table)
 
-        def change(state):
-            for props in compat.properties_of(state):
-                name = props.plugin_name()
-                if name == PLUGIN and (folder / str(props.get("filename", ""))).resolve() == file:
-                    props["filename"], props["storage"] = str(start), "float32"
-                elif name == "path":
-                    props["max_depth"] = props.get("max_depth", scenes.MAX_DEPTHS[name])
-                    props.set_plugin_name("prb")
+            def change(state):
+                for props in compat.properties_of(state):
+                    name = props.plugin_name()
+                    if name == PLUGIN and (folder / str(props.get("filename", ""))).resolve() == file:
+                        props["filename"], props["storage"] = str(own), "float32"
+                    elif name == "path":
+                        props["max_depth"] = props.get("max_depth", scenes.MAX_DEPTHS[name])
+                        props.set_plugin_name("prb")
 
-        self.scene = scenes.load(path, defines=defines, change=change)
+            self.scene = scenes.load(path, defines=defines, change=change)
         self.spp, self.rig, self._cones = spp, Rig(self.scene, views), {}
         self._seeing = footprint.textures(self.scene)
         #: Array → the parameter of the scene that is set for it.
-        self.keys = self._parameters(start)
+        self.keys = self._parameters(own)
         self.parameters = mi.traverse(self.scene)
         self.parameters.keep([re.escape(key) + "$" for key in self.keys.values()])
 
-    def _parameters(self, start: Path) -> dict[str, str]:
+    def _parameters(self, own: Path) -> dict[str, str]:
         made = [m for m in scenes.instances(self.scene) if plugins.origin(m)["plugin"] == PLUGIN]
-        reading = [m for m in made if Path(plugins.origin(m)["filename"]).resolve() == start and m.net is not None]
+        reading = [m for m in made if Path(plugins.origin(m)["filename"]).resolve() == own and m.net is not None]
         if not reading:
-            raise UsageError(f"{start}: holds no arrays that could be trained, or no surface of the scene reads it")
+            raise UsageError(f"{own.name}: holds no arrays that could be trained, or no surface of the scene reads it")
         parameters, arrays = mi.traverse(self.scene), reading[0].net.arrays
+        for array in arrays.values():
+            array.folded = False  # what it will hold is folded already: half of the kernel would be that
         known = {compat.identity(array.data): name for name, array in arrays.items()}
         found = {}
         for key in parameters.keys():
@@ -95,9 +97,7 @@ class TrainedScene:
         Let the scene's texture read the entries of the arrays of ``net``, which are folded already; differentiable.
         """
         for name, array in net.arrays.items():
-            data, entries = array.data, array.data.array
-            below = dr.minimum(dr.detach(entries), BELOW_ONE) - dr.detach(entries)
-            self.parameters[self.keys[name]] = type(data)(entries + below, data.shape)
+            self.parameters[self.keys[name]] = array.data
         self.parameters.update()
 
     def place(self, view: View) -> None:
