@@ -275,139 +275,7 @@ def test_a_folder_for_references_that_cannot_be(path, tmp_path):
         References(path, Views(), 4, tmp_path / "nowhere" / "kept")
 
 
-# -- the scene with its arrays as parameters --------------------------------------------------------------------------
-
-
-def opaque(seed):
-    return dr.opaque(mi.UInt32, seed)
-
-
-def test_the_scene_reads_what_it_is_given(path, trained):
-    """Against the scene as it is written, which reads bytes; also from another view, with its footprints."""
-    scene, problem = trained
-    scene.hold(rounded(problem.net))
-    plain = scenes.load(path)
-    rig = Rig(plain, ORBIT)
-    for view in (View(), ORBIT.trained()[1]):
-        scene.place(view)
-        rig.place(view)
-        footprint.attach(plain)
-        image, expected = scene.render(opaque(3), opaque(4)).numpy(), mi.render(plain, spp=1, seed=3).numpy()
-        np.testing.assert_allclose(image, expected, atol=2e-3 * expected.max())
-    # One name for each array sets it for all maps
-    assert set(scene.keys) == {"level0", "coarse", "cascaded"} and len(scene.parameters) == 3
-    everything = mi.traverse(scene.scene)
-    named = [key for key in everything.keys() if key.endswith("tables.coarse")]
-    assert len(named) == len(NAMES)
-    scene.hold(problem.net.changed(lambda array, bits: array.unfolded(lambda entries: 0.5 * entries)))
-    values = [everything[key].numpy() for key in named]
-    np.testing.assert_array_equal(values[0], values[1])
-    assert values[0].max() <= 0.5
-
-
-def test_no_other_scene_reads_the_same_arrays(path, trained):
-    scene, problem = trained
-    other = scenes.load(path, change=lambda state: [
-        props.__setitem__("storage", "float32") for props in scenes.compat.properties_of(state)
-        if props.plugin_name() == "neural_texture"
-    ])  # fmt: skip
-    key = next(key for key in mi.traverse(other).keys() if key.endswith("tables.coarse"))
-    before = mi.traverse(other)[key].numpy()
-    scene.hold(problem.net.changed(lambda array, bits: array.unfolded(lambda entries: 0.5 * entries)))
-    np.testing.assert_array_equal(mi.traverse(other)[key].numpy(), before)
-
-
-def test_values_and_derivatives_have_their_own_samples(trained):
-    scene, problem = trained
-    scene.place(View())
-    found = {}
-    for seeds in ((1, 2), (1, 3), (5, 2)):
-        net = rounded(problem.net)
-        dr.enable_grad(net.cascaded.data)
-        scene.hold(net)
-        image = scene.render(*map(opaque, seeds))
-        dr.backward(dr.sum(image, axis=None))
-        found[seeds] = image.numpy(), dr.grad(net.cascaded.data).numpy()
-    (a, da), (b, db), (c, dc) = found.values()
-    np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(da, dc)
-    assert np.abs(a - c).max() > 1e-3 and np.abs(da - db).max() > 1e-3 * np.abs(da).max()
-
-
-@pytest.mark.parametrize("name", ["level0", "coarse", "cascaded"])
-def test_gradients_against_differences(trained, name):
-    """
-    Of a weighted sum of all pixels with respect to entries of each array, seven of those with the largest gradients and
-    three others, by central differences at equal samples. The sun's direction is no random number, so nothing is
-    sampled that would depend on the entries. More of them, with normals: ``benchmarks/bench_shading_scene.py``.
-    """
-    scene, problem = trained
-    scene.place(View())
-    rng = np.random.default_rng(0)
-    weights = mi.TensorXf(rng.random((24, 24, 3), dtype=np.float32))
-    net = rounded(problem.net)
-    array = net.arrays[name]
-
-    def total(data, seed):
-        array.data = data
-        scene.hold(net)
-        return dr.sum(scene.render(opaque(seed), opaque(7 - seed)) * weights, axis=None)
-
-    data = mi.TensorXf(0.02 + 0.96 * array.data)  # away from what is limited to [0, 1]
-    dr.enable_grad(data)
-    dr.backward(total(data, 4))
-    gradient = dr.grad(data).numpy()
-    assert np.isfinite(gradient).all()
-    values, largest = dr.detach(data).numpy(), float(np.abs(gradient).max())
-    used = np.argsort(-np.abs(gradient), axis=None)
-    for index in [*rng.choice(used[:70], 7, replace=False), *rng.choice(used[70:], 3, replace=False)]:
-        found = []
-        for step in (4e-3, -4e-3):
-            changed = values.copy()
-            changed.flat[index] += step
-            with dr.suspend_grad():
-                found.append(float(total(mi.TensorXf(changed), 3).array[0]))
-        difference = (found[0] - found[1]) / 8e-3
-        assert gradient.flat[index] == pytest.approx(difference, rel=0.05, abs=5e-3 * largest)
-
-
-def test_which_texture(path, folder):
-    assert texture_file(path) == (folder / "material.npz", "")
-    assert texture_file(path, folder / "material.npz")[0] == folder / "material.npz"
-    with pytest.raises(UsageError, match=r"no neural_texture reads .*other\.npz, the files are material\.npz"):
-        texture_file(path, folder / "other.npz")
-    plain = folder / "plain.xml"
-    plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
-    with pytest.raises(UsageError, match="names 0 files of neural_texture"):
-        texture_file(plain)
-
-
-# -- training ---------------------------------------------------------------------------------------------------------
-
-
-def test_errors_of_pixels():
-    problem = object.__new__(SceneProblem)
-    error = mi.Float([-3, -0.5, 0, 0.25, 2])
-    for loss, bound, expected, slope in (
-        ("mse", None, [9, 0.25, 0, 0.0625, 4], [-6, -1, 0, 0.5, 4]),
-        ("mse", 1.0, [5, 0.25, 0, 0.0625, 3], [-2, -1, 0, 0.5, 2]),
-        ("mae", 1.0, [3, 0.5, 0, 0.25, 2], [-1, -1, 0, 1, 1]),
-    ):
-        problem.recipe = SceneRecipe(bound=bound)
-        problem.settings = dataclasses.replace(problem.recipe.settings, loss=loss)
-        x = mi.Float(error)
-        dr.enable_grad(x)
-        found = problem.errors(x)
-        dr.backward(found)
-        np.testing.assert_allclose(found.numpy(), expected)
-        nonzero = np.array(error) != 0
-        np.testing.assert_allclose(dr.grad(x).numpy()[nonzero], np.array(slope)[nonzero])
-
-
-def test_exposure():
-    image = np.linspace(0, 2, 100, dtype=np.float32).reshape(10, 10, 1) * np.float32([1, 0.5, 0.2])
-    assert exposure_of([image]) == pytest.approx(1 / 1.9, rel=0.02)
-    assert exposure_of([np.zeros((2, 2, 3))]) == 1
+# -- training, while no other scene is there ---------------------------------------------------------------------------
 
 
 def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
@@ -422,7 +290,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     table.arrays["cascaded"] = dataclasses.replace(entries, entries=255 - entries.entries)
     save_table(tmp_path / "material.npz", table)
     scene = scene_file(tmp_path / "material.npz", NAMES)
-    recipe = SceneRecipe(reference_spp=16)
+    recipe = SceneRecipe(share=1.0, reference_spp=16)
     changed = {"steps": 6, "measure_every": 3, "batch": 2048, "lr": 0.1, "schedule": "constant"}
     recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
 
@@ -470,6 +338,152 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     assert [h["psnr_db"] for h in resumed.history] == history
     for name, array in again.arrays.items():
         np.testing.assert_array_equal(array.entries, found.arrays[name].entries)
+
+
+# -- the scene with its arrays as parameters --------------------------------------------------------------------------
+
+
+def opaque(seed):
+    return dr.opaque(mi.UInt32, seed)
+
+
+def test_the_scene_reads_what_it_is_given(path, trained):
+    """Against the scene as it is written, which reads bytes; also from another view, with its footprints."""
+    scene, problem = trained
+    scene.hold(rounded(problem.net))
+    plain = scenes.load(path)
+    rig = Rig(plain, ORBIT)
+    for view in (View(), ORBIT.trained()[1]):
+        scene.place(view)
+        rig.place(view)
+        footprint.attach(plain)
+        image, expected = scene.render(opaque(3), opaque(4)).numpy(), mi.render(plain, spp=1, seed=3).numpy()
+        np.testing.assert_allclose(image, expected, atol=2e-3 * expected.max())
+    # One name for each array sets it for all maps
+    assert set(scene.keys) == {"level0", "coarse", "cascaded"} and len(scene.parameters) == 3
+    everything = mi.traverse(scene.scene)
+    named = [key for key in everything.keys() if key.endswith("tables.coarse")]
+    assert len(named) == len(NAMES)
+    scene.hold(problem.net.changed(lambda array, bits: array.unfolded(lambda entries: 0.5 * entries)))
+    values = [everything[key].numpy() for key in named]
+    np.testing.assert_array_equal(values[0], values[1])
+    assert values[0].max() <= 0.5
+
+
+def test_no_other_scene_reads_the_same_arrays(path, trained):
+    scene, problem = trained
+    other = scenes.load(path, change=lambda state: [
+        props.__setitem__("storage", "float32") for props in scenes.compat.properties_of(state)
+        if props.plugin_name() == "neural_texture"
+    ])  # fmt: skip
+    key = next(key for key in mi.traverse(other).keys() if key.endswith("tables.coarse"))
+    before = mi.traverse(other)[key].numpy()
+    scene.hold(problem.net.changed(lambda array, bits: array.unfolded(lambda entries: 0.5 * entries)))
+    np.testing.assert_array_equal(mi.traverse(other)[key].numpy(), before)
+
+
+def inside(net):
+    """The arrays as training sees them, away from the ends of [0, 1]."""
+    net = rounded(net)
+    for array in net.arrays.values():
+        array.data = mi.TensorXf(0.02 + 0.96 * array.data)
+    return net
+
+
+def rendered(scene, net, weights, *seeds):
+    """An image, and the gradients of a weighted sum of its pixels with respect to all arrays."""
+    for array in net.arrays.values():
+        dr.enable_grad(array.data)
+    scene.hold(net)
+    image = scene.render(*map(opaque, seeds))
+    dr.backward(dr.sum(image * weights, axis=None))
+    return image.numpy(), {name: dr.grad(array.data).numpy() for name, array in net.arrays.items()}
+
+
+@pytest.fixture(scope="module")
+def weights(one_core):
+    return mi.TensorXf(np.random.default_rng(0).random((24, 24, 3), dtype=np.float32))
+
+
+def test_values_and_derivatives_have_their_own_samples(trained, weights):
+    scene, problem = trained
+    scene.place(View())
+    (a, da), (b, db), (c, dc) = (
+        rendered(scene, inside(problem.net), weights, *seeds) for seeds in ((1, 2), (1, 3), (5, 2))
+    )
+    np.testing.assert_array_equal(a, b)
+    assert np.abs(a - c).max() > 1e-3
+    for name, gradient in da.items():
+        np.testing.assert_array_equal(gradient, dc[name])
+        assert np.abs(gradient - db[name]).max() > 1e-3 * np.abs(gradient).max()
+
+
+def test_gradients_against_differences(trained, weights):
+    """
+    Of a weighted sum of all pixels with respect to entries of each array, seven of those with the largest gradients and
+    three others, by central differences at equal samples. The sun's direction is no random number, so nothing is
+    sampled that would depend on the entries. More of them, with normals: ``benchmarks/bench_shading_scene.py``.
+    """
+    scene, problem = trained
+    scene.place(View())
+    rng, net = np.random.default_rng(1), inside(problem.net)
+    _, gradients = rendered(scene, net, weights, 4, 3)
+    for name, gradient in gradients.items():
+        assert np.isfinite(gradient).all()
+        array, used = net.arrays[name], np.argsort(-np.abs(gradient), axis=None)
+        before, values = array.data, array.data.numpy()
+        for index in [*rng.choice(used[:70], 7, replace=False), *rng.choice(used[70:], 3, replace=False)]:
+            found = []
+            for step in (4e-3, -4e-3):
+                changed = values.copy()
+                changed.flat[index] += step
+                array.data = mi.TensorXf(changed)
+                with dr.suspend_grad():
+                    scene.hold(net)
+                    image = scene.render(opaque(3), opaque(4)) * weights
+                found.append(float(dr.sum(image, axis=None).array[0]))
+            expected, largest = (found[0] - found[1]) / 8e-3, float(np.abs(gradient).max())
+            assert gradient.flat[index] == pytest.approx(expected, rel=0.05, abs=5e-3 * largest)
+        array.data = before
+
+
+def test_which_texture(path, folder):
+    assert texture_file(path) == (folder / "material.npz", "")
+    assert texture_file(path, folder / "material.npz")[0] == folder / "material.npz"
+    with pytest.raises(UsageError, match=r"no neural_texture reads .*other\.npz, the files are material\.npz"):
+        texture_file(path, folder / "other.npz")
+    plain = folder / "plain.xml"
+    plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
+    with pytest.raises(UsageError, match="names 0 files of neural_texture"):
+        texture_file(plain)
+
+
+# -- its parts --------------------------------------------------------------------------------------------------------
+
+
+def test_errors_of_pixels():
+    problem = object.__new__(SceneProblem)
+    error = mi.Float([-3, -0.5, 0, 0.25, 2])
+    for loss, bound, expected, slope in (
+        ("mse", None, [9, 0.25, 0, 0.0625, 4], [-6, -1, 0, 0.5, 4]),
+        ("mse", 1.0, [5, 0.25, 0, 0.0625, 3], [-2, -1, 0, 0.5, 2]),
+        ("mae", 1.0, [3, 0.5, 0, 0.25, 2], [-1, -1, 0, 1, 1]),
+    ):
+        problem.recipe = SceneRecipe(bound=bound)
+        problem.settings = dataclasses.replace(problem.recipe.settings, loss=loss)
+        x = mi.Float(error)
+        dr.enable_grad(x)
+        found = problem.errors(x)
+        dr.backward(found)
+        np.testing.assert_allclose(found.numpy(), expected)
+        nonzero = np.array(error) != 0
+        np.testing.assert_allclose(dr.grad(x).numpy()[nonzero], np.array(slope)[nonzero])
+
+
+def test_exposure():
+    image = np.linspace(0, 2, 100, dtype=np.float32).reshape(10, 10, 1) * np.float32([1, 0.5, 0.2])
+    assert exposure_of([image]) == pytest.approx(1 / 1.9, rel=0.02)
+    assert exposure_of([np.zeros((2, 2, 3))]) == 1
 
 
 @pytest.mark.parametrize("preset", ["ours", "paper"])

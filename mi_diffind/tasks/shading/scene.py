@@ -63,12 +63,12 @@ def fit_scene(
     if recipe.start == "untrained":
         texture = problem_of(source, size_of(table), texture.recipe, texture.pyramid)
         table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
-    scene = TrainedScene(path, file, views, recipe.spp, table, defines)
     rendered = References(
         path, views, recipe.reference_spp, references, defines, recipe.against, (source.digest,), request.progress
     )
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
+    scene = TrainedScene(path, file, views, recipe.spp, table, defines)
     problem = SceneProblem(
         texture, scene, [*zip(trained, images, strict=False)],
         [*zip(measured, images[len(trained) :], strict=True)], recipe, rendered.digest,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import os
@@ -79,10 +80,17 @@ class References:
         return hashlib.sha256((self.digest + json.dumps(asdict(view))).encode()).hexdigest()
 
     def images(self, views: Sequence[View]) -> list[np.ndarray]:
-        """The linear images, ``(height, width, channels)``, float32; what is missing is rendered."""
+        """
+        The linear images, ``(height, width, channels)``, float32; what is missing is rendered. The exact scene is gone
+        then: Dr.Jit compiles the materials of all scenes that there are into every kernel.
+        """
         bar = tqdm(total=len(views) * self.spp, desc="references", unit="spp", disable=None if self.progress else True)
-        with bar:
-            return [self._image(view, bar) for view in views]
+        try:
+            with bar:
+                return [self._image(view, bar) for view in views]
+        finally:
+            self._loaded = None
+            gc.collect()
 
     def _image(self, view: View, bar: tqdm) -> np.ndarray:
         path = self.path(view)
