@@ -1,0 +1,77 @@
+"""
+Write rust.xml and the maps of its metal: a plate and balls of hammered metal with rust, seen from afar.
+
+``-D metal=rust_plain.npz`` shows the same with the texture that is not trained for its shading. The maps are compressed
+by ``mi-diffind fit texture`` and ``mi-diffind fit shading``, see README.md.
+"""
+
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from scene_xml import element, head, lying, plugin, transform, write
+
+from mi_diffind.studies.shading.materials import made
+
+ABOUT = """Hammered metal with rust, minified: what a texture that is trained for its shading is for. Written by
+make_rust.py: change that file.
+
+"-D metal=rust_plain.npz" takes the texture that is not. The sky is found by scattering alone: with "-D sky=0 -D
+max_depth=2" the light has no noise, and all that differs from many samples of bitmaps is the texture."""
+
+FOLDER = Path(__file__).resolve().parent
+
+#: Texels along each side of the maps; half of the width of the plate, and how often it repeats them.
+SIDE, PLATE, REPEATS = 256, 5.0, 24.0
+
+
+def write_maps() -> None:
+    """Write rust_*.png and rust.json."""
+    source, files = made("hammered", SIDE), {}
+    for m in source.maps:
+        files[m.name] = f"rust_{m.name}.png"
+        values = np.rint(255 * m.values).astype(np.uint8)
+        mi.Bitmap(np.ascontiguousarray(values if m.channels == 3 else values[..., 0])).write(
+            str(FOLDER / "assets" / files[m.name])
+        )
+    (FOLDER / "assets" / "rust.json").write_text(json.dumps({"maps": files}, indent=2) + "\n", encoding="utf-8")
+
+
+def metal(repeats: float, id: str):
+    """The material, its maps repeated so often."""
+
+    def of(channels: str, parameter: str):
+        scale = transform("to_uv", scale={"x": repeats, "y": repeats})
+        return plugin("texture", "neural_texture", scale, name=parameter, channels=channels,
+                      filename="assets/$metal", storage="$storage", filter="$filter")  # fmt: skip
+
+    names = (("albedo", "base_color"), ("roughness", "roughness"), ("metallic", "metallic"))
+    inner = plugin("bsdf", "neural_disney", *(of(*pair) for pair in names))
+    return plugin("bsdf", "normalmap", of("normal", "normalmap"), inner, id=id)
+
+
+def main() -> None:
+    mi.set_variant("scalar_rgb")
+    write_maps()
+    camera = {"origin": (0, 4.2, 7.5), "target": (0, 0.35, 0.2), "up": (0, 1, 0)}
+    defaults = {"metal": "rust_shaded.npz", "storage": "uint8", "filter": "anisotropic", "sky": 0.5}
+    content = head(960, 540, defaults, fov=36.0, camera=camera)
+    sun = plugin("emitter", "directional", element("vector", name="direction", x=-0.55, y=-0.6, z=0.35),
+                 irradiance=(3.2, 3.0, 2.7))  # fmt: skip
+    sky = element("emitter", element("float", name="radiance", value="$sky"),
+                  element("float", name="sampling_weight", value="0"), type="constant")  # fmt: skip
+    balls = []
+    for i, (x, z, radius) in enumerate(((-1.7, 0.4, 0.8), (0.25, -0.6, 0.8), (1.9, 0.9, 0.6))):
+        placed = transform(rotate={"x": 1, "angle": -90}, translate={"x": x, "y": radius, "z": z})
+        balls.append(plugin("shape", "sphere", placed, metal((3.0, 8.0, 16.0)[i], f"ball_{i}"), radius=radius))
+    content += [
+        "A sun, and a sky that is found by scattering alone", sun, sky,
+        "The plate", metal(REPEATS, "plate"), lying(PLATE, PLATE, element("ref", id="plate")),
+        "Balls, on which the maps are repeated 3, 8 and 16 times", *balls,
+    ]  # fmt: skip
+    write(FOLDER / "rust.xml", ABOUT, content)
+
+
+if __name__ == "__main__":
+    main()
