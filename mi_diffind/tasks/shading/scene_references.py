@@ -27,6 +27,13 @@ PASS = 1 << 23
 SEEDS = 1 << 31
 
 
+def colours(image):
+    """An image, an array or a tensor ``(height, width, channels)``, without transparency and what else is no colour."""
+    found = image.shape[2]
+    wanted = 3 if found >= 3 else 1
+    return image if found == wanted else image[:, :, :wanted]
+
+
 @dataclass
 class References:
     """
@@ -113,7 +120,7 @@ class References:
                 if path is not None:
                     with replacing(path) as temporary:
                         np.savez(temporary, total=total, done=np.int64(done))
-        return (total / done).astype(np.float32)
+        return colours((total / done).astype(np.float32))
 
     def _kept(self, path: Path | None) -> tuple:
         """The sum of the samples that are kept for a view, and their number; a damaged file counts as none."""
