@@ -265,6 +265,32 @@ def convergence(folder: Path, steps=240) -> dict:
     return found
 
 
+def losses(folder: Path, count=120) -> dict:
+    """What losses reach from the fitted texture at the default rate: under the sun, and with the noise of a sky."""
+    fitted(material(folder, 64, names=NAMES), 600, "0:2:4,1:3:6", 2, 6, 2**14)
+    found = {}
+    for light, views in (
+        ("directional", ORBIT),
+        ("constant", dataclasses.replace(ORBIT, light_azimuth=None, light_elevation=None)),
+    ):
+        path = scene_file(folder / "material.npz", NAMES, light, 48, 3)
+        for loss, bound in (("mse", 1.0), ("mse", None), ("mae", None)):
+            recipe = SceneRecipe(bound=bound, reference_spp=256)
+            settings = dataclasses.replace(
+                recipe.settings, steps=count, batch=2**14, loss=loss, measure_every=count // 4, check_every=10
+            )
+            recipe = dataclasses.replace(recipe, settings=settings)
+            request = Request("ours", settings, None, progress=False)
+            _, result = fit_scene(path, views, recipe, request, references=folder / "kept")
+            found[light, loss, bound] = say(
+                what="losses", light=light, loss=loss, bound=bound, restarts=result.restarts,
+                psnr_db=[round(h["psnr_db"], 2) for h in result.history],
+                texture_db=[round(h["texture_psnr_db"], 2) for h in result.history],
+            )  # fmt: skip
+            gc.collect()
+    return {" ".join(map(str, key)): value for key, value in found.items()}
+
+
 def resident() -> float:
     """MiB of this process that are in memory."""
     return int(re.search(r"VmRSS:\s*(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))[1]) / 1024
@@ -305,7 +331,7 @@ def steps(folder: Path, count=2000) -> dict:
 
 
 def main() -> None:
-    parts = {"differences": differences, "means": means, "convergence": convergence, "steps": steps}
+    parts = {"differences": differences, "means": means, "convergence": convergence, "losses": losses, "steps": steps}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", default=list(parts), help=", ".join(parts))
     parser.add_argument("--json")

@@ -63,8 +63,9 @@ def fit_scene(
         texture = problem_of(source, size_of(table), texture.recipe, texture.pyramid)
         table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
     rendered = References(
-        path, views, recipe.reference_spp, references, defines, recipe.against, (source.digest,), request.progress
-    )
+        path, views, recipe.reference_spp, references, defines, recipe.against,
+        without=(file,), inputs=(source.digest,), progress=request.progress,
+    )  # fmt: skip
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
     scene = TrainedScene(path, file, views, recipe.spp, table, defines)
