@@ -274,11 +274,15 @@ def losses(folder: Path, count=120) -> dict:
         ("constant", dataclasses.replace(ORBIT, light_azimuth=None, light_elevation=None)),
     ):
         path = scene_file(folder / "material.npz", NAMES, light, 48, 3)
-        for loss, bound in (("mse", 1.0), ("mse", None), ("mae", None)):
+        for loss, bound in (("none", 1.0), ("mse", 1.0), ("mse", None), ("mae", None)):
             recipe = SceneRecipe(bound=bound, reference_spp=256)
             settings = dataclasses.replace(
-                recipe.settings, steps=count, batch=2**14, loss=loss, measure_every=count // 4, check_every=10
+                recipe.settings, steps=count, batch=2**14, measure_every=count // 4, check_every=10
             )
+            if loss == "none":  # as it was
+                settings = dataclasses.replace(settings, steps=1, lr=1e-9)
+            else:
+                settings = dataclasses.replace(settings, loss=loss)
             recipe = dataclasses.replace(recipe, settings=settings)
             request = Request("ours", settings, None, progress=False)
             _, result = fit_scene(path, views, recipe, request, references=folder / "kept")
