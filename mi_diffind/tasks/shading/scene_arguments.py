@@ -82,7 +82,7 @@ RECIPE = (
 
 FILES = (
     Argument("--texture", metavar="FILE.npz", help="which file of the scene's textures (default: the only one)"),
-    Argument("--reference-folder", metavar="FOLDER", help="keep the references there, to go on with"),
+    Argument("--references", metavar="FOLDER", help="keep the references there, to go on with"),
     Argument("--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"),
 )
 
