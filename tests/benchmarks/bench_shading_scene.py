@@ -220,13 +220,13 @@ def means(folder: Path, count=300) -> dict:
 def convergence(folder: Path, steps=240) -> dict:
     """
     Steps to the PSNR that a wrong start reaches in the end, less half a decibel, of it and of the fitted texture. Wrong
-    are: the cascaded array turned into its negative; all arrays, which are another material's.
+    are: the cascaded array, which is one grey, or its negative; all arrays, which are another material's.
     """
     (folder / "other").mkdir()
     right = load(fitted(material(folder, 64, names=NAMES), 600, "0:2:4,1:3:6", 2, 6, 2**14))
     other = load(fitted(material(folder / "other", 64, 7, names=NAMES[::-1]), 600, "0:2:4,1:3:6", 2, 6, 2**14))
     histories = {}
-    for start in ("fitted", "negative", "other"):
+    for start in ("fitted", "grey", "negative", "other"):
         table, where = load(folder / "material.npz"), folder / start
         where.mkdir(exist_ok=True)
         for file in folder.iterdir():
@@ -235,8 +235,9 @@ def convergence(folder: Path, steps=240) -> dict:
         for name, array in right.arrays.items():
             if start == "other":
                 table.arrays[name] = dataclasses.replace(array, entries=other.arrays[name].entries)
-            elif start == "negative" and name == "cascaded":
-                table.arrays[name] = dataclasses.replace(array, entries=255 - array.entries)
+            elif start != "fitted" and name == "cascaded":
+                entries = 255 - array.entries if start == "negative" else np.full_like(array.entries, 128)
+                table.arrays[name] = dataclasses.replace(array, entries=entries)
         save_table(where / "material.npz", table)
         path = scene_file(where / "material.npz", NAMES, "directional", 48)
         recipe = SceneRecipe(reference_spp=256)
@@ -254,7 +255,7 @@ def convergence(folder: Path, steps=240) -> dict:
         )  # fmt: skip
         gc.collect()
     found = {}
-    for start in ("negative", "other"):
+    for start in ("grey", "negative", "other"):
         goal = histories[start][-1][1] - 0.5
         needed = {k: next((s for s, p, _ in histories[k] if p >= goal), None) for k in ("fitted", start)}
         found[start] = say(
