@@ -218,48 +218,82 @@ def means(folder: Path, count=300) -> dict:
 
 
 def convergence(folder: Path, steps=240) -> dict:
-    """Steps to the PSNR that a wrong start reaches in the end, less half a decibel; from a wrong start and the fit."""
+    """
+    Steps to the PSNR that a wrong start reaches in the end, less half a decibel, of it and of the fitted texture. Wrong
+    are: the cascaded array, which is one grey, or its negative; all arrays, which are another material's.
+    """
     (folder / "other").mkdir()
-    right = fitted(material(folder, 64, names=NAMES), 600, "0:2:4,1:3:6", 2, 6, 2**14)
-    wrong = fitted(material(folder / "other", 64, 7, names=NAMES[::-1]), 600, "0:2:4,1:3:6", 2, 6, 2**14)
-    table = load(right)
-    other = load(wrong)
-    for name, array in table.arrays.items():
-        table.arrays[name] = dataclasses.replace(array, entries=255 - other.arrays[name].entries) if array.bits == 8 \
-            else dataclasses.replace(array, entries=other.arrays[name].entries)  # fmt: skip
+    right = load(fitted(material(folder, 64, names=NAMES), 600, "0:2:4,1:3:6", 2, 6, 2**14))
+    other = load(fitted(material(folder / "other", 64, 7, names=NAMES[::-1]), 600, "0:2:4,1:3:6", 2, 6, 2**14))
+    histories = {}
+    for start in ("fitted", "grey", "negative", "other"):
+        table, where = load(folder / "material.npz"), folder / start
+        where.mkdir(exist_ok=True)
+        for file in folder.iterdir():
+            if file.suffix in (".png", ".json"):
+                (where / file.name).write_bytes(file.read_bytes())
+        for name, array in right.arrays.items():
+            if start == "other":
+                table.arrays[name] = dataclasses.replace(array, entries=other.arrays[name].entries)
+            elif start != "fitted" and name == "cascaded":
+                entries = 255 - array.entries if start == "negative" else np.full_like(array.entries, 128)
+                table.arrays[name] = dataclasses.replace(array, entries=entries)
+        save_table(where / "material.npz", table)
+        path = scene_file(where / "material.npz", NAMES, "directional", 48)
+        recipe = SceneRecipe(reference_spp=256)
+        settings = dataclasses.replace(
+            recipe.settings, steps=steps, lr=1e-2, measure_every=steps // 24, batch=2**14, check_every=10
+        )
+        recipe = dataclasses.replace(recipe, settings=settings)
+        request = Request("ours", settings, None, progress=False)
+        begin = time.perf_counter()
+        _, result = fit_scene(path, ORBIT, recipe, request, references=folder / "kept", preview=folder / "p.png")
+        histories[start] = [(h["step"], h["psnr_db"], h["texture_psnr_db"]) for h in result.history]
+        say(
+            what="run", start=start, seconds=time.perf_counter() - begin, restarts=result.restarts,
+            history=[(s, round(p, 2), round(t, 2)) for s, p, t in histories[start][::3]],
+        )  # fmt: skip
+        gc.collect()
     found = {}
-    for share in (1.0, 0.9):
-        histories = {}
-        for start in ("wrong", "fitted"):
-            where = folder / f"{start}_{share}"
-            where.mkdir()
-            for file in folder.iterdir():
-                if file.suffix in (".png", ".json", ".npz"):
-                    (where / file.name).write_bytes(file.read_bytes())
-            if start == "wrong":
-                save_table(where / "material.npz", table)
-            path = scene_file(where / "material.npz", NAMES, "directional", 48)
-            recipe = SceneRecipe(share=share, reference_spp=256)
-            settings = dataclasses.replace(
-                recipe.settings, steps=steps, lr=1e-2, measure_every=steps // 24, batch=2**14, check_every=10
-            )
-            recipe = dataclasses.replace(recipe, settings=settings)
-            request = Request("ours", settings, None, progress=False)
-            begin = time.perf_counter()
-            _, result = fit_scene(path, ORBIT, recipe, request, references=folder / "kept", preview=folder / "p.png")
-            histories[start] = [(h["step"], h["psnr_db"], h["texture_psnr_db"]) for h in result.history]
-            say(
-                what="run", share=share, start=start, seconds=time.perf_counter() - begin, restarts=result.restarts,
-                history=[(s, round(p, 2), round(t, 2)) for s, p, t in histories[start][:: 4 if steps > 100 else 1]],
-            )  # fmt: skip
-            gc.collect()
-        goal = histories["wrong"][-1][1] - 0.5
-        needed = {k: next((s for s, p, _ in h if p >= goal), None) for k, h in histories.items()}
-        found[str(share)] = say(
-            what="convergence", share=share, goal_db=goal, steps=needed,
-            first={k: h[0][1] for k, h in histories.items()}, last={k: h[-1][1] for k, h in histories.items()},
+    for start in ("grey", "negative", "other"):
+        goal = histories[start][-1][1] - 0.5
+        needed = {k: next((s for s, p, _ in histories[k] if p >= goal), None) for k in ("fitted", start)}
+        found[start] = say(
+            what="convergence", start=start, goal_db=goal, steps=needed, first=histories[start][0][1],
+            last=histories[start][-1][1], fitted_first=histories["fitted"][0][1],
+            fitted_last=histories["fitted"][-1][1],
         )  # fmt: skip
     return found
+
+
+def losses(folder: Path, count=120) -> dict:
+    """What losses reach from the fitted texture at the default rate: under the sun, and with the noise of a sky."""
+    fitted(material(folder, 64, names=NAMES), 600, "0:2:4,1:3:6", 2, 6, 2**14)
+    found = {}
+    for light, views in (
+        ("directional", ORBIT),
+        ("constant", dataclasses.replace(ORBIT, light_azimuth=None, light_elevation=None)),
+    ):
+        path = scene_file(folder / "material.npz", NAMES, light, 48, 3)
+        for loss, bound in (("none", 1.0), ("mse", 1.0), ("mse", None), ("mae", None)):
+            recipe = SceneRecipe(bound=bound, reference_spp=256)
+            settings = dataclasses.replace(
+                recipe.settings, steps=count, batch=2**14, measure_every=count // 4, check_every=10
+            )
+            if loss == "none":  # as it was
+                settings = dataclasses.replace(settings, steps=1, lr=1e-9)
+            else:
+                settings = dataclasses.replace(settings, loss=loss)
+            recipe = dataclasses.replace(recipe, settings=settings)
+            request = Request("ours", settings, None, progress=False)
+            _, result = fit_scene(path, views, recipe, request, references=folder / "kept")
+            found[light, loss, bound] = say(
+                what="losses", light=light, loss=loss, bound=bound, restarts=result.restarts,
+                psnr_db=[round(h["psnr_db"], 2) for h in result.history],
+                texture_db=[round(h["texture_psnr_db"], 2) for h in result.history],
+            )  # fmt: skip
+            gc.collect()
+    return {" ".join(map(str, key)): value for key, value in found.items()}
 
 
 def resident() -> float:
@@ -302,7 +336,7 @@ def steps(folder: Path, count=2000) -> dict:
 
 
 def main() -> None:
-    parts = {"differences": differences, "means": means, "convergence": convergence, "steps": steps}
+    parts = {"differences": differences, "means": means, "convergence": convergence, "losses": losses, "steps": steps}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", default=list(parts), help=", ".join(parts))
     parser.add_argument("--json")

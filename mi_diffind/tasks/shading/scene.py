@@ -20,12 +20,11 @@ from ...fitting import FitResult
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
-from ...settings import FitSettings
 from ...tables import PAGES, Table, TableError
 from ..task import Request
 from ..texture.compressed import CompressedTexture, form_of, load, to_table
 from ..texture.nets import PaperForm
-from ..texture.presets import Recipe
+from ..texture.presets import PRESETS, Recipe
 from ..texture.sizing import Fine, PaperSize, Size
 from ..texture.training import TextureProblem, problem_of, stored_form
 from .scene_problem import SceneProblem
@@ -64,8 +63,9 @@ def fit_scene(
         texture = problem_of(source, size_of(table), texture.recipe, texture.pyramid)
         table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
     rendered = References(
-        path, views, recipe.reference_spp, references, defines, recipe.against, (source.digest,), request.progress
-    )
+        path, views, recipe.reference_spp, references, defines, recipe.against,
+        without=(file,), inputs=(source.digest,), progress=request.progress,
+    )  # fmt: skip
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
     scene = TrainedScene(path, file, views, recipe.spp, table, defines)
@@ -74,9 +74,10 @@ def fit_scene(
         [*zip(measured, images[len(trained) :], strict=True)], recipe, rendered.digest,
         None if preview is None else Path(preview),
     )  # fmt: skip
+    problem.identity |= {"views": dataclasses.asdict(views)}
     result = request.train(problem)
     settings = {**request.recorded(), **{k: v for k, v in problem.identity.items() if k not in ("form", "border")}}
-    settings |= {"views": dataclasses.asdict(views), "scene_path": _relative(path, request)}
+    settings["scene_path"] = _relative(path, request)
     if request.seconds is not None:
         settings["steps"] = result.steps
     found = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net)), settings)
@@ -114,10 +115,10 @@ def texture_problem(table: Table, source: Source) -> TextureProblem:
 
 
 def recipe_of(table: Table) -> Recipe:
-    """How a texture was trained, as far as its file says it."""
+    """How the arrays of a file are trained as a texture."""
+    own = PRESETS["ours" if table.settings.get("layered", True) else "paper"]
     names = [f.name for f in dataclasses.fields(Recipe) if f.name != "settings"]
-    settings = FitSettings(loss=table.settings.get("loss", "mse"))
-    return Recipe(**{n: table.settings[n] for n in names if n in table.settings}, settings=settings)
+    return dataclasses.replace(own, **{n: table.settings[n] for n in names if n in table.settings})
 
 
 def size_of(table: Table) -> Size | PaperSize:

@@ -14,9 +14,11 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from ... import __version__, scenes
+from ... import __version__, plugins, scenes
 from ...files import replacing, writable_folder
+from ...measure.store import fingerprint
 from ...plugins.support import footprint
+from .. import disney
 from .scene_recipe import View, Views
 from .scene_rig import Rig
 
@@ -27,13 +29,21 @@ PASS = 1 << 23
 SEEDS = 1 << 31
 
 
+def colours(image):
+    """An image, an array or a tensor ``(height, width, channels)``, without transparency and what else is no colour."""
+    found = image.shape[2]
+    wanted = 3 if found >= 3 else 1
+    return image if found == wanted else image[:, :, :wanted]
+
+
 @dataclass
 class References:
     """
     Images of the views of a scene file with exact plugins, or those that ``against`` names, at ``spp`` samples a pixel.
     ``folder``, which is made if its parent exists, keeps a file for each (``None``: nothing is kept), under a name that
-    changes with whatever an image depends on: the scene, the files it names but for tables, ``inputs`` (texts that
-    stand for further ones), the view, the samples, versions. Files are replaced in one piece, after each pass.
+    changes with whatever an image depends on: the scene, the files that it names but those ``without`` any influence,
+    such as the table that is trained, ``inputs`` (texts that stand for further ones), the view, the samples, versions
+    and the code of plugins. Files are replaced in one piece, after each pass.
 
     Raises :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.files.OutputError`.
     """
@@ -44,6 +54,7 @@ class References:
     folder: str | os.PathLike | None = None
     defines: dict[str, str] | None = None
     against: str = "exact"
+    without: Sequence[Path] = ()
     inputs: Sequence[str] = ()
     progress: bool = True
     #: Passes that were rendered, and those that were there already.
@@ -58,17 +69,15 @@ class References:
 
     def _digest(self) -> str:
         """Of all that the images of all views have in common."""
-        tables = {
-            Path(f).resolve() for f, _ in scenes.tables_of(self.scene, scenes.learned_plugins(self.scene, self.defines))
-        }
+        code = [*Path(plugins.__file__).resolve().parent.rglob("*.py"), *Path(disney.__file__).parent.glob("*.py")]
         common = {
             "defines": dict(sorted((self.defines or {}).items())), "against": self.against, "inputs": list(self.inputs),
             "spp": self.spp, "target": self.views.target, "up": self.views.up, "variant": mi.variant(),
-            "versions": [mi.__version__, __version__], "pass": PASS,
+            "versions": [mi.__version__, __version__, fingerprint(code)], "pass": PASS,
         }  # fmt: skip
         digest = hashlib.sha256(json.dumps(common).encode())
         for file in scenes.files_of(self.scene, self.defines):
-            if file not in tables:
+            if file not in self.without:
                 digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
         return digest.hexdigest()
 
@@ -113,7 +122,7 @@ class References:
                 if path is not None:
                     with replacing(path) as temporary:
                         np.savez(temporary, total=total, done=np.int64(done))
-        return (total / done).astype(np.float32)
+        return colours((total / done).astype(np.float32))
 
     def _kept(self, path: Path | None) -> tuple:
         """The sum of the samples that are kept for a view, and their number; a damaged file counts as none."""

@@ -14,6 +14,7 @@ from ...errors import UsageError
 from ...plugins.support import footprint
 from ...tables import Table, save_table
 from .scene_recipe import View, Views
+from .scene_references import colours
 from .scene_rig import Rig
 
 #: The plugin whose arrays are trained.
@@ -115,6 +116,8 @@ class TrainedScene:
         of ``seed``, derivatives from those of ``seed_grad``: a loss's derivative by the image is then independent of
         the image's by the arrays, and their product right on average for squared errors.
         """
-        return mi.render(
-            self.scene, self.parameters, spp=spp or self.spp, spp_grad=self.spp, seed=seed, seed_grad=seed_grad
+        return colours(
+            mi.render(
+                self.scene, self.parameters, spp=spp or self.spp, spp_grad=self.spp, seed=seed, seed_grad=seed_grad
+            )
         )
