@@ -61,13 +61,16 @@ class Shaded(Material):
         return cls(**{n: getattr(material, n) for n in PARAMETERS}, albedo=albedo, luminance=luminance)
 
 
-def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects = Effects()):  # noqa: B008
-    """BRDF · cosine in RGB: from ``decoder``, or straight from the formulas if it is ``None``."""
-    p = Shaded.of(m, albedo)
+def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects = Effects(), lobes=None):  # noqa: B008
+    """
+    BRDF · cosine in RGB: from ``decoder``, or straight from the formulas if it is ``None``; of some ``lobes``, all that
+    are in use unless given.
+    """
+    p, lobes = Shaded.of(m, albedo), lobes or effects.lobes
     if decoder is None:
-        return model.colour(compose(p, exact_factors(p, wi, wo)).values(), albedo, p.luminance)
+        return model.colour(compose(p, exact_factors(p, wi, wo), lobes).values(), albedo, p.luminance)
     c = {group: decoder.coefficients(group, p, effects) for group in decoder.required(effects)}
-    return decoder.value(c, effects, effects.lobes, p, wi, wo)
+    return decoder.value(c, effects, lobes, p, wi, wo)
 
 
 class DisneyProblem(Problem):

@@ -1,0 +1,92 @@
+"""
+Task 5: textures that are trained for what they look like when they are shaded, not for their values.
+
+Its truth is appearance that is filtered: the analytic Disney BRDF of task 2, averaged over footprints. What is trained
+are the arrays of task 4, through frozen tables of task 2; the result is a file of the task ``texture``.
+
+- :mod:`.material`: what the maps of a material mean, and what light it sends where;
+- :mod:`.reference`: appearance that is filtered; :mod:`.evaluation`: images that no training saw;
+- :mod:`.clip`: derivatives that are limited; :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and
+  what ``fit shading`` does; :mod:`.preview`: a picture on the way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+from ...arguments import Argument
+from ..map_arguments import SIZES, SOURCES
+from ..task import Request, Task
+from .presets import PRESETS, REFERENCES
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from 0 to 1")
+    return value
+
+
+def _bound(text: str) -> float:
+    try:
+        value = 0.0 if text == "none" else float(text)
+    except ValueError:
+        value = -1.0
+    if not (0 < value < float("inf") or text == "none"):
+        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are positive numbers and none")
+    return value
+
+
+class Shading(Task):
+    """The task. Its presets are the recipes of :mod:`.presets`; files are those of the task ``texture``."""
+
+    name = "shading"
+    title = "a texture, for what it looks like when it is shaded"
+    section = "supplemental 1.5"
+    presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
+    storages = ()
+    arguments = (
+        Argument("source", metavar="MATERIAL.json", help="a manifest of the maps of a material"),
+        *(size for size in SIZES if size.name != "psnr"),
+        Argument(
+            "--start", metavar="FILE.npz",
+            help="arrays to start from, as written by fit texture (default: trained first, with half of --seconds)",
+        ),
+        Argument(
+            "--lambda", dest="share", type=_share, metavar="L",
+            help="share of the loss of shaded values, 0 to 1 "
+            f"(default: {', '.join(f'{r.share} for {name}' for name, r in PRESETS.items())})",
+        ),
+        Argument(
+            "--clip", type=_bound, metavar="X",
+            help="bound of the derivatives of a sample's error through the specular lobe, or none (default: 0.1)",
+        ),
+        Argument(
+            "--reference", choices=REFERENCES,
+            help="what shaded values are compared with: 16 unfiltered samples (jittered, default), the paper's 16 "
+            "prefiltered ones (default of paper), or 256 unfiltered ones (converged)",
+        ),
+        *SOURCES,
+    )  # fmt: skip
+
+    def settings(self, preset, given, options):
+        own = PRESETS[preset].settings
+        steps = given.get("steps", own.steps)
+        return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
+
+    def check(self, request: Request) -> None:
+        from .fit import check
+
+        check(request)
+
+    def fit(self, request: Request):
+        from .fit import fit
+
+        return fit(request)
+
+
+TASK = Shading()

@@ -1,0 +1,121 @@
+"""How good a shaded texture is: images of it at levels of detail, under views and lights that no training saw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ... import metrics
+from ...maps.compressed import FilteredMaps, decibel
+from ...maps.pyramid import Pyramid
+from ..disney.decoder import Decoder
+from ..disney.effects import Effects
+from ..disney.training import uniform_hemisphere
+from .material import shaded, surface_of
+from .reference import KINDS, reference
+
+#: ``(u, v, level, wi, wo) → Array3f`` of shaded values.
+Reader = Callable[[Any, Any, Any, Any, Any], Any]
+
+#: What images are compared with: letter → kind of reference.
+TRUTHS = {"C": "converged", "P": "prefiltered"}
+
+#: Samples of the converged reference along the side of each texel of level 0, and at most along that of a footprint:
+#: with 16 × 16 in all, its own noise is at 36 dB on level 5 of a glossy material.
+PER_TEXEL, LARGEST = 4, 64
+
+#: Seed of the views and lights; trainings draw theirs from other generators.
+SEED = 20231212
+
+
+def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None) -> Reader:
+    """Filtered parameters, shaded: by ``decoder``, or by the analytic model."""
+    decoder = decoder or Decoder()
+
+    def read(u, v, level, wi, wo):
+        return shaded(decoder, surface_of(maps, maps.filtered(u, v, level)), wi, wo, effects)
+
+    return read
+
+
+class Evaluation:
+    """
+    Images of a material, at most ``side`` texels wide and high, of ``levels`` levels of detail, level 0 the first, for
+    ``pairs`` of a view and a light. Their references are made here: ``truths[letter][level]``, ``(pairs, rows, columns,
+    3)``, linear.
+    """
+
+    def __init__(
+        self, pyramid: Pyramid, effects: Effects, levels: int = 6, pairs: int = 16, side: int = 64, truths="CP"
+    ):
+        self.pyramid, self.effects, self.types = pyramid, effects, pyramid.types
+        self.levels = min(levels, pyramid.levels)
+        rng = np.random.default_rng(SEED)
+        numbers = rng.random((4, pairs))
+        # One view or light for each of as many strata of the cosine, so that none is far from all others
+        order = [rng.permutation(pairs) for _ in range(2)]
+        cosines = [(o + n) / pairs for o, n in zip(order, numbers[:2], strict=True)]
+        self.directions = [(cosines[0][i], numbers[2][i], cosines[1][i], numbers[3][i]) for i in range(pairs)]
+        self.windows = [self._window(level, side) for level in range(self.levels)]
+        self.truths = {letter: [self._truth(TRUTHS[letter], i) for i in range(self.levels)] for letter in truths}
+
+    def _window(self, level: int, side: int) -> tuple[int, int, int, int]:
+        """First row and column, rows and columns of the texels of a level that are looked at: its middle."""
+        rows, columns, _ = self.pyramid.values[level].shape
+        high, wide = min(rows, side), min(columns, side)
+        return (rows - high) // 2, (columns - wide) // 2, high, wide
+
+    def _lanes(self, level: int, pairs=None) -> tuple:
+        """``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""
+        types, pairs = self.types, range(len(self.directions)) if pairs is None else pairs
+        top, left, rows, columns = self.windows[level]
+        n_rows, n_columns, _ = self.pyramid.values[level].shape
+        v, u = ((np.arange(n) + start + 0.5) / whole for n, start, whole in
+                ((rows, top, n_rows), (columns, left, n_columns)))  # fmt: skip
+        shape = (len(pairs), rows, columns)
+        u, v = (np.broadcast_to(x, shape).astype(np.float32).ravel() for x in (u[None, None, :], v[None, :, None]))
+        numbers = np.array([self.directions[p] for p in pairs], np.float32).repeat(rows * columns, axis=0)
+        a, b, c, d = (types.Float(np.ascontiguousarray(n)) for n in numbers.T)
+        wi, wo = uniform_hemisphere(types, a, b), uniform_hemisphere(types, c, d)
+        level = dr.opaque(types.Float, level, len(u))
+        lanes = (types.Float(u), types.Float(v), level, wi, wo)
+        dr.eval(lanes)
+        return lanes, shape
+
+    def _truth(self, kind: str, level: int) -> np.ndarray:
+        lanes, shape = self._lanes(level)
+        side = int(np.clip(PER_TEXEL << level, KINDS[kind], LARGEST)) if kind == "converged" else KINDS[kind]
+        return _image(reference(kind, self.pyramid, *lanes, self.effects, side=side), shape)
+
+    def images(self, read: Reader, level: int, pairs=None) -> np.ndarray:
+        """What a reader shows at a level, ``(pairs, rows, columns, 3)``, linear; all pairs unless some are named."""
+        lanes, shape = self._lanes(level, pairs)
+        with dr.suspend_grad():
+            return _image(read(*lanes), shape)
+
+    def measure(self, read: Reader, flip: bool = True) -> dict[str, dict]:
+        """
+        For each truth ``psnr_db``, of values clipped to [0, 1], at each level; ``mean_db``, their mean; ``coarse_db``,
+        their mean from level 2 on; ``flip``, the mean FLIP of the images as displayed, at each level of 16 pixels or
+        more, if it is wanted.
+        """
+        found = {letter: {"psnr_db": [], "flip": []} for letter in self.truths}
+        for level in range(self.levels):
+            got = np.clip(self.images(read, level), 0, 1)
+            for letter, truths in self.truths.items():
+                truth, own = np.clip(truths[level], 0, 1), found[letter]
+                own["psnr_db"].append(decibel(float(np.mean((got - truth) ** 2, dtype=np.float64))))
+                if flip and min(truth.shape[1:3]) >= 16:
+                    own["flip"].append(float(np.mean([metrics.flip(a, b) for a, b in zip(truth, got, strict=True)])))
+        for own in found.values():
+            own["mean_db"] = float(np.mean(own["psnr_db"]))
+            own["coarse_db"] = float(np.mean(own["psnr_db"][2:])) if self.levels > 2 else math.nan
+        return found
+
+
+def _image(value, shape) -> np.ndarray:
+    return np.stack([c.numpy() for c in value], axis=-1).reshape(*shape, 3)

@@ -1,0 +1,116 @@
+"""``fit shading``: from what was asked for to a texture that is trained for what it looks like."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+from ...errors import UsageError
+from ...maps.pyramid import Pyramid
+from ...maps.source import load_source
+from ...tables import MAX_BYTES, Table
+from ..map_arguments import asked_bytes
+from ..task import Fitted, Request
+from ..texture import TASK as TEXTURE
+from ..texture import fit as texture_fit
+from ..texture import training as textures
+from ..texture.presets import PRESETS as TEXTURES
+from . import material, training
+from .evaluation import Evaluation
+from .presets import PRESETS, Recipe
+
+
+def recipe_of(preset: str, settings, options) -> Recipe:
+    """The recipe of a preset with what the options change."""
+    own = PRESETS[preset]
+    given = {"share": options["share"], "reference": options["reference"]}
+    given = {k: v for k, v in given.items() if v is not None}
+    if options["clip"] is not None:
+        given["clip"] = options["clip"] or None  # 0 means none
+    return dataclasses.replace(own, settings=settings or own.settings, **given)
+
+
+def check(request: Request) -> None:
+    """Raise :class:`UsageError` for options that do not go together."""
+    options = request.options
+    if options["source"] is None:
+        raise UsageError("source: not given, a manifest of the maps of a material is needed")
+    if options["start"] is not None and any(options[name] for name in ("compression", "bytes", "bpp")):
+        raise UsageError("--start: the arrays have their size, leave out --compression, --bytes and --bpp")
+
+
+def fit(request: Request) -> Fitted:
+    """
+    Train as a texture, unless arrays are given that were, then for shading, and measure. With a time, half of it goes
+    to each. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
+    :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.fitting.FittingError`.
+    """
+    options, folder = request.options, (request.output or Path("x")).resolve().parent
+    source = load_source(options["source"], nonfinite=options["nonfinite"])
+    recipe = recipe_of(request.preset, request.settings, options)
+    texture = TEXTURES[recipe.texture]
+    border = None if options["border"] == "auto" else (options["border"],) * 2
+    pyramid = Pyramid.of(source, textures.layout_of(source, texture), request.types, border)
+    effects, reasons = material.effects_of(pyramid.layout)
+    if not pyramid.layout.stored:
+        raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
+    if options["start"] is not None:
+        start, result = started(options["start"], source, request), None
+    else:
+        start, result = pretrained(source, pyramid, recipe, request)
+    if result is None or not result.interrupted:
+        seconds = request.seconds
+        own = dataclasses.replace(request, seconds=seconds if result is None or seconds is None else seconds / 2)
+        if own.resume and not os.path.exists(own.checkpoint or ""):
+            own.resume = False  # it was the training as a texture that was interrupted
+        evaluation = Evaluation(pyramid, effects)
+        preview = None if request.output is None else request.output.with_name(f"{request.output.stem}_preview.png")
+        try:
+            net = training.start_of(start, pyramid)
+        except ValueError as e:
+            raise UsageError(str(e)) from None
+        table, result = training.fit_shading(source, net, recipe, own, pyramid, evaluation, preview)
+    else:
+        table = start
+    table.settings["source_path"] = os.path.relpath(Path(options["source"]).resolve(), folder)
+    lines = [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
+    lines += [f"left out: {effect} ({reason})" for effect, reason in reasons.items()]
+    lines += [f"not shaded: {name} ({reason})" for name, reason in material.left_out(pyramid.layout).items()]
+    figures = {
+        "source_bytes": source.nbytes,
+        "compression": source.nbytes / table.nbytes,
+        "effects_in_use": list(effects.names),
+        "effects_left_out": reasons,
+        "maps_not_shaded": material.left_out(pyramid.layout),
+        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
+        "bits": {name: a.bits for name, a in table.arrays.items()},
+    }
+    return Fitted(table, result, lines, figures)
+
+
+def started(path, source, request: Request) -> Table:
+    """A texture's file to start from. Raises :class:`UsageError` if it is of another source."""
+    table = TEXTURE.load(path)
+    if table.settings.get("source", source.digest) != source.digest:
+        raise UsageError(f"{path}: was made from another source than {request.options['source']}")
+    return table
+
+
+def pretrained(source, pyramid: Pyramid, recipe: Recipe, request: Request) -> tuple:
+    """A training as a texture alone, with a checkpoint of its own: its table, and its record."""
+    own = TEXTURES[recipe.texture]
+    settings = dataclasses.replace(own.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic)
+    own = dataclasses.replace(own, settings=settings)
+    options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(request.options)
+    asked = asked_bytes(options, source)
+    size = texture_fit.size_of(source, pyramid, asked, own, options)
+    if size.nbytes > MAX_BYTES:
+        raise UsageError(f"the arrays would take {size.nbytes:,} bytes, allowed are {MAX_BYTES:,}")
+    checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
+    first = dataclasses.replace(
+        request, preset=recipe.texture, checkpoint=checkpoint, options=options,
+        resume=request.resume and os.path.exists(checkpoint or ""),
+        seconds=None if request.seconds is None else request.seconds / 2,
+    )  # fmt: skip
+    return textures.fit_texture(source, size, own, first, pyramid)

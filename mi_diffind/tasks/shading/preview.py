@@ -1,0 +1,42 @@
+"""A picture of how far a training has come: shaded images at some levels beside their truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ... import metrics
+from ...files import replacing
+from .evaluation import Evaluation, Reader
+
+#: Levels that are shown, and how often a difference is amplified.
+LEVELS, AMPLIFIED = (0, 2, 4), 4
+
+
+def write_preview(path: Path, evaluation: Evaluation, read: Reader, pair: int = 0) -> None:
+    """
+    Write a picture of one view and light: for each of :data:`LEVELS` a row, and in it the truth, what a reader shows,
+    and their difference, amplified, as displayed.
+    """
+    import mitsuba as mi
+
+    truths = evaluation.truths[next(iter(evaluation.truths))]
+    rows = []
+    side = max(w[3] for w in evaluation.windows)
+    for level in (i for i in LEVELS if i < evaluation.levels):
+        truth, got = truths[level][pair], evaluation.images(read, level, [pair])[0]
+        row = [metrics.srgb(truth), metrics.srgb(got), np.clip(AMPLIFIED * np.abs(truth - got), 0, 1)]
+        rows.append(np.concatenate([_enlarged(image, side) for image in row], axis=1))
+    picture = np.rint(255 * np.concatenate(rows)).astype(np.uint8)
+    with replacing(path) as temporary:
+        mi.Bitmap(np.ascontiguousarray(picture)).write(str(temporary))
+
+
+def _enlarged(image: np.ndarray, side: int) -> np.ndarray:
+    """An image of at most ``side`` × ``side`` pixels that is about as wide, in whole pixels; the rest stays white."""
+    times = max(1, side // max(image.shape[:2]))
+    image = image.repeat(times, axis=0).repeat(times, axis=1)
+    found = np.ones((side, side, 3))
+    found[: image.shape[0], : image.shape[1]] = image
+    return found
