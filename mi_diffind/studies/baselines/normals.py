@@ -45,8 +45,9 @@ STEEPEST = 0.1
 #: Biases of the level of detail that are tried.
 BIASES = tuple(np.arange(-8, 5) / 8)
 
-#: Values of roughness that are tried for each texel; between them, a parabola through three errors is minimised.
-TRIED = np.linspace(0.03, 1.0, 28)
+#: Values of roughness that are tried for each texel, between its own (0) and 1; a parabola through three errors makes
+#: the best one more precise.
+TRIED = np.linspace(0, 1, 28)
 
 #: Views and lights that roughness and biases are chosen for, and the seed that they are drawn from, no other's.
 PAIRS, SEED = 32, 20050711
@@ -328,7 +329,9 @@ def directions(types, count: int = PAIRS, seed: int = SEED) -> list[tuple]:
 def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS, truth: Pyramid | None = None) -> list[np.ndarray]:
     """
     The roughness, ``(height, width)`` for each level, with which filtered parameters at a texel's centre look most like
-    the converged truth: the least squares of values clipped to [0, 1], over ``pairs`` of a view and a light.
+    the converged truth: the least squares of values clipped to [0, 1], over ``pairs`` of a view and a light. It is
+    never below what is filtered (where light is lost, least squares would have no highlight at all), and the same on
+    level 0. ``truth``: the source's pyramid, if ``pyramid`` is another one.
     """
     types, found = pyramid.types, [np.array(roughness_of(pyramid)[0])]
     Float, UInt32 = types.Float, types.UInt32
@@ -336,7 +339,7 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS, truth: Pyramid 
     values = Float(TRIED.astype(np.float32))
     for level, texels in enumerate(pyramid.values[1:], 1):
         rows, columns, _ = texels.shape
-        side = 8 if level < 4 else 16
+        side = _side(level)
         step = max(1, CHUNK // max(side * side, tried))
         errors = []
         for start in range(0, rows * columns, step):
@@ -348,7 +351,9 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS, truth: Pyramid 
             detail = dr.opaque(Float, level, count)
             place, own = _outer(UInt32, count, tried)
             parts = [dr.gather(Float, x, place) for x in (u, v, detail)]
-            surface = replace(surface_of(pyramid, pyramid.filtered(*parts)), roughness=dr.gather(Float, values, own))
+            surface = surface_of(pyramid, pyramid.filtered(*parts))
+            filtered = Float(surface.roughness)
+            surface = replace(surface, roughness=dr.lerp(filtered, 1, dr.gather(Float, values, own)))
             dr.eval(surface.albedo, surface.normal, surface.roughness, surface.metallic)
             total = dr.zeros(Float, count * tried)
             for wi, wo in made:
@@ -360,8 +365,18 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS, truth: Pyramid 
                 total += dr.squared_norm(got - wanted)
                 dr.eval(total)
             errors.append(total.numpy().reshape(count, tried))
-        found.append(_least(np.concatenate(errors)).reshape(rows, columns).astype(np.float32))
+        own = roughness_of(pyramid)[level]
+        share = _least(np.concatenate(errors)).reshape(rows, columns)
+        found.append((own + share * (1 - own)).astype(np.float32))
     return found
+
+
+def _side(level: int) -> int:
+    """
+    Samples along the side of a footprint, two for each texel or more: with one, they might all be at centres of texels,
+    or all at corners, where normals vary less.
+    """
+    return min(max(8, 2 << level), 128)
 
 
 def _outer(UInt32, count: int, tried: int) -> tuple:
@@ -379,12 +394,12 @@ def _wide(count: int, *directions) -> list:
 
 def _least(errors: np.ndarray) -> np.ndarray:
     """The value among :data:`TRIED`, which are equidistant, with the least error of each row, made more precise."""
-    best = np.clip(errors.argmin(axis=1), 1, len(TRIED) - 2)
-    lane = np.arange(len(errors))
-    before, at, after = (errors[lane, best + i].astype(np.float64) for i in (-1, 0, 1))
+    best = errors.argmin(axis=1)
+    middle, lane = np.clip(best, 1, len(TRIED) - 2), np.arange(len(errors))
+    before, at, after = (errors[lane, middle + i].astype(np.float64) for i in (-1, 0, 1))
     bend = before - 2 * at + after
-    shift = np.where(bend > 1e-12, 0.5 * (before - after) / np.maximum(bend, 1e-12), 0)
-    return np.clip(TRIED[best] + np.clip(shift, -1, 1) * (TRIED[1] - TRIED[0]), 0, 1)
+    shift = np.where((bend > 1e-12) & (best == middle), 0.5 * (before - after) / np.maximum(bend, 1e-12), best - middle)
+    return TRIED[middle] + shift * (TRIED[1] - TRIED[0])
 
 
 def toksvig_levels(source: Source, pyramid: Pyramid) -> list[np.ndarray]:
@@ -469,7 +484,7 @@ def choose_biases(pyramid: Pyramid, effects: Effects, pairs: int = MORE_PAIRS) -
         for wi, wo in made:
             ways = _wide(count, wi, wo)
             detail = dr.opaque(types.Float, level, count)
-            truth = dr.clip(reference("converged", pyramid, u, v, detail, *ways, effects), 0, 1)
+            truth = dr.clip(reference("converged", pyramid, u, v, detail, *ways, effects, side=_side(level)), 0, 1)
             for i, bias in enumerate(BIASES):
                 got = plain(u, v, dr.opaque(types.Float, level + bias, count), *ways)
                 errors[i] += float(dr.mean(dr.squared_norm(dr.clip(got, 0, 1) - truth))[0])

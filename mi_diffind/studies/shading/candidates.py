@@ -42,6 +42,7 @@ from ...tasks import task
 from ...tasks.shading import presets
 from ...tasks.shading.evaluation import Evaluation, Reader, reader
 from ...tasks.shading.material import effects_of, frozen_decoder
+from ...tasks.shading.training import fit_shading, start_of
 from ...tasks.texture import presets as texture_presets
 from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
@@ -150,8 +151,14 @@ class Setting:
 
     @cached_property
     def evaluation(self) -> Evaluation:
-        levels, pairs, side = (4, 2, 24) if self.request.quick else (6, 8, 96)
+        levels, pairs, side = (3, 2, 16) if self.request.quick else (6, 16, 64)
         return Evaluation(self.pyramid, self.effects, levels, pairs, side)
+
+    @cached_property
+    def choice(self) -> Evaluation:
+        """Fewer images, of other views and lights, by which a training chooses among its states."""
+        levels, pairs, side = (3, 1, 16) if self.request.quick else (6, 7, 32)
+        return Evaluation(self.pyramid, self.effects, levels, pairs, side, "C")
 
     @cached_property
     def motion(self) -> Motion:
@@ -298,8 +305,6 @@ class _Run(_Trained):
     base: _Run | None = None
 
     def run(self, folder, progress):
-        from ...tasks.shading.training import fit_shading
-
         begin, setting = time.perf_counter(), self.setting
         own = presets.PRESETS["ours"]
         settings = dataclasses.replace(
@@ -307,7 +312,8 @@ class _Run(_Trained):
         )
         recipe = dataclasses.replace(own, share=self.share, clip=CLIP if self.way.clip else None, settings=settings)
         request = dataclasses.replace(setting.training(setting.request.seconds, self.seed, progress), settings=settings)
-        made, result = fit_shading(setting.source, self.start.table, recipe, request, setting.pyramid)
+        net = start_of(self.start.table, setting.pyramid)
+        made, result = fit_shading(setting.source, net, recipe, request, setting.pyramid, setting.choice)
         details = {"kind": "run", "share": self.share, "clip": self.way.clip, "schedule": self.way.schedule,
                    "seed": self.seed, "way": self.way.name}  # fmt: skip
         record = self.trained(folder, made, result, begin, **details)
@@ -377,7 +383,7 @@ def plan(sources: dict[str, Source], request: Request) -> Plan:
 
 
 def _seen(request: Request) -> str:
-    return "4 levels, 2 pairs" if request.quick else "6 levels, 8 pairs of a view and a light"
+    return "3 levels, 2 pairs" if request.quick else "6 levels, 16 pairs of a view and a light"
 
 
 def _jobs(setting: Setting) -> list[Job]:
