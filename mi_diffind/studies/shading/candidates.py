@@ -6,8 +6,8 @@ at several weights λ of the shading loss, λ = 0 among them, which is more of t
 a large λ are on or off: derivatives that are clipped on their way through the specular lobe, and a learning rate that
 falls. All of it for several seeds, those of λ = 0 too.
 
-Beside them stand classical filters of normals (:mod:`..baselines.normals`), uncompressed, and two of these, Toksvig's
-and roughness that is baked, compressed as λ = 0 is, with as much time.
+Beside them stand classical filters of normals (:mod:`..baselines.normals`), uncompressed, and those that an ordinary
+texture can hold, compressed as λ = 0 is, with as much time: Toksvig's and baked roughness, the truth's kernel, both.
 
 *Errors* are those of :class:`mi_diffind.tasks.shading.evaluation.Evaluation`: PSNR of shaded values and FLIP, under
 views and lights of no training, against C, converged, and P, the paper's reference. *Flicker*: :mod:`.motion`.
@@ -47,6 +47,7 @@ from ...tasks.texture import presets as texture_presets
 from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
 from ..baselines import normals
+from ..texture import levels
 from . import pictures
 from .conclusions import conclusions, table
 from .materials import MADE, made
@@ -140,6 +141,17 @@ class Setting:
     def kernel(self) -> Pyramid:
         """The pyramid under the kernel of the truth."""
         return normals.boxed(self.source, self.types, self.pyramid.border)
+
+    @cached_property
+    def stored_kernel(self) -> Pyramid:
+        """The same in the source's layout: what is compressed in its place."""
+        found = levels.images(self.kernel)
+        for m in self.source.maps:
+            if m.kind == "normal":
+                vectors = [2 * values - 1 for values in found[m.name]]
+                lengths = [np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-6) for v in vectors]
+                found[m.name] = [0.5 + 0.5 * v / n for v, n in zip(vectors, lengths, strict=True)]
+        return levels.pyramid_of(found, self.pyramid)
 
     @cached_property
     def effects(self):
@@ -281,15 +293,15 @@ class _Start(_Trained):
 
 
 @dataclass
-class _Rough(_Trained):
-    """A texture of task 4 with another roughness, with the time of both trainings."""
+class _Compressed(_Trained):
+    """A texture of task 4 of another ``pyramid`` than the source's, with the time of both trainings."""
 
     label: str = ""
-    levels: Callable[[Path | None], list[np.ndarray]] = lambda folder: []
+    pyramid: Callable[[Path | None], Pyramid] = lambda folder: None
 
     def run(self, folder, progress):
         start, setting, request = time.perf_counter(), self.setting, self.setting.request
-        pyramid = normals.with_roughness(setting.pyramid, self.levels(folder))
+        pyramid = self.pyramid(folder)
         made, result = setting.texture(pyramid, request.pretraining + request.seconds, 0, progress)
         return self.trained(folder, made, result, start, kind="compressed", label=self.label)
 
@@ -415,10 +427,19 @@ def _jobs(setting: Setting) -> list[Job]:
     classical("baked", lambda folder: normals.baked(pyramid(), setting.effects, bake(folder)))
     if not request.quick:
         classical("baked, kernel", lambda folder: normals.baked(k(), setting.effects, bake(folder, True)))
-    found.append(_Rough(f"{name}, Toksvig compressed", setting, label="Toksvig compressed",
-                        levels=lambda folder: normals.toksvig_levels(source, pyramid())))  # fmt: skip
+
+    def compressed(label: str, make: Callable[[Path | None], Pyramid]) -> None:
+        found.append(_Compressed(f"{name}, {label}", setting, label=label, pyramid=make))
+
+    def rough(folder: Path | None, kernel: bool) -> Pyramid:
+        return normals.with_roughness(setting.stored_kernel if kernel else pyramid(), bake(folder, kernel))
+
+    compressed("Toksvig, compressed",
+               lambda folder: normals.with_roughness(pyramid(), normals.toksvig_levels(source, pyramid())))  # fmt: skip
     if not request.quick:
-        found.append(_Rough(f"{name}, baked compressed", setting, label="baked compressed", levels=bake))
+        compressed("kernel, compressed", lambda folder: setting.stored_kernel)
+        compressed("baked, compressed", lambda folder: rough(folder, False))
+        compressed("baked, kernel, compressed", lambda folder: rough(folder, True))
     for seed in range(request.seeds):
         start = _Start(f"{name}, texture, seed {seed}", setting, seed=seed)
         found.append(start)
@@ -442,7 +463,7 @@ def _pairs(request: Request) -> int:
 def _candidates(setting: Setting, jobs: list[Job]) -> list[Candidate]:
     found = []
     for job in jobs:
-        if isinstance(job, (_Classical, _Rough)):
+        if isinstance(job, (_Classical, _Compressed)):
             found.append(_candidate(setting, job.name, [job], job.label, {"kind": job.label}))
     groups: dict[tuple, list[_Run]] = {}
     for job in jobs:

@@ -60,8 +60,8 @@ class Curves:
 
     @property
     def best_classical(self) -> str | None:
-        """The best of :data:`PLAIN` against C, uncompressed."""
-        known = [label for label in PLAIN if label in self.classical]
+        """The best classical filter against C, uncompressed."""
+        known = [label for label in (*PLAIN, *COMBINED) if label in self.classical]
         return max(known, key=lambda label: self.classical[label]["C"]["mean_db"], default=None)
 
 

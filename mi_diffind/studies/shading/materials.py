@@ -87,8 +87,8 @@ def lacquer(side: int, seed: int = 3) -> dict[str, np.ndarray]:
     colour = _mixed([0.30, 0.13, 0.06], [0.58, 0.34, 0.16], rings)
     dust = _step(noise(rng, side, 0.0, side / 8), 2.2, 0.6)
     height = noise(rng, side, 1.0, side / 24, side / 5) + 2 * dust
-    roughness = 0.14 + 0.03 * noise(rng, side, 1.0, 2) + 0.25 * dust
-    return {"albedo": colour, "normal": normals(height, 0.12), "roughness": roughness}
+    roughness = 0.28 + 0.04 * noise(rng, side, 1.0, 2) + 0.25 * dust
+    return {"albedo": colour, "normal": normals(height, 0.2), "roughness": roughness}
 
 
 #: Name → what makes the maps, linear floats, of a side.

@@ -16,7 +16,8 @@ from .conclusions import WITH, Curves, curves
 from .motion import GRID
 
 #: Lines of classical filters: label → style.
-CLASSICAL = {"filtered": ":", "kernel": (0, (1, 3)), "Toksvig": (0, (5, 1)), "LEAN": "--", "baked": "-."}
+CLASSICAL = {"filtered": ":", "kernel": (0, (1, 3)), "Toksvig": (0, (5, 1)), "LEAN": "--", "LEAN, kernel": (0, (6, 2)),
+             "baked": "-."}  # fmt: skip
 
 #: Level of detail of the strip, and texels of its crops.
 LEVEL, CROP = 3, 48
@@ -63,7 +64,7 @@ def _shares(axes, own: Curves, letter: str) -> None:
                 axes.annotate(f"{lost}", (a, b), xytext=(4, -9), textcoords="offset points", fontsize=6.5)
     for i, (label, style) in enumerate(CLASSICAL.items()):
         if label in own.classical:
-            axes.axhline(own.classical[label][letter]["mean_db"], linestyle=style, linewidth=1.0, color=f"{0.15 * i}",
+            axes.axhline(own.classical[label][letter]["mean_db"], linestyle=style, linewidth=1.0, color=f"{0.12 * i}",
                          label=f"{label}, uncompressed")  # fmt: skip
     for label, d in own.compressed.items():
         axes.plot([0], [d[letter]["mean_db"]], marker="*", markersize=8, linestyle="", color="0.3", label=label)
@@ -81,7 +82,7 @@ def levels(settings: dict, result: dict):
             axes = sheet.add_subplot(len(found), 2, 2 * row + column + 1)
             for i, (label, style) in enumerate(CLASSICAL.items()):
                 if label in own.classical:
-                    axes.plot(own.classical[label][letter]["psnr_db"], linestyle=style, color=f"{0.15 * i}",
+                    axes.plot(own.classical[label][letter]["psnr_db"], linestyle=style, color=f"{0.12 * i}",
                               linewidth=1.0, label=f"{label}, uncompressed")  # fmt: skip
             for (colour, marker), share in zip(plot.STYLES, _shown(own), strict=False):
                 axes.plot(own.levels(WITH, share, letter), color=colour, marker=marker, markersize=4, linewidth=1.3,
