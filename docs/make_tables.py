@@ -151,6 +151,21 @@ def texture_levels(study: dict) -> str:
     return table(["", "ratio", *(f"L{i}" for i in range(count))], rows)
 
 
+def texture_presets() -> str:
+    """Our preset and the paper's, trained as long."""
+    rows = []
+    for source in ("boombox", "boombox_albedo"):
+        for preset in ("ours", "paper"):
+            f = measured(f"fit_texture_{source}_{preset}")
+            by_level = [v for k, v in f["measured"].items() if re.fullmatch(r"psnr_l\d+_db", k)]
+            mean = 100 * f["measured"]["mean_error"]
+            rows.append(
+                [source, preset, f"{f['bytes']:,}", f"{f['step']:,}", *(f"{v:.1f}" for v in by_level), f"{mean:.2f}%"]
+            )
+    head = ["source", "preset", "bytes", "best step", *(f"L{i}" for i in range(len(by_level))), "mean off by"]
+    return table(head, rows)
+
+
 def texture_memory() -> str:
     """Resident memory of a scene with many textures."""
     found = measured("texture_memory")
@@ -161,10 +176,12 @@ def texture_memory() -> str:
     return table([f"{found['count']} textures of {found['side']}²", "MiB", "times less"], rows)
 
 
-TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_pages, texture_memory)}
+TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_pages, texture_memory, texture_presets)}
 for source in ("", "_boombox"):
-    for make in (texture_renders, texture_factors, texture_levels):
+    for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
+for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
+    TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
 
 
 def written() -> dict[Path, str]:

@@ -13,17 +13,20 @@ from .evaluation import Evaluation, Reader
 #: Levels that are shown, and how often a difference is amplified.
 LEVELS, AMPLIFIED = (0, 2, 4), 4
 
+#: Pixels along the side of each image, at least.
+PANEL = 192
 
-def write_preview(path: Path, evaluation: Evaluation, read: Reader, pair: int = 0) -> None:
+
+def write_preview(path: Path, evaluation: Evaluation, read: Reader) -> None:
     """
-    Write a picture of one view and light: for each of :data:`LEVELS` a row, and in it the truth, what a reader shows,
-    and their difference, amplified, as displayed.
+    Write a picture of one view and light, those of the brightest images: for each of :data:`LEVELS` a row, and in it
+    the truth, what a reader shows, and their difference, amplified, as displayed.
     """
     import mitsuba as mi
 
     truths = evaluation.truths[next(iter(evaluation.truths))]
-    rows = []
-    side = max(w[3] for w in evaluation.windows)
+    pair = int(np.clip(truths[0], 0, 1).mean(axis=(1, 2, 3)).argmax())
+    rows, side = [], max(PANEL, *(max(w[2:]) for w in evaluation.windows))
     for level in (i for i in LEVELS if i < evaluation.levels):
         truth, got = truths[level][pair], evaluation.images(read, level, [pair])[0]
         row = [metrics.srgb(truth), metrics.srgb(got), np.clip(AMPLIFIED * np.abs(truth - got), 0, 1)]
