@@ -118,4 +118,5 @@ class Evaluation:
 
 
 def _image(value, shape) -> np.ndarray:
+    dr.eval(value)  # all three at once: NumPy asks for one after the other, each a kernel
     return np.stack([c.numpy() for c in value], axis=-1).reshape(*shape, 3)
