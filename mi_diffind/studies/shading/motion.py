@@ -73,6 +73,7 @@ class Motion:
         return self.render(lambda *lanes: reference("converged", self.pyramid, *lanes, self.effects))
 
     def _shown(self, value) -> np.ndarray:
+        dr.eval(value)
         with dr.suspend_grad():
             image = np.stack([c.numpy() for c in value], axis=-1)
         return metrics.srgb(image.reshape(self.side, self.side, 3)).astype(np.float32)
