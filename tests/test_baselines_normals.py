@@ -267,3 +267,15 @@ def test_moments_of_what_is_interpolated(types, rng, border):
     np.testing.assert_allclose(found[..., :5], expected, atol=0.015)
     np.testing.assert_allclose(found[..., 5], 0.4**4, rtol=1e-4)
     assert (normals.slopes(n)[..., 2:4] - found[..., 2:4]).mean() > 0.03  # where texels alone have more variance
+
+
+def test_mean_cosine(types, rng):
+    """A surface that hardly reflects but diffusely, lit from above: LEAN has the mean of the cosines to noise."""
+    slopes = rng.normal(0, 0.3, (64, 64, 2))
+    source = material(slopes, 0.9)
+    pyramid, effects = prepared(source, types)
+    n = normals.unit_normals(source)
+    place = lanes(types, [0.5], 0.5, 6, [0, 0, 1], [0, 0, 1])
+    lean, plain = (values(make)[0] for make in (normals.lean(source, pyramid, effects)(*place),
+                                                normals.filtered(pyramid, effects)(*place)))  # fmt: skip
+    assert lean / plain == pytest.approx(n[..., 2].mean(), rel=0.02) and n[..., 2].mean() < 0.94

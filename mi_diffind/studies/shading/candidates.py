@@ -422,8 +422,8 @@ def _jobs(setting: Setting) -> list[Job]:
     classical("filtered", lambda folder: normals.filtered(pyramid(), setting.effects))
     classical("kernel", lambda folder: normals.filtered(k(), setting.effects))
     classical("Toksvig", lambda folder: normals.toksvig(source, pyramid(), setting.effects))
-    classical("LEAN", lambda folder: normals.lean(source, pyramid(), setting.effects), 5)
-    classical("LEAN, kernel", lambda folder: normals.lean(source, k(), setting.effects, smooth=True), 5)
+    classical("LEAN", lambda folder: normals.lean(source, pyramid(), setting.effects), 6)
+    classical("LEAN, kernel", lambda folder: normals.lean(source, k(), setting.effects, smooth=True), 6)
     classical("baked", lambda folder: normals.baked(pyramid(), setting.effects, bake(folder)))
     if not request.quick:
         classical("baked, kernel", lambda folder: normals.baked(k(), setting.effects, bake(folder, True)))
