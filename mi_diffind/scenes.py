@@ -40,16 +40,20 @@ def load(
     longest_path: int | None = None,
     defines: dict[str, str] | None = None,
     against: str = "exact",
+    change: Callable[[object], object] | None = None,
 ):
     """
     Load a scene as :func:`load_file` does; with ``exact``, every learned plugin is replaced by its exact counterpart,
     or by the one that ``against`` names (:func:`swap`).
 
     ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
-    infinite), and ``defines`` (name → value) the scene's ``<default>`` values. Raises :class:`SceneError`.
+    infinite), and ``defines`` (name → value) the scene's ``<default>`` values. ``change(state)`` may change the parsed
+    scene (``mi.parser.ParserState``) before anything else does. Raises :class:`SceneError`.
     """
     with scene_errors(path), _resolving(path):
         config, state = _parse(path, defines)
+        if change is not None:
+            change(state)
         if exact:
             swap(state, against)
         if longest_path is not None:
