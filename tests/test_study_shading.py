@@ -148,8 +148,8 @@ def test_the_zoom_is_what_the_camera_sees(mi_rgb):
     np.testing.assert_allclose(aligned[0][inner], aligned[2][inner], atol=1e-3)
 
 
-COMMAND = ["--quick", "--lambda", "1", "--remedies", "on", "--side", "16", "--frames", "2", "--seconds", "1",
-           "--pretrain-seconds", "1"]  # fmt: skip
+COMMAND = ["--quick", "--lambda", "1", "--remedies", "on", "--side", "16", "--frames", "2", "--steps", "2",
+           "--pretrain-steps", "2"]  # fmt: skip
 
 
 def test_what_is_written(tmp_path, monkeypatch, capsys):
@@ -209,6 +209,8 @@ def test_what_is_written(tmp_path, monkeypatch, capsys):
         (["granite"], "hammered, weave, lacquer"),
         (["lacquer", "lacquer"], "twice"),
         (["--compression", "0"], "0"),
+        (["--steps", "3"], "--pretrain-steps"),
+        (["--steps", "3", "--pretrain-steps", "3", "--seconds", "1"], "beside seconds"),
     ],
 )
 def test_bad_options(tmp_path, options, message, capsys):

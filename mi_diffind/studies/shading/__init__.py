@@ -45,6 +45,10 @@ class ShadingStudy(Study):
                             help="of training for shading (default: 15; --quick: 1)")  # fmt: skip
         parser.add_argument("--pretrain-seconds", type=positive, metavar="N",
                             help="of training as a texture, before (default: 20; --quick: 1)")  # fmt: skip
+        parser.add_argument("--steps", type=positive, metavar="N",
+                            help="of training for shading in place of seconds, which repeats on any machine; "
+                            "--pretrain-steps needs to be given, too")  # fmt: skip
+        parser.add_argument("--pretrain-steps", type=positive, metavar="N", help="of training as a texture")
         parser.add_argument("--compression", default="12x", metavar="N", help="of all trainings (default: 12x)")
         parser.add_argument("--remedies", choices=("all", "both", "on"), default="all",
                             help="clipped derivatives and a falling rate: all four combinations, both or none, or both "
@@ -58,6 +62,10 @@ class ShadingStudy(Study):
         from ...sizes import parse_compression
         from .candidates import materials_of
 
+        if (arguments.steps is None) != (arguments.pretrain_steps is None):
+            raise ValueError("--steps and --pretrain-steps: one is given, both or none are allowed")
+        if arguments.steps and (arguments.seconds or arguments.pretrain_seconds):
+            raise ValueError("--steps: given beside seconds, one of them is allowed")
         arguments.ratio = parse_compression(arguments.compression)
         arguments.loaded = materials_of(arguments.materials, arguments.side or (64 if arguments.quick else 512),
                                         arguments.quick)  # fmt: skip
@@ -71,11 +79,12 @@ class ShadingStudy(Study):
             tuple(sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))})),
             ways[:: len(ways) - 1] if quick and len(ways) > 1 else ways,
             arguments.seeds or (1 if quick else 3),
-            float(arguments.seconds or (1 if quick else 15)),
-            float(arguments.pretrain_seconds or (1 if quick else 20)),
+            float(arguments.steps or arguments.seconds or (1 if quick else 15)),
+            float(arguments.pretrain_steps or arguments.pretrain_seconds or (1 if quick else 20)),
             arguments.ratio,
             arguments.frames or (4 if quick else 60),
             quick,
+            "steps" if arguments.steps else "s",
         )
         return plan(arguments.loaded, request)
 

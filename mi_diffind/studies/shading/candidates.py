@@ -37,6 +37,7 @@ from ...maps.source import Source, SourceError, load_source
 from ...measure.store import file_name
 from ...measure.study import Candidate, Job, Plan
 from ...runtime import array_module
+from ...settings import FitSettings
 from ...tables import Table, save_table
 from ...tasks import task
 from ...tasks.shading import presets
@@ -82,19 +83,20 @@ WAYS = (Way(True, True), Way(False, True), Way(True, False), Way(False, False))
 @dataclass(frozen=True)
 class Request:
     """
-    What is asked for: ``lambdas``, 0 among them; ``ways``; ``seeds``, so many; ``seconds`` of training for shading, and
-    ``pretraining``, of training as a texture before it; ``compression``; ``frames`` of the zoom; ``quick``, a smoke
-    run.
+    What is asked for: ``lambdas``, 0 among them; ``ways``; ``seeds``, so many; the ``length`` of training for shading,
+    and of ``pretraining``, training as a texture before it, in the ``unit`` ``"s"`` or ``"steps"``; ``compression``;
+    ``frames`` of the zoom; ``quick``, a smoke run.
     """
 
     lambdas: tuple[float, ...]
     ways: tuple[Way, ...] = WAYS
     seeds: int = 3
-    seconds: float = 15.0
+    length: float = 15.0
     pretraining: float = 20.0
     compression: float = 12.0
     frames: int = 60
     quick: bool = False
+    unit: str = "s"
 
 
 def materials_of(given: Sequence[str], side: int, quick: bool = False) -> dict[str, Source]:
@@ -168,8 +170,8 @@ class Setting:
 
     @cached_property
     def choice(self) -> Evaluation:
-        """Fewer images, of other views and lights, by which a training chooses among its states."""
-        levels, pairs, side = (3, 1, 16) if self.request.quick else (6, 7, 32)
+        """Smaller images, of other views and lights, by which a training chooses among its states."""
+        levels, pairs, side = (3, 1, 16) if self.request.quick else (6, 32, 24)
         return Evaluation(self.pyramid, self.effects, levels, pairs, side, "C")
 
     @cached_property
@@ -184,8 +186,12 @@ class Setting:
         """Errors of shaded images, for the details of a record."""
         return {"material": self.name, **self.evaluation.measure(read)}
 
-    def training(self, seconds: float, seed: int, progress: bool) -> task.Request:
-        settings = dataclasses.replace(self.recipe.settings, seed=seed, deterministic=False)
+    def training(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.Request:
+        """A request for a training of a ``length``, by ``settings`` as they are changed for it."""
+        settings, seconds = dataclasses.replace(settings, seed=seed, deterministic=False), length
+        if self.request.unit == "steps":
+            every = max(1, int(length) // 10)
+            settings, seconds = dataclasses.replace(settings, steps=int(length), measure_every=every), None
         return task.Request("ours", settings, self.types, seconds=seconds, progress=progress, options=self.options)
 
     @cached_property
@@ -194,11 +200,11 @@ class Setting:
         known = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
         return {**known, "compression": self.request.compression}
 
-    def texture(self, pyramid: Pyramid, seconds: float, seed: int, progress: bool) -> tuple:
+    def texture(self, pyramid: Pyramid, length: float, seed: int, progress: bool) -> tuple:
         """A training of task 4, on a pyramid in place of the source's: the table and the run's record."""
         from ...tasks.texture.fit import size_of
 
-        request = self.training(seconds, seed, progress)
+        request = self.training(self.recipe.settings, length, seed, progress)
         recipe = dataclasses.replace(self.recipe, settings=request.settings)
         nbytes = self.source.nbytes / self.request.compression
         size = size_of(self.source, pyramid, nbytes, recipe, self.options)
@@ -302,7 +308,7 @@ class _Compressed(_Trained):
     def run(self, folder, progress):
         start, setting, request = time.perf_counter(), self.setting, self.setting.request
         pyramid = self.pyramid(folder)
-        made, result = setting.texture(pyramid, request.pretraining + request.seconds, 0, progress)
+        made, result = setting.texture(pyramid, request.pretraining + request.length, 0, progress)
         return self.trained(folder, made, result, start, kind="compressed", label=self.label)
 
 
@@ -319,11 +325,10 @@ class _Run(_Trained):
     def run(self, folder, progress):
         begin, setting = time.perf_counter(), self.setting
         own = presets.PRESETS["ours"]
-        settings = dataclasses.replace(
-            own.settings, seed=self.seed, schedule="cosine" if self.way.schedule else "constant", deterministic=False
-        )
-        recipe = dataclasses.replace(own, share=self.share, clip=CLIP if self.way.clip else None, settings=settings)
-        request = dataclasses.replace(setting.training(setting.request.seconds, self.seed, progress), settings=settings)
+        settings = dataclasses.replace(own.settings, schedule="cosine" if self.way.schedule else "constant")
+        request = setting.training(settings, setting.request.length, self.seed, progress)
+        clip = CLIP if self.way.clip else None
+        recipe = dataclasses.replace(own, share=self.share, clip=clip, settings=request.settings)
         net = start_of(self.start.table, setting.pyramid)
         made, result = fit_shading(setting.source, net, recipe, request, setting.pyramid, setting.choice)
         details = {"kind": "run", "share": self.share, "clip": self.way.clip, "schedule": self.way.schedule,
@@ -382,8 +387,8 @@ def plan(sources: dict[str, Source], request: Request) -> Plan:
         accuracy_label="PSNR of shaded values against converged truth, mean of levels, dB",
         details={"sources": digests, "request": asked, "evaluation": _seen(request)},
         notes=[
-            f"{sizes}; {request.compression:g}x, {request.pretraining:g} s of training as a texture, then "
-            f"{request.seconds:g} s for shading; C: converged truth, P: the paper's reference."
+            f"{sizes}; {request.compression:g}x, {request.pretraining:g} {request.unit} of training as a texture, then "
+            f"{request.length:g} {request.unit} for shading; C: converged truth, P: the paper's reference."
         ],
         jobs=jobs,
         jobs_fingerprint=f"{digests} {asked}",
