@@ -7,7 +7,8 @@ are the arrays of task 4, through frozen tables of task 2; the result is a file 
 - :mod:`.material`: what the maps of a material mean, and what light it sends where;
 - :mod:`.reference`: appearance that is filtered; :mod:`.evaluation`: images that no training saw;
 - :mod:`.clip`: derivatives that are limited; :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and
-  what ``fit shading`` does; :mod:`.preview`: a picture on the way.
+  what ``fit shading`` does; :mod:`.preview`: a picture on the way;
+- :mod:`.scene` and what is called ``scene_…``: the same inside a scene, through renders of it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from ...arguments import Argument
 from ..map_arguments import SIZES, SOURCES
 from ..task import Request, Task
 from .presets import PRESETS, REFERENCES
+from .scene_arguments import SCENE_ARGUMENTS
+from .scene_recipe import SceneRecipe
 
 
 def _share(text: str) -> float:
@@ -41,6 +44,11 @@ def _bound(text: str) -> float:
     return value
 
 
+def is_scene(source) -> bool:
+    """Is a scene meant, rather than the maps of a material?"""
+    return str(source).lower().endswith(".xml")
+
+
 class Shading(Task):
     """The task. Its presets are the recipes of :mod:`.presets`; files are those of the task ``texture``."""
 
@@ -50,7 +58,10 @@ class Shading(Task):
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
     arguments = (
-        Argument("source", metavar="MATERIAL.json", help="a manifest of the maps of a material"),
+        Argument(
+            "source", metavar="MATERIAL.json|SCENE.xml",
+            help="a manifest of the maps of a material, or a scene with a neural_texture that is trained in it",
+        ),
         *(size for size in SIZES if size.name != "psnr"),
         Argument(
             "--start", metavar="FILE.npz",
@@ -71,10 +82,11 @@ class Shading(Task):
             "prefiltered ones (default of paper), or 256 unfiltered ones (converged)",
         ),
         *SOURCES,
+        *SCENE_ARGUMENTS,
     )  # fmt: skip
 
     def settings(self, preset, given, options):
-        own = PRESETS[preset].settings
+        own = SceneRecipe().settings if is_scene(options["source"]) else PRESETS[preset].settings
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
 

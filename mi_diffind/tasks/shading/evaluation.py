@@ -45,39 +45,44 @@ def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None)
 class Evaluation:
     """
     Images of a material, at most ``side`` texels wide and high, of ``levels`` levels of detail, level 0 the first, for
-    ``pairs`` of a view and a light. Their references are made here: ``truths[letter][level]``, ``(pairs, rows, columns,
-    3)``, linear.
+    ``pairs`` of a view and a light. Each shows another part of the material, and its pixels are those of a level, but
+    shifted by a part of one: as in a render, pixels are not texels. Their references are made here:
+    ``truths[letter][level]``, ``(pairs, rows, columns, 3)``, linear. ``stream`` draws others.
     """
 
     def __init__(
-        self, pyramid: Pyramid, effects: Effects, levels: int = 6, pairs: int = 16, side: int = 64, truths="CP"
-    ):
+        self, pyramid: Pyramid, effects: Effects, levels: int = 6, pairs: int = 16, side: int = 64, truths="CP",
+        stream: int = 0,
+    ):  # fmt: skip
         self.pyramid, self.effects, self.types = pyramid, effects, pyramid.types
-        self.levels = min(levels, pyramid.levels)
-        rng = np.random.default_rng(SEED)
+        self.levels, self.form = min(levels, pyramid.levels), (levels, pairs, side)
+        rng = np.random.default_rng((SEED, stream))
         numbers = rng.random((4, pairs))
         # One view or light for each of as many strata of the cosine, so that none is far from all others
         order = [rng.permutation(pairs) for _ in range(2)]
         cosines = [(o + n) / pairs for o, n in zip(order, numbers[:2], strict=True)]
         self.directions = [(cosines[0][i], numbers[2][i], cosines[1][i], numbers[3][i]) for i in range(pairs)]
-        self.windows = [self._window(level, side) for level in range(self.levels)]
+        sizes = [level.shape[:2] for level in pyramid.values[: self.levels]]
+        self.sizes = [(min(rows, side), min(columns, side)) for rows, columns in sizes]
+        # Of each level and pair, where its image begins, in pixels from the top and from the left
+        spare = np.array(sizes) - np.array(self.sizes)
+        shifts = rng.random((self.levels, pairs, 2))
+        self.origins = np.floor(rng.random(shifts.shape) * (spare[:, None] + 1)).clip(0, spare[:, None]) + shifts
         self.truths = {letter: [self._truth(TRUTHS[letter], i) for i in range(self.levels)] for letter in truths}
 
-    def _window(self, level: int, side: int) -> tuple[int, int, int, int]:
-        """First row and column, rows and columns of the texels of a level that are looked at: its middle."""
-        rows, columns, _ = self.pyramid.values[level].shape
-        high, wide = min(rows, side), min(columns, side)
-        return (rows - high) // 2, (columns - wide) // 2, high, wide
+    def another(self) -> Evaluation:
+        """Images of the same form and number under other views and lights, with the converged truth alone."""
+        return Evaluation(self.pyramid, self.effects, *self.form, "C", stream=1)
 
     def _lanes(self, level: int, pairs=None) -> tuple:
         """``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""
         types, pairs = self.types, range(len(self.directions)) if pairs is None else pairs
-        top, left, rows, columns = self.windows[level]
-        n_rows, n_columns, _ = self.pyramid.values[level].shape
-        v, u = ((np.arange(n) + start + 0.5) / whole for n, start, whole in
-                ((rows, top, n_rows), (columns, left, n_columns)))  # fmt: skip
+        (rows, columns), whole = self.sizes[level], self.pyramid.values[level].shape
+        origins = self.origins[level][list(pairs)]
         shape = (len(pairs), rows, columns)
-        u, v = (np.broadcast_to(x, shape).astype(np.float32).ravel() for x in (u[None, None, :], v[None, :, None]))
+        v = (np.arange(rows)[None, :, None] + origins[:, 0, None, None]) / whole[0]
+        u = (np.arange(columns)[None, None, :] + origins[:, 1, None, None]) / whole[1]
+        u, v = (np.broadcast_to(x, shape).astype(np.float32).ravel() for x in (u, v))
         numbers = np.array([self.directions[p] for p in pairs], np.float32).repeat(rows * columns, axis=0)
         a, b, c, d = (types.Float(np.ascontiguousarray(n)) for n in numbers.T)
         wi, wo = uniform_hemisphere(types, a, b), uniform_hemisphere(types, c, d)

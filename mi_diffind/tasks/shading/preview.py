@@ -26,7 +26,7 @@ def write_preview(path: Path, evaluation: Evaluation, read: Reader) -> None:
 
     truths = evaluation.truths[next(iter(evaluation.truths))]
     pair = int(np.clip(truths[0], 0, 1).mean(axis=(1, 2, 3)).argmax())
-    rows, side = [], max(PANEL, *(max(w[2:]) for w in evaluation.windows))
+    rows, side = [], max(PANEL, *(max(size) for size in evaluation.sizes))
     for level in (i for i in LEVELS if i < evaluation.levels):
         truth, got = truths[level][pair], evaluation.images(read, level, [pair])[0]
         row = [metrics.srgb(truth), metrics.srgb(got), np.clip(AMPLIFIED * np.abs(truth - got), 0, 1)]

@@ -132,11 +132,13 @@ def fit_shading(
 ) -> tuple[Table, FitResult]:
     """
     Train the arrays ``start`` (:func:`start_of`) of ``source`` for its shading and return them as a table of the task
-    ``texture``, with their errors as a texture and as shaded images, and the run's record. ``preview`` is a picture
-    that is written at each measurement.
+    ``texture``, with their errors as a texture and as shaded images of the ``evaluation``, and the run's record. Which
+    state is the best, other images of the same form decide. ``preview`` is a picture that is written at each
+    measurement.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
-    problem = ShadingProblem(start, pyramid, recipe, source.digest, evaluation)
+    validation = None if evaluation is None else evaluation.another()
+    problem = ShadingProblem(start, pyramid, recipe, source.digest, validation)
     problem.preview = preview
     result = request.train(problem, "shading")
     identity = {k: v for k, v in problem.identity.items() if k not in ("form", "border")}
