@@ -114,6 +114,16 @@ def materials_of(given: Sequence[str], side: int, quick: bool = False) -> dict[s
     return found
 
 
+class _Images(Evaluation):
+    """Images of a material; those by which trainings choose among their states are made once for all trainings."""
+
+    _others: Evaluation | None = None
+
+    def another(self) -> Evaluation:
+        self._others = self._others or super().another()
+        return self._others
+
+
 # -- a material -------------------------------------------------------------------------------------------------------
 
 
@@ -166,13 +176,7 @@ class Setting:
     @cached_property
     def evaluation(self) -> Evaluation:
         levels, pairs, side = (3, 2, 16) if self.request.quick else (6, 16, 64)
-        return Evaluation(self.pyramid, self.effects, levels, pairs, side)
-
-    @cached_property
-    def choice(self) -> Evaluation:
-        """Smaller images, of other views and lights, by which a training chooses among its states."""
-        levels, pairs, side = (3, 1, 16) if self.request.quick else (6, 32, 24)
-        return Evaluation(self.pyramid, self.effects, levels, pairs, side, "C")
+        return _Images(self.pyramid, self.effects, levels, pairs, side)
 
     @cached_property
     def motion(self) -> Motion:
@@ -330,7 +334,7 @@ class _Run(_Trained):
         clip = CLIP if self.way.clip else None
         recipe = dataclasses.replace(own, share=self.share, clip=clip, settings=request.settings)
         net = start_of(self.start.table, setting.pyramid)
-        made, result = fit_shading(setting.source, net, recipe, request, setting.pyramid, setting.choice)
+        made, result = fit_shading(setting.source, net, recipe, request, setting.pyramid, setting.evaluation)
         details = {"kind": "run", "share": self.share, "clip": self.way.clip, "schedule": self.way.schedule,
                    "seed": self.seed, "way": self.way.name}  # fmt: skip
         record = self.trained(folder, made, result, begin, **details)
