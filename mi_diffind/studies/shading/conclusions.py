@@ -53,10 +53,10 @@ class Curves:
         """PSNR of each level, the mean over seeds."""
         return np.mean([d[letter]["psnr_db"] for d in self.runs[way, share]], axis=0)
 
-    def best(self, way: str = WITH) -> float | None:
-        """The λ > 0 with the best mean against C; ``None`` if there is none."""
-        shares = [s for s in self.shares(way) if s > 0]
-        return max(shares, key=lambda s: self.mean(way, s), default=None)
+    def best(self) -> tuple[str, float] | None:
+        """The way and λ > 0 with the best mean against C, of ways that λ = 0 is known of; ``None`` if there is none."""
+        known = [(way, s) for way, s in self.runs if s > 0 and (way, 0.0) in self.runs]
+        return max(known, key=lambda key: self.mean(*key), default=None)
 
     @property
     def best_classical(self) -> str | None:
@@ -156,32 +156,36 @@ _WORDS = {"nan": "met a NaN", "restarts": "were restarted", "spike": "had a loss
 
 def _gains(own: Curves) -> list[str]:
     """The best λ against λ = 0, in everything that was measured."""
-    lines = []
-    share = own.best()
-    if share is None or (WITH, 0.0) not in own.runs:
-        return lines
-    parts = []
+    best = own.best()
+    if best is None:
+        return []
+    lines, parts = [], []
+    way, share = best
     for letter in "CP":
-        gain, coarse = (own.mean(WITH, share, letter, w) - own.mean(WITH, 0.0, letter, w)
-                        for w in ("mean_db", "coarse_db"))  # fmt: skip
-        flips = [own.mean(WITH, s, letter, "flip") for s in (0.0, share)]
-        worst = (own.levels(WITH, share, letter) - own.levels(WITH, 0.0, letter)).min()
-        parts.append(f"against {letter} {gain:+.2f} dB, from level {COARSE} on {coarse:+.2f}, the worst level "
-                     f"{worst:+.2f}, FLIP {flips[0]:.4f} to {flips[1]:.4f}")  # fmt: skip
-    seeds = own.values(WITH, share)
-    low, high = min(seeds), max(seeds)
-    spread = f", {low:.2f} to {high:.2f} dB over {len(seeds)} seeds" if len(seeds) > 1 else ""
-    lines.append(f"{own.name}: the best lambda is {share:g} ({own.mean(WITH, share):.2f} dB{spread}); over lambda = 0, "
-                 f"{'; '.join(parts)}")  # fmt: skip
-    others = [s for s in own.shares(WITH) if 0 < s <= 0.25]
+        gain, coarse = (
+            own.mean(way, share, letter, w) - own.mean(way, 0.0, letter, w) for w in ("mean_db", "coarse_db")
+        )
+        flips = [own.mean(way, s, letter, "flip") for s in (0.0, share)]
+        worst = (own.levels(way, share, letter) - own.levels(way, 0.0, letter)).min()
+        parts.append(
+            f"against {letter} {gain:+.2f} dB, from level {COARSE} on {coarse:+.2f}, the worst level {worst:+.2f}, "
+            f"FLIP {flips[0]:.4f} to {flips[1]:.4f}"
+        )
+    seeds = own.values(way, share)
+    spread = f", {min(seeds):.2f} to {max(seeds):.2f} dB over {len(seeds)} seeds" if len(seeds) > 1 else ""
+    lines.append(
+        f"{own.name}: the best lambda is {share:g}, {way} ({own.mean(way, share):.2f} dB{spread}); over lambda = 0, "
+        f"{'; '.join(parts)}"
+    )
+    others = [s for s in own.shares(way) if 0 < s <= 0.25]
     if others and share not in others:
-        text = enumeration([f"{own.mean(WITH, s) - own.mean(WITH, 0.0):+.2f} dB at {s:g}" for s in others])
+        text = enumeration([f"{own.mean(way, s) - own.mean(way, 0.0):+.2f} dB at {s:g}" for s in others])
         lines.append(f"{own.name}: in the paper's range of lambda, against C, {text}")
     return lines
 
 
 def _classical(own: Curves) -> list[str]:
-    lines, best, share = [], own.best_classical, own.best()
+    lines, best, ours_key = [], own.best_classical, own.best()
     if best is None:
         return lines
     plain = own.classical.get("filtered", own.classical[best])["C"]["mean_db"]
@@ -189,9 +193,10 @@ def _classical(own: Curves) -> list[str]:
     if kernel:
         lines.append(f"{own.name}: the kernel alone, uncompressed, is worth {kernel['C']['mean_db'] - plain:+.2f} dB "
                      "against C over filtered parameters")  # fmt: skip
-    if share is None:
+    if ours_key is None:
         return lines
-    ours, ours_p = (own.mean(WITH, share, letter) for letter in "CP")
+    way, share = ours_key
+    ours, ours_p = (own.mean(way, share, letter) for letter in "CP")
     known = {label: own.classical[label] for label in (*PLAIN, *COMBINED) if label in own.classical}
     parts = [f"{label} {ours - d['C']['mean_db']:+.2f} (P {ours_p - d['P']['mean_db']:+.2f})" for label, d in
              {**known, **own.compressed}.items()]  # fmt: skip
@@ -200,7 +205,7 @@ def _classical(own: Curves) -> list[str]:
     for label in ("LEAN", "LEAN, kernel"):
         if label not in known:
             continue
-        levels = np.asarray(known[label]["C"]["psnr_db"]) - own.levels(WITH, share)
+        levels = np.asarray(known[label]["C"]["psnr_db"]) - own.levels(way, share)
         ahead = [f"{i} ({d:+.2f} dB)" for i, d in enumerate(levels) if d > 0]
         wins = known[label]["C"]["mean_db"] > ours
         verdict = "wins" if wins else "loses"
@@ -214,10 +219,11 @@ def _remedies(own: Curves) -> list[str]:
     """What clipping and the schedule are worth at the largest λ, and at the best."""
     lines = []
     shares = [s for s in own.shares(WITH) if s > 0]
-    for share in dict.fromkeys(s for s in (own.best(), max(shares, default=None)) if s is not None):
+    best = own.best()
+    for share in dict.fromkeys(s for s in (best and best[1], max(shares, default=None)) if s is not None):
         for other, what in (("no clip, schedule", "clipping"), ("clip, no schedule", "the falling rate"),
                             (WITHOUT, "both remedies")):  # fmt: skip
-            if (other, share) not in own.runs:
+            if (other, share) not in own.runs or (WITH, share) not in own.runs:
                 continue
             gains = (own.mean(WITH, share, letter) - own.mean(other, share, letter) for letter in "CP")
             text = " and ".join(f"{g:+.2f} dB against {letter}" for g, letter in zip(gains, "CP", strict=True))

@@ -12,7 +12,7 @@ from ... import metrics
 from ...measure import plot
 from ...measure.words import machine_line, state
 from ..texture.zoom import flicker
-from .conclusions import WITH, Curves, curves
+from .conclusions import Curves, curves
 from .motion import GRID
 
 #: Lines of classical filters: label → style.
@@ -84,8 +84,8 @@ def levels(settings: dict, result: dict):
                 if label in own.classical:
                     axes.plot(own.classical[label][letter]["psnr_db"], linestyle=style, color=f"{0.12 * i}",
                               linewidth=1.0, label=f"{label}, uncompressed")  # fmt: skip
-            for (colour, marker), share in zip(plot.STYLES, _shown(own), strict=False):
-                axes.plot(own.levels(WITH, share, letter), color=colour, marker=marker, markersize=4, linewidth=1.3,
+            for (colour, marker), (way, share) in zip(plot.STYLES, _shown(own), strict=False):
+                axes.plot(own.levels(way, share, letter), color=colour, marker=marker, markersize=4, linewidth=1.3,
                           label=f"λ {share:g}")  # fmt: skip
             axes.set_title(f"{own.name}, against {letter}", fontsize=9)
             axes.set_xlabel("level of detail", fontsize=8)
@@ -148,10 +148,10 @@ def zoom(settings: dict, result: dict):
     return sheet
 
 
-def _shown(own: Curves) -> list[float]:
-    """λ = 0 and the best λ, with both remedies."""
+def _shown(own: Curves) -> list[tuple[str, float]]:
+    """λ = 0 and the best λ, with its way."""
     best = own.best()
-    return [s for s in (0.0, best) if s is not None and (WITH, s) in own.runs]
+    return [] if best is None else [(best[0], 0.0), best]
 
 
 def _columns(own: Curves) -> list[tuple[str, str]]:
@@ -160,8 +160,8 @@ def _columns(own: Curves) -> list[tuple[str, str]]:
     best = own.best_classical
     if best is not None:
         found.append((f"{best}, uncompressed", f"{own.name}, {best}"))
-    for share in _shown(own):
-        d = own.runs[WITH, share][0]
+    for way, share in _shown(own):
+        d = own.runs[way, share][0]
         found.append((f"λ {share:g}, compressed", f"{own.name}, lambda {share:g}, {d['way']}, seed {d['seed']}"))
     return found
 
