@@ -60,7 +60,7 @@ SHIPPED = "scenes/assets/tiles.json"
 #: dB that a run may end below its best state.
 DRIFT = 0.2
 
-#: The specular lobe's derivatives are limited to this, where they are.
+#: The specular lobe's derivatives are limited to this where they are, unless our preset says to what.
 CLIP = 0.1
 
 
@@ -331,7 +331,7 @@ class _Run(_Trained):
         own = presets.PRESETS["ours"]
         settings = dataclasses.replace(own.settings, schedule="cosine" if self.way.schedule else "constant")
         request = setting.training(settings, setting.request.length, self.seed, progress)
-        clip = CLIP if self.way.clip else None
+        clip = (own.clip or CLIP) if self.way.clip else None
         recipe = dataclasses.replace(own, share=self.share, clip=clip, settings=request.settings)
         net = start_of(self.start.table, setting.pyramid)
         made, result = fit_shading(setting.source, net, recipe, request, setting.pyramid, setting.evaluation)
