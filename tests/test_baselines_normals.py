@@ -244,11 +244,26 @@ def test_biases(types, rng):
     place, finer = (lanes(types, rng.random(50), rng.random(50), level) for level in (2, 1.5))
     finer = (*place[:2], finer[2], *place[3:])
     plain = normals.filtered(pyramid, effects)
-    np.testing.assert_array_equal(values(normals.biased(pyramid, effects, [0] * 5)(*place)), values(plain(*place)))
-    biased = normals.biased(pyramid, effects, [0, 0, -0.5, 0, 0])
+    np.testing.assert_array_equal(values(normals.biased(plain, [0] * 5)(*place)), values(plain(*place)))
+    biased = normals.biased(plain, [0, 0, -0.5, 0, 0])
     np.testing.assert_allclose(values(biased(*place)), values(plain(*finer)), atol=1e-5)
-    chosen = normals.choose_biases(pyramid, effects, 3)
-    assert len(chosen) == pyramid.levels and set(chosen) <= set(normals.BIASES)
+    between = lanes(types, rng.random(50), rng.random(50), 1.5), lanes(types, rng.random(50), rng.random(50), 1.25)
+    between = [(*place[:2], lane[2], *place[3:]) for lane in between]
+    np.testing.assert_allclose(values(biased(*between[0])), values(plain(*between[1])), atol=1e-5)
+
+
+def test_a_bias_that_is_known_is_found(types, rng):
+    """A reader that is a quarter of a level off, of a surface on which each level looks different."""
+    source = material(rng.normal(0, 0.02, (32, 32, 2)))
+    pyramid, effects = prepared(source, types)
+    plain = normals.filtered(pyramid, effects)
+    own = normals.choose_biases(plain, pyramid, effects, 2**10)
+    shifted = normals.choose_biases(
+        lambda u, v, level, wi, wo: plain(u, v, level + 0.25, wi, wo), pyramid, effects, 2**10
+    )
+    assert len(own) == pyramid.levels and set(own) <= set(normals.BIASES)
+    for level in range(1, 4):
+        assert shifted[level] == own[level] - 0.25 or own[level] - 0.25 < normals.BIASES[0]
 
 
 @pytest.mark.parametrize("border", ["repeat", "clamp"])

@@ -178,7 +178,17 @@ def test_what_is_written(tmp_path, monkeypatch, capsys):
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["resumed"] and not result["interrupted"]
     ways = ["lambda 0, clip, schedule", "lambda 1, clip, schedule"]
-    names = ["filtered", "kernel", "Toksvig", "LEAN", "LEAN, kernel", "baked", "Toksvig, compressed", *ways]
+    names = [
+        "filtered",
+        "kernel",
+        "Toksvig",
+        "LEAN",
+        "LEAN, kernel",
+        "baked",
+        "Toksvig, compressed",
+        "kernel, compressed",
+        *ways,
+    ]
     assert list(result["candidates"]) == [f"lacquer, {name}" for name in names]
     for c in result["candidates"].values():
         e = c["errors"]

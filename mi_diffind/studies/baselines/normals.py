@@ -10,7 +10,7 @@ Each takes the maps of a material at every level of detail, uncompressed, and gi
   Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased Displacement and
   Reflectance Mapping*, 2013);
 - :func:`baked`: each texel of each level has the roughness with which it looks most like the converged truth;
-- :func:`biased`, :func:`boxed`: filtered parameters again, with another kernel. What these gain is no matter of
+- :func:`biased`, :func:`boxed`: the same with another kernel. What filtered parameters gain by it is no matter of
   shading.
 
 The first three know the source's moments, not compressed ones. A GGX lobe has no variance of slopes; what is said of
@@ -52,8 +52,8 @@ TRIED = np.linspace(0, 1, 28)
 #: Views and lights that roughness and biases are chosen for, and the seed that they are drawn from, no other's.
 PAIRS, SEED = 32, 20050711
 
-#: Texels, and pairs of a view and a light, that a bias is chosen for.
-TEXELS, MORE_PAIRS = 2**10, 96
+#: Places of each level, each under a view and a light of its own, that a bias is chosen for, and levels that have one.
+PLACES, BIASED = 2**14, 7
 
 #: Places along each side of a texel where its moments are averaged.
 INSIDE = 4
@@ -451,45 +451,42 @@ def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
 # -- the kernel -------------------------------------------------------------------------------------------------------
 
 
-def biased(pyramid: Pyramid, effects: Effects, biases: Sequence[float] | None = None) -> Reader:
+def biased(read: Reader, biases: Sequence[float]) -> Reader:
     """
-    Filtered parameters at another level of detail: ``biases`` (default: :func:`choose_biases`), one for each whole
-    level, are added, and interpolated between them.
+    What ``read`` shows of another level of detail: ``biases`` (:func:`choose_biases`), one for each whole level, are
+    added, and interpolated between them.
     """
-    types = pyramid.types
-    biases = choose_biases(pyramid, effects) if biases is None else biases
-    table = types.Float(np.append(biases, biases[-1]).astype(np.float32))
-    plain = filtered(pyramid, effects)
 
-    def read(u, v, level, wi, wo):
-        level = clamp(level, 0.0, float(len(biases) - 1))
-        lower = types.UInt32(level)
-        a, b = dr.gather(types.Float, table, lower), dr.gather(types.Float, table, lower + 1)
-        return plain(u, v, level + dr.lerp(a, b, level - types.Float(lower)), wi, wo)
+    def at(u, v, level, wi, wo):
+        Float = type(u)
+        table = Float(np.append(biases, biases[-1]).astype(np.float32))
+        own = clamp(level, 0.0, float(len(biases) - 1))
+        lower = dr.uint32_array_t(Float)(own)
+        a, b = dr.gather(Float, table, lower), dr.gather(Float, table, lower + 1)
+        return read(u, v, dr.maximum(level + dr.lerp(a, b, own - Float(lower)), 0), wi, wo)
 
-    return read
+    return at
 
 
-def choose_biases(pyramid: Pyramid, effects: Effects, pairs: int = MORE_PAIRS) -> list[float]:
-    """Of each level, the one of :data:`BIASES` with the least error at texels of it, against the converged truth."""
-    types, plain, found = pyramid.types, filtered(pyramid, effects), []
+def choose_biases(read: Reader, pyramid: Pyramid, effects: Effects, places: int = PLACES) -> list[float]:
+    """
+    Of each level, the one of :data:`BIASES` with which ``read`` errs least against the converged truth, at random
+    ``places``, views and lights. Few of these see a highlight, so that the same ones are used for all levels.
+    """
+    types, found = pyramid.types, []
     rng = np.random.default_rng(SEED)
-    made = directions(types, pairs)
-    for level, texels in enumerate(pyramid.values):
-        rows, columns, _ = texels.shape
-        count = min(rows * columns, TEXELS)
-        index = rng.choice(rows * columns, count, replace=False)
-        u = types.Float(((index % columns + 0.5) / columns).astype(np.float32))
-        v = types.Float(((index // columns + 0.5) / rows).astype(np.float32))
-        errors = np.zeros(len(BIASES))
-        for wi, wo in made:
-            ways = _wide(count, wi, wo)
-            detail = dr.opaque(types.Float, level, count)
-            truth = dr.clip(reference("converged", pyramid, u, v, detail, *ways, effects, side=_side(level)), 0, 1)
-            for i, bias in enumerate(BIASES):
-                got = plain(u, v, dr.opaque(types.Float, level + bias, count), *ways)
-                errors[i] += float(dr.mean(dr.squared_norm(dr.clip(got, 0, 1) - truth))[0])
-        found.append(float(BIASES[int(errors.argmin())]))
+    numbers = [types.Float(x) for x in rng.random((6, places), dtype=np.float32)]
+    u, v = numbers[:2]
+    ways = [uniform_hemisphere(types, numbers[i], numbers[i + 1]) for i in (2, 4)]
+    dr.eval(ways)
+    for level in range(min(BIASED, pyramid.levels)):
+        detail = dr.opaque(types.Float, level, places)
+        truth = dr.clip(reference("converged", pyramid, u, v, detail, *ways, effects, side=_side(level)), 0, 1)
+        errors = []
+        for bias in BIASES:
+            got = read(u, v, dr.opaque(types.Float, max(level + bias, 0), places), *ways)
+            errors.append(float(dr.mean(dr.squared_norm(dr.clip(got, 0, 1) - truth))[0]))
+        found.append(float(BIASES[int(np.argmin(errors))]))
     return found
 
 

@@ -7,7 +7,8 @@ a large λ are on or off: derivatives that are clipped on their way through the 
 falls. All of it for several seeds, those of λ = 0 too.
 
 Beside them stand classical filters of normals (:mod:`..baselines.normals`), uncompressed, and those that an ordinary
-texture can hold, compressed as λ = 0 is, with as much time: Toksvig's and baked roughness, the truth's kernel, both.
+texture can hold, compressed as λ = 0 is, with as much time: Toksvig's and baked roughness. The *kernel* control reads
+at other levels of detail, those with which it errs least; λ = 0 is read so, too.
 
 *Errors* are those of :class:`mi_diffind.tasks.shading.evaluation.Evaluation`: PSNR of shaded values and FLIP, under
 views and lights of no training, against C, converged, and P, the paper's reference. *Flicker*: :mod:`.motion`.
@@ -48,7 +49,6 @@ from ...tasks.texture import presets as texture_presets
 from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
 from ..baselines import normals
-from ..texture import levels
 from . import pictures
 from .conclusions import conclusions, table
 from .materials import MADE, made
@@ -148,22 +148,6 @@ class Setting:
     @cached_property
     def pyramid(self) -> Pyramid:
         return Pyramid.of(self.source, textures.layout_of(self.source, self.recipe), self.types)
-
-    @cached_property
-    def kernel(self) -> Pyramid:
-        """The pyramid under the kernel of the truth."""
-        return normals.boxed(self.source, self.types, self.pyramid.border)
-
-    @cached_property
-    def stored_kernel(self) -> Pyramid:
-        """The same in the source's layout: what is compressed in its place."""
-        found = levels.images(self.kernel)
-        for m in self.source.maps:
-            if m.kind == "normal":
-                vectors = [2 * values - 1 for values in found[m.name]]
-                lengths = [np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-6) for v in vectors]
-                found[m.name] = [0.5 + 0.5 * v / n for v, n in zip(vectors, lengths, strict=True)]
-        return levels.pyramid_of(found, self.pyramid)
 
     @cached_property
     def effects(self):
@@ -344,6 +328,29 @@ class _Run(_Trained):
         return record
 
 
+@dataclass
+class _Shifted(_Made):
+    """λ = 0 read at other levels of detail, those that suit the truth's kernel best: nothing is trained."""
+
+    label: str = ""
+    base: _Run | None = None
+    kernel: Callable = lambda make: make
+
+    def _read(self) -> Reader:
+        return self.kernel(lambda folder: self.setting.readers[self.base.name]())(None)
+
+    def known(self, folder, record):
+        self.record = record
+        if record is not None:
+            self.setting.readers[self.name] = self._read
+        return record
+
+    def run(self, folder, progress):
+        start, read = time.perf_counter(), self._read()
+        self.setting.readers[self.name] = lambda: read
+        return self.kept(self.base.table.nbytes, start, read, kind="compressed", label=self.label)
+
+
 def troubles(details: dict, base: dict | None) -> list[str]:
     """What went wrong in a run, in words (see above); ``base`` is λ = 0 of the same seed."""
     history, found = details["history"], []
@@ -415,40 +422,54 @@ def _jobs(setting: Setting) -> list[Job]:
     def classical(label: str, make: Callable[[Path | None], Reader], channels: int = 0) -> None:
         found.append(_Classical(f"{name}, {label}", setting, label=label, make=make, channels=channels))
 
-    def bake(folder: Path | None, kernel: bool = False) -> list[np.ndarray]:
+    def bake(folder: Path | None) -> list[np.ndarray]:
         """The fitted roughness, kept in the folder."""
         if folder is None:
-            return normals.bake(setting.kernel if kernel else pyramid(), setting.effects, _pairs(request), pyramid())
-        file = folder / f"{file_name(name)}_roughness{'_kernel' * kernel}.npz"
+            return normals.bake(pyramid(), setting.effects, _pairs(request))
+        file = folder / f"{file_name(name)}_roughness.npz"
         if not file.is_file():
-            levels = bake(None, kernel)
+            levels = bake(None)
             with replacing(file) as temporary, open(temporary, "wb") as stream:
                 np.savez(stream, *levels)
         with np.load(file, allow_pickle=False) as data:
             return [data[f"arr_{i}"] for i in range(len(data.files))]
 
-    source, k = setting.source, (lambda: setting.kernel)
-    classical("filtered", lambda folder: normals.filtered(pyramid(), setting.effects))
-    classical("kernel", lambda folder: normals.filtered(k(), setting.effects))
+    def shifted(make: Callable[[Path | None], Reader]) -> Callable[[Path | None], Reader]:
+        """The same with the kernel that suits the truth best."""
+
+        def biased(folder: Path | None) -> Reader:
+            read = make(folder)
+            places = 2**10 if request.quick else normals.PLACES
+            return normals.biased(read, normals.choose_biases(read, pyramid(), setting.effects, places))
+
+        return biased
+
+    def filtered(folder: Path | None) -> Reader:
+        return normals.filtered(pyramid(), setting.effects)
+
+    def baked(folder: Path | None) -> Reader:
+        return normals.baked(pyramid(), setting.effects, bake(folder))
+
+    def lean(folder: Path | None, smooth: bool = False) -> Reader:
+        return normals.lean(source, pyramid(), setting.effects, smooth)
+
+    def rough(levels: Callable[[Path | None], list[np.ndarray]]) -> Callable[[Path | None], Pyramid]:
+        return lambda folder: normals.with_roughness(pyramid(), levels(folder))
+
+    source = setting.source
+    classical("filtered", filtered)
+    classical("kernel", shifted(filtered))
     classical("Toksvig", lambda folder: normals.toksvig(source, pyramid(), setting.effects))
-    classical("LEAN", lambda folder: normals.lean(source, pyramid(), setting.effects), 6)
-    classical("LEAN, kernel", lambda folder: normals.lean(source, k(), setting.effects, smooth=True), 6)
-    classical("baked", lambda folder: normals.baked(pyramid(), setting.effects, bake(folder)))
+    classical("LEAN", lean, 6)
+    classical("LEAN, kernel", shifted(lambda folder: lean(folder, True)), 6)
+    classical("baked", baked)
     if not request.quick:
-        classical("baked, kernel", lambda folder: normals.baked(k(), setting.effects, bake(folder, True)))
-
-    def compressed(label: str, make: Callable[[Path | None], Pyramid]) -> None:
+        classical("baked, kernel", shifted(baked))
+    made = {"Toksvig, compressed": rough(lambda folder: normals.toksvig_levels(source, pyramid()))}
+    if not request.quick:
+        made["baked, compressed"] = rough(bake)
+    for label, make in made.items():
         found.append(_Compressed(f"{name}, {label}", setting, label=label, pyramid=make))
-
-    def rough(folder: Path | None, kernel: bool) -> Pyramid:
-        return normals.with_roughness(setting.stored_kernel if kernel else pyramid(), bake(folder, kernel))
-
-    compressed("Toksvig, compressed",
-               lambda folder: normals.with_roughness(pyramid(), normals.toksvig_levels(source, pyramid())))  # fmt: skip
-    if not request.quick:
-        compressed("kernel, compressed", lambda folder: setting.stored_kernel)
-        compressed("baked, compressed", lambda folder: rough(folder, False))
-        compressed("baked, kernel, compressed", lambda folder: rough(folder, True))
     for seed in range(request.seeds):
         start = _Start(f"{name}, texture, seed {seed}", setting, seed=seed)
         found.append(start)
@@ -459,9 +480,12 @@ def _jobs(setting: Setting) -> list[Job]:
                     continue  # there is nothing to clip
                 run = _Run(f"{name}, lambda {share:g}, {way.name}, seed {seed}", setting, start=start, way=way,
                            share=share, seed=seed, base=bases.get(way.schedule))  # fmt: skip
-                if share == 0:
-                    bases[way.schedule] = run
                 found.append(run)
+                if share == 0:
+                    if not bases and seed == 0:
+                        found.append(_Shifted(f"{name}, kernel, compressed", setting, label="kernel, compressed",
+                                              base=run, kernel=shifted))  # fmt: skip
+                    bases[way.schedule] = run
     return found
 
 
@@ -472,7 +496,7 @@ def _pairs(request: Request) -> int:
 def _candidates(setting: Setting, jobs: list[Job]) -> list[Candidate]:
     found = []
     for job in jobs:
-        if isinstance(job, (_Classical, _Compressed)):
+        if isinstance(job, (_Classical, _Compressed, _Shifted)):
             found.append(_candidate(setting, job.name, [job], job.label, {"kind": job.label}))
     groups: dict[tuple, list[_Run]] = {}
     for job in jobs:

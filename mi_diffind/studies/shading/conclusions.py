@@ -13,7 +13,7 @@ from ...measure.words import enumeration, grid
 #: The way with both remedies, and the one without.
 WITH, WITHOUT = "clip, schedule", "no clip, no schedule"
 
-#: Classical filters that use no kernel but a mip map's, those that have the truth's, and what is said of them.
+#: Classical filters and the control of the kernel, and those with that kernel.
 PLAIN = ("Toksvig", "LEAN", "baked", "kernel")
 COMBINED = ("LEAN, kernel", "baked, kernel")
 
@@ -210,7 +210,7 @@ def _classical(own: Curves) -> list[str]:
         wins = known[label]["C"]["mean_db"] > ours
         verdict = "wins" if wins else "loses"
         where = f"it is ahead on level {enumeration(ahead)}" if ahead else "on no level is it ahead"
-        lines.append(f"{own.name}: uncompressed mip maps with {label} {'of the truth ' * (',' in label)}{verdict} "
+        lines.append(f"{own.name}: uncompressed mip maps with {label} {verdict} "
                      f"against C ({known[label]['C']['mean_db']:.2f} to {ours:.2f} dB); {where}")  # fmt: skip
     return lines
 
