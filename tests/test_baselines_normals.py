@@ -184,30 +184,6 @@ def test_lean_is_the_mean_of_what_it_filters(types, rng, sigmas):
     assert error < 0.1 and error < 0.5 * without
 
 
-def test_kernel_of_the_truth(types, rng):
-    """Means of what is interpolated between texels, by hand, at all levels; normals keep their directions."""
-    source = material(rng.normal(0, 0.3, (16, 16, 2)))
-    pyramid = normals.boxed(source, types, ("repeat", "repeat"))
-    base = normals.unit_normals(source)
-    fine = 32
-    x = (np.arange(16 * fine) + 0.5) / fine - 0.5
-    lower = np.floor(x).astype(int)
-    weight = (x - lower)[:, None, None]
-    rows = base[lower % 16] * (1 - weight) + base[(lower + 1) % 16] * weight
-    rows = rows.swapaxes(0, 1)
-    image = (rows[lower % 16] * (1 - weight) + rows[(lower + 1) % 16] * weight).swapaxes(0, 1)
-    for level in range(4):
-        size, n = 16 >> level, fine << level
-        expected = image.reshape(size, n, size, n, 3).mean(axis=(1, 3))
-        expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
-        centres = (np.arange(size) + 0.5) / size
-        v, u = (a.ravel() for a in np.meshgrid(centres, centres, indexing="ij"))
-        place = lanes(types, u, v, level)
-        found = values(surface_of(pyramid, pyramid.filtered(*place[:3])).normal)
-        found /= np.linalg.norm(found, axis=-1, keepdims=True)
-        np.testing.assert_allclose(found.reshape(size, size, 3), expected, atol=2e-3)
-
-
 def test_baked_roughness(types, rng):
     """Of a surface that is flat it is its own, as on level 0; that of slopes is larger on coarser levels."""
     flat = material(rng.normal(0, 1e-3, (16, 16, 2)), 0.42, metallic=1.0)

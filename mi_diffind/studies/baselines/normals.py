@@ -10,11 +10,11 @@ Each takes the maps of a material at every level of detail, uncompressed, and gi
   Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased Displacement and
   Reflectance Mapping*, 2013);
 - :func:`baked`: each texel of each level has the roughness with which it looks most like the converged truth;
-- :func:`biased`, :func:`boxed`: the same with another kernel. What filtered parameters gain by it is no matter of
-  shading.
+- :func:`biased`: any of these at other levels of detail, chosen on training pairs: what filtered parameters gain by it
+  is a matter of the filter's kernel, not of shading.
 
-The first three know the source's moments, not compressed ones. A GGX lobe has no variance of slopes; what is said of
-one is that of the Beckmann lobe of the same α, which is α²/2 along each axis.
+Toksvig's and LEAN's know the source's moments, not compressed ones. A GGX lobe has no variance of slopes; what is said
+of one is that of the Beckmann lobe of the same α, which is α²/2 along each axis.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 
-from ... import metrics
 from ...indirection import aligned
 from ...lookup import clamp
 from ...maps.layout import FROM_NORMAL, Layout, MapLayout
@@ -196,7 +195,7 @@ def toksvig_alpha2(alpha2, length):
 def toksvig(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> Reader:
     """
     Roughness from the length of the mean normal (:func:`toksvig_alpha2`), which is read unnormalised. ``smooth``: the
-    mean is over what is :func:`interpolated` between texels, as the truth has it; ``pyramid`` then is :func:`boxed`.
+    mean is over what is :func:`interpolated` between texels, as the truth has it.
     """
     if unit_normals(source) is None:
         return filtered(pyramid, effects)
@@ -310,11 +309,9 @@ def roughness_reader(pyramid: Pyramid, effects: Effects, levels: Sequence[np.nda
     return read
 
 
-def baked(
-    pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray] | None = None, truth: Pyramid | None = None
-) -> Reader:
+def baked(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray] | None = None) -> Reader:
     """Filtered parameters with roughness as :func:`bake` has it, made now unless its ``levels`` are given."""
-    return roughness_reader(pyramid, effects, bake(pyramid, effects, truth=truth) if levels is None else levels)
+    return roughness_reader(pyramid, effects, bake(pyramid, effects) if levels is None else levels)
 
 
 def directions(types, count: int = PAIRS, seed: int = SEED) -> list[tuple]:
@@ -327,12 +324,12 @@ def directions(types, count: int = PAIRS, seed: int = SEED) -> list[tuple]:
     return [(uniform_hemisphere(types, a, b), uniform_hemisphere(types, c, d)) for a, b, c, d in made]
 
 
-def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS, truth: Pyramid | None = None) -> list[np.ndarray]:
+def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndarray]:
     """
     The roughness, ``(height, width)`` for each level, with which filtered parameters at a texel's centre look most like
     the converged truth: the least squares of values clipped to [0, 1], over ``pairs`` of a view and a light. It is
     never below what is filtered (where light is lost, least squares would have no highlight at all), and the same on
-    level 0. ``truth``: the source's pyramid, if ``pyramid`` is another one.
+    level 0.
     """
     types, found = pyramid.types, [np.array(roughness_of(pyramid)[0])]
     Float, UInt32 = types.Float, types.UInt32
@@ -358,9 +355,7 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS, truth: Pyramid 
             dr.eval(surface.albedo, surface.normal, surface.roughness, surface.metallic)
             total = dr.zeros(Float, count * tried)
             for wi, wo in made:
-                wanted = reference(
-                    "converged", truth or pyramid, u, v, detail, *_wide(count, wi, wo), effects, side=side
-                )
+                wanted = reference("converged", pyramid, u, v, detail, *_wide(count, wi, wo), effects, side=side)
                 wanted = dr.gather(types.Array3f, dr.clip(wanted, 0, 1), place)
                 got = dr.clip(shaded(None, surface, *_wide(count * tried, wi, wo), effects), 0, 1)
                 total += dr.squared_norm(got - wanted)
@@ -488,35 +483,3 @@ def choose_biases(read: Reader, pyramid: Pyramid, effects: Effects, places: int 
             errors.append(float(dr.mean(dr.squared_norm(dr.clip(got, 0, 1) - truth))[0]))
         found.append(float(BIASES[int(np.argmin(errors))]))
     return found
-
-
-def smoothed(base: np.ndarray, border) -> np.ndarray:
-    """
-    A level 0, ``(height, width, k)``, with (1, 6, 1)/8 along both axes: the means over texels of what is interpolated
-    between their centres. Its own means over 2^L × 2^L texels are those of the interpolated values, too.
-    """
-    for axis, way in enumerate(border):
-        width = [(1, 1) if i == axis else (0, 0) for i in range(base.ndim)]
-        padded = np.pad(base, width, "wrap" if way == "repeat" else "edge")
-        n = base.shape[axis]
-        before, after = (np.take(padded, np.arange(n) + i, axis) for i in (0, 2))
-        base = 0.75 * base + 0.125 * (before + after)
-    return base
-
-
-def boxed(source: Source, types, border) -> Pyramid:
-    """
-    The mip pyramid of a source under the kernel of the converged truth: its footprint is a square in which level 0 is
-    interpolated, where a mip map has plain means of texels.
-    """
-    maps = []
-    for m in source.maps:
-        if m.kind == "normal" and m.channels == 3:
-            values = 0.5 + 0.5 * smoothed(unit_normals(source), border)
-        elif m.color_space == "srgb":
-            values = metrics.srgb(smoothed(metrics.linear(m.values.astype(np.float64)), border))
-        else:
-            values = smoothed(m.values.astype(np.float64), border)
-        maps.append(replace(m, values=values.astype(np.float32), depth=4))
-    changed = replace(source, maps=tuple(maps))
-    return Pyramid.of(changed, types=types, border=border)
