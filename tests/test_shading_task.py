@@ -1,5 +1,6 @@
 """``fit shading``, in sample mode: what a material looks like, references, limited derivatives, training, command."""
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -464,18 +465,21 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
         (["--lambda", "1.5"], "argument --lambda: found '1.5', allowed are numbers from 0 to 1"),
         (["--clip", "-1"], "argument --clip: found '-1', allowed are positive numbers and none"),
         (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size"),
+        (["--spp", "4"], "--spp: is for a scene, found "),
     ],
 )
 def test_bad_arguments_are_one_sentence(manifest, tmp_path, capsys, changed, message):
-    with pytest.raises(SystemExit) if changed[0] != "--start" else _none():
+    with pytest.raises(SystemExit) if "argument" in message else contextlib.nullcontext():
         assert main(["fit", "shading", str(manifest), "-o", str(tmp_path / "x.npz"), *changed]) == 2
     assert message in capsys.readouterr().err
 
 
-def _none():
-    import contextlib
-
-    return contextlib.nullcontext()
+def test_arguments_of_materials_are_refused_for_scenes(tmp_path, capsys):
+    command = ["fit", "shading", "room.xml", "-o", str(tmp_path / "x.npz")]
+    assert main([*command, "--clip", "1"]) == 2
+    assert "--clip: is for the maps of a material, found room.xml" in capsys.readouterr().err
+    assert main([*command, "--preset", "paper"]) == 2
+    assert "--preset: found paper, a scene's texture is trained on as it was made" in capsys.readouterr().err
 
 
 def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):

@@ -74,7 +74,8 @@ class Shading(Task):
         ),
         Argument(
             "--clip", type=_bound, metavar="X",
-            help="bound of the derivatives of a sample's error through the specular lobe, or none (default: 0.1)",
+            help="bound of the derivatives of a sample's error through the specular lobe, or none "
+            f"(default: {', '.join(f'{r.clip:g} for {name}' for name, r in PRESETS.items())})",
         ),
         Argument(
             "--reference", choices=REFERENCES,

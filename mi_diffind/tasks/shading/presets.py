@@ -24,7 +24,7 @@ class Recipe:
     """
 
     share: float = 0.9
-    clip: float | None = 0.1
+    clip: float | None = 1.0
     reference: str = "jittered"
     bounded: bool = True
     texture: str = "ours"
@@ -34,13 +34,13 @@ class Recipe:
 #: Steps of a training that is not told how long it may take.
 STEPS = 600
 
-_OURS = FitSettings(steps=STEPS, batch=2**16, lr=1.5e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10)
+_OURS = FitSettings(steps=STEPS, batch=2**16, lr=3e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10)
 
 #: The first is the default. The paper's λ is 0.1 or 0.25, by its scene.
 PRESETS = {
     "ours": Recipe(settings=_OURS),
     "paper": Recipe(
-        share=0.25, reference="prefiltered", bounded=False, texture="paper",
+        share=0.25, clip=0.1, reference="prefiltered", bounded=False, texture="paper",
         settings=dataclasses.replace(_OURS, lr=1e-3, schedule="constant", loss="mae"),
     ),
 }  # fmt: skip
