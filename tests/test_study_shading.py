@@ -50,6 +50,7 @@ def history(losses, values):
         ({"history": history([1, 1, 1], [20, 23, 22])}, ["drift"]),
         ({"C": {"mean_db": 19.0}}, ["below"]),
         ({"C": {"mean_db": float("nan")}}, ["nan"]),
+        ({"history": []}, ["diverged"]),
     ],
 )
 def test_trouble(changes, trouble):
@@ -101,7 +102,7 @@ def test_sentences(result):
         "uncompressed mip maps with LEAN wins against C (24.00 to 22.88 dB); it is ahead on level 0 (+1.00 dB)" in text
     )
     assert "lambda 0.9: both remedies gives +4.88 dB against C" in text
-    last = f"{conclusions.WITHOUT}: of 2 runs with lambda > 0, 0 met a NaN, 2 were restarted"
+    last = f"{conclusions.WITHOUT}: of 2 runs with lambda > 0, 0 met a NaN, 0 were given up, 2 were restarted"
     assert lines[-1].startswith(last) and lines[-1].endswith("1 ended below lambda = 0")
     rows = conclusions.table(result)
     assert rows[0].startswith("m ") and any(r.endswith("restarts 2, below 1") for r in rows)

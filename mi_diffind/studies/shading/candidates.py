@@ -13,9 +13,10 @@ at other levels of detail, those with which it errs least; λ = 0 is read so, to
 *Errors* are those of :class:`mi_diffind.tasks.shading.evaluation.Evaluation`: PSNR of shaded values and FLIP, under
 views and lights of no training, against C, converged, and P, the paper's reference. *Flicker*: :mod:`.motion`.
 
-A run is in *trouble* if its loss became NaN or exploded, so that it was restarted (``restarts``); if a measurement was
-not finite (``nan``); if the loss was above ten times its median (``spike``); if in the end it was worse than on the
-way (``drift``, more than :data:`DRIFT` dB); or if it ends below λ = 0 of the same seed (``below``).
+A run is in *trouble* if its loss became NaN or exploded, so that it was restarted (``restarts``), or given up
+(``diverged``: what counts then is where it started from); if a measurement was not finite (``nan``); if the loss was
+above ten times its median (``spike``); if in the end it was worse than on the way (``drift``, more than :data:`DRIFT`
+dB); or if it ends below λ = 0 of the same seed (``below``).
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ import mitsuba as mi
 import numpy as np
 
 from ...files import replacing
+from ...fitting import FitResult
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, SourceError, load_source
 from ...measure.store import file_name
 from ...measure.study import Candidate, Job, Plan
 from ...runtime import array_module
-from ...settings import FitSettings
+from ...settings import FitSettings, FittingError
 from ...tables import Table, save_table
 from ...tasks import task
 from ...tasks.shading import presets
@@ -48,6 +50,7 @@ from ...tasks.shading.training import fit_shading, start_of
 from ...tasks.texture import presets as texture_presets
 from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
+from ...tasks.texture.fit import size_of
 from ..baselines import normals
 from . import pictures
 from .conclusions import conclusions, table
@@ -190,8 +193,6 @@ class Setting:
 
     def texture(self, pyramid: Pyramid, length: float, seed: int, progress: bool) -> tuple:
         """A training of task 4, on a pyramid in place of the source's: the table and the run's record."""
-        from ...tasks.texture.fit import size_of
-
         request = self.training(self.recipe.settings, length, seed, progress)
         recipe = dataclasses.replace(self.recipe, settings=request.settings)
         nbytes = self.source.nbytes / self.request.compression
@@ -224,7 +225,7 @@ class _Made(Job):
 
 @dataclass
 class _Classical(_Made):
-    """A classical filter, uncompressed; ``make`` its reader. ``baked`` is the file of a roughness that was fitted."""
+    """A classical filter, uncompressed: ``make`` its reader; it needs ``channels`` beyond the maps of a mip map."""
 
     label: str = ""
     make: Callable[[Path | None], Reader] = lambda folder: None
@@ -318,7 +319,10 @@ class _Run(_Trained):
         clip = (own.clip or CLIP) if self.way.clip else None
         recipe = dataclasses.replace(own, share=self.share, clip=clip, settings=request.settings)
         net = start_of(self.start.table, setting.pyramid)
-        made, result = fit_shading(setting.source, net, recipe, request, setting.pyramid, setting.evaluation)
+        try:
+            made, result = fit_shading(setting.source, net, recipe, request, setting.pyramid, setting.evaluation)
+        except FittingError:  # it diverged again and again: nothing was gained over where it started from
+            made, result = self.start.table, FitResult({}, 0, 0, 0.0, False, 0, [])
         details = {"kind": "run", "share": self.share, "clip": self.way.clip, "schedule": self.way.schedule,
                    "seed": self.seed, "way": self.way.name}  # fmt: skip
         record = self.trained(folder, made, result, begin, **details)
@@ -354,6 +358,8 @@ class _Shifted(_Made):
 def troubles(details: dict, base: dict | None) -> list[str]:
     """What went wrong in a run, in words (see above); ``base`` is λ = 0 of the same seed."""
     history, found = details["history"], []
+    if not history:
+        found.append("diverged")
     numbers = [v for h in history for k, v in h.items() if k != "step" and v is not None]
     if not np.isfinite(np.asarray([*numbers, details["C"]["mean_db"]], float)).all():
         found.append("nan")

@@ -142,16 +142,21 @@ def conclusions(result: dict) -> list[str]:
             for d in ds]  # fmt: skip
     for way in dict.fromkeys(way for way, _, _ in runs):
         of_way = [d for w, _, d in runs if w == way]
-        kinds = {word: sum(word in d["trouble"] for d in of_way) for word in ("nan", "restarts", "spike", "drift",
-                                                                              "below")}  # fmt: skip
+        kinds = {word: sum(word in d["trouble"] for d in of_way) for word in _WORDS}
         text = enumeration([f"{n} {_WORDS[word]}" for word, n in kinds.items()])
         lines.append(f"{way}: of {len(of_way)} runs with lambda > 0, {text}")
     return lines
 
 
 #: Kinds of trouble, as a sentence about so many runs has them.
-_WORDS = {"nan": "met a NaN", "restarts": "were restarted", "spike": "had a loss above ten times its median",
-          "drift": "ended below their best state", "below": "ended below lambda = 0"}  # fmt: skip
+_WORDS = {
+    "nan": "met a NaN",
+    "diverged": "were given up",
+    "restarts": "were restarted",
+    "spike": "had a loss above ten times its median",
+    "drift": "ended below their best state",
+    "below": "ended below lambda = 0",
+}
 
 
 def _gains(own: Curves) -> list[str]:
