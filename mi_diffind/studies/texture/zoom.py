@@ -73,7 +73,7 @@ class Zoom:
 
     def aligned(self, frames: np.ndarray) -> np.ndarray:
         """What the points look like, ``(frames, n, 3)``."""
-        return np.stack([_bilinear(image, self.places(k)) for k, image in enumerate(frames)])
+        return np.stack([bilinear(image, self.places(k)) for k, image in enumerate(frames)])
 
 
 def flicker(frames: np.ndarray) -> float:
@@ -81,7 +81,7 @@ def flicker(frames: np.ndarray) -> float:
     return float(np.var(frames, axis=0, dtype=np.float64).mean())
 
 
-def _bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+def bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     height, width = image.shape[:2]
     position = places - 0.5
     lower = np.floor(position).astype(int)

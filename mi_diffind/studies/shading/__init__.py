@@ -1,0 +1,92 @@
+"""
+``tradeoff shading``: textures that are trained for what they look like when they are shaded, for several weights λ of
+that, beside textures that are not, and beside classical filters of normals: the paper's figure 2. :mod:`.candidates`
+says more.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from ...arguments import positive
+from ...measure.study import Plan, Study
+
+#: λ of the paper's figure 2.
+LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from 0 to 1")
+    return value
+
+
+class ShadingStudy(Study):
+    """Quality of shaded images against the weight of the shading loss, with and without its remedies."""
+
+    name = "shading"
+    title = "textures trained for their shading, by the weight of that, and classical filters of normals"
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument(
+            "materials", nargs="*", default=[], metavar="MATERIAL.json|NAME",
+            help="manifests of maps, or names of materials that are made: hammered, weave, lacquer "
+            "(default: scenes/assets/tiles.json, if it is there, and these; --quick: hammered)",
+        )  # fmt: skip
+        parser.add_argument("--lambda", action="append", type=_share, dest="lambdas", metavar="X",
+                            help="weight of the shading loss; may be repeated; 0 is always among them (default: "
+                            "0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1; --quick: 0, 0.9)")  # fmt: skip
+        parser.add_argument("--seeds", type=positive, metavar="N", help="of each training (default: 3; --quick: 1)")
+        parser.add_argument("--seconds", type=positive, metavar="N",
+                            help="of training for shading (default: 15; --quick: 1)")  # fmt: skip
+        parser.add_argument("--pretrain-seconds", type=positive, metavar="N",
+                            help="of training as a texture, before (default: 20; --quick: 1)")  # fmt: skip
+        parser.add_argument("--steps", type=positive, metavar="N",
+                            help="of training for shading in place of seconds, which repeats on any machine; "
+                            "--pretrain-steps needs to be given, too")  # fmt: skip
+        parser.add_argument("--pretrain-steps", type=positive, metavar="N", help="of training as a texture")
+        parser.add_argument("--compression", default="12x", metavar="N", help="of all trainings (default: 12x)")
+        parser.add_argument("--remedies", choices=("all", "both", "on"), default="all",
+                            help="clipped derivatives and a falling rate: all four combinations, both or none, or both "
+                            "only (default: all)")  # fmt: skip
+        parser.add_argument("--side", type=positive, metavar="N",
+                            help="texels along each side of what is made (default: 512; --quick: 64)")  # fmt: skip
+        parser.add_argument("--frames", type=positive, metavar="N", help="of the zoom (default: 60; --quick: 4)")
+
+    def check(self, arguments) -> None:
+        """Also reads the materials, before anything is made of them; raises what :func:`.load_source` does."""
+        from ...sizes import parse_compression
+        from .candidates import materials_of
+
+        if (arguments.steps is None) != (arguments.pretrain_steps is None):
+            raise ValueError("--steps and --pretrain-steps: one is given, both or none are allowed")
+        if arguments.steps and (arguments.seconds or arguments.pretrain_seconds):
+            raise ValueError("--steps: given beside seconds, one of them is allowed")
+        arguments.ratio = parse_compression(arguments.compression)
+        arguments.loaded = materials_of(arguments.materials, arguments.side or (64 if arguments.quick else 512),
+                                        arguments.quick)  # fmt: skip
+
+    def plan(self, arguments) -> Plan:
+        from .candidates import WAYS, Request, plan
+
+        quick = arguments.quick
+        ways = {"all": WAYS, "both": (WAYS[0], WAYS[-1]), "on": WAYS[:1]}[arguments.remedies]
+        request = Request(
+            tuple(sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))})),
+            ways[:: len(ways) - 1] if quick and len(ways) > 1 else ways,
+            arguments.seeds or (1 if quick else 3),
+            float(arguments.steps or arguments.seconds or (1 if quick else 15)),
+            float(arguments.pretrain_steps or arguments.pretrain_seconds or (1 if quick else 20)),
+            arguments.ratio,
+            arguments.frames or (4 if quick else 60),
+            quick,
+            "steps" if arguments.steps else "s",
+        )
+        return plan(arguments.loaded, request)
+
+
+STUDY = ShadingStudy()

@@ -1,0 +1,106 @@
+"""
+Materials to study, made by arithmetic from a seed: what shading-aware training is for, in three kinds.
+
+All maps are 8-bit, as files have them, and repeat. ``hammered`` is a metal with texel-scale normals and rust, where it
+is none; ``weave`` is a fabric of two colours of yarn; ``lacquer`` is a glossy dielectric with a pattern under a coat
+that is not quite even.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ...maps.source import Source, from_arrays
+
+#: Texels along each side.
+SIDE = 512
+
+
+def noise(rng, side: int, slope: float, low: float = 1.0, high: float = 1e9) -> np.ndarray:
+    """
+    A random field that repeats, mean 0 and variance 1, ``(side, side)``: amplitudes fall with the frequency to the
+    power of ``slope``, none are below ``low`` or above ``high`` periods along the side.
+    """
+    f = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None]) * side
+    spectrum = np.where((f >= low) & (f <= high), np.maximum(f, 1) ** -slope, 0)
+    field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((side, side))) * spectrum, (side, side))
+    return (field - field.mean()) / field.std()
+
+
+def normals(height: np.ndarray, strength: float) -> np.ndarray:
+    """Unit normals, ``(side, side, 3)``, of a height that repeats, whose slopes get that standard deviation."""
+    rows = 0.5 * (np.roll(height, -1, 0) - np.roll(height, 1, 0))
+    columns = 0.5 * (np.roll(height, -1, 1) - np.roll(height, 1, 1))
+    scale = strength / max(np.sqrt(0.5 * (rows.var() + columns.var())), 1e-9)
+    n = np.stack([-scale * columns, -scale * rows, np.ones_like(height)], axis=-1)
+    return n / np.linalg.norm(n, axis=-1, keepdims=True)
+
+
+def _step(x: np.ndarray, at: float, width: float) -> np.ndarray:
+    t = np.clip((x - at) / width + 0.5, 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _mixed(a, b, share: np.ndarray) -> np.ndarray:
+    return np.asarray(a) * (1 - share[..., None]) + np.asarray(b) * share[..., None]
+
+
+def hammered(side: int, seed: int = 1) -> dict[str, np.ndarray]:
+    """Metal with bumps of all sizes down to a texel, scratches along one axis, and rust in places."""
+    rng = np.random.default_rng(seed)
+    rust = _step(noise(rng, side, 1.6, 2, side / 8), 1.0, 0.5)
+    scratches = np.tile(noise(rng, side, 0.3, 4)[:1], (side, 1)) * _step(noise(rng, side, 1.5, 2, 24), 0.0, 1.0)
+    grain = noise(rng, side, 0.2, side / 6)
+    bumps = noise(rng, side, 2.2, 3, side / 6)
+    height = bumps * side / 60 + 0.35 * scratches + (0.5 + 0.7 * rust) * grain
+    tone = 1 + 0.08 * noise(rng, side, 1.0, 2)
+    colour = _mixed([0.86, 0.72, 0.48], [0.42, 0.20, 0.10], rust) * tone[..., None]
+    roughness = 0.40 + 0.06 * noise(rng, side, 1.2, 2) + 0.35 * rust
+    return {"albedo": colour, "normal": normals(height, 0.2), "roughness": roughness, "metallic": 1 - rust}
+
+
+def weave(side: int, seed: int = 2) -> dict[str, np.ndarray]:
+    """Plain weave, eight texels a yarn: round yarns that pass over and under each other, with fibres along them."""
+    rng = np.random.default_rng(seed)
+    yarn = 8
+    y, x = np.mgrid[:side, :side] + 0.5 + yarn / 2
+    phase_x, phase_y = np.pi * x / yarn, np.pi * y / yarn
+    across, along = np.abs(np.sin(phase_x)) ** 0.7, np.abs(np.sin(phase_y)) ** 0.7
+    odd = ((x // yarn + y // yarn) % 2).astype(float)
+    over = _step(odd + 0.3 * (along - across), 0.5, 0.4)
+    fibres = noise(rng, side, 0.2, side / 8)
+    height = yarn * 0.35 * np.where(over > 0.5, across, along) + 0.4 * fibres
+    pattern = (((x // (8 * yarn)) + (y // (8 * yarn))) % 2).astype(float)
+    warp = _mixed([0.14, 0.20, 0.42], [0.45, 0.10, 0.12], pattern)
+    colour = warp * (1 - over[..., None]) + np.array([0.78, 0.74, 0.64]) * over[..., None]
+    colour = colour * (1 + 0.12 * fibres + 0.06 * noise(rng, side, 1.0, 2))[..., None]
+    roughness = 0.62 + 0.06 * noise(rng, side, 0.8, 4) + 0.12 * (1 - over)
+    return {"albedo": colour, "normal": normals(height, 0.5), "roughness": roughness}
+
+
+def lacquer(side: int, seed: int = 3) -> dict[str, np.ndarray]:
+    """Rings of dark wood under a gloss that has orange peel and dust in it."""
+    rng = np.random.default_rng(seed)
+    rings = 0.5 + 0.5 * np.sin(10 * noise(rng, side, 2.2, 1, 12) + 0.6 * noise(rng, side, 1.0, 4))
+    colour = _mixed([0.30, 0.13, 0.06], [0.58, 0.34, 0.16], rings)
+    dust = _step(noise(rng, side, 0.0, side / 8), 2.2, 0.6)
+    height = noise(rng, side, 1.0, side / 24, side / 5) + 2 * dust
+    roughness = 0.28 + 0.04 * noise(rng, side, 1.0, 2) + 0.25 * dust
+    return {"albedo": colour, "normal": normals(height, 0.2), "roughness": roughness}
+
+
+#: Name → what makes the maps, linear floats, of a side.
+MADE: dict[str, Callable[[int], dict[str, np.ndarray]]] = {"hammered": hammered, "weave": weave, "lacquer": lacquer}
+
+
+def made(name: str, side: int = SIDE) -> Source:
+    """One of :data:`MADE` as a source of 8-bit maps: albedo sRGB-encoded, normals as (n + 1)/2."""
+    from ...metrics import srgb
+
+    found = {}
+    for key, values in MADE[name](side).items():
+        values = srgb(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values
+        found[key] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return from_arrays(found)
