@@ -176,10 +176,62 @@ def texture_memory() -> str:
     return table([f"{found['count']} textures of {found['side']}²", "MiB", "times less"], rows)
 
 
+def shading_curves(study: str) -> dict:
+    """What the study of shading found, by material."""
+    from mi_diffind.studies.shading.conclusions import curves
+
+    return curves(measured(study))
+
+
+def shading_filters(study: str) -> str:
+    """Trained for the shading beside filters that are not learned, and a texture that is not trained for it."""
+    from mi_diffind.studies.shading.conclusions import COMBINED, PLAIN
+
+    rows = []
+    for name, own in shading_curves(study).items():
+        kinds = [(f"{label}, uncompressed", [own.classical[label]]) for label in ("filtered", *PLAIN, *COMBINED)
+                 if label in own.classical]  # fmt: skip
+        kinds += [(label, [details]) for label, details in own.compressed.items()]
+        way, best = own.best()
+        kinds += [("texture, λ = 0", own.runs[way, 0.0]), (f"trained, λ = {best:g}", own.runs[way, best])]
+        for label, found in kinds:
+            cells = [f"{mean(d['C']['mean_db'] for d in found):.2f}", f"{mean(d['C']['coarse_db'] for d in found):.2f}"]
+            cells += [f"{mean(mean(d['C']['flip']) for d in found):.3f}"]
+            cells += [f"{mean(d['C']['psnr_db'][level] for d in found):.1f}" for level in range(6)]
+            cells += [f"{mean(d['P']['mean_db'] for d in found):.2f}"]
+            rows.append([name, label, *cells])
+    head = ["material", "", "C, dB", "C, L2 on", "FLIP", *(f"L{i}" for i in range(6)), "P, dB"]
+    return table(head, rows)
+
+
+def shading_shares(study: str) -> str:
+    """The paper's figure 2: quality by λ, with the spread over seeds."""
+    rows = []
+    for name, own in shading_curves(study).items():
+        for way in own.ways:
+            for letter in "CP":
+                cells = []
+                for share in own.shares(way):
+                    values = own.values(way, share, letter)
+                    spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
+                    cells.append(f"{mean(values):.2f}{spread}")
+                rows.append([name, way, letter, *cells])
+    shares = max((own.shares(way) for own in shading_curves(study).values() for way in own.ways), key=len)
+    return table(["material", "", "", *(f"λ {share:g}" for share in shares)], rows)
+
+
+def mean(values) -> float:
+    """The mean of an iterable."""
+    values = list(values)
+    return sum(values) / len(values)
+
+
 TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_pages, texture_memory, texture_presets)}
 for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
+for make in (shading_filters, shading_shares):
+    TABLES[make.__name__] = lambda make=make: make("tradeoff_shading")
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
 

@@ -118,8 +118,9 @@ def fit_in_scene(request: Request) -> Fitted:
     options = request.options
     views, recipe = views_of(options, request.settings.seed), scene_recipe_of(options, request.settings)
     table, result = fit_scene(
-        options["source"], views, recipe, request, options["texture"], options["references"], preview_of(request)
-    )
+        options["source"], views, recipe, request, options["texture"], options["references"], preview_of(request),
+        dict(options["defines"] or ()),
+    )  # fmt: skip
     figures = {
         "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
         "bits": {name: a.bits for name, a in table.arrays.items()},

@@ -47,6 +47,14 @@ def bound(text: str) -> float | None:
     return found
 
 
+def define(text: str) -> tuple[str, str]:
+    """``NAME=VALUE``. Raises ``ArgumentTypeError``."""
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected NAME=VALUE")
+    return name, value
+
+
 _OWN = SceneRecipe()
 _NEGATIVE = "if the first number is negative, write --azimuth=-30:30"
 
@@ -81,6 +89,9 @@ RECIPE = (
 )  # fmt: skip
 
 FILES = (
+    Argument(
+        "-D", dest="defines", action="append", type=define, metavar="NAME=VALUE", help="set a <default> of the scene"
+    ),
     Argument("--texture", metavar="FILE.npz", help="which file of the scene's textures (default: the only one)"),
     Argument("--references", metavar="FOLDER", help="keep the references there, to go on with"),
     Argument("--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"),
