@@ -16,7 +16,7 @@ from mi_diffind.cli import main
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
 STORED = [
-    *(SCENES / f"{name}.xml" for name in ("horizon", "materials", "metals", "still_life", "tiles")),
+    *(SCENES / f"{name}.xml" for name in ("horizon", "materials", "metals", "rust", "still_life", "tiles")),
     TESTS / "lamp.xml",
 ]
 
