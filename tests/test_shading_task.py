@@ -304,7 +304,7 @@ def start(ad, tmp_path_factory):
     path = tmp_path_factory.mktemp("shading") / "start.npz"
     save_table(path, table)
     effects, _ = material.effects_of(pyramid.layout)
-    evaluation = Evaluation(pyramid, effects, levels=4, pairs=6, side=16)
+    evaluation = Evaluation(pyramid, effects, levels=4, pairs=24, side=16)
     return source, pyramid, TEXTURE.load(path), evaluation, path, size
 
 
@@ -314,8 +314,9 @@ def quick(**changed):
     return dataclasses.replace(OURS, settings=dataclasses.replace(OURS.settings, **settings), **changed)
 
 
-def trained(start, ad, recipe, **request):
+def trained(start, ad, recipe, measured=True, **request):
     source, pyramid, table, evaluation, *_ = start
+    evaluation = evaluation if measured else None
     net = training.start_of(table, pyramid)
     asked = Request("ours", recipe.settings, ad, progress=False, **request)
     return training.fit_shading(source, net, recipe, asked, pyramid, evaluation)
@@ -342,11 +343,20 @@ def test_training_for_shading_gains(start, ad):
         assert np.array_equal(arrays[name].numpy(), values)
 
 
+def test_a_training_that_loses_keeps_its_start(start, ad):
+    """At a rate that destroys everything, what comes out is what went in."""
+    table = start[2]
+    found, _ = trained(start, ad, quick(steps=2, measure_every=2, lr=0.3))
+    assert found.settings["kept_start"]
+    for name, array in table.arrays.items():
+        assert np.array_equal(found.arrays[name].entries, array.entries)
+
+
 def test_share_zero_is_the_texture_alone(start, ad):
     """λ = 0 trains as task 4 does, entry by entry."""
     source, pyramid, table, *_ = start
     recipe = quick(share=0.0, steps=5)
-    found, _ = trained(start, ad, recipe)
+    found, _ = trained(start, ad, recipe, measured=False)  # else the start might be kept
     problem = textures.TextureProblem(training.start_of(table, pyramid), pyramid, TEXTURES["ours"], source.digest)
     from mi_diffind.fitting import fit
 
@@ -366,7 +376,7 @@ def test_training_can_be_resumed(start, ad, tmp_path):
 
     def measure(self, net):
         calls.append(1)
-        if len(calls) == 2:
+        if len(calls) == 3:  # the start, and the first two measurements
             raise Stop
         return problem_measure(self, net)
 
@@ -440,7 +450,7 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     mi = mi_rgb
     short = dataclasses.replace(TEXTURES["ours"].settings, steps=6, batch=4096, measure_every=6)
     monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], settings=short))
-    monkeypatch.setattr(shading_fit, "Evaluation", functools.partial(Evaluation, levels=4, pairs=6, side=16))
+    monkeypatch.setattr(shading_fit, "Evaluation", functools.partial(Evaluation, levels=4, pairs=24, side=16))
     # The same arrays as those of other tests, lest everything is compiled anew
     monkeypatch.setattr(shading_fit.texture_fit, "size_of", lambda *a: start[5])
     out, record = tmp_path / "metal.npz", tmp_path / "record.json"

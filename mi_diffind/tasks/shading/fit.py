@@ -33,6 +33,9 @@ def recipe_of(preset: str, settings, options) -> Recipe:
     return dataclasses.replace(own, settings=settings or own.settings, **given)
 
 
+#: Images that measure: of many views and lights, since a few that are almost mirrors decide what a PSNR is.
+PAIRS, SIDE = 32, 48
+
 #: Arguments that only a material has, and only a scene.
 OF_MATERIALS = ("compression", "bytes", "bpp", "start", "clip", "reference")
 OF_SCENES = tuple(argument for argument in SCENE_ARGUMENTS if argument.name != "preview")
@@ -82,7 +85,7 @@ def fit(request: Request) -> Fitted:
         own = dataclasses.replace(request, seconds=seconds if result is None or seconds is None else seconds / 2)
         if own.resume and not os.path.exists(own.checkpoint or ""):
             own.resume = False  # it was the training as a texture that was interrupted
-        evaluation = Evaluation(pyramid, effects)
+        evaluation = Evaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
         preview = preview_of(request)
         try:
             net = training.start_of(start, pyramid)
@@ -93,6 +96,8 @@ def fit(request: Request) -> Fitted:
         table = start
     table.settings["source_path"] = os.path.relpath(Path(options["source"]).resolve(), folder)
     lines = [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
+    if table.settings.get("kept_start"):
+        lines.append("training for the shading gained nothing: these are the arrays that it started from")
     lines += [f"left out: {effect} ({reason})" for effect, reason in reasons.items()]
     lines += [f"not shaded: {name} ({reason})" for name, reason in material.left_out(pyramid.layout).items()]
     figures = {

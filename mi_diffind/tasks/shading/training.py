@@ -133,19 +133,23 @@ def fit_shading(
     """
     Train the arrays ``start`` (:func:`start_of`) of ``source`` for its shading and return them as a table of the task
     ``texture``, with their errors as a texture and as shaded images of the ``evaluation``, and the run's record. Which
-    state is the best, other images of the same form decide. ``preview`` is a picture that is written at each
-    measurement.
+    state is the best, other images of the same form decide; it may be the one that the training started from (settings
+    ``kept_start``). ``preview`` is a picture that is written at each measurement.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
     validation = None if evaluation is None else evaluation.another()
     problem = ShadingProblem(start, pyramid, recipe, source.digest, validation)
+    first, before = textures.stored_form(start), {} if validation is None else problem.measure(start)
     problem.preview = preview
     result = request.train(problem, "shading")
+    kept = any(before[name] > result.measured[name] for name in list(before)[:1])
     identity = {k: v for k, v in problem.identity.items() if k not in ("form", "border")}
     settings = {**request.recorded(), **identity}
     if request.seconds is not None:
         settings["steps"] = result.steps
-    texture = CompressedTexture(pyramid.layout, textures.stored_form(problem.net))
+    if kept:
+        settings["kept_start"] = True
+    texture = CompressedTexture(pyramid.layout, first if kept else textures.stored_form(problem.net))
     table = to_table(texture, settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
     found = CompressedTexture.of(table, request.types.TensorXf).measure(source)
