@@ -157,6 +157,8 @@ def test_passes_of_references_repeat_to_the_last_bit(regress):
 #: What other variants of the same scenes show already, and what takes longest.
 SLOW = {
     ("horizon", "llvm_ad_mono"),
+    ("rust", "llvm_ad_mono"),
+    ("rust", "llvm_ad_spectral"),
     ("still_life", "llvm_ad_spectral"),
     ("still_life", "llvm_ad_mono"),
     ("metals", "llvm_ad_mono"),
