@@ -230,8 +230,9 @@ TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_pages, textur
 for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
-for make in (shading_filters, shading_shares):
-    TABLES[make.__name__] = lambda make=make: make("tradeoff_shading")
+for source in ("", "_boombox"):
+    for make in (shading_filters, shading_shares):
+        TABLES[make.__name__ + source] = lambda make=make, source=source: make("tradeoff_shading" + source)
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
 
