@@ -13,19 +13,22 @@ from .evaluation import Evaluation, Reader
 #: Levels that are shown, and how often a difference is amplified.
 LEVELS, AMPLIFIED = (0, 2, 4), 4
 
+#: Mean linear value of the image that is shown, about.
+BRIGHTNESS = 0.3
+
 #: Pixels along the side of each image, at least.
 PANEL = 192
 
 
 def write_preview(path: Path, evaluation: Evaluation, read: Reader) -> None:
     """
-    Write a picture of one view and light, those of the brightest images: for each of :data:`LEVELS` a row, and in it
-    the truth, what a reader shows, and their difference, amplified, as displayed.
+    Write a picture of one view and light, under which the material is neither dark nor glaring: for each of
+    :data:`LEVELS` a row, and in it the truth, what a reader shows, and their difference, amplified, as displayed.
     """
     import mitsuba as mi
 
     truths = evaluation.truths[next(iter(evaluation.truths))]
-    pair = int(np.clip(truths[0], 0, 1).mean(axis=(1, 2, 3)).argmax())
+    pair = int(np.abs(np.clip(truths[0], 0, 1).mean(axis=(1, 2, 3)) - BRIGHTNESS).argmin())
     rows, side = [], max(PANEL, *(max(size) for size in evaluation.sizes))
     for level in (i for i in LEVELS if i < evaluation.levels):
         truth, got = truths[level][pair], evaluation.images(read, level, [pair])[0]
