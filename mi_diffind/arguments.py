@@ -49,3 +49,14 @@ def natural(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is not a whole number ≥ 0")
     return value
+
+
+def fraction(text: str) -> float:
+    """A number from 0 to 1. Raises ``ArgumentTypeError``."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from 0 to 1")
+    return value

@@ -473,7 +473,7 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     "changed, message",
     [
         (["--lambda", "1.5"], "argument --lambda: found '1.5', allowed are numbers from 0 to 1"),
-        (["--clip", "-1"], "argument --clip: found '-1', allowed are positive numbers and none"),
+        (["--clip", "-1"], "argument --clip: found '-1', expected a positive number or none"),
         (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size"),
         (["--spp", "4"], "--spp: is for a scene, found "),
     ],

@@ -8,21 +8,11 @@ from __future__ import annotations
 
 import argparse
 
-from ...arguments import positive
+from ...arguments import fraction, positive
 from ...measure.study import Plan, Study
 
 #: λ of the paper's figure 2.
 LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
-
-
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from 0 to 1")
-    return value
 
 
 class ShadingStudy(Study):
@@ -37,7 +27,7 @@ class ShadingStudy(Study):
             help="manifests of maps, or names of materials that are made: hammered, weave, lacquer "
             "(default: scenes/assets/tiles.json, if it is there, and these; --quick: hammered)",
         )  # fmt: skip
-        parser.add_argument("--lambda", action="append", type=_share, dest="lambdas", metavar="X",
+        parser.add_argument("--lambda", action="append", type=fraction, dest="lambdas", metavar="X",
                             help="weight of the shading loss; may be repeated; 0 is always among them (default: "
                             "0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1; --quick: 0, 0.9)")  # fmt: skip
         parser.add_argument("--seeds", type=positive, metavar="N", help="of each training (default: 3; --quick: 1)")

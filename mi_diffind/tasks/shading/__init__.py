@@ -13,35 +13,14 @@ are the arrays of task 4, through frozen tables of task 2; the result is a file 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 
-from ...arguments import Argument
+from ...arguments import Argument, fraction
 from ..map_arguments import SIZES, SOURCES
 from ..task import Request, Task
 from .presets import PRESETS, REFERENCES
-from .scene_arguments import SCENE_ARGUMENTS
+from .scene_arguments import SCENE_ARGUMENTS, bound
 from .scene_recipe import SceneRecipe
-
-
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from 0 to 1")
-    return value
-
-
-def _bound(text: str) -> float:
-    try:
-        value = 0.0 if text == "none" else float(text)
-    except ValueError:
-        value = -1.0
-    if not (0 < value < float("inf") or text == "none"):
-        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are positive numbers and none")
-    return value
 
 
 def is_scene(source) -> bool:
@@ -68,12 +47,12 @@ class Shading(Task):
             help="arrays to start from, as written by fit texture (default: trained first, with half of --seconds)",
         ),
         Argument(
-            "--lambda", dest="share", type=_share, metavar="L",
+            "--lambda", dest="share", type=fraction, metavar="L",
             help="share of the loss of shaded values, 0 to 1 "
             f"(default: {', '.join(f'{r.share} for {name}' for name, r in PRESETS.items())})",
         ),
         Argument(
-            "--clip", type=_bound, metavar="X",
+            "--clip", type=bound, metavar="X",
             help="bound of the derivatives of a sample's error through the specular lobe, or none "
             f"(default: {', '.join(f'{r.clip:g} for {name}' for name, r in PRESETS.items())})",
         ),

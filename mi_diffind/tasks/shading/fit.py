@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from pathlib import Path
 
@@ -29,7 +30,7 @@ def recipe_of(preset: str, settings, options) -> Recipe:
     given = {"share": options["share"], "reference": options["reference"]}
     given = {k: v for k, v in given.items() if v is not None}
     if options["clip"] is not None:
-        given["clip"] = options["clip"] or None  # 0 means none
+        given["clip"] = None if options["clip"] == math.inf else options["clip"]
     return dataclasses.replace(own, settings=settings or own.settings, **given)
 
 
