@@ -96,7 +96,7 @@ class SceneProblem(Problem):
         """The loss of the render of the step's view: an array of the shares of all pixels."""
         seeds = rng.integers(mi.UInt32, 2, 0, SEEDS - 1)
         value, derivative = (dr.gather(mi.UInt32, seeds, i) for i in range(2))
-        self.scene.hold(self._seen(net))
+        self.scene.hold(self.texture.seen(unfolded(net)))
         self.scene.place(self.views[self._view])
         error = self.exposure * self.scene.render(value, derivative) - self.references[self._view]
         return self.errors(error.array) * (1 / math.prod(error.shape))
@@ -109,11 +109,6 @@ class SceneProblem(Problem):
         if bound is None:
             return dr.square(error)
         return dr.select(size < bound, dr.square(error), bound * (2 * size - bound))
-
-    def _seen(self, net):
-        """The arrays as training sees them, folded."""
-        net = unfolded(net)
-        return rounded(net) if self.texture.recipe.rounded else net
 
     def measure(self, net) -> dict[str, float]:
         """

@@ -54,11 +54,11 @@ class ShadingProblem(textures.TextureProblem):
         self.identity = {**self.identity, "shading": own}
 
     def loss(self, net, rng, size: int):
-        net, share = unfolded(net), self.shading.share
+        net, share = self.seen(unfolded(net)), self.shading.share
         losses = []
         if share < 1:
             inputs, targets = self.batch(rng, size)
-            outputs = self.predict(net, inputs)
+            outputs = self.read(net, inputs)
             for name, target in targets.items():
                 errors = [o - t for o, t in zip(outputs[name], target, strict=True)]
                 squared = self.recipe.settings.loss == "mse"
@@ -69,12 +69,11 @@ class ShadingProblem(textures.TextureProblem):
         return losses
 
     def shading_errors(self, net, rng, size: int):
-        """The error of each of ``size`` samples: of shaded values, the mean over three colours."""
+        """The error of each of ``size`` samples: of shaded values, the mean over colours; ``net`` as it is seen."""
         recipe, types = self.shading, self.types
         (u, v, level), (wi, wo) = self.places(rng, size), random_directions(rng, types, size)
         truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng)
         dr.eval(u, v, level, wi, wo, truth)
-        net = textures.rounded(net) if self.recipe.rounded else net
         surface = surface_of(self.pyramid, net.filtered(u, v, level))
         limit = None if recipe.clip is None else recipe.clip * recipe.share / size
         value = shaded(self.decoder, surface, wi, wo, self.effects, limit)

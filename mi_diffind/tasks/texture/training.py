@@ -132,8 +132,15 @@ class TextureProblem(Problem):
         return {name: [stored[i] for i in channels] for name, channels in self.groups.items()}
 
     def predict(self, net, inputs) -> dict[str, list]:
+        return self.read(self.seen(net), inputs)
+
+    def seen(self, net):
+        """The folded arrays as training sees them."""
+        return rounded(net) if self.recipe.rounded else net
+
+    def read(self, net, inputs) -> dict[str, list]:
+        """What arrays that are as training sees them have for the inputs of a batch."""
         u, v, level, footprint = inputs
-        net = rounded(net) if self.recipe.rounded else net
         if isinstance(net, PaperNet) and footprint is not None:
             return self._grouped(net.at_footprint(u, v, footprint))
         return self._grouped(net.filtered(u, v, level))
