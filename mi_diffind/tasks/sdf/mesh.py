@@ -44,8 +44,9 @@ class Mesh:
     int32, counter-clockwise from outside.
 
     ``watertight``: each edge is run through as often one way as the other, so that the winding number is a whole number
-    everywhere but on the surface and changes nowhere else. A point of the file is ``vertices · scale + centre``. ``digest`` is a SHA-256 over vertices and faces; ``warnings``
-    has a sentence for each thing that was repaired or is doubtful.
+    everywhere but on the surface and changes nowhere else. A point of the file is ``vertices · scale + centre``.
+    ``digest`` is a SHA-256 over vertices and faces; ``warnings`` has a sentence for each thing that was repaired or is
+    doubtful.
     """
 
     vertices: np.ndarray
@@ -119,7 +120,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
     """
     path = Path(path)
     if not path.is_file():
-        raise MeshError(f"{path}: {'is a folder, expected' if path.is_dir() else 'there is no such file, expected'} a mesh")
+        raise MeshError(f"{path}: {'is a folder' if path.is_dir() else 'there is no such file'}, expected a mesh")
     vertices, faces = _read(path)
     return make_mesh(vertices, faces, str(path))
 
