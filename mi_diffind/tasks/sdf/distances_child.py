@@ -46,9 +46,10 @@ def read(stream):
 class Queries:
     """What libigl is asked for, of one mesh. The trees are built when they are needed."""
 
-    #: Accuracy of the fast winding number; where it lies within ``DOUBT`` of a half, it is found once more with the
-    #: second accuracy (largest errors that were seen: 4e-3 and 1e-7).
-    ACCURACY, EXACT, DOUBT = 2.0, 64.0, 0.05
+    #: Accuracies of the fast winding number, and how near to a half its values are doubtful: those are found once more
+    #: with the next accuracy, in the end exactly. The largest errors that were seen are 0.23 and 0.013; the exact
+    #: number takes ten times as long.
+    ACCURACIES = ((1.0, 0.3), (2.0, 0.05))
 
     def __init__(self, vertices, faces):
         import igl
@@ -73,16 +74,26 @@ class Queries:
         return {"distance": self.nearest(points)["distance"]}
 
     def winding(self, points):
+        return {"winding": self._windings(points, self.ACCURACIES[-1:])}
+
+    def inside(self, points):
+        return {"inside": self._windings(points, self.ACCURACIES) >= 0.5}
+
+    def _windings(self, points, accuracies):
         import numpy as np
 
         if self.hierarchy is None:
             self.hierarchy = self.igl.FastWindingNumberBVH()
             self.hierarchy.init(self.vertices, self.faces)
-        found = np.array(self.hierarchy.winding_number(points, self.ACCURACY)).reshape(-1)
-        doubtful = np.flatnonzero(np.abs(np.abs(found) - 0.5) < self.DOUBT)
-        if len(doubtful):
-            found[doubtful] = self.hierarchy.winding_number(np.ascontiguousarray(points[doubtful]), self.EXACT)
-        return {"winding": found}
+        order = spatial_order(points)
+        found = np.empty(len(points))
+        for accuracy, doubt in accuracies:
+            found[order] = self.hierarchy.winding_number(np.ascontiguousarray(points[order]), accuracy)
+            order = order[np.abs(found[order] - 0.5) < doubt]
+        if len(order):
+            exact = self.igl.winding_number(self.vertices, self.faces, np.ascontiguousarray(points[order]))
+            found[order] = np.reshape(exact, -1)
+        return found
 
 
 def spatial_order(points):
