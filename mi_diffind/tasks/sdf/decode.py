@@ -54,7 +54,7 @@ def extract(field: Field, resolution: int, scale: float = 1.0, centre=(0.0, 0.0,
         return outside
 
     vertices, faces = march(layers, cells, OFF_NODE * spacing)
-    return _trimesh((lower + spacing * vertices) * scale + np.array(centre), faces)
+    return surface_of((lower + spacing * vertices) * scale + np.array(centre), faces)
 
 
 def grid(field: Field, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,7 +140,8 @@ def _spacing(field: Field, resolution: int) -> float:
     return float(np.max(np.array(field.upper) - np.array(field.lower))) / int(resolution)
 
 
-def _trimesh(vertices: np.ndarray, faces: np.ndarray):
+def surface_of(vertices: np.ndarray, faces: np.ndarray):
+    """Triangles as a ``trimesh.Trimesh``, as they are."""
     import trimesh
 
     return trimesh.Trimesh(vertices, faces, process=False, validate=False)

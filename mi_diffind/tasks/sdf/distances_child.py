@@ -3,7 +3,7 @@ The process in which libigl runs: a script of its own, since some meshes make li
 
 It reads requests from standard input and writes answers to standard output until its input ends, and imports NumPy and
 libigl only. A message is one line of JSON, a list of ``[name, dtype, shape]`` after the name of a request, and then the
-bytes of these arrays.
+bytes of these arrays. A name is a question and, after a space, which mesh it is about.
 """
 
 import contextlib
@@ -64,11 +64,10 @@ class Queries:
             self.tree = self.igl.AABB()
             self.tree.init(self.vertices, self.faces)
         order = spatial_order(points)
-        squared, face, closest = self.tree.squared_distance(self.vertices, self.faces, points[order])
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        distance = np.sqrt(np.maximum(squared, 0))[back]
-        return {"distance": distance, "face": face[back].astype(np.int32), "closest": closest[back]}
+        found = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points[order]))
+        distance, face, closest = np.empty(len(points)), np.empty(len(points), np.int32), np.empty_like(points)
+        distance[order], face[order], closest[order] = np.sqrt(np.maximum(found[0], 0)), found[1], found[2]
+        return {"distance": distance, "face": face, "closest": closest}
 
     def distance(self, points):
         return {"distance": self.nearest(points)["distance"]}
@@ -118,15 +117,16 @@ def main():
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     requests = sys.stdin.buffer
-    queries = None
+    meshes = {}
     while (message := read(requests)) is not None:
         name, arrays = message
         try:
-            if name == "mesh":
-                queries = Queries(arrays["vertices"], arrays["faces"])
+            question, _, mesh = name.partition(" ")
+            if question == "mesh":
+                meshes[mesh] = Queries(arrays["vertices"], arrays["faces"])
                 result = {}
             else:
-                result = getattr(queries, name)(arrays["points"])
+                result = getattr(meshes[mesh], question)(arrays["points"])
         except Exception as e:
             name, result = f"error: {type(e).__name__}: {e}", {}
         write(answers, name, result)
