@@ -26,7 +26,7 @@ import numpy as np
 from ...errors import DiffindError, reason
 from . import solids
 from .distances_child import read, write
-from .mesh import Mesh
+from .mesh import NO_VOLUME, Mesh
 
 #: Points per request: fewer than a second's work, so that Ctrl-C is heard.
 CHUNK = 2**17
@@ -112,7 +112,7 @@ class Distances:
         :class:`DistancesError` if there is nothing of the kind.
         """
         found = solids.bounding(self.solid, self.inside)
-        if not len(found.faces):
+        if not len(found.faces) or (found.watertight and abs(found.volume) < NO_VOLUME):
             raise DistancesError(f"{self.mesh.path}: encloses no volume, expected the surface of a solid")
         return found
 
@@ -224,7 +224,7 @@ class Distances:
         if self._child is None:
             self._start()
         if name not in self._sent:
-            arrays = {"vertices": mesh.vertices, "faces": mesh.faces.astype(np.int64)}
+            arrays = {"vertices": mesh.vertices, "faces": mesh.faces.astype(np.int64), "watertight": mesh.watertight}
             self._request(f"mesh {name}", {key: np.ascontiguousarray(a) for key, a in arrays.items()})
             self._sent.add(name)
         answers = [self._request(f"{question} {name}", {"points": part}) for part in parts]
