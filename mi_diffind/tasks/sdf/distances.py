@@ -220,7 +220,9 @@ class Distances:
     def _ask(self, question: str, points, name: str, mesh: Mesh) -> dict[str, np.ndarray]:
         """The answers for all points of a mesh, which is sent under its ``name`` when it is needed, chunk by chunk."""
         points = _checked(points)
-        parts = [points[i : i + CHUNK] for i in range(0, max(len(points), 1), CHUNK)]
+        if not len(points):
+            return {key: found[:0] for key, found in self._ask(question, np.zeros((1, 3)), name, mesh).items()}
+        parts = [points[i : i + CHUNK] for i in range(0, len(points), CHUNK)]
         if self._child is None:
             self._start()
         if name not in self._sent:
