@@ -64,7 +64,9 @@ class Sdf(Task):
         ),
     )  # fmt: skip
     decode_arguments = (
-        Argument("--resolution", type=positive, metavar="N", help="cells along the longest side (default: finer than it)"),
+        Argument(
+            "--resolution", type=positive, metavar="N", help="cells along the longest side (default: finer than it)"
+        ),
     )
 
     def settings(self, preset, given, options):

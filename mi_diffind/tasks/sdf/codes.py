@@ -122,7 +122,9 @@ def decoded(entry, n, d, scale, offset):
     root = np.sqrt if isinstance(n[0], np.ndarray) else dr.sqrt
     beyond = square > EDGE**2
     c = 1 - _select(n, beyond, EDGE**2, square) / 2
-    f = _select(n, beyond, EDGE, 1.0) * root((1 - _select(n, beyond, EDGE**2, square) / 4) / _select(n, beyond, square, 1.0))
+    f = _select(n, beyond, EDGE, 1.0) * root(
+        (1 - _select(n, beyond, EDGE**2, square) / 4) / _select(n, beyond, square, 1.0)
+    )
     t, u = orthonormal(n)
     normal = tuple(c * k + f * (a * p + b * q) for k, p, q in zip(n, t, u, strict=True))
     return d + n[0] * offset[0] + n[1] * offset[1] + n[2] * offset[2] + e, normal

@@ -56,7 +56,9 @@ def load(path) -> Table:
         array = table.arrays.get(name)
         if array is None or len(array.shape) != dims + 1 or array.shape[-1] != channels:
             found = "is missing" if array is None else f"has the shape {array.shape}"
-            raise TableError(f'{path}: the array "{name}" {found}, expected {dims} dimension(s) and {channels} channels')
+            raise TableError(
+                f'{path}: the array "{name}" {found}, expected {dims} dimension(s) and {channels} channels'
+            )
     numbers = {"lower": 3, "centre": 3} | ({"upper": 3} if layout == "pair" else {})
     singles = ["scale", "slope", *(("spacing", "bits", "nodes") if layout == "sparse" else ("band",))]
     for name, count in (numbers | dict.fromkeys(singles, 1)).items():

@@ -34,7 +34,9 @@ class SdfModel(Model):
         self.scale, self.centre = float(settings["scale"]), tuple(settings["centre"])
 
     def copy(self):
-        return type(self)(self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype, self.form)
+        return type(self)(
+            self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype, self.form
+        )
 
     @property
     def storage(self):
@@ -107,7 +109,9 @@ class SdfModel(Model):
         with replacing(output) as temporary:
             mesh.export(temporary)
         seconds = time.perf_counter() - start
-        return [(output, f"{len(mesh.faces):,} triangles at {resolution} cells along the longest side, {seconds:.1f} s")]
+        return [
+            (output, f"{len(mesh.faces):,} triangles at {resolution} cells along the longest side, {seconds:.1f} s")
+        ]
 
     def _decode_grid(self, output: Path, resolution: int, grid):
         from ...files import replacing

@@ -106,7 +106,9 @@ class SparseNodes(Field):
         if self.nodes is not None:
             return _split(dr.gather(self.types.Array4f, self.nodes.array, number, active))
         pointer = codes.pointer_at(self._pointers, number, self.bits, active)
-        entry = codes.entries_of(dr.gather(self.types.UInt32, self._entries, pointer, active), *self._affine, self.types)
+        entry = codes.entries_of(
+            dr.gather(self.types.UInt32, self._entries, pointer, active), *self._affine, self.types
+        )
         n, d, scale = codes.frames(record[3], self.types)
         middle = (BLOCK - 1) / 2
         offset = [self.types.Float(v & 3) - middle for v in (i, j, k)]

@@ -31,7 +31,7 @@ class Recipe:
 PRESETS = {
     "sparse": Recipe(
         settings=FitSettings(
-            steps=200, batch=2**18, lr=2e-2, schedule="cosine", loss="mse", measure_every=50, deterministic=True
+            steps=250, batch=2**18, lr=2e-2, schedule="cosine", loss="mae", measure_every=50, deterministic=True
         )
     ),
     "dense": Recipe("pair", "distance", FitSettings(steps=300, batch=2**17, lr=1e-2, schedule="cosine", loss="mae")),
