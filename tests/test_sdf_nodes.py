@@ -5,13 +5,12 @@ import dataclasses
 import drjit as dr
 import numpy as np
 import pytest
+from solids import box, sphere, together
 
 from mi_diffind.runtime import array_module
 from mi_diffind.tasks.sdf import codes, encoding, files, nodes, structure
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.mesh import make_mesh
-
-from solids import box, sphere, together
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +45,12 @@ def coded(types, sampled, bits=8):
     return files.coded_field(types, sampled.structure, 3.0, frames, words, bits, entries), frames, entries[pointers]
 
 
-# -- masks --------------------------------------------------------------------------------------------------------------
+# -- masks -------------------------------------------------------------------------------------------------------------
 
 
 def test_every_node_of_the_grid_has_its_sign(ad, solid):
     """Also those that are not stored, of which there is one bit for eight: against winding numbers."""
-    mesh, distances, sampled = solid
+    _mesh, distances, sampled = solid
     s = sampled.structure
     grid = np.stack(np.meshgrid(*[np.arange(n - 1) for n in s.shape], indexing="ij"), axis=-1).reshape(-1, 3)
     places = np.array(s.lower) + s.spacing * grid
@@ -99,7 +98,7 @@ def test_masks_that_do_not_go_together(solid, changes, says):
         dataclasses.replace(solid[2].structure, **changes).check()
 
 
-# -- codes --------------------------------------------------------------------------------------------------------------
+# -- codes -------------------------------------------------------------------------------------------------------------
 
 
 def test_frames_are_the_same_for_both_kinds_of_arrays(ad, rng):
@@ -150,7 +149,7 @@ def test_pointers_in_words(ad, bits, rng):
     assert np.array_equal(found.numpy(), values[index.numpy()])
 
 
-# -- what cells say -----------------------------------------------------------------------------------------------------
+# -- what cells say ----------------------------------------------------------------------------------------------------
 
 
 def test_quadratic_functions_are_exact(ad, solid):

@@ -3,8 +3,8 @@ What a sparse grid's nodes hold: a distance and a normal, coded in the frame of 
 
 A block of 4 × 4 × 4 nodes is described by a plane, its *frame*: a normal N (octahedral, 2 × 10 bits), the distance D of
 the block's middle (8 bits), and a scale s (4 bits). A node holds a pointer into one small array that all blocks share,
-the *cascaded array*. Its entry ``(e, a, b)`` says how the node differs from the plane: with the offset o from the middle,
-in spacings,
+the *cascaded array*. Its entry ``(e, a, b)`` says how the node differs from the plane: with the offset o from the
+middle, in spacings,
 
     distance = D + N·o + s e,    normal = c N + f s (a T + b B),    r² = s² (a² + b²),  c = 1 − r²/2,  f = √(1 − r²/4)
 

@@ -52,7 +52,10 @@ def sample(distances: Distances, spacing: float) -> Sampled:
     )
     # In the order of the structure
     positions, block = structure.node_positions()
-    key = lambda p: np.ravel_multi_index(np.asarray(p, np.int64).T, structure.shape)
+
+    def key(p):
+        return np.ravel_multi_index(np.asarray(p, np.int64).T, structure.shape)
+
     order = np.argsort(key(nodes))
     place = order[np.searchsorted(key(nodes), key(positions), sorter=order)]
     back = np.empty_like(place)
@@ -68,7 +71,10 @@ def fit_frames(s: Sampled) -> np.ndarray:
     if not s.structure.blocks:
         return np.zeros(0, np.uint32)
     count = np.bincount(s.block, minlength=s.structure.blocks)
-    mean = lambda v: np.bincount(s.block, v, minlength=s.structure.blocks) / count
+
+    def mean(v):
+        return np.bincount(s.block, v, minlength=s.structure.blocks) / count
+
     n = np.stack([mean(s.normals[:, a]) for a in range(3)], axis=1)
     length = np.linalg.norm(n, axis=1, keepdims=True)
     n = np.where(length > 1e-3, n / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])

@@ -75,9 +75,12 @@ def load(path) -> Table:
 
 
 def structure_of(table: Table) -> Structure:
-    """The structure of a sparse field. Raises :class:`~mi_diffind.tables.TableError` if its masks do not go together."""
+    """The structure of a sparse field. Raises :class:`~mi_diffind.tables.TableError` if its masks are damaged."""
     settings = table.settings
-    words = lambda raw: np.ascontiguousarray(raw).view("<u4")
+
+    def words(raw):
+        return np.ascontiguousarray(raw).view("<u4")
+
     blocks, masks = table.arrays["blocks"].entries, table.arrays["region_masks"].entries
     bits, nodes = settings["bits"], settings["nodes"]
     regions = table.arrays["regions"].entries[..., 0]
@@ -113,7 +116,10 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> Field:
         net = Indirection(arrays["primary"], arrays["cascaded"])
         return PairField(types, net, settings["lower"], settings["upper"], settings["band"], settings["slope"])
     structure = structure_of(table)
-    words = lambda name, part=slice(None): np.ascontiguousarray(table.arrays[name].entries[:, part]).view("<u4")[:, 0]
+
+    def words(name, part=slice(None)):
+        return np.ascontiguousarray(table.arrays[name].entries[:, part]).view("<u4")[:, 0]
+
     frames = words("blocks", slice(9, 13))[: structure.blocks]
     entries = table.arrays["entries"].values
     if storage == "float32":

@@ -128,8 +128,8 @@ def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: R
     structure = sampled.structure
     if structure.nodes == 0:
         raise FittingError(
-            f"{mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, 1/{1 / structure.spacing:.0f} of the "
-            f"longest side: ask for more --bytes"
+            f"{mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, 1/{1 / structure.spacing:.0f} of "
+            f"the longest side: ask for more --bytes"
         )
     field = nodes.SparseNodes(request.types, structure, 1.0)
     held_out = training.HeldOut(distances, request.types, structure.spacing)
@@ -149,14 +149,14 @@ def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: R
     lines = []
     if sampled.missed > THIN:
         lines.append(
-            f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of sign: "
-            f"parts may be thinner than a cell, 1/{1 / structure.spacing:.0f} of the longest side; more --bytes help"
+            f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of "
+            f"sign: parts may be thinner than a cell, 1/{1 / structure.spacing:.0f} of the longest side; more --bytes help"
         )
     field = files.coded_field(request.types, structure, slope, coding.frames, words, bits, coding.entries)
     return table, result, field, lines
 
 
-# -- the supplement's ---------------------------------------------------------------------------------------------------
+# -- the supplement's --------------------------------------------------------------------------------------------------
 
 
 def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Request):
@@ -175,7 +175,8 @@ def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Req
     uniform = int(UNIFORM * SAMPLES)
     seed = request.settings.seed
     points = np.concatenate([
-        samples.near(distances.surface, SAMPLES - uniform, spacing / 2, [seed, 1]), samples.far(lower, upper, uniform, [seed, 2])
+        samples.near(distances.surface, SAMPLES - uniform, spacing / 2, [seed, 1]),
+        samples.far(lower, upper, uniform, [seed, 2]),
     ])  # fmt: skip
     points = np.clip(points, lower, upper)
     d = distances.signed(points)

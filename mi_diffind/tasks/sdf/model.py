@@ -90,7 +90,7 @@ class SdfModel(Model):
             return Evaluation(loaded, distances, count).measure(self.field)
 
     def decode(self, output: Path, resolution: int | None = None):
-        """The surface as triangles, or the distances as a grid (``.npz``), ``resolution`` cells along the longest side."""
+        """The surface as triangles, or distances as a grid (``.npz``), ``resolution`` cells along the longest side."""
         from .decode import extract, grid
 
         resolution = resolution or min(1024, round(1.5 / self.field.spacing))
@@ -117,7 +117,10 @@ class SdfModel(Model):
         from ...files import replacing
 
         values, lower, upper = grid(self.field, resolution)
-        place = lambda p: np.asarray(p) * self.scale + np.array(self.centre)
+
+        def place(p):
+            return np.asarray(p) * self.scale + np.array(self.centre)
+
         with replacing(output) as temporary, open(temporary, "wb") as stream:
             np.savez_compressed(
                 stream, distance=values * np.float32(self.scale), lower=place(lower), upper=place(upper)

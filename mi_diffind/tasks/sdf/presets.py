@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ...settings import FitSettings
 
@@ -24,7 +24,7 @@ class Recipe:
 
     layout: str = "sparse"
     start: str = "ramp"
-    settings: FitSettings = FitSettings()
+    settings: FitSettings = field(default_factory=FitSettings)
 
 
 #: The first is the default.

@@ -33,7 +33,10 @@ class Surface:
 
     def __init__(self, mesh: Mesh, types):
         self.types, self.count = types, len(mesh.faces)
-        flat = lambda v: types.Float(np.ascontiguousarray(v.reshape(-1), np.float32))
+
+        def flat(v):
+            return types.Float(np.ascontiguousarray(v.reshape(-1), np.float32))
+
         corners = mesh.corners
         self.sums = flat(np.cumsum(mesh.areas) / mesh.areas.sum())
         self.corner, self.first, self.second = (
@@ -77,8 +80,8 @@ class NodeProblem(Problem):
     The field is to be zero on the surface and its gradient the surface's normal, both where it is read and as nodes
     blend it. Distances are not needed: the nodes begin with theirs.
 
-    On the way, nodes get their codes, half of them and then more (:class:`.encoding.Coding`): from then on they are what
-    their pointers say.
+    On the way, nodes get their codes, half of them and then more (:class:`.encoding.Coding`): from then on they are
+    what their pointers say.
     """
 
     #: The last state is the one to keep: earlier ones are better only because less of them is rounded.
@@ -144,7 +147,10 @@ class PairProblem(Problem):
 
     def __init__(self, field: PairField, mesh: Mesh, points: np.ndarray, distances: np.ndarray, held_out, bits: bool):
         self.field, self.types, self.net = field, field.types, field.net
-        flat = lambda v: self.types.Float(np.ascontiguousarray(v, np.float32))
+
+        def flat(v):
+            return self.types.Float(np.ascontiguousarray(v, np.float32))
+
         self.points = [flat(v) for v in points.T]
         self.targets = flat(np.clip(distances / field.band, -1, 1) / 2 + 0.5)
         self.identity = {"source": mesh.digest, "resolution": list(self.net.primary[0].resolution)}
