@@ -92,6 +92,17 @@ def test_as_many_pieces_as_the_mesh(types, sampled):
     assert volumes[2] == pytest.approx(0.5**3, rel=0.05)
 
 
+def test_empty_blocks_are_left_out_of_decoding(types, sampled, monkeypatch):
+    """The same triangles, whether all of the grid is looked at or what is near stored nodes only."""
+    field = coded(types, sampled[1])
+    few = decode.extract(field, 100)
+    blocks = decode.crossed_blocks(field, np.array(field.lower), 1 / 100, [100] * 3)
+    assert blocks.shape == (4, 4, 4) and 0.2 < blocks.mean() < 0.95
+    monkeypatch.setattr(decode, "crossed_blocks", lambda field, lower, spacing, cells: np.ones(-(-cells // 32), bool))
+    every = decode.extract(field, 100)
+    assert np.array_equal(few.vertices, every.vertices) and np.array_equal(few.faces, every.faces)
+
+
 # -- holes ------------------------------------------------------------------------------------------------------------
 
 
