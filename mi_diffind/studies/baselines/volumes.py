@@ -1,8 +1,7 @@
 """
 What learned signed distance fields are compared with: dense grids of 8 bits, and bricks of 8 bits near the surface.
 
-Everything is in the unit frame of :mod:`mi_diffind.tasks.sdf.field`. A truth, ``distances``, has a function
-``signed(points)`` of NumPy arrays, ``(N, 3)`` → ``(N,)``, and a box is that of the mesh: ``(lower, upper)``.
+Everything is in the unit frame of :mod:`mi_diffind.tasks.sdf.field`.
 
 Distances are stored in ``2^bits`` equal steps between ± ``band``, none of which is at zero, so that no sign is lost.
 What counts as bytes is all that a read needs: nodes and the index.
@@ -13,15 +12,22 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 
 from ...lookup import clamp
+from ...tasks.sdf import codes, samples
+from ...tasks.sdf.cells import CORNERS, surface_cells
+from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import Field
+from ...tasks.sdf.mesh import Mesh
+from ...tasks.sdf.nodes import SparseNodes
+from ...tasks.sdf.structure import Structure
 
-#: The eight corners of a cell, x first.
-CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(8, 3)
+#: No corner of a cell that the surface crosses is further from it than this, in cells.
+NEAREST = 1.75
 
 
 def stored(values: np.ndarray, band: float, bits: int = 8) -> np.ndarray:
@@ -126,6 +132,21 @@ def _slabs(nodes: np.ndarray, thick: int = 32):
         yield nodes[i : i + thick + 1]
 
 
+def dense(types, distances: Distances, size: float, train: Training | None = None, band: float = NEAREST) -> ByteGrid:
+    """A dense grid of cells ``size`` wide with exact distances at its nodes, or with nodes that ``train``."""
+    lower, upper = distances.mesh.lower, distances.mesh.upper
+    cells = _dense_cells(distances.mesh, size)
+    lower, shape = (lower + upper) / 2 - cells * size / 2, cells + 1
+    values = distances.signed(lower + _places(shape) * size)
+    if train is not None:
+        values = trained(distances, lower, size, shape, np.arange(len(values)), values, train)
+    return ByteGrid(types, stored(values.reshape(shape), band * size), lower, size, band * size)
+
+
+def _dense_cells(mesh: Mesh, size: float) -> np.ndarray:
+    return np.ceil((mesh.upper - mesh.lower) / size + 1).astype(int)
+
+
 # -- bricks -----------------------------------------------------------------------------------------------------------
 
 
@@ -143,7 +164,9 @@ class Bricks(_Cells):
     lie without gaps, and are read by two bytes.
     """
 
-    def __init__(self, types, nodes, present, negative, lower, size: float, band: float, side: int, slope: float, bits=8):
+    def __init__(
+        self, types, nodes, present, negative, lower, size: float, band: float, side: int, slope: float, bits: int = 8
+    ):
         self.side, self.apron = side, nodes.shape[1] == side + 1
         # Without an apron, the last nodes of the last bricks have nothing beyond
         cells = [side * n - (not self.apron) for n in present.shape]
@@ -268,26 +291,61 @@ def _words(flags: np.ndarray) -> np.ndarray:
     return np.pad(packed, (0, -len(packed) % 4)).view("<u4").astype(np.uint32)
 
 
-def bricks_near(signed: Callable, lower, shape, side: float, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def bricks(
+    types,
+    distances: Distances,
+    size: float,
+    side: int,
+    apron: bool = True,
+    train: Training | None = None,
+    band: float = NEAREST,
+    bits: int = 8,
+) -> Bricks:
     """
-    Of a grid of ``shape`` bricks, ``side`` long: the places ``(K, 3)`` of those that the surface may pass, or that it
-    may come nearer to than ``margin``, and which of all bricks have a centre inside (bool, ``shape``).
+    The bricks of ``side``³ cells, ``size`` wide, that have a cell with corners of both signs (without an ``apron``, all
+    that have a corner of such a cell). ``band`` is in cells. Nodes hold exact distances, or they ``train``.
     """
-    lower, coarse = np.asarray(lower, np.float64), 8
-    number = [-(-n // coarse) for n in shape]
-    found, negative = _places(number), np.zeros([n * coarse for n in number], bool)
-    while True:
-        length = side * coarse
-        d = signed(lower + (found + 0.5) * length)
-        parts = (found[:, None] * coarse + _places((coarse,) * 3)).reshape(-1, 3)
-        negative[tuple(parts.T)] = np.repeat(d < 0, coarse**3)
-        found = found[np.abs(d) <= length * math.sqrt(3) / 2 + margin]
-        if coarse == 1:
-            break
-        coarse //= 2
-        found = (2 * found[:, None] + CORNERS).reshape(-1, 3)
-    found = found[(found < shape).all(axis=1)]
-    return found[np.ravel_multi_index(found.T, shape).argsort()], negative[tuple(map(slice, shape))]
+    lower, upper = distances.mesh.lower, distances.mesh.upper
+    grid = np.ceil((upper - lower) / (side * size) + (1 if apron else 3) / side).astype(int)
+    lower = (lower + upper) / 2 - (grid * side - (not apron)) * size / 2
+    n, shape = side + 1, grid * side + 1
+    places = surface_cells(distances, lower, side * size, grid, 0 if apron else 2 * size)
+    nodes = (places[:, None] * side + _places((n,) * 3)).reshape(-1, 3)
+    keys, back = np.unique(np.ravel_multi_index(nodes.T, shape), return_inverse=True)
+    values = distances.signed(lower + np.stack(np.unravel_index(keys, shape), -1) * size)
+    if train is not None:
+        values = trained(distances, lower, size, shape, keys, values, train)
+    values = values[back].reshape(-1, n, n, n)
+    present = np.zeros(grid, bool)
+    for part in np.array_split(np.arange(len(places)), max(1, values.size // 2**22)):
+        windows = np.lib.stride_tricks.sliding_window_view(values[part] < 0, (2, 2, 2), axis=(1, 2, 3))
+        crossed = windows.any(axis=(4, 5, 6)) & ~windows.all(axis=(4, 5, 6))
+        for corner in CORNERS[:1] if apron else CORNERS:
+            ends = crossed[(slice(None), *(slice(side - 1, None) if c else slice(None) for c in corner))]
+            present[tuple((places[part][ends.any(axis=(1, 2, 3))] + corner).T)] = True
+    near = np.zeros(grid, bool)
+    near[tuple(places.T)] = True
+    if (present & ~near).any():
+        raise AssertionError("a brick would be read that is not near the surface")
+    negative = _sides(distances, lower, side * size, ~near)
+    negative[tuple(places.T)] = values[:, 0, 0, 0] < 0  # what is not stored has one sign, which its nodes know
+    numbers = stored(values[present[tuple(places.T)]], band * size, bits)
+    slope = max((_slope(restored(b, band * size, bits), size) for b in _parts(numbers)), default=1.0)
+    numbers = numbers if apron else numbers[:, :side, :side, :side]
+    return Bricks(types, numbers, present, negative, lower, size, band * size, side, slope, bits)
+
+
+def _sides(distances: Distances, lower, side: float, empty: np.ndarray) -> np.ndarray:
+    """Of a grid of bricks, which of those are inside that the surface does not pass: one question each piece."""
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(empty)
+    _, first = np.unique(pieces.ravel(), return_index=True)
+    first = first[pieces.ravel()[first] > 0]
+    centres = lower + (np.stack(np.unravel_index(first, empty.shape), -1) + 0.5) * side
+    inside = np.zeros(count + 1, bool)
+    inside[pieces.ravel()[first]] = distances.inside(centres)
+    return inside[pieces]
 
 
 def _places(shape) -> np.ndarray:
@@ -295,58 +353,169 @@ def _places(shape) -> np.ndarray:
     return np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
 
 
-def sampled_bricks(
-    types, distances, box, size: float, side: int, apron: bool = True, band: float = 0.0, bits: int = 8
-) -> Bricks:
-    """
-    Exact distances at the nodes of all bricks that have a cell with corners of both signs (without an ``apron``, of all
-    that have a corner of such a cell). ``band`` is in cells; 0: all that a brick can have at its corners.
-    """
-    lower, upper = (np.asarray(v, np.float64) for v in box)
-    grid = np.ceil((upper - lower) / (side * size) + (1 if apron else 3) / side).astype(int)
-    lower = (lower + upper) / 2 - (grid * side - (not apron)) * size / 2
-    n, shape = side + 1, grid * side + 1
-    places, negative = bricks_near(distances.signed, lower, grid, side * size, 0 if apron else 2 * size)
-    nodes = (places[:, None] * side + _places((n,) * 3)).reshape(-1, 3)
-    unique, back = np.unique(np.ravel_multi_index(nodes.T, shape), return_inverse=True)
-    values = distances.signed(lower + np.stack(np.unravel_index(unique, shape), -1) * size)
-    bricks = values[back].reshape(-1, n, n, n)
-    negative[tuple(places.T)] = bricks[:, 0, 0, 0] < 0  # what is not stored has one sign, which its nodes know
-    band = (band or side * math.sqrt(3)) * size
-    present = np.zeros(grid, bool)
-    for part in np.array_split(np.arange(len(places)), max(1, bricks.size // 2**22)):
-        windows = np.lib.stride_tricks.sliding_window_view(bricks[part] < 0, (2, 2, 2), axis=(1, 2, 3))
-        crossed = windows.any(axis=(4, 5, 6)) & ~windows.all(axis=(4, 5, 6))
-        for corner in CORNERS[:1] if apron else CORNERS:
-            ends = crossed[(slice(None), *(slice(side - 1, None) if c else slice(None) for c in corner))]
-            present[tuple((places[part][ends.any(axis=(1, 2, 3))] + corner).T)] = True
-    kept = bricks[present[tuple(places.T)]]
-    if len(kept) != present.sum():
-        raise AssertionError("a brick is read that the surface does not pass")
-    numbers = stored(kept, band, bits)
-    slope = max((_slope(restored(b, band, bits), size) for b in _parts(numbers)), default=1.0)
-    return Bricks(types, numbers if apron else numbers[:, :side, :side, :side], present, negative, lower, size, band,
-                  side, slope, bits)  # fmt: skip
-
-
 def _parts(values: np.ndarray, most: int = 2**21):
     """Parts along the first axis of so many numbers."""
     yield from np.array_split(values, max(1, values.size // most))
 
 
-def at_bytes(make: Callable[[float], Field], nbytes: int, size: float, power: float = 2.0, builds: int = 6) -> Field:
+# -- training ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Training:
     """
-    The field ``make(size)`` with the finest cells that fits into ``nbytes``, within 1%: ``size`` is where the search
-    starts, bytes go about with ``size`` to the power of -``power``. Raises ``ValueError`` if nothing fits.
+    Nodes by linear least squares: ``samples`` a cell, of distances and, with the weight ``normals``, of their gradients
+    times the size of a cell; those at the distance of ``focus`` cells weigh half; ``keep`` is the weight of the
+    distance that was sampled at a node. It is the exact minimum: there is no rate, no schedule, and no batch.
     """
-    best, wanted = None, 0.995
-    for _ in range(builds):
+
+    samples: int = 16
+    normals: float = 0.3
+    focus: float = 0.5
+    keep: float = 0.03
+    seed: int = 1
+
+
+def trained(distances: Distances, lower, size: float, shape, keys, values, how: Training) -> np.ndarray:
+    """
+    The ``values`` of the nodes ``keys`` (places in a grid of ``shape`` nodes, C order, ascending) with those changed
+    that belong to a cell which the surface passes and which has all of its nodes, such that trilinear interpolation
+    comes nearest to the truth there.
+    """
+    from scipy import sparse
+    from scipy.sparse.linalg import cg
+
+    rng = np.random.default_rng(how.seed)
+    cells = surface_cells(distances, lower, size, np.asarray(shape) - 1)
+    corners = np.ravel_multi_index((cells[:, None] + CORNERS).reshape(-1, 3).T, shape)
+    at = np.minimum(np.searchsorted(keys, corners), len(keys) - 1)
+    whole = (keys[at] == corners).reshape(-1, 8).all(axis=1)
+    cells, corners = cells[whole], at.reshape(-1, 8)[whole]
+    blocks, right = np.empty((len(cells), 8, 8), np.float32), np.empty((len(cells), 8), np.float32)
+    for part in np.array_split(np.arange(len(cells)), max(1, len(cells) * how.samples // 2**18)):
+        place = rng.random((len(part), how.samples, 3))
+        d, g = distances.signed_normals((lower + (cells[part][:, None] + place) * size).reshape(-1, 3))
+        # Per sample a row for the distance, in cells, and three for the gradient
+        ends = np.where(CORNERS == 1, place[..., None, :], 1 - place[..., None, :])
+        signs = 2.0 * CORNERS - 1
+        rows = [ends.prod(-1), *(ends[..., np.delete(np.arange(3), a)].prod(-1) * signs[:, a] for a in range(3))]
+        known = np.concatenate([d[:, None] / size, g], axis=1).reshape(len(part), how.samples, 4)
+        weight = 1 / (1 + (known[..., :1] / how.focus) ** 2) * np.array([1, *[how.normals**2] * 3])
+        rows = np.stack(rows, -2)
+        weighted = rows * weight[..., None]
+        blocks[part] = np.einsum("nsrc,nsrd->ncd", weighted, rows, optimize=True)
+        right[part] = np.einsum("nsrc,nsr->nc", weighted, known, optimize=True)
+    used, at = np.unique(corners, return_inverse=True)
+    at = at.reshape(-1, 8)
+    start, keep = values[used].astype(np.float64) / size, how.keep * how.samples
+    places = np.repeat(at, 8, axis=1).ravel(), np.tile(at, (1, 8)).ravel()
+    matrix = sparse.coo_array((blocks.ravel(), places), (len(used),) * 2).tocsr().astype(np.float64)
+    matrix += sparse.diags_array(np.full(len(used), keep))
+    wanted = np.bincount(at.ravel(), right.ravel(), len(used)) + keep * start
+    found, _ = cg(matrix, wanted, start, rtol=1e-4, maxiter=200)
+    result = values.copy()
+    result[used] = found * size
+    return result
+
+
+# -- nodes ------------------------------------------------------------------------------------------------------------
+
+
+class DistanceNodes(SparseNodes):
+    """
+    Distances alone at the nodes of a sparse ``structure``, ``bits`` each, in the order of its nodes: what is left of
+    ours without normals and without indirection.
+    """
+
+    def __init__(self, types, structure: Structure, numbers: np.ndarray, band: float, bits: int, slope: float):
+        super().__init__(types, structure, slope, pointers=codes.pointer_words(numbers, bits), bits=bits)
+        self.told, self.kept = band / self.spacing, 4 * len(codes.pointer_words(numbers, bits))
+
+    def _node(self, number, record, i, j, k, active):
+        value = self.types.Float(codes.pointer_at(self._pointers, number, self.bits, active))
+        half = 2 ** (self.bits - 1)
+        zero = self.types.Float(0)
+        return (value + (0.5 - half)) * (self.told / half), (zero, zero, zero)
+
+    def normal(self, p, active=True):
+        return self.gradient(p, active)[1]
+
+    @property
+    def nbytes(self) -> int:
+        return self.structure.nbytes + self.kept
+
+
+def distance_nodes(
+    types, distances: Distances, size: float, train: Training | None = None, band: float = NEAREST, bits: int = 6
+) -> DistanceNodes:
+    """The corners of all cells, ``size`` wide, with corners of both signs: exact distances, or nodes that ``train``."""
+    from ...tasks.sdf.encoding import sample
+
+    found = sample(distances, size)
+    structure = found.structure
+    keys = np.ravel_multi_index(found.positions.astype(np.int64).T, structure.shape)
+    order = np.argsort(keys)
+    values = found.distances * size
+    if train is not None:
+        # All cells that the surface passes have a part; signs stay, since they say which nodes there are
+        lower = np.asarray(structure.lower)
+        new = trained(distances, lower, size, structure.shape, keys[order], values[order], train)
+        least = 0.5 * band * size / 2 ** (bits - 1)
+        new = np.where(values[order] < 0, np.minimum(new, -least), np.maximum(new, least))
+        values[order] = new
+    numbers = stored(values, band * size, bits)
+    corners = restored(numbers, band * size, bits)[found.corners].reshape(-1, 2, 2, 2)
+    slope = max(_slope(part, size) for part in _parts(corners))
+    return DistanceNodes(types, structure, numbers, band * size, bits, slope)
+
+
+# -- sizes ------------------------------------------------------------------------------------------------------------
+
+
+def fitted(
+    mesh: Mesh, make: Callable[[float], Field], nbytes: int, side: int, apron: bool = False, seed: int = 1
+) -> Field:
+    """
+    The field ``make(size)`` with the finest cells that fits into ``nbytes``, within 1.5%. How many bricks (of ``side``³
+    cells, or nodes) there are of a size is estimated by points of the surface; what the estimate is off by, coarse
+    cells tell, and after that those that were made. Raises ``ValueError`` if nothing fits.
+    """
+    points = samples.surface(mesh, 2**20, seed)[0]
+    size = 0.03
+    found = make(size)
+    factor, best = found.nbytes / _estimate(points, size, side, apron), None
+    for _ in range(5):
+        for _ in range(6):
+            size *= math.sqrt(factor * _estimate(points, size, side, apron) / (0.994 * nbytes))
         found = make(size)
         if found.nbytes <= nbytes and (best is None or found.nbytes > best.nbytes):
             best = found
-        if best is not None and best.nbytes >= 0.99 * nbytes:
+        if best is not None and best.nbytes >= 0.985 * nbytes:
             break
-        size *= (found.nbytes / (wanted * nbytes)) ** (1 / power)
+        factor = found.nbytes / _estimate(points, size, side, apron)
     if best is None:
         raise ValueError(f"{nbytes:,} bytes are too few: {found.nbytes:,} are the least that was found")
     return best
+
+
+def _estimate(points: np.ndarray, size: float, side: int, apron: bool) -> int:
+    """Bricks that are near points of the surface; without an apron, those that share corners of their cells."""
+    if apron:
+        return len(_distinct(np.floor(points / (side * size)).astype(np.int64) + 2**19))
+    cells = _distinct(np.floor(points / size).astype(np.int64) + 2**19)
+    return len(_distinct((cells[:, None] + CORNERS).reshape(-1, 3) // side))
+
+
+def _distinct(cells: np.ndarray) -> np.ndarray:
+    keys = np.unique((cells[:, 0] << 40) + (cells[:, 1] << 20) + cells[:, 2])
+    return np.stack([keys >> 40, (keys >> 20) & 0xFFFFF, keys & 0xFFFFF], -1)
+
+
+def dense_size(mesh: Mesh, nbytes: int) -> float:
+    """The side of the cells of the finest :func:`dense` grid of ``nbytes``."""
+    low, high = 1e-4, 1.0
+    for _ in range(40):
+        size = math.sqrt(low * high)
+        fits = np.prod(_dense_cells(mesh, size) + 1.0) <= nbytes
+        low, high = (low, size) if fits else (size, high)
+    return high
