@@ -1,6 +1,6 @@
 """
-Hash grids with a network behind them (``drjit.nn``; Müller et al., *Instant Neural Graphics Primitives*, 2022) as signed
-distance fields.
+Hash grids with a network behind them (``drjit.nn``; Müller et al., *Instant Neural Graphics Primitives*, 2022) as
+signed distance fields.
 """
 
 from __future__ import annotations
@@ -83,25 +83,20 @@ def halved(net: Network) -> None:
 
 class HashProblem(Problem):
     """
-    The training of a :class:`Network` on the distances to a mesh: from a pool of ``count`` points, three quarters of
-    which are near the surface (at distances of 0.002 and 0.01), the others anywhere in the box.
+    The training of a :class:`Network` on distances to a ``mesh``: those of a ``pool`` of points, measured at those of
+    another one (:func:`pool`).
     """
 
-    def __init__(self, net, types, distances: Distances, count: int = 2**20, seed: int = 1):
-        self.net = net.alloc(types.TensorXf, 3, dr.rng(seed=seed))
-        self.types = types
-        self.field = HashField(types, self.net, distances.mesh)
-        self.pool = _pool(distances, self.field, count, seed)
-        held = _pool(distances, self.field, 2**16, seed + 1)
-        self.held = self._arrays(held)
-        self.pool = self._arrays(self.pool)
-        self.count = count
-        self.identity = {"mesh": distances.mesh.digest, "count": count, "seed": seed}
+    def __init__(self, net: Network, types, mesh: Mesh, pool: tuple, held: tuple, seed: int = 1):
+        self.net, self.types = net.alloc(types.TensorXf, 3, dr.rng(seed=seed)), types
+        self.field = HashField(types, self.net, mesh)
+        self.pool, self.held = self._arrays(*pool), self._arrays(*held)
+        self.count = len(pool[1])
+        self.identity = {"mesh": mesh.digest, "count": self.count, "seed": seed}
 
-    def _arrays(self, found):
-        points, d = found
+    def _arrays(self, points: np.ndarray, distances: np.ndarray):
         points = [self.types.Float(np.ascontiguousarray(x)) for x in points.T]
-        return [*points, self.types.Float(np.clip(d / BAND, -1, 1))]
+        return [*points, self.types.Float(np.clip(distances / BAND, -1, 1))]
 
     def batch(self, rng, size: int):
         index = dr.minimum(self.types.UInt32(rng.random(self.types.Float, size) * self.count), self.count - 1)
@@ -109,21 +104,21 @@ class HashProblem(Problem):
         return p, {"d": [d]}
 
     def predict(self, net, inputs) -> dict[str, list]:
-        return {"d": net(self._local(inputs))}
-
-    def _local(self, p):
-        return [x - a for x, a in zip(p, self.field.lower, strict=True)]
+        return {"d": net([x - a for x, a in zip(inputs, self.field.lower, strict=True)])}
 
     def measure(self, net) -> dict[str, float]:
         *p, d = self.held
-        error = dr.clip(net(self._local(p))[0], -1, 1) - d
+        error = dr.clip(self.predict(net, p)["d"][0], -1, 1) - d
         return {"psnr_db": -10 * math.log10(max(float(dr.mean(dr.square(error))[0]), 1e-12))}
 
 
-def _pool(distances: Distances, field: Field, count: int, seed: int):
+def pool(distances: Distances, lower, upper, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    ``count`` points and their distances, three quarters near the surface (normal distributions of 0.002 and 0.01), the
+    others anywhere in the box.
+    """
     rng = np.random.default_rng(seed)
     near = [samples.near(distances.mesh, 3 * count // 8, width, rng) for width in (0.002, 0.01)]
-    rest = samples.far(field.lower, field.upper, count - sum(map(len, near)), rng)
-    points = np.clip(np.concatenate([*near, rest]), field.lower, field.upper)
-    points = points[rng.permutation(len(points))].astype(np.float32)
-    return points, distances.signed(points)
+    rest = samples.far(lower, upper, count - sum(map(len, near)), rng)
+    points = np.clip(np.concatenate([*near, rest]), lower, upper)[rng.permutation(count)].astype(np.float32)
+    return points, distances.signed(points, 2 * BAND)

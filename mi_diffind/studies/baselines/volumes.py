@@ -9,14 +9,18 @@ What counts as bytes is all that a read needs: nodes and the index.
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
 
+from ...files import replacing
 from ...lookup import clamp
 from ...tasks.sdf import codes, samples
 from ...tasks.sdf.cells import CORNERS, surface_cells
@@ -111,6 +115,7 @@ class ByteGrid(_Cells):
 
     def __init__(self, types, nodes: np.ndarray, lower, size: float, band: float):
         super().__init__(types, lower, [n - 1 for n in nodes.shape], size, band, 8)
+        self.state = {"nodes": nodes, "lower": np.array(lower), "size": size, "band": band}
         self.nodes = types.UInt8(np.ascontiguousarray(nodes.ravel()))
         self.nbytes = nodes.size
         self.slope = max(_slope(restored(part, band), size) for part in _slabs(nodes))
@@ -137,7 +142,7 @@ def dense(types, distances: Distances, size: float, train: Training | None = Non
     lower, upper = distances.mesh.lower, distances.mesh.upper
     cells = _dense_cells(distances.mesh, size)
     lower, shape = (lower + upper) / 2 - cells * size / 2, cells + 1
-    values = distances.signed(lower + _places(shape) * size)
+    values = distances.signed(lower + _places(shape) * size, 3 * size)
     if train is not None:
         values = trained(distances, lower, size, shape, np.arange(len(values)), values, train)
     return ByteGrid(types, stored(values.reshape(shape), band * size), lower, size, band * size)
@@ -167,6 +172,10 @@ class Bricks(_Cells):
     def __init__(
         self, types, nodes, present, negative, lower, size: float, band: float, side: int, slope: float, bits: int = 8
     ):
+        self.state = {
+            "nodes": nodes, "present": present, "negative": negative, "lower": np.array(lower), "size": size,
+            "band": band, "side": side, "slope": slope, "bits": bits,
+        }  # fmt: skip
         self.side, self.apron = side, nodes.shape[1] == side + 1
         # Without an apron, the last nodes of the last bricks have nothing beyond
         cells = [side * n - (not self.apron) for n in present.shape]
@@ -312,7 +321,7 @@ def bricks(
     places = surface_cells(distances, lower, side * size, grid, 0 if apron else 2 * size)
     nodes = (places[:, None] * side + _places((n,) * 3)).reshape(-1, 3)
     keys, back = np.unique(np.ravel_multi_index(nodes.T, shape), return_inverse=True)
-    values = distances.signed(lower + np.stack(np.unravel_index(keys, shape), -1) * size)
+    values = distances.signed(lower + np.stack(np.unravel_index(keys, shape), -1) * size, 3 * size)
     if train is not None:
         values = trained(distances, lower, size, shape, keys, values, train)
     values = values[back].reshape(-1, n, n, n)
@@ -366,11 +375,13 @@ class Training:
     """
     Nodes by linear least squares: ``samples`` a cell, of distances and, with the weight ``normals``, of their gradients
     times the size of a cell; those at the distance of ``focus`` cells weigh half; ``keep`` is the weight of the
-    distance that was sampled at a node. It is the exact minimum: there is no rate, no schedule, and no batch.
+    distance that was sampled at a node. ``most`` limits the samples of all cells. It is the exact minimum: there is no
+    rate, no schedule, and no batch.
     """
 
     samples: int = 16
-    normals: float = 0.3
+    most: int = 2**21
+    normals: float = 0.2
     focus: float = 0.5
     keep: float = 0.03
     seed: int = 1
@@ -391,15 +402,16 @@ def trained(distances: Distances, lower, size: float, shape, keys, values, how: 
     at = np.minimum(np.searchsorted(keys, corners), len(keys) - 1)
     whole = (keys[at] == corners).reshape(-1, 8).all(axis=1)
     cells, corners = cells[whole], at.reshape(-1, 8)[whole]
+    each = int(np.clip(how.most / max(1, len(cells)), 4, how.samples))
     blocks, right = np.empty((len(cells), 8, 8), np.float32), np.empty((len(cells), 8), np.float32)
-    for part in np.array_split(np.arange(len(cells)), max(1, len(cells) * how.samples // 2**18)):
-        place = rng.random((len(part), how.samples, 3))
+    for part in np.array_split(np.arange(len(cells)), max(1, len(cells) * each // 2**18)):
+        place = rng.random((len(part), each, 3))
         d, g = distances.signed_normals((lower + (cells[part][:, None] + place) * size).reshape(-1, 3))
         # Per sample a row for the distance, in cells, and three for the gradient
         ends = np.where(CORNERS == 1, place[..., None, :], 1 - place[..., None, :])
         signs = 2.0 * CORNERS - 1
         rows = [ends.prod(-1), *(ends[..., np.delete(np.arange(3), a)].prod(-1) * signs[:, a] for a in range(3))]
-        known = np.concatenate([d[:, None] / size, g], axis=1).reshape(len(part), how.samples, 4)
+        known = np.concatenate([d[:, None] / size, g], axis=1).reshape(len(part), each, 4)
         weight = 1 / (1 + (known[..., :1] / how.focus) ** 2) * np.array([1, *[how.normals**2] * 3])
         rows = np.stack(rows, -2)
         weighted = rows * weight[..., None]
@@ -407,7 +419,7 @@ def trained(distances: Distances, lower, size: float, shape, keys, values, how: 
         right[part] = np.einsum("nsrc,nsr->nc", weighted, known, optimize=True)
     used, at = np.unique(corners, return_inverse=True)
     at = at.reshape(-1, 8)
-    start, keep = values[used].astype(np.float64) / size, how.keep * how.samples
+    start, keep = values[used].astype(np.float64) / size, how.keep * each
     places = np.repeat(at, 8, axis=1).ravel(), np.tile(at, (1, 8)).ravel()
     matrix = sparse.coo_array((blocks.ravel(), places), (len(used),) * 2).tocsr().astype(np.float64)
     matrix += sparse.diags_array(np.full(len(used), keep))
@@ -429,6 +441,8 @@ class DistanceNodes(SparseNodes):
 
     def __init__(self, types, structure: Structure, numbers: np.ndarray, band: float, bits: int, slope: float):
         super().__init__(types, structure, slope, pointers=codes.pointer_words(numbers, bits), bits=bits)
+        self.state = {"numbers": numbers, "band": band, "bits": bits, "slope": slope}
+        self.state |= {f"structure_{f.name}": getattr(structure, f.name) for f in dataclasses.fields(structure)}
         self.told, self.kept = band / self.spacing, 4 * len(codes.pointer_words(numbers, bits))
 
     def _node(self, number, record, i, j, k, active):
@@ -469,6 +483,38 @@ def distance_nodes(
     return DistanceNodes(types, structure, numbers, band * size, bits, slope)
 
 
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def save(path: Path | str, field: ByteGrid | Bricks | DistanceNodes) -> None:
+    """Write a field, which :func:`load` reads."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(_packed(field))
+
+
+def load(path: Path | str, types) -> ByteGrid | Bricks | DistanceNodes:
+    """What :func:`save` wrote, for the module ``types``."""
+    with np.load(path, allow_pickle=False) as file:
+        state = {name: file[name] if file[name].ndim else file[name].item() for name in file}
+    kind = {c.__name__: c for c in (ByteGrid, Bricks, DistanceNodes)}[state.pop("kind")]
+    parts = {name: state.pop(name) for name in list(state) if name.startswith("structure_")}
+    if parts:
+        parts = {name.removeprefix("structure_"): v for name, v in parts.items()}
+        state["structure"] = Structure(**{**parts, "lower": tuple(parts["lower"].tolist())})
+    return kind(types, **state)
+
+
+def file_bytes(field: ByteGrid | Bricks | DistanceNodes) -> int:
+    """How large the file is, whose arrays are compressed (zlib)."""
+    return len(_packed(field))
+
+
+def _packed(field) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, kind=type(field).__name__, **field.state)
+    return file.getvalue()
+
+
 # -- sizes ------------------------------------------------------------------------------------------------------------
 
 
@@ -481,7 +527,7 @@ def fitted(
     cells tell, and after that those that were made. Raises ``ValueError`` if nothing fits.
     """
     points = samples.surface(mesh, 2**20, seed)[0]
-    size = 0.03
+    size = 1 / 64
     found = make(size)
     factor, best = found.nbytes / _estimate(points, size, side, apron), None
     for _ in range(5):
