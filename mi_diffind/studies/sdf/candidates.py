@@ -60,6 +60,16 @@ KINDS = {
 }
 ONCE = ("indirection", "paper", "hash")
 
+#: Kind → what it is a kind of, for pictures.
+FAMILIES = {
+    "dense": "dense grid", "dense-trained": "dense grid", "bricks8": "bricks", "bricks4": "bricks",
+    "bricks4-shared": "bricks", "distances": "sparse distances", "distances-trained": "sparse distances",
+    "ours": "ours", "indirection": "supplement's arrays", "paper": "supplement's arrays", "hash": "network",
+}  # fmt: skip
+
+#: Kinds that the times of ours are divided by.
+AGAINST = ("dense-trained", "bricks4", "distances-trained")
+
 #: Kind → preset, of those that ``fit sdf`` makes.
 PRESETS = {"ours": "", "indirection": "dense", "paper": "paper"}
 
@@ -164,7 +174,7 @@ def plan(mesh: Mesh, name: str, request: Request) -> Plan:
         queries=("value",),
         accuracy="iou_near_db",
         accuracy_label="near the surface, −10 log₁₀(1 − IoU), dB",
-        ratios=[(ours, n) for n in (*traced, MESH, grid) if n != ours] if ours else [],
+        ratios=[(ours, n) for n in (*(n for n in traced if jobs[n].kind in AGAINST), MESH, grid)] if ours else [],
         details={
             "source": name, "source_digest": mesh.digest, "triangles": len(mesh.faces), "request": asdict(request),
             "first": first, "film": list(request.film),
@@ -176,7 +186,6 @@ def plan(mesh: Mesh, name: str, request: Request) -> Plan:
         ],
         jobs=list(jobs.values()),
         jobs_fingerprint=fingerprint(made_by) + mesh.digest[:16],
-        panels=("bytes",),
         pictures=pictures.of(setting, stage_of),
         table=table,
         conclusions=conclusions,
@@ -203,8 +212,8 @@ class Made(Job):
 
     def candidate(self) -> Candidate:
         return Candidate(
-            self.name, KINDS[self.kind], size_text(self.nbytes), job=self.name, in_passes=self.kind != "hash",
-            queries=None, details={"kind": self.kind, "asked": self.nbytes},
+            self.name, FAMILIES[self.kind], size_text(self.nbytes), job=self.name, label=KINDS[self.kind],
+            in_passes=self.kind != "hash", details={"kind": self.kind, "asked": self.nbytes},
         )  # fmt: skip
 
     def known(self, folder: Path | None, record: dict | None) -> dict | None:
