@@ -15,6 +15,14 @@ from .conclusions import by_size, size_text
 #: The error of normals that is as dark as it gets, in degrees.
 WORST = 15.0
 
+#: Kind → colour, marker and line: trained ones dashed.
+STYLES = {
+    "dense": ("#4d4d4d", "s", ":"), "dense-trained": ("#4d4d4d", "s", "--"), "bricks8": ("#c47a00", "D", ":"),
+    "bricks4": ("#762a83", "v", ":"), "bricks4-shared": ("#762a83", "^", "--"), "distances": ("#2166ac", "o", ":"),
+    "distances-trained": ("#2166ac", "o", "--"), "ours": ("#b2182b", "o", "-"), "indirection": ("#1b7837", "P", ":"),
+    "paper": ("#1b7837", "X", ":"), "hash": ("#12908e", "*", ":"),
+}  # fmt: skip
+
 #: Kinds that are shown as pictures, if they were made.
 SHOWN = ("dense-trained", "bricks4", "bricks4-shared", "distances", "ours")
 
@@ -60,12 +68,11 @@ def shapes(setting, view: stage.Stage, result: dict):
         bar = found.colorbar(drawn, ax=found.axes[1:], shrink=0.8, pad=0.01)
         bar.set_label("error of the normal, degrees", fontsize=8)
         bar.ax.tick_params(labelsize=7)
-    styles = _styles(result)
     third = 2 * columns
     for k, (key, label, missing) in enumerate(CURVES):
-        _curves(found.add_subplot(grid[1, third * k : third * (k + 1)]), result, key, label, missing, styles)
+        _curves(found.add_subplot(grid[1, third * k : third * (k + 1)]), result, key, label, missing)
     axes = found.add_subplot(grid[1, 2 * third :])
-    labels = _against_time(axes, result, styles)
+    labels = _against_time(axes, result)
     plot.fix(found)
     plot.place(axes, labels, [label.at for label in labels])
     return found
@@ -104,25 +111,20 @@ def _shaded(normals: np.ndarray, hit: np.ndarray) -> np.ndarray:
     return np.where(hit[..., None], grey[..., None] * np.array([1.0, 0.96, 0.9]), 1.0)
 
 
-def _styles(result: dict) -> dict[str, tuple[str, str, str]]:
-    """Representation → colour, marker and line."""
-    names = dict.fromkeys(c["representation"] for made in by_size(result).values() for c in made.values())
-    return {
-        name: (*plot.STYLES[i % len(plot.STYLES)], "-" if name == "ours" else ("--" if "trained" in name else ":"))
-        for i, name in enumerate(names)
-    }
-
-
-def _curves(axes, result: dict, key: str, label: str, missing: bool, styles: dict) -> None:
-    """An error against bytes, a line for each representation."""
-    for name, (colour, marker, line) in styles.items():
-        points = sorted(
-            (c["bytes"] / 2**20, 1 - c["errors"][key] if missing else c["errors"][key])
-            for made in by_size(result).values() for c in made.values() if c["representation"] == name
-        )  # fmt: skip
-        axes.plot(*zip(*points, strict=True), color=colour, marker=marker, markersize=4, linestyle=line, label=name,
-                  linewidth=2.0 if name == "ours" else 1.0)  # fmt: skip
+def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
+    """An error against bytes, a line for each kind."""
+    made = [c for found in by_size(result).values() for c in found.values()]
+    for kind, (colour, marker, line) in STYLES.items():
+        own = [c for c in made if c["details"]["kind"] == kind]
+        points = sorted((c["bytes"] / 2**20, 1 - c["errors"][key] if missing else c["errors"][key]) for c in own)
+        if points:
+            axes.plot(*zip(*points, strict=True), color=colour, marker=marker, markersize=4, linestyle=line,
+                      label=own[0]["label"], linewidth=2.0 if kind == "ours" else 1.0,
+                      markerfacecolor="white" if line == ":" else colour)  # fmt: skip
+    sizes = sorted({c["details"]["asked"] / 2**20 for c in made})
     axes.set_xscale("log", base=2)
+    axes.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
+    axes.set_xticks(sizes)
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     plot.log_ticks(axes.yaxis, low, high, lambda v: f"{v:.2g}")
@@ -133,7 +135,7 @@ def _curves(axes, result: dict, key: str, label: str, missing: bool, styles: dic
         axes.legend(fontsize=6, loc="best")
 
 
-def _against_time(axes, result: dict, styles: dict) -> list[plot.Label]:
+def _against_time(axes, result: dict) -> list[plot.Label]:
     """The error of normals against the time of a ray; the times of the mesh and of ``sdfgrid`` as lines."""
     labels, timings = [], result["cases"].get("rays", {}).get("queries", {}).get("ray", {})
     for name, t in timings.items():
@@ -143,12 +145,11 @@ def _against_time(axes, result: dict, styles: dict) -> list[plot.Label]:
             axes.text(t["time"], 0.98, c["label"], transform=axes.get_xaxis_transform(), fontsize=7, rotation=90,
                       va="top", ha="right", color="0.4")  # fmt: skip
             continue
-        colour, marker, _ = styles[c["representation"]]
+        colour, marker, line = STYLES[c["details"]["kind"]]
         at = (t["time"], c["errors"]["normal_deg"])
-        axes.plot(*at, color=colour, marker=marker, markersize=5, linestyle="none")
-        labels.append(
-            plot.Label(c["representation"], at, colour, "bold" if c["representation"] == "ours" else "normal")
-        )
+        axes.plot(*at, color=colour, marker=marker, markersize=5, linestyle="none",
+                  markerfacecolor="white" if line == ":" else colour)  # fmt: skip
+        labels.append(plot.Label(c["label"], at, colour, "bold" if c["label"] == "ours" else "normal"))
     if timings:
         axes.set_xscale("log")
         low, high = axes.get_xlim()
