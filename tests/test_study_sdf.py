@@ -1,5 +1,5 @@
-"""``tradeoff sdf``: what distance fields are compared with, against trilinear interpolation by NumPy and exact distances by
-formulas; what the study makes, says and writes."""
+"""``tradeoff sdf``: what distance fields are compared with, against trilinear interpolation by NumPy and exact distances
+by formulas; what the study makes, says and writes."""
 
 import json
 import math
@@ -61,14 +61,13 @@ def arrays(points):
 
 
 def lattice(field):
-    """Where its nodes are, how far apart, and steps between ± band."""
-    origin = np.array(getattr(field, "structure", field).lower)
-    return origin, field.spacing, (0.5 if isinstance(field, volumes.DistanceNodes) else 0.5)
+    """Where the first of its nodes is, and how far apart they are."""
+    return np.array(getattr(field, "structure", field).lower), field.spacing
 
 
 def interpolated(field, points):
     """The corners' rounded distances and their trilinear interpolation, by NumPy."""
-    origin, h, _ = lattice(field)
+    origin, h = lattice(field)
     band = 1.75 * h
     half = 2 ** (field.bits - 1)
     place = (points - origin) / h
@@ -102,7 +101,7 @@ def test_gradients_are_those_of_the_values(fields, name, rng):
     points, normals = surface_points(rng, 4000)
     value, found = field.gradient(arrays(points))
     assert np.abs(value.numpy() - field.value(arrays(points)).numpy()).max() < 1e-6
-    origin, h, _ = lattice(field)
+    origin, h = lattice(field)
     place = (points - origin) / h % 1
     inner = ((place > 0.05) & (place < 0.95)).all(axis=1)  # off the sides of cells, where the gradient jumps
     for axis in range(3):
@@ -233,7 +232,10 @@ def test_hash_grid(rng):
     assert np.array_equal(problem.net.entries.numpy(), problem.net.entries.numpy().astype(np.float16))
     points = rng.uniform(-0.4, 0.4, (200, 3))
     _, found = field.gradient(arrays(points))
-    unclipped = lambda p: field.net([x - a for x, a in zip(arrays(p), field.lower, strict=True)])[0].numpy() * 0.02
+
+    def unclipped(p):
+        return field.net([x - a for x, a in zip(arrays(p), field.lower, strict=True)])[0].numpy() * hash_grids.BAND
+
     for axis in range(3):
         e = 1e-4 * np.eye(3)[axis]
         difference = (unclipped(points + e) - unclipped(points - e)) / 2e-4
