@@ -1,5 +1,5 @@
-"""``tradeoff sdf``: what distance fields are compared with, against trilinear interpolation by NumPy and exact distances
-by formulas; what the study makes, says and writes."""
+"""``tradeoff sdf``: what distance fields are compared with, against trilinear interpolation by NumPy and exact
+distances by formulas; what the study makes, says and writes."""
 
 import json
 import math
@@ -192,10 +192,10 @@ def test_as_fine_as_the_bytes_allow(side, apron):
     def make(h):
         return volumes.bricks(T, Ball(), h, side, apron) if side > 1 else volumes.distance_nodes(T, Ball(), h)
 
-    found = volumes.fitted(Ball.mesh, make, 60000, side, apron)
+    found = volumes.fitted(make, 60000)
     assert 0.97 * 60000 <= found.nbytes <= 60000
     with pytest.raises(ValueError, match="too few"):
-        volumes.fitted(Ball.mesh, make, 10, side, apron)
+        volumes.fitted(make, 10)
 
 
 def test_dense_size():
@@ -225,7 +225,7 @@ def test_hash_grid(rng):
     from mi_diffind.fitting import FitSettings, fit
 
     entries = problem.net.entries.numpy()
-    fit(problem, FitSettings(seed=1, steps=30, batch=2**11, lr=1e-2, loss="mae", measure_every=30), progress=False)
+    fit(problem, FitSettings(seed=1, steps=100, batch=2**11, lr=2e-2, loss="mae", measure_every=100), progress=False)
     assert problem.measure(problem.net)["psnr_db"] > start + 3
     assert not np.array_equal(problem.net.entries.numpy(), entries)  # the grid learns, too
     hash_grids.halved(problem.net)
@@ -297,19 +297,16 @@ def test_fields_and_meshes_are_in_one_place(folder):
 
     mesh = load_mesh(folder / "dent.ply")
     view = stage.Stage(mesh, (64, 48))
-    found = candidates.Setting(mesh, "", candidates.Request((24576,)), T)
-    models = folder / "out" / "tradeoff_sdf_models"
-    bricks = volumes.load(models / "4__bricks_24_KiB.npz", T) if (models / "4__bricks_24_KiB.npz").is_file() else None
-    bricks = bricks or volumes.load(next(models.glob("4*bricks*.npz")), T)
+    bricks = volumes.load(next((folder / "out" / "tradeoff_sdf_models").glob("4*bricks*.npz")), T)
     o, d = view.rays(mi)
     expected = stage.met(view.mesh_scene(), o, d).numpy()
     hit = np.isfinite(expected)
-    assert 0.2 < hit.mean() < 0.8 and found.name == ""
+    assert 0.2 < hit.mean() < 0.8
     for t in (stage.traced(bricks, o, d), stage.met(view.grid_scene(bricks, 48), o, d)):
         t = t.numpy()
         assert np.mean(np.isfinite(t) != hit) < 0.03
         both = np.isfinite(t) & hit
-        assert np.median(np.abs(t - expected)[both]) < 5e-3
+        assert np.median(np.abs(t[both] - expected[both])) < 5e-3
 
 
 def result_of(**errors):

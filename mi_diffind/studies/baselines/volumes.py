@@ -22,7 +22,7 @@ import numpy as np
 
 from ...files import replacing
 from ...lookup import clamp
-from ...tasks.sdf import codes, samples
+from ...tasks.sdf import codes
 from ...tasks.sdf.cells import CORNERS, surface_cells
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import Field
@@ -284,6 +284,9 @@ class Bricks(_Cells):
         return value, step
 
 
+#: Sides of cells, of the longest side: where the search for a size begins, and its limits.
+FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 12
+
 #: Bricks of a side of a group; what stands for the number of a group that is inside or outside as a whole.
 _GROUP, _INSIDE, _OUTSIDE = 4, 0xFFFE, 0xFFFF
 
@@ -518,43 +521,28 @@ def _packed(field) -> bytes:
 # -- sizes ------------------------------------------------------------------------------------------------------------
 
 
-def fitted(
-    mesh: Mesh, make: Callable[[float], Field], nbytes: int, side: int, apron: bool = False, seed: int = 1
-) -> Field:
+def fitted(make: Callable[[float], Field], nbytes: int) -> Field:
     """
-    The field ``make(size)`` with the finest cells that fits into ``nbytes``, within 1.5%. How many bricks (of ``side``³
-    cells, or nodes) there are of a size is estimated by points of the surface; what the estimate is off by, coarse
-    cells tell, and after that those that were made. Raises ``ValueError`` if nothing fits.
+    The field ``make(size)`` with the finest cells that fits into ``nbytes``, within 1.5%; what is finer takes more.
+    Raises ``ValueError`` if nothing fits.
     """
-    points = samples.surface(mesh, 2**20, seed)[0]
-    size = 1 / 64
-    found = make(size)
-    factor, best = found.nbytes / _estimate(points, size, side, apron), None
-    for _ in range(5):
-        for _ in range(6):
-            size *= math.sqrt(factor * _estimate(points, size, side, apron) / (0.994 * nbytes))
+    size, power, before, best = FIRST, 2.0, None, None
+    for _ in range(8):
         found = make(size)
         if found.nbytes <= nbytes and (best is None or found.nbytes > best.nbytes):
             best = found
         if best is not None and best.nbytes >= 0.985 * nbytes:
             break
-        factor = found.nbytes / _estimate(points, size, side, apron)
+        if before is not None and found.nbytes != before[1]:
+            power = math.log(found.nbytes / before[1]) / math.log(before[0] / size)
+        before = size, found.nbytes
+        aim = size * (found.nbytes / (0.993 * nbytes)) ** (1 / np.clip(power, 1.5, 3.0))
+        size = float(np.clip(aim, FINEST, COARSEST))
+        if size == before[0]:
+            break
     if best is None:
         raise ValueError(f"{nbytes:,} bytes are too few: {found.nbytes:,} are the least that was found")
     return best
-
-
-def _estimate(points: np.ndarray, size: float, side: int, apron: bool) -> int:
-    """Bricks that are near points of the surface; without an apron, those that share corners of their cells."""
-    if apron:
-        return len(_distinct(np.floor(points / (side * size)).astype(np.int64) + 2**19))
-    cells = _distinct(np.floor(points / size).astype(np.int64) + 2**19)
-    return len(_distinct((cells[:, None] + CORNERS).reshape(-1, 3) // side))
-
-
-def _distinct(cells: np.ndarray) -> np.ndarray:
-    keys = np.unique((cells[:, 0] << 40) + (cells[:, 1] << 20) + cells[:, 2])
-    return np.stack([keys >> 40, (keys >> 20) & 0xFFFFF, keys & 0xFFFFF], -1)
 
 
 def dense_size(mesh: Mesh, nbytes: int) -> float:

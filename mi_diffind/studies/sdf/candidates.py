@@ -247,11 +247,10 @@ class Sampled(Made):
         if name == "dense":
             return volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
         if name == "distances":
-            return volumes.fitted(mesh, lambda h: volumes.distance_nodes(types, distances, h, train), nbytes, 1)
+            found = volumes.fitted(lambda h: volumes.distance_nodes(types, distances, h), nbytes)
+            return found if train is None else volumes.distance_nodes(types, distances, found.spacing, train)
         side, apron = int(name.removeprefix("bricks")[0]), not name.endswith("-shared")
-        return volumes.fitted(
-            mesh, lambda h: volumes.bricks(types, distances, h, side, apron, train), nbytes, side, apron
-        )
+        return volumes.fitted(lambda h: volumes.bricks(types, distances, h, side, apron), nbytes)
 
     def run(self, folder: Path | None, progress: bool) -> dict:
         start = time.perf_counter()
