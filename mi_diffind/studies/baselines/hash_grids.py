@@ -23,13 +23,14 @@ BAND = 0.02
 #: How far beyond the mesh's box there is a field.
 PADDING = 0.01
 
-#: Width and hidden layers of the network, levels of the grid, its coarsest and finest resolution.
-WIDTH, LAYERS, LEVELS, COARSEST, FINEST = 32, 2, 8, 16, 256
+#: Width and hidden layers of the network, levels of the grid, its coarsest resolution, and the finest one in 1 MiB.
+WIDTH, LAYERS, LEVELS, COARSEST, FINEST = 32, 2, 8, 8, 256
 
 
 def network(nbytes: int) -> Network:
     """The largest of its kind with 2 bytes for each parameter (not yet allocated)."""
-    scale = (FINEST / COARSEST) ** (1 / (LEVELS - 1))
+    finest = max(2 * COARSEST, FINEST * math.sqrt(nbytes / 2**20))
+    scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
     features = 2
     weights = features * LEVELS * WIDTH + (LAYERS - 1) * WIDTH**2 + WIDTH + LAYERS * WIDTH + 1
     resolutions = [math.ceil(COARSEST * scale**level) for level in range(LEVELS)]
