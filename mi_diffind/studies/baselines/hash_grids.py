@@ -51,7 +51,8 @@ class HashField(Field):
     """The field of a trained ``net``, whose outputs are distances divided by :data:`BAND`. It knows no slope."""
 
     def __init__(self, types, net: Network, mesh: Mesh):
-        super().__init__(types, mesh.lower - PADDING, mesh.upper + PADDING, 1 / FINEST, BAND)
+        finest = net.grid["base_resolution"] * net.grid["per_level_scale"] ** (net.grid["n_levels"] - 1)
+        super().__init__(types, mesh.lower - PADDING, mesh.upper + PADDING, 1 / finest, BAND)
         self.net = net
         self.nbytes = 2 * net.parameters
 
