@@ -247,16 +247,16 @@ def test_hash_grid(rng):
 
 # -- the study --------------------------------------------------------------------------------------------------------
 
-LEFT_OUT = [k for k in candidates.KINDS if k not in ("dense-trained", "bricks4", "ours")]
+LEFT_OUT = [k for k in candidates.KINDS if k not in ("bricks4", "ours")]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """What a quick run leaves, and the mesh, a ball with a dent."""
+    """What a quick run leaves, and the mesh, a ball that is flat on top."""
     pytest.importorskip("igl", reason="libigl is not installed")
     folder = tmp_path_factory.mktemp("sdf")
     vertices, faces = solids.sphere(16)
-    vertices[vertices[:, 2] > 0.8, 2] = 0.8
+    vertices[:, 2] = np.minimum(vertices[:, 2], 0.64 + 0.2 * vertices[:, 2])
     solids.write(folder / "dent.ply", (vertices, faces))
     with pytest.MonkeyPatch.context() as patch:
         small = frame.Settings(2**10, 2, 1, 2**10, True)
@@ -274,7 +274,7 @@ def command(folder, *more):
 def test_what_is_written(folder):
     result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
     made = {n: c for n, c in result["candidates"].items() if not c["is_reference"]}
-    assert set(made) == {"dense grid, trained 24 KiB", "4³ bricks 24 KiB", "ours 24 KiB"}
+    assert set(made) == {"4³ bricks 24 KiB", "ours 24 KiB"}
     for name, c in made.items():
         e = c["errors"]
         assert 0.5 * 24576 < c["bytes"] <= 24576 and c["details"]["file_bytes"] > 0, name
@@ -285,7 +285,7 @@ def test_what_is_written(folder):
     assert set(result["cases"]["reads"]["queries"]) == {"value", "normal"}
     out = folder / "out"
     assert (out / "tradeoff_sdf_shapes.png").stat().st_size > 20_000
-    assert len(list((out / "tradeoff_sdf_models").glob("*.npz"))) == 3
+    assert len(list((out / "tradeoff_sdf_models").glob("*.npz"))) == 2
     assert result["conclusions"][0].startswith("24 KiB: ")
 
 
