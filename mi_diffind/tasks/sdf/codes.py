@@ -3,8 +3,8 @@ What a sparse grid's nodes hold: a distance and a normal, coded in the frame of 
 
 A block of 4 × 4 × 4 nodes is described by a plane, its *frame*: a normal N (octahedral, 2 × 10 bits), the distance D of
 the block's middle (8 bits), and a scale s (4 bits). A node holds a pointer into one small array that all blocks share,
-the *cascaded array*. Its entry ``(e, a, b)`` says how the node differs from the plane: with the offset o from the middle,
-in spacings,
+the *cascaded array*. Its entry ``(e, a, b)`` says how the node differs from the plane: with the offset o from the
+middle, in spacings,
 
     distance = D + N·o + s e,    normal = c N + f s (a T + b B),    r² = s² (a² + b²),  c = 1 − r²/2,  f = √(1 − r²/4)
 
@@ -122,7 +122,9 @@ def decoded(entry, n, d, scale, offset):
     root = np.sqrt if isinstance(n[0], np.ndarray) else dr.sqrt
     beyond = square > EDGE**2
     c = 1 - _select(n, beyond, EDGE**2, square) / 2
-    f = _select(n, beyond, EDGE, 1.0) * root((1 - _select(n, beyond, EDGE**2, square) / 4) / _select(n, beyond, square, 1.0))
+    f = _select(n, beyond, EDGE, 1.0) * root(
+        (1 - _select(n, beyond, EDGE**2, square) / 4) / _select(n, beyond, square, 1.0)
+    )
     t, u = orthonormal(n)
     normal = tuple(c * k + f * (a * p + b * q) for k, p, q in zip(n, t, u, strict=True))
     return d + n[0] * offset[0] + n[1] * offset[1] + n[2] * offset[2] + e, normal
