@@ -83,8 +83,8 @@ def _mesh_normals(view: stage.Stage) -> tuple[np.ndarray, np.ndarray]:
     import mitsuba as mi
 
     o, d = view.rays(mi)
-    si = view.mesh_scene().ray_intersect(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)))
-    width, height = view.film
+    scene, (width, height) = view.mesh_scene(), view.film
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)))
     hit = si.is_valid().numpy().reshape(height, width)
     return np.array(si.n).T.reshape(height, width, 3), hit
 

@@ -114,5 +114,5 @@ def traced(field: Field, o, d):
 
 
 def met(scene, o, d):
-    """The same in a scene of Mitsuba's."""
+    """The same in a scene of Mitsuba's, which has to live until the result is evaluated."""
     return scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), coherent=True).t
