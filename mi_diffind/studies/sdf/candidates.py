@@ -4,8 +4,8 @@ index, too.
 
 *Dense grids* of 8 bits hold exact distances, or nodes that were trained. *Bricks* of 4³ and 8³ cells with 8 bits lie
 where the surface passes; either each has its own borders, or they share nodes as OpenVDB's leaves do. *Sparse
-distances* are what is left of ours without normals and without indirection: 6 bits at each node of a cell that the
-surface crosses, exact or trained. *Ours* is the default preset, *indirection* and *paper* are the others
+distances* are what is left of ours without normals and without indirection: 6 or 8 bits, whichever is better, at each
+node of a cell that the surface crosses, exact or trained. *Ours* is the default preset, *indirection* and *paper* are the others
 (:mod:`mi_diffind.tasks.sdf`). *Hash grid + network* is that of ``drjit.nn``, in half precision. Nodes of grids are
 trained by least squares, so that there is nothing left to gain; the network until twice as many steps gain little.
 Each kind is as fine as the bytes allow; to find that out is part of the seconds.
@@ -76,6 +76,9 @@ PRESETS = {"ours": "", "indirection": "dense", "paper": "paper"}
 #: What renders and rays are compared with.
 MESH, GRID = "mesh (Embree)", "sdfgrid"
 
+#: Bits of a sparse distance that are tried; those with the best normals are kept.
+SPARSE_BITS = (6, 8)
+
 #: How much of the mesh is sampled to train the network, and how it is trained.
 POOL = 2**20
 HASH_SETTINGS = FitSettings(seed=1, schedule="cosine", deterministic=False, lr=1e-2, batch=2**13, loss="mae")
@@ -110,6 +113,7 @@ class Setting:
     request: Request
     types: object
     jobs: dict[str, Made] = field(default_factory=dict)
+    _sparse: dict[int, volumes.DistanceNodes] = field(default_factory=dict)
 
     @functools.cached_property
     def distances(self) -> Distances:
@@ -125,6 +129,16 @@ class Setting:
         lower, upper = (self.mesh.lower - hash_grids.PADDING, self.mesh.upper + hash_grids.PADDING)
         counts = (POOL, 2**16) if self.request.points >= 2**18 else (2**14, 2**10)
         return [hash_grids.pool(self.distances, lower, upper, n, seed) for seed, n in enumerate(counts, 1)]
+
+    def sparse_distances(self, nbytes: int) -> volumes.DistanceNodes:
+        """Exact distances in so many bytes: with the number of bits whose normals are best."""
+        if nbytes not in self._sparse:
+            found = [
+                volumes.fitted(lambda h, b=bits: volumes.distance_nodes(self.types, self.distances, h, bits=b), nbytes)
+                for bits in SPARSE_BITS
+            ]
+            self._sparse[nbytes] = min(found, key=lambda f: self.evaluation.measure(f)["normal_deg"])
+        return self._sparse[nbytes]
 
     def errors(self, found: Field) -> dict[str, float]:
         """All errors of a field, with ``iou_db`` and ``iou_near_db``, the shares that are wrong in decibels."""
@@ -234,6 +248,7 @@ class Made(Job):
         if nbytes > self.nbytes:
             raise AssertionError(f"{self.name}: takes {nbytes:,} bytes")
         details |= {"file_bytes": file_bytes, "spacing": found.spacing, "slope": found.slope}
+        details |= {"bits": found.bits} if isinstance(found, volumes.DistanceNodes) else {}
         return {"bytes": nbytes, "seconds": seconds, "errors": self.setting.errors(found), "details": details}
 
 
@@ -247,8 +262,10 @@ class Sampled(Made):
         if name == "dense":
             return volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
         if name == "distances":
-            found = volumes.fitted(lambda h: volumes.distance_nodes(types, distances, h), nbytes)
-            return found if train is None else volumes.distance_nodes(types, distances, found.spacing, train)
+            found = setting.sparse_distances(nbytes)
+            if train is None:
+                return found
+            return volumes.distance_nodes(types, distances, found.spacing, train, bits=found.bits)
         side, apron = int(name.removeprefix("bricks")[0]), not name.endswith("-shared")
         return volumes.fitted(lambda h: volumes.bricks(types, distances, h, side, apron), nbytes)
 
