@@ -5,10 +5,10 @@ index, too.
 *Dense grids* of 8 bits hold exact distances, or nodes that were trained. *Bricks* of 4³ and 8³ cells with 8 bits lie
 where the surface passes; either each has its own borders, or they share nodes as OpenVDB's leaves do. *Sparse
 distances* are what is left of ours without normals and without indirection: 6 or 8 bits, whichever is better, at each
-node of a cell that the surface crosses, exact or trained. *Ours* is the default preset, *indirection* and *paper* are the others
-(:mod:`mi_diffind.tasks.sdf`). *Hash grid + network* is that of ``drjit.nn``, in half precision. Nodes of grids are
-trained by least squares, so that there is nothing left to gain; the network until twice as many steps gain little.
-Each kind is as fine as the bytes allow; to find that out is part of the seconds.
+node of a cell that the surface crosses, exact or trained. *Ours* is the default preset, *indirection* and *paper* are
+the others (:mod:`mi_diffind.tasks.sdf`). *Hash grid + network* is that of ``drjit.nn``, in half precision. Nodes of
+grids are trained by least squares, so that there is nothing left to gain; the network until twice as many steps gain
+little. Each kind is as fine as the bytes allow; to find that out is part of the seconds.
 
 Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.Evaluation`; all lengths are in units of the longest side.
 Times: reads at random points within 0.01 of the surface; primary rays, beside Embree on the mesh itself and Mitsuba's
