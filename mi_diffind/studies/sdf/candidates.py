@@ -194,7 +194,7 @@ def plan(mesh: Mesh, name: str, request: Request) -> Plan:
             "first": first, "film": list(request.film),
         },
         notes=[
-            f"{name}, {len(mesh.faces):,} triangles. IoU near: within 0.01 of the longest side. Bytes are those of all "
+            f"{Path(name).name}, {len(mesh.faces):,} triangles. IoU near: within 0.01 of the longest side. Bytes are those of all "
             "that a read needs.",
             *setting.distances.warnings,
         ],

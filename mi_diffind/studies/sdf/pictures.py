@@ -116,20 +116,20 @@ def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
     made = [c for found in by_size(result).values() for c in found.values()]
     for kind, (colour, marker, line) in STYLES.items():
         own = [c for c in made if c["details"]["kind"] == kind]
-        points = sorted((c["bytes"] / 2**20, 1 - c["errors"][key] if missing else c["errors"][key]) for c in own)
+        points = sorted((c["bytes"], 1 - c["errors"][key] if missing else c["errors"][key]) for c in own)
         if points:
             axes.plot(*zip(*points, strict=True), color=colour, marker=marker, markersize=4, linestyle=line,
                       label=own[0]["label"], linewidth=2.0 if kind == "ours" else 1.0,
                       markerfacecolor="white" if line == ":" else colour)  # fmt: skip
-    sizes = sorted({c["details"]["asked"] / 2**20 for c in made})
+    sizes = sorted({c["details"]["asked"] for c in made})
     axes.set_xscale("log", base=2)
     axes.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
     axes.set_xticks(sizes)
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     plot.log_ticks(axes.yaxis, low, high, lambda v: f"{v:.2g}")
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_xlabel("MiB in memory", fontsize=8)
+    axes.xaxis.set_major_formatter(lambda value, _: size_text(round(value)))
+    axes.set_xlabel("memory", fontsize=8)
     _finish(axes, label)
     if missing:
         axes.legend(fontsize=6, loc="best")
