@@ -289,6 +289,24 @@ def test_what_is_written(folder):
     assert result["conclusions"][0].startswith("24 KiB: ")
 
 
+def test_what_was_made_is_known(folder):
+    import mitsuba as mi
+
+    from mi_diffind.tasks.sdf.mesh import load_mesh
+
+    assert mi.variant() == "llvm_ad_rgb"
+    result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
+    request = candidates.Request((24576,), tuple(LEFT_OUT))
+    plan = candidates.plan(load_mesh(folder / "dent.ply"), str(folder / "dent.ply"), request)
+    assert [job.name for job in plan.jobs] == list(result["jobs"])
+    models = folder / "out" / "tradeoff_sdf_models"
+    for job in plan.jobs:
+        record = result["jobs"][job.name]
+        assert job.known(models, None) is None and job.known(None, record) is None
+        assert job.known(models, record) == record
+        assert (job.field.spacing, job.field.slope) == (record["details"]["spacing"], record["details"]["slope"])
+
+
 def test_fields_and_meshes_are_in_one_place(folder):
     """The rays of fields, of the mesh and of the decoded grid meet surfaces in the same places."""
     import mitsuba as mi

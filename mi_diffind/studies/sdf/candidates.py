@@ -194,9 +194,9 @@ def plan(mesh: Mesh, name: str, request: Request) -> Plan:
             "first": first, "film": list(request.film),
         },
         notes=[
-            f"{Path(name).name}, {len(mesh.faces):,} triangles. IoU near: within 0.01 of the longest side. Bytes are those of all "
-            "that a read needs.",
-            *setting.distances.warnings,
+            f"{Path(name).name}, {len(mesh.faces):,} triangles. IoU near: within 0.01 of the longest side. Bytes are "
+            "those of all that a read needs.",
+            *(_sentence(said, mesh) for said in (*mesh.warnings, *setting.distances.warnings)),
         ],
         jobs=list(jobs.values()),
         jobs_fingerprint=fingerprint(made_by) + mesh.digest[:16],
@@ -204,6 +204,12 @@ def plan(mesh: Mesh, name: str, request: Request) -> Plan:
         table=table,
         conclusions=conclusions,
     )  # fmt: skip
+
+
+def _sentence(said: str, mesh: Mesh) -> str:
+    """A warning about ``mesh`` without its path."""
+    said = said.removeprefix(f"{mesh.path}: ")
+    return f"{said[:1].upper()}{said[1:]}."
 
 
 # -- jobs -------------------------------------------------------------------------------------------------------------
