@@ -60,7 +60,7 @@ class SdfStudy(Study):
             hash_steps=(40, 80) if quick else (500, 4000),
             film=(48, 32) if quick else (480, 320),
             grid=32 if quick else 256,
-            decoded=48 if quick else 512,
+            decoded=96 if quick else 768,
             spp=1 if quick else 4,
         )
         return plan(arguments.loaded, arguments.source, request)

@@ -79,6 +79,9 @@ MESH, GRID = "mesh (Embree)", "sdfgrid"
 #: Bits of a sparse distance that are tried; those with the best normals are kept.
 SPARSE_BITS = (6, 8)
 
+#: How much finer than its cells a field is decoded to measure its surface.
+FINER = 1.5
+
 #: How much of the mesh is sampled to train the network, and how it is trained.
 POOL = 2**20
 HASH_SETTINGS = FitSettings(seed=1, schedule="cosine", deterministic=False, lr=1e-2, batch=2**13, loss="mae")
@@ -89,7 +92,7 @@ class Request:
     """
     ``sizes`` in bytes, the first of which is shown most; kinds left out (``without``); held-out ``points``; ``steps``
     of trainings by presets (0: the preset's own); ``hash_steps`` of the network's first and longest training; ``film``,
-    width and height of pictures; ``grid``, cells of ``sdfgrid`` along the longest side; ``decoded``, those of the
+    width and height of pictures; ``grid``, cells of ``sdfgrid`` along the longest side; ``decoded``, the most of the
     surface that the Chamfer distance is measured of; ``spp`` of the render.
     """
 
@@ -100,7 +103,7 @@ class Request:
     hash_steps: tuple[int, int] = (500, 4000)
     film: tuple[int, int] = (480, 320)
     grid: int = 256
-    decoded: int = 512
+    decoded: int = 768
     spp: int = 4
 
 
@@ -144,8 +147,9 @@ class Setting:
         """All errors of a field, with ``iou_db`` and ``iou_near_db``, the shares that are wrong in decibels."""
         errors = self.evaluation.measure(found)
         errors |= {f"{name}_db": -10 * math.log10(max(1 - errors[name], 1e-6)) for name in ("iou", "iou_near")}
-        if 1.5 / found.spacing <= self.request.decoded:
-            surface = decode.extract(found, self.request.decoded, self.mesh.scale, self.mesh.centre)
+        finer = math.ceil(FINER / found.spacing)
+        if finer <= self.request.decoded:
+            surface = decode.extract(found, max(finer, self.request.decoded // 3), self.mesh.scale, self.mesh.centre)
             errors |= self.evaluation.chamfer(surface, max(2**10, self.request.points // 4))
         return errors
 
