@@ -27,6 +27,9 @@ FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 8
 #: How much smaller than asked for a sparse field may be.
 TOLERANCE = 0.02
 
+#: What a cell that the surface passes through takes, at least.
+BYTES_PER_CELL = 3
+
 #: Samples of the dense arrays, and the share that is uniform in the box.
 SAMPLES, UNIFORM = 2**20, 0.2
 
@@ -96,9 +99,11 @@ def sampled_for(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
             found = sampled
         if fits and size >= (1 - TOLERANCE) * nbytes:
             break
-        # Nodes, blocks and their words grow with the square
-        fixed = 16 * 2**bits // 4
-        aim = spacing * np.sqrt(max(size - fixed, 1) / max((1 - TOLERANCE / 2) * nbytes - fixed, 1))
+        # Nodes, blocks and their words grow with the square. Where a solid is thinner than cells, so do those that its
+        # surface passes through
+        fixed = 4 * entries_for(sampled, bits)
+        expected = max(size - fixed, BYTES_PER_CELL * sampled.cells)
+        aim = spacing * np.sqrt(expected / max((1 - TOLERANCE / 2) * nbytes - fixed, 1))
         following = float(np.clip(aim, FINEST, COARSEST))
         if following in tried:
             break
@@ -150,7 +155,8 @@ def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: R
     if sampled.missed > THIN:
         lines.append(
             f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of "
-            f"sign: parts may be thinner than a cell, 1/{1 / structure.spacing:.0f} of the longest side; more --bytes help"
+            f"sign: parts may be thinner than a cell, 1/{1 / structure.spacing:.0f} of the longest side: more --bytes "
+            f"help"
         )
     field = files.coded_field(request.types, structure, slope, coding.frames, words, bits, coding.entries)
     return table, result, field, lines

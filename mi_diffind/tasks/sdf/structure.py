@@ -45,8 +45,8 @@ class Structure:
     Which nodes are stored. ``regions``: ``(X, Y, Z)`` bytes, :data:`ACTIVE` or what is known of an empty one.
     ``region_masks``, ``region_signs``: ``(R, 2)`` words of 32 bits, for each region with nodes the blocks that have
     some, and the signs (1: inside) of those that have none. ``block_masks``: ``(B, 2)`` words, the nodes that are
-    stored in each block, ``block_signs``: ``(B,)`` bytes, the signs of its eight groups of 2 × 2 × 2 nodes. Regions and blocks
-    in lexicographic order, blocks region by region; bits of a mask likewise, z fastest.
+    stored in each block, ``block_signs``: ``(B,)`` bytes, the signs of its eight groups of 2 × 2 × 2 nodes. Regions and
+    blocks in lexicographic order, blocks region by region; bits of a mask likewise, z fastest.
     """
 
     lower: tuple[float, float, float]
