@@ -220,6 +220,36 @@ def shading_shares(study: str) -> str:
     return table(["material", "", "", *(f"λ {share:g}" for share in shares)], rows)
 
 
+def sdf_errors(study: str) -> str:
+    """Distance fields in equal bytes: IoU, IoU near the surface, normals."""
+    from mi_diffind.studies.sdf.conclusions import by_size, size_text
+
+    sizes = by_size(measured(study))
+    rows: dict[str, dict[int, str]] = {}
+    for size, made in sizes.items():
+        for c in made.values():
+            e = c["errors"]
+            cell = f"{e['iou']:.4f} / {e['iou_near']:.4f} / {e['normal_deg']:.2f}°"
+            rows.setdefault(c["label"], {})[size] = cell
+    return table(["", *map(size_text, sizes)], [[name, *(row.get(s, "") for s in sizes)] for name, row in rows.items()])
+
+
+def sdf_times(study: str) -> str:
+    """Distance fields of one size: seconds until there is one, reads, rays, renders."""
+    result = measured(study)
+    reads, rays = (result["cases"][case] for case in ("reads", "rays"))
+    rows = []
+    for name, c in result["candidates"].items():
+        if name not in rays["queries"]["ray"] and name not in reads["queries"]["value"]:
+            continue
+        cells = [reads["queries"][q].get(name) for q in ("value", "normal")]
+        cells += [rays["queries"]["ray"].get(name), rays["passes"].get("render", {}).get(name)]
+        seconds = "" if c["is_reference"] else f"{c['training_seconds']:.0f}"
+        rows.append([c["label"], f"{c['bytes']:,}", seconds, *("" if t is None else f"{t['time']:.3g}" for t in cells)])
+    head = ["", "bytes", "seconds", "a distance, ns", "a gradient, ns", "a primary ray, ns", "a render, ms"]
+    return table(head, rows)
+
+
 def mean(values) -> float:
     """The mean of an iterable."""
     values = list(values)
@@ -233,6 +263,9 @@ for source in ("", "_boombox"):
 for source in ("", "_boombox"):
     for make in (shading_filters, shading_shares):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make("tradeoff_shading" + source)
+for source in ("suzanne", "armadillo", "bunny"):
+    for make in (sdf_errors, sdf_times):
+        TABLES[f"{make.__name__}_{source}"] = lambda make=make, source=source: make(f"tradeoff_sdf_{source}")
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
 

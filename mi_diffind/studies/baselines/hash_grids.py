@@ -1,0 +1,126 @@
+"""
+Hash grids with a network behind them (``drjit.nn``; Müller et al., *Instant Neural Graphics Primitives*, 2022) as
+signed distance fields.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import numpy as np
+
+from ...fitting import Problem
+from ...tasks.sdf import samples
+from ...tasks.sdf.distances import Distances
+from ...tasks.sdf.field import Field
+from ...tasks.sdf.mesh import Mesh
+from .networks import Network
+
+#: Half the range of distances that are learned.
+BAND = 0.02
+
+#: How far beyond the mesh's box there is a field.
+PADDING = 0.01
+
+#: Width and hidden layers of the network, levels of the grid, its coarsest resolution, and the finest one in 1 MiB.
+WIDTH, LAYERS, LEVELS, COARSEST, FINEST = 32, 2, 8, 8, 256
+
+
+def network(nbytes: int) -> Network:
+    """The largest of its kind with 2 bytes for each parameter (not yet allocated)."""
+    finest = max(2 * COARSEST, FINEST * math.sqrt(nbytes / 2**20))
+    scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
+    features = 2
+    weights = features * LEVELS * WIDTH + (LAYERS - 1) * WIDTH**2 + WIDTH + LAYERS * WIDTH + 1
+    resolutions = [math.ceil(COARSEST * scale**level) for level in range(LEVELS)]
+    size = 0
+    for power in np.arange(8, 24, 0.05):
+        most = int(2**power) // 16 * 16
+        entries = sum(min(most, (n + 1) ** 3) for n in resolutions)
+        if 2 * (features * entries + weights) <= nbytes:
+            size = most
+    if not size:
+        raise ValueError(f"{nbytes:,} bytes are too few for a hash grid of {LEVELS} levels")
+    grid = {"n_levels": LEVELS, "n_features_per_level": features, "hashmap_size": size, "base_resolution": COARSEST,
+            "per_level_scale": scale, "align_corners": True, "init_scale": 1e-4}  # fmt: skip
+    return Network(3, WIDTH, LAYERS, grid)
+
+
+class HashField(Field):
+    """The field of a trained ``net``, whose outputs are distances divided by :data:`BAND`. It knows no slope."""
+
+    def __init__(self, types, net: Network, mesh: Mesh):
+        finest = net.grid["base_resolution"] * net.grid["per_level_scale"] ** (net.grid["n_levels"] - 1)
+        super().__init__(types, mesh.lower - PADDING, mesh.upper + PADDING, 1 / finest, BAND)
+        self.net = net
+        self.nbytes = 2 * net.parameters
+
+    def value(self, p, active=True):
+        active = self.inside(p) & active
+        found = self.net([(x - a) for x, a in zip(p, self.lower, strict=True)])[0]
+        return dr.select(active, dr.clip(found * BAND, -BAND, BAND), BAND)
+
+    def gradient(self, p, active=True):
+        active = self.inside(p) & active
+        with dr.resume_grad():
+            q = self.types.Array3f(dr.detach(p))
+            dr.enable_grad(q)
+            found = self.net([(x - a) for x, a in zip(q, self.lower, strict=True)])[0] * BAND
+            dr.backward(found)
+            slope = dr.detach(dr.grad(q))
+        value = dr.clip(dr.detach(found), -BAND, BAND)
+        return dr.select(active, value, BAND), dr.select(active, slope, 0)
+
+    def look(self, p, d, active=True):
+        raise NotImplementedError("no bound of the slope of a network is known")
+
+
+def halved(net: Network) -> None:
+    """Round all parameters to half precision, in which they are stored."""
+    for key in net:
+        value = net[key].numpy().astype(np.float16).astype(np.float32)
+        net[key] = type(net[key])(value)
+
+
+class HashProblem(Problem):
+    """
+    The training of a :class:`Network` on distances to a ``mesh``: those of a ``pool`` of points, measured at those of
+    another one (:func:`pool`).
+    """
+
+    def __init__(self, net: Network, types, mesh: Mesh, pool: tuple, held: tuple, seed: int = 1):
+        self.net, self.types = net.alloc(types.TensorXf, 3, dr.rng(seed=seed)), types
+        self.field = HashField(types, self.net, mesh)
+        self.pool, self.held = self._arrays(*pool), self._arrays(*held)
+        self.count = len(pool[1])
+        self.identity = {"mesh": mesh.digest, "count": self.count, "seed": seed}
+
+    def _arrays(self, points: np.ndarray, distances: np.ndarray):
+        points = [self.types.Float(np.ascontiguousarray(x)) for x in points.T]
+        return [*points, self.types.Float(np.clip(distances / BAND, -1, 1))]
+
+    def batch(self, rng, size: int):
+        index = dr.minimum(self.types.UInt32(rng.random(self.types.Float, size) * self.count), self.count - 1)
+        *p, d = (dr.gather(self.types.Float, v, index) for v in self.pool)
+        return p, {"d": [d]}
+
+    def predict(self, net, inputs) -> dict[str, list]:
+        return {"d": net([x - a for x, a in zip(inputs, self.field.lower, strict=True)])}
+
+    def measure(self, net) -> dict[str, float]:
+        *p, d = self.held
+        error = dr.clip(self.predict(net, p)["d"][0], -1, 1) - d
+        return {"psnr_db": -10 * math.log10(max(float(dr.mean(dr.square(error))[0]), 1e-12))}
+
+
+def pool(distances: Distances, lower, upper, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    ``count`` points and their distances, three quarters near the surface (normal distributions of 0.002 and 0.01), the
+    others anywhere in the box.
+    """
+    rng = np.random.default_rng(seed)
+    near = [samples.near(distances.mesh, 3 * count // 8, width, rng) for width in (0.002, 0.01)]
+    rest = samples.far(lower, upper, count - sum(map(len, near)), rng)
+    points = np.clip(np.concatenate([*near, rest]), lower, upper)[rng.permutation(count)].astype(np.float32)
+    return points, distances.signed(points, 2 * BAND)

@@ -1,0 +1,395 @@
+"""
+What the study of distance fields compares, all in the same bytes of memory: everything that a read needs counts, the
+index, too.
+
+*Dense grids* of 8 bits hold exact distances, or nodes that were trained. *Bricks* of 4³ and 8³ cells with 8 bits lie
+where the surface passes; either each has its own borders, or they share nodes as OpenVDB's leaves do. *Sparse
+distances* are what is left of ours without normals and without indirection: 6 or 8 bits, whichever is better, at each
+node of a cell that the surface crosses, exact or trained. *Ours* is the default preset, *indirection* and *paper* are
+the others (:mod:`mi_diffind.tasks.sdf`). *Hash grid + network* is that of ``drjit.nn``, in half precision. Nodes of
+grids are trained by least squares, so that there is nothing left to gain; the network until twice as many steps gain
+little. Each kind is as fine as the bytes allow; to find that out is part of the seconds.
+
+Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.Evaluation`; all lengths are in units of the longest side.
+Times: reads at random points within 0.01 of the surface; primary rays, beside Embree on the mesh itself and Mitsuba's
+``sdfgrid``; a whole render.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...fitting import FitSettings
+from ...measure.store import file_name, fingerprint
+from ...measure.study import FLOOR, Candidate, Case, Job, Plan
+from ...measure.training import Training
+from ...runtime import array_module
+from ...tables import save_table
+from ...tasks import task
+from ...tasks.sdf import decode
+from ...tasks.sdf.distances import Distances
+from ...tasks.sdf.evaluation import Evaluation
+from ...tasks.sdf.field import Field
+from ...tasks.sdf.mesh import Mesh
+from ..baselines import hash_grids, volumes
+from . import pictures, stage
+from .conclusions import conclusions, size_text, table
+
+#: Kind → its label. Those of :data:`ONCE` are made of the first size only.
+KINDS = {
+    "dense": "dense grid",
+    "dense-trained": "dense grid, trained",
+    "bricks8": "8³ bricks",
+    "bricks4": "4³ bricks",
+    "bricks4-shared": "4³ bricks, shared nodes",
+    "distances": "sparse distances",
+    "distances-trained": "sparse distances, trained",
+    "ours": "ours",
+    "indirection": "indirection",
+    "paper": "paper",
+    "hash": "hash grid + network",
+}
+ONCE = ("indirection", "paper", "hash")
+
+#: Kind → what it is a kind of, for pictures.
+FAMILIES = {
+    "dense": "dense grid", "dense-trained": "dense grid", "bricks8": "bricks", "bricks4": "bricks",
+    "bricks4-shared": "bricks", "distances": "sparse distances", "distances-trained": "sparse distances",
+    "ours": "ours", "indirection": "supplement's arrays", "paper": "supplement's arrays", "hash": "network",
+}  # fmt: skip
+
+#: Kinds that the times of ours are divided by.
+AGAINST = ("dense-trained", "bricks4", "distances-trained")
+
+#: Kind → preset, of those that ``fit sdf`` makes.
+PRESETS = {"ours": "", "indirection": "dense", "paper": "paper"}
+
+#: What renders and rays are compared with.
+MESH, GRID = "mesh (Embree)", "sdfgrid"
+
+#: Bits of a sparse distance that are tried; those with the best normals are kept.
+SPARSE_BITS = (6, 8)
+
+#: How much finer than its cells a field is decoded to measure its surface.
+FINER = 1.5
+
+#: How much of the mesh is sampled to train the network, and how it is trained.
+POOL = 2**20
+HASH_SETTINGS = FitSettings(seed=1, schedule="cosine", deterministic=False, lr=1e-2, batch=2**13, loss="mae")
+
+
+@dataclass(frozen=True)
+class Request:
+    """
+    ``sizes`` in bytes, the first of which is shown most; kinds left out (``without``); held-out ``points``; ``steps``
+    of trainings by presets (0: the preset's own); ``hash_steps`` of the network's first and longest training; ``film``,
+    width and height of pictures; ``grid``, cells of ``sdfgrid`` along the longest side; ``decoded``, the most of the
+    surface that the Chamfer distance is measured of; ``spp`` of the render.
+    """
+
+    sizes: tuple[int, ...]
+    without: tuple[str, ...] = ()
+    points: int = 2**20
+    steps: int = 0
+    hash_steps: tuple[int, int] = (500, 4000)
+    film: tuple[int, int] = (480, 320)
+    grid: int = 256
+    decoded: int = 768
+    spp: int = 4
+
+
+@dataclass
+class Setting:
+    """What all candidates share: the ``mesh``, of the file ``name``, its distances, held-out points and the view."""
+
+    mesh: Mesh
+    name: str
+    request: Request
+    types: object
+    jobs: dict[str, Made] = field(default_factory=dict)
+    _sparse: dict[int, volumes.DistanceNodes] = field(default_factory=dict)
+
+    @functools.cached_property
+    def distances(self) -> Distances:
+        return Distances(self.mesh)
+
+    @functools.cached_property
+    def evaluation(self) -> Evaluation:
+        return Evaluation(self.mesh, self.distances, self.request.points)
+
+    @functools.cached_property
+    def pools(self):
+        """The points that a network is trained on, and those that it is measured at."""
+        lower, upper = (self.mesh.lower - hash_grids.PADDING, self.mesh.upper + hash_grids.PADDING)
+        counts = (POOL, 2**16) if self.request.points >= 2**18 else (2**14, 2**10)
+        return [hash_grids.pool(self.distances, lower, upper, n, seed) for seed, n in enumerate(counts, 1)]
+
+    def sparse_distances(self, nbytes: int) -> volumes.DistanceNodes:
+        """Exact distances in so many bytes: with the number of bits whose normals are best."""
+        if nbytes not in self._sparse:
+            found = [
+                volumes.fitted(lambda h, b=bits: volumes.distance_nodes(self.types, self.distances, h, bits=b), nbytes)
+                for bits in SPARSE_BITS
+            ]
+            self._sparse[nbytes] = min(found, key=lambda f: self.evaluation.measure(f)["normal_deg"])
+        return self._sparse[nbytes]
+
+    def errors(self, found: Field) -> dict[str, float]:
+        """All errors of a field, with ``iou_db`` and ``iou_near_db``, the shares that are wrong in decibels."""
+        errors = self.evaluation.measure(found)
+        errors |= {f"{name}_db": -10 * math.log10(max(1 - errors[name], 1e-6)) for name in ("iou", "iou_near")}
+        finer = math.ceil(FINER / found.spacing)
+        if finer <= self.request.decoded:
+            surface = decode.extract(found, max(finer, self.request.decoded // 3), self.mesh.scale, self.mesh.centre)
+            errors |= self.evaluation.chamfer(surface, max(2**10, self.request.points // 4))
+        return errors
+
+
+def plan(mesh: Mesh, name: str, request: Request) -> Plan:
+    """What is measured of ``mesh``, of the file ``name``, in the variant that is set."""
+    setting = Setting(mesh, name, request, array_module(mi.variant()))
+    first = request.sizes[0]
+    for size in request.sizes:
+        for kind in KINDS:
+            if kind not in request.without and (size == first or kind not in ONCE):
+                made = Made.of(kind, size, setting)
+                setting.jobs[made.name] = made
+    jobs = setting.jobs
+    candidates = [job.candidate() for job in jobs.values()]
+    grid = f"{GRID} {request.grid}³"
+    reference = {"is_reference": True, "in_passes": True}
+    candidates.append(Candidate(MESH, "mesh", bytes=12 * (len(mesh.vertices) + len(mesh.faces)), **reference))
+    candidates.append(Candidate(grid, "sdfgrid", bytes=4 * request.grid**3, **reference))
+    shown = [name for name, job in jobs.items() if job.nbytes == first]
+    traced = [name for name in shown if jobs[name].kind != "hash"]
+    stage_of = functools.cache(lambda: stage.Stage(mesh, request.film))
+    cases = [
+        Case("reads", lambda lanes: _reads(setting, shown, lanes), candidates=tuple(shown),
+             query_names=("value", "normal")),
+        Case("rays", lambda lanes: _rays(setting, stage_of(), traced, grid, lanes),
+             lambda: _renders(setting, stage_of(), traced, grid), candidates=(*traced, MESH, grid),
+             query_names=("ray",)),
+    ]  # fmt: skip
+    ours = next((n for n in shown if jobs[n].kind == "ours"), "")
+    package = Path(__file__).resolve().parents[2]
+    made_by = [*(package / "tasks" / "sdf").glob("*.py"), package / "fitting.py", package / "indirection.py"]
+    made_by += [package / "studies" / "baselines" / f"{n}.py" for n in ("volumes", "hash_grids", "networks")]
+    return Plan(
+        study="sdf",
+        title=f"Signed distance field: {Path(name).stem}",
+        variant=mi.variant(),
+        candidates=candidates,
+        cases=cases,
+        queries=("value",),
+        accuracy="iou_near_db",
+        accuracy_label="near the surface, −10 log₁₀(1 − IoU), dB",
+        ratios=[(ours, n) for n in (*(n for n in traced if jobs[n].kind in AGAINST), MESH, grid)] if ours else [],
+        details={
+            "source": name, "source_digest": mesh.digest, "triangles": len(mesh.faces), "request": asdict(request),
+            "first": first, "film": list(request.film),
+        },
+        notes=[
+            f"{Path(name).name}, {len(mesh.faces):,} triangles. IoU near: within 0.01 of the longest side. Bytes are "
+            "those of all that a read needs.",
+            *(_sentence(said, mesh) for said in (*mesh.warnings, *setting.distances.warnings)),
+        ],
+        jobs=list(jobs.values()),
+        jobs_fingerprint=fingerprint(made_by) + mesh.digest[:16],
+        pictures=pictures.of(setting, stage_of),
+        table=table,
+        conclusions=conclusions,
+    )  # fmt: skip
+
+
+def _sentence(said: str, mesh: Mesh) -> str:
+    """A warning about ``mesh`` without its path."""
+    said = said.removeprefix(f"{mesh.path}: ")
+    return f"{said[:1].upper()}{said[1:]}."
+
+
+# -- jobs -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Made(Job):
+    """A field of a ``kind`` in at most ``nbytes``: after :meth:`known` or :meth:`run`, ``field`` is what it became."""
+
+    kind: str
+    nbytes: int
+    setting: Setting
+    name: str = ""
+    file: Path | None = None
+
+    @staticmethod
+    def of(kind: str, nbytes: int, setting: Setting) -> Made:
+        own = Fitted if kind in PRESETS else Hashed if kind == "hash" else Sampled
+        return own(kind, nbytes, setting, f"{KINDS[kind]} {size_text(nbytes)}")
+
+    def candidate(self) -> Candidate:
+        return Candidate(
+            self.name, FAMILIES[self.kind], size_text(self.nbytes), job=self.name, label=KINDS[self.kind],
+            in_passes=self.kind != "hash", details={"kind": self.kind, "asked": self.nbytes},
+        )  # fmt: skip
+
+    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+        self.file = folder / f"{file_name(self.name)}.npz" if folder else None
+        self.__dict__.pop("field", None)
+        return record if record and self.file is not None and self.file.is_file() else None
+
+    @functools.cached_property
+    def field(self) -> Field:
+        """The field, from the file of the models' folder if it was not just made."""
+        return self.load(self.file)
+
+    def load(self, path: Path) -> Field:
+        raise NotImplementedError
+
+    def record(self, found: Field, nbytes: int, seconds: float, file_bytes: int, **details) -> dict:
+        self.field = found
+        if nbytes > self.nbytes:
+            raise AssertionError(f"{self.name}: takes {nbytes:,} bytes")
+        details |= {"file_bytes": file_bytes, "spacing": found.spacing, "slope": found.slope}
+        details |= {"bits": found.bits} if isinstance(found, volumes.DistanceNodes) else {}
+        return {"bytes": nbytes, "seconds": seconds, "errors": self.setting.errors(found), "details": details}
+
+
+class Sampled(Made):
+    """A grid, bricks or sparse distances."""
+
+    def make(self) -> Field:
+        setting, train = self.setting, volumes.Training() if self.kind.endswith("-trained") else None
+        types, distances, mesh, nbytes = setting.types, setting.distances, setting.mesh, self.nbytes
+        name = self.kind.removesuffix("-trained")
+        if name == "dense":
+            return volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
+        if name == "distances":
+            found = setting.sparse_distances(nbytes)
+            if train is None:
+                return found
+            return volumes.distance_nodes(types, distances, found.spacing, train, bits=found.bits)
+        side, apron = int(name.removeprefix("bricks")[0]), not name.endswith("-shared")
+        return volumes.fitted(lambda h: volumes.bricks(types, distances, h, side, apron), nbytes)
+
+    def run(self, folder: Path | None, progress: bool) -> dict:
+        start = time.perf_counter()
+        found = self.make()
+        seconds = time.perf_counter() - start
+        if self.file:
+            volumes.save(self.file, found)
+        return self.record(found, found.nbytes, seconds, volumes.file_bytes(found))
+
+    def load(self, path: Path) -> Field:
+        return volumes.load(path, self.setting.types)
+
+
+class Fitted(Made):
+    """By a preset of ``fit sdf``."""
+
+    def run(self, folder: Path | None, progress: bool) -> dict | None:
+        request = self.setting.request
+        given = {"steps": request.steps} if request.steps else {}
+        if not self.file:
+            raise ValueError("ours is measured from a file: give a folder")
+        start = time.perf_counter()
+        fitted = task.fit(
+            "sdf", PRESETS[self.kind], mi.variant(), progress=progress, output=self.file, deterministic=False,
+            source=self.setting.name, bytes=str(self.nbytes), **given,
+        )  # fmt: skip
+        seconds = time.perf_counter() - start
+        if fitted.result.interrupted:
+            return None
+        save_table(self.file, fitted.table)
+        model = self.model(self.file)
+        return self.record(
+            model.field, model.nbytes, seconds, self.file.stat().st_size, steps=fitted.result.steps,
+            trained_seconds=fitted.result.seconds,
+        )  # fmt: skip
+
+    def model(self, path: Path):
+        return task.tasks()["sdf"].open(self.setting.types.TensorXf, str(path))
+
+    def load(self, path: Path) -> Field:
+        return self.model(path).field
+
+
+class Hashed(Made):
+    """A hash grid with a network, trained to convergence."""
+
+    @functools.cached_property
+    def training(self) -> Training:
+        setting, (steps, longest) = self.setting, self.setting.request.hash_steps
+
+        def problem():
+            net = hash_grids.network(self.nbytes)
+            return hash_grids.HashProblem(net, setting.types, setting.mesh, *setting.pools)
+
+        settings = FitSettings(**{**asdict(HASH_SETTINGS), "steps": steps})
+        return Training(f"{self.name} training", problem, settings, longest, 8)
+
+    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+        super().known(folder, record)
+        return record if record and self.training.known(folder, record) else None
+
+    def load(self, path: Path) -> Field:
+        hash_grids.halved(self.training.net)
+        return hash_grids.HashField(self.setting.types, self.training.net, self.setting.mesh)
+
+    def run(self, folder: Path | None, progress: bool) -> dict | None:
+        record = self.training.run(folder, progress)
+        if record is None:
+            return None
+        found = self.load(None)
+        own = self.record(found, found.nbytes, record["seconds"], found.nbytes, steps=record["steps"])
+        return {**record, **own, "name": self.name}
+
+
+# -- time -------------------------------------------------------------------------------------------------------------
+
+
+def _reads(setting: Setting, names: list[str], lanes: int) -> dict:
+    """Values and gradients at random points near the surface."""
+    points = setting.evaluation.near
+    points = np.ascontiguousarray(np.resize(points, (lanes, 3)).T)
+    p = setting.types.Array3f(*(setting.types.Float(np.ascontiguousarray(v)) for v in points))
+    dr.make_opaque(p)
+    value, normal = {FLOOR: lambda: list(p)}, {FLOOR: lambda: list(p)}
+    for name in names:
+        own = setting.jobs[name].field
+        value[name] = lambda f=own: [f.value(p)]
+        normal[name] = lambda f=own: [f.gradient(p)[1]]
+    return {"value": value, "normal": normal}
+
+
+def _rays(setting: Setting, view: stage.Stage, names: list[str], grid: str, lanes: int) -> dict:
+    """The distance at which the rays of a camera meet each of the fields, and the mesh."""
+    o, d = view.rays(setting.types, lanes)
+    found: dict[str, Callable] = {FLOOR: lambda: [*o, *d]}
+    for name in names:
+        found[name] = lambda f=setting.jobs[name].field: [stage.traced(f, o, d)]
+    for name, scene in ((MESH, view.mesh_scene()), (grid, view.grid_scene(_grid_field(setting), setting.request.grid))):
+        found[name] = lambda s=scene: [stage.met(s, o, d)]
+    return {"ray": found}
+
+
+def _renders(setting: Setting, view: stage.Stage, names: list[str], grid: str) -> dict:
+    scenes = {name: view.field_scene(setting.jobs[name].field, True) for name in names}
+    scenes[MESH] = view.mesh_scene(True)
+    scenes[grid] = view.grid_scene(_grid_field(setting), setting.request.grid, True)
+    spp = setting.request.spp
+    return {name: lambda k, s=scene: mi.render(s, spp=spp, seed=k) for name, scene in scenes.items()}
+
+
+def _grid_field(setting: Setting) -> Field:
+    """What ``sdfgrid`` is decoded from: the field with the least error of solids."""
+    jobs = setting.jobs.values()
+    best = min((job for job in jobs if job.kind != "hash"), key=lambda job: (job.kind != "ours", -job.nbytes))
+    return best.field

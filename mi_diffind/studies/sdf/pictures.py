@@ -1,0 +1,168 @@
+"""The picture of the study of distance fields: where normals are off in equal bytes, errors against bytes and time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import numpy as np
+
+from ...measure import plot
+from ...measure.words import machine_line, state
+from . import stage
+from .conclusions import by_size, size_text
+
+#: The error of normals that is as dark as it gets, in degrees.
+WORST = 15.0
+
+#: Kind → colour, marker and line: trained ones dashed.
+STYLES = {
+    "dense": ("#4d4d4d", "s", ":"), "dense-trained": ("#4d4d4d", "s", "--"), "bricks8": ("#c47a00", "D", ":"),
+    "bricks4": ("#762a83", "v", ":"), "bricks4-shared": ("#762a83", "^", "--"), "distances": ("#2166ac", "o", ":"),
+    "distances-trained": ("#2166ac", "o", "--"), "ours": ("#b2182b", "o", "-"), "indirection": ("#1b7837", "P", ":"),
+    "paper": ("#1b7837", "X", ":"), "hash": ("#12908e", "*", ":"),
+}  # fmt: skip
+
+#: Kinds that are shown as pictures, if they were made.
+SHOWN = ("dense-trained", "bricks4", "bricks4-shared", "distances", "ours")
+
+#: Errors that are drawn against bytes: the error, its label, whether what is drawn is what is missing to 1.
+CURVES = (
+    ("iou_near", "1 − IoU within 0.01 of the surface", True),
+    ("normal_deg", "normals, mean error in degrees", False),
+)
+
+
+def of(setting, stage_of: Callable) -> dict[str, Callable[[dict], object]]:
+    """The pictures of a plan: ``shapes``."""
+    return {"shapes": lambda result: shapes(setting, stage_of(), result)}
+
+
+def shapes(setting, view: stage.Stage, result: dict):
+    """
+    Above, the angles between normals of the mesh and those of fields of the first size, where rays meet them; below,
+    errors of all sizes against bytes, and of the first against the time of a ray.
+    """
+    first = result["details"]["first"]
+    kinds = {job.kind: job for job in setting.jobs.values() if job.nbytes == first}
+    shown = [kinds[k] for k in SHOWN if k in kinds]
+    columns = max(3, len(shown) + 1)
+    caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
+    found = plot.sheet(f"{result['title']}, {size_text(first)} above", caption, 2.6 * columns, 6.4)
+    grid = found.add_gridspec(2, 6 * columns, height_ratios=[1, 1.25])
+    truth, hit = _mesh_normals(view)
+    rows, cols = np.flatnonzero(hit.any(axis=1)), np.flatnonzero(hit.any(axis=0))
+    crop = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)) if len(rows) else (slice(None),) * 2
+    for k, job in enumerate([None, *shown]):
+        axes = found.add_subplot(grid[0, 6 * k : 6 * k + 6])
+        if job is None:
+            axes.imshow(_shaded(truth, hit)[crop])
+            axes.set_title("mesh", fontsize=9)
+        else:
+            angles = _angles(setting.types, view, job.field, truth, hit)
+            drawn = axes.imshow(angles[crop], vmin=0, vmax=WORST, cmap="inferno_r")
+            error = result["candidates"][job.name]["errors"]["normal_deg"]
+            axes.set_title(f"{job.name.removesuffix(' ' + size_text(first))}\n{error:.2f}°", fontsize=8)
+        axes.set_axis_off()
+    if shown:
+        bar = found.colorbar(drawn, ax=found.axes[1:], shrink=0.8, pad=0.01)
+        bar.set_label("error of the normal, degrees", fontsize=8)
+        bar.ax.tick_params(labelsize=7)
+    third = 2 * columns
+    for k, (key, label, missing) in enumerate(CURVES):
+        _curves(found.add_subplot(grid[1, third * k : third * (k + 1)]), result, key, label, missing)
+    axes = found.add_subplot(grid[1, 2 * third :])
+    labels = _against_time(axes, result)
+    plot.fix(found)
+    plot.place(axes, labels, [label.at for label in labels])
+    return found
+
+
+def _mesh_normals(view: stage.Stage) -> tuple[np.ndarray, np.ndarray]:
+    """The normals of the mesh's triangles at all pixels ``(height, width, 3)``, and where there are any."""
+    import mitsuba as mi
+
+    o, d = view.rays(mi)
+    scene, (width, height) = view.mesh_scene(), view.film
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)))
+    hit = si.is_valid().numpy().reshape(height, width)
+    return np.array(si.n).T.reshape(height, width, 3), hit
+
+
+def _angles(types, view: stage.Stage, field, truth: np.ndarray, hit: np.ndarray) -> np.ndarray:
+    """Angles in degrees between normals; NaN where neither is met, 90 where one of the two is."""
+    o, d = view.rays(types)
+    with dr.suspend_grad():
+        t = stage.traced(field, o, d)
+        found = dr.isfinite(t)
+        g = np.array(field.gradient(types.Array3f(dr.fma(d, dr.select(found, t, 0), o)))[1]).T.astype(np.float64)
+    found = found.numpy()
+    g /= np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-12)
+    angles = np.degrees(np.arccos(np.clip(np.sum(g * truth.reshape(-1, 3), axis=1), -1, 1)))
+    angles[found != hit.ravel()] = 90
+    angles[~found & ~hit.ravel()] = np.nan
+    return angles.reshape(hit.shape)
+
+
+def _shaded(normals: np.ndarray, hit: np.ndarray) -> np.ndarray:
+    """A picture of the mesh: light from the upper left."""
+    light = np.array([-0.4, 0.7, 0.6]) / np.linalg.norm([-0.4, 0.7, 0.6])
+    grey = 0.25 + 0.65 * np.clip(normals @ light, 0, 1)
+    return np.where(hit[..., None], grey[..., None] * np.array([1.0, 0.96, 0.9]), 1.0)
+
+
+def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
+    """An error against bytes, a line for each kind."""
+    made = [c for found in by_size(result).values() for c in found.values()]
+    for kind, (colour, marker, line) in STYLES.items():
+        own = [c for c in made if c["details"]["kind"] == kind]
+        points = sorted((c["bytes"], 1 - c["errors"][key] if missing else c["errors"][key]) for c in own)
+        if points:
+            axes.plot(*zip(*points, strict=True), color=colour, marker=marker, markersize=4, linestyle=line,
+                      label=own[0]["label"], linewidth=2.0 if kind == "ours" else 1.0,
+                      markerfacecolor="white" if line == ":" else colour)  # fmt: skip
+    sizes = sorted({c["details"]["asked"] for c in made})
+    axes.set_xscale("log", base=2)
+    axes.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
+    axes.set_xticks(sizes)
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    plot.log_ticks(axes.yaxis, low, high, lambda v: f"{v:.2g}")
+    axes.xaxis.set_major_formatter(lambda value, _: size_text(round(value)))
+    axes.set_xlabel("memory", fontsize=8)
+    _finish(axes, label)
+    if missing:
+        axes.legend(fontsize=6, loc="best")
+
+
+def _against_time(axes, result: dict) -> list[plot.Label]:
+    """The error of normals against the time of a ray; the times of the mesh and of ``sdfgrid`` as lines."""
+    labels, timings = [], result["cases"].get("rays", {}).get("queries", {}).get("ray", {})
+    for name, t in timings.items():
+        c = result["candidates"][name]
+        if c["is_reference"]:
+            axes.axvline(t["time"], color="0.55", linestyle=(0, (1, 1.5)))
+            axes.text(t["time"], 0.98, c["label"], transform=axes.get_xaxis_transform(), fontsize=7, rotation=90,
+                      va="top", ha="right", color="0.4")  # fmt: skip
+            continue
+        colour, marker, line = STYLES[c["details"]["kind"]]
+        at = (t["time"], c["errors"]["normal_deg"])
+        axes.plot(*at, color=colour, marker=marker, markersize=5, linestyle="none",
+                  markerfacecolor="white" if line == ":" else colour)  # fmt: skip
+        labels.append(plot.Label(c["label"], at, colour, "bold" if c["label"] == "ours" else "normal"))
+    if timings:
+        axes.set_xscale("log")
+        low, high = axes.get_xlim()
+        axes.set_xlim(low / 1.5, high * 1.5)
+        plot.log_ticks(axes.xaxis, low / 1.5, high * 1.5, plot.plain)
+    axes.set_xlabel(f"ns a primary ray, {size_text(result['details']['first'])}", fontsize=8)
+    _finish(axes, "normals, mean error in degrees")
+    return labels
+
+
+def _finish(axes, label: str) -> None:
+    axes.set_ylabel(label, fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.minorticks_off()
+    axes.grid(color="0.92", linewidth=0.5)
+    axes.set_axisbelow(True)
