@@ -1,0 +1,216 @@
+"""
+Solids: shapes of Mitsuba that are signed distance fields, traced by an integrator of ours.
+
+Mitsuba 3.9 has no shapes written in Python but meshes. A :class:`Solid` is therefore a mesh of eight triangles without
+area, at the corners of the field's box: the scene knows its extent, its material and its parameters, and no ray ever
+hits it. Integrators that know of solids (:func:`solids_of`) trace the fields themselves (:func:`meet`,
+:func:`occluded`) and make of what they met what Mitsuba would (:func:`interaction`).
+
+This file is the seam: with the next Mitsuba's Python shapes (``mi.Shape`` with ``bbox``,
+``ray_intersect_preliminary``, ``compute_surface_interaction``), :class:`Solid` becomes one of these, the functions its
+methods, and any integrator sees it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind.tasks.sdf import tracing
+
+#: Secondary rays start this far from a surface, in steps of a ray.
+OFFSET = 3 * tracing.EPSILON
+
+#: Below this cosine between ray and normal, a hit moves with the field's entries as at it.
+GRAZING = 1e-2
+
+#: Triangles without area, and an attribute that keeps Mitsuba from merging them with others' meshes.
+CORNERS, UNMERGED = 8, "face_solid"
+
+
+@dataclass(frozen=True)
+class Placement:
+    """
+    From the unit frame to the world: ``p ↦ size · rotation p + origin``, where ``rotation`` may be a reflection, too.
+    """
+
+    rotation: np.ndarray
+    size: float
+    origin: np.ndarray
+
+    @classmethod
+    def of(cls, to_world, scale: float, centre) -> Placement:
+        """
+        Of a mesh whose box has the centre ``centre`` and the longest side ``scale``, in its own units, as ``to_world``
+        (``mi.ScalarTransform4f``) moves it. Raises ``RuntimeError`` unless that is a rotation, a uniform scale and a
+        translation.
+        """
+        matrix = np.array(to_world.matrix, np.float64)
+        linear = matrix[:3, :3]
+        size = float(np.abs(np.linalg.det(linear))) ** (1 / 3)
+        turned = np.isfinite(matrix).all() and size > 0 and np.allclose(matrix[3], (0, 0, 0, 1))
+        if not turned or not np.allclose(linear.T @ linear, size**2 * np.eye(3), atol=1e-4 * size**2):
+            raise RuntimeError(
+                f'parameter "to_world": found {_written(linear)}, allowed are rotations, uniform scales and translations'
+            )
+        return cls(linear / size, size * scale, linear @ np.asarray(centre, np.float64) + matrix[:3, 3])
+
+    def world(self, p: np.ndarray) -> np.ndarray:
+        """Points ``(N, 3)`` of the unit frame in the world."""
+        return self.size * (p @ self.rotation.T) + self.origin
+
+
+def _written(linear: np.ndarray) -> str:
+    return "[" + ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in linear) + "]"
+
+
+class Solid(mi.Mesh):
+    """
+    A shape that is the surface of a ``field``, put into the world by ``placement``. ``smooth``: its shading normals are
+    the field's smooth ones.
+    """
+
+    def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
+        self.field, self.placement, self.smooth = field, placement, smooth
+        self.ready = False
+        super().__init__(props.plugin_name(), CORNERS, CORNERS, props)
+        if self.is_emitter():
+            raise RuntimeError("an emitter: signed distance fields emit no light")
+        if self.is_medium_transition():
+            raise RuntimeError("a medium: signed distance fields hold none")
+        box = np.array([field.lower, field.upper], np.float64)
+        corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
+        buffers = mi.traverse(self)
+        buffers["vertex_positions"] = placement.world(corners).astype(np.float32).ravel()
+        buffers["faces"] = np.repeat(np.arange(CORNERS, dtype=np.uint32), 3)
+        buffers.update()
+        self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
+        self.ready = True
+        self._place()
+
+    def _place(self) -> None:
+        """The placement as opaque numbers: another one compiles nothing anew."""
+        at = self.placement
+        self.axes = mi.Frame3f(*(mi.Vector3f(column.tolist()) for column in at.rotation.T))
+        dr.make_opaque(self.axes)
+        self.origin = dr.opaque(mi.Point3f, at.origin.tolist())
+        self.size = dr.opaque(mi.Float, at.size)
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        if not self.ready:
+            super().traverse(cb)
+            return
+        cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
+
+    def optimised(self) -> bool:
+        """Is a derivative with respect to the field asked for?"""
+        return False
+
+    # -- between the world and the unit frame ---------------------------------------------------------------------
+
+    def local_ray(self, o, d):
+        """A ray's origin and direction in the unit frame; lengths there are those of the world by ``size``."""
+        return self.axes.to_local(mi.Vector3f(o - self.origin)) / self.size, self.axes.to_local(d)
+
+    def to_world(self, p):
+        """A point of the unit frame."""
+        return mi.Point3f(dr.fma(self.axes.to_world(mi.Vector3f(p)), self.size, self.origin))
+
+    # -- the surface ----------------------------------------------------------------------------------------------
+
+    def surface(self, p, d, active):
+        """
+        Place, geometric and shading normal, in the world, where a ray with the direction ``d`` met the surface at ``p``
+        (unit frame): attached to the field's entries if derivatives are asked for and not suspended.
+        """
+        p = mi.Point3f(dr.detach(p))
+        if self.optimised() and dr.grad_enabled(self.field.value(p)):
+            d = self.axes.to_local(dr.detach(d))
+            value, slope = self.field.gradient(p, active)
+            along = dr.dot(dr.detach(slope), d)
+            along = dr.copysign(dr.maximum(dr.abs(along), GRAZING * dr.norm(dr.detach(slope))), along)
+            # The value at the place stays zero: dt = - df / (slope · d)
+            p = p - mi.Vector3f(d) * ((value - dr.detach(value)) / along)
+        _, slope = self.field.gradient(p, active)
+        normal = self._unit(slope, d)
+        shading = self._unit(self.field.normal(p, active), d) if self.smooth else normal
+        return self.to_world(p), self.axes.to_world(normal), self.axes.to_world(shading)
+
+    def _unit(self, v, d):
+        length = dr.norm(v)
+        known = length > 0
+        turned = self.axes.to_local(dr.detach(d))
+        return dr.select(known, mi.Vector3f(v) / dr.select(known, length, 1), -turned)
+
+
+def solids_of(scene: mi.Scene) -> list[Solid]:
+    """The solids of a scene. Raises ``RuntimeError`` for those in a shape group, which cannot be traced."""
+    found = [shape for shape in scene.shapes() if isinstance(shape, Solid)]
+    hidden = [shape for shape in mi.traverse(scene).hierarchy if isinstance(shape, Solid) and shape not in found]
+    if hidden:
+        raise RuntimeError(
+            f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file with '
+            f'a "to_world" of their own share its memory, and trace="grid" may be instanced'
+        )
+    return found
+
+
+# -- rays --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Met:
+    """What rays met of the solids: ``which``, its place in the list and 1 more, 0: none; ``t``; ``p`` (unit frame)."""
+
+    which: mi.UInt32
+    t: mi.Float
+    p: mi.Point3f
+
+
+def meet(solids: list[Solid], o, d, maxt, active=True) -> Met:
+    """The first place before ``maxt`` where rays meet a solid; ``t`` is ``maxt`` for those that do not."""
+    found = Met(mi.UInt32(0), mi.Float(maxt), mi.Point3f(0))
+    for i, solid in enumerate(solids):
+        start, direction = solid.local_ray(o, d)
+        hit = tracing.intersect(solid.field, start, direction, found.t / solid.size, active)
+        found.which = dr.select(hit.found, i + 1, found.which)
+        found.t = dr.select(hit.found, hit.t * solid.size, found.t)
+        found.p = dr.select(hit.found, mi.Point3f(hit.p), found.p)
+    return found
+
+
+def occluded(solids: list[Solid], o, d, maxt, active=True):
+    """Whether rays meet any solid before ``maxt``."""
+    found = mi.Bool(False)
+    for solid in solids:
+        start, direction = solid.local_ray(o, d)
+        found |= tracing.occluded(solid.field, start, direction, maxt / solid.size, active & ~found)
+    return found
+
+
+def interaction(solids: list[Solid], met: Met, ray, si, active=True):
+    """``si`` (``mi.SurfaceInteraction3f``), replaced where a solid was met by what Mitsuba would say of it."""
+    for i, solid in enumerate(solids):
+        here = (met.which == i + 1) & active
+        p, normal, shading = solid.surface(met.p, ray.d, here)
+        at = dr.zeros(mi.SurfaceInteraction3f)
+        at.t, at.time, at.wavelengths = met.t, ray.time, ray.wavelengths
+        at.p, at.n = p, mi.Normal3f(normal)
+        at.sh_frame = mi.Frame3f(shading)
+        at.dp_du, at.dp_dv = at.sh_frame.s, at.sh_frame.t
+        at.wi = at.sh_frame.to_local(-ray.d)
+        at.shape = mi.ShapePtr(solid)
+        si = dr.select(here, at, si)
+    return si
+
+
+def spawn(solids: list[Solid], met: Met, si, d):
+    """The origin of a ray from ``si`` in the direction ``d``: off a solid by more than a step of a ray."""
+    o = si.spawn_ray(d).o
+    for i, solid in enumerate(solids):
+        away = dr.copysign(OFFSET * solid.size, dr.dot(si.n, d))
+        o = dr.select(met.which == i + 1, dr.fma(si.n, away, si.p), o)
+    return mi.Point3f(o)
