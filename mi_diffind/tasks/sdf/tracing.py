@@ -75,7 +75,8 @@ def intersect(field, o, d, maxt, active=True, epsilon: float = EPSILON, exact: b
     with dr.suspend_grad():
         o, d = Point(dr.detach(o)), Point(dr.detach(d))
         near, far, active = enter(field, o, d, dr.detach(maxt), active)
-        start = dr.fma(d, near, o)  # from here on, numbers are small
+        # From here on, numbers are small. Rounding must not leave a ray outside, where the field says nothing
+        start = Point(dr.clip(dr.fma(d, near, o), Point(*field.lower), Point(*field.upper)))
         length = far - near
         hit_box = active & (far < maxt)
         leaving = (near == 0) & (field.value(start, active) < 0)
@@ -103,7 +104,7 @@ def intersect(field, o, d, maxt, active=True, epsilon: float = EPSILON, exact: b
             safe = dr.select(back | other, safe, t + dr.maximum(step, epsilon))
             if dr.hint(exact, mode="scalar"):
                 width = high - low
-                done = found & ((width < TOLERANCE) | (size < ZERO))
+                done = found & ((width < TOLERANCE) | ((size < ZERO) & (turns > 0)))
                 share = dr.clip(low_value / (low_value - high_value), 0.03, 0.97)
                 share = dr.select(turns < FALSE_POSITIONS, share, 0.5)
                 turns = dr.select(found, turns + 1, 0)
