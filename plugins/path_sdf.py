@@ -84,10 +84,16 @@ def integrator() -> type:
                 after.t += at.t
                 pi[hidden] = after
             pi, met = self.nearer(solids, ray, pi, active)
+            came, left = mi.Ray3f(ray), dr.zeros(sdf.Met)  # the ray to the vertex before, and what that was
 
             while dr.hint(active, max_iterations=self.max_depth, label=f"path_sdf ({mode.name})"):
                 with dr.resume_grad(when=moving):
                     si = self.interaction(solids, ray, pi, met, active)
+                    if dr.hint(moving, mode="scalar"):
+                        # Seen from the vertex before, which moves, too
+                        aside = sdf.shift(solids, left, came.d, active & si.is_valid())
+                        turn = aside - ray.d * dr.dot(aside, ray.d)
+                        si.wi += dr.detach(si.sh_frame).to_local(turn) * dr.rcp(dr.select(si.is_valid(), si.t, 1))
                 fixed = dr.detach(si)
                 bsdf = si.bsdf(ray)
 
@@ -175,6 +181,7 @@ def integrator() -> type:
                 density = bs.pdf
                 delta = delta_next
                 depth[going] += 1
+                came, left = ray, met
                 ray, pi, met, active = following, pi_next, met_next, further
 
             shown = dr.select(valid, L, 0) if primal else δL

@@ -121,19 +121,27 @@ class Solid(mi.Mesh):
 
     # -- the surface ----------------------------------------------------------------------------------------------
 
-    def surface(self, p, d, active):
+    def moved(self, p, d, active=True):
         """
-        Place, geometric and shading normal, in the world, where a ray with the direction ``d`` met the surface at ``p``
-        (unit frame): attached to the field's entries if derivatives are asked for and not suspended.
+        The place ``p`` (unit frame) where a ray with the direction ``d`` (world) met the surface, attached to the
+        field's entries if derivatives are asked for and not suspended: along the ray, where the value stays zero.
         """
         p = mi.Point3f(dr.detach(p))
-        if self.optimised() and dr.grad_enabled(self.field.value(p)):
-            d = self.axes.to_local(dr.detach(d))
-            value, slope = self.field.gradient(p, active)
-            along = dr.dot(dr.detach(slope), d)
-            along = dr.copysign(dr.maximum(dr.abs(along), GRAZING * dr.norm(dr.detach(slope))), along)
-            # The value at the place stays zero: dt = - df / (slope · d)
-            p = p - mi.Vector3f(d) * ((value - dr.detach(value)) / along)
+        if not self.optimised():
+            return p
+        d = self.axes.to_local(dr.detach(d))
+        value, slope = self.field.gradient(p, active)
+        slope = dr.detach(slope)
+        along = dr.dot(slope, d)
+        along = dr.copysign(dr.maximum(dr.abs(along), dr.maximum(GRAZING * dr.norm(slope), 1e-6)), along)
+        return p - mi.Vector3f(d) * ((value - dr.detach(value)) / along)
+
+    def surface(self, p, d, active=True):
+        """
+        Place, geometric and shading normal, in the world, where a ray with the direction ``d`` met the surface at ``p``
+        (unit frame), attached as :meth:`moved` is.
+        """
+        p = self.moved(p, d, active)
         _, slope = self.field.gradient(p, active)
         normal = self._unit(slope, d)
         shading = self._unit(self.field.normal(p, active), d) if self.smooth else normal
@@ -205,6 +213,16 @@ def interaction(solids: list[Solid], met: Met, ray, si, active=True):
         at.shape = mi.ShapePtr(solid)
         si = dr.select(here, at, si)
     return si
+
+
+def shift(solids: list[Solid], met: Met, d, active=True):
+    """Zero, with the derivative of the place in the world where rays with the direction ``d`` met a solid."""
+    found = mi.Vector3f(0)
+    for i, solid in enumerate(solids):
+        here = (met.which == i + 1) & active
+        p = solid.to_world(solid.moved(met.p, d, here))
+        found = dr.select(here, p - dr.detach(p), found)
+    return found
 
 
 def spawn(solids: list[Solid], met: Met, si, d):
