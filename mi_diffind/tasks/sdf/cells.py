@@ -1,0 +1,53 @@
+"""
+Which cells of a grid a surface passes through, found from coarse to fine.
+
+A grid has a ``lower`` corner, cells of the side ``spacing`` and ``shape`` of them along x, y and z; cell ``(i, j, k)``
+lies at ``lower + spacing · (i, j, k)``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .distances import Distances
+
+#: The corners of a cell, z fastest, ``(8, 3)``.
+CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
+
+#: Cells along an axis at the coarsest level, at most.
+COARSEST = 16
+
+
+def surface_cells(distances: Distances, lower, spacing: float, shape, reach: float = 0.0) -> np.ndarray:
+    """
+    The cells whose circumscribed sphere the surface touches, or comes as near to as ``reach``: whole numbers
+    ``(K, 3)``, int32, in lexicographic order. No cell that the surface passes through is missing; about a sixth of
+    those that are named are only passed by.
+    """
+    lower, shape = np.asarray(lower, dtype=np.float64), np.asarray(shape)
+    side = 1
+    while -(-int(shape.max()) // side) > COARSEST:
+        side *= 2
+    cells = np.stack(np.meshgrid(*[np.arange(-(-n // side)) for n in shape], indexing="ij"), axis=-1).reshape(-1, 3)
+    while True:
+        centres = lower + (cells + 0.5) * (side * spacing)
+        found = distances.unsigned(centres) <= (np.sqrt(3) / 2 * side * spacing + reach) * (1 + 1e-6)
+        cells = cells[found]
+        if side == 1:
+            break
+        side //= 2
+        cells = (2 * cells[:, None] + CORNERS).reshape(-1, 3)
+        cells = cells[np.all(cells * side < shape, axis=1)]
+    return cells[np.lexsort(cells.T[::-1])].astype(np.int32)
+
+
+def near_nodes(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    The corners of cells, each once: nodes ``(M, 3)``, int32, in lexicographic order, and for each cell the positions of
+    its eight corners among them, ``(K, 8)``, int32, z fastest.
+    """
+    corners = (np.asarray(cells, dtype=np.int64)[:, None] + CORNERS).reshape(-1, 3)
+    ny, nz = (int(corners[:, axis].max(initial=0)) + 1 for axis in (1, 2))
+    keys, inverse = np.unique((corners[:, 0] * ny + corners[:, 1]) * nz + corners[:, 2], return_inverse=True)
+    nodes = np.stack([keys // (ny * nz), keys // nz % ny, keys % nz], axis=-1)
+    return nodes.astype(np.int32), inverse.reshape(-1, 8).astype(np.int32)

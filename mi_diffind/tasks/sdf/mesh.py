@@ -1,0 +1,336 @@
+"""
+Triangle meshes in the unit frame: the bounding box is centred at the origin and its longest side is 1.
+
+All distances, tolerances and points of this task are in that frame; negative is inside. Any format that trimesh reads
+is read; what had to be repaired for "inside" to mean something is said.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import logging
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DiffindError, reason
+
+#: Of the longest side: what is flatter than this along an axis holds no volume that float32 could tell.
+FLAT = 1e-6
+
+#: Of the cube of the longest side: a closed mesh whose volume is smaller than this encloses nothing.
+NO_VOLUME = 1e-12
+
+#: Of the square of the longest edge: twice the area of a triangle that has none.
+SLIVER = 1e-12
+
+#: The most components whose orientation is looked at one by one.
+MAX_ORIENTED = 200
+
+
+class MeshError(DiffindError, ValueError):
+    """A mesh that cannot be used; the message is one sentence that names the file and the fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """
+    A triangle mesh: ``vertices`` ``(V, 3)`` float64 in the unit frame, each position once, and ``faces`` ``(F, 3)``
+    int32, counter-clockwise from outside.
+
+    ``watertight``: each edge is run through as often one way as the other, so that the winding number is a whole number
+    everywhere but on the surface and changes nowhere else. A point of the file is ``vertices · scale + centre``.
+    ``digest`` is a SHA-256 over vertices and faces; ``warnings`` has a sentence for each thing that was repaired or is
+    doubtful.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    watertight: bool
+    scale: float = 1.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    path: str = ""
+    digest: str = ""
+    warnings: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def lower(self) -> np.ndarray:
+        """The lower corner of the bounding box, ``(3,)``."""
+        return self.vertices.min(axis=0)
+
+    @property
+    def upper(self) -> np.ndarray:
+        return self.vertices.max(axis=0)
+
+    @functools.cached_property
+    def corners(self) -> np.ndarray:
+        """The vertices of each triangle, ``(F, 3, 3)``."""
+        return self.vertices[self.faces]
+
+    @functools.cached_property
+    def _crosses(self) -> np.ndarray:
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return np.cross(b - a, c - a)
+
+    @functools.cached_property
+    def areas(self) -> np.ndarray:
+        """Of each triangle, ``(F,)``."""
+        return np.linalg.norm(self._crosses, axis=1) / 2
+
+    @property
+    def area(self) -> float:
+        return float(self.areas.sum())
+
+    @functools.cached_property
+    def normals(self) -> np.ndarray:
+        """Of each triangle, ``(F, 3)``, of length 1."""
+        return self._crosses / (2 * self.areas)[:, None]
+
+    @functools.cached_property
+    def labels(self) -> np.ndarray:
+        """The number of its component for each triangle, ``(F,)``: what is joined by vertices belongs together."""
+        return _labels(self.faces, len(self.vertices))
+
+    @property
+    def components(self) -> int:
+        """Pieces of the surface; overlapping ones count apart, although they enclose one solid."""
+        return int(self.labels.max()) + 1
+
+    @property
+    def volume(self) -> float:
+        """Of a watertight mesh; what overlaps counts as often as it does."""
+        return float(_volumes(self.vertices, self.faces).sum())
+
+    def to_file_frame(self, points: np.ndarray) -> np.ndarray:
+        """Points of the unit frame, ``(…, 3)``, in units and place of the file."""
+        return points * self.scale + np.array(self.centre)
+
+
+def load_mesh(path: str | os.PathLike) -> Mesh:
+    """
+    Read a mesh, or a scene of them whose meshes are taken together, where their transforms put them.
+
+    Equal vertices become one, triangles without an area are left out, and triangles that are wound against their
+    neighbours, or around their solid the wrong way, are turned. Raises :class:`MeshError`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"{path}: {'is a folder' if path.is_dir() else 'there is no such file'}, expected a mesh")
+    vertices, faces = _read(path)
+    return make_mesh(vertices, faces, str(path))
+
+
+def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Mesh:
+    """The same from arrays in any units and place: ``vertices`` ``(V, 3)`` and ``faces`` ``(F, 3)``, whole numbers."""
+    vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(f"{name}: has vertices {vertices.shape} and faces {faces.shape}, expected (V, 3) and (F, 3)")
+    if len(faces) == 0:
+        raise MeshError(f"{name}: has no triangles, expected a surface that encloses a solid")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"{name}: a triangle names vertex {int(faces.max())} of {len(vertices)}")
+    vertices, inverse = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
+    faces = inverse.reshape(-1, 3).astype(np.int64)
+    if not np.all(np.isfinite(vertices)):
+        raise MeshError(f"{name}: has vertices that are NaN or infinite, allowed are finite ones")
+
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    with np.errstate(over="ignore"):
+        extent = upper - lower
+    scale = float(extent.max())
+    if not np.isfinite(scale) or scale <= 0 or scale < 1e-12 * np.abs(vertices).max():
+        raise MeshError(f"{name}: has the extent {scale:g}, too small for, or too large for, its numbers")
+    if extent.min() <= FLAT * scale:
+        axis = "xyz"[int(extent.argmin())]
+        raise MeshError(f"{name}: is flat, its extent along {axis} is {extent.min() / scale:g} of its longest side")
+    centre = lower + 0.5 * extent
+    vertices = (vertices - centre) / scale
+
+    said = []
+    vertices, faces, watertight = _repaired(vertices, faces, name, said)
+    vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int32)
+    digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()
+    mesh = Mesh(vertices, faces, watertight, scale, tuple(float(c) for c in centre), name, digest, said)
+    if mesh.watertight and abs(mesh.volume) < NO_VOLUME:
+        raise MeshError(f"{name}: encloses no volume, expected the surface of a solid")
+    return mesh
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """All triangles of a file: vertices and faces."""
+    import trimesh
+
+    level = logging.getLogger("trimesh").level
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            loaded = trimesh.load(path, process=False)
+    except MemoryError:
+        raise
+    except Exception as e:  # readers of a dozen formats raise whatever they like
+        raise MeshError(f"{path}: cannot be read as a mesh ({reason(e)})") from None
+    finally:
+        logging.getLogger("trimesh").setLevel(level)
+    if isinstance(loaded, trimesh.Scene):
+        placed = [(loaded.geometry[name], matrix) for _, (matrix, name) in _nodes(loaded)]
+    else:
+        placed = [(loaded, np.eye(4))]
+    vertices, faces, first = [], [], 0
+    for geometry, matrix in placed:
+        if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
+            continue
+        own, mirrored = np.asarray(geometry.faces), np.linalg.det(matrix[:3, :3]) < 0
+        found = np.asarray(geometry.vertices, dtype=np.float64)
+        if len(own) and (own.min() < 0 or own.max() >= len(found)):
+            raise MeshError(f"{path}: a triangle names vertex {int(own.max())} of {len(found)}")
+        vertices.append(found if np.array_equal(matrix, np.eye(4)) else found @ matrix[:3, :3].T + matrix[:3, 3])
+        faces.append((own[:, ::-1] if mirrored else own) + first)
+        first += len(found)
+    if not faces:
+        raise MeshError(f"{path}: has no triangles, expected a surface that encloses a solid")
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _nodes(scene):
+    return [(node, scene.graph[node]) for node in scene.graph.nodes_geometry]
+
+
+# -- repairs ----------------------------------------------------------------------------------------------------------
+
+
+def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, said: list[str]):
+    """Faces and vertices without what has no area, turned where that is sure; sentences are added to ``said``."""
+    twice = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+    faces = faces[~twice]
+    if not len(faces):
+        raise MeshError(f"{name}: has no triangle that has an area, expected the surface of a solid")
+
+    turned = _inconsistent(faces)
+    if turned.any():
+        faces[turned] = faces[turned, ::-1]
+        said.append(f"{name}: {turned.sum():,} triangles wound against their neighbours were turned")
+    turned = _inside_out(vertices, faces)
+    if turned.any():
+        faces[turned] = faces[turned, ::-1]
+        share = "all triangles were" if turned.all() else f"{turned.sum():,} triangles of closed pieces were"
+        said.append(f"{name}: {share} wound inside out and were turned")
+
+    # Slivers hold their neighbours together, but have no part in distances or in winding numbers
+    open_edges = int(np.count_nonzero(_balance(faces, len(vertices))[0]))
+    if open_edges:
+        said.append(f"{name}: is not closed, {open_edges:,} edges have more triangles on one side than on the other")
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    longest = np.max([np.sum((b - a) ** 2, axis=1), np.sum((c - b) ** 2, axis=1), np.sum((a - c) ** 2, axis=1)], axis=0)
+    flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) <= SLIVER * longest
+    if flat.all():
+        raise MeshError(f"{name}: has no triangle that has an area, expected the surface of a solid")
+    dropped = int(twice.sum() + flat.sum())
+    if dropped:
+        said.append(f"{name}: {dropped:,} triangles without an area were left out")
+    used, faces = np.unique(faces[~flat], return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3), not open_edges
+
+
+def _edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of the three edges of each triangle a number that both directions share, ``(3 F,)``, and the direction, ±1."""
+    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    return ends.min(axis=1) * count + ends.max(axis=1), np.where(ends[:, 0] < ends[:, 1], 1, -1)
+
+
+def _balance(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of each edge, how much more often it is run through one way than the other; and the edge of each side, (F, 3)."""
+    keys, signs = _edges(faces, count)
+    unique, which = np.unique(keys, return_inverse=True)
+    return np.bincount(which, signs, len(unique)), which.reshape(-1, 3)
+
+
+def _labels(faces: np.ndarray, count: int) -> np.ndarray:
+    """Numbers of components, ``(F,)``."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    of_vertices = connected_components(graph, directed=False)[1][faces[:, 0]]
+    return np.unique(of_vertices, return_inverse=True)[1]
+
+
+def _volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Of the tetrahedron of each triangle and the origin, ``(F,)``, signed."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+
+
+def _inconsistent(faces: np.ndarray) -> np.ndarray:
+    """
+    Which triangles have to be turned for neighbours to agree, ``(F,)``: the smaller half of each piece whose triangles
+    can agree at all, none of the others.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    keys, signs = _edges(faces, int(faces.max()) + 1)
+    order = np.argsort(keys, kind="stable")
+    keys, signs, owner = keys[order], signs[order], order // 3
+    starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
+    pairs = starts[np.diff(np.r_[starts, len(keys)]) == 2]
+    f, g, same = owner[pairs], owner[pairs + 1], signs[pairs] == signs[pairs + 1]
+    none = np.zeros(len(faces), dtype=bool)
+    if not same.any():
+        return none
+    # Each triangle twice, as it is and turned; neighbours that agree are joined
+    n = len(faces)
+    rows = np.concatenate([f, f + n])
+    columns = np.concatenate([np.where(same, g + n, g), np.where(same, g, g + n)])
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(2 * n, 2 * n))
+    kept, turned = connected_components(graph, directed=False)[1].reshape(2, n)
+    piece, state = np.minimum(kept, turned), kept > turned
+    votes, sizes = np.bincount(piece, state, 2 * n), np.bincount(piece, minlength=2 * n)
+    state ^= (votes > sizes / 2)[piece]
+    return np.where(kept == turned, False, state)
+
+
+def _inside_out(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """
+    Which triangles belong to closed pieces that are wound inside out, ``(F,)``: those of negative volume that do not
+    lie in another piece, as a cavity does. All, if a mesh with open pieces has a negative volume as a whole.
+    """
+    labels = _labels(faces, len(vertices))
+    edges, which = _balance(faces, len(vertices))
+    unbalanced = np.bincount(labels, (edges != 0)[which].sum(axis=1))
+    volumes = np.bincount(labels, _volumes(vertices, faces))
+    if unbalanced.any() and volumes.sum() < 0:
+        return np.ones(len(faces), dtype=bool)
+    turned = np.zeros(len(faces), dtype=bool)
+    suspects = np.flatnonzero((volumes < 0) & (unbalanced == 0))
+    if len(suspects) > MAX_ORIENTED:
+        suspects = suspects[np.argsort(volumes[suspects])[:MAX_ORIENTED]]
+    for label in suspects:
+        own = labels == label
+        place = vertices[faces[own][0]].mean(axis=0)
+        others = ~own
+        # The other pieces as if they were all wound the right way, for which of them is right is the question
+        winding = _windings(vertices, faces[others], labels[others], place)
+        enclosing = np.sum(np.abs(winding) > 0.5)
+        if enclosing % 2 == 0:
+            turned |= own
+    return turned
+
+
+def _windings(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """The winding number of each of the ``labels`` around a place, by the solid angles of Van Oosterom and Strackee."""
+    if not len(faces):
+        return np.zeros(1)
+    a, b, c = np.moveaxis(vertices[faces] - place, 1, 0)
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    above = np.einsum("ij,ij->i", a, np.cross(b, c))
+    below = la * lb * lc
+    for x, y, l in ((a, b, lc), (b, c, la), (c, a, lb)):
+        below = below + np.einsum("ij,ij->i", x, y) * l
+    return np.bincount(labels, np.arctan2(above, below) / (2 * np.pi))
