@@ -1,0 +1,257 @@
+"""
+Rays through a sparse grid (:class:`.nodes.SparseNodes`), from cell to cell.
+
+A ray goes from one empty region, block or cell to the next, as bit masks say; only in the cells that the surface
+crosses is anything read, all corners at once, and evaluated at :data:`SAMPLES` places along the ray. What a cell of the
+spacing h is missed by that enters and leaves the solid between two places, no more than h·√3 / :data:`SAMPLES` apart.
+
+Lengths are in spacings here, as the structure's.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+from .nodes import CORNERS
+from .structure import ACTIVE, BLOCK, _bits, _words
+
+#: Places along the ray at which a cell is looked at, and steps by false position from there.
+SAMPLES, ROOTS = 3, 3
+
+#: How far a ray goes beyond the side of a cell, so that it is in the next one.
+HAIR = 1e-3
+
+#: Components of a direction below this count as zero.
+TINY = 1e-12
+
+#: Eight blocks: the one of a cell's lowest corner, and those that its others may lie in.
+NEIGHBOURS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
+
+
+class Marcher:
+    """
+    What is made of a field's masks, once: for each block, which cells are crossed, the signs of the others, and the
+    numbers of the blocks beside it.
+    """
+
+    def __init__(self, field):
+        self.field = field
+        structure, UInt32 = field.structure, field.types.UInt32
+        crossed, inside, beside = cells_of(structure)
+        words = np.concatenate([_words(crossed), _words(inside)], axis=1)
+        self.cells, self.beside = (UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (words, beside))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of it."""
+        return 4 * (dr.width(self.cells) + dr.width(self.beside))
+
+    # -- where a ray is -----------------------------------------------------------------------------------------------
+
+    def locate(self, i, j, k, active):
+        """
+        Of cell (i, j, k): whether it is crossed, the number of its block, the logarithm of the size of what is empty
+        around it, its sign (meaningless if it is crossed), and how far from anywhere in it the surface is at least.
+        """
+        field, UInt32 = self.field, self.field.types.UInt32
+        _, ny, nz = field.structure.regions.shape
+        word = dr.gather(UInt32, field._regions, UInt32(((i >> 4) * ny + (j >> 4)) * nz + (k >> 4)), active)
+        region = active & (word < 2**31)
+        Packet = dr.uint32_array_t(field.types.Array4f)
+        low, high, low_sign, high_sign = dr.gather(Packet, field._region_masks, word, region)
+        bit = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
+        block, rank = bit_and_rank(low, high, bit)
+        block &= region
+        number = dr.gather(UInt32, field._first_blocks, word, block) + rank
+        cell = UInt32((i & 3) * 16 + (j & 3) * 4 + (k & 3))
+        cells = dr.gather(Packet, self.cells, number, block)
+        crossed = block & bit_of(cells[0], cells[1], cell)
+        sign = bit_of(dr.select(block, cells[2], low_sign), dr.select(block, cells[3], high_sign),
+                      dr.select(block, cell, bit))  # fmt: skip
+        sign = dr.select(region, sign, (word & 1) == 1)
+        shift = dr.select(block, UInt32(0), dr.select(region, UInt32(2), UInt32(4)))
+        free = dr.select(region | ~active, 0, field.types.Float(word >> 1 & 127) * 0.5)
+        return crossed, number, shift, sign, free
+
+    def corners(self, number, i, j, k, active):
+        """Distance and gradient, in spacings, of the eight nodes of a crossed cell, in the order of ``CORNERS``."""
+        field, UInt32 = self.field, self.field.types.UInt32
+        beside = [dr.gather(UInt32, self.beside, number * 8 + n, active) for n in range(8)]
+        found = []
+        for a, b, c in CORNERS:
+            x, y, z = i + a, j + b, k + c
+            own = beside[0]
+            if a or b or c:
+                which = [((v ^ w) >> 2 != 0) for v, w, e in zip((x, y, z), (i, j, k), (a, b, c)) if e]
+                keys = [m for m, e in zip((4, 2, 1), (a, b, c)) if e]
+                for subset in range(1, 2 ** len(keys)):
+                    n = sum(key for s, key in enumerate(keys) if subset >> s & 1)
+                    condition = True
+                    for s, cond in enumerate(which):
+                        condition = condition & (cond if subset >> s & 1 else ~cond)
+                    own = dr.select(condition, beside[n], own)
+            record = field._record(own, active)
+            _, node, _ = field._in_block(record, x, y, z)
+            found.append(field._node(node, record, x, y, z, active))
+        return found
+
+
+def blend(corners, place):
+    """The field's value in spacings at ``place`` in a cell, 0 to 1 along each axis, from its corners."""
+    x, y, z = place
+    # One axis after the other: what corners say of the place, blended along z, y and x
+    said = []
+    for (a, b, c), (d, g) in zip(CORNERS, corners, strict=True):
+        said.append(d + 0.5 * (g[0] * (x - a) + g[1] * (y - b) + g[2] * (z - c)))
+    for t in (z, y, x):
+        said = [dr.fma(t, q - p, p) for p, q in zip(said[::2], said[1::2], strict=True)]
+    return said[0]
+
+
+def bit_of(low, high, bit):
+    """Whether a bit of a mask of 64 bits, two words, is set."""
+    return (dr.select(bit < 32, low, high) >> (bit & 31) & 1) == 1
+
+
+def bit_and_rank(low, high, bit):
+    """The same, and how many bits below it are set."""
+    upper = bit >= 32
+    word = dr.select(upper, high, low)
+    below = dr.popcnt(word & ((type(low)(1) << (bit & 31)) - 1))
+    return (word >> (bit & 31) & 1) == 1, below + dr.select(upper, dr.popcnt(low), 0)
+
+
+def cross(marcher, o, d, cell, number, low, end, leaving, fresh):
+    """
+    Whether, and where, the sign changes in a crossed cell between ``low`` and ``end`` along the ray; and what it was at
+    the start. ``(found, t, leaving)``.
+    """
+    corners = marcher.corners(number, *cell, True)
+    to = [x - marcher.field.types.Float(c) for x, c in zip(o, cell, strict=True)]
+
+    def value(t):
+        return blend(corners, [dr.fma(v, t, x) for x, v in zip(to, d, strict=True)])
+
+    step = (end - low) * (1 / SAMPLES)
+    start, high = low, low
+    a = b = value(low)
+    leaving = dr.select(fresh, a < 0, leaving)
+    found = (a < 0) != leaving
+    for n in range(SAMPLES):
+        t = dr.fma(step, n + 1, start)
+        v = value(t)
+        other = (v < 0) != leaving
+        high, b = dr.select(other & ~found, t, high), dr.select(other & ~found, v, b)
+        found |= other
+        low, a = dr.select(found, low, t), dr.select(found, a, v)
+    for _ in range(ROOTS):
+        t = dr.fma(high - low, _share(a, b), low)
+        v = value(t)
+        other = (v < 0) != leaving
+        low, a = dr.select(other, low, t), dr.select(other, a, v)
+        high, b = dr.select(other, t, high), dr.select(other, v, b)
+    return found, dr.fma(high - low, _share(a, b), low), leaving
+
+
+def _share(a, b):
+    """Where between two places with the values a and b of different signs the value is zero; 0 if they are equal."""
+    return dr.select(a == b, 0, dr.clip(a / (a - b), 0.02, 0.98))
+
+
+class Course:
+    """A ray ``o + t·d`` in a grid, and what of it does not change."""
+
+    def __init__(self, types, o, d):
+        self.types, self.o, self.d = types, list(o), list(d)
+        still = [dr.abs(v) < TINY for v in d]
+        self.inverse = [dr.rcp(dr.select(s, TINY, v)) for s, v in zip(still, d, strict=True)]
+        self.up = [dr.select((v > 0) | s, types.Int32(1), 0) for s, v in zip(still, d, strict=True)]
+
+    def cell(self, t, last):
+        """The cell of the place ``t``, at most ``last`` along each axis."""
+        return [
+            dr.clip(self.types.Int32(dr.floor(dr.fma(v, t, x))), 0, n)
+            for x, v, n in zip(self.o, self.d, last, strict=True)
+        ]
+
+    def end(self, cell, shift):
+        """Where it leaves the cube of 2^shift cells around a cell."""
+        sides = [
+            (self.types.Float(((c >> shift) + e) << shift) - x) * r
+            for x, c, e, r in zip(self.o, cell, self.up, self.inverse, strict=True)
+        ]
+        return dr.minimum(dr.minimum(sides[0], sides[1]), sides[2])
+
+
+@dr.syntax
+def march(marcher, o, d, length, fresh, active):
+    """
+    Rays ``o + t·d`` from within the grid, ``d`` of length 1, ``o`` and ``t`` in spacings from its lower corner:
+    ``(found, t, leaving)`` of the first change of sign before ``length``. A ray that is ``fresh`` starts with the sign
+    that it finds; others start outside.
+    """
+    types = marcher.field.types
+    last = [n - 2 for n in marcher.field.structure.shape]
+    course = Course(types, o, d)
+    t, found, leaving = types.Float(0), types.Bool(False), types.Bool(False)
+    fresh, active = types.Bool(fresh), types.Bool(active)
+    while dr.hint(active, label="march"):
+        cell = course.cell(t, last)
+        crossed, number, shift, sign, free = marcher.locate(*cell, active)
+        end = dr.maximum(course.end(cell, types.Int32(shift)), t)
+        leaving = dr.select(fresh & ~crossed, sign, leaving)
+        hit, place, leaving = dr.if_stmt(
+            (cell, number, t, end, leaving, fresh, sign),
+            crossed & active,
+            lambda cell, number, t, end, leaving, fresh, sign: cross(
+                marcher, course.o, course.d, cell, number, t, end, leaving, fresh
+            ),
+            lambda cell, number, t, end, leaving, fresh, sign: (sign != leaving, t, leaving),
+        )
+        hit &= active
+        found |= hit
+        fresh &= ~active
+        t = dr.select(hit, place, dr.maximum(end, t + free) + HAIR)
+        active &= ~hit & (t < length)
+    return found & (t <= length), t, leaving
+
+
+def cells_of(structure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    For each block: whether each of its 64 cells is crossed, that is, all its corners are stored; whether the others are
+    inside, ``(B, 64)``; and the blocks that their corners lie in, ``(B, 8)``, the block itself where there is none.
+    """
+    at = structure.block_positions() // BLOCK
+    number = np.full([n // BLOCK + 1 for n in structure.shape], -1)
+    number[tuple(at.T)] = np.arange(len(at))
+    beside = np.stack([number[tuple((at + n).T)] for n in NEIGHBOURS], axis=1)
+
+    # The signs of blocks without nodes, beyond the grid outside
+    empty = np.zeros(number.shape, bool)
+    coarse = (structure.regions & 1).astype(bool)
+    for x, y, z in np.ndindex(4, 4, 4):
+        part = coarse.copy()
+        part[structure.regions == ACTIVE] = _bits(structure.region_signs)[:, x * 16 + y * 4 + z]
+        empty[x : x + 4 * coarse.shape[0] : 4, y : y + 4 * coarse.shape[1] : 4, z : z + 4 * coarse.shape[2] : 4][
+            : coarse.shape[0], : coarse.shape[1], : coarse.shape[2]
+        ] = part
+
+    nodes = np.concatenate([_bits(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)])
+    groups = (structure.block_signs[:, None] >> np.arange(8) & 1).astype(bool).reshape(-1, 2, 2, 2)
+    signs = groups.repeat(2, 1).repeat(2, 2).repeat(2, 3)
+    stored, inside = np.zeros((2, len(at), 5, 5, 5), bool)
+    for which, n in enumerate(NEIGHBOURS):
+        to = (slice(None), *(slice(4 * e, 4 + e) for e in n))
+        of = (slice(None), *(slice(0, 1 if e else 4) for e in n))
+        there = beside[:, which]
+        stored[to] = nodes[there][of]
+        known = np.where(there[:, None, None, None] >= 0, signs[there], empty[tuple((at + n).T)][:, None, None, None])
+        inside[to] = known[of]
+    crossed, within = np.ones((len(at), 4, 4, 4), bool), np.zeros((len(at), 4, 4, 4), bool)
+    for a, b, c in CORNERS:
+        corner = (slice(None), slice(a, a + 4), slice(b, b + 4), slice(c, c + 4))
+        crossed &= stored[corner]
+        within |= ~stored[corner] & inside[corner]
+    beside = np.where(beside < 0, np.arange(len(at))[:, None], beside)
+    return crossed.reshape(-1, 64), within.reshape(-1, 64), beside
