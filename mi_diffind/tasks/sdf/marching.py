@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import drjit as dr
 import numpy as np
+from scipy.ndimage import distance_transform_cdt
 
 from .nodes import CORNERS
 from .structure import ACTIVE, BLOCK, _bits, _words
@@ -22,6 +23,9 @@ SAMPLES, ROOTS = 3, 3
 #: How far a ray goes beyond the side of a cell, so that it is in the next one.
 HAIR = 1e-3
 
+#: A word of a block without crossed cells: this, the sign, and how far the next one that has some is, in blocks.
+EMPTY, INSIDE = 1 << 31, 1 << 30
+
 #: Components of a direction below this count as zero.
 TINY = 1e-12
 
@@ -31,48 +35,52 @@ NEIGHBOURS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
 class Marcher:
     """
-    What is made of a field's masks, once: for each block, which cells are crossed, the signs of the others, and the
+    What is made of a field's masks, once: for each block of the grid its number, or how many blocks around it are empty
+    and their sign; for each that is not empty, which of its cells are crossed, the signs of the others, and the
     numbers of the blocks beside it.
     """
 
     def __init__(self, field):
         self.field = field
         structure, UInt32 = field.structure, field.types.UInt32
-        crossed, inside, beside = cells_of(structure)
+        crossed, inside, beside, empty = cells_of(structure)
+        self.blocks = tuple(n // BLOCK for n in structure.shape)
         words = np.concatenate([_words(crossed), _words(inside)], axis=1)
-        self.cells, self.beside = (UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (words, beside))
+        self.cells, self.beside, self.words = (
+            UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1))
+            for v in (words, beside, blocks_of(structure, crossed, inside, empty))
+        )
 
     @property
     def nbytes(self) -> int:
         """Bytes of it."""
-        return 4 * (dr.width(self.cells) + dr.width(self.beside))
+        return 4 * sum(map(dr.width, (self.words, self.cells, self.beside)))
 
     # -- where a ray is -----------------------------------------------------------------------------------------------
 
     def locate(self, i, j, k, active):
         """
-        Of cell (i, j, k): whether it is crossed, the number of its block, the logarithm of the size of what is empty
-        around it, its sign (meaningless if it is crossed), and how far from anywhere in it the surface is at least.
+        Of cell (i, j, k): whether it is crossed; the number of its block; ``shift`` and ``reach``: the cubes of 2^shift
+        cells around it of which fewer than ``reach`` in each direction are empty; its sign (of no meaning if it is
+        crossed).
         """
-        field, UInt32 = self.field, self.field.types.UInt32
-        _, ny, nz = field.structure.regions.shape
-        word = dr.gather(UInt32, field._regions, UInt32(((i >> 4) * ny + (j >> 4)) * nz + (k >> 4)), active)
-        region = active & (word < 2**31)
-        Packet = dr.uint32_array_t(field.types.Array4f)
-        low, high, low_sign, high_sign = dr.gather(Packet, field._region_masks, word, region)
-        bit = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
-        block, rank = bit_and_rank(low, high, bit)
-        block &= region
-        number = dr.gather(UInt32, field._first_blocks, word, block) + rank
-        cell = UInt32((i & 3) * 16 + (j & 3) * 4 + (k & 3))
-        cells = dr.gather(Packet, self.cells, number, block)
-        crossed = block & bit_of(cells[0], cells[1], cell)
-        sign = bit_of(dr.select(block, cells[2], low_sign), dr.select(block, cells[3], high_sign),
-                      dr.select(block, cell, bit))  # fmt: skip
-        sign = dr.select(region, sign, (word & 1) == 1)
-        shift = dr.select(block, UInt32(0), dr.select(region, UInt32(2), UInt32(4)))
-        free = dr.select(region | ~active, 0, field.types.Float(word >> 1 & 127) * 0.5)
-        return crossed, number, shift, sign, free
+        types = self.field.types
+        UInt32, Int32 = types.UInt32, types.Int32
+        _, ny, nz = self.blocks
+        word = dr.gather(UInt32, self.words, UInt32(((i >> 2) * ny + (j >> 2)) * nz + (k >> 2)), active)
+        empty = word >= EMPTY
+        low, high, low_sign, high_sign = dr.gather(types.Array4u, self.cells, word, active & ~empty)
+        x, y, z = UInt32(i & 3), UInt32(j & 3), UInt32(k & 3)
+        upper = x >= 2
+        half, signs = dr.select(upper, high, low), dr.select(upper, high_sign, low_sign)
+        bit = (x & 1) * 16 + y * 4 + z
+        crossed = active & ~empty & (((half >> bit) & 1) == 1)
+        # The cell and its seven neighbours in a cube of 2 × 2 × 2 are bits of one word
+        alone = (half & (UInt32(0x330033) << ((y & 2) * 4 + (z & 2)))) == 0
+        shift = dr.select(empty, Int32(2), dr.select(alone, 1, 0))
+        reach = dr.select(empty, Int32(word & 0xFFFF), 1)
+        sign = dr.select(empty, (word & INSIDE) != 0, ((signs >> bit) & 1) == 1)
+        return crossed, word, shift, reach, sign
 
     def corners(self, number, i, j, k, active):
         """Distance and gradient, in spacings, of the eight nodes of a crossed cell, in the order of ``CORNERS``."""
@@ -107,19 +115,6 @@ def blend(corners, place):
     for t in (z, y, x):
         said = [dr.fma(t, q - p, p) for p, q in zip(said[::2], said[1::2], strict=True)]
     return said[0]
-
-
-def bit_of(low, high, bit):
-    """Whether a bit of a mask of 64 bits, two words, is set."""
-    return (dr.select(bit < 32, low, high) >> (bit & 31) & 1) == 1
-
-
-def bit_and_rank(low, high, bit):
-    """The same, and how many bits below it are set."""
-    upper = bit >= 32
-    word = dr.select(upper, high, low)
-    below = dr.popcnt(word & ((type(low)(1) << (bit & 31)) - 1))
-    return (word >> (bit & 31) & 1) == 1, below + dr.select(upper, dr.popcnt(low), 0)
 
 
 def cross(marcher, o, d, cell, number, low, end, leaving, fresh):
@@ -166,7 +161,7 @@ class Course:
         self.types, self.o, self.d = types, list(o), list(d)
         still = [dr.abs(v) < TINY for v in d]
         self.inverse = [dr.rcp(dr.select(s, TINY, v)) for s, v in zip(still, d, strict=True)]
-        self.up = [dr.select((v > 0) | s, types.Int32(1), 0) for s, v in zip(still, d, strict=True)]
+        self.up = [(v > 0) | s for s, v in zip(still, d, strict=True)]
 
     def cell(self, t, last):
         """The cell of the place ``t``, at most ``last`` along each axis."""
@@ -175,10 +170,10 @@ class Course:
             for x, v, n in zip(self.o, self.d, last, strict=True)
         ]
 
-    def end(self, cell, shift):
-        """Where it leaves the cube of 2^shift cells around a cell."""
+    def end(self, cell, shift, reach):
+        """Where it leaves the cubes of 2^shift cells around a cell, fewer than ``reach`` in each direction."""
         sides = [
-            (self.types.Float(((c >> shift) + e) << shift) - x) * r
+            (self.types.Float(((c >> shift) + dr.select(e, reach, 1 - reach)) << shift) - x) * r
             for x, c, e, r in zip(self.o, cell, self.up, self.inverse, strict=True)
         ]
         return dr.minimum(dr.minimum(sides[0], sides[1]), sides[2])
@@ -198,8 +193,8 @@ def march(marcher, o, d, length, fresh, active):
     fresh, active = types.Bool(fresh), types.Bool(active)
     while dr.hint(active, label="march"):
         cell = course.cell(t, last)
-        crossed, number, shift, sign, free = marcher.locate(*cell, active)
-        end = dr.maximum(course.end(cell, types.Int32(shift)), t)
+        crossed, number, shift, reach, sign = marcher.locate(*cell, active)
+        end = dr.maximum(course.end(cell, shift, reach), t)
         leaving = dr.select(fresh & ~crossed, sign, leaving)
         hit, place, leaving = dr.if_stmt(
             (cell, number, t, end, leaving, fresh, sign),
@@ -212,15 +207,16 @@ def march(marcher, o, d, length, fresh, active):
         hit &= active
         found |= hit
         fresh &= ~active
-        t = dr.select(hit, place, dr.maximum(end, t + free) + HAIR)
+        t = dr.select(hit, place, end + HAIR)
         active &= ~hit & (t < length)
     return found & (t <= length), t, leaving
 
 
 def cells_of(structure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    For each block: whether each of its 64 cells is crossed, that is, all its corners are stored; whether the others are
+    For each block with nodes: whether each of its 64 cells is crossed, that is, all its corners are stored; whether the others are
     inside, ``(B, 64)``; and the blocks that their corners lie in, ``(B, 8)``, the block itself where there is none.
+    And the signs of blocks without nodes, at their places in the grid.
     """
     at = structure.block_positions() // BLOCK
     number = np.full([n // BLOCK + 1 for n in structure.shape], -1)
@@ -254,4 +250,18 @@ def cells_of(structure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         crossed &= stored[corner]
         within |= ~stored[corner] & inside[corner]
     beside = np.where(beside < 0, np.arange(len(at))[:, None], beside)
-    return crossed.reshape(-1, 64), within.reshape(-1, 64), beside
+    return crossed.reshape(-1, 64), within.reshape(-1, 64), beside, empty[:-1, :-1, :-1]
+
+
+def blocks_of(structure, crossed, inside, empty) -> np.ndarray:
+    """For each block of the grid its number, or what is said of empty ones (:data:`EMPTY`), uint32."""
+    number = np.zeros(empty.shape, np.uint32)
+    full = np.zeros(empty.shape, bool)
+    at = tuple((structure.block_positions() // BLOCK).T)
+    full[at] = crossed.any(axis=1)
+    number[at] = np.arange(len(crossed))
+    sign = empty.copy()
+    sign[at] = inside[:, 0]  # of one without crossed cells, all have the same
+    # Beyond the grid nothing is to be met
+    far = distance_transform_cdt(~full, "chessboard") if full.any() else np.full(full.shape, max(full.shape))
+    return np.where(full, number, EMPTY | np.where(sign, INSIDE, 0) | far).astype(np.uint32)
