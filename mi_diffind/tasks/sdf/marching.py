@@ -58,12 +58,12 @@ class Marcher:
 
     # -- where a ray is -----------------------------------------------------------------------------------------------
 
-    def locate(self, i, j, k, active):
+    def locate(self, course, t, active):
         """
-        Of cell (i, j, k): whether it is crossed; the number of its block; ``shift`` and ``reach``: the cubes of 2^shift
-        cells around it of which fewer than ``reach`` in each direction are empty; its sign (of no meaning if it is
-        crossed).
+        Of the cell at ``t`` of a ray: whether it is crossed; the number of its block; where the ray leaves it, or what is
+        empty around it; its sign (of no meaning if it is crossed).
         """
+        i, j, k = cell = course.cell(t)
         types = self.field.types
         UInt32, Int32 = types.UInt32, types.Int32
         _, ny, nz = self.blocks
@@ -80,25 +80,19 @@ class Marcher:
         shift = dr.select(empty, Int32(2), dr.select(alone, 1, 0))
         reach = dr.select(empty, Int32(word & 0xFFFF), 1)
         sign = dr.select(empty, (word & INSIDE) != 0, ((signs >> bit) & 1) == 1)
-        return crossed, word, shift, reach, sign
+        return crossed, word, dr.maximum(course.end(cell, shift, reach), t), sign
 
     def corners(self, number, i, j, k, active):
         """Distance and gradient, in spacings, of the eight nodes of a crossed cell, in the order of ``CORNERS``."""
         field, UInt32 = self.field, self.field.types.UInt32
-        beside = [dr.gather(UInt32, self.beside, number * 8 + n, active) for n in range(8)]
         found = []
+        far = [dr.select((v & 3) == 3, UInt32(m), 0) for v, m in zip((i, j, k), (4, 2, 1))]
         for a, b, c in CORNERS:
             x, y, z = i + a, j + b, k + c
-            own = beside[0]
-            if a or b or c:
-                which = [((v ^ w) >> 2 != 0) for v, w, e in zip((x, y, z), (i, j, k), (a, b, c)) if e]
-                keys = [m for m, e in zip((4, 2, 1), (a, b, c)) if e]
-                for subset in range(1, 2 ** len(keys)):
-                    n = sum(key for s, key in enumerate(keys) if subset >> s & 1)
-                    condition = True
-                    for s, cond in enumerate(which):
-                        condition = condition & (cond if subset >> s & 1 else ~cond)
-                    own = dr.select(condition, beside[n], own)
+            n = number * 8
+            for e, m in zip((a, b, c), far):
+                n = n + m if e else n
+            own = number if not (a or b or c) else dr.gather(UInt32, self.beside, n, active)
             record = field._record(own, active)
             _, node, _ = field._in_block(record, x, y, z)
             found.append(field._node(node, record, x, y, z, active))
@@ -117,16 +111,17 @@ def blend(corners, place):
     return said[0]
 
 
-def cross(marcher, o, d, cell, number, low, end, leaving, fresh):
+def cross(marcher, course, low, end, number, leaving, fresh):
     """
     Whether, and where, the sign changes in a crossed cell between ``low`` and ``end`` along the ray; and what it was at
     the start. ``(found, t, leaving)``.
     """
+    cell = course.cell(low)
     corners = marcher.corners(number, *cell, True)
-    to = [x - marcher.field.types.Float(c) for x, c in zip(o, cell, strict=True)]
+    to = [x - course.types.Float(c) for x, c in zip(course.o, cell, strict=True)]
 
     def value(t):
-        return blend(corners, [dr.fma(v, t, x) for x, v in zip(to, d, strict=True)])
+        return blend(corners, [dr.fma(v, t, x) for x, v in zip(to, course.d, strict=True)])
 
     step = (end - low) * (1 / SAMPLES)
     start, high = low, low
@@ -157,17 +152,19 @@ def _share(a, b):
 class Course:
     """A ray ``o + t·d`` in a grid, and what of it does not change."""
 
-    def __init__(self, types, o, d):
-        self.types, self.o, self.d = types, list(o), list(d)
+    def __init__(self, field, o, d):
+        self.types, self.last = field.types, [n - 2 for n in field.structure.shape]
+        self.o, self.d = list(o), list(d)
+        types = self.types
         still = [dr.abs(v) < TINY for v in d]
         self.inverse = [dr.rcp(dr.select(s, TINY, v)) for s, v in zip(still, d, strict=True)]
         self.up = [(v > 0) | s for s, v in zip(still, d, strict=True)]
 
-    def cell(self, t, last):
-        """The cell of the place ``t``, at most ``last`` along each axis."""
+    def cell(self, t):
+        """The cell of the place ``t``."""
         return [
             dr.clip(self.types.Int32(dr.floor(dr.fma(v, t, x))), 0, n)
-            for x, v, n in zip(self.o, self.d, last, strict=True)
+            for x, v, n in zip(self.o, self.d, self.last, strict=True)
         ]
 
     def end(self, cell, shift, reach):
@@ -187,27 +184,33 @@ def march(marcher, o, d, length, fresh, active):
     that it finds; others start outside.
     """
     types = marcher.field.types
-    last = [n - 2 for n in marcher.field.structure.shape]
-    course = Course(types, o, d)
+    course = Course(marcher.field, o, d)
     t, found, leaving = types.Float(0), types.Bool(False), types.Bool(False)
     fresh, active = types.Bool(fresh), types.Bool(active)
-    while dr.hint(active, label="march"):
-        cell = course.cell(t, last)
-        crossed, number, shift, reach, sign = marcher.locate(*cell, active)
-        end = dr.maximum(course.end(cell, shift, reach), t)
-        leaving = dr.select(fresh & ~crossed, sign, leaving)
+    while dr.hint(active, label="cells that are crossed"):
+        # All rays of a packet go on until each has found one: reading it is what costs
+        seeking, number, end = types.Bool(active), types.UInt32(0), t
+        while dr.hint(seeking, label="cells that are not"):
+            crossed, word, following, sign = marcher.locate(course, t, seeking)
+            leaving = dr.select(fresh & seeking & ~crossed, sign, leaving)
+            fresh &= crossed | ~seeking
+            jumped = seeking & ~crossed & (sign != leaving)
+            number, end = dr.select(crossed, word, number), dr.select(crossed, following, end)
+            found |= jumped
+            seeking &= ~crossed & ~jumped
+            t = dr.select(seeking, following + HAIR, t)
+            active &= ~jumped & (t < length)
+            seeking &= active
         hit, place, leaving = dr.if_stmt(
-            (cell, number, t, end, leaving, fresh, sign),
-            crossed & active,
-            lambda cell, number, t, end, leaving, fresh, sign: cross(
-                marcher, course.o, course.d, cell, number, t, end, leaving, fresh
-            ),
-            lambda cell, number, t, end, leaving, fresh, sign: (sign != leaving, t, leaving),
+            (t, end, number, leaving, fresh),
+            active,
+            lambda t, end, number, leaving, fresh: cross(marcher, course, t, end, number, leaving, fresh),
+            lambda t, end, number, leaving, fresh: (types.Bool(False), t, leaving),
         )
         hit &= active
         found |= hit
         fresh &= ~active
-        t = dr.select(hit, place, end + HAIR)
+        t = dr.select(hit, place, dr.select(active, end + HAIR, t))
         active &= ~hit & (t < length)
     return found & (t <= length), t, leaving
 
