@@ -1,1 +1,109 @@
-"""Task 6: signed distance fields."""
+"""
+Task 6: signed distance fields of meshes.
+
+- :mod:`.mesh`, :mod:`.distances`, :mod:`.samples`: the truth;
+- :mod:`.field`: what every field offers; :mod:`.nodes` (with :mod:`.structure`, :mod:`.codes`), :mod:`.pair`: ours and
+  the supplement's;
+- :mod:`.encoding`, :mod:`.training`, :mod:`.fit`, :mod:`.presets`: how they come about;
+- :mod:`.tracing`, :mod:`.decode`, :mod:`.evaluation`: where rays meet them, what other programs read, how good they are;
+- :mod:`.files`, :mod:`.model`: the result, as a file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+from ... import sizes
+from ...arguments import Argument, positive
+from ...errors import UsageError
+from ..task import Request, Task
+from .presets import PRESETS
+
+#: Bits of a pointer that go into words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
+BITS = (4, 5, 6, 8, 10, 16)
+
+
+def _bytes(text: str) -> str:
+    try:
+        sizes.parse_bytes(text)
+    except ValueError as e:
+        raise argparse.ArgumentTypeError(str(e)) from None
+    return text
+
+
+def _ratio(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 1 <= value <= 16:
+        raise argparse.ArgumentTypeError(f"found {text}, allowed are ratios from 1 to 16")
+    return value
+
+
+class Sdf(Task):
+    """The task. Its presets are the recipes of :mod:`.presets`; files are always stored as bytes."""
+
+    name = "sdf"
+    title = "the signed distance field of a mesh"
+    section = "supplemental 1.6"
+    presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
+    storages = ()
+    arguments = (
+        Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
+        Argument("--bytes", type=_bytes, metavar="N", help="size in memory, as in 256k or 1.5M (default: 1M)"),
+        Argument(
+            "--bits", type=int, choices=BITS, default=10,
+            help="bits of a pointer of the sparse layout (default: 10)",
+        ),
+        Argument("--ratio", type=_ratio, help="of dense and paper: side of the primary over side of the cascaded array"),
+        Argument(
+            "--constant", action="store_true",
+            help="of paper: begin with a constant cascaded array, not with the nearest samples",
+        ),
+    )  # fmt: skip
+    decode_arguments = (
+        Argument("--resolution", type=positive, metavar="N", help="cells along the longest side (default: finer than it)"),
+    )
+
+    def settings(self, preset, given, options):
+        own = self.presets[preset]
+        steps = given.get("steps", own.steps)
+        return dataclasses.replace(own, measure_every=max(1, steps // 4), **given)
+
+    def check(self, request: Request) -> None:
+        from .fit import asked_bytes
+
+        options = request.options
+        if options["source"] is None:
+            raise UsageError("source: not given, a mesh is needed")
+        asked_bytes(options)
+        if options["constant"] and request.preset != "paper":
+            raise UsageError(f"--constant is of the preset paper, found {request.preset}")
+        if options["ratio"] is not None and PRESETS[request.preset].layout != "pair":
+            raise UsageError(f"--ratio is of the presets dense and paper, found {request.preset}")
+
+    def fit(self, request: Request):
+        from .fit import fit
+
+        return fit(request)
+
+    def load(self, path):
+        from .files import load
+
+        return load(path)
+
+    def model_class(self):
+        from .model import SdfModel
+
+        return SdfModel
+
+    def allocate(self, table, dtype, storage=""):
+        return super().allocate(table, dtype, storage) if table.settings["layout"] == "pair" else {}
+
+    def model(self, table, dtype, storage=""):
+        return self.model_class()(table, self.allocate(table, dtype, storage), dtype, storage)
+
+
+TASK = Sdf()

@@ -51,3 +51,33 @@ def near_nodes(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     keys, inverse = np.unique((corners[:, 0] * ny + corners[:, 1]) * nz + corners[:, 2], return_inverse=True)
     nodes = np.stack([keys // (ny * nz), keys // nz % ny, keys % nz], axis=-1)
     return nodes.astype(np.int32), inverse.reshape(-1, 8).astype(np.int32)
+
+
+def node_distances(distances: Distances, lower, spacing: float, shape, limit: float) -> np.ndarray:
+    """
+    The signed distance, truncated to ± ``limit``, at all nodes ``lower + spacing · (i, j, k)`` of a grid: float32 of
+    the ``shape`` (nodes along x, y and z). Only nodes near the surface are asked for one by one; neighbours among the
+    others share a sign, of which one is asked for.
+    """
+    from scipy.ndimage import label
+
+    shape = tuple(int(n) for n in shape)
+    lower = np.asarray(lower, dtype=np.float64)
+    cells = surface_cells(distances, lower, spacing, np.array(shape) - 1, max(0.0, limit - 0.8 * spacing))
+    nodes, _ = near_nodes(cells)
+    near = np.zeros(shape, dtype=bool)
+    near[tuple(nodes.T)] = True
+    values = np.empty(shape, np.float32)
+    if distances.solid.watertight:
+        pieces, count = label(~near)
+        first = np.zeros(count + 1, dtype=np.int64)
+        flat = pieces.reshape(-1)
+        first[flat[::-1]] = np.arange(len(flat))[::-1]
+        places = np.stack(np.unravel_index(first, shape), axis=-1)
+        signs = np.where(distances.inside(lower + spacing * places), -1, 1).astype(np.float32)
+        values[...] = limit * signs[pieces]
+    else:
+        far = np.argwhere(~near)
+        values[tuple(far.T)] = np.where(distances.inside(lower + spacing * far), -limit, limit)
+    values[tuple(nodes.T)] = distances.signed(lower + spacing * nodes).clip(-limit, limit)
+    return values

@@ -118,10 +118,11 @@ def decoded(entry, n, d, scale, offset):
     """
     e, a, b = (v * scale for v in entry)
     square = a * a + b * b
-    limited = _select(n, square < EDGE**2, square, EDGE**2)
-    c, f = 1 - limited / 2, (np.sqrt if isinstance(n[0], np.ndarray) else dr.sqrt)(1 - limited / 4)
-    f = f * _select(n, square < EDGE**2, 1.0, EDGE / (np.sqrt if isinstance(n[0], np.ndarray) else dr.sqrt)(
-        _select(n, square < EDGE**2, EDGE**2, square)))  # fmt: skip
+    # Beyond the edge, on it
+    root = np.sqrt if isinstance(n[0], np.ndarray) else dr.sqrt
+    beyond = square > EDGE**2
+    c = 1 - _select(n, beyond, EDGE**2, square) / 2
+    f = _select(n, beyond, EDGE, 1.0) * root((1 - _select(n, beyond, EDGE**2, square) / 4) / _select(n, beyond, square, 1.0))
     t, u = orthonormal(n)
     normal = tuple(c * k + f * (a * p + b * q) for k, p, q in zip(n, t, u, strict=True))
     return d + n[0] * offset[0] + n[1] * offset[1] + n[2] * offset[2] + e, normal

@@ -65,6 +65,8 @@ def sample(distances: Distances, spacing: float) -> Sampled:
 
 def fit_frames(s: Sampled) -> np.ndarray:
     """The frames of blocks, words (B,): mean normal, best distance, root mean square of what remains."""
+    if not s.structure.blocks:
+        return np.zeros(0, np.uint32)
     count = np.bincount(s.block, minlength=s.structure.blocks)
     mean = lambda v: np.bincount(s.block, v, minlength=s.structure.blocks) / count
     n = np.stack([mean(s.normals[:, a]) for a in range(3)], axis=1)

@@ -4,11 +4,15 @@ How good a field is: against held-out points of the mesh itself, made once. All 
 
 from __future__ import annotations
 
+import functools
+import math
+
 import drjit as dr
 import numpy as np
 
 from . import samples
-from .cells import surface_cells
+from .cells import node_distances, surface_cells
+from .decode import OFF_NODE, components, march, surface_of
 from .distances import Distances
 from .field import Field
 from .mesh import Mesh
@@ -26,7 +30,7 @@ CHUNK = 2**20
 class Evaluation:
     """
     Held-out points of ``mesh``: ``count`` uniform ones in its box, padded by 0.05; ``count`` uniform ones among those
-    nearer than 0.01 to the surface; ``count``/4 on the surface, uniform over its area where it bounds the solid.
+    nearer than 0.01 to the surface; ``count``/4 on the surface, uniform over its area.
     """
 
     def __init__(self, mesh: Mesh, distances: Distances, count: int = 2**20, seed: int = 1):
@@ -36,7 +40,7 @@ class Evaluation:
         self.uniform = samples.far(mesh.lower - PADDING, mesh.upper + PADDING, count, rng).astype(np.float32)
         self.uniform_inside = distances.inside(self.uniform)
         self.near, self.near_distance = self._near(rng)
-        self.surface, self.normals = bounding(distances, *samples.surface(mesh, max(1, count // 4), rng))
+        self.surface, self.normals = samples.surface(distances.surface, max(1, count // 4), rng)
 
     def _near(self, rng) -> tuple[np.ndarray, np.ndarray]:
         """Uniform points of the band, and their signed distances: from the cells that reach into it."""
@@ -77,12 +81,44 @@ class Evaluation:
             "normal_smooth_deg": float(smooth.mean(dtype=np.float64)),
         }
 
+    def chamfer(self, decoded, count: int = 2**18) -> dict[str, float]:
+        """
+        Of a decoded ``trimesh.Trimesh`` (units and place of the file): ``chamfer``, the mean distance from points
+        uniform on one surface to the other one, averaged over both directions, infinite if one is empty; and
+        ``components``, the pieces of the decoded surface, with ``components_mesh``, those of the mesh's solid.
 
-def bounding(distances: Distances, points: np.ndarray, normals: np.ndarray, step: float = 1e-5):
-    """Of points on the surface and their normals, those with the solid on one side only: where pieces overlap, not."""
-    outer, inner = distances.inside(points + step * normals), distances.inside(points - step * normals)
-    kept = outer != inner
-    return points[kept], normals[kept]
+        Decode on a grid finer than the field's own cells, lest the grid's error be measured.
+        """
+        pieces = {"components": len(components(decoded)), "components_mesh": self.components}
+        if not len(decoded.faces):
+            return {"chamfer": math.inf, **pieces}
+        vertices = (np.asarray(decoded.vertices) - np.array(self.mesh.centre)) / self.mesh.scale
+        found = Mesh(vertices, np.asarray(decoded.faces), True, path="the decoded mesh")
+        rng = np.random.default_rng([self.seed, 8])
+        ours, _ = samples.surface(found, count, rng)
+        theirs, _ = samples.surface(self.distances.surface, count, rng)
+        there = self.distances.unsigned(ours).mean()
+        with Distances(found) as distances:
+            back = distances.to_triangles(theirs).mean()
+        return {"chamfer": float(there + back) / 2, **pieces}
+
+    @functools.cached_property
+    def components(self) -> int:
+        """
+        Pieces of the surface of the mesh's solid: of the mesh itself, or if its pieces overlap or it is open, of the
+        exact distance's surface on a grid of 256 cells.
+        """
+        solid = self.distances.surface
+        return solid.components if solid is self.mesh else len(components(self.truth(256)))
+
+    def truth(self, resolution: int):
+        """The solid's surface by marching cubes of exact distances, in units and place of the file."""
+        spacing = 1 / resolution
+        lower = self.mesh.lower - 1.5 * spacing
+        cells = np.ceil((self.mesh.upper - lower) / spacing + 1.5).astype(int)
+        values = node_distances(self.distances, lower, spacing, cells + 1, 2 * spacing)
+        vertices, faces = march(lambda a, b: values[a : b + 1], cells, OFF_NODE * spacing)
+        return surface_of(self.mesh.to_file_frame(lower + spacing * vertices), faces)
 
 
 def _iou(a: np.ndarray, b: np.ndarray) -> float:

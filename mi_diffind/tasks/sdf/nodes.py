@@ -12,14 +12,12 @@ go until it reaches another cell.
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import numpy as np
 
 from . import codes
 from .field import Field
-from .structure import ACTIVE, BLOCK, REGION, Structure
+from .structure import ACTIVE, BLOCK, Structure
 
 #: Spacings up to which values are told.
 BAND = 2.0
@@ -136,8 +134,8 @@ class SparseNodes(Field):
 
     def _blend(self, p, active, derivatives: bool):
         """
-        The value in spacings, its gradient per spacing (or None), the smooth normal, whether all corners are stored, and
-        the sign of the first corner.
+        The value in spacings, its gradient (if ``derivatives``), the smooth normal, whether all corners are stored, and
+        whether one is.
         """
         Float = self.types.Float
         cell, place = self._grid(p)
@@ -165,18 +163,18 @@ class SparseNodes(Field):
                     slope[axis] = dr.fma(change, part, slope[axis])
                     slope[axis] = dr.fma(w * dr.select(complete, 0.5, 1.0), g[axis], slope[axis])
         some = weight_sum > 0
-        inside = corners[0][4]
-        for (stored, *_, sign) in corners:
-            inside = inside & (sign | stored) | (~stored & sign)
         whole = dr.select(complete, 1, dr.rcp(dr.select(some, weight_sum, 1)))
         value, smooth = value * whole, [s * whole for s in smooth]
         slope = [dr.select(complete, s, m) for s, m in zip(slope, smooth, strict=True)]
         return value, slope, smooth, complete, some
 
-    def _signed(self, p, active, derivatives: bool):
-        active = self.inside(p) & active
-        value, slope, smooth, complete, some = self._blend(p, active, derivatives)
-        return active, value, slope, smooth, complete, some
+    def blend(self, p):
+        """
+        For training: the value in spacings, its gradient, the smooth normal (three each), and whether this is a cell
+        whose nodes are all stored.
+        """
+        value, slope, smooth, complete, _ = self._blend(p, self.inside(p), True)
+        return value, slope, smooth, complete
 
     def _outside(self, p, active):
         """The sign, as ± 1, of cells whose corners are not all stored."""
@@ -300,4 +298,14 @@ def middles(positions: np.ndarray) -> np.ndarray:
     return positions % BLOCK - (BLOCK - 1) / 2
 
 
-__all__ = ["BAND", "SparseNodes", "math", "middles", "slope_bound", "REGION"]
+def decoded_nodes(structure: Structure, frames: np.ndarray, entries: np.ndarray) -> np.ndarray:
+    """The nodes (n, 4), float32, distances in spacings and normals, of frames (B,), and the entry of each node (n, 3)."""
+    positions, block = structure.node_positions()
+    n, d, scale = (v[block] for v in codes.frames_numpy(frames))
+    distance, normal = codes.decoded(
+        tuple(entries.astype(np.float64).T), tuple(n.T), d, scale, tuple(middles(positions).T)
+    )
+    return np.stack([distance, *normal], axis=1).astype(np.float32)
+
+
+__all__ = ["BAND", "SparseNodes", "decoded_nodes", "middles", "slope_bound"]
