@@ -99,6 +99,13 @@ class Marcher:
         return found
 
 
+def of(field) -> Marcher:
+    """That of a field, made once."""
+    if "_marcher" not in vars(field):
+        field._marcher = Marcher(field)
+    return field._marcher
+
+
 def blend(corners, place):
     """The field's value in spacings at ``place`` in a cell, 0 to 1 along each axis, from its corners."""
     x, y, z = place

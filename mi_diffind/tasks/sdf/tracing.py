@@ -17,6 +17,8 @@ from typing import Any
 
 import drjit as dr
 
+from . import marching
+
 #: The shortest step, in units of the longest side: a solid that a ray crosses in less may be missed.
 EPSILON = 1e-4
 
@@ -62,25 +64,50 @@ def enter(field, o, d, maxt, active=True):
     return near, far, active
 
 
-@dr.syntax
-def intersect(field, o, d, maxt, active=True, epsilon: float = EPSILON, exact: bool = True) -> Hit:
+def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
     """
     The first place where rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, change from outside to inside of the
     solid or the other way. If not ``exact``, only ``found`` and ``leaving`` mean anything, which is faster.
 
     A ray that starts in the box starts where the field says; one that does not is outside of the solid.
     """
-    types = field.types
-    Float, Bool, Point = types.Float, types.Bool, types.Array3f
+    Float, Point = field.types.Float, field.types.Array3f
     with dr.suspend_grad():
-        o, d = Point(dr.detach(o)), Point(dr.detach(d))
-        near, far, active = enter(field, o, d, dr.detach(maxt), active)
+        o, d, maxt = Point(dr.detach(o)), Point(dr.detach(d)), Float(dr.detach(maxt))
+        near, far, active = enter(field, o, d, maxt, active)
         # From here on, numbers are small. Rounding must not leave a ray outside, where the field says nothing
         start = Point(dr.clip(dr.fma(d, near, o), Point(*field.lower), Point(*field.upper)))
         length = far - near
-        hit_box = active & (far < maxt)
-        leaving = (near == 0) & (field.value(start, active) < 0)
-        found = Bool(False)
+        if hasattr(field, "structure"):
+            found, t, leaving = march(field, start, d, length, near == 0, active)
+        else:
+            found, t, leaving = spheres(field, start, d, length, near == 0, active, exact)
+        # What is solid up to the side of the box ends there
+        cut = active & (far < maxt) & leaving & ~found
+        t = dr.select(cut, length, t)
+        found |= cut
+        return Hit(found, dr.select(found, near + t, dr.inf), dr.fma(d, t, start), leaving)
+
+
+def march(field, start, d, length, fresh, active):
+    """As :func:`spheres`, of a sparse grid: from cell to cell (:mod:`.marching`)."""
+    marcher = marching.of(field)
+    o = [(x - a) / field.spacing for x, a in zip(start, field.lower, strict=True)]
+    found, t, leaving = marching.march(marcher, o, d, length / field.spacing, fresh, active)
+    return found, t * field.spacing, leaving
+
+
+@dr.syntax
+def spheres(field, start, d, length, fresh, active, exact: bool = True, epsilon: float = EPSILON):
+    """
+    The first change of sign along rays from ``start``, a place in the box, up to ``length``: ``(found, t, leaving)``.
+    Rays that are ``fresh`` start with the sign that they find, others outside.
+    """
+    types = field.types
+    Float, Bool = types.Float, types.Bool
+    with dr.suspend_grad():
+        active, found = Bool(active), Bool(False)
+        leaving = Bool(fresh) & (field.value(start, active) < 0)
 
         reach = RELAXATION * field.spacing
         t, safe = Float(0), Float(0)
@@ -114,11 +141,7 @@ def intersect(field, o, d, maxt, active=True, epsilon: float = EPSILON, exact: b
             else:
                 t = dr.select(back, safe, dr.maximum(safe, t + ahead))
                 active &= ~found & (t <= length)
-        # What is solid up to the side of the box ends there
-        cut = hit_box & leaving & ~found
-        t = dr.select(cut, length, t)
-        found |= cut
-        return Hit(found, dr.select(found, near + t, dr.inf), dr.fma(d, t, start), leaving)
+        return found, t, leaving
 
 
 def trace(field, o, d, maxt, active=True) -> tuple:
