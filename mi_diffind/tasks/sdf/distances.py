@@ -26,7 +26,7 @@ import numpy as np
 from ...errors import DiffindError, reason
 from . import solids
 from .distances_child import read, write
-from .mesh import Mesh
+from .mesh import NO_VOLUME, Mesh
 
 #: Points per request: fewer than a second's work, so that Ctrl-C is heard.
 CHUNK = 2**17
@@ -112,7 +112,7 @@ class Distances:
         :class:`DistancesError` if there is nothing of the kind.
         """
         found = solids.bounding(self.solid, self.inside)
-        if not len(found.faces):
+        if not len(found.faces) or (found.watertight and abs(found.volume) < NO_VOLUME):
             raise DistancesError(f"{self.mesh.path}: encloses no volume, expected the surface of a solid")
         return found
 
@@ -220,11 +220,13 @@ class Distances:
     def _ask(self, question: str, points, name: str, mesh: Mesh) -> dict[str, np.ndarray]:
         """The answers for all points of a mesh, which is sent under its ``name`` when it is needed, chunk by chunk."""
         points = _checked(points)
-        parts = [points[i : i + CHUNK] for i in range(0, max(len(points), 1), CHUNK)]
+        if not len(points):
+            return {key: found[:0] for key, found in self._ask(question, np.zeros((1, 3)), name, mesh).items()}
+        parts = [points[i : i + CHUNK] for i in range(0, len(points), CHUNK)]
         if self._child is None:
             self._start()
         if name not in self._sent:
-            arrays = {"vertices": mesh.vertices, "faces": mesh.faces.astype(np.int64)}
+            arrays = {"vertices": mesh.vertices, "faces": mesh.faces.astype(np.int64), "watertight": mesh.watertight}
             self._request(f"mesh {name}", {key: np.ascontiguousarray(a) for key, a in arrays.items()})
             self._sent.add(name)
         answers = [self._request(f"{question} {name}", {"points": part}) for part in parts]

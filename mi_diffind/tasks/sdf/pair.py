@@ -82,8 +82,10 @@ def initial(start: str, primary, cascaded, grid_distance, samples, distances, ba
         places = ramp(cascaded, 3, ("clamp",) * 3).reshape(-1, 3)
         nearest = cKDTree(samples).query(places, workers=-1)[1]
         entries = np.clip(distances[nearest] / band, -1, 1).reshape(*cascaded, 1) / 2 + 0.5
-    arrays = DifferentiableArray(primary, 3, pointers, fold=True), DifferentiableArray(cascaded, 1, entries)
-    return Indirection(*arrays)
+    # Both are folded: distances are bounded, and bytes hold nothing beyond
+    return Indirection(
+        DifferentiableArray(primary, 3, pointers, fold=True), DifferentiableArray(cascaded, 1, entries, fold=True)
+    )
 
 
 def slope_of(net: Indirection, lower, upper, band: float) -> float:

@@ -16,7 +16,7 @@ STEP = 2e-6
 
 #: Triangles whose longest edge is larger are looked at in parts, and parts are halved down to the second length where
 #: some of it bounds the solid and some does not.
-COARSE, FINE = 1 / 64, 1 / 512
+COARSE, FINE = 1 / 64, 1 / 256
 
 #: Places at which a triangle is looked at (barycentric): the middle and near the corners.
 PLACES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9]])
@@ -57,21 +57,23 @@ def closed(mesh: Mesh) -> Mesh:
 
 def bounding(mesh: Mesh, inside: Callable[[np.ndarray], np.ndarray]) -> Mesh:
     """
-    The triangles of ``mesh``, or parts of them, that have ``inside`` on one side only. The mesh itself if all do.
+    The triangles of ``mesh``, or parts of them, that have ``inside`` behind them only. The mesh itself if all do.
     """
-    simple = _bounds(mesh.corners.mean(axis=1), mesh.normals, inside)
+    middle = mesh.corners.mean(axis=1)
+    before, behind = (inside(middle + side * STEP * mesh.normals) for side in (1, -1))
+    # Sheets without a thickness bound nothing, and need not be looked at in parts
+    sheet = ~before & ~behind
     # Where pieces cross there are triangles that bound nothing, or large ones
     crossed = np.zeros(len(mesh.vertices), dtype=bool)
-    crossed[mesh.faces[~simple]] = True
+    crossed[mesh.faces[before == behind]] = True
     looked = crossed[mesh.faces].any(axis=1) | (_longest(mesh.corners)[0] > COARSE**2)
-    if not looked.any():
-        return mesh
-    owner = np.flatnonzero(looked)
+    owner = np.flatnonzero(looked & ~sheet)
     corners = mesh.corners[owner]
-    kept, dropped = [], np.zeros(len(mesh.faces), dtype=bool)
+    kept, dropped = [(corners[:0], owner[:0])], sheet
     while len(owner):
         places = np.einsum("pc,ncx->npx", PLACES, corners).reshape(-1, 3)
-        found = _bounds(places, np.repeat(mesh.normals[owner], len(PLACES), axis=0), inside).reshape(-1, len(PLACES))
+        normals = np.repeat(mesh.normals[owner], len(PLACES), axis=0)
+        found = _bounds(places, normals, inside, mesh.watertight).reshape(-1, len(PLACES))
         squared, edge = _longest(corners)
         mixed = found.any(axis=1) & ~found.all(axis=1)
         split = (squared > COARSE**2) | (mixed & (squared > FINE**2))
@@ -89,9 +91,13 @@ def bounding(mesh: Mesh, inside: Callable[[np.ndarray], np.ndarray]) -> Mesh:
     return dataclasses.replace(mesh, vertices=vertices, faces=faces.astype(np.int32), watertight=False)
 
 
-def _bounds(points: np.ndarray, normals: np.ndarray, inside) -> np.ndarray:
-    """Whether there is inside on one side of a triangle only, at points on it."""
-    return inside(points + STEP * normals) != inside(points - STEP * normals)
+def _bounds(points: np.ndarray, normals: np.ndarray, inside, watertight: bool) -> np.ndarray:
+    """
+    Whether there is inside on one side of a triangle only, at points on it. The winding number of a watertight mesh is
+    larger by one behind a triangle, so it suffices to look in front of it.
+    """
+    before = inside(points + STEP * normals)
+    return ~before if watertight else inside(points - STEP * normals) & ~before
 
 
 def _longest(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

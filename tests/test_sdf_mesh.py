@@ -1,0 +1,533 @@
+"""Meshes in the unit frame and distances to them: against formulas, brute force, and meshes that are broken."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import solids
+import trimesh
+
+from mi_diffind.errors import DiffindError
+from mi_diffind.tasks.sdf import samples
+from mi_diffind.tasks.sdf.cells import CORNERS, near_nodes, node_distances, surface_cells
+from mi_diffind.tasks.sdf.distances import Distances, DistancesError
+from mi_diffind.tasks.sdf.mesh import Mesh, MeshError, load_mesh, make_mesh
+
+igl = pytest.importorskip("igl", reason="libigl is not installed")
+
+
+def sentence(error):
+    text = str(error.value)
+    assert isinstance(error.value, DiffindError) and "\n" not in text and not text.endswith("."), text
+    return text
+
+
+def inside_share(mesh, distances, count=40000):
+    """The share of the bounding box that is inside, by points."""
+    points = samples.far(mesh.lower, mesh.upper, count, 5)
+    return distances.inside(points).mean()
+
+
+# -- meshes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a.off", "a.obj", "a.ply", "a.stl", "a.glb"])
+def test_formats(tmp_path, name):
+    """Each format gives the same solid; STL and the like have each corner by itself, which are joined again."""
+    vertices, faces = solids.box((2, 1, 0.5), (10, -3, 4))
+    mesh = load_mesh(solids.write(tmp_path / name, (vertices, faces)))
+    assert mesh.watertight and mesh.components == 1 and mesh.warnings == [] and mesh.path == str(tmp_path / name)
+    assert mesh.vertices.shape == (8, 3) and mesh.faces.shape == (12, 3) and mesh.faces.dtype == np.int32
+    assert mesh.scale == pytest.approx(2) and mesh.centre == pytest.approx((10, -3, 4))
+    assert np.allclose(mesh.upper, [0.5, 0.25, 0.125]) and np.allclose(mesh.lower, -mesh.upper)
+    assert mesh.volume == pytest.approx(1 / 8) and mesh.area == pytest.approx(7 / 4)
+    assert np.allclose(np.sort(mesh.to_file_frame(mesh.vertices), axis=0), np.sort(vertices, axis=0))
+
+
+def test_scene_is_placed(tmp_path):
+    """A scene's meshes are taken together where transforms put them, mirrored ones are turned."""
+    scene = trimesh.Scene()
+    thing = trimesh.Trimesh(*solids.box(), process=False)
+    scene.add_geometry(thing, transform=np.diag([1.0, 1, 2, 1]))
+    mirror = np.diag([-1.0, 1, 1, 1])
+    mirror[0, 3] = 3
+    scene.add_geometry(thing, transform=mirror)
+    scene.export(tmp_path / "scene.glb")
+    mesh = load_mesh(tmp_path / "scene.glb")
+    assert mesh.components == 2 and mesh.watertight and mesh.warnings == []
+    assert mesh.volume * mesh.scale**3 == pytest.approx(3) and mesh.scale == pytest.approx(4)
+
+
+def test_scale_and_place_do_not_matter():
+    vertices, faces = solids.sphere(8)
+    reference = make_mesh(vertices, faces)
+    points = samples.near(reference, 500, 0.05, 1)
+    with Distances(reference) as d:
+        truth = d.signed(points)
+    for scale, centre in ((1e-6, 1e-3), (1e6, -1e9)):
+        mesh = make_mesh(vertices * scale + centre, faces)
+        assert mesh.scale == pytest.approx(2 * scale) and mesh.centre == pytest.approx([centre] * 3)
+        with Distances(mesh) as d:
+            assert np.allclose(d.signed(points), truth, atol=1e-6)
+
+
+def test_digest_knows_content():
+    vertices, faces = solids.box()
+    digest = make_mesh(vertices, faces).digest
+    assert make_mesh(3 * vertices, faces).digest == digest and len(digest) == 64
+    assert make_mesh(vertices * [1, 1, 0.999], faces).digest != digest
+
+
+@pytest.mark.parametrize(
+    "content, found",
+    [
+        (b"", "cannot be read as a mesh"),
+        (b"OFF\n3 1 0\n0 0 0\n1 0", "cannot be read as a mesh"),
+        (b"\x00\xff\xfe nonsense", "cannot be read as a mesh"),
+        (b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", ""),
+    ],
+)
+def test_unreadable_files(tmp_path, content, found):
+    (tmp_path / "a.off").write_bytes(content)
+    with pytest.raises(MeshError) as error:
+        load_mesh(tmp_path / "a.off")
+    assert found in sentence(error) and str(tmp_path / "a.off") in str(error.value)
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(MeshError, match="there is no such file"):
+        load_mesh(tmp_path / "none.ply")
+    with pytest.raises(MeshError, match="is a folder"):
+        load_mesh(tmp_path)
+    (tmp_path / "a.xyzzy").write_text("what")
+    with pytest.raises(MeshError) as error:
+        load_mesh(tmp_path / "a.xyzzy")
+    assert "a.xyzzy: cannot be read as a mesh" in sentence(error)
+    (tmp_path / "points.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        "0 0 0\n1 1 1\n"
+    )
+    with pytest.raises(MeshError, match="has no triangles"):
+        load_mesh(tmp_path / "points.ply")
+
+
+def test_truncated_glb(tmp_path):
+    whole = solids.write(tmp_path / "a.glb", solids.sphere(8)).read_bytes()
+    for share in (0.1, 0.5, 0.95):
+        (tmp_path / "b.glb").write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(MeshError) as error:
+            load_mesh(tmp_path / "b.glb")
+        assert "b.glb" in sentence(error)
+
+
+NOTHING = np.zeros((0, 3), int)
+
+
+@pytest.mark.parametrize(
+    "vertices, faces, found",
+    [
+        (np.zeros((0, 3)), NOTHING, "has no triangles"),
+        (np.eye(3), NOTHING, "has no triangles"),
+        (np.eye(3), [[0, 1, 3]], "names vertex 3 of 3"),
+        (np.eye(3), [[0, 1, -1]], "a triangle names vertex"),
+        (np.eye(3), [[0, 1]], "expected (V, 3) and (F, 3)"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, np.nan]], [[0, 1, 2]], "NaN or infinite"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, np.inf]], [[0, 1, 2]], "NaN or infinite"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "flat, its extent along z is 0"),
+        ([[0, 0, 0], [1, 1, 1], [2, 2, 2]], [[0, 1, 2]], "no triangle that has an area"),
+        ([[0, 0, 0], [1, 1, 1], [2, 2, 3]], [[0, 1, 1], [2, 2, 0]], "no triangle that has an area"),
+        ([[5, 5, 5]] * 3, [[0, 1, 2]], "has the extent 0"),
+        ([[0, 0, 0], [1e200, 0, 0], [0, 1e200, -1e200]], [[0, 1, 2]], ""),
+        ([[-1e308, 0, 0], [1e308, 0, 0], [0, 1e308, 1e308]], [[0, 1, 2]], "has the extent inf"),
+    ],
+)
+def test_meshes_that_are_none(vertices, faces, found):
+    """Refused when they are read, or at the latest when distances are asked for; always in one sentence."""
+    with pytest.raises((MeshError, DistancesError)) as error, Distances(make_mesh(vertices, faces, "a.ply")) as d:
+        d.signed(np.zeros((1, 3)))
+    assert found in sentence(error) and str(error.value).startswith("a.ply: ")
+
+
+def test_degenerate_triangles_are_left_out():
+    vertices, faces = solids.box()
+    vertices = np.concatenate([vertices, [[0, 0, 0], (vertices[0] + vertices[1]) / 2]])
+    faces = np.concatenate([faces, [[0, 0, 1], [3, 3, 3], [0, 9, 1]]])
+    mesh = make_mesh(vertices, faces, "a.ply")
+    assert len(mesh.faces) == 12 and len(mesh.vertices) == 8
+    assert "a.ply: 3 triangles without an area were left out" in mesh.warnings
+
+
+def test_a_sliver_may_hold_a_mesh_together():
+    """A T-junction closed by a triangle without an area: left out, and the mesh is watertight all the same."""
+    vertices, faces = solids.box()
+    a, b, c = faces[0]
+    middle = len(vertices)
+    vertices = np.concatenate([vertices, [(vertices[a] + vertices[b]) / 2]])
+    faces = np.concatenate([faces[1:], [[a, middle, c], [middle, b, c], [a, b, middle]]])
+    mesh = make_mesh(vertices, faces)
+    assert mesh.watertight and len(mesh.faces) == 13 and mesh.volume == pytest.approx(1)
+    assert mesh.warnings == ["mesh: 1 triangles without an area were left out"]
+
+
+def test_orientation_is_repaired():
+    ball = solids.sphere(8)
+    volume = make_mesh(*ball).volume
+    mesh = make_mesh(*solids.turned(ball))
+    assert mesh.volume == pytest.approx(volume) and "all triangles were wound inside out" in mesh.warnings[0]
+    some = (ball[0], np.where(np.arange(len(ball[1]))[:, None] % 5 == 0, ball[1][:, ::-1], ball[1]))
+    mesh = make_mesh(*some)
+    assert mesh.volume == pytest.approx(volume) and mesh.watertight
+    assert "wound against their neighbours were turned" in mesh.warnings[0]
+    # One of two pieces; but a cavity is meant to be the wrong way round, and so is a ball in it the right one
+    beside = solids.sphere(8, 0.5, (3, 0, 0))
+    mesh = make_mesh(*solids.together(ball, solids.turned(beside)))
+    assert mesh.volume * mesh.scale**3 == pytest.approx(volume * 8 * 9 / 8, rel=1e-3)
+    shell = solids.together(ball, solids.turned(solids.sphere(8, 0.5)), solids.sphere(8, 0.25))
+    mesh = make_mesh(*shell)
+    assert mesh.volume == pytest.approx(volume * (1 - 1 / 8 + 1 / 64)) and mesh.warnings == []
+
+
+def test_a_moebius_strip_does_no_harm():
+    n = 40
+    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    across = np.stack([np.cos(angle / 2) * np.cos(angle), np.cos(angle / 2) * np.sin(angle), np.sin(angle / 2)], -1)
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    vertices = np.concatenate([ring + 0.3 * across, ring - 0.3 * across])
+    i, j = np.arange(n), (np.arange(n) + 1) % n
+    flip = i == n - 1
+    c, d = np.where(flip, j + n, j), np.where(flip, j, j + n)
+    mesh = make_mesh(vertices, np.concatenate([np.stack([i, c, d], 1), np.stack([i, d, i + n], 1)]))
+    assert not mesh.watertight and mesh.components == 1
+    with Distances(mesh) as d, contextlib.suppress(DistancesError):
+        assert np.isfinite(d.signed(np.zeros((1, 3)))).all()
+
+
+# -- distances --------------------------------------------------------------------------------------------------------
+
+
+def test_distances_of_a_box():
+    """Against the formula, in a frame where the box's longest side is 1."""
+    size = np.array([1, 0.6, 0.3])
+    mesh = make_mesh(*solids.box(7 * size, (3, 2, 1)))
+    points = np.concatenate([samples.far([-0.7] * 3, [0.7] * 3, 3000, 0), samples.near(mesh, 3000, 0.01, 1)])
+    with Distances(mesh) as d:
+        truth = solids.box_distance(points, size)
+        found = d.signed(points)
+        assert found.dtype == np.float32 and np.abs(found - truth).max() < 1e-6
+        assert np.array_equal(d.inside(points), truth < 0)
+        assert np.abs(d.signed(points, 0.05) - truth.clip(-0.05, 0.05)).max() < 1e-6
+        value, gradient = d.signed_normals(points)
+        step = 1e-5
+        ahead = solids.box_distance(points + step * gradient, size)
+    assert np.array_equal(value, found) and np.allclose(np.linalg.norm(gradient, axis=1), 1, atol=1e-5)
+    assert np.quantile(np.abs((ahead - truth) / step - 1), 0.99) < 1e-3  # but for those with several nearest points
+
+
+def test_distances_and_windings_of_a_bad_mesh():
+    """A random soup of triangles, against brute force: |d|, winding numbers and which triangle is nearest."""
+    rng = np.random.default_rng(3)
+    mesh = make_mesh(rng.random((40, 3)), rng.permuted(np.tile(np.arange(40), (60, 1)), axis=1)[:, :3])
+    points = rng.uniform(-0.6, 0.6, (500, 3))
+    with Distances(mesh) as d:
+        assert np.abs(d.to_triangles(points) - solids.brute_distance(points, mesh.corners)).max() < 1e-9
+        winding, truth = d.winding(points), solids.brute_winding(points, mesh.corners)
+    assert np.abs(winding - truth).max() < 0.05
+    near = np.abs(truth - 0.5) < 0.02
+    assert near.any() and np.abs(winding - truth)[near].max() < 1e-5
+
+
+def test_on_the_surface():
+    """Points of the surface have a distance of 0 and the triangle's normal, whatever their rounding."""
+    mesh = make_mesh(*solids.sphere(16))
+    points, normals = samples.surface(mesh, 4000, 2)
+    with Distances(mesh) as d:
+        value, gradient = d.signed_normals(points)
+        _, face, closest = d.nearest(points)
+    assert np.abs(value).max() < 1e-12 and np.abs(gradient - normals).max() < 1e-6
+    assert np.abs(closest - points).max() < 1e-12 and np.all(
+        np.linalg.norm(mesh.normals[face] - normals, axis=1) < 1e-9
+    )
+
+
+def test_questions_of_any_length():
+    mesh = make_mesh(*solids.box())
+    with Distances(mesh) as d:
+        assert d.signed(np.zeros((0, 3))).shape == (0,) and d.signed(np.zeros((1, 3))) == pytest.approx(-0.5)
+        assert d.nearest(np.zeros((0, 3)))[2].shape == (0, 3)
+        many = np.zeros((300_001, 3))
+        many[:, 0] = np.linspace(0, 0.6, len(many))
+        assert np.allclose(d.signed(many), many[:, 0] - 0.5, atol=1e-6)
+        for bad in (np.zeros(3), np.zeros((2, 2)), np.full((1, 3), np.nan)):
+            with pytest.raises(ValueError, match="points: "):
+                d.signed(bad)
+
+
+# -- what open, overlapping and thin meshes enclose -------------------------------------------------------------------
+
+
+def test_an_open_mesh_is_closed():
+    """A bowl: its opening is closed flat, and the doubt about it is told."""
+    vertices, faces = solids.sphere(24)
+    open_mesh = solids.without((vertices, faces), vertices[faces][:, :, 2].max(axis=1) > 0.2)
+    mesh = make_mesh(*open_mesh, "bowl.ply")
+    assert not mesh.watertight and "bowl.ply: is not closed" in mesh.warnings[0]
+    with Distances(mesh) as d:
+        assert d.solid.watertight and 0.3 < d.ambiguity < 0.9
+        doubt = [w for w in d.warnings if "ambiguous" in w]
+        assert len(doubt) == 1 and doubt[0].startswith("bowl.ply: ") and "%" in doubt[0]
+        assert f"{100 * d.ambiguity:.2g}%" in doubt[0]
+        # On the axis, from the bottom to beyond the opening: the distance to the lid's plane
+        lid = mesh.upper[2]
+        points = np.array([[0, 0, lid - 0.05], [0, 0, lid + 0.05]])
+        assert np.allclose(d.signed(points), [-0.05, 0.05], atol=0.01)
+        cells = surface_cells(d, mesh.lower - 1 / 32, 1 / 32, (36, 36, 36))
+        middle = np.floor((np.array([0, 0, lid]) - mesh.lower + 1 / 32) * 32).astype(int)
+        assert np.any(np.all(np.abs(cells - middle) <= 1, axis=1)), "the lid is part of the surface"
+
+
+def test_a_small_hole_is_a_small_doubt():
+    mesh = make_mesh(*solids.without(solids.sphere(16), [100]))
+    with Distances(mesh) as d:
+        assert 0 < d.ambiguity < 0.02
+        assert inside_share(mesh, d) == pytest.approx(np.pi / 6, abs=0.02)
+
+
+def test_cracks_everywhere():
+    """Triangles that do not meet: closing each would enclose nothing, winding numbers tell."""
+    vertices, faces = solids.sphere(16)
+    corners = vertices[faces] + np.random.default_rng(0).normal(scale=1e-4, size=(len(faces), 3, 3))
+    mesh = make_mesh(corners.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))
+    with Distances(mesh) as d:
+        assert d.solid is mesh and inside_share(mesh, d) == pytest.approx(np.pi / 6, abs=0.02)
+
+
+def test_one_triangle_encloses_nothing():
+    mesh = make_mesh([[0, 0, 0], [1, 0, 0.2], [0, 1, 1]], [[0, 1, 2]], "one.ply")
+    with Distances(mesh) as d, pytest.raises(DistancesError) as error:
+        d.signed(np.zeros((1, 3)))
+    assert sentence(error) == "one.ply: encloses no volume, expected the surface of a solid"
+
+
+@pytest.mark.parametrize("shift", [(0.5, 0.3, 0.2), (0.5, 0, 0), (1, 0, 0)])
+def test_overlapping_boxes_are_their_union(shift):
+    """Also where sides coincide: |d| inside is to the union's surface, not to the sides buried in it."""
+    mesh = make_mesh(*solids.together(solids.box(), solids.box(centre=shift)))
+    points = samples.far([-0.6] * 3, [0.6] * 3, 4000, 1)
+    with Distances(mesh) as d:
+        found, surface = d.signed(points), d.surface
+        said = [w for w in d.warnings if "pieces overlap" in w]
+    file = mesh.to_file_frame(points)
+    a, b = solids.box_distance(file, (1, 1, 1)), solids.box_distance(file, (1, 1, 1), shift)
+    assert np.array_equal(found < 0, np.minimum(a, b) < 0) and said
+    outside = found > 0
+    assert np.abs(found - np.minimum(a, b) / mesh.scale)[outside].max() < 0.01
+    # The exact distance to the union's surface: to all points of either box in front of which neither is
+    cloud, normals = samples.surface(make_mesh(*solids.box()), 40000, 2)
+    cloud, ahead = (np.concatenate([c, c + np.array(shift)]) for c in (cloud, cloud + 1e-6 * normals))
+    seen = np.minimum(solids.box_distance(ahead, (1, 1, 1)), solids.box_distance(ahead, (1, 1, 1), shift)) > 0
+    from scipy.spatial import KDTree
+
+    truth, _ = KDTree(cloud[seen]).query(file)
+    error = np.abs(np.abs(found) - truth / mesh.scale)
+    assert np.quantile(error, 0.99) < 0.01 and error.max() < 0.02
+    assert surface.area < mesh.area
+
+
+def test_a_sheet_has_no_part():
+    """A sheet without a thickness beside a ball: nothing is inside of it, and no distance leads to it."""
+    sheet = np.array([[2, -1, -1], [2, 1, -1], [2, 1, 1], [2, -1, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    both = solids.together(solids.sphere(12), sheet, solids.turned(sheet))
+    mesh = make_mesh(*both)
+    with Distances(mesh) as d:
+        at = (np.array([[1.9, 0.2, 0.1]]) - mesh.centre) / mesh.scale
+        assert d.signed(at) == pytest.approx((np.linalg.norm([1.9, 0.2, 0.1]) - 1) / mesh.scale, rel=0.02)
+
+
+def test_self_intersecting():
+    """A tube that runs through itself: inside is where it winds at least once around."""
+    t = np.linspace(0, 2 * np.pi, 120, endpoint=False)
+    path = np.stack([np.sin(t), np.sin(2 * t) * 0.8, 0.02 * np.cos(t)], axis=-1)
+    ahead = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    side = np.cross(ahead, [0, 0, 1])
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    up = np.cross(side, ahead)
+    s = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = path[:, None] + 0.15 * (np.cos(s)[None, :, None] * side[:, None] + np.sin(s)[None, :, None] * up[:, None])
+    i, j = np.meshgrid(np.arange(120), np.arange(24), indexing="ij")
+    n = lambda a, b: (a % 120 * 24 + b % 24).ravel()  # noqa: E731
+    faces = np.concatenate([np.stack([n(i, j), n(i + 1, j), n(i + 1, j + 1)], 1),
+                            np.stack([n(i, j), n(i + 1, j + 1), n(i, j + 1)], 1)])  # fmt: skip
+    mesh = make_mesh(ring.reshape(-1, 3), faces)
+    points = samples.far(mesh.lower, mesh.upper, 5000, 4)
+    distance = np.min(np.linalg.norm(mesh.to_file_frame(points)[:, None] - path[None], axis=-1), axis=1)
+    with Distances(mesh) as d:
+        inside = d.inside(points)
+        crossing = (np.array([[0, 0, 0.05]]) - mesh.centre) / mesh.scale
+        depth = d.signed(crossing)
+    sure = np.abs(distance - 0.15) > 0.02
+    assert np.array_equal(inside[sure], distance[sure] < 0.15)
+    assert depth < -0.08 / mesh.scale, "where the tube crosses itself, its walls do not count"
+
+
+def test_thin_plate():
+    """1 : 1 : 20, and a plate of a thousandth of its length."""
+    for size in ((1, 1, 20), (1, 1, 0.001)):
+        mesh = make_mesh(*solids.box(size))
+        unit = np.array(size) / max(size)
+        points = samples.near(mesh, 4000, 0.3 * unit.min(), 3)
+        with Distances(mesh) as d:
+            truth = solids.box_distance(points, unit)
+            assert np.abs(d.signed(points) - truth).max() < 1e-6 and (truth < 0).mean() > 0.05
+
+
+# -- cells and grids --------------------------------------------------------------------------------------------------
+
+
+def test_surface_cells_miss_nothing():
+    """All cells with a point of the surface in them are named, once, and none further than its half diagonal."""
+    mesh = make_mesh(*solids.together(solids.sphere(16), solids.box((0.02, 0.02, 1.5), (1.2, 0, 0))))
+    spacing, lower = 1 / 50, mesh.lower - 0.03
+    shape = np.ceil((mesh.upper + 0.03 - lower) / spacing).astype(int)
+    with Distances(mesh) as d:
+        cells = surface_cells(d, lower, spacing, shape)
+        wide = surface_cells(d, lower, spacing, shape, reach=0.05)
+        everywhere = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
+        distance = d.unsigned(lower + (everywhere + 0.5) * spacing)
+    points, _ = samples.surface(mesh, 200_000, 0)
+    hit = np.unique(np.floor((points - lower) / spacing).astype(int), axis=0)
+    named = set(map(tuple, cells.tolist()))
+    assert len(named) == len(cells) and cells.dtype == np.int32 and set(map(tuple, hit.tolist())) <= named
+    half = np.sqrt(3) / 2 * spacing
+    assert np.array_equal(cells, everywhere[distance <= half * (1 + 1e-6)])
+    assert np.array_equal(wide, everywhere[distance <= (half + 0.05) * (1 + 1e-6)])
+    nodes, corners = near_nodes(cells)
+    assert np.array_equal(nodes[corners], cells[:, None] + CORNERS) and len(np.unique(nodes, axis=0)) == len(nodes)
+    assert near_nodes(cells[:0])[0].shape == (0, 3) and near_nodes(cells[:0])[1].shape == (0, 8)
+
+
+def test_grid_of_distances():
+    """Far nodes take their sign from neighbours: the same as one by one, with a cavity and two pieces."""
+    mesh = make_mesh(*solids.together(solids.sphere(10), solids.turned(solids.sphere(8, 0.6)),
+                                      solids.sphere(6, 0.3, (1.5, 0, 0))))  # fmt: skip
+    lower, spacing = mesh.lower - 0.1, 0.03
+    shape = np.ceil((mesh.upper + 0.1 - lower) / spacing).astype(int) + 1
+    with Distances(mesh) as d:
+        values = node_distances(d, lower, spacing, shape, 0.05)
+        nodes = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+        truth = d.signed((lower + spacing * nodes).reshape(-1, 3)).reshape(values.shape)
+    assert values.dtype == np.float32 and np.abs(values - truth.clip(-0.05, 0.05)).max() < 1e-6
+    assert (values == -np.float32(0.05)).any() and (values == np.float32(0.05)).any()
+
+
+def test_samples():
+    mesh = make_mesh(*solids.together(solids.box(), solids.box((0.1, 0.1, 0.1), (2, 0, 0))))
+    points, normals = samples.surface(mesh, 10_000, 7)
+    assert np.array_equal(points, samples.surface(mesh, 10_000, 7)[0])
+    assert not np.array_equal(points, samples.surface(mesh, 10_000, 8)[0])
+    small = mesh.to_file_frame(points)[:, 0] > 1
+    assert abs(small.sum() - 10_000 * 0.06 / 6.06) <= 1, "each part of the surface gets its share"
+    with Distances(mesh) as d:
+        assert d.unsigned(points).max() < 1e-12
+    sides = points[~small & (normals[:, 2] > 0.9)]
+    assert np.allclose(np.histogram2d(sides[:, 0], sides[:, 1], bins=4)[0], len(sides) / 16, rtol=0.4)
+
+
+# -- the process ------------------------------------------------------------------------------------------------------
+
+
+def test_a_child_that_dies_is_one_sentence():
+    """Killed in the middle, as by an abort of libigl: the parent lives, and the next question starts it anew."""
+    mesh = make_mesh(*solids.box(), "box.ply")
+    with Distances(mesh) as d:
+        assert d.signed(np.zeros((1, 3))) == pytest.approx(-0.5)
+        os.kill(d._child.pid, signal.SIGABRT)
+        d._child.wait()
+        with pytest.raises(DistancesError) as error:
+            d.signed(np.zeros((1, 3)))
+        assert "box.ply: libigl ended" in sentence(error) and "SIGABRT" in str(error.value)
+        assert d.signed(np.zeros((1, 3))) == pytest.approx(-0.5)
+        child = d._child
+    assert child.poll() is not None, "it ends with the block"
+
+
+def test_a_mesh_on_which_libigl_crashes():
+    """A vertex that is not there, past the checks of files."""
+    mesh = Mesh(np.eye(3), np.array([[0, 1, 2_000_000_000]]), True, path="bad.ply")
+    with Distances(mesh) as d, pytest.raises(DistancesError) as error:
+        d.winding(np.zeros((10, 3)))
+    assert "bad.ply: libigl ended" in sentence(error) and "SIG" in str(error.value)
+
+
+def test_an_exception_of_the_child_is_one_sentence():
+    mesh = Mesh(np.zeros(3), np.array([[0, 1, 2]]), True, path="bad.ply")
+    with Distances(mesh) as d, pytest.raises(DistancesError) as error:
+        d.winding(np.zeros((10, 3)))
+    assert "bad.ply: libigl finds no distances" in sentence(error)
+
+
+def test_without_libigl(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with Distances(make_mesh(*solids.box(), "box.ply")) as d, pytest.raises(DistancesError) as error:
+        d.signed(np.zeros((1, 3)))
+    assert "box.ply: distances need libigl" in sentence(error) and "pip install libigl" in str(error.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_the_child_ends_with_its_parent():
+    """However the parent ends, and without the parent's modules in it."""
+    program = textwrap.dedent("""
+        import os, numpy as np, solids
+        from mi_diffind.tasks.sdf.distances import Distances
+        from mi_diffind.tasks.sdf.mesh import make_mesh
+        d = Distances(make_mesh(*solids.box()))
+        d.signed(np.zeros((1, 3)))
+        maps = open(f"/proc/{d._child.pid}/maps").read()
+        print(d._child.pid, "drjit" in maps or "mitsuba" in maps, flush=True)
+        os.kill(os.getpid(), 9)
+    """)
+    path = os.pathsep.join(filter(None, sys.path))
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
+    )
+    assert done.returncode == -9, done.stderr
+    pid, loaded = done.stdout.split()
+    assert loaded == "False"
+    for _ in range(100):
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except FileNotFoundError:
+            break
+        if state == "Z":
+            break
+        time.sleep(0.05)
+    else:
+        pytest.fail("the child lives on")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="signals")
+def test_ctrl_c_ends_a_question():
+    """A Ctrl-C in the middle of a question goes through, and the next one is answered rightly."""
+    mesh = make_mesh(*solids.sphere(16))
+    points = samples.far([-0.6] * 3, [0.6] * 3, 2**19, 0)
+    with Distances(mesh) as d:
+        few = d.signed(points[:100])
+        handler = signal.getsignal(signal.SIGINT)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0.1)
+            with pytest.raises(KeyboardInterrupt):
+                while True:
+                    d.unsigned(points)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGINT, handler)
+        assert np.array_equal(d.signed(points[:100]), few)
