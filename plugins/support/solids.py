@@ -109,6 +109,11 @@ class Solid(mi.Mesh):
         """Is a derivative with respect to the field asked for?"""
         return False
 
+    @property
+    def index_bytes(self) -> int:
+        """Bytes of what is made of the field so that rays find their way."""
+        return tracing.index_of(self.field)
+
     # -- between the world and the unit frame ---------------------------------------------------------------------
 
     def local_ray(self, o, d):
@@ -164,6 +169,32 @@ def solids_of(scene: mi.Scene) -> list[Solid]:
             f'a "to_world" of their own share its memory, and trace="grid" may be instanced'
         )
     return found
+
+
+def native_grid(props: mi.Properties, values: np.ndarray, lower, upper, to_world, normals: str):
+    """
+    Mitsuba's ``sdfgrid`` of ``values`` (Z, Y, X) in a box with these corners, which ``to_world`` moves; with the
+    material of ``props``. Rotated, it is an instance.
+    """
+    at = mi.ScalarTransform4f
+    box = at().translate(list(map(float, lower))).scale([float(b - a) for a, b in zip(lower, upper, strict=True)])
+    grid = {
+        "type": "sdfgrid",
+        "id": props.id() or "grid",
+        "grid": mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32)),
+        "normals": normals,
+    }
+    for name, child in props.objects():
+        grid[name] = child
+    linear = np.array(to_world.matrix, np.float64)[:3, :3]
+    if np.allclose(linear, linear[0, 0] * np.eye(3), atol=1e-6 * abs(linear[0, 0])) and linear[0, 0] > 0:
+        return mi.load_dict({**grid, "to_world": to_world @ box}, parallel=False)
+    group = mi.load_dict({"type": "shapegroup", "grid": {**grid, "to_world": box}}, parallel=False)
+    instance = mi.load_dict({"type": "instance", "group": group, "to_world": to_world}, parallel=False)
+    both = mi.Properties("merge")
+    both["group"], both["instance"] = group, instance
+    both.set_id(props.id())
+    return mi.PluginManager.instance().create_object(both)
 
 
 # -- rays --------------------------------------------------------------------------------------------------------------

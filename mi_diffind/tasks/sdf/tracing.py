@@ -153,3 +153,8 @@ def trace(field, o, d, maxt, active=True) -> tuple:
 def occluded(field, o, d, maxt, active=True):
     """Whether rays meet the surface before ``maxt``."""
     return intersect(field, o, d, maxt, active, exact=False).found
+
+
+def index_of(field) -> int:
+    """Bytes of what tracing makes of a field, once."""
+    return marching.of(field).nbytes if hasattr(field, "structure") else 0
