@@ -12,7 +12,7 @@ from mi_diffind.tables import TableError
 from mi_diffind.tasks.sdf import TASK
 from mi_diffind.tasks.task import stamp
 
-from . import Counterpart, Plugin, reports_as
+from . import Counterpart, Plugin, reports_as, shown_as
 from .support import properties, tables
 from .support.sdf_meshes import to_mesh
 from .support.solids import Placement, Solid, native_grid
@@ -195,7 +195,7 @@ def factory(props: mi.Properties):
     Placement.of(to_world, model.scale, model.centre)  # refuses what is none
     to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)
     to_world = mi.ScalarTransform4f(np.array(to_world.matrix))
-    made = native_grid(props, values, lower, upper, to_world @ to_unit, normals)
+    made, kept = native_grid(props, values, lower, upper, to_world @ to_unit, normals)
     seconds = time.perf_counter() - start
     said = {
         "preset": model.table.preset,
@@ -203,10 +203,12 @@ def factory(props: mi.Properties):
         "table_bytes": model.nbytes,
         "trace": "grid",
         "resolution": list(values.shape[::-1]),
-        "grid_bytes": values.nbytes,
+        "grid_bytes": 4 * max(values.shape) ** 3,
         "seconds": round(seconds, 2),
     }
-    reports_as(made, lambda: said)
+    if kept is not made:
+        shown_as(made, kept)
+    reports_as(kept, lambda: said)
     return made
 
 
