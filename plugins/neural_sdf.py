@@ -20,6 +20,9 @@ from .support.solids import Placement, Solid, native_grid
 #: Whose arrays cannot be optimised are shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()
 
+#: Mean difference between the field and a grid of it, near the surface, in cells of the field, that is close enough.
+CLOSE = 0.05
+
 #: The finest grid that ``trace="grid"`` takes by itself, along the longest side: 1.5 GB in Mitsuba.
 FINEST = 256
 
@@ -81,8 +84,8 @@ class NeuralSDF(Solid):
 
      * - resolution
        - |int|
-       - Of ``grid``: cells along the longest side, 4 to 512. (Default: the coarsest grid whose error is below the
-         field's own, at most 256)
+       - Of ``grid``: cells along the longest side, 4 to 512. (Default: the coarsest grid that differs from the field by
+         less than 5% of its cells on average, at most 256)
        - --
 
      * - storage
@@ -187,8 +190,7 @@ def factory(props: mi.Properties):
     resolution = props.get("resolution", 0)
     if not isinstance(resolution, int) or ("resolution" in props and not 4 <= resolution <= 512):
         raise RuntimeError(f'parameter "resolution": found {resolution}, allowed are whole numbers from 4 to 512')
-    error = float(model.table.measured.get("mae_near") or 1e-4)
-    resolution = resolution or decode.resolution_for(model.field, error, finest=FINEST)
+    resolution = resolution or decode.resolution_for(model.field, CLOSE * model.field.spacing, finest=FINEST)
     values, lower, upper = decode.grid(model.field, resolution)
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
     to_world = props.get("to_world", mi.ScalarTransform4f())
