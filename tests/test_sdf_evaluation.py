@@ -96,7 +96,8 @@ def test_points_are_seeded(ball, held_out):
 
 def test_a_perfect_field(held_out):
     found = held_out.measure(Ball(0.5, band=0.05))
-    assert list(found) == ["iou", "iou_near", "mae_near", "normal_deg", "normal_p95_deg", "normal_smooth_deg"]
+    normals = ["normal_deg", "normal_p95_deg", "normal_smooth_deg"]
+    assert list(found) == ["iou", "iou_near", "mae_near", "mae_surface", *normals]
     assert found["iou"] > 0.998 and found["iou_near"] > 0.98 and found["mae_near"] < 2e-4
     assert found["normal_deg"] < 1.5  # facets of 1.9 degrees
     assert all(isinstance(v, float) for v in found.values())
@@ -113,6 +114,7 @@ def test_errors_are_told(held_out):
     r = np.linspace(0.49, 0.51, 2001)
     error = np.abs(np.clip(r - 0.497, -0.01, 0.01) - (r - 0.5))
     assert found["mae_near"] == pytest.approx(np.average(error, weights=r**2), rel=0.05)
+    assert found["mae_surface"] == pytest.approx(0.003, rel=0.1)
     z = np.linspace(-1, 1, 2001)
     turned = np.degrees(2 * np.arcsin(np.sqrt(1 - z**2) * math.sin(math.radians(5))))
     assert found["normal_deg"] == pytest.approx(turned.mean(), rel=0.05)

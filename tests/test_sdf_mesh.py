@@ -391,7 +391,7 @@ def test_thin_plate():
 # -- cells and grids --------------------------------------------------------------------------------------------------
 
 
-def test_surface_cells_miss_nothing():
+def test_surface_cells_miss_nothing(monkeypatch):
     """All cells with a point of the surface in them are named, once, and none further than its half diagonal."""
     mesh = make_mesh(*solids.together(solids.sphere(16), solids.box((0.02, 0.02, 1.5), (1.2, 0, 0))))
     spacing, lower = 1 / 50, mesh.lower - 0.03
@@ -410,6 +410,9 @@ def test_surface_cells_miss_nothing():
     assert np.array_equal(wide, everywhere[distance <= (half + 0.05) * (1 + 1e-6)])
     nodes, corners = near_nodes(cells)
     assert np.array_equal(nodes[corners], cells[:, None] + CORNERS) and len(np.unique(nodes, axis=0)) == len(nodes)
+    monkeypatch.setattr("mi_diffind.tasks.sdf.cells.MAPPED", 0)
+    assert all(np.array_equal(a, b) for a, b in zip(near_nodes(cells), (nodes, corners), strict=True))
+    assert np.array_equal(nodes, nodes[np.lexsort(nodes.T[::-1])])
     assert near_nodes(cells[:0])[0].shape == (0, 3) and near_nodes(cells[:0])[1].shape == (0, 8)
 
 

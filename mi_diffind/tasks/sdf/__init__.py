@@ -5,7 +5,7 @@ Task 6: signed distance fields of meshes.
 - :mod:`.field`: what every field offers; :mod:`.nodes` (with :mod:`.structure`, :mod:`.codes`), :mod:`.pair`: ours and
   the supplement's;
 - :mod:`.encoding`, :mod:`.training`, :mod:`.fit`, :mod:`.presets`: how they come about;
-- :mod:`.tracing`, :mod:`.decode`, :mod:`.evaluation`: where rays meet them, what other programs read, how good they are;
+- :mod:`.tracing`, :mod:`.decode`, :mod:`.evaluation`: where rays meet them, as meshes and grids, how good they are;
 - :mod:`.files`, :mod:`.model`: the result, as a file.
 """
 
@@ -57,14 +57,16 @@ class Sdf(Task):
             "--bits", type=int, choices=BITS, default=10,
             help="bits of a pointer of the sparse layout (default: 10)",
         ),
-        Argument("--ratio", type=_ratio, help="of dense and paper: side of the primary over side of the cascaded array"),
+        Argument("--ratio", type=_ratio, help="of dense and paper: primary's side over cascaded array's side"),
         Argument(
             "--constant", action="store_true",
             help="of paper: begin with a constant cascaded array, not with the nearest samples",
         ),
     )  # fmt: skip
     decode_arguments = (
-        Argument("--resolution", type=positive, metavar="N", help="cells along the longest side (default: finer than it)"),
+        Argument(
+            "--resolution", type=positive, metavar="N", help="cells along the longest side (default: finer than it)"
+        ),
     )
 
     def settings(self, preset, given, options):

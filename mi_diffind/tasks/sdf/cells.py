@@ -14,6 +14,9 @@ from .distances import Distances
 #: The corners of a cell, z fastest, ``(8, 3)``.
 CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
 
+#: Nodes of a grid up to which a number is kept for each of them.
+MAPPED = 2**26
+
 #: Cells along an axis at the coarsest level, at most.
 COARSEST = 16
 
@@ -38,7 +41,8 @@ def surface_cells(distances: Distances, lower, spacing: float, shape, reach: flo
         side //= 2
         cells = (2 * cells[:, None] + CORNERS).reshape(-1, 3)
         cells = cells[np.all(cells * side < shape, axis=1)]
-    return cells[np.lexsort(cells.T[::-1])].astype(np.int32)
+    keys = np.sort(np.ravel_multi_index(cells.T, tuple(shape)))
+    return np.stack(np.unravel_index(keys, tuple(shape)), axis=-1).astype(np.int32)
 
 
 def near_nodes(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -46,11 +50,19 @@ def near_nodes(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     The corners of cells, each once: nodes ``(M, 3)``, int32, in lexicographic order, and for each cell the positions of
     its eight corners among them, ``(K, 8)``, int32, z fastest.
     """
-    corners = (np.asarray(cells, dtype=np.int64)[:, None] + CORNERS).reshape(-1, 3)
-    ny, nz = (int(corners[:, axis].max(initial=0)) + 1 for axis in (1, 2))
-    keys, inverse = np.unique((corners[:, 0] * ny + corners[:, 1]) * nz + corners[:, 2], return_inverse=True)
-    nodes = np.stack([keys // (ny * nz), keys // nz % ny, keys % nz], axis=-1)
-    return nodes.astype(np.int32), inverse.reshape(-1, 8).astype(np.int32)
+    cells = np.asarray(cells, dtype=np.int64)
+    shape = tuple(cells.max(axis=0, initial=0) + 2)
+    keys = np.ravel_multi_index(cells.T, shape)[:, None] + np.ravel_multi_index(CORNERS.T, shape)
+    if np.prod(shape) <= MAPPED:  # several times as fast as sorting
+        number = np.zeros(np.prod(shape), dtype=bool)
+        number[keys] = True
+        found = np.flatnonzero(number)
+        number = np.cumsum(number, dtype=np.int32)
+        inverse = number[keys] - 1
+    else:
+        found, inverse = np.unique(keys, return_inverse=True)
+    nodes = np.stack(np.unravel_index(found, shape), axis=-1).astype(np.int32)
+    return nodes, inverse.reshape(-1, 8).astype(np.int32)
 
 
 def node_distances(distances: Distances, lower, spacing: float, shape, limit: float) -> np.ndarray:

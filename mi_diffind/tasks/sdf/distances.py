@@ -131,8 +131,8 @@ class Distances:
 
     @property
     def warnings(self) -> list[str]:
-        """A sentence for each thing that has to be said of what is inside of the mesh; begins with the mesh's own."""
-        said = list(self.mesh.warnings)
+        """A sentence for each thing that has to be said of what is inside of the mesh, besides the mesh's own."""
+        said = []
         if not self.mesh.watertight:
             unclear, doubtful = self._ambiguous
             how = "its holes were closed" if self.solid is not self.mesh else "inside is where it is at least 0.5"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,11 +10,11 @@ from scipy.spatial import cKDTree
 from . import codes
 from .cells import near_nodes, surface_cells
 from .distances import Distances
-from .nodes import middles
+from .nodes import decoded_nodes, middles
 from .structure import Structure, build
 
 #: Weight of a distance (in spacings) against a normal in choosing entries.
-DISTANCE_WEIGHT = 3.0
+DISTANCE_WEIGHT = 5.0
 
 
 @dataclass
@@ -52,7 +52,10 @@ def sample(distances: Distances, spacing: float) -> Sampled:
     )
     # In the order of the structure
     positions, block = structure.node_positions()
-    key = lambda p: np.ravel_multi_index(np.asarray(p, np.int64).T, structure.shape)
+
+    def key(p):
+        return np.ravel_multi_index(np.asarray(p, np.int64).T, structure.shape)
+
     order = np.argsort(key(nodes))
     place = order[np.searchsorted(key(nodes), key(positions), sorter=order)]
     back = np.empty_like(place)
@@ -68,7 +71,10 @@ def fit_frames(s: Sampled) -> np.ndarray:
     if not s.structure.blocks:
         return np.zeros(0, np.uint32)
     count = np.bincount(s.block, minlength=s.structure.blocks)
-    mean = lambda v: np.bincount(s.block, v, minlength=s.structure.blocks) / count
+
+    def mean(v):
+        return np.bincount(s.block, v, minlength=s.structure.blocks) / count
+
     n = np.stack([mean(s.normals[:, a]) for a in range(3)], axis=1)
     length = np.linalg.norm(n, axis=1, keepdims=True)
     n = np.where(length > 1e-3, n / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
@@ -108,3 +114,52 @@ def assign(values: np.ndarray, entries: np.ndarray) -> np.ndarray:
     """The nearest entry of each value, (n,)."""
     weights = [DISTANCE_WEIGHT, 1, 1]
     return cKDTree(entries * weights).query(values * weights, workers=-1)[1].astype(np.uint32)
+
+
+class Coding:
+    """
+    The codes of a grid's nodes, decided on little by little while the nodes are trained: the ``frames`` of blocks and
+    the ``entries`` of the cascaded array once, then a ``pointer`` for more and more nodes (``done``). Those that are
+    left make up for what rounding the others did.
+    """
+
+    def __init__(self, sampled: Sampled, bits: int, seed: int = 0):
+        self.sampled, self.bits, self.seed = sampled, bits, seed
+        count = sampled.structure.nodes
+        self.frames = self.entries = None
+        self.pointers, self.done = np.zeros(count, np.uint32), np.zeros(count, bool)
+
+    def commit(self, values: np.ndarray, share: float) -> None:
+        """Decide on the codes of nodes with the values (n, 4), until a ``share`` of all has one."""
+        at = replace(self.sampled, distances=values[:, 0], normals=values[:, 1:])
+        if self.frames is None:
+            self.frames = fit_frames(at)
+            count = max(1, min(2**self.bits, len(values)))
+            self.entries = rounded_entries(cluster(targets(at, self.frames), count, self.seed))
+        order = np.random.default_rng([self.seed, 1]).random(len(values))
+        now = (order < share) & ~self.done
+        self.pointers[now] = assign(targets(at, self.frames)[now], self.entries)
+        self.done |= now
+
+    def values(self) -> np.ndarray:
+        """The nodes that the pointers stand for, (n, 4), float32."""
+        return decoded_nodes(self.sampled.structure, self.frames, self.entries[self.pointers])
+
+    def state(self) -> dict[str, np.ndarray]:
+        """For a checkpoint; :meth:`restore` is the reverse."""
+        if self.frames is None:
+            return {}
+        return {"frames": self.frames, "entries": self.entries, "pointers": self.pointers, "done": self.done}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        for name, value in state.items():
+            setattr(self, name, value.copy())
+
+
+def rounded_entries(entries: np.ndarray) -> np.ndarray:
+    """Entries as words hold them, float32, so that rounding them again changes nothing."""
+    entries = entries.astype(np.float32)
+    offset, step = codes.entry_scale(entries)
+    top = 2 ** np.array(codes.ENTRY_BITS) - 1
+    whole = np.clip(np.round((entries - offset) / step), 0, top)
+    return (offset + whole * step).astype(np.float32)

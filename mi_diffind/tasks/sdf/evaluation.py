@@ -64,18 +64,21 @@ class Evaluation:
     def measure(self, field: Field) -> dict[str, float]:
         """
         ``iou``: intersection over union of the solids; ``iou_near``: of their parts within 0.01 of the surface;
-        ``mae_near``: mean absolute error of the distance there, both truncated to ± 0.01; ``normal_deg`` and
+        ``mae_near``: mean absolute error of the distance there, both truncated to ± 0.01, which counts what a field
+        does not tell so far away; ``mae_surface``: mean absolute value of the field on the surface; ``normal_deg`` and
         ``normal_p95_deg``: mean and 95th percentile of the angle between the field's gradient and the mesh's normal
         on the surface, in degrees; ``normal_smooth_deg``: the mean for the field's smooth normals.
         """
         inside = _values(field, self.uniform) < 0
         near = _values(field, self.near)
+        surface = _values(field, self.surface)
         analytic = _angles(field, self.surface, self.normals, lambda p: field.gradient(p)[1])
         smooth = _angles(field, self.surface, self.normals, field.normal)
         return {
             "iou": _iou(inside, self.uniform_inside),
             "iou_near": _iou(near < 0, self.near_distance < 0),
             "mae_near": float(np.mean(np.abs(np.clip(near, -BAND, BAND) - self.near_distance), dtype=np.float64)),
+            "mae_surface": float(np.mean(np.abs(surface), dtype=np.float64)),
             "normal_deg": float(analytic.mean(dtype=np.float64)),
             "normal_p95_deg": float(np.quantile(analytic, 0.95)),
             "normal_smooth_deg": float(smooth.mean(dtype=np.float64)),

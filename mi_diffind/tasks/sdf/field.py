@@ -109,7 +109,10 @@ class DenseField(Field):
         (i, _), (j, _), (k, _) = cell
         _, ny, nz = self.resolution
         first = (i * ny + j) * nz + k
-        get = lambda n: dr.gather(self.types.Float, self.values.array, first + n, active)
+
+        def get(n):
+            return dr.gather(self.types.Float, self.values.array, first + n, active)
+
         return [[[get((a * ny + b) * nz + c) for c in (0, 1)] for b in (0, 1)] for a in (0, 1)]
 
     def value(self, p, active=True):

@@ -56,7 +56,9 @@ def load(path) -> Table:
         array = table.arrays.get(name)
         if array is None or len(array.shape) != dims + 1 or array.shape[-1] != channels:
             found = "is missing" if array is None else f"has the shape {array.shape}"
-            raise TableError(f'{path}: the array "{name}" {found}, expected {dims} dimension(s) and {channels} channels')
+            raise TableError(
+                f'{path}: the array "{name}" {found}, expected {dims} dimension(s) and {channels} channels'
+            )
     numbers = {"lower": 3, "centre": 3} | ({"upper": 3} if layout == "pair" else {})
     singles = ["scale", "slope", *(("spacing", "bits", "nodes") if layout == "sparse" else ("band",))]
     for name, count in (numbers | dict.fromkeys(singles, 1)).items():
@@ -73,9 +75,12 @@ def load(path) -> Table:
 
 
 def structure_of(table: Table) -> Structure:
-    """The structure of a sparse field. Raises :class:`~mi_diffind.tables.TableError` if its masks do not go together."""
+    """The structure of a sparse field. Raises :class:`~mi_diffind.tables.TableError` if its masks are damaged."""
     settings = table.settings
-    words = lambda raw: np.ascontiguousarray(raw).view("<u4")
+
+    def words(raw):
+        return np.ascontiguousarray(raw).view("<u4")
+
     blocks, masks = table.arrays["blocks"].entries, table.arrays["region_masks"].entries
     bits, nodes = settings["bits"], settings["nodes"]
     regions = table.arrays["regions"].entries[..., 0]
@@ -111,7 +116,10 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> Field:
         net = Indirection(arrays["primary"], arrays["cascaded"])
         return PairField(types, net, settings["lower"], settings["upper"], settings["band"], settings["slope"])
     structure = structure_of(table)
-    words = lambda name, part=slice(None): np.ascontiguousarray(table.arrays[name].entries[:, part]).view("<u4")[:, 0]
+
+    def words(name, part=slice(None)):
+        return np.ascontiguousarray(table.arrays[name].entries[:, part]).view("<u4")[:, 0]
+
     frames = words("blocks", slice(9, 13))[: structure.blocks]
     entries = table.arrays["entries"].values
     if storage == "float32":

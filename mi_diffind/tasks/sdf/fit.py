@@ -128,55 +128,35 @@ def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: R
     structure = sampled.structure
     if structure.nodes == 0:
         raise FittingError(
-            f"{mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, 1/{1 / structure.spacing:.0f} of the "
-            f"longest side: ask for more --bytes"
+            f"{mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, 1/{1 / structure.spacing:.0f} of "
+            f"the longest side: ask for more --bytes"
         )
     field = nodes.SparseNodes(request.types, structure, 1.0)
-    held_out = training.HeldOut(mesh, distances, request.types, structure.spacing)
-    start = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
-    problem = training.NodeProblem(field, mesh, start, held_out)
+    held_out = training.HeldOut(distances, request.types, structure.spacing)
+    coding = encoding.Coding(sampled, bits, request.settings.seed)
+    problem = training.NodeProblem(field, distances.surface, coding, held_out)
+    problem.identity["source"] = mesh.digest
     result = request.train(problem)
-    values = problem.net.unit(request.types).numpy().astype(np.float64)
-    table, field = stored(sampled, values, bits, request)
-    lines = []
-    if sampled.missed > THIN:
-        lines.append(
-            f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of sign: "
-            f"parts may be thinner than a cell, 1/{1 / structure.spacing:.0f} of the longest side; more --bytes help"
-        )
-    return table, result, field, lines
-
-
-def stored(sampled: encoding.Sampled, values: np.ndarray, bits: int, request: Request):
-    """The table of trained nodes ``values`` (n, 4), and its field: frames, the cascaded array, pointers."""
-    structure = sampled.structure
-    sampled.distances, sampled.normals = values[:, 0], values[:, 1:]
-    frames = encoding.fit_frames(sampled)
-    wanted = encoding.targets(sampled, frames)
-    entries = encoding.cluster(wanted, entries_for(sampled, bits), request.settings.seed)
-    entries = rounded_entries(entries)
-    pointers = encoding.assign(wanted, entries)
-    words = codes.pointer_words(pointers, bits)
-    told = nodes.decoded_nodes(structure, frames, entries[pointers]).astype(np.float64)
+    coding.commit(problem.net.unit(request.types).numpy().astype(np.float64), 1.0)
+    words = codes.pointer_words(coding.pointers, bits)
+    told = coding.values().astype(np.float64)
     slope = nodes.slope_bound(told[:, 0], told[:, 1:], sampled.corners)
-    table = Table("sdf", files.sparse_arrays(structure, frames, words, entries))
+    table = Table("sdf", files.sparse_arrays(structure, coding.frames, words, coding.entries))
     table.settings = {
         "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": bits,
         "nodes": structure.nodes, "slope": slope,
     }  # fmt: skip
-    return table, files.coded_field(request.types, structure, slope, frames, words, bits, entries)
+    lines = []
+    if sampled.missed > THIN:
+        lines.append(
+            f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of "
+            f"sign: parts may be thinner than a cell, 1/{1 / structure.spacing:.0f} of the longest side; more --bytes help"
+        )
+    field = files.coded_field(request.types, structure, slope, coding.frames, words, bits, coding.entries)
+    return table, result, field, lines
 
 
-def rounded_entries(entries: np.ndarray) -> np.ndarray:
-    """Entries as words hold them, float32, so that rounding them again changes nothing."""
-    entries = entries.astype(np.float32)
-    offset, step = codes.entry_scale(entries)
-    top = 2 ** np.array(codes.ENTRY_BITS) - 1
-    whole = np.clip(np.round((entries - offset) / step), 0, top)
-    return (offset + whole * step).astype(np.float32)
-
-
-# -- the supplement's ---------------------------------------------------------------------------------------------------
+# -- the supplement's --------------------------------------------------------------------------------------------------
 
 
 def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Request):
@@ -195,7 +175,8 @@ def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Req
     uniform = int(UNIFORM * SAMPLES)
     seed = request.settings.seed
     points = np.concatenate([
-        samples.near(mesh, SAMPLES - uniform, spacing / 2, [seed, 1]), samples.far(lower, upper, uniform, [seed, 2])
+        samples.near(distances.surface, SAMPLES - uniform, spacing / 2, [seed, 1]),
+        samples.far(lower, upper, uniform, [seed, 2]),
     ])  # fmt: skip
     points = np.clip(points, lower, upper)
     d = distances.signed(points)
@@ -213,7 +194,7 @@ def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Req
         net = pair.initial(start, primary, cascaded, at, unit, d, band)
     net = net.alloc(request.types.TensorXf)
     field = pair.PairField(request.types, net, lower, upper, band, 1.0)
-    held_out = training.HeldOut(mesh, distances, request.types, spacing / 2)
+    held_out = training.HeldOut(distances, request.types, spacing / 2)
     problem = training.PairProblem(field, mesh, unit, d, held_out, True)
     result: FitResult = request.train(problem)
     kept = pair.Indirection([problem.net.primary[0].quantised(8)], problem.net.cascaded.quantised(8))

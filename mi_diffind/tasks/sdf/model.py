@@ -34,7 +34,9 @@ class SdfModel(Model):
         self.scale, self.centre = float(settings["scale"]), tuple(settings["centre"])
 
     def copy(self):
-        return type(self)(self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype, self.form)
+        return type(self)(
+            self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype, self.form
+        )
 
     @property
     def storage(self):
@@ -88,7 +90,7 @@ class SdfModel(Model):
             return Evaluation(loaded, distances, count).measure(self.field)
 
     def decode(self, output: Path, resolution: int | None = None):
-        """The surface as triangles, or the distances as a grid (``.npz``), ``resolution`` cells along the longest side."""
+        """The surface as triangles, or distances as a grid (``.npz``), ``resolution`` cells along the longest side."""
         from .decode import extract, grid
 
         resolution = resolution or min(1024, round(1.5 / self.field.spacing))
@@ -107,13 +109,18 @@ class SdfModel(Model):
         with replacing(output) as temporary:
             mesh.export(temporary)
         seconds = time.perf_counter() - start
-        return [(output, f"{len(mesh.faces):,} triangles at {resolution} cells along the longest side, {seconds:.1f} s")]
+        return [
+            (output, f"{len(mesh.faces):,} triangles at {resolution} cells along the longest side, {seconds:.1f} s")
+        ]
 
     def _decode_grid(self, output: Path, resolution: int, grid):
         from ...files import replacing
 
         values, lower, upper = grid(self.field, resolution)
-        place = lambda p: np.asarray(p) * self.scale + np.array(self.centre)
+
+        def place(p):
+            return np.asarray(p) * self.scale + np.array(self.centre)
+
         with replacing(output) as temporary, open(temporary, "wb") as stream:
             np.savez_compressed(
                 stream, distance=values * np.float32(self.scale), lower=place(lower), upper=place(upper)

@@ -6,8 +6,8 @@ dense arrays only; this is ours):
 
     f(x) = Σ wᵢ (dᵢ + ½ gᵢ · (x − xᵢ))
 
-with trilinear weights w, which is exact for quadratic functions. Everywhere else the sign is known, and how far a ray may
-go until it reaches another cell.
+with trilinear weights w, which is exact for quadratic functions. Everywhere else the sign is known, and how far a ray
+may go until it reaches another cell.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class SparseNodes(Field):
         return dr.gather(dr.uint32_array_t(self.types.Array4f), self._blocks, number, active)
 
     def _in_block(self, record, i, j, k):
-        """Whether node (i, j, k) of the block with this record is stored, its number, and whether it is inside if not."""
+        """Whether node (i, j, k) of the block with this record is stored, its number, and if not, whether inside."""
         UInt32 = self.types.UInt32
         x, y, z = UInt32(i & 3), UInt32(j & 3), UInt32(k & 3)
         stored, rank = _bit_and_rank(record[0], record[1], x * 16 + y * 4 + z)
@@ -106,7 +106,9 @@ class SparseNodes(Field):
         if self.nodes is not None:
             return _split(dr.gather(self.types.Array4f, self.nodes.array, number, active))
         pointer = codes.pointer_at(self._pointers, number, self.bits, active)
-        entry = codes.entries_of(dr.gather(self.types.UInt32, self._entries, pointer, active), *self._affine, self.types)
+        entry = codes.entries_of(
+            dr.gather(self.types.UInt32, self._entries, pointer, active), *self._affine, self.types
+        )
         n, d, scale = codes.frames(record[3], self.types)
         middle = (BLOCK - 1) / 2
         offset = [self.types.Float(v & 3) - middle for v in (i, j, k)]
@@ -203,7 +205,10 @@ class SparseNodes(Field):
         # The sign of a cell that no surface crosses is that of its corners, whatever their extension says
         short = dr.select(some, dr.minimum(dr.maximum(sign * value, 1e-3), BAND), BAND)
         value = dr.select(complete, dr.minimum(dr.maximum(value, -BAND), BAND), sign * short) * self.spacing
-        vector = lambda v: self.types.Array3f(*(dr.select(active & some, x, 0) for x in v))
+
+        def vector(v):
+            return self.types.Array3f(*(dr.select(active & some, x, 0) for x in v))
+
         return dr.select(active, value, self.band), vector(slope), vector(smooth)
 
     # -- how far a ray may go -----------------------------------------------------------------------------------------
@@ -299,7 +304,7 @@ def middles(positions: np.ndarray) -> np.ndarray:
 
 
 def decoded_nodes(structure: Structure, frames: np.ndarray, entries: np.ndarray) -> np.ndarray:
-    """The nodes (n, 4), float32, distances in spacings and normals, of frames (B,), and the entry of each node (n, 3)."""
+    """The nodes (n, 4), float32, distances in spacings and normals, of frames (B,) and the nodes' entries (n, 3)."""
     positions, block = structure.node_positions()
     n, d, scale = (v[block] for v in codes.frames_numpy(frames))
     distance, normal = codes.decoded(

@@ -99,8 +99,12 @@ def slope_of(net: Indirection, lower, upper, band: float) -> float:
     ranges = [_ranges(pointers[..., c]) for c in range(3)]
     # The steepest slope along each axis within the cells that a cell's pointers reach; where that is many, anywhere
     local = [np.full(ranges[0][0].shape, s) for s in steepest]
-    first = [np.clip(np.floor(ranges[c][0] * (values.shape[c] - 1)).astype(int), 0, values.shape[c] - 2) for c in range(3)]
-    last = [np.clip(np.floor(ranges[c][1] * (values.shape[c] - 1)).astype(int), 0, values.shape[c] - 2) for c in range(3)]
+    first = [
+        np.clip(np.floor(ranges[c][0] * (values.shape[c] - 1)).astype(int), 0, values.shape[c] - 2) for c in range(3)
+    ]
+    last = [
+        np.clip(np.floor(ranges[c][1] * (values.shape[c] - 1)).astype(int), 0, values.shape[c] - 2) for c in range(3)
+    ]
     narrow = np.all([b - a <= 3 for a, b in zip(first, last, strict=True)], axis=0)
     for c in range(3):
         cells = _cell_slopes(values, c)

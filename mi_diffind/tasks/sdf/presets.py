@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ...settings import FitSettings
 
@@ -24,14 +24,14 @@ class Recipe:
 
     layout: str = "sparse"
     start: str = "ramp"
-    settings: FitSettings = FitSettings()
+    settings: FitSettings = field(default_factory=FitSettings)
 
 
 #: The first is the default.
 PRESETS = {
     "sparse": Recipe(
         settings=FitSettings(
-            steps=200, batch=2**18, lr=2e-2, schedule="cosine", loss="mse", measure_every=50, deterministic=True
+            steps=250, batch=2**18, lr=2e-2, schedule="cosine", loss="mae", measure_every=50, deterministic=True
         )
     ),
     "dense": Recipe("pair", "distance", FitSettings(steps=300, batch=2**17, lr=1e-2, schedule="cosine", loss="mae")),

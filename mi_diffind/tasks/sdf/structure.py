@@ -44,8 +44,8 @@ class Structure:
     """
     Which nodes are stored. ``regions``: ``(X, Y, Z)`` bytes, :data:`ACTIVE` or what is known of an empty one.
     ``region_masks``, ``region_signs``: ``(R, 2)`` words of 32 bits, for each region with nodes the blocks that have
-    some, and the signs (1: inside) of those that have none. ``block_masks``: ``(B, 2)`` words, the nodes that are stored
-    in each block, ``block_signs``: ``(B,)`` bytes, the signs of its eight groups of 2 × 2 × 2 nodes. Regions and blocks
+    some, and the signs (1: inside) of those that have none. ``block_masks``: ``(B, 2)`` words, the nodes that are
+    stored in each block, ``block_signs``: ``(B,)`` bytes, the signs of its eight groups of 2 × 2 × 2 nodes. Regions and blocks
     in lexicographic order, blocks region by region; bits of a mask likewise, z fastest.
     """
 
@@ -114,19 +114,21 @@ class Structure:
             raise StructureError(f"{blocks} blocks have nodes, masks are there for {self.blocks}")
         if self.nodes > MOST_NODES or max(self.shape) > MOST_SIDE:
             raise StructureError(
-                f"found {self.nodes:,} nodes in a grid of {self.shape}, allowed are {MOST_NODES:,} and {MOST_SIDE} along "
-                f"a side"
+                f"found {self.nodes:,} nodes in a grid of {self.shape}, allowed are {MOST_NODES:,} and {MOST_SIDE} "
+                f"along a side"
             )
 
 
 def build(positions: np.ndarray, inside: np.ndarray, shape, lower, spacing: float, sign, bound) -> Structure:
     """
     The structure of the nodes at ``positions`` (n, 3), whole numbers of a grid of ``shape`` nodes, that are ``inside``
-    (n,) or not. ``sign`` and ``bound`` are functions of points (m, 3): whether they are inside, and a lower bound of the
-    distance to the surface. Nodes are to be in any order; :meth:`Structure.node_positions` has the order of the result.
+    (n,) or not. ``sign`` and ``bound`` are functions of points (m, 3): whether they are inside, and a lower bound of
+    the distance to the surface. Nodes are in any order; :meth:`Structure.node_positions` has that of the result.
     """
     regions_shape = tuple(-(-int(n) // REGION) for n in shape)
-    at = lambda nodes: np.asarray(lower) + spacing * nodes
+
+    def at(nodes):
+        return np.asarray(lower) + spacing * nodes
 
     region_of = np.ravel_multi_index((positions // REGION).T, regions_shape)
     active, region_of = np.unique(region_of, return_inverse=True)

@@ -10,12 +10,19 @@ from ...fitting import Problem
 from ...indirection import Indirection
 from . import samples
 from .distances import Distances
+from .encoding import Coding
 from .mesh import Mesh
 from .nodes import SparseNodes
 from .pair import PairField
 
-#: Weight of normals against distances (in spacings): the field's gradient, and the blended normals of nodes.
-GRADIENT, SMOOTH = 0.2, 0.05
+#: Weights of the distance (in spacings), of the field's gradient and of the blended normals of nodes.
+DISTANCE, GRADIENT, SMOOTH = 0.3, 0.05, 0.02
+
+#: Distances below which errors count by their squares, in spacings.
+ROUND = 0.01
+
+#: When, in shares of the training, how many of the nodes have got their codes.
+COMMITTED = ((0.6, 0.5), (0.8, 0.8))
 
 #: Points at which a state is looked at on the way.
 HELD_OUT = 2**16
@@ -26,11 +33,16 @@ class Surface:
 
     def __init__(self, mesh: Mesh, types):
         self.types, self.count = types, len(mesh.faces)
-        flat = lambda v: types.Float(np.ascontiguousarray(v.reshape(-1), np.float32))
+
+        def flat(v):
+            return types.Float(np.ascontiguousarray(v.reshape(-1), np.float32))
+
         corners = mesh.corners
         self.sums = flat(np.cumsum(mesh.areas) / mesh.areas.sum())
-        self.corner, self.first, self.second = flat(corners[:, 0]), flat(corners[:, 1] - corners[:, 0]), flat(
-            corners[:, 2] - corners[:, 0]
+        self.corner, self.first, self.second = (
+            flat(corners[:, 0]),
+            flat(corners[:, 1] - corners[:, 0]),
+            flat(corners[:, 2] - corners[:, 0]),
         )
         self.normals = flat(mesh.normals)
 
@@ -66,29 +78,67 @@ class NodeValues(nn.Module):
 class NodeProblem(Problem):
     """
     The field is to be zero on the surface and its gradient the surface's normal, both where it is read and as nodes
-    blend it: squares of all three, in spacings and for vectors of length 1. Distances are not needed: the nodes begin
-    with theirs.
+    blend it. Distances are not needed: the nodes begin with theirs.
+
+    On the way, nodes get their codes, half of them and then more (:class:`.encoding.Coding`): from then on they are
+    what their pointers say.
     """
 
-    def __init__(self, field: SparseNodes, mesh: Mesh, start: np.ndarray, held_out):
-        self.field, self.types = field, field.types
+    #: The last state is the one to keep: earlier ones are better only because less of them is rounded.
+    tolerance = 1.0
+
+    def __init__(self, field: SparseNodes, mesh: Mesh, coding: Coding, held_out):
+        self.field, self.types, self.coding, self.held_out = field, field.types, coding, held_out
         self.surface = Surface(mesh, self.types)
+        at = coding.sampled
+        start = np.concatenate([at.distances[:, None], at.normals], axis=1)
         self.net = NodeValues(self.types.TensorXf(np.ascontiguousarray(start, np.float32)))
-        self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": field.spacing}
-        self.held_out = held_out
+        self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": field.spacing, "bits": coding.bits}
+        self.stage, self._fixed = 0, None
+
+    def begin(self, step: int, share: float) -> str:
+        while self.stage < len(COMMITTED) and share >= COMMITTED[self.stage][0]:
+            values = dr.detach(self.nodes(self.net)).numpy().astype(np.float64)
+            self.coding.commit(values, COMMITTED[self.stage][1])
+            self._fix()
+            self.stage += 1
+        return f"stage {self.stage}"
+
+    def _fix(self) -> None:
+        done = np.repeat(self.coding.done[:, None], 4, axis=1).astype(np.float32)
+        self._fixed = self.types.TensorXf(done), self.types.TensorXf(self.coding.values())
+
+    def kept(self) -> dict[str, np.ndarray]:
+        return {"stage": np.int64(self.stage), **self.coding.state()}
+
+    def restore(self, kept: dict[str, np.ndarray]) -> None:
+        self.stage = int(kept.pop("stage", 0))
+        self.coding.restore(kept)
+        self._fixed = None
+        if self.stage:
+            self._fix()
+
+    def nodes(self, net):
+        """The nodes as they are read: those without codes as they are trained."""
+        values = net.unit(self.types)
+        if self._fixed is None:
+            return values
+        done, fixed = self._fixed
+        return dr.fma(done, fixed - values, values)
 
     def loss(self, net, rng, size: int):
         p, n = self.surface.draw(rng, size)
-        self.field.nodes = net.unit(self.types)
+        self.field.nodes = self.nodes(net)
         value, slope, smooth, complete = self.field.blend(p)
         Array3f = self.types.Array3f
-        error = dr.square(value) + GRADIENT * dr.squared_norm(Array3f(*slope) - n)
-        error += SMOOTH * dr.squared_norm(Array3f(*smooth) - n)
+        square = dr.square(value)
+        error = DISTANCE * (dr.sqrt(square + ROUND**2) if self.settings.loss == "mae" else 10 * square)
+        error += GRADIENT * dr.squared_norm(Array3f(*slope) - n) + SMOOTH * dr.squared_norm(Array3f(*smooth) - n)
         return dr.select(complete, error, 0) / size
 
     def measure(self, net):
         with dr.suspend_grad():
-            self.field.nodes = net.unit(self.types)
+            self.field.nodes = dr.detach(self.nodes(net))
             return self.held_out.measure(self.field)
 
 
@@ -97,7 +147,10 @@ class PairProblem(Problem):
 
     def __init__(self, field: PairField, mesh: Mesh, points: np.ndarray, distances: np.ndarray, held_out, bits: bool):
         self.field, self.types, self.net = field, field.types, field.net
-        flat = lambda v: self.types.Float(np.ascontiguousarray(v, np.float32))
+
+        def flat(v):
+            return self.types.Float(np.ascontiguousarray(v, np.float32))
+
         self.points = [flat(v) for v in points.T]
         self.targets = flat(np.clip(distances / field.band, -1, 1) / 2 + 0.5)
         self.identity = {"source": mesh.digest, "resolution": list(self.net.primary[0].resolution)}
@@ -128,8 +181,8 @@ def as_stored(net: Indirection) -> Indirection:
 class HeldOut:
     """Points near the surface, their signs, and points on it with normals: for a look at a state during training."""
 
-    def __init__(self, mesh: Mesh, distances: Distances, types, width: float, seed: int = 3):
-        self.types = types
+    def __init__(self, distances: Distances, types, width: float, seed: int = 3):
+        self.types, mesh = types, distances.surface
         near = samples.near(mesh, HELD_OUT, width, seed).astype(np.float32)
         self.inside = distances.inside(near)
         points, self.normals = samples.surface(mesh, HELD_OUT, seed + 1)

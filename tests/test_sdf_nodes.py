@@ -1,0 +1,289 @@
+"""The sparse layout of signed distance fields: masks, codes, what cells say, how far rays may go."""
+
+import dataclasses
+
+import drjit as dr
+import numpy as np
+import pytest
+from solids import box, sphere, together
+
+from mi_diffind.runtime import array_module
+from mi_diffind.tasks.sdf import codes, encoding, files, nodes, structure
+from mi_diffind.tasks.sdf.distances import Distances
+from mi_diffind.tasks.sdf.mesh import make_mesh
+
+
+@pytest.fixture(scope="module")
+def ad():
+    return array_module("llvm")
+
+
+@pytest.fixture(scope="module")
+def solid():
+    """A ball and a box apart from it, and the nodes of a grid around them: mesh, distances, samples."""
+    mesh = make_mesh(*together(sphere(24, 0.5, (0, 0, 0)), box((0.3, 0.5, 0.4), (1.1, 0.1, -0.1))))
+    with Distances(mesh) as distances:
+        sampled = encoding.sample(distances, 1 / 96)
+        yield mesh, distances, sampled
+
+
+def points(types, values):
+    return types.Array3f(*np.ascontiguousarray(np.asarray(values, np.float32).T))
+
+
+def decoded(types, sampled):
+    values = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1).astype(np.float32)
+    return nodes.SparseNodes(types, sampled.structure, 3.0, nodes=types.TensorXf(values))
+
+
+def coded(types, sampled, bits=8):
+    frames = encoding.fit_frames(sampled)
+    wanted = encoding.targets(sampled, frames)
+    entries = encoding.cluster(wanted, min(2**bits, len(wanted)))
+    pointers = encoding.assign(wanted, entries)
+    words = codes.pointer_words(pointers, bits)
+    return files.coded_field(types, sampled.structure, 3.0, frames, words, bits, entries), frames, entries[pointers]
+
+
+# -- masks -------------------------------------------------------------------------------------------------------------
+
+
+def test_every_node_of_the_grid_has_its_sign(ad, solid):
+    """Also those that are not stored, of which there is one bit for eight: against winding numbers."""
+    _mesh, distances, sampled = solid
+    s = sampled.structure
+    grid = np.stack(np.meshgrid(*[np.arange(n - 1) for n in s.shape], indexing="ij"), axis=-1).reshape(-1, 3)
+    places = np.array(s.lower) + s.spacing * grid
+    inside = distances.inside(places)
+    # A hair within the cell whose lowest corner the node is, so that rounding does not choose another
+    found = decoded(ad, sampled).value(points(ad, places + 1e-4 * s.spacing)).numpy()
+    sure = np.abs(distances.unsigned(places)) > 1e-3 * s.spacing
+    assert 0.02 < inside.mean() < 0.5
+    assert np.array_equal((found < 0)[sure], inside[sure])
+
+
+def test_positions_follow_from_masks(solid):
+    _, _, sampled = solid
+    s = sampled.structure
+    positions, block = s.node_positions()
+    assert len(positions) == s.nodes == len(np.unique(positions, axis=0))
+    assert np.array_equal(positions // 4 * 4, s.block_positions()[block])
+    # The corners of a cell, z fastest
+    corner = positions[sampled.corners]
+    assert np.array_equal(corner - corner[:, :1], np.broadcast_to(nodes.CORNERS, corner.shape))
+    signs = (sampled.distances < 0)[sampled.corners]
+    assert np.all(signs.any(axis=1) & ~signs.all(axis=1))
+
+
+def test_empty_regions_keep_their_distance(solid):
+    _, distances, sampled = solid
+    s = sampled.structure
+    index = np.argwhere(s.regions != structure.ACTIVE)
+    rng = np.random.default_rng(0)
+    places = np.array(s.lower) + s.spacing * (16 * index[:, None] + 16 * rng.random((len(index), 64, 3)))
+    known = (s.regions[tuple(index.T)] // 2) * s.spacing
+    assert known.max() > 0
+    assert np.all(distances.unsigned(places.reshape(-1, 3)).reshape(len(index), 64) >= known[:, None])
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"block_masks": np.zeros((1, 2), np.uint32)}, "blocks have nodes, masks are there for 1"),
+        ({"region_masks": np.zeros((0, 2), np.uint32)}, "regions have nodes, masks are there for 0"),
+    ],
+)
+def test_masks_that_do_not_go_together(solid, changes, says):
+    with pytest.raises(structure.StructureError, match=says):
+        dataclasses.replace(solid[2].structure, **changes).check()
+
+
+# -- codes -------------------------------------------------------------------------------------------------------------
+
+
+def test_frames_are_the_same_for_both_kinds_of_arrays(ad, rng):
+    n = rng.normal(size=(2000, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    n[:6] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]
+    d, s = rng.uniform(-4.4, 4.4, 2000), 2.0 ** rng.uniform(-6.9, 0.4, 2000)
+    words = codes.frame_words(n, d, s)
+    normal, distance, scale = codes.frames_numpy(words)
+    assert np.degrees(np.arccos(np.sum(normal * n, axis=1).clip(-1, 1))).max() < 0.25
+    assert np.abs(distance - d).max() <= 4.5 / 255 + 1e-9
+    assert np.all(np.abs(np.log2(scale / s)) <= 0.2501)
+    found, e, k = codes.frames(ad.UInt32(words), ad)
+    assert np.allclose(np.stack([v.numpy() for v in found], axis=1), normal, atol=2e-6)
+    assert np.allclose(e.numpy(), distance, atol=1e-6) and np.allclose(k.numpy(), scale, rtol=1e-6)
+
+
+def test_residuals_reach_every_direction(rng):
+    """decoded() undoes residuals(), whatever the angle between a node and its block; NumPy against Dr.Jit elsewhere."""
+    count = 5000
+    n, g = rng.normal(size=(2, count, 3))
+    n, g = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (n, g))
+    offsets, d, s = rng.uniform(-1.5, 1.5, (count, 3)), rng.uniform(-2, 2, count), 2.0 ** rng.integers(-4, 1, count)
+    distance = rng.uniform(-2, 2, count)
+    entry = codes.residuals(distance, g, offsets, n, d, s)
+    back, normal = codes.decoded(tuple(entry.T), tuple(n.T), d, s, tuple(offsets.T))
+    opposite = np.sum(n * g, axis=1) < -0.99
+    assert np.allclose(back, distance, atol=1e-9)
+    assert np.allclose(np.stack(normal, axis=1)[~opposite], g[~opposite], atol=1e-6)
+    length = np.linalg.norm(np.stack(normal, axis=1), axis=1)
+    assert np.allclose(length, 1, atol=1e-6)
+
+
+def test_entries_beyond_the_projections_edge_stay_unit_vectors():
+    n = tuple(np.array([[0.0, 0.6, 0.8]]).T)
+    for a in (1.9, 1.9999, 2.5, 100.0):
+        _, normal = codes.decoded((0.0, np.array([a]), np.array([0.0])), n, 0.0, 1.0, (0.0, 0.0, 0.0))
+        assert np.isclose(np.linalg.norm(np.array(normal)), 1, atol=1e-6), a
+
+
+@pytest.mark.parametrize("bits", codes.POINTERS)
+def test_pointers_in_words(ad, bits, rng):
+    values = rng.integers(2**bits, size=1001).astype(np.uint32)
+    words = codes.pointer_words(values, bits)
+    assert np.array_equal(codes.pointers_of(words, bits, 1001), values)
+    index = ad.UInt32(rng.permutation(1001).astype(np.uint32))
+    found = codes.pointer_at(ad.UInt32(words), index, bits, ad.Bool(True))
+    assert np.array_equal(found.numpy(), values[index.numpy()])
+
+
+# -- what cells say ----------------------------------------------------------------------------------------------------
+
+
+def test_quadratic_functions_are_exact(ad, solid):
+    """f(x) = Σ wᵢ (dᵢ + ½ gᵢ·(x − xᵢ)) has no error but rounding for any quadratic f, and so have its gradients."""
+    _, _, sampled = solid
+    s = sampled.structure
+    positions, _ = s.node_positions()
+    a = np.array([[0.02, 0.01, -0.03], [0.01, -0.04, 0.02], [-0.03, 0.02, 0.05]])
+    b, c = np.array([0.3, -0.2, 0.5]), -20.0
+    x = positions.astype(float)
+    values = np.concatenate([(np.einsum("ni,ij,nj->n", x, a, x) + x @ b + c)[:, None], 2 * x @ a + b], axis=1)
+    values[:, 0] /= 40
+    values[:, 1:] /= 40
+    field = nodes.SparseNodes(ad, s, 1.0, nodes=ad.TensorXf(values.astype(np.float32)))
+    rng = np.random.default_rng(1)
+    cells = positions[sampled.corners[rng.integers(len(sampled.corners), size=500), 0]] + rng.random((500, 3))
+    p = points(ad, np.array(s.lower) + s.spacing * cells)
+    value, slope, _, complete = field.blend(p)
+    assert np.all(complete.numpy())
+    cells = np.stack([(p[i].numpy() - s.lower[i]) / s.spacing for i in range(3)], axis=1).astype(float)
+    truth = (np.einsum("ni,ij,nj->n", cells, a, cells) + cells @ b + c) / 40
+    assert np.abs(value.numpy() - truth).max() < 2e-4 * np.abs(truth).max()
+    assert np.abs(np.stack([v.numpy() for v in slope], axis=1) - (2 * cells @ a + b) / 40).max() < 1e-3
+
+
+def test_gradients_are_those_of_the_values(ad, solid):
+    """In place: central differences. In the nodes: changes of nodes, one by one."""
+    _, _, sampled = solid
+    field, s = decoded(ad, sampled), sampled.structure
+    rng = np.random.default_rng(2)
+    corner = s.node_positions()[0][sampled.corners[rng.integers(len(sampled.corners), size=400), 0]]
+    places = np.array(s.lower) + s.spacing * (corner + 0.1 + 0.8 * rng.random((400, 3)))
+    p = points(ad, places)
+    _, slope = field.gradient(p)
+    h = 0.02 * s.spacing
+    for axis in range(3):
+        step = [h if i == axis else 0 for i in range(3)]
+        found = (field.value(p + ad.Array3f(*step)) - field.value(p - ad.Array3f(*step))) / (2 * h)
+        assert np.abs(found.numpy() - slope[axis].numpy()).max() < 5e-3
+
+    start = field.nodes
+    weights = ad.Float(rng.normal(size=400).astype(np.float32))
+    dr.enable_grad(start)
+    field.nodes = start
+    dr.backward(dr.sum(weights * field.value(p)) / s.spacing)
+    grad = dr.grad(start).numpy()
+    values = dr.detach(start).numpy()
+    touched = np.argwhere(np.abs(grad) > 1e-3)
+    assert len(touched) > 500
+    for node, channel in touched[rng.integers(len(touched), size=8)]:
+        found = []
+        for sign in (1, -1):
+            moved = values.copy()
+            moved[node, channel] += sign * 0.01
+            field.nodes = ad.TensorXf(moved)
+            found.append(dr.sum(weights * field.value(p))[0] / s.spacing)
+        assert (found[0] - found[1]) / 0.02 == pytest.approx(grad[node, channel], rel=2e-2, abs=2e-3)
+
+
+def test_coded_nodes_are_the_decoded_ones(ad, solid):
+    """Read from pointers, entries and frames in the kernel, and decoded by NumPy: one field."""
+    _, _, sampled = solid
+    field, frames, entries = coded(ad, sampled)
+    values = nodes.decoded_nodes(sampled.structure, frames, entries)
+    other = nodes.SparseNodes(ad, sampled.structure, 3.0, nodes=ad.TensorXf(values))
+    rng = np.random.default_rng(3)
+    p = points(ad, rng.uniform(field.lower, field.upper, (20000, 3)))
+    assert np.abs(field.value(p).numpy() - other.value(p).numpy()).max() < 2e-2 * field.spacing
+    known = np.abs(other.value(p).numpy()) < field.band
+    gap = np.abs(np.stack([v.numpy() for v in field.gradient(p)[1] - other.gradient(p)[1]]))[:, known]
+    assert known.sum() > 500 and gap.max() < 0.02
+
+
+def test_coding_costs_little(ad, solid):
+    """Eight bits a node, against nodes as they were sampled: within a twentieth of a spacing, and a degree or two."""
+    _, distances, sampled = solid
+    field, *_ = coded(ad, sampled)
+    positions, _ = sampled.structure.node_positions()
+    rng = np.random.default_rng(4)
+    corner = positions[sampled.corners[rng.integers(len(sampled.corners), size=4000), 0]]
+    p = points(ad, np.array(field.lower) + field.spacing * (corner + rng.random((4000, 3))))
+    gap = (field.value(p) - decoded(ad, sampled).value(p)).numpy() / field.spacing
+    assert np.sqrt(np.mean(gap**2)) < 0.05
+    # and against the mesh itself
+    truth = distances.signed(np.stack([v.numpy() for v in p], axis=1))
+    assert np.mean(np.abs(field.value(p).numpy() - truth)) < 0.06 * field.spacing
+
+
+def test_slope_is_bounded(ad, solid):
+    _, _, sampled = solid
+    bound = nodes.slope_bound(sampled.distances, sampled.normals, sampled.corners)
+    rng = np.random.default_rng(5)
+    corner = sampled.structure.node_positions()[0][np.repeat(sampled.corners[:, 0], 16)]
+    field = decoded(ad, sampled)
+    p = points(ad, np.array(field.lower) + field.spacing * (corner + rng.random(corner.shape)))
+    _, slope, _, complete = field.blend(p)
+    steepest = dr.max(dr.select(complete, dr.norm(ad.Array3f(*slope)), 0))[0]
+    assert 0.5 * bound < steepest <= bound < 3
+
+
+def test_the_sign_holds_as_far_as_it_is_vouched_for(ad, solid):
+    """look(): nowhere within its step has the field the other sign. Also along axes, and for every kind of cell."""
+    _, _, sampled = solid
+    field, *_ = coded(ad, sampled)
+    field.slope = 3.0
+    rng = np.random.default_rng(6)
+    count = 20000
+    o = rng.uniform(field.lower, field.upper, (count, 3))
+    d = rng.normal(size=(count, 3))
+    d[:3000] = np.eye(3)[rng.integers(3, size=3000)] * rng.choice([-1, 1], size=(3000, 1))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    p, v = points(ad, o), points(ad, d)
+    value, step = field.look(p, v)
+    assert np.all(np.isfinite(step.numpy())) and np.all(step.numpy() >= 0)
+    assert np.mean(step.numpy() > 4 * field.spacing) > 0.1
+    told = field.value(p).numpy()
+    sure = np.abs(told) > 1e-3 * field.spacing
+    assert np.array_equal((value.numpy() < 0)[sure], (told < 0)[sure])
+    for share in rng.random(12):
+        # A hair of the step is beyond the side of a cell
+        there = p + (dr.maximum(step * float(share) - 2e-3 * field.spacing, 0)) * v
+        other = field.value(there).numpy()
+        inside_box = field.inside(there).numpy()
+        changed = (other < 0) != (told < 0)
+        assert not np.any(changed & inside_box & sure & (np.abs(other) > 2e-3 * field.spacing))
+
+
+def test_places_where_there_is_nothing(ad, solid):
+    _, _, sampled = solid
+    field, *_ = coded(ad, sampled)
+    p = points(ad, [[np.nan, 0, 0], [0, 0, 9], [-1e30, 0, 0], [np.inf, 0, 0]])
+    value, slope = field.gradient(p)
+    assert np.array_equal(value.numpy(), np.full(4, np.float32(field.band)))
+    assert np.all(slope.numpy() == 0)
+    assert np.all(field.value(p, ad.Bool(False)).numpy() == np.float32(field.band))
+    corners = points(ad, [field.lower, field.upper])
+    assert np.all(field.value(corners).numpy() > 0)
