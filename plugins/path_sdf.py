@@ -55,9 +55,7 @@ def integrator() -> type:
             return sdf.interaction(solids, met, ray, si, active)
 
         @dr.syntax
-        def sample_solids(
-            self, mode, scene, solids, sampler, ray, δL=None, state_in=None, active=True, **kwargs
-        ):
+        def sample_solids(self, mode, scene, solids, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
             """As ``sample`` of ``path_footprint``, of a scene with solids."""
             primal = mode == dr.ADMode.Primal
             moving = not primal and any(solid.optimised() for solid in solids)

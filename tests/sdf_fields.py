@@ -54,6 +54,49 @@ class Steps(Ball):
         return value, dr.abs(value) - 0.02
 
 
+def torus(p):
+    """Distance to a torus of radii 0.34 and 0.12 that fills the unit frame, and its gradient, at points (n, 3)."""
+    ring = np.linalg.norm(p[:, :2], axis=1)
+    to = np.stack([ring - 0.38, p[:, 2]], axis=1)
+    length = np.maximum(np.linalg.norm(to, axis=1), 1e-12)
+    flat = p[:, :2] / np.maximum(ring, 1e-12)[:, None] * (to[:, :1] / length[:, None])
+    return length - 0.12, np.concatenate([flat, to[:, 1:] / length[:, None]], axis=1)
+
+
+def sparse_table(shape=torus, spacing=1 / 40, bits=8, scale=2.0, centre=(0.5, -1.0, 0.25)):
+    """The table of a formula's sparse field, as ``fit sdf`` would write it."""
+    from mi_diffind.tables import Table
+    from mi_diffind.tasks.sdf import codes, encoding, files, nodes, structure
+
+    lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
+    n = int(np.ceil((1 + 3 * spacing) / spacing)) + 1
+    index = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = (shape(lower + spacing * index)[0] < 0).reshape(n, n, n)
+    corner = np.stack([inside[a : n - 1 + a, b : n - 1 + b, c : n - 1 + c] for a, b, c in nodes.CORNERS], axis=-1)
+    cells = np.argwhere(corner.any(-1) & ~corner.all(-1))
+    around = cells[:, None] + np.array(nodes.CORNERS)
+    used = np.unique(around.reshape(-1, 3), axis=0)
+    sign = lambda p: shape(np.asarray(p))[0] < 0
+    found = structure.build(used, sign(lower + spacing * used), (n, n, n), lower, spacing, sign,
+                            lambda p: np.abs(shape(np.asarray(p))[0]))  # fmt: skip
+    positions, block = found.node_positions()
+    d, g = shape(np.array(found.lower) + spacing * positions)
+    key = lambda p: np.ravel_multi_index(p.T, found.shape)
+    order = np.argsort(key(positions))
+    corners = order[np.searchsorted(key(positions), key(around.reshape(-1, 3)), sorter=order)].reshape(-1, 8)
+    sampled = encoding.Sampled(found, positions, block, d / spacing, g, corners, 0.0)
+    frames = encoding.fit_frames(sampled)
+    wanted = encoding.targets(sampled, frames)
+    entries = encoding.cluster(wanted, 2**bits)
+    pointers = encoding.assign(wanted, entries)
+    table = Table("sdf", files.sparse_arrays(found, frames, codes.pointer_words(pointers, bits), entries))
+    table.preset = "sparse"
+    slope = nodes.slope_bound(d / spacing, g, corners)
+    table.settings = {"layout": "sparse", "lower": list(found.lower), "spacing": spacing, "bits": bits,
+                      "nodes": found.nodes, "slope": slope, "scale": scale, "centre": list(centre)}  # fmt: skip
+    return table
+
+
 def register(mi, fields: dict, name: str = "test_solid") -> None:
     """A shape ``name`` whose ``field`` is the key of one in ``fields``; its box is as large as in the unit frame."""
     solids = sys.modules["mi_diffind.plugins.support.solids"]

@@ -73,6 +73,9 @@ class Solid(mi.Mesh):
     the field's smooth ones.
     """
 
+    #: The integrators that trace it.
+    seen_by = ("path_sdf",)
+
     def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
         self.field, self.placement, self.smooth = field, placement, smooth
         self.ready = False

@@ -135,7 +135,9 @@ def spheres(field, start, d, length, fresh, active, exact: bool = True, epsilon:
                 share = dr.clip(low_value / (low_value - high_value), 0.03, 0.97)
                 share = dr.select(turns < FALSE_POSITIONS, share, 0.5)
                 turns = dr.select(found, turns + 1, 0)
-                following = dr.select(found, dr.fma(width, share, low), dr.select(back, safe, dr.maximum(safe, t + ahead)))
+                following = dr.select(
+                    found, dr.fma(width, share, low), dr.select(back, safe, dr.maximum(safe, t + ahead))
+                )
                 t = dr.select(done, t, following)
                 active &= ~done & (found | (t <= length))
             else:
