@@ -190,11 +190,11 @@ def factory(props: mi.Properties):
     resolution = props.get("resolution", 0)
     if not isinstance(resolution, int) or ("resolution" in props and not 4 <= resolution <= 512):
         raise RuntimeError(f'parameter "resolution": found {resolution}, allowed are whole numbers from 4 to 512')
+    to_world = props.get("to_world", mi.ScalarTransform4f())
+    Placement.of(to_world, model.scale, model.centre)  # refuses what is none
     resolution = resolution or decode.resolution_for(model.field, CLOSE * model.field.spacing, finest=FINEST)
     values, lower, upper = decode.grid(model.field, resolution)
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
-    to_world = props.get("to_world", mi.ScalarTransform4f())
-    Placement.of(to_world, model.scale, model.centre)  # refuses what is none
     to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)
     to_world = mi.ScalarTransform4f(np.array(to_world.matrix))
     made, kept = native_grid(props, values, lower, upper, to_world @ to_unit, normals)

@@ -189,12 +189,12 @@ def test_derivatives_reach_the_nodes(mi_rgb, folder):
     for sign in (1, -1):
         params[key] = mi.TensorXf(flat + sign * step)
         params.update()
-        images.append(np.array(mi.render(made, spp=64, seed=2, integrator=integrator)))
+        images.append(np.array(mi.render(made, spp=16, seed=2, integrator=integrator)))
     differences = (images[0] - images[1]).sum() / 0.04
     params[key] = mi.TensorXf(flat)
     dr.enable_grad(params[key])
     params.update()
-    image = mi.render(made, params, spp=64, seed=2, integrator=integrator)
+    image = mi.render(made, params, spp=16, seed=2, integrator=integrator)
     dr.backward(dr.sum(image.array))
     found = np.array(dr.grad(params[key]))[:, 0].sum()
     assert abs(differences) > 1e-3

@@ -35,26 +35,25 @@ NEIGHBOURS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
 class Marcher:
     """
-    What is made of a field's masks, once: for each block of the grid its number, or how many blocks around it are empty
-    and their sign; for each that is not empty, which of its cells are crossed, the signs of the others, and the
-    numbers of the blocks beside it.
+    What is made of a field's masks, once: how many regions around an empty one are empty, and their sign; for each
+    block of the others its number, or the same; for each block with crossed cells, which these are, the signs of the
+    others, and the numbers of the blocks beside it.
     """
 
     def __init__(self, field):
         self.field = field
         structure, UInt32 = field.structure, field.types.UInt32
         crossed, inside, beside, empty = cells_of(structure)
-        self.blocks = tuple(n // BLOCK for n in structure.shape)
+        regions, blocks = words_of(structure, crossed, inside, empty)
         words = np.concatenate([_words(crossed), _words(inside)], axis=1)
-        self.cells, self.beside, self.words = (
-            UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1))
-            for v in (words, beside, blocks_of(structure, crossed, inside, empty))
+        self.cells, self.beside, self.regions, self.words = (
+            UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (words, beside, regions, blocks)
         )
 
     @property
     def nbytes(self) -> int:
         """Bytes of it."""
-        return 4 * sum(map(dr.width, (self.words, self.cells, self.beside)))
+        return 4 * sum(map(dr.width, (self.regions, self.words, self.cells, self.beside)))
 
     # -- where a ray is -----------------------------------------------------------------------------------------------
 
@@ -66,8 +65,12 @@ class Marcher:
         i, j, k = cell = course.cell(t)
         types = self.field.types
         UInt32, Int32 = types.UInt32, types.Int32
-        _, ny, nz = self.blocks
-        word = dr.gather(UInt32, self.words, UInt32(((i >> 2) * ny + (j >> 2)) * nz + (k >> 2)), active)
+        _, ny, nz = self.field.structure.regions.shape
+        region = dr.gather(UInt32, self.regions, UInt32(((i >> 4) * ny + (j >> 4)) * nz + (k >> 4)), active)
+        wide = region >= EMPTY
+        place = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
+        word = dr.gather(UInt32, self.words, region * 64 + place, active & ~wide)
+        word = dr.select(wide, region, word)
         empty = word >= EMPTY
         low, high, low_sign, high_sign = dr.gather(types.Array4u, self.cells, word, active & ~empty)
         x, y, z = UInt32(i & 3), UInt32(j & 3), UInt32(k & 3)
@@ -77,7 +80,7 @@ class Marcher:
         crossed = active & ~empty & (((half >> bit) & 1) == 1)
         # The cell and its seven neighbours in a cube of 2 × 2 × 2 are bits of one word
         alone = (half & (UInt32(0x330033) << ((y & 2) * 4 + (z & 2)))) == 0
-        shift = dr.select(empty, Int32(2), dr.select(alone, 1, 0))
+        shift = dr.select(wide, Int32(4), dr.select(empty, 2, dr.select(alone, 1, 0)))
         reach = dr.select(empty, Int32(word & 0xFFFF), 1)
         sign = dr.select(empty, (word & INSIDE) != 0, ((signs >> bit) & 1) == 1)
         return crossed, word, dr.maximum(course.end(cell, shift, reach), t), sign
@@ -263,15 +266,27 @@ def cells_of(structure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return crossed.reshape(-1, 64), within.reshape(-1, 64), beside, empty[:-1, :-1, :-1]
 
 
-def blocks_of(structure, crossed, inside, empty) -> np.ndarray:
-    """For each block of the grid its number, or what is said of empty ones (:data:`EMPTY`), uint32."""
-    number = np.zeros(empty.shape, np.uint32)
-    full = np.zeros(empty.shape, bool)
+def words_of(structure, crossed, inside, empty) -> tuple[np.ndarray, np.ndarray]:
+    """
+    For each region the number of its blocks' words, or what is said of empty ones (:data:`EMPTY`), uint32; for each
+    block of those that are not empty, ``(R, 64)``, its number, or the same.
+    """
+    number, full = np.zeros(empty.shape, np.uint32), np.zeros(empty.shape, bool)
     at = tuple((structure.block_positions() // BLOCK).T)
     full[at] = crossed.any(axis=1)
     number[at] = np.arange(len(crossed))
     sign = empty.copy()
-    sign[at] = inside[:, 0]  # of one without crossed cells, all have the same
-    # Beyond the grid nothing is to be met
+    sign[at] = inside[:, 0]  # where no cell is crossed, all have the same
+    shape = structure.regions.shape
+    parts = lambda v: v.reshape(np.stack([shape, (4, 4, 4)], 1).ravel()).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 64)
+    blocks = parts(np.where(full, number, _free(full, sign)).astype(np.uint32))
+    some = parts(full).any(axis=1)
+    regions = _free(some.reshape(shape), parts(sign)[:, 0].reshape(shape)).ravel()
+    regions[some] = np.arange(some.sum())
+    return regions.astype(np.uint32), blocks[some]
+
+
+def _free(full: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """What is said of empty parts of a grid, of which ``full`` ones are not."""
     far = distance_transform_cdt(~full, "chessboard") if full.any() else np.full(full.shape, max(full.shape))
-    return np.where(full, number, EMPTY | np.where(sign, INSIDE, 0) | far).astype(np.uint32)
+    return np.int64(EMPTY) | np.where(sign, INSIDE, 0) | far
