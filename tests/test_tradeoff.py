@@ -64,7 +64,7 @@ def small(tmp_path, monkeypatch):
 
 
 def test_studies_are_found():
-    assert list(studies()) == ["disney", "ggx", "image", "scene", "shading", "texture"]
+    assert list(studies()) == ["disney", "ggx", "image", "scene", "sdf", "shading", "texture"]
 
 
 def test_studies_of_others_are_found(small):
