@@ -69,7 +69,7 @@ def test_studies_are_found():
 
 def test_studies_of_others_are_found(small):
     with pytest.warns(RuntimeWarning) as warned:
-        assert list(studies()) == ["disney", "ggx", "image", "scene", "shading", "texture", "small"]
+        assert list(studies()) == ["disney", "ggx", "image", "scene", "sdf", "shading", "texture", "small"]
     texts = sorted(str(w.message) for w in warned)
     assert len(texts) == 2 and "No module named 'no_such_module_at_all'" in texts[0]
     assert texts[1].startswith('"ggx" (its_module) is left out: mi_diffind.studies has ')
