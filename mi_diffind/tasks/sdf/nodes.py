@@ -148,7 +148,7 @@ class SparseNodes(Field):
         for stored, *_, sign in corners:
             complete, inside = complete & stored, inside | (sign & ~stored)
         value, weight_sum = Float(0), Float(0)
-        slope, smooth = [Float(0)] * 3, [Float(0)] * 3
+        slope, mean, told = [Float(0)] * 3, [Float(0)] * 3, []
         for (a, b, c), (stored, number, record, at, _) in zip(CORNERS, corners, strict=True):
             d, g = self._node(number, record, *at, active & stored)
             ends = [(t if e else 1 - t) for e, t in zip((a, b, c), place, strict=True)]
@@ -158,7 +158,8 @@ class SparseNodes(Field):
             part = dr.fma(dr.select(complete, 0.5, 1.0), towards, d)
             w = dr.select(stored & active, ends[0] * ends[1] * ends[2], 0)
             value, weight_sum = dr.fma(w, part, value), weight_sum + w
-            smooth = [dr.fma(w, x, s) for x, s in zip(g, smooth, strict=True)]
+            mean = [dr.fma(w, x, s) for x, s in zip(g, mean, strict=True)]
+            told.append((w, g))
             if derivatives:
                 part = dr.select(stored & active, part, 0)
                 for axis, e in enumerate((a, b, c)):
@@ -168,8 +169,15 @@ class SparseNodes(Field):
                     slope[axis] = dr.fma(w * dr.select(complete, 0.5, 1.0), g[axis], slope[axis])
         some = weight_sum > 0
         whole = dr.select(complete, 1, dr.rcp(dr.select(some, weight_sum, 1)))
-        value, smooth = value * whole, [s * whole for s in smooth]
-        slope = [dr.select(complete, s, m) for s, m in zip(slope, smooth, strict=True)]
+        value, mean = value * whole, [s * whole for s in mean]
+        if not derivatives:
+            return value, slope, mean, complete, some, inside
+        slope = [dr.select(complete, s, m) for s, m in zip(slope, mean, strict=True)]
+        # In a thin wall, nodes tell the normal of its other side: less the further they turn away, at last nothing
+        smooth = [Float(0)] * 3
+        for w, g in told:
+            w = w * dr.maximum(g[0] * slope[0] + g[1] * slope[1] + g[2] * slope[2], 0)
+            smooth = [dr.fma(w, x, s) for x, s in zip(g, smooth, strict=True)]
         return value, slope, smooth, complete, some, inside
 
     def blend(self, p):
@@ -188,7 +196,7 @@ class SparseNodes(Field):
         return value, slope
 
     def normal(self, p, active=True):
-        return self._told(p, active, False)[2]
+        return self._told(p, active, True)[2]
 
     def _told(self, p, active, derivatives: bool):
         active = self.inside(p) & active
