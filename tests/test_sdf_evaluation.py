@@ -9,7 +9,7 @@ import pytest
 import solids
 
 from mi_diffind.errors import DiffindError
-from mi_diffind.tasks.sdf import decode
+from mi_diffind.tasks.sdf import decode, evaluation
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.evaluation import BAND, PADDING, Evaluation
 from mi_diffind.tasks.sdf.field import DenseField, Field
@@ -284,3 +284,16 @@ def test_components_of_overlapping_pieces():
     lens = math.pi * 2 * (1 - 1 / 2) ** 2 * (1 - (1 - 1 / 2) / 3)
     volume = 2 * 4 / 3 * math.pi - lens + 4 / 3 * math.pi / 8
     assert truth.volume == pytest.approx(volume, rel=0.05)
+
+
+def test_lost_pieces():
+    """A piece that is smaller than the cells is missing in the field, and is counted."""
+    mesh = make_mesh(
+        *solids.together(solids.sphere(12), solids.sphere(6, 0.02, (1.5, 0, 0)), solids.sphere(6, 0.02, (0, 1.4, 0)))
+    )
+    place = [(np.array(c) - mesh.centre) / mesh.scale for c in ((0, 0, 0), (1.5, 0, 0), (0, 1.4, 0))]
+    parts = [Ball(r / mesh.scale, tuple(c), half=0.6) for r, c in zip((1, 0.02, 0.02), place, strict=True)]
+    with Distances(mesh) as d:
+        for missing in (0, 1, 2, 3):
+            field = Union(*parts[missing:]) if missing < 3 else Ball(-1.0)
+            assert evaluation.lost_pieces(field, d) == missing

@@ -124,6 +124,24 @@ class Evaluation:
         return surface_of(self.mesh.to_file_frame(lower + spacing * vertices), faces)
 
 
+def lost_pieces(field: Field, distances: Distances, count: int = 32, seed: int = 2) -> int:
+    """
+    How many pieces of the mesh's surface the field does not know of: at none of ``count`` places on it is the field's
+    surface nearer than one of its cells.
+    """
+    surface = distances.surface
+    labels = surface.labels
+    rng = np.random.default_rng(seed)
+    order = np.argsort(labels, kind="stable")
+    first = np.searchsorted(labels[order], np.arange(surface.components + 1))
+    span = np.diff(first)[:, None]
+    which = order[first[:-1, None] + np.minimum(rng.random((len(span), count)) * span, span - 1).astype(np.int64)]
+    weights = rng.dirichlet((1, 1, 1), which.shape)
+    points = np.einsum("...c,...cx->...x", weights, surface.corners[which])
+    near = np.abs(_values(field, points.reshape(-1, 3))) < min(field.spacing, 0.99 * field.band)
+    return int(np.sum(~near.reshape(which.shape).any(axis=1)))
+
+
 def _iou(a: np.ndarray, b: np.ndarray) -> float:
     union = np.count_nonzero(a | b)
     return float(np.count_nonzero(a & b) / union) if union else 1.0
