@@ -292,7 +292,7 @@ def test_lost_pieces():
         *solids.together(solids.sphere(12), solids.sphere(6, 0.02, (1.5, 0, 0)), solids.sphere(6, 0.02, (0, 1.4, 0)))
     )
     place = [(np.array(c) - mesh.centre) / mesh.scale for c in ((0, 0, 0), (1.5, 0, 0), (0, 1.4, 0))]
-    parts = [Ball(r / mesh.scale, tuple(c), half=0.6) for r, c in zip((1, 0.02, 0.02), place, strict=True)]
+    parts = [Ball(r / mesh.scale, tuple(c.tolist()), half=0.6) for r, c in zip((1, 0.02, 0.02), place, strict=True)]
     with Distances(mesh) as d:
         for missing in (0, 1, 2, 3):
             field = Union(*parts[missing:]) if missing < 3 else Ball(-1.0)
