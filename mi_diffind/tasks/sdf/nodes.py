@@ -211,26 +211,21 @@ class SparseNodes(Field):
         cell, _ = self._grid(p)
         number, has, inside, region, free = self._block(*cell, inside_box)
         record = self._record(number, has)
-        stored, node, sign = self._in_block(record, *cell)
+        stored, _, sign = self._in_block(record, *cell)
         stored = stored & has
         # To the end of the region, of the block, of the cell
         shift = dr.select(region, dr.select(has, 0, 2), 4)
-        size = Float(1 << shift) * self.spacing
-        step = self.cell_exit(p, d, [i >> shift for i in cell], size)
+        step = self.cell_exit(p, d, [i >> shift for i in cell], Float(1 << shift) * self.spacing)
         step = dr.maximum(step, free * self.spacing)
         value = dr.select(dr.select(has, sign, inside), -1.0, 1.0) * self.spacing
 
-        def near(p, node, record, cell_x, cell_y, cell_z, step, stored):
+        def near(p, value, step, stored):
             told, *_, complete, _, inside = self._blend(p, stored, False)
             told = dr.select(complete, told * self.spacing, dr.select(inside, -1.0, 1.0) * self.spacing)
             return told, dr.select(complete, dr.abs(told) / self.slope, step)
 
-        told, nearer = dr.if_stmt(
-            (self.types.Array3f(p), node, self.types.Array4u(record) if hasattr(self.types, "Array4u") else record,
-             *cell, step, stored),
-            stored, near, lambda p, node, record, x, y, z, step, stored: (Float(value), Float(step)),
-        )  # fmt: skip
-        return dr.select(stored, told, value), dr.select(stored, nearer, step)
+        arguments = self.types.Array3f(p), value, step, stored
+        return dr.if_stmt(arguments, stored, near, lambda p, value, step, stored: (value, step))
 
     @property
     def nbytes(self) -> int:
