@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from pathlib import Path
 
@@ -544,3 +545,38 @@ def test_ctrl_c_ends_a_question():
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGINT, handler)
         assert np.array_equal(d.signed(points[:100]), few)
+
+
+def test_the_child_outlives_a_thread():
+    """Asked first by a thread that ends: the process is not that thread's."""
+    found = []
+    with Distances(make_mesh(*solids.box())) as d:
+        thread = threading.Thread(target=lambda: found.append(d.signed(np.zeros((1, 3)))))
+        thread.start()
+        thread.join()
+        child = d._child
+        time.sleep(0.2)
+        assert d.signed(np.zeros((1, 3))) == found[0] and d._child is child
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_fork_leaves_the_child_alone():
+    """A forked copy of the parent asks a process of its own, and ends only that."""
+    program = textwrap.dedent("""
+        import os, numpy as np, solids
+        from mi_diffind.tasks.sdf.distances import Distances
+        from mi_diffind.tasks.sdf.mesh import make_mesh
+        d = Distances(make_mesh(*solids.box()))
+        before, child = d.signed(np.zeros((1, 3))), d._child
+        pid = os.fork()
+        if pid == 0:
+            same = d.signed(np.zeros((1, 3))) == before and d._child.pid != child.pid
+            d.close()
+            os._exit(0 if same else 1)
+        print(os.waitpid(pid, 0)[1], (d.signed(np.zeros((1, 3))) == before).all(), d._child is child)
+    """)
+    path = os.pathsep.join(filter(None, sys.path))
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
+    )
+    assert done.stdout.split() == ["0", "True", "True"], done.stderr
