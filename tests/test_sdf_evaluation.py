@@ -9,7 +9,7 @@ import pytest
 import solids
 
 from mi_diffind.errors import DiffindError
-from mi_diffind.tasks.sdf import decode
+from mi_diffind.tasks.sdf import decode, evaluation
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.evaluation import BAND, PADDING, Evaluation
 from mi_diffind.tasks.sdf.field import DenseField, Field
@@ -51,6 +51,9 @@ class Union(Field):
             found[0] = dr.minimum(found[0], other)
         return found[0]
 
+    def gradient(self, p, active=True):
+        return self.value(p, active), T.Array3f(p)
+
 
 @pytest.fixture(scope="module")
 def ball():
@@ -71,6 +74,8 @@ def held_out(ball):
 def test_points(held_out):
     e = held_out
     assert e.uniform.shape == e.near.shape == (2**16, 3) and e.surface.shape == e.normals.shape == (2**14, 3)
+    assert e.band_volume == pytest.approx(4 / 3 * math.pi * (0.51**3 - 0.49**3), rel=0.01)
+    assert np.abs(np.linalg.norm(e.uniform[e.uniform_near], axis=1) - 0.5).max() < BAND + 5e-4
     assert e.uniform.min() >= -0.5 - PADDING - 1e-6 and e.uniform.min() < -0.545
     radius = np.linalg.norm(e.near, axis=1)
     assert np.abs(np.abs(radius - 0.5) - np.abs(e.near_distance)).max() < 5e-4 and np.abs(e.near_distance).max() < BAND
@@ -106,7 +111,7 @@ def test_a_perfect_field(held_out):
 def test_errors_are_told(held_out):
     """A ball too small by 0.003, whose gradient is turned by 10° about z, and whose values end at 0.005."""
     found = held_out.measure(Ball(0.497, band=0.05, tilt=math.radians(10)))
-    assert found["iou"] == pytest.approx((0.497 / 0.5) ** 3, abs=4e-3)
+    assert found["iou"] == pytest.approx((0.497 / 0.5) ** 3, abs=1e-3)
     inside = (0.5**3 - 0.49**3) / (0.51**3 - 0.49**3)
     near = (0.497**3 - 0.49**3) / (0.51**3 - 0.49**3)
     assert found["iou_near"] == pytest.approx(near / inside, abs=0.01)
@@ -123,6 +128,35 @@ def test_errors_are_told(held_out):
     # A band that ends before the one that is measured counts as an error
     short = held_out.measure(Ball(0.5, band=0.005))["mae_near"]
     assert short == pytest.approx(np.average(np.maximum(np.abs(r - 0.5) - 0.005, 0), weights=r**2), rel=0.05)
+
+
+def test_iou_knows_what_is_far(held_out):
+    """A cavity deep inside and a ball apart count by their volumes."""
+
+    class Shell(Ball):
+        def value(self, p, active=True):
+            return dr.maximum(super().value(p, active), 0.2 - dr.norm(p))
+
+    field = Union(Shell(0.5), Ball(0.04, (0.45, 0.45, 0.45)))
+    assert held_out.measure(field)["iou"] == pytest.approx((0.5**3 - 0.2**3) / (0.5**3 + 0.04**3), abs=2e-3)
+
+
+def test_iou_of_thin_solids():
+    """A rod of a thousandth of the box: its volume is found as exactly as that of a ball."""
+    mesh = make_mesh(*solids.box((0.012, 0.012, 1), (0, 0, 0)))
+
+    class Rod(Ball):
+        def value(self, p, active=True):
+            d = dr.maximum(dr.abs(p.x), dr.abs(p.y)) - 0.0055
+            return dr.clip(dr.maximum(d, dr.abs(p.z) - 0.5), -self.band, self.band)
+
+        def gradient(self, p, active=True):
+            return self.value(p), T.Array3f(p.x, p.y, 0 * p.z)
+
+    with Distances(mesh) as d:
+        found = Evaluation(mesh, d, count=2**14).measure(Rod(0.1))
+    assert found["iou"] == pytest.approx((0.011 / 0.012) ** 2, abs=0.03)
+    assert found["iou_near"] == pytest.approx(found["iou"])
 
 
 def test_fields_that_say_nothing(held_out):
@@ -284,3 +318,16 @@ def test_components_of_overlapping_pieces():
     lens = math.pi * 2 * (1 - 1 / 2) ** 2 * (1 - (1 - 1 / 2) / 3)
     volume = 2 * 4 / 3 * math.pi - lens + 4 / 3 * math.pi / 8
     assert truth.volume == pytest.approx(volume, rel=0.05)
+
+
+def test_lost_pieces():
+    """A piece that is smaller than the cells is missing in the field, and is counted."""
+    mesh = make_mesh(
+        *solids.together(solids.sphere(12), solids.sphere(6, 0.02, (1.5, 0, 0)), solids.sphere(6, 0.02, (0, 1.4, 0)))
+    )
+    place = [(np.array(c) - mesh.centre) / mesh.scale for c in ((0, 0, 0), (1.5, 0, 0), (0, 1.4, 0))]
+    parts = [Ball(r / mesh.scale, tuple(c.tolist()), half=0.6) for r, c in zip((1, 0.02, 0.02), place, strict=True)]
+    with Distances(mesh) as d:
+        for missing in (0, 1, 2, 3):
+            field = Union(*parts[missing:]) if missing < 3 else Ball(-1.0)
+            assert evaluation.lost_pieces(field, d) == missing

@@ -115,7 +115,7 @@ def shoot(types, distances, field, count, seed):
     trace = pytest.importorskip("mi_diffind.tasks.sdf.tracing").trace
     rng = np.random.default_rng(seed)
     h = field.spacing
-    pool = samples.far(distances.mesh.lower, distances.mesh.upper, 400_000, rng)
+    pool = samples.far(distances.mesh.lower - 3 * h, distances.mesh.upper + 3 * h, 400_000, rng)
     d = distances.signed(pool, 4 * h)
     deep, free = pool[d < -1.5 * h], pool[d > 1.5 * h]
     missed = astray = 0

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from pathlib import Path
 
@@ -162,6 +163,16 @@ def test_degenerate_triangles_are_left_out():
     mesh = make_mesh(vertices, faces, "a.ply")
     assert len(mesh.faces) == 12 and len(mesh.vertices) == 8
     assert "a.ply: 3 triangles without an area were left out" in mesh.warnings
+
+
+def test_zeros_of_either_sign_are_one_position():
+    vertices, faces = solids.box()
+    vertices = vertices + 0.5
+    split = np.where(
+        vertices[faces] == 0, np.where(np.arange(len(faces))[:, None, None] % 2, 0.0, -0.0), vertices[faces]
+    )
+    mesh = make_mesh(split.reshape(-1, 3), np.arange(36).reshape(-1, 3))
+    assert len(mesh.vertices) == 8 and mesh.watertight
 
 
 def test_a_sliver_may_hold_a_mesh_together():
@@ -534,3 +545,38 @@ def test_ctrl_c_ends_a_question():
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGINT, handler)
         assert np.array_equal(d.signed(points[:100]), few)
+
+
+def test_the_child_outlives_a_thread():
+    """Asked first by a thread that ends: the process is not that thread's."""
+    found = []
+    with Distances(make_mesh(*solids.box())) as d:
+        thread = threading.Thread(target=lambda: found.append(d.signed(np.zeros((1, 3)))))
+        thread.start()
+        thread.join()
+        child = d._child
+        time.sleep(0.2)
+        assert d.signed(np.zeros((1, 3))) == found[0] and d._child is child
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_fork_leaves_the_child_alone():
+    """A forked copy of the parent asks a process of its own, and ends only that."""
+    program = textwrap.dedent("""
+        import os, numpy as np, solids
+        from mi_diffind.tasks.sdf.distances import Distances
+        from mi_diffind.tasks.sdf.mesh import make_mesh
+        d = Distances(make_mesh(*solids.box()))
+        before, child = d.signed(np.zeros((1, 3))), d._child
+        pid = os.fork()
+        if pid == 0:
+            same = d.signed(np.zeros((1, 3))) == before and d._child.pid != child.pid
+            d.close()
+            os._exit(0 if same else 1)
+        print(os.waitpid(pid, 0)[1], (d.signed(np.zeros((1, 3))) == before).all(), d._child is child)
+    """)
+    path = os.pathsep.join(filter(None, sys.path))
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
+    )
+    assert done.stdout.split() == ["0", "True", "True"], done.stderr

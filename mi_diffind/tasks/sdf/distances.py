@@ -61,6 +61,7 @@ class Distances:
         self.mesh = mesh
         self._child: subprocess.Popen | None = None
         self._stderr = None
+        self._owner = 0
         self._sent: set[str] = set()
         self._ambiguity: tuple[float, float] | None = None
 
@@ -77,7 +78,7 @@ class Distances:
         """End the process, if it runs."""
         child, self._child = self._child, None
         self._sent = set()
-        if child is not None:
+        if child is not None and self._owner == os.getpid():  # not that of whoever was forked
             for stream in (child.stdin, child.stdout):
                 with contextlib.suppress(OSError):
                     stream.close()
@@ -223,6 +224,8 @@ class Distances:
         if not len(points):
             return {key: found[:0] for key, found in self._ask(question, np.zeros((1, 3)), name, mesh).items()}
         parts = [points[i : i + CHUNK] for i in range(0, len(points), CHUNK)]
+        if self._owner != os.getpid():
+            self.close()
         if self._child is None:
             self._start()
         if name not in self._sent:
@@ -254,6 +257,7 @@ class Distances:
             raise DistancesError(
                 f"{self.mesh.path}: distances need libigl, which is not installed (pip install libigl)"
             )
+        self._owner = os.getpid()
         script = Path(__file__).with_name("distances_child.py")
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115
         self._child = subprocess.Popen(

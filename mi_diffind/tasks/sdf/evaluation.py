@@ -47,42 +47,61 @@ class Evaluation:
         lower = self.mesh.lower - 2 * BAND
         shape = np.ceil((self.mesh.upper + 2 * BAND - lower) / BAND).astype(int)
         cells = surface_cells(self.distances, lower, BAND, shape, reach=BAND)
-        points, distance, have = [], [], 0
+        points, distance, have, tried = [], [], 0, 0
         while have < self.count:
-            share = have / sum(map(len, points)) if points else 0.5
+            share = have / tried if have else 0.5
             wanted = int(1.05 * (self.count - have) / max(share, 0.1)) + 64
             found = lower + BAND * (cells[rng.integers(len(cells), size=wanted)] + rng.random((wanted, 3)))
             found = found.astype(np.float32)
             d = self.distances.unsigned(found)
             points.append(found[d < BAND])
             distance.append(d[d < BAND])
-            have += len(points[-1])
+            have, tried = have + len(points[-1]), tried + wanted
+        self.band_volume = have / tried * len(cells) * BAND**3
+        self.uniform_near = self._in_band(self.uniform, lower, shape, cells)
         points, distance = np.concatenate(points)[: self.count], np.concatenate(distance)[: self.count]
         sign = np.where(self.distances.inside(points), -1, 1)
         return points, (sign * distance).astype(np.float32)
 
+    def _in_band(self, points: np.ndarray, lower, shape, cells) -> np.ndarray:
+        """Which points lie in the band: those in none of its cells need not be asked for."""
+        named = np.zeros(shape, dtype=bool)
+        named[tuple(cells.T)] = True
+        cell = np.floor((points - lower) / BAND).astype(int)
+        found = np.all((cell >= 0) & (cell < shape), axis=1)
+        found[found] = named[tuple(cell[found].T)]
+        found[found] = self.distances.unsigned(points[found]) < BAND
+        return found
+
     def measure(self, field: Field) -> dict[str, float]:
         """
-        ``iou``: intersection over union of the solids; ``iou_near``: of their parts within 0.01 of the surface;
-        ``mae_near``: mean absolute error of the distance there, both truncated to ± 0.01, which counts what a field
-        does not tell so far away; ``mae_surface``: mean absolute value of the field on the surface; ``normal_deg`` and
-        ``normal_p95_deg``: mean and 95th percentile of the angle between the field's gradient and the mesh's normal
-        on the surface, in degrees; ``normal_smooth_deg``: the mean for the field's smooth normals.
+        ``iou``: intersection over union of the solids, near the surface from the points of the band, elsewhere from the
+        uniform ones, so that thin solids are measured as well as thick ones; ``iou_near``: of their parts within 0.01
+        of the surface; ``mae_near``: mean absolute error of the distance there, both truncated to ± 0.01, which counts
+        what a field does not tell so far away; ``mae_surface``: mean absolute value of the field on the surface;
+        ``normal_deg`` and ``normal_p95_deg``: mean and 95th percentile of the angle between the field's gradient and
+        the mesh's normal on the surface, in degrees; ``normal_smooth_deg``: the mean for the field's smooth normals.
         """
-        inside = _values(field, self.uniform) < 0
         near = _values(field, self.near)
         surface = _values(field, self.surface)
         analytic = _angles(field, self.surface, self.normals, lambda p: field.gradient(p)[1])
         smooth = _angles(field, self.surface, self.normals, field.normal)
         return {
-            "iou": _iou(inside, self.uniform_inside),
-            "iou_near": _iou(near < 0, self.near_distance < 0),
+            "iou": self._iou(_values(field, self.uniform) < 0, near < 0),
+            "iou_near": _ratio(*_overlap(near < 0, self.near_distance < 0)),
             "mae_near": float(np.mean(np.abs(np.clip(near, -BAND, BAND) - self.near_distance), dtype=np.float64)),
             "mae_surface": float(np.mean(np.abs(surface), dtype=np.float64)),
             "normal_deg": float(analytic.mean(dtype=np.float64)),
             "normal_p95_deg": float(np.quantile(analytic, 0.95)),
             "normal_smooth_deg": float(smooth.mean(dtype=np.float64)),
         }
+
+    def _iou(self, uniform: np.ndarray, near: np.ndarray) -> float:
+        """Of what the field says is inside, of uniform points and of those of the band."""
+        side = self.mesh.upper - self.mesh.lower + 2 * PADDING
+        far = ~self.uniform_near
+        total = float(np.prod(side)) / self.count * _overlap(uniform[far], self.uniform_inside[far])
+        return _ratio(*(total + self.band_volume / self.count * _overlap(near, self.near_distance < 0)))
 
     def chamfer(self, decoded, count: int = 2**18) -> dict[str, float]:
         """
@@ -124,9 +143,31 @@ class Evaluation:
         return surface_of(self.mesh.to_file_frame(lower + spacing * vertices), faces)
 
 
-def _iou(a: np.ndarray, b: np.ndarray) -> float:
-    union = np.count_nonzero(a | b)
-    return float(np.count_nonzero(a & b) / union) if union else 1.0
+def lost_pieces(field: Field, distances: Distances, count: int = 32, seed: int = 2) -> int:
+    """
+    How many pieces of the mesh's surface the field does not know of: at none of ``count`` places on it is the field's
+    surface nearer than one of its cells.
+    """
+    surface = distances.surface
+    labels = surface.labels
+    rng = np.random.default_rng(seed)
+    order = np.argsort(labels, kind="stable")
+    first = np.searchsorted(labels[order], np.arange(surface.components + 1))
+    span = np.diff(first)[:, None]
+    which = order[first[:-1, None] + np.minimum(rng.random((len(span), count)) * span, span - 1).astype(np.int64)]
+    weights = rng.dirichlet((1, 1, 1), which.shape)
+    points = np.einsum("...c,...cx->...x", weights, surface.corners[which])
+    near = np.abs(_values(field, points.reshape(-1, 3))) < min(field.spacing, 0.99 * field.band)
+    return int(np.sum(~near.reshape(which.shape).any(axis=1)))
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """How many points lie in both and in one of two sets."""
+    return np.array([np.count_nonzero(a & b), np.count_nonzero(a | b)])
+
+
+def _ratio(both: float, one: float) -> float:
+    return float(both / one) if one else 1.0
 
 
 def _points(field: Field, points: np.ndarray):

@@ -134,8 +134,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
         raise MeshError(f"{name}: has no triangles, expected a surface that encloses a solid")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(f"{name}: a triangle names vertex {int(faces.max())} of {len(vertices)}")
-    vertices, inverse = np.unique(vertices[faces].reshape(-1, 3), axis=0, return_inverse=True)
-    faces = inverse.reshape(-1, 3).astype(np.int64)
+    vertices, faces = _joined(vertices, faces)
     if not np.all(np.isfinite(vertices)):
         raise MeshError(f"{name}: has vertices that are NaN or infinite, allowed are finite ones")
 
@@ -235,6 +234,21 @@ def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, said: list[str
         said.append(f"{name}: {dropped:,} triangles without an area were left out")
     used, faces = np.unique(faces[~flat], return_inverse=True)
     return vertices[used], faces.reshape(-1, 3), not open_edges
+
+
+def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices that are used, each position once, in lexicographic order, and faces that name them."""
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    vertices = vertices[used]
+    order = np.lexsort(vertices.T[::-1])
+    found = vertices[order]
+    first = np.concatenate([[True], np.any(found[1:] != found[:-1], axis=1)])
+    number = np.empty(len(order), np.int64)
+    number[order] = np.cumsum(first) - 1
+    renamed = np.empty(len(used), np.int64)
+    renamed[used] = number
+    return found[first], renamed[faces]
 
 
 def _edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

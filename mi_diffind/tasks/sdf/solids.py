@@ -16,7 +16,7 @@ STEP = 2e-6
 
 #: Triangles whose longest edge is larger are looked at in parts, and parts are halved down to the second length where
 #: some of it bounds the solid and some does not.
-COARSE, FINE = 1 / 64, 1 / 256
+COARSE, FINE = 1 / 32, 1 / 256
 
 #: Places at which a triangle is looked at (barycentric): the middle and near the corners.
 PLACES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9]])
