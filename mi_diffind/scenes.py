@@ -61,8 +61,26 @@ def load(
         loaded = compat.instantiate(config, state)
         if not isinstance(loaded, mi.Scene):
             raise RuntimeError(f"{path}: holds a {type(loaded).__name__}, a scene is expected")
+        found = [props.plugin_name() for props in compat.properties_of(state, mi.ObjectType.Integrator)]
+        unseen = _unseen(loaded, found or ["path"])
+        if unseen:
+            raise RuntimeError(unseen)
         footprint.attach(loaded)
         return loaded
+
+
+def _unseen(scene, integrators: list[str]) -> str:
+    """A sentence about a shape that is seen by none of the ``integrators`` (names of plugins), "" if there is none."""
+    for made in instances(scene):
+        seen_by = getattr(made, "seen_by", integrators)
+        if not set(seen_by) & set(integrators):
+            allowed = " or ".join(f'"{name}"' for name in seen_by)
+            found = ", ".join(f'"{name}"' for name in integrators)
+            return (
+                f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} alone, '
+                f'found {found}: take that integrator, or trace="grid"'
+            )
+    return ""
 
 
 def load_file(path: str | os.PathLike, **defines):
@@ -74,6 +92,10 @@ def load_file(path: str | os.PathLike, **defines):
     """
     loaded = mi.load_file(str(path), **defines)
     if isinstance(loaded, mi.Scene):
+        said = plugins.origin(loaded.integrator())
+        unseen = _unseen(loaded, [said["plugin"] if said else loaded.integrator().class_name()])
+        if unseen:  # another integrator may be meant
+            mi.Log(mi.LogLevel.Warn, unseen)
         footprint.attach(loaded)
     return loaded
 

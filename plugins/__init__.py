@@ -96,6 +96,9 @@ _declared: dict[str, dict[str, Plugin]] = {}
 #: Objects of Mitsuba's own that factories returned: id → the object, what its properties said, what it does.
 _native: dict[int, list] = {}
 
+#: What factories are about to return, if a scene takes it apart: id → the part of it that is looked for.
+_parts: dict[int, object] = {}
+
 
 def supported(variant: str) -> bool:
     """Can the plugins run in this variant? Python plugins need a vectorised (JIT) one with derivatives."""
@@ -178,11 +181,12 @@ def _checked(plugin: Plugin):
         said = plugin.described(props)
         for key in unknown:
             props.mark_queried(key, False)
-        if hasattr(made, "__dict__"):
-            made._made_from = _Origin(said)
+        shown = _parts.pop(id(made), made)
+        if hasattr(shown, "__dict__"):
+            shown._made_from = _Origin(said)
         else:
             _forget_dead()
-            _native.setdefault(id(made), [made, said, None])[1] = said
+            _native.setdefault(id(shown), [shown, said, None])[1] = said
         return made
 
     return make
@@ -202,6 +206,14 @@ def reports_as(made, report: Callable[[], dict]) -> None:
     """
     _forget_dead()
     _native[id(made)] = [made, None, report]
+
+
+def shown_as(made, part) -> None:
+    """
+    For a factory that is about to return ``made``, an object of Mitsuba's own that a scene takes apart and drops, as a
+    ``merge`` of shapes: what is left of it in the scene is ``part``.
+    """
+    _parts[id(made)] = part
 
 
 def _forget_dead() -> None:

@@ -119,15 +119,19 @@ def decoded(entry, n, d, scale, offset):
     e, a, b = (v * scale for v in entry)
     square = a * a + b * b
     # Beyond the edge, on it
-    root = np.sqrt if isinstance(n[0], np.ndarray) else dr.sqrt
-    beyond = square > EDGE**2
-    c = 1 - _select(n, beyond, EDGE**2, square) / 2
-    f = _select(n, beyond, EDGE, 1.0) * root(
-        (1 - _select(n, beyond, EDGE**2, square) / 4) / _select(n, beyond, square, 1.0)
-    )
-    t, u = orthonormal(n)
-    normal = tuple(c * k + f * (a * p + b * q) for k, p, q in zip(n, t, u, strict=True))
-    return d + n[0] * offset[0] + n[1] * offset[1] + n[2] * offset[2] + e, normal
+    if isinstance(n[0], np.ndarray):
+        inside, inverse = np.minimum(square, EDGE**2), -1 / (1 + np.abs(n[2]))
+        f = np.sqrt(1 - inside / 4) * np.where(square > EDGE**2, EDGE / np.sqrt(np.maximum(square, EDGE**2)), 1)
+    else:  # few divisions and roots: this is where rays spend their time
+        inside, inverse = dr.minimum(square, EDGE**2), -dr.rcp(1 + dr.abs(n[2]))
+        f = dr.sqrt(1 - inside / 4) * dr.select(square > EDGE**2, EDGE * dr.rsqrt(square), 1)
+    # T and B are those of :func:`orthonormal`, their products with N shared
+    x, y, z = n
+    sign = _select(n, z >= 0, 1.0, -1.0)
+    c, p, q = 1 - inside / 2, f * a, sign * f * b
+    m = sign * (x * p + y * q)
+    along = c + sign * inverse * m
+    return d + x * offset[0] + y * offset[1] + z * offset[2] + e, (x * along + p, y * along + q, c * z - m)
 
 
 def entry_scale(entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...errors import UsageError
 from .field import Field
+from .structure import BLOCK as NODES
 
 #: Cells along each side of the blocks that marching cubes is run on, if the surface passes through them.
 BLOCK = 32
@@ -32,28 +33,33 @@ def extract(field: Field, resolution: int, scale: float = 1.0, centre=(0.0, 0.0,
     The surface as a ``trimesh.Trimesh``, closed, in units and place of the file: ``vertices · scale + centre``. Without
     vertices if there is nothing inside.
 
-    Values are only kept of 32 layers of cells at a time, and marching cubes runs where signs differ; 512 cells take
-    about 300 MB. Decode finer than the field's own cells where the result is to be measured. Raises
-    :class:`~mi_diffind.errors.UsageError` for a resolution out of 4 … 1024.
+    Values are only kept of 32 layers of cells at a time, and of a sparse field only found near its nodes. Decode finer
+    than the field's own cells where the result is to be measured. Raises :class:`~mi_diffind.errors.UsageError` for a
+    resolution out of 4 … 1024.
     """
     spacing = _spacing(field, resolution)
     # One more cell on either side, where all is outside, so that what the box cuts is closed
     lower = np.array(field.lower) - spacing
     cells = np.ceil((np.array(field.upper) - np.array(field.lower)) / spacing - 1e-6).astype(int) + 2
 
+    crossed = crossed_blocks(field, lower, spacing, cells)
+
     def layers(first: int, last: int) -> np.ndarray:
-        values = node_values(field, lower, spacing, (first, last + 1), *[(0, n + 1) for n in cells[1:]])
-        outside = np.nan_to_num(values, nan=field.band, posinf=field.band, neginf=-field.band)
-        for axis, n in enumerate(cells[1:], 1):
-            for side in (0, n):
-                outside[(slice(None),) * axis + (side,)] = field.band
-        if first == 0:
-            outside[0] = field.band
-        if last == cells[0]:
-            outside[-1] = field.band
+        needed = np.zeros((last - first + 1, *(cells[1:] + 1)), dtype=bool)
+        for y, z in np.argwhere(crossed[first // BLOCK]) * BLOCK:
+            needed[:, y : y + BLOCK + 1, z : z + BLOCK + 1] = True
+        outside = np.full(needed.shape, field.band, np.float32)
+        # What lies beyond the box, on all sides, stays outside
+        needed[:, [0, -1]] = needed[:, :, [0, -1]] = False
+        needed[0] &= first > 0
+        needed[-1] &= last < cells[0]
+        where = np.flatnonzero(needed)
+        start = lower + spacing * np.array([first, 0, 0])
+        found = node_values(field, start, spacing, needed.shape, where)
+        outside.reshape(-1)[where] = np.nan_to_num(found, nan=field.band, posinf=field.band, neginf=-field.band)
         return outside
 
-    vertices, faces = march(layers, cells, OFF_NODE * spacing)
+    vertices, faces = march(layers, cells, OFF_NODE * spacing, crossed)
     return surface_of((lower + spacing * vertices) * scale + np.array(centre), faces)
 
 
@@ -69,40 +75,81 @@ def grid(field: Field, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndar
     step = max(1, CHUNK // int(np.prod(cells[1:] + 1)))
     for first in range(0, cells[0] + 1, step):
         last = min(first + step, cells[0] + 1)
-        found = node_values(field, lower, spacing, (first, last), *[(0, n + 1) for n in cells[1:]])
+        start = lower + spacing * np.array([first, 0, 0])
+        found = node_values(field, start, spacing, (last - first, *(cells[1:] + 1)))
         values[:, :, first:last] = found.transpose(2, 1, 0)
     return values, lower, lower + spacing * cells
 
 
-def node_values(field: Field, lower, spacing: float, *ranges) -> np.ndarray:
-    """Values at the nodes ``lower + spacing · (i, j, k)`` with i, j and k in ``ranges``: float32, (X, Y, Z)."""
+def crossed_blocks(field: Field, lower, spacing: float, cells) -> np.ndarray:
+    """
+    Which blocks of :data:`BLOCK` cells along each side the surface may pass through, bool (X, Y, Z): of a sparse field,
+    those with stored nodes around; of any other, all.
+    """
+    count = -(-np.asarray(cells) // BLOCK)
+    structure = getattr(field, "structure", None)
+    if structure is None:
+        return np.ones(count, dtype=bool)
+    # How many blocks of nodes there are below each place, so that those in a box are counted by differences
+    places = structure.block_positions() // NODES
+    shape = np.array(structure.shape) // NODES
+    total = np.zeros(shape + 1, dtype=np.int32)
+    total[tuple(places.T + 1)] = 1
+    for axis in range(3):
+        total = np.cumsum(total, axis=axis, dtype=np.int32)
+    ranges = []
+    for axis, n in enumerate(count):
+        first = lower[axis] + spacing * BLOCK * np.arange(n) - structure.lower[axis]
+        side = NODES * structure.spacing
+        low = np.floor((first - structure.spacing) / side).astype(int)
+        high = np.floor((first + BLOCK * spacing + structure.spacing) / side).astype(int) + 1
+        ranges.append((low.clip(0, shape[axis]), high.clip(0, shape[axis])))
+    (a, b), (c, d), (e, f) = ranges
+    inside = 0
+    for x, i in ((b, 1), (a, -1)):
+        for y, j in ((d, 1), (c, -1)):
+            for z, k in ((f, 1), (e, -1)):
+                inside = inside + i * j * k * total[np.ix_(x, y, z)]
+    return inside > 0
+
+
+def node_values(field: Field, lower, spacing: float, shape, where=None) -> np.ndarray:
+    """
+    Values at the nodes ``lower + spacing · (i, j, k)`` of a grid of the ``shape`` (X, Y, Z): float32 of that shape, or
+    at the nodes with the numbers ``where``, (N,).
+    """
     t = field.types
-    shape = [last - first for first, last in ranges]
-    count, found = math.prod(shape), []
+    count, found = math.prod(shape) if where is None else len(where), [np.zeros(0, np.float32)]
     with dr.suspend_grad():
         for start in range(0, count, CHUNK):
-            n = dr.arange(t.UInt32, start, min(start + CHUNK, count))
+            last = min(start + CHUNK, count)
+            n = dr.arange(t.UInt32, start, last) if where is None else t.UInt32(where[start:last].astype(np.uint32))
             k, n = n % shape[2], n // shape[2]
             index = (n // shape[1], n % shape[1], k)
-            p = [dr.fma(t.Float(i + r[0]), spacing, float(a)) for i, r, a in zip(index, ranges, lower, strict=True)]
+            p = [dr.fma(t.Float(i), spacing, float(a)) for i, a in zip(index, lower, strict=True)]
             found.append(field.value(t.Array3f(*p)).numpy())
-    return np.concatenate(found).reshape(shape)
+    return np.concatenate(found).reshape(shape if where is None else count)
 
 
-def march(layers, cells, smallest: float) -> tuple[np.ndarray, np.ndarray]:
+def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.ndarray]:
     """
     Marching cubes over ``cells`` (along x, y and z): vertices ``(V, 3)`` float64 in units of cells, faces ``(F, 3)``,
     counter-clockwise from outside. ``layers(first, last)`` gives the values at the nodes of x from ``first`` to
-    ``last``, ``(last − first + 1, Y, Z)``; they are kept ``smallest`` away from zero.
+    ``last``, ``(last − first + 1, Y, Z)``; they are kept ``smallest`` away from zero. Only the ``crossed``
+    blocks (X, Y, Z) are looked at, by default all.
     """
     from skimage.measure import marching_cubes
 
     vertices, faces, count = [], [], 0
     for x in range(0, cells[0], BLOCK):
+        if crossed is not None and not crossed[x // BLOCK].any():
+            continue
         values = layers(x, min(x + BLOCK, int(cells[0])))
         values = np.where(values < 0, np.minimum(values, -smallest), np.maximum(values, smallest)).astype(np.float32)
         for y in range(0, cells[1], BLOCK):
             for z in range(0, cells[2], BLOCK):
+                if crossed is not None and not crossed[x // BLOCK, y // BLOCK, z // BLOCK]:
+                    continue
                 block = values[:, y : y + BLOCK + 1, z : z + BLOCK + 1]
                 if min(block.shape) < 2 or (block.min() < 0) == (block.max() < 0):
                     continue

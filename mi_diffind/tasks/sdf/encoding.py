@@ -199,7 +199,7 @@ class Coding:
     def _borders(self) -> tuple[np.ndarray, np.ndarray]:
         """
         The sides of stored cells behind which there is none: their cell's nodes, turned so that the side is where the
-        first coordinate is 0 (m, 2, 2, 2), and the order of its axes and whether it was turned (m,), 0 to 5.
+        first coordinate is 0 (m, 2, 2, 2), and the axis that they are turned from (m,).
         """
         corners, positions = self.sampled.corners.reshape(-1, 2, 2, 2), self.sampled.positions
         cell = positions[corners[:, 0, 0, 0]].astype(np.int64)
@@ -216,7 +216,7 @@ class Coding:
                 alone = np.flatnonzero(order[place] != other)
                 turned = np.moveaxis(corners[alone], 1 + axis, 1)
                 found.append(turned[:, ::-1] if end else turned)
-                which.append(np.full(len(alone), 2 * axis + end))
+                which.append(np.full(len(alone), axis))
         return np.concatenate(found), np.concatenate(which)
 
     def _hold_borders(self) -> np.ndarray:
@@ -227,7 +227,7 @@ class Coding:
         lines = np.stack([1 - u, u])
         lowest = np.empty(len(cells))
         for part in np.array_split(np.arange(len(cells)), max(1, len(cells) // 2**14)):
-            axis, end = which[part] // 2, which[part] % 2
+            axis = which[part]
             face = cells[part][:, 0]  # (m, 2, 2)
             d, g = values[face, 0], values[face, 1:]
             others = np.array([[1, 2], [0, 2], [0, 1]])[axis]

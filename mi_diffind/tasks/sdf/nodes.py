@@ -136,15 +136,17 @@ class SparseNodes(Field):
 
     def _blend(self, p, active, derivatives: bool):
         """
-        The value in spacings, its gradient (if ``derivatives``), the smooth normal, whether all corners are stored, and
-        whether one is.
+        The value in spacings, its gradient (if ``derivatives``), the smooth normal, whether all corners are stored,
+        whether one is, and whether those that are not lie inside.
         """
         Float = self.types.Float
         cell, place = self._grid(p)
         corners = self._corners(cell, active)
-        complete = active
-        for stored, *_ in corners:
-            complete = complete & stored
+        # Where a corner is not stored, the signs of all are the same, and its own is known exactly: those of nodes may
+        # have been lost in training or by rounding
+        complete, inside = active, dr.mask_t(Float)(False)
+        for stored, *_, sign in corners:
+            complete, inside = complete & stored, inside | (sign & ~stored)
         value, weight_sum = Float(0), Float(0)
         slope, smooth = [Float(0)] * 3, [Float(0)] * 3
         for (a, b, c), (stored, number, record, at, _) in zip(CORNERS, corners, strict=True):
@@ -168,25 +170,15 @@ class SparseNodes(Field):
         whole = dr.select(complete, 1, dr.rcp(dr.select(some, weight_sum, 1)))
         value, smooth = value * whole, [s * whole for s in smooth]
         slope = [dr.select(complete, s, m) for s, m in zip(slope, smooth, strict=True)]
-        return value, slope, smooth, complete, some
+        return value, slope, smooth, complete, some, inside
 
     def blend(self, p):
         """
         For training: the value in spacings, its gradient, the smooth normal (three each), and whether this is a cell
         whose nodes are all stored.
         """
-        value, slope, smooth, complete, _ = self._blend(p, self.inside(p), True)
+        value, slope, smooth, complete, *_ = self._blend(p, self.inside(p), True)
         return value, slope, smooth, complete
-
-    def _outside(self, p, active):
-        """The sign, as ± 1, of cells whose corners are not all stored."""
-        cell, _ = self._grid(p)
-        number, has, inside, *_ = self._block(*cell, active)
-        stored, node, sign = self._in_block(self._record(number, has), *cell)
-        own = active & has & stored
-        d, _ = self._node(node, self._record(number, has), *cell, own)
-        inside = dr.select(has, dr.select(stored, dr.detach(d) < 0, sign), inside)
-        return dr.select(inside, -1.0, 1.0)
 
     def value(self, p, active=True):
         return self._told(p, active, False)[0]
@@ -200,8 +192,8 @@ class SparseNodes(Field):
 
     def _told(self, p, active, derivatives: bool):
         active = self.inside(p) & active
-        value, slope, smooth, complete, some = self._blend(p, active, derivatives)
-        sign = self._outside(p, active & ~complete)
+        value, slope, smooth, complete, some, inside = self._blend(p, active, derivatives)
+        sign = dr.select(inside, -1.0, 1.0)
         # The sign of a cell that no surface crosses is that of its corners, whatever their extension says
         short = dr.select(some, dr.minimum(dr.maximum(sign * value, 1e-3), BAND), BAND)
         value = dr.select(complete, dr.minimum(dr.maximum(value, -BAND), BAND), sign * short) * self.spacing
@@ -219,27 +211,21 @@ class SparseNodes(Field):
         cell, _ = self._grid(p)
         number, has, inside, region, free = self._block(*cell, inside_box)
         record = self._record(number, has)
-        stored, node, sign = self._in_block(record, *cell)
+        stored, _, sign = self._in_block(record, *cell)
         stored = stored & has
         # To the end of the region, of the block, of the cell
         shift = dr.select(region, dr.select(has, 0, 2), 4)
-        size = Float(1 << shift) * self.spacing
-        step = self.cell_exit(p, d, [i >> shift for i in cell], size)
+        step = self.cell_exit(p, d, [i >> shift for i in cell], Float(1 << shift) * self.spacing)
         step = dr.maximum(step, free * self.spacing)
         value = dr.select(dr.select(has, sign, inside), -1.0, 1.0) * self.spacing
 
-        def near(p, node, record, cell_x, cell_y, cell_z, step, stored):
-            told, *_, complete, _ = self._blend(p, stored, False)
-            own, _ = self._node(node, record, cell_x, cell_y, cell_z, stored)
-            told = dr.select(complete, told * self.spacing, dr.select(own < 0, -1.0, 1.0) * self.spacing)
+        def near(p, value, step, stored):
+            told, *_, complete, _, inside = self._blend(p, stored, False)
+            told = dr.select(complete, told * self.spacing, dr.select(inside, -1.0, 1.0) * self.spacing)
             return told, dr.select(complete, dr.abs(told) / self.slope, step)
 
-        told, nearer = dr.if_stmt(
-            (self.types.Array3f(p), node, self.types.Array4u(record) if hasattr(self.types, "Array4u") else record,
-             *cell, step, stored),
-            stored, near, lambda p, node, record, x, y, z, step, stored: (Float(value), Float(step)),
-        )  # fmt: skip
-        return dr.select(stored, told, value), dr.select(stored, nearer, step)
+        arguments = self.types.Array3f(p), value, step, stored
+        return dr.if_stmt(arguments, stored, near, lambda p, value, step, stored: (value, step))
 
     @property
     def nbytes(self) -> int:

@@ -1,0 +1,223 @@
+from __future__ import annotations  # Delayed parsing of type annotations
+
+import time
+from pathlib import Path
+from weakref import WeakValueDictionary
+
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind import compat
+from mi_diffind.tables import TableError
+from mi_diffind.tasks.sdf import TASK
+from mi_diffind.tasks.task import stamp
+
+from . import Counterpart, Plugin, reports_as, shown_as
+from .support import properties, tables
+from .support.sdf_meshes import to_mesh
+from .support.solids import Placement, Solid, native_grid
+
+#: Whose arrays cannot be optimised are shared by all shapes of a file.
+_shared: WeakValueDictionary = WeakValueDictionary()
+
+#: Mean difference between the field and a grid of it, near the surface, in cells of the field, that is close enough.
+CLOSE = 0.05
+
+#: The finest grid that ``trace="grid"`` takes by itself, along the longest side: 1.5 GB in Mitsuba.
+FINEST = 256
+
+
+def open_model(props: mi.Properties):
+    """The model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
+    if not path:
+        raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit sdf" is needed')
+    key = (path, stamp(Path(path)))
+    try:
+        if storage == "float32":
+            return TASK.open(mi.TensorXf, path, storage=storage)
+        model = _shared.get(key)
+        if model is None:
+            _shared[key] = model = TASK.open(mi.TensorXf, path)
+        return model
+    except (TableError, ValueError) as e:
+        raise RuntimeError(str(e)) from None
+
+
+class NeuralSDF(Solid):
+    r"""
+    .. _shape-neural_sdf:
+
+    Signed distance field (:monosp:`neural_sdf`)
+    --------------------------------------------
+
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - A signed distance field, as written by ``mi-diffind fit sdf``.
+       - --
+
+     * - to_world
+       - |transform|
+       - From the mesh's own place and size to the world: rotations, uniform scales and translations; reflections,
+         too. (Default: none)
+       - --
+
+     * - bsdf
+       - |bsdf|
+       - The material. (Default: diffuse)
+       - --
+
+     * - normals
+       - |string|
+       - Shading normals: ``smooth``, the stored normals blended; ``analytic``, the gradient of the field, which is what
+         the surface is. (Default: ``smooth``)
+       - --
+
+     * - trace
+       - |string|
+       - ``arrays``: rays are traced through the arrays themselves, by the integrator :monosp:`path_sdf`. ``grid``: the
+         distances are decoded to Mitsuba's :monosp:`sdfgrid` when the scene is loaded, which any integrator sees.
+         (Default: ``arrays``)
+       - --
+
+     * - resolution
+       - |int|
+       - Of ``grid``: cells along the longest side, 4 to 512. (Default: the coarsest grid that differs from the field by
+         less than 5% of its cells on average, at most 256)
+       - --
+
+     * - storage
+       - |string|
+       - ``uint8``, as in the file; ``float32``, which can be optimised. (Default: ``uint8``)
+       - --
+
+     * - tables.nodes, tables.primary, tables.cascaded
+       - |tensor|
+       - With ``storage`` ``float32``: of the sparse layout, distance (in spacings) and gradient of each node,
+         ``(n, 4)``; of the others their arrays.
+       - |exposed|, |differentiable|
+
+    A mesh stored as a signed distance field in a few hundred kilobytes (Datta et al., *Efficient Graphics
+    Representation with Differentiable Indirection*, SIGGRAPH Asia 2023, supplement 1.6; the default layout is a sparse
+    one of ours). What it holds is a solid: a ray meets its surface from either side, and dielectrics know inside from
+    outside. The exact counterpart is the mesh that the file was made from.
+
+    **With** ``arrays``, nothing is decoded. Mitsuba 3.9 knows of no shapes written in Python but meshes, so this one is
+    a mesh without area: other integrators than :monosp:`path_sdf` do not see it, and the commands of ``mi-diffind``
+    refuse to render a scene with one of these. Several shapes of one file share its arrays. There are no texture
+    coordinates (they are 0), no emitters and no media, and it cannot be in a :monosp:`shapegroup`.
+
+    **With** ``grid``, a rotation makes of it an instance. 256³ cells take 1.5 GB and some seconds; the derivatives and
+    parameters are those of :monosp:`sdfgrid`.
+
+    .. tabs::
+        .. code-tab:: xml
+            :name: neural_sdf
+
+            <shape type="neural_sdf">
+                <string name="filename" value="suzanne.npz"/>
+                <bsdf type="dielectric"/>
+            </shape>
+
+        .. code-tab:: python
+
+            'type': 'neural_sdf',
+            'filename': 'suzanne.npz',
+            'bsdf': {'type': 'dielectric'}
+    """
+
+    def __init__(self, props: mi.Properties):
+        self.model = open_model(props)
+        smooth = properties.one_of(props, "normals", ("smooth", "analytic")) == "smooth"
+        properties.one_of(props, "trace", ("arrays", "grid"))
+        if "resolution" in props:
+            raise RuntimeError('parameter "resolution": has no effect with trace="arrays"')
+        to_world = props.get("to_world", mi.ScalarTransform4f())
+        super().__init__(props, self.model.field, Placement.of(to_world, self.model.scale, self.model.centre), smooth)
+
+    def entries(self) -> dict:
+        """Names of what can be optimised → tensors."""
+        field = self.model.field
+        if getattr(field, "nodes", None) is not None:
+            return {"nodes": field.nodes}
+        return {name: array.data for name, array in tables.exposed(self.model.arrays).items()}
+
+    def optimised(self) -> bool:
+        return any(compat.has_gradient(values) for values in self.entries().values())
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        super().traverse(cb)
+        if self.ready:
+            for name, values in self.entries().items():
+                cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys=()) -> None:
+        if not self.ready:
+            super().parameters_changed(keys)
+            return
+        nodes = getattr(self.model.field, "nodes", None)
+        if nodes is not None and tuple(nodes.shape) != (self.model.field.structure.nodes, 4):
+            raise RuntimeError(
+                f'parameter "tables.nodes": has the shape {tuple(nodes.shape)}, expected '
+                f"{(self.model.field.structure.nodes, 4)}"
+            )
+        tables.check_shapes(tables.exposed(self.model.arrays))
+
+    def report(self) -> dict:
+        return {
+            "preset": self.model.table.preset,
+            "storage": self.model.storage,
+            "table_bytes": self.model.nbytes,
+            "trace": "arrays",
+            "index_bytes": self.index_bytes,
+        }
+
+    def to_string(self) -> str:
+        return f'NeuralSDF[\n  filename = "{self.model.table.path}",\n  trace = arrays,\n  scale = {self.placement.size:g}\n]'
+
+
+def factory(props: mi.Properties):
+    """The shape, or Mitsuba's own if it is to trace a grid."""
+    if properties.one_of(props, "trace", ("arrays", "grid")) == "arrays":
+        return NeuralSDF(props)
+    if properties.one_of(props, "storage", ("uint8", "float32")) == "float32":
+        raise RuntimeError('parameter "storage": found "float32", trace="grid" has no arrays that can be optimised')
+    from mi_diffind.tasks.sdf import decode
+
+    start, model = time.perf_counter(), open_model(props)
+    resolution = props.get("resolution", 0)
+    if not isinstance(resolution, int) or ("resolution" in props and not 4 <= resolution <= 512):
+        raise RuntimeError(f'parameter "resolution": found {resolution}, allowed are whole numbers from 4 to 512')
+    to_world = props.get("to_world", mi.ScalarTransform4f())
+    Placement.of(to_world, model.scale, model.centre)  # refuses what is none
+    resolution = resolution or decode.resolution_for(model.field, CLOSE * model.field.spacing, finest=FINEST)
+    values, lower, upper = decode.grid(model.field, resolution)
+    normals = properties.one_of(props, "normals", ("smooth", "analytic"))
+    to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)
+    to_world = mi.ScalarTransform4f(np.array(to_world.matrix))
+    made, kept = native_grid(props, values, lower, upper, to_world @ to_unit, normals)
+    seconds = time.perf_counter() - start
+    said = {
+        "preset": model.table.preset,
+        "storage": model.storage,
+        "table_bytes": model.nbytes,
+        "trace": "grid",
+        "resolution": list(values.shape[::-1]),
+        "grid_bytes": 4 * max(values.shape) ** 3,
+        "seconds": round(seconds, 2),
+    }
+    if kept is not made:
+        shown_as(made, kept)
+    reports_as(kept, lambda: said)
+    return made
+
+
+PLUGIN = Plugin(
+    "neural_sdf",
+    "shape",
+    factory,
+    task=TASK.name,
+    exact=Counterpart("ply", ("normals", "trace", "resolution", "storage"), convert=to_mesh),
+)

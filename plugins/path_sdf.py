@@ -1,0 +1,191 @@
+from __future__ import annotations  # Delayed parsing of type annotations
+
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+
+from . import Plugin, path_footprint
+from .path_footprint import power_heuristic, relative
+from .support import solids as sdf
+
+MANUAL = r"""
+.. _integrator-path_sdf:
+"""
+
+
+def solid_angle(origin, place, normal):
+    """The solid angle of a unit of area at ``place``, as ``origin`` sees it."""
+    to = place - origin
+    squared = dr.squared_norm(to)
+    return dr.abs(dr.dot(to, normal)) * dr.rcp(squared * dr.sqrt(squared))
+
+
+@cache
+def integrator() -> type:
+    """The class, in the variant that is set."""
+
+    class PathSDF(path_footprint.integrator()):
+        __doc__ = MANUAL
+
+        def to_string(self) -> str:
+            return super().to_string().replace("PathFootprint", "PathSDF", 1)
+
+        def sample(self, mode, scene, *args, **kwargs):
+            """See ``ADIntegrator.sample``. A scene without solids is what ``path_footprint`` makes of it."""
+            solids = sdf.solids_of(scene)
+            if not solids:
+                return super().sample(mode, scene, *args, **kwargs)
+            return self.sample_solids(mode, scene, solids, *args, **kwargs)
+
+        def meet(self, scene, solids, ray, coherent, active):
+            """The nearest of what rays meet: an ordinary shape (else not valid), and a solid."""
+            pi = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+            return self.nearer(solids, ray, pi, active)
+
+        def nearer(self, solids, ray, pi, active):
+            met = sdf.meet(solids, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active)
+            pi.t = dr.select(met.which > 0, dr.inf, pi.t)
+            return pi, met
+
+        def interaction(self, solids, ray, pi, met, active):
+            """What there is at that place; ordinary shapes are not differentiated."""
+            with dr.suspend_grad():
+                si = pi.compute_surface_interaction(ray, ray_flags=mi.RayFlags.All, active=active)
+            return sdf.interaction(solids, met, ray, si, active)
+
+        @dr.syntax
+        def sample_solids(self, mode, scene, solids, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
+            """As ``sample`` of ``path_footprint``, of a scene with solids."""
+            primal = mode == dr.ADMode.Primal
+            moving = not primal and any(solid.optimised() for solid in solids)
+            environment = scene.environment() is not None and not self.hide_emitters
+            context = mi.BSDFContext()
+
+            ray = mi.Ray3f(dr.detach(ray))
+            active = mi.Bool(active)
+            valid = mi.Bool(environment)
+            depth = mi.UInt32(0)
+            L = mi.Spectrum(0 if primal else state_in)
+            δL = mi.Spectrum(0 if δL is None else δL)
+            throughput = mi.Spectrum(1)
+            eta = mi.Float(1)
+            before = dr.zeros(mi.SurfaceInteraction3f)
+            density = mi.Float(1)
+            delta = mi.Bool(True)
+
+            pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+            if dr.hint(self.hide_emitters, mode="scalar"):
+                hidden = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
+                at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
+                after = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
+                after.t += at.t
+                pi[hidden] = after
+            pi, met = self.nearer(solids, ray, pi, active)
+            came, left = mi.Ray3f(ray), dr.zeros(sdf.Met)  # the ray to the vertex before, and what that was
+
+            while dr.hint(active, max_iterations=self.max_depth, label=f"path_sdf ({mode.name})"):
+                with dr.resume_grad(when=moving):
+                    si = self.interaction(solids, ray, pi, met, active)
+                    if dr.hint(moving, mode="scalar"):
+                        # Seen from the vertex before, which moves, too
+                        aside = sdf.shift(solids, left, came.d, active & si.is_valid())
+                        turn = aside - ray.d * dr.dot(aside, ray.d)
+                        si.wi += dr.detach(si.sh_frame).to_local(turn) * dr.rcp(dr.select(si.is_valid(), si.t, 1))
+                fixed = dr.detach(si)
+                bsdf = si.bsdf(ray)
+
+                # Emission, weighted against having sampled the emitter at the vertex before
+                shown = active
+                if dr.hint(self.hide_emitters, mode="scalar"):
+                    shown &= (depth > 0) | si.is_valid()
+                ds = mi.DirectionSample3f(scene, fixed, before)
+                weight = power_heuristic(density, scene.pdf_emitter_direction(before, ds, shown & ~delta))
+                with dr.resume_grad(when=not primal):
+                    emitted = throughput * weight * ds.emitter.eval(fixed, shown)
+
+                # Light from an emitter
+                going = active & si.is_valid() & (depth + 1 < self.max_depth)
+                lit = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                ds, emitter_weight = scene.sample_emitter_direction(fixed, sampler.next_2d(), True, lit)
+                lit &= ds.pdf != 0
+                start = sdf.spawn(solids, met, fixed, ds.d)
+                to = ds.p - start
+                distance = dr.norm(to)
+                lit &= ~sdf.occluded(solids, start, to / distance, distance * (1 - mi.math.ShadowEpsilon), lit)
+                with dr.resume_grad(when=not primal):
+                    factor = mi.Float(1)
+                    if dr.hint(moving, mode="scalar"):
+                        # Points of emitters stay where they are, directions to infinite ones do
+                        flags = ds.emitter.flags()
+                        finite = ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
+                        away = dr.norm(ds.p - si.p)
+                        toward = dr.select(finite, (ds.p - si.p) / away, ds.d)
+                        ds.d = dr.replace_grad(ds.d, toward)
+                        ds.dist = dr.replace_grad(ds.dist, dr.select(finite, away, ds.dist))
+                        if mi.has_flag(flags, mi.EmitterFlags.Surface):
+                            factor = relative(solid_angle(si.p, ds.p, ds.n))
+                    if dr.hint(not primal, mode="scalar"):
+                        value = scene.eval_emitter_direction(si, ds, lit) * dr.select(lit, dr.rcp(ds.pdf), 0)
+                        emitter_weight = dr.replace_grad(emitter_weight, value) * factor
+                    bsdf_value, bsdf_pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), lit)
+                    weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
+                    direct = dr.select(lit, throughput * weight * bsdf_value * emitter_weight, 0)
+
+                # Where to go on
+                with dr.resume_grad(when=not primal):
+                    bs, bsdf_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), going)
+                bs = dr.detach(bs)
+                delta_next = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+                L = L + emitted + direct if primal else L - dr.detach(emitted + direct)
+                out = fixed.to_world(bs.wo)
+                following = fixed.spawn_ray(out)
+                following.o = sdf.spawn(solids, met, fixed, out)
+                valid |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+
+                # Whether to go on: radiance changes by η² at a boundary, which is undone for this
+                passed = throughput * dr.detach(bsdf_weight)
+                eta *= bs.eta
+                largest = dr.max(passed)
+                survival = dr.minimum(largest * dr.square(eta), 0.95)
+                roulette = depth >= self.rr_depth
+                survives = sampler.next_1d() < survival
+                passed[roulette] *= dr.rcp(survival)
+                further = going & (largest != 0) & (~roulette | survives)
+                pi_next, met_next = self.meet(scene, solids, following, False, further)
+
+                if dr.hint(not primal, mode="scalar"):
+                    factor, wo = mi.Float(1), bs.wo
+                    if dr.hint(moving, mode="scalar"):
+                        # The next vertex stays where it is, or the direction if there is none
+                        target = self.interaction(solids, following, pi_next, met_next, further)
+                        bound = further & target.is_valid()
+                        with dr.resume_grad():
+                            toward = dr.select(bound, dr.normalize(target.p - si.p), out)
+                            wo = dr.replace_grad(bs.wo, si.to_local(toward))
+                            factor = dr.select(bound, relative(solid_angle(si.p, target.p, target.n)), 1)
+                    with dr.resume_grad():
+                        # A smooth mirror cannot be evaluated: there, the weight itself is differentiated
+                        smooth = bsdf.eval(context, si, wo, going & ~delta_next)
+                        reflected = L * dr.select(delta_next, relative(bsdf_weight), relative(smooth) * factor)
+                        contribution = emitted + direct + dr.select(going, reflected, 0)
+                        if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
+                            dr.backward_from(δL * contribution)
+                        else:
+                            δL += dr.forward_to(contribution)
+
+                before = fixed
+                throughput = passed
+                density = bs.pdf
+                delta = delta_next
+                depth[going] += 1
+                came, left = ray, met
+                ray, pi, met, active = following, pi_next, met_next, further
+
+            shown = dr.select(valid, L, 0) if primal else δL
+            return shown, valid, [], L
+
+    return PathSDF
+
+
+PLUGIN = Plugin("path_sdf", "integrator", lambda props: integrator()(props))

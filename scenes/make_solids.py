@@ -1,0 +1,62 @@
+"""
+Write solids.xml: meshes and the signed distance fields that were made from them, ``mi-diffind fit sdf``, see README.md.
+
+``-D trace=grid -D integrator=path`` shows the same through Mitsuba's own grids.
+"""
+
+from pathlib import Path
+
+import mitsuba as mi
+from scene_xml import Whole, element, environment, head, lying, plugin, softbox, transform, write
+
+ABOUT = """Signed distance fields beside and in the place of meshes: Suzanne as a mesh (left) and as a field (right, the same
+clay), a knot of gold that casts a shadow on the latter, one behind a pane of glass, one of glass. Written by
+make_solids.py: change that file.
+
+"-D trace=grid -D integrator=path" decodes the fields to grids that any integrator traces."""
+
+FOLDER = Path(__file__).resolve().parent
+
+
+def solid(file: str, *children, **steps):
+    """A signed distance field."""
+    return plugin("shape", "neural_sdf", transform(**steps), *children, filename=f"assets/{file}.npz", trace="$trace")
+
+
+def main() -> None:
+    mi.set_variant("scalar_rgb")
+    camera = {"origin": (0.3, 3.1, 8.2), "target": (0.05, 0.85, 0), "up": (0, 1, 0)}
+    content = head(960, 540, {"trace": "arrays", "integrator": "path_sdf"}, fov=36.0, camera=camera)
+    integrator = next(item for item in content if item.tag == "integrator")
+    integrator.set("type", "$integrator")
+    clay = plugin("bsdf", "principled", id="clay", base_color=(0.62, 0.31, 0.2), roughness=0.6, specular=0.4)
+    gold = plugin("bsdf", "roughconductor", id="gold", material="Au", alpha=0.12)
+    glass = plugin("bsdf", "dielectric", id="glass", int_ior=1.5)
+    blue = plugin("bsdf", "principled", id="blue", base_color=(0.08, 0.2, 0.5), roughness=0.25)
+    floor = plugin("bsdf", "diffuse", reflectance=(0.55, 0.53, 0.5))
+    pane = plugin("shape", "cube", transform(
+        scale={"x": 0.75, "y": 0.8, "z": 0.03}, rotate={"y": 1, "angle": -12}, translate={"x": 2.75, "y": 0.8, "z": 1.9},
+    ), element("ref", id="glass"))  # fmt: skip
+    ref = lambda name: element("ref", id=name)
+    place = lambda x, y, z: {"x": x, "y": y, "z": z}
+    content += [
+        "A room by day, and a softbox from the right",
+        environment("interior.exr", 0.35, 60.0),
+        softbox((1.2, 1.2), {"origin": (5.5, 6.0, 4.0), "target": (0.6, 0.6, 0), "up": (0, 1, 0)}, (16.0, 14.5, 12.5)),
+        "What things are made of", clay, gold, glass, blue,
+        "The floor", lying(12, 12, floor),
+        "Suzanne, a mesh and a field",
+        plugin("shape", "ply", transform(rotate={"y": 1, "angle": 18}, translate=place(-1.75, 0, 0)), ref("clay"),
+               filename="assets/suzanne.ply"),
+        solid("suzanne", ref("clay"), rotate={"y": 1, "angle": -8}, translate=place(0.75, 0, -0.2)),
+        "A knot that casts a shadow on the field, one behind a pane, one of glass",
+        solid("knot", ref("gold"), scale={"value": 0.5}, rotate={"x": 1, "angle": 35}, translate=place(1.75, 2.0, 1.3)),
+        solid("knot", ref("blue"), scale={"value": 0.6}, rotate={"y": 1, "angle": 60}, translate=place(2.9, 0.6, 0.6)),
+        pane,
+        solid("knot", ref("glass"), scale={"value": 0.55}, rotate={"x": 1, "angle": 90}, translate=place(-0.55, 0.5, 1.9)),
+    ]  # fmt: skip
+    write(FOLDER / "solids.xml", ABOUT, content)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,242 @@
+"""The integrator that traces signed distance fields, against Mitsuba's own shapes and against differences."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from sdf_fields import Ball, register
+
+from mi_diffind.tasks.sdf.field import DenseField
+
+BSDFS = {
+    "diffuse": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}},
+    "rough": {"type": "roughconductor", "alpha": 0.2},
+    "glass": {"type": "dielectric"},
+    "mask": {"type": "mask", "opacity": 0.4, "nested": {"type": "twosided", "bsdf": {"type": "diffuse"}}},
+}
+
+
+def scene(mi, shapes: dict, size=(32, 24), look=((0, -5, 2.5), (0, 0, 0)), **more):
+    """Shapes on a floor, with a lamp, a point light and a sky."""
+    at = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}}
+    lamp = {"type": "area", "radiance": {"type": "rgb", "value": 8.0}}
+    return mi.load_dict({
+        "type": "scene",
+        "floor": {"type": "rectangle", "to_world": at().translate([0, 0, -1]).scale(3)},
+        "lamp": {"type": "rectangle", "to_world": at().translate([0, 1, 4]).scale([1, 1, -1]), "emitter": lamp},
+        "point": {"type": "point", "position": [-3, -2, 1], "intensity": 4.0},
+        "sky": {"type": "constant", "radiance": 0.3},
+        "sensor": {
+            "type": "perspective",
+            "fov": 45,
+            "to_world": at().look_at(*look, [0, 0, 1]),
+            "film": film,
+            "sampler": {"type": "independent"},
+        },
+        **shapes,
+        **more,
+    })  # fmt: skip
+
+
+def render(mi, made, integrator="path_sdf", spp=16, seed=0, **options):
+    found = mi.load_dict({"type": integrator, "max_depth": 6, **options})
+    return np.array(mi.render(made, spp=spp, seed=seed, integrator=found))
+
+
+@pytest.fixture
+def fields(mi_rgb):
+    """The fields that a ``test_solid`` may name."""
+    import mi_diffind.compat
+
+    types = mi_diffind.compat.module_of(mi_rgb.Float)
+    found = {"ball": Ball(types), "aside": Ball(types, 0.3, (0.15, 0.1, -0.05))}
+    register(mi_rgb, found)
+    return found
+
+
+def solid(mi, name, scale=2.5, **more):
+    return {"type": "test_solid", "field": name, "to_world": mi.ScalarTransform4f().scale(scale), **more}
+
+
+def same_light(one, other, passes=16):
+    """``one(seed)`` and ``other(seed)`` are images with the same mean, as far as their noise lets one see."""
+    a, b = (np.stack([make(seed) for seed in range(k, k + passes)]) for k, make in ((0, one), (100, other)))
+    assert np.isfinite(a).all() and np.isfinite(b).all()
+    a, b = (np.minimum(v, 20).mean(-1) for v in (a, b))
+    a, b = (v.reshape(passes, v.shape[1] // 4, 4, v.shape[2] // 4, 4).mean((2, 4)) for v in (a, b))
+    error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / passes)
+    difference = a.mean(0) - b.mean(0)
+    seen = error > 1e-6
+    assert np.abs(difference[~seen]).max(initial=0) < 1e-5
+    z = difference[seen] / error[seen]
+    assert np.abs(z).max() < 5.5 and abs(z.mean()) < 5 / np.sqrt(z.size) and z.std() < 1.5, (z.mean(), z.std())
+    assert abs(difference.mean()) < 4 * np.sqrt((error**2).sum()) / error.size + 1e-5
+
+
+@pytest.mark.parametrize("integrator", ["path_footprint", "prb"])
+def test_scenes_without_solids(mi_rgb, integrator):
+    ball = {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}}
+    made = scene(mi_rgb, ball)
+    found, expected = (render(mi_rgb, made, name) for name in ("path_sdf", integrator))
+    assert np.allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*BSDFS])
+def test_balls_are_spheres(mi_rgb, fields, name):
+    """Light, shadows, reflections and refractions of a solid are those of Mitsuba's sphere."""
+    mi, bsdf = mi_rgb, BSDFS[name]
+    other = {"other": {"type": "sphere", "center": [1.6, 1.0, -0.4], "radius": 0.6, "bsdf": BSDFS["diffuse"]}}
+    found = scene(mi, {"ball": solid(mi, "ball", bsdf=bsdf), **other})
+    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": bsdf}, **other})
+    same_light(lambda seed: render(mi, found, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+
+
+def test_several_solids_turned_scaled_and_overlapping(mi_rgb, fields):
+    """Three solids of two fields, one of them a reflection, beside a mesh that one of them cuts."""
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    turns = {
+        "a": at().translate([-0.8, 0.2, 0.1]).rotate([0.6, 0, 0.8], 70).scale(2.0),
+        "b": at().translate([0.1, -0.3, 0]).rotate([0, 1, 0], 200).scale(2.4),
+        "c": at().translate([1.1, 0.4, -0.2]) @ at().scale([-1.6, 1.6, 1.6]),
+    }
+    bsdfs = {"a": BSDFS["diffuse"], "b": BSDFS["rough"], "c": BSDFS["glass"]}
+    block = {"block": {"type": "cube", "to_world": at().translate([0.2, 1.2, -0.6]).scale(0.5)}}
+    solids, spheres = {}, {}
+    for name, turn in turns.items():
+        solids[name] = {"type": "test_solid", "field": "aside", "to_world": turn, "bsdf": bsdfs[name]}
+        centre = np.array(turn.matrix)[:3] @ [0.15, 0.1, -0.05, 1]
+        radius = 0.3 * np.cbrt(abs(np.linalg.det(np.array(turn.matrix)[:3, :3])))
+        spheres[name] = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": bsdfs[name]}
+    found, expected = scene(mi, {**solids, **block}), scene(mi, {**spheres, **block})
+    same_light(lambda seed: render(mi, found, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+
+
+@pytest.mark.parametrize("place", ["within glass", "behind glass", "in the box"])
+def test_where_the_camera_is(mi_rgb, fields, place):
+    mi = mi_rgb
+    shape = {"within glass": "glass", "behind glass": "glass", "in the box": "diffuse"}[place]
+    look = {
+        "within glass": ((0.1, -0.5, 0.2), (0.5, 0.5, -0.2)),
+        "behind glass": ((0, -4, 0.2), (0, 0, 0)),
+        "in the box": ((0.95, -0.95, 0.95), (0, 0.2, 0)),
+    }[place]
+    pane = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, -2, 0]).scale([1.5, 0.1, 1.5])}
+    panes = {"pane": {**pane, "bsdf": BSDFS["glass"]}} if place == "behind glass" else {}
+    bsdf = BSDFS["diffuse" if place == "behind glass" else shape]
+    found = scene(mi, {"ball": solid(mi, "ball", bsdf=bsdf), **panes}, look=look)
+    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": bsdf}, **panes}, look=look)
+    same_light(lambda seed: render(mi, found, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+
+
+@pytest.mark.parametrize("options", [{"max_depth": 1}, {"max_depth": 2, "hide_emitters": True}, {"rr_depth": 1}])
+def test_depths_and_hidden_emitters(mi_rgb, fields, options):
+    mi, look = mi_rgb, ((0, -5, 8.0), (0, 0, 1))
+    found = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, look=look)
+    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}}, look=look)
+    same_light(
+        lambda seed: render(mi, found, seed=seed, **options),
+        lambda seed: render(mi, expected, "path", seed=seed, **options),
+    )
+
+
+def test_solids_are_not_hit_by_other_rays(mi_rgb, fields):
+    """The shape that stands for a solid tells its extent, and is nowhere."""
+    mi = mi_rgb
+    made = mi.load_dict({"type": "scene", "ball": solid(mi, "ball")})
+    box = made.bbox()
+    assert np.allclose([box.min, box.max], [[-1.25] * 3, [1.25] * 3], atol=1e-6)
+    corners = np.stack(np.meshgrid(*[[-1.25, 1.25]] * 3), -1).reshape(-1, 3)
+    towards = np.repeat(corners, 8, 0)
+    d = towards - np.tile(corners * 3 + 0.1, (8, 1))
+    ray = mi.Ray3f(mi.Point3f((towards - d).T), mi.Vector3f(d.T))
+    assert not dr.any(made.ray_test(ray)) and not dr.any(made.ray_intersect(ray).is_valid())
+
+
+def test_solids_in_groups_are_refused(mi_rgb, fields):
+    mi = mi_rgb
+    group = {"type": "shapegroup", "ball": solid(mi, "ball")}
+    made = scene(mi, {"group": group, "one": {"type": "instance", "group": {"type": "ref", "id": "group"}}})
+    with pytest.raises(RuntimeError) as raised:
+        render(mi, made)
+    from mi_diffind import compat
+
+    assert "is in a shapegroup" in compat.one_sentence(raised.value)
+
+
+@pytest.mark.parametrize(
+    "more, message",
+    [
+        ({"emitter": {"type": "area"}}, "emit no light"),
+        ({"interior": {"type": "homogeneous"}}, "hold none"),
+        ({"to_world": [1.0, 1.0, 2.0]}, 'parameter "to_world": found'),
+    ],
+)
+def test_what_solids_cannot_be(mi_rgb, fields, more, message):
+    mi = mi_rgb
+    if "to_world" in more:
+        more = {"to_world": mi.ScalarTransform4f().scale(more["to_world"])}
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "test_solid", "field": "ball", **more})
+
+
+# -- derivatives -------------------------------------------------------------------------------------------------------
+
+
+def interior(mi):
+    """A sensor that sees the middle of the ball only."""
+    film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
+    at = mi.ScalarTransform4f().look_at((0, -1.9, 1.1), (0, 0, 0.25), [0, 0, 1])
+    return {"sensor": {"type": "perspective", "fov": 20, "to_world": at, "film": film}}
+
+
+def both_modes(mi, made, ball, depth, spp=64, seed=3):
+    """The image's derivative with respect to the radius, and its sum as it comes backward."""
+    integrator = mi.load_dict({"type": "path_sdf", "max_depth": depth})
+    ball.r = r = mi.Float(0.4)
+    dr.enable_grad(r)
+    dr.set_grad(r, 1.0)
+    forward = np.array(integrator.render_forward(made, None, spp=spp, seed=seed))
+    ball.r = r = mi.Float(0.4)
+    dr.enable_grad(r)
+    integrator.render_backward(made, None, dr.ones(mi.TensorXf, forward.shape), spp=spp, seed=seed)
+    backward = np.array(dr.grad(r))
+    ball.r = mi.Float(0.4)
+    assert backward == pytest.approx(forward.sum(), rel=1e-3)
+    return forward, backward
+
+
+@pytest.mark.parametrize("name, depth", [("diffuse", 2), ("rough", 2), ("rough", 5)])
+def test_derivatives_are_those_of_prb(mi_rgb, fields, name, depth):
+    """The same random numbers lead to the same derivatives as for Mitsuba's own sphere, at all vertices of a path."""
+    mi = mi_rgb
+    other = {"other": {"type": "sphere", "center": [0.6, -0.9, 1.6], "radius": 0.5, "bsdf": BSDFS["rough"]}}
+    made = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS[name]), **other}, **interior(mi))
+    found, _ = both_modes(mi, made, fields["ball"], depth)
+    made = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS[name]}, **other}, **interior(mi))
+    params = mi.traverse(made)
+    r = mi.Float(0.4)
+    dr.enable_grad(r)
+    params["ball.to_world"] = mi.AffineTransform4f().scale(2.5 * r)
+    params.update()
+    dr.forward(r, dr.ADFlag.ClearEdges)
+    expected = np.array(mi.load_dict({"type": "prb", "max_depth": depth}).render_forward(made, params, spp=64, seed=3))
+    # Where paths part, by a rounding error or since frames differ, derivatives are other ones
+    error = np.abs(found - expected)
+    assert np.median(error) < 0.02 * np.median(np.abs(expected))
+    assert found.mean() == pytest.approx(expected.mean(), rel=0.01 if depth == 2 else 0.15)
+
+
+def test_derivatives_against_differences(mi_rgb, fields):
+    """Of direct light without noise: of a point light, where the camera sees no silhouette."""
+    mi, ball = mi_rgb, fields["ball"]
+    point = {"type": "point", "position": [-3, -4, 4], "intensity": 20.0}
+    made = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, **interior(mi), point=point, lamp={"type": "sphere", "center": [0, 0, 90]},
+                 sky={"type": "sphere", "center": [0, 0, 99]})  # fmt: skip
+    integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
+    images = []
+    for r in (0.399, 0.401):
+        ball.r = mi.Float(r)
+        images.append(np.array(mi.render(made, spp=64, seed=3, integrator=integrator)))
+    differences = (images[1] - images[0]) / 2e-3
+    forward, backward = both_modes(mi, made, ball, 2)
+    assert np.abs(forward - differences).mean() < 2e-3 * np.abs(differences).mean()

@@ -1,0 +1,163 @@
+"""Where rays meet a signed distance field, against formulas and a slow march."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from sdf_fields import Ball, Slab, Steps
+
+from mi_diffind.tasks.sdf import tracing
+from mi_diffind.tasks.sdf.field import DenseField
+
+COUNT = 4096
+
+
+@pytest.fixture
+def types(mi_rgb):
+    import mi_diffind.compat
+
+    return mi_diffind.compat.module_of(mi_rgb.Float)
+
+
+def unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def trace(field, o, d, maxt=np.inf):
+    """Distances, hits, places and whether the ray came from within, as NumPy arrays."""
+    types = field.types
+    o, d = (types.Array3f(np.array(v, np.float32).T) for v in np.broadcast_arrays(o, d))
+    hit = tracing.intersect(field, o, d, types.Float(maxt))
+    t, found = tracing.trace(field, o, d, types.Float(maxt))
+    assert (np.array(found) == np.array(hit.found)).all()
+    assert (np.array(tracing.occluded(field, o, d, types.Float(maxt))) == np.array(found)).all()
+    return np.array(t), np.array(found), np.array(hit.p).T, np.array(hit.leaving)
+
+
+def sphere(o, d, r):
+    """Both distances to a sphere around the origin, NaN for a miss."""
+    o, d = np.broadcast_arrays(np.asarray(o, np.float64), np.asarray(d, np.float64))
+    b, c = (o * d).sum(-1), (o * o).sum(-1) - r * r
+    with np.errstate(invalid="ignore"):
+        root = np.sqrt(b * b - c)
+    return -b - root, -b + root
+
+
+@pytest.mark.parametrize("start", ["far", "near", "within"])
+def test_spheres(types, rng, start):
+    """From outside of the box, from within it and from within the solid, whichever way the ray goes."""
+    d = unit(rng.normal(size=(COUNT, 3)))
+    at = unit(rng.normal(size=(COUNT, 3)))
+    o = {"far": 0.3 * at - 2 * d, "near": 0.45 * at, "within": 0.35 * at * rng.random((COUNT, 1))}[start]
+    near, far = sphere(o, d, 0.4)
+    t, found, p, leaving = trace(Ball(types), o, d)
+    expected = near if start != "within" else far
+    hits = expected > 0
+    clear = np.abs(np.linalg.norm(np.cross(o, d), axis=1) - 0.4) > 1e-5
+    assert (found == hits)[clear].all() and 0.1 < hits.mean()
+    both = found & hits & clear
+    cosine = np.abs(((o + expected[:, None] * d) * d).sum(-1) / 0.4)[both]
+    assert (np.abs(t[both] - expected[both]) * cosine < 2e-5).all()
+    assert np.abs(np.linalg.norm(p[both], axis=1) - 0.4).max() < 1e-5
+    assert (leaving[both] == (start == "within")).all() and np.isinf(t[~found]).all()
+
+
+def test_axis_aligned_rays(types):
+    """Components that are zero, of either sign, also where the ray lies in a side of the box or starts on it."""
+    ball = Ball(types)
+    o, d, expected = [], [], []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            for zero in (0.0, -0.0):
+                for offset, t in ((0.0, 0.1), (0.3, 0.5 - np.sqrt(0.16 - 0.09)), (0.45, np.inf), (0.5, np.inf)):
+                    for start in (0.5, 3.0):
+                        direction, origin = np.full(3, zero), np.zeros(3)
+                        direction[axis], origin[axis], origin[axis - 1] = sign, -sign * start, offset
+                        o.append(origin), d.append(direction), expected.append(t + start - 0.5)
+    t, found, _, _ = trace(ball, np.array(o), np.array(d))
+    expected = np.array(expected)
+    assert (found == np.isfinite(expected)).all()
+    assert np.abs(t[found] - expected[found]).max() < 2e-5
+
+
+def test_from_a_thousand_times_its_size(types, rng):
+    """Float32 leaves a hit within 1e-3 there; the place itself is on the surface."""
+    d = unit(rng.normal(size=(COUNT, 3)))
+    side = unit(np.cross(d, rng.normal(size=(COUNT, 3)))) * rng.random((COUNT, 1)) * 0.6
+    o = side - 1000 * d
+    t, found, p, _ = trace(Ball(types), o, d)
+    distance = np.linalg.norm(side, axis=1)
+    assert found[distance < 0.398].all() and not found[distance > 0.402].any()
+    assert np.abs(np.linalg.norm(p[found], axis=1) - 0.4).max() < 1e-5
+    direct = found & (distance < 0.3)
+    assert np.abs(t[direct] - sphere(o, d, 0.4)[0][direct]).max() < 1e-3
+
+
+def test_length_of_rays(types):
+    """A ray ends where it is said to end: before the surface it finds nothing."""
+    o, d = np.array([[0, 0, -2.0]] * 4), np.array([[0, 0, 1.0]] * 4)
+    _, found, _, _ = trace(Ball(types), o, d, np.array([1.0, 1.599, 1.601, 9], np.float32))
+    assert found.tolist() == [False, False, True, True]
+
+
+def test_what_is_no_ray_ends(types):
+    """NaN, infinity and no direction at all: nothing is found, and nothing goes on for ever."""
+    bad = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]]
+    o = np.array([[0, 0, -2.0]] * 3 + bad[:2] + [[0.45, 0.45, 0.45]])
+    d = np.array([*bad, [1.0, 0, 0], [1.0, 0, 0], [0, 0, 0]])
+    _, found, _, _ = trace(Ball(types), o, d, 4.0)
+    assert not found.any()
+
+
+@pytest.mark.parametrize("thickness", [3e-4, 0.02])
+def test_thin_walls_have_no_holes(types, rng, thickness):
+    slab = Slab(types, thickness, (0.3, 0.2, 1.0))
+    aim = rng.uniform(-0.2, 0.2, (4 * COUNT, 3))
+    aim -= (aim @ slab.axis)[:, None] * slab.axis
+    d = unit(rng.normal(size=(4 * COUNT, 3)))
+    t, found, _, _ = trace(slab, aim - 2 * d, d)
+    assert found.all()
+    cosine = np.abs(d @ slab.axis)
+    clear = cosine > 4 * thickness
+    assert (np.abs((2 - t) * cosine - thickness / 2)[clear] < 2e-5).all()
+
+
+def test_what_the_box_cuts_is_closed(types):
+    """A solid that reaches the side of the box ends there, seen from outside and from within."""
+    slab = Slab(types, 0.2)
+    o = np.array([[-2.0, 0, 0], [-2.0, 0, 0.3], [0, 0, 0], [0.2, 0, 0.05]])
+    d = np.array([[1.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0], [-1.0, 0, 0]])
+    t, found, _, _ = trace(slab, o, d)
+    assert found.tolist() == [True, False, True, True]
+    assert np.abs(t[[0, 2, 3]] - [1.5, 0.5, 0.7]).max() < 1e-5
+    _, found, _, _ = trace(slab, o, d, 0.4)
+    assert not found.any()
+
+
+def test_jumps_are_bracketed(types, rng):
+    """Where the sign changes without a zero, bisection ends at the jump."""
+    d = unit(rng.normal(size=(COUNT, 3)))
+    o = 0.3 * unit(rng.normal(size=(COUNT, 3))) - 2 * d
+    t, found, _, _ = trace(Steps(types), o, d)
+    assert found.all()
+    assert np.abs(t - sphere(o, d, 0.4)[0]).max() < 5e-5
+
+
+def test_grids_against_a_slow_march(types, rng):
+    """Of a bumpy grid, the first change of sign that steps of 2e-4 see, but where a ray only touches."""
+    n = 17
+    x = np.linspace(-0.5, 0.5, n)
+    grid = np.stack(np.meshgrid(x, x, x, indexing="ij"), -1)
+    values = np.linalg.norm(grid, axis=-1) - 0.33 + rng.uniform(-0.02, 0.02, (n, n, n))
+    field = DenseField(types.TensorXf(values.astype(np.float32)), (-0.5,) * 3, (0.5,) * 3, 0.2)
+    count = 1024
+    d = unit(rng.normal(size=(count, 3)))
+    o = 0.4 * rng.random((count, 1)) * unit(rng.normal(size=(count, 3))) - d
+    t, found, _, _ = trace(field, o, d)
+    steps = np.arange(0, 2, 2e-4, dtype=np.float32)
+    p = (o[:, None] + steps[None, :, None] * d[:, None]).reshape(-1, 3).astype(np.float32)
+    inside = np.array(field.value(types.Array3f(p.T)) < 0).reshape(count, -1)
+    first = np.where(inside.any(1), steps[inside.argmax(1)], np.inf)
+    agree = np.isclose(t, first, rtol=0, atol=4e-4)
+    # A ray may touch a bump for less than a step, which either of the two may see
+    assert agree.mean() > 0.998 and np.isfinite(t[found]).all()
+    assert not (found & (t > first + 4e-4)).sum() > 1
