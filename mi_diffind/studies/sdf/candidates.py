@@ -79,6 +79,9 @@ MESH, GRID = "mesh (Embree)", "sdfgrid"
 #: Bits of a sparse distance that are tried; those with the best normals are kept.
 SPARSE_BITS = (6, 8)
 
+#: Kinds of which an image is rendered.
+RENDERED = ("dense-trained", "bricks4", "bricks4-shared", "distances-trained", "ours")
+
 #: How much finer than its cells a field is decoded to measure its surface.
 FINER = 1.5
 
@@ -237,7 +240,7 @@ class Made(Job):
     def candidate(self) -> Candidate:
         return Candidate(
             self.name, FAMILIES[self.kind], size_text(self.nbytes), job=self.name, label=KINDS[self.kind],
-            in_passes=self.kind != "hash", details={"kind": self.kind, "asked": self.nbytes},
+            in_passes=self.kind in RENDERED, details={"kind": self.kind, "asked": self.nbytes},
         )  # fmt: skip
 
     def known(self, folder: Path | None, record: dict | None) -> dict | None:
@@ -381,7 +384,8 @@ def _rays(setting: Setting, view: stage.Stage, names: list[str], grid: str, lane
 
 
 def _renders(setting: Setting, view: stage.Stage, names: list[str], grid: str) -> dict:
-    scenes = {name: view.field_scene(setting.jobs[name].field, True) for name in names}
+    jobs = setting.jobs
+    scenes = {name: view.field_scene(jobs[name].field, True) for name in names if jobs[name].kind in RENDERED}
     scenes[MESH] = view.mesh_scene(True)
     scenes[grid] = view.grid_scene(_grid_field(setting), setting.request.grid, True)
     spp = setting.request.spp
