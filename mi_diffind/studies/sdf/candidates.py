@@ -119,7 +119,7 @@ class Setting:
     request: Request
     types: object
     jobs: dict[str, Made] = field(default_factory=dict)
-    _sparse: dict[int, volumes.DistanceNodes] = field(default_factory=dict)
+    _sparse: dict[int, tuple[volumes.DistanceNodes, float]] = field(default_factory=dict)
 
     @functools.cached_property
     def distances(self) -> Distances:
@@ -136,14 +136,16 @@ class Setting:
         counts = (POOL, 2**16) if self.request.points >= 2**18 else (2**14, 2**10)
         return [hash_grids.pool(self.distances, lower, upper, n, seed) for seed, n in enumerate(counts, 1)]
 
-    def sparse_distances(self, nbytes: int) -> volumes.DistanceNodes:
-        """Exact distances in so many bytes: with the number of bits whose normals are best."""
+    def sparse_distances(self, nbytes: int) -> tuple[volumes.DistanceNodes, float]:
+        """Exact distances in so many bytes, with the number of bits whose normals are best; and the seconds it took."""
         if nbytes not in self._sparse:
+            start = time.perf_counter()
             found = [
                 volumes.fitted(lambda h, b=bits: volumes.distance_nodes(self.types, self.distances, h, bits=b), nbytes)
                 for bits in SPARSE_BITS
             ]
-            self._sparse[nbytes] = min(found, key=lambda f: self.evaluation.measure(f)["normal_deg"])
+            seconds = time.perf_counter() - start
+            self._sparse[nbytes] = min(found, key=lambda f: self.evaluation.measure(f)["normal_deg"]), seconds
         return self._sparse[nbytes]
 
     def errors(self, found: Field) -> dict[str, float]:
@@ -268,24 +270,26 @@ class Made(Job):
 class Sampled(Made):
     """A grid, bricks or sparse distances."""
 
-    def make(self) -> Field:
+    def make(self) -> tuple[Field, float]:
+        """The field, and how many seconds it took."""
+        start, before = time.perf_counter(), 0.0
         setting, train = self.setting, volumes.Training() if self.kind.endswith("-trained") else None
         types, distances, mesh, nbytes = setting.types, setting.distances, setting.mesh, self.nbytes
         name = self.kind.removesuffix("-trained")
         if name == "dense":
-            return volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
-        if name == "distances":
-            found = setting.sparse_distances(nbytes)
-            if train is None:
-                return found
-            return volumes.distance_nodes(types, distances, found.spacing, train, bits=found.bits)
-        side, apron = int(name.removeprefix("bricks")[0]), not name.endswith("-shared")
-        return volumes.fitted(lambda h: volumes.bricks(types, distances, h, side, apron), nbytes)
+            found = volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
+        elif name == "distances":
+            found, before = setting.sparse_distances(nbytes)
+            start = time.perf_counter()
+            if train is not None:
+                found = volumes.distance_nodes(types, distances, found.spacing, train, bits=found.bits)
+        else:
+            side, apron = int(name.removeprefix("bricks")[0]), not name.endswith("-shared")
+            found = volumes.fitted(lambda h: volumes.bricks(types, distances, h, side, apron), nbytes)
+        return found, before + time.perf_counter() - start
 
     def run(self, folder: Path | None, progress: bool) -> dict:
-        start = time.perf_counter()
-        found = self.make()
-        seconds = time.perf_counter() - start
+        found, seconds = self.make()
         if self.file:
             volumes.save(self.file, found)
         return self.record(found, found.nbytes, seconds, volumes.file_bytes(found))
@@ -302,18 +306,16 @@ class Fitted(Made):
         given = {"steps": request.steps} if request.steps else {}
         if not self.file:
             raise ValueError("ours is measured from a file: give a folder")
-        start = time.perf_counter()
         fitted = task.fit(
             "sdf", PRESETS[self.kind], mi.variant(), progress=progress, output=self.file, deterministic=False,
             source=self.setting.name, bytes=str(self.nbytes), **given,
         )  # fmt: skip
-        seconds = time.perf_counter() - start
         if fitted.result.interrupted:
             return None
         save_table(self.file, fitted.table)
-        model = self.model(self.file)
+        model, prepared = self.model(self.file), fitted.figures["prepared_seconds"]
         return self.record(
-            model.field, model.nbytes, seconds, self.file.stat().st_size, steps=fitted.result.steps,
+            model.field, model.nbytes, prepared + fitted.result.seconds, self.file.stat().st_size, steps=fitted.result.steps,
             trained_seconds=fitted.result.seconds,
         )  # fmt: skip
 
