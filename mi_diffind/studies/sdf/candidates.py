@@ -313,10 +313,10 @@ class Fitted(Made):
         if fitted.result.interrupted:
             return None
         save_table(self.file, fitted.table)
-        model, prepared = self.model(self.file), fitted.figures["prepared_seconds"]
+        model, seconds = self.model(self.file), fitted.result.seconds
         return self.record(
-            model.field, model.nbytes, prepared + fitted.result.seconds, self.file.stat().st_size, steps=fitted.result.steps,
-            trained_seconds=fitted.result.seconds,
+            model.field, model.nbytes, fitted.figures["prepared_seconds"] + seconds, self.file.stat().st_size,
+            steps=fitted.result.steps, trained_seconds=seconds,
         )  # fmt: skip
 
     def model(self, path: Path):
