@@ -226,7 +226,7 @@ def test_hash_grid(rng):
     from mi_diffind.fitting import FitSettings, fit
 
     entries = problem.net.entries.numpy()
-    fit(problem, FitSettings(seed=1, steps=100, batch=2**11, lr=1e-2, loss="mae", measure_every=100), progress=False)
+    fit(problem, FitSettings(seed=1, steps=80, batch=2**11, lr=1e-2, loss="mae", measure_every=80), progress=False)
     assert problem.measure(problem.net)["psnr_db"] > start + 6
     assert not np.array_equal(problem.net.entries.numpy(), entries)  # the grid learns, too
     hash_grids.halved(problem.net)

@@ -209,7 +209,10 @@ class Bricks(_Cells):
         self.nbytes, self.slope = nodes.size + self.index_bytes, slope
 
     def _find(self, bricks, active):
-        """For the brick at a place (three arrays): whether it is stored, its number, whether it is inside if not."""
+        """
+        For the brick at a place (three arrays): whether it is stored, its number, whether it is inside if not, and
+        whether its group has any.
+        """
         UInt32 = self.types.UInt32
         groups = [b // _GROUP for b in bricks]
         x, y, z = (b - g * _GROUP for b, g in zip(bricks, groups, strict=True))
@@ -223,11 +226,11 @@ class Bricks(_Cells):
         stored = (present & bit) != 0
         number = dr.gather(UInt32, self.ranks, word, mixed & stored) + dr.popcnt(present & (bit - 1))
         negative = (dr.gather(UInt32, self.negative, word, mixed & ~stored) & bit) != 0
-        return stored, number, dr.select(mixed, negative, group == _INSIDE)
+        return stored, number, dr.select(mixed, negative, group == _INSIDE), mixed
 
     def _read(self, found, place, active):
         """The node at a place (three arrays) in the brick that was found, or the largest number of its sign."""
-        stored, number, negative = found
+        stored, number, negative, _ = found
         x, y, z = place
         n, active = self.side + self.apron, stored & active
         at = ((number * n + x) * n + y) * n + z
@@ -275,11 +278,12 @@ class Bricks(_Cells):
         rows = [dr.lerp(dr.lerp(c[a][0][0], c[a][0][1], w), dr.lerp(c[a][1][0], c[a][1][1], w), v) for a in (0, 1)]
         value = dr.select(active, self._distance(dr.lerp(rows[0], rows[1], u)), self.band)
         bricks = [i // self.side for i in index]
-        leave = self.cell_exit(p, d, bricks, self.side * self.size)
+        base, _, _, mixed = self._find(bricks, active)
+        wide = dr.select(mixed, self.side * self.size, _GROUP * self.side * self.size)
+        leave = self.cell_exit(p, d, [dr.select(mixed, b, b // _GROUP) for b in bricks], wide)
         # The bound of the slope holds where all corners are stored, so not beyond this brick
         step = dr.select(stored, dr.minimum(dr.abs(value) / self.slope, leave), leave)
         if not self.apron:
-            base = self._find(bricks, active)[0]
             step = dr.select(base & ~stored, self.cell_exit(p, d, index, self.size), step)
         return value, step
 

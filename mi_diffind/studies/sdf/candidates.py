@@ -79,6 +79,9 @@ MESH, GRID = "mesh (Embree)", "sdfgrid"
 #: Bits of a sparse distance that are tried; those with the best normals are kept.
 SPARSE_BITS = (6, 8)
 
+#: Kinds of which an image is rendered.
+RENDERED = ("dense-trained", "bricks4", "bricks4-shared", "distances-trained", "ours")
+
 #: How much finer than its cells a field is decoded to measure its surface.
 FINER = 1.5
 
@@ -116,7 +119,7 @@ class Setting:
     request: Request
     types: object
     jobs: dict[str, Made] = field(default_factory=dict)
-    _sparse: dict[int, volumes.DistanceNodes] = field(default_factory=dict)
+    _sparse: dict[int, tuple[volumes.DistanceNodes, float]] = field(default_factory=dict)
 
     @functools.cached_property
     def distances(self) -> Distances:
@@ -133,14 +136,16 @@ class Setting:
         counts = (POOL, 2**16) if self.request.points >= 2**18 else (2**14, 2**10)
         return [hash_grids.pool(self.distances, lower, upper, n, seed) for seed, n in enumerate(counts, 1)]
 
-    def sparse_distances(self, nbytes: int) -> volumes.DistanceNodes:
-        """Exact distances in so many bytes: with the number of bits whose normals are best."""
+    def sparse_distances(self, nbytes: int) -> tuple[volumes.DistanceNodes, float]:
+        """Exact distances in so many bytes, with the number of bits whose normals are best; and the seconds it took."""
         if nbytes not in self._sparse:
+            start = time.perf_counter()
             found = [
                 volumes.fitted(lambda h, b=bits: volumes.distance_nodes(self.types, self.distances, h, bits=b), nbytes)
                 for bits in SPARSE_BITS
             ]
-            self._sparse[nbytes] = min(found, key=lambda f: self.evaluation.measure(f)["normal_deg"])
+            seconds = time.perf_counter() - start
+            self._sparse[nbytes] = min(found, key=lambda f: self.evaluation.measure(f)["normal_deg"]), seconds
         return self._sparse[nbytes]
 
     def errors(self, found: Field) -> dict[str, float]:
@@ -237,7 +242,7 @@ class Made(Job):
     def candidate(self) -> Candidate:
         return Candidate(
             self.name, FAMILIES[self.kind], size_text(self.nbytes), job=self.name, label=KINDS[self.kind],
-            in_passes=self.kind != "hash", details={"kind": self.kind, "asked": self.nbytes},
+            in_passes=self.kind in RENDERED, details={"kind": self.kind, "asked": self.nbytes},
         )  # fmt: skip
 
     def known(self, folder: Path | None, record: dict | None) -> dict | None:
@@ -265,24 +270,26 @@ class Made(Job):
 class Sampled(Made):
     """A grid, bricks or sparse distances."""
 
-    def make(self) -> Field:
+    def make(self) -> tuple[Field, float]:
+        """The field, and how many seconds it took."""
+        start, before = time.perf_counter(), 0.0
         setting, train = self.setting, volumes.Training() if self.kind.endswith("-trained") else None
         types, distances, mesh, nbytes = setting.types, setting.distances, setting.mesh, self.nbytes
         name = self.kind.removesuffix("-trained")
         if name == "dense":
-            return volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
-        if name == "distances":
-            found = setting.sparse_distances(nbytes)
-            if train is None:
-                return found
-            return volumes.distance_nodes(types, distances, found.spacing, train, bits=found.bits)
-        side, apron = int(name.removeprefix("bricks")[0]), not name.endswith("-shared")
-        return volumes.fitted(lambda h: volumes.bricks(types, distances, h, side, apron), nbytes)
+            found = volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
+        elif name == "distances":
+            found, before = setting.sparse_distances(nbytes)
+            start = time.perf_counter()
+            if train is not None:
+                found = volumes.distance_nodes(types, distances, found.spacing, train, bits=found.bits)
+        else:
+            side, apron = int(name.removeprefix("bricks")[0]), not name.endswith("-shared")
+            found = volumes.fitted(lambda h: volumes.bricks(types, distances, h, side, apron), nbytes)
+        return found, before + time.perf_counter() - start
 
     def run(self, folder: Path | None, progress: bool) -> dict:
-        start = time.perf_counter()
-        found = self.make()
-        seconds = time.perf_counter() - start
+        found, seconds = self.make()
         if self.file:
             volumes.save(self.file, found)
         return self.record(found, found.nbytes, seconds, volumes.file_bytes(found))
@@ -299,19 +306,17 @@ class Fitted(Made):
         given = {"steps": request.steps} if request.steps else {}
         if not self.file:
             raise ValueError("ours is measured from a file: give a folder")
-        start = time.perf_counter()
         fitted = task.fit(
             "sdf", PRESETS[self.kind], mi.variant(), progress=progress, output=self.file, deterministic=False,
             source=self.setting.name, bytes=str(self.nbytes), **given,
         )  # fmt: skip
-        seconds = time.perf_counter() - start
         if fitted.result.interrupted:
             return None
         save_table(self.file, fitted.table)
-        model = self.model(self.file)
+        model, seconds = self.model(self.file), fitted.result.seconds
         return self.record(
-            model.field, model.nbytes, seconds, self.file.stat().st_size, steps=fitted.result.steps,
-            trained_seconds=fitted.result.seconds,
+            model.field, model.nbytes, fitted.figures["prepared_seconds"] + seconds, self.file.stat().st_size,
+            steps=fitted.result.steps, trained_seconds=seconds,
         )  # fmt: skip
 
     def model(self, path: Path):
@@ -381,7 +386,8 @@ def _rays(setting: Setting, view: stage.Stage, names: list[str], grid: str, lane
 
 
 def _renders(setting: Setting, view: stage.Stage, names: list[str], grid: str) -> dict:
-    scenes = {name: view.field_scene(setting.jobs[name].field, True) for name in names}
+    jobs = setting.jobs
+    scenes = {name: view.field_scene(jobs[name].field, True) for name in names if jobs[name].kind in RENDERED}
     scenes[MESH] = view.mesh_scene(True)
     scenes[grid] = view.grid_scene(_grid_field(setting), setting.request.grid, True)
     spp = setting.request.spp

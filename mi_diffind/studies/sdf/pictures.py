@@ -73,7 +73,9 @@ def shapes(setting, view: stage.Stage, result: dict):
         _curves(found.add_subplot(grid[1, third * k : third * (k + 1)]), result, key, label, missing)
     axes = found.add_subplot(grid[1, 2 * third :])
     labels = _against_time(axes, result)
+    found.get_layout_engine().set(hspace=0.16)
     plot.fix(found)
+    _legend(found, axes.get_position().y1)
     plot.place(axes, labels, [label.at for label in labels])
     return found
 
@@ -131,8 +133,15 @@ def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
     axes.xaxis.set_major_formatter(lambda value, _: size_text(round(value)))
     axes.set_xlabel("memory", fontsize=8)
     _finish(axes, label)
-    if missing:
-        axes.legend(fontsize=6, loc="best")
+
+
+def _legend(found, above: float) -> None:
+    """The kinds, in two lines above the curves, whose upper end is at ``above``."""
+    handles, labels = found.axes[-3].get_legend_handles_labels()
+    found.legend(
+        handles, labels, loc="lower center", bbox_to_anchor=(0.5, above + 0.01), ncols=-(-len(labels) // 2),
+        fontsize=7.5, frameon=False,
+    )  # fmt: skip
 
 
 def _against_time(axes, result: dict) -> list[plot.Label]:
