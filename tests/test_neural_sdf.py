@@ -1,7 +1,6 @@
 """The plugin ``neural_sdf``: files, places, the two ways in which it is traced, what it refuses."""
 
 import json
-import sys
 
 import drjit as dr
 import numpy as np
@@ -244,11 +243,11 @@ def test_damaged_files(mi_rgb, folder, tmp_path, fault):
     if fault == "truncated":
         path.write_bytes(whole[: len(whole) // 2])
     elif fault == "NaN":
-        table = sparse_table(spacing=1 / 16)
-        table.arrays["entries"].entries[3] = np.nan
-        with pytest.raises(ValueError, match="NaN|finite"):
-            save_table(path, table)
-        return
+        with np.load(folder / "torus.npz") as file:
+            content = dict(file)
+        entries = next(v for v in content.values() if v.dtype == np.float32 and v.ndim == 2 and v.shape[1] == 3)
+        entries[3] = np.nan
+        np.savez(path, **content)
     elif fault == "other task":
         path = GGX.file()
     sentence = refused(mi_rgb, folder, path.name, filename=str(path))
@@ -257,11 +256,11 @@ def test_damaged_files(mi_rgb, folder, tmp_path, fault):
 
 def test_other_integrators_are_refused(mi_rgb, folder, tmp_path):
     """Rather than an image in which the shape is missing."""
-    text = f"""<scene version="3.0.0"><shape type="neural_sdf" id="ring"><string name="filename" value="{folder}/torus.npz"/>
-        </shape><integrator type="path"/><sensor type="perspective"/></scene>"""
+    text = f"""<scene version="3.0.0"><shape type="neural_sdf" id="ring">
+        <string name="filename" value="{folder}/torus.npz"/></shape><integrator type="path"/><sensor type="perspective"/></scene>"""
     path = tmp_path / "scene.xml"
     path.write_text(text)
-    with pytest.raises(SceneError, match='"ring".*"path_sdf".*found "path"'):
+    with pytest.raises(SceneError, match=r'"ring".*"path_sdf".*found "path"'):
         scenes.load(path)
     path.write_text(text.replace('type="path"', 'type="path_sdf"'))
     assert len(scenes.load(path).shapes()) == 1
