@@ -78,7 +78,7 @@ def _unseen(scene, integrators: list[str]) -> str:
             found = ", ".join(f'"{name}"' for name in integrators)
             return (
                 f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} alone, '
-                f'found {found}: take that integrator, or trace="grid"'
+                f'found {found}: take that one, or trace="grid"'
             )
     return ""
 

@@ -89,7 +89,7 @@ def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     assert (np.isfinite(expected) == found[~within]).mean() > 0.995 and both.mean() > 0.3
     assert np.median(np.abs(t[~within][both] - expected[both])) < 1e-3
     where = np.array(hit.p).T[found]
-    assert np.abs(np.array(field.value(mi.Point3f(where.T)))).max() < 2e-5
+    assert np.abs(np.array(field.value(mi.Point3f(where.T)))).max() < 5e-5
 
 
 def test_axis_aligned_rays_through_cells(mi_rgb, folder):
@@ -176,7 +176,7 @@ def test_derivatives_reach_the_nodes(mi_rgb, folder):
         "to_world": mi.ScalarTransform4f().look_at([0.5, -3, 2.5], [0.5, -1.75, 0.4], [0, 0, 1]),
     }
     close["film"] = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
-    made = scene(mi, {"a": shape(folder, storage="float32")}, sensor=close)
+    made = scene(mi, {"a": shape(folder, storage="float32", normals="analytic")}, sensor=close)
     params = mi.traverse(made)
     key = "a.tables.nodes"
     nodes = mi.TensorXf(params[key])
@@ -265,9 +265,7 @@ def test_other_integrators_are_refused(mi_rgb, folder, tmp_path):
     path.write_text(text.replace('type="path"', 'type="path_sdf"'))
     assert len(scenes.load(path).shapes()) == 1
     mesh = scenes.load(path, exact=True).shapes()[0]
-    assert mesh.face_count() == 96 * 48 * 2 and not isinstance(
-        mesh, sys.modules["mi_diffind.plugins.neural_sdf"].NeuralSDF
-    )
+    assert mesh.face_count() == 96 * 48 * 2 and type(mesh) is mi_rgb.Mesh
 
 
 def test_plugin_is_declared(mi_rgb):

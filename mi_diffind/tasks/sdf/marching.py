@@ -165,7 +165,6 @@ class Course:
     def __init__(self, field, o, d):
         self.types, self.last = field.types, [n - 2 for n in field.structure.shape]
         self.o, self.d = list(o), list(d)
-        types = self.types
         still = [dr.abs(v) < TINY for v in d]
         self.inverse = [dr.rcp(dr.select(s, TINY, v)) for s, v in zip(still, d, strict=True)]
         self.up = [(v > 0) | s for s, v in zip(still, d, strict=True)]
