@@ -77,7 +77,8 @@ def _unseen(scene, integrators: list[str]) -> str:
             allowed = " or ".join(f'"{name}"' for name in seen_by)
             found = ", ".join(f'"{name}"' for name in integrators)
             return (
-                f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} alone, '
+                f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} '
+                f"alone, "
                 f'found {found}: take that one, or trace="grid"'
             )
     return ""

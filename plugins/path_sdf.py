@@ -24,8 +24,8 @@ Path tracer for signed distance fields (:monosp:`path_sdf`)
 
 The estimator of :monosp:`path` for scenes in which a :monosp:`neural_sdf` is traced as it is stored: with any BSDF,
 all emitters, both sampled and weighted by the power heuristic. Ordinary shapes and any number of fields mix: the
-nearest hit wins, light is blocked by either, rays are reflected and refracted by either. A scene without such a field is
-rendered as by :monosp:`path_footprint`, footprints included; in a scene with one, textures see no footprints.
+nearest hit wins, light is blocked by either, rays are reflected and refracted by either. A scene without such a field
+is rendered as by :monosp:`path_footprint`, footprints included; in a scene with one, textures see no footprints.
 
 **Rays** go from one empty region to the next, as the masks of a sparse field say, and read only the cells that the
 surface crosses. Fields of the other layouts are sphere-traced (Hart, *Sphere Tracing*, The Visual Computer 1996): a

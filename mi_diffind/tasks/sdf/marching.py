@@ -227,8 +227,8 @@ def march(marcher, o, d, length, fresh, active):
 def cells_of(structure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     For each block with nodes: whether each of its 64 cells is crossed, that is, all its corners are stored; whether the
-    others are inside, ``(B, 64)``; and the blocks that their corners lie in, ``(B, 8)``, the block itself where there is none.
-    And the signs of blocks without nodes, at their places in the grid.
+    others are inside, ``(B, 64)``; and the blocks that their corners lie in, ``(B, 8)``, the block itself where there
+    is none. And the signs of blocks without nodes, at their places in the grid.
     """
     at = structure.block_positions() // BLOCK
     number = np.full([n // BLOCK + 1 for n in structure.shape], -1)
