@@ -257,7 +257,8 @@ def test_damaged_files(mi_rgb, folder, tmp_path, fault):
 def test_other_integrators_are_refused(mi_rgb, folder, tmp_path):
     """Rather than an image in which the shape is missing."""
     text = f"""<scene version="3.0.0"><shape type="neural_sdf" id="ring">
-        <string name="filename" value="{folder}/torus.npz"/></shape><integrator type="path"/><sensor type="perspective"/></scene>"""
+        <string name="filename" value="{folder}/torus.npz"/></shape>
+        <integrator type="path"/><sensor type="perspective"/></scene>"""
     path = tmp_path / "scene.xml"
     path.write_text(text)
     with pytest.raises(SceneError, match=r'"ring".*"path_sdf".*found "path"'):
