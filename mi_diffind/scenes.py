@@ -77,8 +77,9 @@ def _unseen(scene, integrators: list[str]) -> str:
             allowed = " or ".join(f'"{name}"' for name in seen_by)
             found = ", ".join(f'"{name}"' for name in integrators)
             return (
-                f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} alone, '
-                f'found {found}: take that integrator, or trace="grid"'
+                f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} '
+                f"alone, "
+                f'found {found}: take that one, or trace="grid"'
             )
     return ""
 

@@ -11,6 +11,50 @@ from .support import solids as sdf
 
 MANUAL = r"""
 .. _integrator-path_sdf:
+
+Path tracer for signed distance fields (:monosp:`path_sdf`)
+-----------------------------------------------------------
+
+.. pluginparameters::
+
+ * - max_depth, rr_depth, hide_emitters, jitter
+   - |int|, |int|, |bool|, |bool|
+   - As of :monosp:`path_footprint`. (Default: -1, 5, false, true)
+   - --
+
+The estimator of :monosp:`path` for scenes in which a :monosp:`neural_sdf` is traced as it is stored: with any BSDF,
+all emitters, both sampled and weighted by the power heuristic. Ordinary shapes and any number of fields mix: the
+nearest hit wins, light is blocked by either, rays are reflected and refracted by either. A scene without such a field
+is rendered as by :monosp:`path_footprint`, footprints included; in a scene with one, textures see no footprints.
+
+**Rays** go from one empty region to the next, as the masks of a sparse field say, and read only the cells that the
+surface crosses. Fields of the other layouts are sphere-traced (Hart, *Sphere Tracing*, The Visual Computer 1996): a
+step is the distance divided by a bound of the field's slope, at least :math:`10^{-4}` of the longest side. A hit is
+where the sign differs from that at the start, so cameras may be within a solid, and a place between the last sign and
+the next is found by false position. Secondary rays start :math:`3 \cdot 10^{-4}` of the longest side off the surface:
+walls thinner than that are not reliable. From :math:`10^3` times the size away, single precision leaves :math:`10^{-4}`
+of it.
+
+**Derivatives** are computed by path replay with respect to materials, textures, emitters and, with ``storage``
+``float32``, the arrays of fields: hits move along their rays by the implicit function theorem, and normals, cosines and
+the solid angles between vertices follow. They are those of *interiors*: where the outline of a solid, its shadow
+or its image in a mirror moves over a pixel, radiance jumps, and this part of the derivative is missing. An
+optimisation from images therefore learns from shading, not from silhouettes; masks, or a loss on the field itself, have
+to make up for that. Ordinary shapes are constants, and so is what is seen in smooth mirrors and through smooth
+glass. Not for polarised variants, nor for media.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: path_sdf
+
+        <integrator type="path_sdf">
+            <integer name="max_depth" value="8"/>
+        </integrator>
+
+    .. code-tab:: python
+
+        'type': 'path_sdf',
+        'max_depth': 8
 """
 
 

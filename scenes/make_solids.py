@@ -7,15 +7,30 @@ Write solids.xml: meshes and the signed distance fields that were made from them
 from pathlib import Path
 
 import mitsuba as mi
-from scene_xml import Whole, element, environment, head, lying, plugin, softbox, transform, write
+from scene_xml import element, environment, head, lying, plugin, softbox, transform, write
 
-ABOUT = """Signed distance fields beside and in the place of meshes: Suzanne as a mesh (left) and as a field (right, the same
-clay), a knot of gold that casts a shadow on the latter, one behind a pane of glass, one of glass. Written by
+ABOUT = """Signed distance fields beside and in the place of meshes: Suzanne as a mesh (left) and as a field (right, the
+same clay), a knot of gold that casts a shadow on the latter, one behind a pane of glass, one of glass. Written by
 make_solids.py: change that file.
 
 "-D trace=grid -D integrator=path" decodes the fields to grids that any integrator traces."""
 
 FOLDER = Path(__file__).resolve().parent
+
+
+def ref(name: str):
+    """A material by its name."""
+    return element("ref", id=name)
+
+
+def place(x: float, y: float, z: float) -> dict:
+    """Where something is moved to."""
+    return {"x": x, "y": y, "z": z}
+
+
+def turn(axis: str, angle: float) -> dict:
+    """A rotation around an axis, in degrees."""
+    return {axis: 1, "angle": angle}
 
 
 def solid(file: str, *children, **steps):
@@ -35,25 +50,23 @@ def main() -> None:
     blue = plugin("bsdf", "principled", id="blue", base_color=(0.08, 0.2, 0.5), roughness=0.25)
     floor = plugin("bsdf", "diffuse", reflectance=(0.55, 0.53, 0.5))
     pane = plugin("shape", "cube", transform(
-        scale={"x": 0.75, "y": 0.8, "z": 0.03}, rotate={"y": 1, "angle": -12}, translate={"x": 2.75, "y": 0.8, "z": 1.9},
+        scale={"x": 0.62, "y": 0.8, "z": 0.03}, rotate=turn("y", -12), translate=place(1.95, 0.8, 0.95),
     ), element("ref", id="glass"))  # fmt: skip
-    ref = lambda name: element("ref", id=name)
-    place = lambda x, y, z: {"x": x, "y": y, "z": z}
     content += [
         "A room by day, and a softbox from the right",
         environment("interior.exr", 0.35, 60.0),
-        softbox((1.2, 1.2), {"origin": (5.5, 6.0, 4.0), "target": (0.6, 0.6, 0), "up": (0, 1, 0)}, (16.0, 14.5, 12.5)),
+        softbox((0.6, 0.6), {"origin": (5.5, 6.0, 4.0), "target": (0.6, 0.6, 0), "up": (0, 1, 0)}, (60.0, 54.0, 47.0)),
         "What things are made of", clay, gold, glass, blue,
         "The floor", lying(12, 12, floor),
         "Suzanne, a mesh and a field",
-        plugin("shape", "ply", transform(rotate={"y": 1, "angle": 18}, translate=place(-1.75, 0, 0)), ref("clay"),
+        plugin("shape", "ply", transform(rotate=turn("y", 14), translate=place(-1.7, 0, 0)), ref("clay"),
                filename="assets/suzanne.ply"),
-        solid("suzanne", ref("clay"), rotate={"y": 1, "angle": -8}, translate=place(0.75, 0, -0.2)),
+        solid("suzanne", ref("clay"), rotate=turn("y", -8), translate=place(0.35, 0, -0.2)),
         "A knot that casts a shadow on the field, one behind a pane, one of glass",
-        solid("knot", ref("gold"), scale={"value": 0.5}, rotate={"x": 1, "angle": 35}, translate=place(1.75, 2.0, 1.3)),
-        solid("knot", ref("blue"), scale={"value": 0.6}, rotate={"y": 1, "angle": 60}, translate=place(2.9, 0.6, 0.6)),
+        solid("knot", ref("gold"), scale={"value": 0.36}, rotate=turn("x", 35), translate=place(1.4, 1.6, 0.85)),
+        solid("knot", ref("blue"), scale={"value": 0.6}, rotate=turn("y", 60), translate=place(2.0, 0, -0.35)),
         pane,
-        solid("knot", ref("glass"), scale={"value": 0.55}, rotate={"x": 1, "angle": 90}, translate=place(-0.55, 0.5, 1.9)),
+        solid("knot", ref("glass"), scale={"value": 0.5}, rotate=turn("x", 75), translate=place(-0.75, 0.35, 1.9)),
     ]  # fmt: skip
     write(FOLDER / "solids.xml", ABOUT, content)
 

@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 from sdf_fields import Ball, register
 
-from mi_diffind.tasks.sdf.field import DenseField
-
 BSDFS = {
     "diffuse": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}},
     "rough": {"type": "roughconductor", "alpha": 0.2},
@@ -230,13 +228,13 @@ def test_derivatives_against_differences(mi_rgb, fields):
     """Of direct light without noise: of a point light, where the camera sees no silhouette."""
     mi, ball = mi_rgb, fields["ball"]
     point = {"type": "point", "position": [-3, -4, 4], "intensity": 20.0}
-    made = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, **interior(mi), point=point, lamp={"type": "sphere", "center": [0, 0, 90]},
-                 sky={"type": "sphere", "center": [0, 0, 99]})  # fmt: skip
+    dark = {name: {"type": "sphere", "center": [0, 0, 99]} for name in ("lamp", "sky")}
+    made = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, **interior(mi), point=point, **dark)
     integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
     images = []
     for r in (0.399, 0.401):
         ball.r = mi.Float(r)
         images.append(np.array(mi.render(made, spp=64, seed=3, integrator=integrator)))
     differences = (images[1] - images[0]) / 2e-3
-    forward, backward = both_modes(mi, made, ball, 2)
+    forward, _ = both_modes(mi, made, ball, 2)
     assert np.abs(forward - differences).mean() < 2e-3 * np.abs(differences).mean()

@@ -54,7 +54,8 @@ class Placement:
         turned = np.isfinite(matrix).all() and size > 0 and np.allclose(matrix[3], (0, 0, 0, 1))
         if not turned or not np.allclose(linear.T @ linear, size**2 * np.eye(3), atol=1e-4 * size**2):
             raise RuntimeError(
-                f'parameter "to_world": found {_written(linear)}, allowed are rotations, uniform scales and translations'
+                f'parameter "to_world": found {_written(linear)}, allowed are rotations, uniform scales and '
+                f"translations"
             )
         return cls(linear / size, size * scale, linear @ np.asarray(centre, np.float64) + matrix[:3, 3])
 
@@ -150,9 +151,13 @@ class Solid(mi.Mesh):
         (unit frame), attached as :meth:`moved` is.
         """
         p = self.moved(p, d, active)
-        _, slope = self.field.gradient(p, active)
-        normal = self._unit(slope, d)
-        shading = self._unit(self.field.normal(p, active), d) if self.smooth else normal
+        if not self.smooth:
+            shading = normal = self._unit(self.field.gradient(p, active)[1], d)
+        elif hasattr(self.field, "_told"):  # both from one read
+            normal, shading = (self._unit(v, d) for v in self.field._told(p, active, True)[1:])
+        else:
+            normal = self._unit(self.field.gradient(p, active)[1], d)
+            shading = self._unit(self.field.normal(p, active), d)
         return self.to_world(p), self.axes.to_world(normal), self.axes.to_world(shading)
 
     def _unit(self, v, d):
@@ -168,8 +173,8 @@ def solids_of(scene: mi.Scene) -> list[Solid]:
     hidden = [shape for shape in mi.traverse(scene).hierarchy if isinstance(shape, Solid) and shape not in found]
     if hidden:
         raise RuntimeError(
-            f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file with '
-            f'a "to_world" of their own share its memory, and trace="grid" may be instanced'
+            f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file '
+            f'with a "to_world" of their own share its memory, and trace="grid" may be instanced'
         )
     return found
 
@@ -177,8 +182,8 @@ def solids_of(scene: mi.Scene) -> list[Solid]:
 def native_grid(props: mi.Properties, values: np.ndarray, lower, upper, to_world, normals: str):
     """
     Mitsuba's ``sdfgrid`` of ``values`` (Z, Y, X) in a box with these corners, which ``to_world`` moves; with the
-    material of ``props``. Rotated, it is an instance, in a ``merge`` with its group. Returns the shape, and what a scene
-    keeps of it.
+    material of ``props``. Rotated, it is an instance, in a ``merge`` with its group. Returns the shape, and what a
+    scene keeps of it.
 
     Mitsuba 3.9 finds next to no hits in grids whose sides differ: what is missing to a cube is filled with outside.
     """

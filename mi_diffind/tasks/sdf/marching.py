@@ -59,8 +59,8 @@ class Marcher:
 
     def locate(self, course, t, active):
         """
-        Of the cell at ``t`` of a ray: whether it is crossed; the number of its block; where the ray leaves it, or what is
-        empty around it; its sign (of no meaning if it is crossed).
+        Of the cell at ``t`` of a ray: whether it is crossed; the number of its block; where the ray leaves it, or what
+        is empty around it; its sign (of no meaning if it is crossed).
         """
         i, j, k = cell = course.cell(t)
         types = self.field.types
@@ -89,11 +89,11 @@ class Marcher:
         """Distance and gradient, in spacings, of the eight nodes of a crossed cell, in the order of ``CORNERS``."""
         field, UInt32 = self.field, self.field.types.UInt32
         found = []
-        far = [dr.select((v & 3) == 3, UInt32(m), 0) for v, m in zip((i, j, k), (4, 2, 1))]
+        far = [dr.select((v & 3) == 3, UInt32(m), 0) for v, m in zip((i, j, k), (4, 2, 1), strict=True)]
         for a, b, c in CORNERS:
             x, y, z = i + a, j + b, k + c
             n = number * 8
-            for e, m in zip((a, b, c), far):
+            for e, m in zip((a, b, c), far, strict=True):
                 n = n + m if e else n
             own = number if not (a or b or c) else dr.gather(UInt32, self.beside, n, active)
             record = field._record(own, active)
@@ -165,7 +165,6 @@ class Course:
     def __init__(self, field, o, d):
         self.types, self.last = field.types, [n - 2 for n in field.structure.shape]
         self.o, self.d = list(o), list(d)
-        types = self.types
         still = [dr.abs(v) < TINY for v in d]
         self.inverse = [dr.rcp(dr.select(s, TINY, v)) for s, v in zip(still, d, strict=True)]
         self.up = [(v > 0) | s for s, v in zip(still, d, strict=True)]
@@ -227,9 +226,9 @@ def march(marcher, o, d, length, fresh, active):
 
 def cells_of(structure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    For each block with nodes: whether each of its 64 cells is crossed, that is, all its corners are stored; whether the others are
-    inside, ``(B, 64)``; and the blocks that their corners lie in, ``(B, 8)``, the block itself where there is none.
-    And the signs of blocks without nodes, at their places in the grid.
+    For each block with nodes: whether each of its 64 cells is crossed, that is, all its corners are stored; whether the
+    others are inside, ``(B, 64)``; and the blocks that their corners lie in, ``(B, 8)``, the block itself where there
+    is none. And the signs of blocks without nodes, at their places in the grid.
     """
     at = structure.block_positions() // BLOCK
     number = np.full([n // BLOCK + 1 for n in structure.shape], -1)
@@ -278,7 +277,10 @@ def words_of(structure, crossed, inside, empty) -> tuple[np.ndarray, np.ndarray]
     sign = empty.copy()
     sign[at] = inside[:, 0]  # where no cell is crossed, all have the same
     shape = structure.regions.shape
-    parts = lambda v: v.reshape(np.stack([shape, (4, 4, 4)], 1).ravel()).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 64)
+
+    def parts(v):
+        return v.reshape(np.stack([shape, (4, 4, 4)], 1).ravel()).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 64)
+
     blocks = parts(np.where(full, number, _free(full, sign)).astype(np.uint32))
     some = parts(full).any(axis=1)
     regions = _free(some.reshape(shape), parts(sign)[:, 0].reshape(shape)).ravel()

@@ -35,8 +35,8 @@ FALSE_POSITIONS = 5
 @dataclass
 class Hit:
     """
-    What a ray met: ``found``; the distance ``t`` along the ray, infinite if nothing was found; the place ``p``, which is
-    more precise than ``o + t·d`` where the ray comes from afar; ``leaving``, whether the ray came from within the solid.
+    What a ray met: ``found``; the distance ``t`` along the ray, infinite if nothing was found; the place ``p``, which
+    is more precise than ``o + t·d`` where the ray comes from afar; ``leaving``, whether it came from within the solid.
     """
 
     found: Any
