@@ -196,7 +196,7 @@ def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, 
         file = task.file(name and Path(scene).resolve().parent / name, entry.get("preset", ""))
         if (str(file), storage) not in found:
             table = task.load(file)
-            found[str(file), storage] = table.to(storage or table.storage)
+            found[str(file), storage] = table.to(storage) if storage else table
     return found
 
 

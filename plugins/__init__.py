@@ -78,9 +78,12 @@ class Plugin:
     def described(self, props) -> dict:
         """
         What properties (``mi.Properties``) say: ``plugin``, ``kind``, ``id``, ``parameters`` (numbers, text, colours
-        and matrices as lists, ``"texture"`` for any object), and by themselves those that only the learned plugin has.
+        and matrices as lists, ``"texture"`` for any object), and by themselves those that only the learned plugin has,
+        and the file that it reads.
         """
         learned_only = self.exact.learned_only if self.exact else ()
+        if self.task and "filename" not in learned_only:
+            learned_only = (*learned_only, "filename")
         return {
             "plugin": self.name,
             "kind": self.kind,

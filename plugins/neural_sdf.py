@@ -72,8 +72,8 @@ class NeuralSDF(Solid):
 
      * - normals
        - |string|
-       - Shading normals: ``smooth``, the stored normals blended; ``analytic``, the gradient of the field, which is what
-         the surface is. (Default: ``smooth``)
+       - Shading normals: ``analytic``, the gradient of the field, which is what the surface is; ``smooth``, the stored
+         normals blended, which rounds edges. (Default: ``analytic``; of ``grid``, ``smooth``)
        - --
 
      * - trace
@@ -130,7 +130,7 @@ class NeuralSDF(Solid):
 
     def __init__(self, props: mi.Properties):
         self.model = open_model(props)
-        smooth = properties.one_of(props, "normals", ("smooth", "analytic")) == "smooth"
+        smooth = properties.one_of(props, "normals", ("analytic", "smooth")) == "smooth"
         properties.one_of(props, "trace", ("arrays", "grid"))
         if "resolution" in props:
             raise RuntimeError('parameter "resolution": has no effect with trace="arrays"')

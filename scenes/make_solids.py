@@ -41,7 +41,7 @@ def solid(file: str, *children, **steps):
 def main() -> None:
     mi.set_variant("scalar_rgb")
     camera = {"origin": (0.3, 3.1, 8.2), "target": (0.05, 0.85, 0), "up": (0, 1, 0)}
-    content = head(960, 540, {"trace": "arrays", "integrator": "path_sdf"}, fov=36.0, camera=camera)
+    content = head(960, 540, {"trace": "arrays", "integrator": "path_sdf"}, fov=40.0, camera=camera)
     integrator = next(item for item in content if item.tag == "integrator")
     integrator.set("type", "$integrator")
     clay = plugin("bsdf", "principled", id="clay", base_color=(0.62, 0.31, 0.2), roughness=0.6, specular=0.4)
@@ -50,7 +50,7 @@ def main() -> None:
     blue = plugin("bsdf", "principled", id="blue", base_color=(0.08, 0.2, 0.5), roughness=0.25)
     floor = plugin("bsdf", "diffuse", reflectance=(0.55, 0.53, 0.5))
     pane = plugin("shape", "cube", transform(
-        scale={"x": 0.62, "y": 0.8, "z": 0.03}, rotate=turn("y", -12), translate=place(1.95, 0.8, 0.95),
+        scale={"x": 0.55, "y": 0.7, "z": 0.02}, rotate=turn("y", -12), translate=place(2.05, 0.7, 0.75),
     ), element("ref", id="glass"))  # fmt: skip
     content += [
         "A room by day, and a softbox from the right",
@@ -66,7 +66,7 @@ def main() -> None:
         solid("knot", ref("gold"), scale={"value": 0.36}, rotate=turn("x", 35), translate=place(1.4, 1.6, 0.85)),
         solid("knot", ref("blue"), scale={"value": 0.6}, rotate=turn("y", 60), translate=place(2.0, 0, -0.35)),
         pane,
-        solid("knot", ref("glass"), scale={"value": 0.5}, rotate=turn("x", 75), translate=place(-0.75, 0.35, 1.9)),
+        solid("knot", ref("glass"), scale={"value": 0.5}, rotate=turn("x", 75), translate=place(-0.7, 0.45, 1.5)),
     ]  # fmt: skip
     write(FOLDER / "solids.xml", ABOUT, content)
 
