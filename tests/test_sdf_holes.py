@@ -14,8 +14,6 @@ from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.field import Field
 from mi_diffind.tasks.sdf.mesh import load_mesh, make_mesh
 
-pytest.importorskip("igl", reason="libigl is not installed")
-
 ARMADILLO = Path(__file__).resolve().parents[2] / "shared/data/meshes/armadillo.off"
 
 
@@ -112,7 +110,8 @@ def shoot(types, distances, field, count, seed):
     each at a place that lies deeper inside than the field's cells are wide: how many go through, how many end elsewhere
     than on the surface.
     """
-    trace = pytest.importorskip("mi_diffind.tasks.sdf.tracing").trace
+    from mi_diffind.tasks.sdf.tracing import trace
+
     rng = np.random.default_rng(seed)
     h = field.spacing
     pool = samples.far(distances.mesh.lower - 3 * h, distances.mesh.upper + 3 * h, 400_000, rng)
