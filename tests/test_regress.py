@@ -16,7 +16,7 @@ from mi_diffind.cli import main
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
 STORED = [
-    *(SCENES / f"{name}.xml" for name in ("horizon", "materials", "metals", "rust", "still_life", "tiles")),
+    *(SCENES / f"{name}.xml" for name in ("horizon", "materials", "metals", "rust", "solids", "still_life", "tiles")),
     TESTS / "lamp.xml",
 ]
 
@@ -159,6 +159,8 @@ SLOW = {
     ("horizon", "llvm_ad_mono"),
     ("rust", "llvm_ad_mono"),
     ("rust", "llvm_ad_spectral"),
+    ("solids", "llvm_ad_mono"),
+    ("solids", "llvm_ad_spectral"),
     ("still_life", "llvm_ad_spectral"),
     ("still_life", "llvm_ad_mono"),
     ("metals", "llvm_ad_mono"),
