@@ -76,15 +76,21 @@ def sparse_table(shape=torus, spacing=1 / 40, bits=8, scale=2.0, centre=(0.5, -1
     cells = np.argwhere(corner.any(-1) & ~corner.all(-1))
     around = cells[:, None] + np.array(nodes.CORNERS)
     used = np.unique(around.reshape(-1, 3), axis=0)
-    sign = lambda p: shape(np.asarray(p))[0] < 0
+
+    def sign(p):
+        return shape(np.asarray(p))[0] < 0
+
     found = structure.build(used, sign(lower + spacing * used), (n, n, n), lower, spacing, sign,
                             lambda p: np.abs(shape(np.asarray(p))[0]))  # fmt: skip
     positions, block = found.node_positions()
     d, g = shape(np.array(found.lower) + spacing * positions)
-    key = lambda p: np.ravel_multi_index(p.T, found.shape)
+
+    def key(p):
+        return np.ravel_multi_index(p.T, found.shape)
+
     order = np.argsort(key(positions))
     corners = order[np.searchsorted(key(positions), key(around.reshape(-1, 3)), sorter=order)].reshape(-1, 8)
-    sampled = encoding.Sampled(found, positions, block, d / spacing, g, corners, 0.0)
+    sampled = encoding.Sampled(found, positions, block, d / spacing, g, corners, len(cells), 0.0)
     frames = encoding.fit_frames(sampled)
     wanted = encoding.targets(sampled, frames)
     entries = encoding.cluster(wanted, 2**bits)
