@@ -90,7 +90,7 @@ def sparse_table(shape=torus, spacing=1 / 40, bits=8, scale=2.0, centre=(0.5, -1
 
     order = np.argsort(key(positions))
     corners = order[np.searchsorted(key(positions), key(around.reshape(-1, 3)), sorter=order)].reshape(-1, 8)
-    sampled = encoding.Sampled(found, positions, block, d / spacing, g, corners, 0.0)
+    sampled = encoding.Sampled(found, positions, block, d / spacing, g, corners, len(cells), 0.0)
     frames = encoding.fit_frames(sampled)
     wanted = encoding.targets(sampled, frames)
     entries = encoding.cluster(wanted, 2**bits)
