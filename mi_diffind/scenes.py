@@ -25,7 +25,7 @@ from .tasks.task import tasks
 
 #: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
 MAX_DEPTHS = {
-    **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer", "path_footprint"), -1),
+    **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer", "path_footprint", "path_sdf"), -1),
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
 }
 

@@ -153,11 +153,8 @@ class Solid(mi.Mesh):
         p = self.moved(p, d, active)
         if not self.smooth:
             shading = normal = self._unit(self.field.gradient(p, active)[1], d)
-        elif hasattr(self.field, "_told"):  # both from one read
-            normal, shading = (self._unit(v, d) for v in self.field._told(p, active, True)[1:])
         else:
-            normal = self._unit(self.field.gradient(p, active)[1], d)
-            shading = self._unit(self.field.normal(p, active), d)
+            normal, shading = (self._unit(v, d) for v in self.field.normals(p, active))
         return self.to_world(p), self.axes.to_world(normal), self.axes.to_world(shading)
 
     def _unit(self, v, d):

@@ -58,6 +58,10 @@ class Field:
         """The direction of the smooth normal at ``p``, of any length; by default, the gradient."""
         return self.gradient(p, active)[1]
 
+    def normals(self, p, active=True):
+        """The gradient at ``p`` and the smooth normal, both of any length: ``(Array3f, Array3f)``."""
+        return self.gradient(p, active)[1], self.normal(p, active)
+
     def look(self, p, d, active=True):
         """
         The value at ``p`` and how far a ray from there in the direction ``d`` (of length 1) goes without the sign

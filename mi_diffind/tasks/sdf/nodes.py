@@ -198,6 +198,9 @@ class SparseNodes(Field):
     def normal(self, p, active=True):
         return self._told(p, active, True)[2]
 
+    def normals(self, p, active=True):
+        return self._told(p, active, True)[1:]
+
     def _told(self, p, active, derivatives: bool):
         active = self.inside(p) & active
         value, slope, smooth, complete, some, inside = self._blend(p, active, derivatives)
