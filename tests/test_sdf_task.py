@@ -111,7 +111,7 @@ def test_training_earns_its_place(folder, evaluation, ad):
 @pytest.mark.parametrize("preset", ["dense", "paper"])
 def test_presets_of_the_supplement(folder, evaluation, ad, preset, tmp_path):
     path = tmp_path / "pair.npz"
-    steps = ["--steps", "60", "--batch", "16384", "--variant", "llvm_ad_rgb"]
+    steps = ["--steps", "40", "--batch", "16384", "--variant", "llvm_ad_rgb"]
     command = ["fit", "sdf", str(folder / "solids.ply"), "--bytes", str(BYTES), "--preset", preset, *steps]
     assert main([*command, "-o", str(path)]) == 0
     table = load_table(path)
@@ -280,7 +280,7 @@ def test_extents_and_scales(tmp_path, ad, extent):
     mesh = box(extent, (5 * extent[0], 0, 0))
     write(tmp_path / "box.obj", (mesh[0], mesh[1])) if extent[0] > 1e-3 else write(tmp_path / "box.ply", mesh)
     source = next(tmp_path.glob("box.*"))
-    done = fit("sdf", source=str(source), bytes="64k", steps=20, batch=4096, variant="llvm_ad_rgb", progress=False)
+    done = fit("sdf", source=str(source), bytes="24k", steps=10, batch=4096, variant="llvm_ad_rgb", progress=False)
     model = tasks()["sdf"].model(done.table, ad.TensorXf)
     assert done.table.measured["iou"] > 0.98
     middle = (np.array([5 * extent[0], 0, 0]) - model.centre) / model.scale

@@ -9,6 +9,12 @@ from ..runtime import array_module
 from ..tasks.task import task_of
 from .common import defines_of, scene_options, set_variant, verb
 
+#: What there is to say about how rays meet a shape: keys of its report.
+_RAYS = {
+    "trace": "traced through", "index_bytes": "bytes of index beside the arrays:", "resolution": "of",
+    "grid_bytes": "bytes:", "seconds": "seconds to decode:",
+}  # fmt: skip
+
 HELP = "say what is in a table file, or which learned plugins a scene uses"
 
 
@@ -106,9 +112,12 @@ def _inspect_scene(arguments) -> dict:
         stored = f", {found['table_bytes']:,} bytes as {found['storage']}" if found.get("storage") else ""
         print(f"  {found['id'] or '(no id)'}: {found['plugin']}, {', '.join(given) or 'defaults'}")
         print(f"    preset    {found.get('preset') or '(unknown)'}{stored}")
-        print(f"    in use    {', '.join(found.get('effects_in_use', ())) or 'grazing reflection only'}")
-        left_out = ", ".join(f"{k} ({v})" for k, v in found.get("effects_left_out", {}).items())
-        print(f"    left out  {left_out or 'nothing'}")
+        if found["kind"] == "shape":
+            print("    rays      " + ", ".join(f"{text} {found[key]}" for key, text in _RAYS.items() if key in found))
+        else:
+            print(f"    in use    {', '.join(found.get('effects_in_use', ())) or 'grazing reflection only'}")
+            left_out = ", ".join(f"{k} ({v})" for k, v in found.get("effects_left_out", {}).items())
+            print(f"    left out  {left_out or 'nothing'}")
         for method, n in found["operations"].items():
             print(
                 f"    {method:9} {n['gathers']} reads of {n['bytes_gathered']} bytes, {n['flops']} flops "
