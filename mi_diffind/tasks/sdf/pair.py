@@ -5,14 +5,13 @@ array of truncated distances. Both span the padded box of the mesh; their sides 
 
 from __future__ import annotations
 
-import math
 
 import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ...indirection import DifferentiableArray, Indirection, ramp
-from .field import Field, trilinear_slope
+from .field import Field
 
 #: Of the spacing of the primary array: how far distances are told. At least :data:`LEAST_BAND` of the longest side.
 BAND = 2.5
@@ -144,6 +143,3 @@ def _ranges_of_steps(values: np.ndarray, axis: int) -> np.ndarray:
         ahead[other], behind[other] = slice(1, None), slice(None, -1)
         steps = np.maximum(steps[tuple(ahead)], steps[tuple(behind)])
     return steps
-
-
-__all__ = ["PairField", "initial", "math", "resolutions", "slope_of", "trilinear_slope"]
