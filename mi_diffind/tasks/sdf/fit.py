@@ -17,7 +17,7 @@ from ...tables import StoredArray, Table
 from ..task import Fitted, Request
 from . import codes, encoding, files, nodes, pair, samples, training
 from .distances import Distances
-from .evaluation import Evaluation
+from .evaluation import Evaluation, lost_pieces
 from .mesh import Mesh, load_mesh
 from .presets import BYTES, PRESETS, ratio_for
 
@@ -64,6 +64,10 @@ def fit(request: Request) -> Fitted:
         table, result, field, lines = make(mesh, distances, nbytes, recipe, request)
         prepared = time.perf_counter() - start - result.seconds
         found = Evaluation(mesh, distances, MEASURED).measure(field)
+        lost = lost_pieces(field, distances)
+    if lost:
+        count = distances.surface.components
+        lines.append(f"{lost} of {count} pieces of the mesh are too small for the field: more --bytes help")
     table.preset, table.seed = request.preset, request.settings.seed
     folder = (request.output or Path("x")).resolve().parent
     table.settings = {
@@ -82,6 +86,7 @@ def fit(request: Request) -> Fitted:
     lines.append(f"{prepared:.1f} s for distances and samples, {result.seconds:.1f} s of training")
     lines.append(f"the mesh itself has {len(mesh.faces):,} triangles, {triangles:,} bytes of positions and indices")
     figures = {"bytes_asked": nbytes, "mesh_bytes": triangles, "prepared_seconds": prepared, "warnings": said}
+    figures["lost_pieces"] = lost
     return Fitted(table, result, lines, figures)
 
 

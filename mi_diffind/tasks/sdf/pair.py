@@ -5,7 +5,6 @@ array of truncated distances. Both span the padded box of the mesh; their sides 
 
 from __future__ import annotations
 
-
 import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
