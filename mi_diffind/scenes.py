@@ -93,8 +93,13 @@ def load_file(path: str | os.PathLike, **defines):
     """
     loaded = mi.load_file(str(path), **defines)
     if isinstance(loaded, mi.Scene):
-        said = plugins.origin(loaded.integrator())
-        unseen = _unseen(loaded, [said["plugin"] if said else loaded.integrator().class_name()])
+        integrator = loaded.integrator()
+        if integrator is None:
+            name = "path"  # as mi.render has it
+        else:
+            said = plugins.origin(integrator)
+            name = said["plugin"] if said else integrator.class_name()
+        unseen = _unseen(loaded, [name])
         if unseen:  # another integrator may be meant
             mi.Log(mi.LogLevel.Warn, unseen)
         footprint.attach(loaded)
