@@ -8,7 +8,7 @@ import pytest
 from solids import box, sphere, together
 
 from mi_diffind.runtime import array_module
-from mi_diffind.tasks.sdf import codes, encoding, files, nodes, structure
+from mi_diffind.tasks.sdf import codes, decode, encoding, files, nodes, structure
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
@@ -287,3 +287,47 @@ def test_places_where_there_is_nothing(ad, solid):
     assert np.all(field.value(p, ad.Bool(False)).numpy() == np.float32(field.band))
     corners = points(ad, [field.lower, field.upper])
     assert np.all(field.value(corners).numpy() > 0)
+
+
+def test_the_surface_stays_in_its_cells(ad, solid):
+    """Nodes that training spoiled keep their sides when they are coded, and nothing is left beside the solids."""
+    _, _, sampled = solid
+    rng = np.random.default_rng(7)
+    values = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
+    values[:, 0] += rng.normal(scale=0.1, size=len(values))
+    values[:, 1:] += rng.normal(scale=0.5, size=(len(values), 3))
+    values[:, 1:] /= np.linalg.norm(values[:, 1:], axis=1, keepdims=True)
+    coding = encoding.Coding(sampled, 8)
+    coding.commit(values, 0.5)
+    assert 0.4 < coding.done.mean() < 0.6
+    before = coding.pointers[coding.done].copy(), coding.done.copy()
+    coding.commit(values, 1.0)
+    assert coding.done.all() and np.mean(coding.pointers[before[1]] == before[0]) > 0.9
+    told = coding.values()
+    assert np.all((told[:, 0] < 0) == (sampled.distances < 0)) and np.all(np.abs(told[:, 0]) > 0.005)
+    words = codes.pointer_words(coding.pointers, 8)
+    field = files.coded_field(ad, sampled.structure, 3.0, coding.frames, words, 8, coding.entries)
+    assert len(decode.components(decode.extract(field, 200))) == 2
+
+    # On the sides of stored cells behind which there is none, the sign is that of their corners
+    s = sampled.structure
+    positions, _ = s.node_positions()
+    cells = positions[sampled.corners[:, 0]]
+    stored, side = set(map(tuple, cells.tolist())), dict(zip(map(tuple, positions.tolist()), coding.side, strict=True))
+    places, signs = [], []
+    for cell in cells:
+        for axis in range(3):
+            for end in (0, 1):
+                beside = cell.copy()
+                beside[axis] += 2 * end - 1
+                if tuple(beside.tolist()) not in stored:
+                    corner = cell.copy()
+                    corner[axis] += end
+                    place = cell + rng.random((4, 3))
+                    place[:, axis] = cell[axis] + (0.999 if end else 0.001)
+                    places.append(place)
+                    signs += [side[tuple(corner.tolist())]] * 4
+    value, *_, complete = field.blend(points(ad, np.array(s.lower) + s.spacing * np.concatenate(places)))
+    assert len(places) > 5000 and np.mean(complete.numpy()) > 0.999
+    wrong = (value.numpy() * signs < -0.005) & complete.numpy()
+    assert np.mean(wrong) < 1e-4

@@ -149,7 +149,19 @@ class Coding:
         if self.frames is None:
             self.frames = fit_frames(at)
             count = max(1, min(2**self.bits, len(values)))
-            self.entries = rounded_entries(cluster(targets(at, self.frames), count, self.seed))
+            wanted = targets(at, self.frames)
+            entries = cluster(wanted, count, self.seed)
+            # As far as nodes have to go that no entry would keep on their side
+            block = self.sampled.block
+            n, d, scale = (v[block] for v in codes.frames_numpy(self.frames))
+            plane = d + np.sum(n * middles(self.sampled.positions), axis=1)
+            furthest = np.where(self.side < 0, entries[:, 0].min(), entries[:, 0].max())
+            short = self.side * (plane + scale * furthest) < 2 * LEAST
+            needed = (2 * LEAST * self.side - plane)[short] / scale[short]
+            for extreme, reach in ((np.argmin, np.minimum), (np.argmax, np.maximum)):
+                which = extreme(entries[:, 0])
+                entries[which, 0] = reach.reduce(needed, initial=entries[which, 0])
+            self.entries = rounded_entries(entries)
         order = np.random.default_rng([self.seed, 1]).random(len(values))
         now = np.flatnonzero((order < share) & ~self.done)
         wanted = targets(at, self.frames)
