@@ -176,19 +176,26 @@ def solids_of(scene: mi.Scene) -> list[Solid]:
     return found
 
 
+def cube_of(values: np.ndarray, lower, upper) -> tuple[np.ndarray, np.ndarray]:
+    """
+    A grid of ``values`` (Z, Y, X) in a box with these corners, filled with outside to a cube, and its upper corner:
+    in grids whose sides differ, the ``sdfgrid`` of Mitsuba 3.9 finds next to no hits, and reads beyond their end.
+    """
+    side = max(values.shape)
+    spacing = (upper[0] - lower[0]) / (values.shape[2] - 1)
+    values = np.pad(values, [(0, side - n) for n in values.shape], constant_values=float(values.max()))
+    return values, np.asarray(lower, np.float64) + spacing * (side - 1)
+
+
 def native_grid(props: mi.Properties, values: np.ndarray, lower, upper, to_world, normals: str):
     """
     Mitsuba's ``sdfgrid`` of ``values`` (Z, Y, X) in a box with these corners, which ``to_world`` moves; with the
     material of ``props``. Rotated, it is an instance, in a ``merge`` with its group. Returns the shape, and what a
     scene keeps of it.
-
-    Mitsuba 3.9 finds next to no hits in grids whose sides differ: what is missing to a cube is filled with outside.
     """
-    side = max(values.shape)
-    spacing = (upper[0] - lower[0]) / (values.shape[2] - 1)
-    values = np.pad(values, [(0, side - n) for n in values.shape], constant_values=float(values.max()))
+    values, upper = cube_of(values, lower, upper)
     at = mi.ScalarTransform4f
-    box = at().translate(list(map(float, lower))).scale(float(spacing) * (side - 1))
+    box = at().translate(list(map(float, lower))).scale(float(upper[0] - lower[0]))
     grid = {
         "type": "sdfgrid",
         "id": props.id() or "grid",

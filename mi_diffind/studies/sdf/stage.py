@@ -66,7 +66,10 @@ class Stage:
 
     def grid_scene(self, field: Field, resolution: int, lit: bool = False):
         """Mitsuba's ``sdfgrid`` of a field, decoded with ``resolution`` cells along the longest side."""
+        from ...plugins.support.solids import cube_of
+
         values, lower, upper = decode.grid(field, resolution)
+        values, upper = cube_of(values, lower, upper)
         to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
         shape = mi.load_dict({"type": "sdfgrid", "grid": grid, "to_world": to_world, "normals": "smooth",
