@@ -1,5 +1,6 @@
 from __future__ import annotations  # Delayed parsing of type annotations
 
+import threading
 import time
 from pathlib import Path
 from weakref import WeakValueDictionary
@@ -19,6 +20,7 @@ from .support.solids import Placement, Solid, native_grid
 
 #: Whose arrays cannot be optimised are shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()
+_lock = threading.RLock()  # Mitsuba makes the shapes of a scene at once; who waits for a kernel may make another one
 
 #: Cells of a grid per cell of the field, along a side. At 0.75, a grid differs from a sparse field by 4% of the field's
 #: cells near the surface, on average (armadillo, 1 MB), at 0.6 by 5%, at 0.3 by 18%.
@@ -33,14 +35,13 @@ def open_model(props: mi.Properties):
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit sdf" is needed')
-    key = (path, stamp(Path(path)))
+    key = (path, stamp(Path(path)), mi.TensorXf)
     try:
         if storage == "float32":
             return TASK.open(mi.TensorXf, path, storage=storage)
-        model = _shared.get(key)
-        if model is None:
-            _shared[key] = model = TASK.open(mi.TensorXf, path)
-        return model
+        with _lock:
+            model = _shared.get(key)
+            return model if model is not None else _shared.setdefault(key, TASK.open(mi.TensorXf, path))
     except (TableError, ValueError) as e:
         raise RuntimeError(str(e)) from None
 

@@ -1,6 +1,9 @@
 """The plugin ``neural_sdf``: files, places, the two ways in which it is traced, what it refuses."""
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
+from weakref import WeakValueDictionary
 
 import drjit as dr
 import numpy as np
@@ -165,6 +168,28 @@ def test_shapes_of_one_file_share_its_arrays(mi_rgb, folder):
     params = mi_rgb.traverse(made)
     assert not [key for key in params.keys() if "vertex" in key or "tables" in key]
     assert "a.bsdf.reflectance.value" in params
+
+
+def test_shapes_made_at_once_share_their_arrays(mi_rgb, folder, monkeypatch):
+    """As Mitsuba makes them: in several threads, of which one may make a shape while it waits within another."""
+    from mi_diffind.plugins import neural_sdf as plugin
+
+    props = mi_rgb.Properties("neural_sdf")
+    props["filename"] = shape(folder)["filename"]
+    opened, nested = plugin.TASK.open, []
+
+    def slowly(*args, **kwargs):
+        time.sleep(0.1)
+        if not nested:
+            nested.append(None)
+            nested.append(plugin.open_model(props))
+        return opened(*args, **kwargs)
+
+    monkeypatch.setattr(type(plugin.TASK), "open", lambda self, *args, **kwargs: slowly(*args, **kwargs))
+    monkeypatch.setattr(plugin, "_shared", WeakValueDictionary())
+    with ThreadPoolExecutor(4) as pool:
+        models = [*pool.map(lambda _: plugin.open_model(props), range(4))]
+    assert {id(model) for model in models} == {id(nested[1])}
 
 
 def test_derivatives_reach_the_nodes(mi_rgb, folder):
