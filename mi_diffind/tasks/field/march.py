@@ -37,7 +37,10 @@ class Marched:
 
 
 def box(field, o, d, near, far, active):
-    """The part of each ray that lies in the field's box: its ends, and where there is one. NaN is nowhere."""
+    """
+    The part of each ray that lies in the field's box: the place where it begins, the distance to there, its length, and
+    where there is one. NaN is nowhere.
+    """
     types = field.types
     near, far = types.Float(near), types.Float(far)
     active = types.Bool(active)
@@ -50,7 +53,8 @@ def box(field, o, d, near, far, active):
         far = dr.select(moves, dr.minimum(far, dr.maximum(first, second)), far)
         active &= moves | ((x >= a) & (x <= b))
     # Comparisons with NaN are false
-    return near, far, active & (near < far) & dr.isfinite(near) & dr.isfinite(far)
+    active &= (near < far) & dr.isfinite(near) & dr.isfinite(far)
+    return types.Array3f(dr.fma(d, near, o)), near, far - near, active
 
 
 @dr.syntax
@@ -61,8 +65,9 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     """
     types = field.types
     with dr.suspend_grad():
-        t, far, active = box(field, o, d, near, far, active)
-        step = dr.opaque(types.Float, field.step)
+        # Counted from the box on: from afar, a step might be too short to change the distance at all
+        o, near, far, active = box(field, o, d, near, far, active)
+        t, step = types.Float(0), dr.opaque(types.Float, field.step)
         seen, depth, through = types.Array3f(0), types.Float(0), types.Float(1)
         offset = types.Float(offset)
         while active:
@@ -78,7 +83,7 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
             if shown:
                 colour = types.Array3f(*field.colour(latent, p, d, shown))
             seen += dr.select(shown, weight * colour, 0)
-            depth += weight * at
+            depth += weight * (near + at)
             through = dr.select(here, passed, through)
             t += step
             active &= here & (t < far) & (through > OPAQUE)
@@ -119,8 +124,9 @@ def tangent(field, o, d, near, far, active, offset, marched: Marched) -> tuple:
 def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
     types = field.types
     with dr.suspend_grad():
-        t, far, active = box(field, o, d, near, far, active)
-        step = dr.opaque(types.Float, field.step)
+        # Counted from the box on: from afar, a step might be too short to change the distance at all
+        o, near, far, active = box(field, o, d, near, far, active)
+        t, step = types.Float(0), dr.opaque(types.Float, field.step)
         through = types.Float(1)
         offset = types.Float(offset)
         total = dr.detach(marched.transmittance)
@@ -142,9 +148,9 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
                 colour = types.Array3f(*field.colour(latent, p, d, shown))
                 fixed = dr.select(shown, dr.detach(colour), 0)
                 rest -= weight * fixed
-                rest_depth -= weight * at
+                rest_depth -= weight * (near + at)
                 if dr.hint(adjoint is not None, mode="scalar"):
-                    slope = dr.dot(d_colour, passed * fixed - rest) + d_depth * (passed * at - rest_depth)
+                    slope = dr.dot(d_colour, passed * fixed - rest) + d_depth * (passed * (near + at) - rest_depth)
                     slope = length * (slope - d_through * total)
                     change = dr.select(here, density * slope, 0)
                     change += dr.select(shown, dr.dot(colour, d_colour * weight), 0)
@@ -153,7 +159,7 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
                     found = dr.forward_to(dr.select(here, density, 0), dr.select(shown, colour, 0))
                     rate = length * found[0]
                     d_colour += rate * (passed * fixed - rest) + weight * found[1]
-                    d_depth += rate * (passed * at - rest_depth)
+                    d_depth += rate * (passed * (near + at) - rest_depth)
                     d_through -= rate * total
             through = dr.select(here, passed, through)
             t += step
