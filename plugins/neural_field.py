@@ -90,8 +90,8 @@ luminance. Not for polarised variants. One field; a nested one is refused.
 
 **Derivatives** with respect to the field's arrays replay the rays (Vicini et al., *Path Replay Backpropagation*,
 SIGGRAPH 2021), of the radiance, of alpha and of the channels of ``aovs``. An inner integrator that replays paths, too
-(:monosp:`path_footprint`, :monosp:`path_sdf`, :monosp:`prb`, …), adds those of materials, textures and emitters; another
-one is a constant. The geometry is.
+(:monosp:`path_footprint`, :monosp:`path_sdf`, :monosp:`prb`, …) adds those of materials, textures and emitters; any
+other one is a constant, and so is the geometry.
 
 Mitsuba's own base classes write an alpha of 0 or 1 and fail with AOVs in the backward pass, because they multiply AOVs,
 which are numbers, by the ray's weight, which is a spectrum. This integrator has passes of its own. Within another
@@ -152,9 +152,9 @@ def has_smooth(scene: mi.Scene) -> bool:
     """Is there a surface in the scene across which rays are followed? One that is instanced counts in any case."""
     for shape in scene.shapes():
         bsdf = shape.bsdf()
-        if bsdf is None or not shape.is_mesh() and shape.class_name() == "Instance":
+        if shape.class_name() == "Instance":
             return True
-        if is_smooth(bsdf) and not shape.is_medium_transition():
+        if bsdf is not None and is_smooth(bsdf) and not shape.is_medium_transition():
             return True
     return False
 
@@ -350,8 +350,8 @@ def integrator() -> type:
 
         def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
             """
-            The derivatives of light, alpha and channels, for ``Forward``; for ``Backward`` these are given (``adjoint``,
-            with the channels as a dictionary) and those of parameters are added to.
+            For ``Forward``, the derivatives of light, alpha and channels; for ``Backward``, what the loss makes of these is
+            given (``adjoint``, the channels as a dictionary), and added to the gradients of parameters.
             """
             light, clear, inner_state = state
             path = self._start(ray, True)

@@ -72,7 +72,7 @@ class Light:
             return mi.Spectrum(sum(w * c for w, c in zip(LUMINANCE, colour, strict=True)))
         if not mi.is_spectral:
             return mi.Spectrum(*colour)
-        scale = 2 * dr.maximum(dr.max(dr.detach(mi.Color3f(*colour))), 1e-20)
+        scale = 2 * dr.maximum(dr.max(mi.Array3f(*colour)), 1e-20)
         at = dr.zeros(mi.SurfaceInteraction3f)
         at.wavelengths = wavelengths
         spectrum = upsampling.spectrum([c / scale for c in colour], wavelengths)
