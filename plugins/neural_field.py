@@ -350,8 +350,8 @@ def integrator() -> type:
 
         def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
             """
-            For ``Forward``, the derivatives of light, alpha and channels; for ``Backward``, what the loss makes of these is
-            given (``adjoint``, the channels as a dictionary), and added to the gradients of parameters.
+            For ``Forward``, the derivatives of light, alpha and channels; for ``Backward``, those with respect to these
+            are given (``adjoint``, the channels as a dictionary), and carried on to the parameters.
             """
             light, clear, inner_state = state
             path = self._start(ray, True)
