@@ -39,7 +39,7 @@ class RadianceField:
     def look(self, p, active=True) -> tuple:
         """
         The density at a point of the box, at least 0, and what :meth:`colour` needs to know of that point: a list of
-        floats.
+        arrays that no derivatives are taken of.
         """
         raise NotImplementedError
 

@@ -1,7 +1,8 @@
 """
 Rays through a field: emission and absorption, from front to back, and the derivatives of what they see.
 
-A ray is divided into steps of a fixed length from where it enters the box, the last one cut where it ends; each is of one
+A ray is divided into steps of a fixed length from where it enters the box, from where distances are counted (from afar,
+a step might be too short to change them at all), the last one cut where it ends; each is of one
 density and radiance, so that a medium that is the same everywhere is Beer–Lambert, exactly. Steps in which there is
 certainly nothing are skipped, which changes nothing; no radiance is read where density is nothing; and the ray ends when
 it is opaque (:data:`OPAQUE`).
@@ -18,7 +19,7 @@ import drjit as dr
 OPAQUE = 1e-3
 
 #: The weight of a step below which its radiance is not read.
-NOTHING = 1e-5
+NOTHING = 1e-4
 
 
 class Marched:
@@ -65,7 +66,6 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     """
     types = field.types
     with dr.suspend_grad():
-        # Counted from the box on: from afar, a step might be too short to change the distance at all
         o, near, far, active = box(field, o, d, near, far, active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
         seen, depth, through = types.Array3f(0), types.Float(0), types.Float(1)
@@ -124,7 +124,6 @@ def tangent(field, o, d, near, far, active, offset, marched: Marched) -> tuple:
 def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
     types = field.types
     with dr.suspend_grad():
-        # Counted from the box on: from afar, a step might be too short to change the distance at all
         o, near, far, active = box(field, o, d, near, far, active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
         through = types.Float(1)
@@ -142,29 +141,60 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
             p = dr.fma(d, at, o)
             with dr.resume_grad():
                 density, latent = field.look(p, here)
-                passed = through * dr.exp(-dr.detach(density) * length)
-                weight = dr.select(here, through - passed, 0)
-                shown = here & (weight > NOTHING)
-                colour = types.Array3f(*field.colour(latent, p, d, shown))
-                fixed = dr.select(shown, dr.detach(colour), 0)
-                rest -= weight * fixed
-                rest_depth -= weight * (near + at)
-                if dr.hint(adjoint is not None, mode="scalar"):
-                    slope = dr.dot(d_colour, passed * fixed - rest) + d_depth * (passed * (near + at) - rest_depth)
-                    slope = length * (slope - d_through * total)
-                    change = dr.select(here, density * slope, 0)
-                    change += dr.select(shown, dr.dot(colour, d_colour * weight), 0)
-                    dr.backward_from(change)
-                else:
-                    found = dr.forward_to(dr.select(here, density, 0), dr.select(shown, colour, 0))
-                    rate = length * found[0]
-                    d_colour += rate * (passed * fixed - rest) + weight * found[1]
-                    d_depth += rate * (passed * (near + at) - rest_depth)
-                    d_through -= rate * total
+            passed = through * dr.exp(-dr.detach(density) * length)
+            weight = dr.select(here, through - passed, 0)
+            shown = here & (weight > NOTHING)
+            colour = types.Array3f(0)
+            if shown:
+                # Nothing that is differentiated leaves this branch
+                with dr.resume_grad():
+                    found = types.Array3f(*field.colour(latent, p, d, shown))
+                    if dr.hint(adjoint is not None, mode="scalar"):
+                        dr.backward_from(dr.dot(found, d_colour * weight))
+                    else:
+                        d_colour += weight * dr.forward_to(found)
+                colour = dr.detach(found)
+            rest -= weight * dr.select(shown, colour, 0)
+            rest_depth -= weight * (near + at)
+            step_colour = passed * dr.select(shown, colour, 0) - rest
+            step_depth = passed * (near + at) - rest_depth
+            if dr.hint(adjoint is not None, mode="scalar"):
+                slope = dr.dot(d_colour, step_colour) + d_depth * step_depth - d_through * total
+                with dr.resume_grad():
+                    dr.backward_from(dr.select(here, density * (length * slope), 0))
+            else:
+                with dr.resume_grad():
+                    rate = length * dr.forward_to(dr.select(here, density, 0))
+                d_colour += rate * step_colour
+                d_depth += rate * step_depth
+                d_through -= rate * total
             through = dr.select(here, passed, through)
             t += step
             active &= here & (t < far) & (through > OPAQUE)
     return d_colour, d_through, d_depth
+
+
+@dr.syntax
+def visibility(field, o, d, near, far, active, target) -> None:
+    """
+    The largest weight, transmittance times opacity of a step, that each cell of ``field.nodes`` has in one of these
+    rays: raises the numbers of ``target``, one for each node, at the first of its corners.
+    """
+    types = field.types
+    with dr.suspend_grad():
+        o, near, far, active = box(field, o, d, near, far, active)
+        t, step = types.Float(0), dr.opaque(types.Float, field.step)
+        through = types.Float(1)
+        while active:
+            t, here = _next(field, o, d, t, far, step, types.Float(0.5), active)
+            end = dr.minimum(t + step, far)
+            p = dr.fma(d, dr.fma(0.5, end - t, t), o)
+            density, _ = field.look(p, here)
+            passed = through * dr.exp(-density * (end - t))
+            dr.scatter_reduce(dr.ReduceOp.Max, target, through - passed, field.nodes.cell(p), here)
+            through = dr.select(here, passed, through)
+            t += step
+            active &= here & (t < far) & (through > OPAQUE)
 
 
 class _March(dr.CustomOp):

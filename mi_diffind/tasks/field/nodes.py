@@ -31,6 +31,9 @@ class Nodes:
         if stored is not None:
             numbers = np.zeros(self.shape, np.uint32)
             numbers[stored] = np.arange(1, np.count_nonzero(stored) + 1)
+            # Of the nodes that are not stored, or whose neighbour is not, nothing is asked
+            numbers[:, :, :-1][~stored[:, :, 1:]] = 0
+            numbers[:, :, -1] = 0
             self.index = types.UInt32(numbers.reshape(-1))
             self.far = distances(cells_of(stored))
             self.distances = types.UInt32(packed(self.far))
@@ -55,11 +58,8 @@ class Nodes:
         stored = self.stored if self.stored is not None else np.ones(self.shape, bool)
         return np.argwhere(stored)
 
-    def corners(self, p, active=True) -> tuple[list, object]:
-        """
-        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell that
-        is not may be 0.
-        """
+    def _place(self, p) -> tuple:
+        """The first corner of the cell that holds ``p``, along each axis, and the place in that cell."""
         cell, fraction = [], []
         for x, a, n in zip(p, self.lower, self.shape, strict=True):
             u = dr.fma(x, 1 / self.spacing, -a / self.spacing)
@@ -67,21 +67,33 @@ class Nodes:
             # A point that rounding has put out of the box, or NaN, stays within its cell
             fraction.append(dr.clip(u - i, 0, 1))
             cell.append(self.types.UInt32(i))
+        return cell, fraction
+
+    def cell(self, p):
+        """The cell that holds ``p``: the place of its first corner in the grid, in lexicographic order."""
+        (x, y, z), _ = self._place(p)
+        return dr.fma(dr.fma(x, self.shape[1], y), self.shape[2], z)
+
+    def corners(self, p, active=True) -> tuple[list, object]:
+        """
+        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell that
+        is not may be 0.
+        """
+        cell, fraction = self._place(p)
         active = self.types.Bool(active)
         _, height, depth = self.shape
         first = dr.fma(dr.fma(cell[0], height, cell[1]), depth, cell[2])
         found = []
         for x in (0, 1):
             for y in (0, 1):
-                for z in (0, 1):
-                    at = first + ((x * height + y) * depth + z)
-                    weight = [f if e else 1 - f for f, e in zip(fraction, (x, y, z), strict=True)]
-                    if self.index is not None:
-                        at = dr.gather(self.types.UInt32, self.index, at, active)
-                    found.append((weight[0] * weight[1] * weight[2], at))
-        if self.index is not None:
-            for _, number in found:
-                active &= number != 0
+                at = first + (x * height + y) * depth
+                if self.index is not None:
+                    # A word for both: of nodes that are neighbours along z, and stored, one number follows the other
+                    at = dr.gather(self.types.UInt32, self.index, at, active)
+                    active &= at != 0
+                across = (fraction[0] if x else 1 - fraction[0]) * (fraction[1] if y else 1 - fraction[1])
+                upper = across * fraction[2]
+                found += [(across - upper, at), (upper, at + 1)]
         return found, active
 
     def skip(self, p, d, active=True):
