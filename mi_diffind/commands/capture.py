@@ -24,7 +24,7 @@ def add(commands) -> None:
     sub.add_argument("--path", choices=["sphere", "orbit"], default="sphere", help="of the cameras (default: sphere)")
     sub.add_argument(
         "--elevation", type=float, nargs=2, metavar=("LOW", "HIGH"),
-        help="degrees above the horizon (default: −90 90 for a sphere, 20 20 for an orbit, which swings between both)",
+        help="degrees above the horizon (default: -90 90 for a sphere, 20 20 for an orbit, which swings between both)",
     )  # fmt: skip
     sub.add_argument("--radius", type=float, metavar="R", help="distance of the cameras (default: all is in sight)")
     sub.add_argument(
