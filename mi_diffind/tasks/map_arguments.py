@@ -7,7 +7,6 @@ from ..arguments import Argument, checked, decibels, positive
 from ..errors import UsageError
 from ..maps.source import NONFINITE, Source
 
-
 _SIZES = (
     ("compression", sizes.parse_compression, "how many times smaller than the source, uncompressed (default: 12x)"),
     ("bytes", sizes.parse_bytes, "size of the arrays, as in 256k or 1.5M"),

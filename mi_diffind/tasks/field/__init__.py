@@ -27,7 +27,9 @@ class Field(Task):
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
     arguments = (
-        Argument("source", metavar="FOLDER", help="views (transforms_*.json): of mi-diffind capture, Blender, nerfstudio"),
+        Argument(
+            "source", metavar="FOLDER", help="views (transforms_*.json): of mi-diffind capture, Blender or nerfstudio"
+        ),
         Argument(
             "--bytes", group="size", type=checked(sizes.parse_bytes), metavar="N",
             help="size in memory, as in 512k or 1.5M",

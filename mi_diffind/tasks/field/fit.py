@@ -12,7 +12,8 @@ import numpy as np
 
 from ... import sizes
 from ...errors import UsageError
-from ...fitting import FitResult, FittingError, fit as train
+from ...fitting import FitResult, FittingError
+from ...fitting import fit as train
 from ...tables import StoredArray, Table, save_table
 from ..task import Fitted, Request
 from . import compression, files, pairs, target

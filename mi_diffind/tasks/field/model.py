@@ -125,7 +125,7 @@ class FieldModel(Model):
 
         folder = (self.table.path or Path("x")).resolve().parent
         path = Path(capture) if capture is not None else folder / self.table.settings.get("capture_path", "")
-        if capture is None and not self.table.settings.get("capture_path") or not path.is_dir():
+        if (capture is None and not self.table.settings.get("capture_path")) or not path.is_dir():
             self._refuse(f"was fitted to the capture {path}, which is not there")
         return evaluate(self.field, Images(self.types, held_views(path)[0]))
 

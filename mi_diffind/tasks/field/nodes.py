@@ -24,8 +24,8 @@ COLUMN = 31
 
 class Nodes:
     """
-    Nodes at ``lower + spacing · (i, j, k)``, ``(i, j, k)`` below ``shape``. With ``stored`` (bool, of this shape), those
-    that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0 on.
+    Nodes at ``lower + spacing · (i, j, k)``, ``(i, j, k)`` below ``shape``. With ``stored`` (bool, of this shape),
+    those that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0 on.
 
     Numbers are found in an index with a word for each node of the grid or, if ``packed``, in bit masks and their ranks,
     which take a tenth of that memory.
@@ -90,8 +90,8 @@ class Nodes:
 
     def corners(self, p, active=True) -> tuple[list, object]:
         """
-        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell that
-        is not may be 0.
+        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell
+        that is not may be 0.
         """
         cell, fraction = self._place(p)
         active = self.types.Bool(active)

@@ -33,7 +33,8 @@ class PairsField(RadianceField):
 
     def __init__(self, nodes: Nodes, density: Indirection, colour: Indirection, low, high, step=None):
         self.nodes, self.low, self.high = nodes, [float(v) for v in low], [float(v) for v in high]
-        self.modules = dict(zip(self.NAMES, (density.primary[0], density.cascaded, colour.primary[0], colour.cascaded)))
+        modules = density.primary[0], density.cascaded, colour.primary[0], colour.cascaded
+        self.modules = dict(zip(self.NAMES, modules, strict=True))
         arrays = {name: module.data for name, module in self.modules.items()}
         super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays, step)
 

@@ -44,7 +44,10 @@ class Sdf(Task):
     storages = ()
     arguments = (
         Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
-        Argument("--bytes", type=checked(sizes.parse_bytes), metavar="N", help="size in memory, as in 256k or 1.5M (default: 1M)"),
+        Argument(
+            "--bytes", type=checked(sizes.parse_bytes), metavar="N",
+            help="size in memory, as in 256k or 1.5M (default: 1M)",
+        ),
         Argument(
             "--bits", type=int, choices=BITS, default=10,
             help="bits of a pointer of the sparse layout (default: 10)",
