@@ -63,7 +63,7 @@ def fraction(text: str) -> float:
 
 
 def checked(parse):
-    """A parser that raises ``ValueError``, as a type of ``argparse``, which shows messages of its own exception only."""
+    """A parser that raises ``ValueError``, as a type of ``argparse``, which shows only messages of its own."""
 
     def parsed(text: str):
         try:

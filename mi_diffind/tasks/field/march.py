@@ -1,10 +1,11 @@
 """
 Rays through a field: emission and absorption, from front to back, and the derivatives of what they see.
 
-A ray is divided into steps of a fixed length from where it enters the box, from where distances are counted (from afar,
-a step might be too short to change them at all), the last one cut where it ends. Each is of one density and radiance, so
-that a medium that is the same everywhere is Beer–Lambert, exactly. Steps in which there is certainly nothing are skipped,
-which changes nothing; no radiance is read where density is nothing; and the ray ends when it is opaque (:data:`OPAQUE`).
+A ray is divided into steps of a fixed length from where it enters the box, from where distances are counted (from
+afar, a step might be too short to change them at all), the last one cut where it ends. Each is of one density and
+radiance, so that a medium that is the same everywhere is Beer–Lambert, exactly. Steps in which there is certainly
+nothing are skipped, which changes nothing; no radiance is read where density is nothing; and the ray ends when it is
+opaque (:data:`OPAQUE`).
 
 Derivatives replay the ray (Vicini et al., *Path Replay Backpropagation*, SIGGRAPH 2021): with what is seen from a step
 on, R, and the transmittance T behind it, ∂L/∂σ = δ (T c − R). Nothing is divided by.
@@ -23,7 +24,7 @@ NOTHING = 1e-6
 
 class Marched:
     """
-    What a ray saw: ``colour`` (premultiplied), ``transmittance``, and ``depth``, Σ w t: divided by the opacity, the mean.
+    What a ray saw: ``colour`` (premultiplied), ``transmittance``, and ``depth``, Σ w t: by the opacity, a mean.
     """
 
     def __init__(self, colour=None, transmittance=None, depth=None):

@@ -25,10 +25,10 @@ COLUMN = 31
 class Nodes:
     """
     Nodes at ``lower + spacing · (i, j, k)``, ``(i, j, k)`` below ``shape``. With ``stored`` (bool, of this shape),
-    those that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0 on.
+    those that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0.
 
-    Numbers are found in an index with a word for each node of the grid or, if ``packed``, in bit masks and their ranks,
-    which take a tenth of that memory.
+    Numbers are found in an index with a word for each node of the grid or, if ``packed``, by bit masks and ranks, which
+    take a tenth of that memory.
     """
 
     def __init__(self, types, lower, spacing: float, shape, stored: np.ndarray | None = None, packed: bool = False):
