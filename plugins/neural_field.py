@@ -7,9 +7,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import compat
+from mi_diffind.tables import TableError
 from mi_diffind.tasks.field.march import OPAQUE
 
-from . import Plugin, path_footprint, path_sdf
+from . import Plugin
+from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
 from .support import properties
 from .support import solids as sdf
@@ -162,9 +164,8 @@ def has_smooth(scene: mi.Scene) -> bool:
 @cache
 def integrator() -> type:
     """The class, in the variant that is set."""
-    Replay = compat.replay_integrator()
 
-    class NeuralField(Replay):
+    class NeuralField(compat.replay_integrator()):
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties, field=None):
@@ -196,13 +197,13 @@ def integrator() -> type:
                 inner = mi.Properties("path_footprint")
                 for name in own:
                     inner[name] = props[name]
-                return path_footprint.integrator()(inner)
+                return path_footprint()(inner)
             if len(given) > 1:
                 raise RuntimeError(f"found {len(given)} nested integrators, allowed is one, for the surfaces")
             if own:
                 raise RuntimeError(f'parameter "{own[0]}": belongs to the nested integrator')
             found = given[0]
-            if isinstance(found, NeuralField):
+            if type(found).__name__ == NeuralField.__name__:
                 raise RuntimeError("a nested neural_field: found a second field, allowed is one")
             if not isinstance(found, mi.SamplingIntegrator):
                 raise RuntimeError(
@@ -263,7 +264,7 @@ def integrator() -> type:
 
         def sample_rays(self, scene, sensor, sampler):
             """As the inner integrator does."""
-            if isinstance(self.surfaces, mi.ad.integrators.common.ADIntegrator):
+            if compat.written_in_python(self.surfaces):
                 return self.surfaces.sample_rays(scene, sensor, sampler)
             return super().sample_rays(scene, sensor, sampler)
 
@@ -366,7 +367,7 @@ def integrator() -> type:
                 path.change_depth = mi.Float(aovs.get("depth", more[1]))
             sampler, path = self._follow(mode, scene, sampler, path, surfaces)
             change = path.change
-            if surfaces and isinstance(self.surfaces, Replay):
+            if surfaces and compat.replays_paths(self.surfaces):
                 δ = None
                 if mode == dr.ADMode.Backward:
                     δ = dr.select(path.handed, path.change * path.throughput, 0)
@@ -394,7 +395,7 @@ def integrator() -> type:
                     setattr(onward, name, dr.select(same, getattr(ray, name), path.ray.o))
                 for name in ("d_x", "d_y"):
                     setattr(onward, name, dr.select(same, getattr(ray, name), path.ray.d))
-            if not isinstance(self.surfaces, mi.ad.integrators.common.ADIntegrator):
+            if not compat.written_in_python(self.surfaces):
                 light, valid, _ = self.surfaces.sample(scene, sampler, onward, None, path.handed)
                 return light, valid, None
             light, valid, _, state = self.surfaces.sample(
@@ -408,7 +409,7 @@ def integrator() -> type:
             Rays up to where the inner integrator takes over: the primal phase if there is no ``mode``. One piece is
             enough where nothing is smooth.
             """
-            solids = sdf.solids_of(scene) if isinstance(self.surfaces, path_sdf.integrator()) else []
+            solids = sdf.solids_of(scene) if hasattr(self.surfaces, "sample_solids") else []
             if self.smooth_depth == 0 or not has_smooth(scene):
                 return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False)
 
@@ -531,12 +532,11 @@ def integrator() -> type:
 
 def open_model(props: mi.Properties):
     """The model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
-    from mi_diffind.tables import TableError
-    from mi_diffind.tasks.field import TASK
-
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
+    from mi_diffind.tasks.field import TASK
+
     try:
         return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
     except (TableError, ValueError) as e:

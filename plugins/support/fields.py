@@ -88,7 +88,7 @@ class Light:
             free = mi.Array3f(dr.detach(colour))
             dr.enable_grad(free)
             dr.backward_from(dr.dot(weight, self.of(free, wavelengths, active)))
-            return dr.select(active, dr.grad(free), 0)
+            return dr.select(active & _coloured(colour), dr.grad(free), 0)
 
     def tangent(self, colour, change, wavelengths, active=True):
         """How the light of ``colour`` changes with its ``change``."""
@@ -98,4 +98,9 @@ class Light:
             free = mi.Array3f(dr.detach(colour))
             dr.enable_grad(free)
             dr.set_grad(free, mi.Array3f(change))
-            return dr.select(active, dr.forward_to(self.of(free, wavelengths, active)), 0)
+            return dr.select(active & _coloured(colour), dr.forward_to(self.of(free, wavelengths, active)), 0)
+
+
+def _coloured(colour):
+    """Black has no derivative, since the spectrum of a colour depends on its hue alone."""
+    return dr.max(mi.Array3f(dr.detach(colour))) > 0
