@@ -398,7 +398,8 @@ def test_derivatives_of_spectra():
     registered(mi)
     made = scene(mi, "bumps", size=(12, 8))
     for ending in ("tables.density", "tables.colour"):
-        check(mi, made, ending, spp=16, step=2e-3)
+        # The table of spectra has a kink at each of its entries
+        check(mi, made, ending, spp=16, step=5e-4, tolerance=0.02)
 
 
 # -- as an object of Mitsuba -------------------------------------------------------------------------------------------
