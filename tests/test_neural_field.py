@@ -399,7 +399,7 @@ def test_derivatives_of_spectra():
     made = scene(mi, "bumps", size=(12, 8))
     for ending in ("tables.density", "tables.colour"):
         # The table of spectra has a kink at each of its entries
-        check(mi, made, ending, spp=16, step=5e-4, tolerance=0.02)
+        check(mi, made, ending, spp=16, tolerance=0.03)
 
 
 # -- as an object of Mitsuba -------------------------------------------------------------------------------------------
