@@ -353,6 +353,11 @@ def instantiate(config, state):
     return mi.parser.instantiate(config, state)
 
 
+def keep_meshes(config) -> None:
+    """Have a parsed scene built with all its meshes apart, where Mitsuba joins those of one material by default."""
+    config.merge_meshes = False
+
+
 def properties_of(state, kind=None) -> list:
     """
     The properties (``mi.Properties``) of all objects of a parsed scene, or of those of a ``kind``, an

@@ -16,10 +16,10 @@ from __future__ import annotations
 import drjit as dr
 
 #: The transmittance at which a ray ends.
-OPAQUE = 1e-3
+OPAQUE = 1e-4
 
 #: The weight of a step below which its radiance is not read.
-NOTHING = 1e-4
+NOTHING = 1e-6
 
 #: Not all arrays have to be differentiated.
 ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
