@@ -76,7 +76,7 @@ Radiance field among surfaces (:monosp:`neural_field`)
 A captured radiance field (Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH
 Asia 2023, task 7) among ordinary surfaces. Each camera ray is marched through the field up to the first surface; what
 the field emits is added up from front to back, and the radiance of the inner integrator is added, times the
-transmittance that is left. A ray that the field makes opaque (a transmittance below :math:`10^{-3}`) never sees a
+transmittance that is left. A ray that the field makes opaque (a transmittance below :math:`10^{-4}`) never sees a
 surface, one that misses the field's box is the inner integrator's alone. On the film, alpha is one minus the
 transmittance where there is nothing behind.
 
