@@ -175,7 +175,8 @@ def reports(scene) -> list[dict]:
     What each learned plugin of a loaded scene does: ``plugin``, ``kind``, ``id`` and ``parameters`` as in
     :func:`learned_plugins`; what it reports, ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
     ``evaluated_once``, ``storage``, ``table_bytes`` and more; and for a BSDF the ``operations`` of ``eval``, ``pdf``
-    and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name).
+    and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance
+    field, how many steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.field.counting.Counts`).
     """
     found = []
     for made in learned_instances(scene):
@@ -185,6 +186,7 @@ def reports(scene) -> list[dict]:
             "id": made.id(),
             **(plugins.report(made) or {}),
             "operations": {method: n.asdict() for method, n in counts.items()},
+            **({"rays": made.counts(scene)} if hasattr(made, "counts") and scene.sensors() else {}),
         })  # fmt: skip
     return found
 

@@ -260,6 +260,13 @@ def integrator() -> type:
                 f'  aovs = "{",".join(self.aovs)}",\n  surfaces = {inner}\n]'
             )
 
+        def counts(self, scene, sensor=0) -> dict:
+            """What the camera's rays, one through each pixel, read of the field (:class:`.counting.Counts`)."""
+            with dr.suspend_grad():
+                _, _, _, ray, _, _ = self._begin(scene, sensor, 0, 1)
+                pi = scene.ray_intersect_preliminary(ray, coherent=True, active=True)
+                return self.placed.count(ray, dr.minimum(pi.t, ray.maxt)).asdict()
+
         # -- the film ---------------------------------------------------------------------------------------------
 
         def sample_rays(self, scene, sensor, sampler):

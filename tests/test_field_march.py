@@ -6,6 +6,7 @@ import pytest
 from radiance_fields import Bumps, Fog
 
 from mi_diffind import compat
+from mi_diffind.tasks.field import counting
 from mi_diffind.tasks.field import march as marching
 
 
@@ -87,28 +88,26 @@ def test_against_numpy(mi_rgb, rng):
         assert found[2][i] == pytest.approx(weights @ at, abs=5e-3)
 
 
-def test_nothing_is_read_that_does_not_count(mi_rgb, rng):
+def test_nothing_is_read_that_does_not_count(mi_rgb):
     """Steps that a field says to be empty are not looked at, and rays that are opaque end."""
     mi = mi_rgb
     types = types_of(mi)
-
-    class Counted(Bumps):
-        def look(self, p, active=True):
-            dr.scatter_add(self.looks, types.UInt32(1), types.UInt32(0), active)
-            return super().look(p, active)
-
-    def looks(o, d, **more):
-        field = Counted(types, **more)
-        field.looks = dr.zeros(types.UInt32, 1)
-        dr.eval(marching.march(field, *rays(mi, o, d), 0, np.inf).transmittance)
-        return int(field.looks[0])
-
     across = [[-3, 0.01 * i, 0.02] for i in range(20)], [[1, 0, 0]] * 20
-    whole = looks(*across, empty=True, blind=True, height=0.1)
-    assert whole == pytest.approx(20 * 80, abs=20)
-    assert looks(*across, empty=True, height=0.1) == pytest.approx(20 * 40, abs=40)
-    assert looks(*across, height=1e4) < 0.5 * whole
-    assert looks([[-3, 2, 0], [5, 0, 0], [0, 0, np.nan]], [[1, 0, 0]] * 3) == 0
+
+    def counted(o, d, **more):
+        return counting.count(Bumps(types, **more), *rays(mi, o, d), 0, np.inf)
+
+    whole = counted(*across, empty=True, blind=True, height=0.1)
+    assert (whole.rays, whole.crossing, whole.opaque, whole.hidden, whole.skipped) == (20, 20, 0, 0, 0)
+    # The last step of 80 may leave a sliver, of rounding
+    assert whole.steps == 20 * 80 and 0 <= whole.looks - whole.steps <= 20 and whole.colours <= 0.52 * whole.steps
+    known = counted(*across, empty=True, height=0.1)
+    assert known.steps == whole.steps and known.skipped == pytest.approx(20 * 40, abs=40)
+    assert known.looks + known.skipped == whole.looks and known.colours == whole.colours
+    thick = counted(*across, height=1e4)
+    assert thick.opaque == 20 and thick.looks < 0.5 * thick.steps and thick.looks + thick.hidden == thick.steps
+    missing = counted([[-3, 2, 0], [5, 0, 0], [0, 0, np.nan]], [[1, 0, 0]] * 3)
+    assert missing.rays == 3 and sum(missing.asdict().values()) == 3
 
 
 def test_hard_rays(mi_rgb):

@@ -274,6 +274,18 @@ def test_what_the_inner_integrator_is_asked(mi_rgb, fields):
     assert 20 < turned.sum() < active.sum() / 2 and (d[1].reshape(active.shape)[turned] < 0).all()
 
 
+def test_counts(mi_rgb, fields):
+    """Of camera rays, up to the first surface."""
+    found = scene(mi_rgb, **surfaces(mi_rgb))
+    counts = found.integrator().counts(found)
+    ray = pixel_rays(mi_rgb, found)
+    si = found.ray_intersect(ray)
+    _, length = inside(ray, np.where(np.array(si.is_valid()), np.array(si.t), np.inf))
+    steps = np.ceil(length / fields["fog"].step)
+    assert counts["rays"] == len(length) and counts["crossing"] == (length > 0).sum() < len(length)
+    assert counts["steps"] == pytest.approx(steps.sum(), rel=0.01) and counts["looks"] == counts["steps"]
+
+
 def test_within_aov(mi_rgb, fields):
     made = scene(mi_rgb, integrator={"aovs": "depth,opacity"}, **surfaces(mi_rgb))
     outer = mi_rgb.load_dict({

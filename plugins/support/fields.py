@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import compat
+from mi_diffind.tasks.field import counting
 from mi_diffind.tasks.field import march as marching
 
 from . import upsampling
@@ -45,6 +46,10 @@ class PlacedField:
     def march(self, ray, far, active=True) -> marching.Marched:
         """What rays see of the field before the distance ``far``; ``depth`` in units of the field's own frame."""
         return marching.march(self.field, *self._local(ray, far, active))
+
+    def count(self, ray, far, active=True) -> counting.Counts:
+        """What :meth:`march` reads."""
+        return counting.count(self.field, *self._local(ray, far, active))
 
     def replay(self, ray, far, active, marched, d_colour, d_transmittance, d_depth) -> None:
         """See :func:`.march.replay`; ``depth`` is that of the world."""
