@@ -207,6 +207,7 @@ def integrator() -> type:
                 field = self.model.field
             self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
             self.light = Light()
+            self.held = self.placed.held()
             self._warned = False
             self._shapes = {name: tuple(values.shape) for name, values in field.arrays.items()}
 

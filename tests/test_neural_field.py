@@ -440,6 +440,20 @@ def test_parameters(mi_rgb, fields):
     assert "NeuralField[" in str(made.integrator()) and "PathFootprint" in str(made.integrator())
 
 
+def test_frozen(mi_rgb, fields, no_garbage_collection):
+    """A recorded render sees other arrays, other seeds."""
+    mi = mi_rgb
+    made = scene(mi, "bumps", glass=mirror(mi, {"type": "conductor"}))
+    params = mi.traverse(made)
+    frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
+    for seed in range(3):
+        params["it.tables.density"] = mi.TensorXf(params["it.tables.density"].numpy() * np.float32(0.7))
+        params.update()
+        found, expected = np.array(frozen(made, mi.UInt32(seed))), render(mi, made, 1, seed)
+        assert np.abs(found - expected).max() < 1e-5
+    assert frozen.n_recordings == 1
+
+
 @pytest.mark.parametrize(
     "more, message",
     [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import drjit as dr
 import mitsuba as mi
 
@@ -28,6 +30,13 @@ class PlacedField:
         dr.make_opaque(self.axes)
         self.origin = dr.opaque(mi.Point3f, self.placement.origin.tolist())
         self.size = dr.opaque(mi.Float, self.placement.size)
+
+    def held(self) -> list:
+        """
+        All arrays that rays read. An instance of a plugin that has them as an attribute of its own can be part of a
+        frozen function (``dr.freeze``), which does not look into other objects.
+        """
+        return [self.axes, self.origin, self.size, *_arrays_of(self.field, set())]
 
     def optimised(self) -> bool:
         """Is a derivative with respect to the field's arrays asked for?"""
@@ -60,6 +69,24 @@ class PlacedField:
         """See :func:`.march.tangent`; ``depth`` is that of the world."""
         colour, transmittance, depth = marching.tangent(self.field, *self._local(ray, far, active), 0.5, marched)
         return colour, transmittance, depth * self.size
+
+
+def _arrays_of(value, known: set) -> list:
+    """The Dr.Jit arrays in an object of ours and in what it refers to."""
+    if id(value) in known:
+        return []
+    known.add(id(value))
+    if isinstance(value, dr.ArrayBase):
+        return [value] if dr.is_jit_v(value) else []
+    if isinstance(value, dict):
+        inside = value.values()
+    elif isinstance(value, (list, tuple)):
+        inside = value
+    else:
+        inside = (
+            vars(value).values() if hasattr(value, "__dict__") and not isinstance(value, (type, ModuleType)) else ()
+        )
+    return [array for one in inside for array in _arrays_of(one, known)]
 
 
 class Light:
