@@ -21,6 +21,9 @@ OPAQUE = 1e-4
 #: The weight of a step below which its radiance is not read.
 NOTHING = 1e-6
 
+#: Not all arrays have to be differentiated.
+ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+
 
 class Marched:
     """
@@ -148,9 +151,9 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
                 with dr.resume_grad():
                     found = types.Array3f(*field.colour(latent, p, d, shown))
                     if dr.hint(adjoint is not None, mode="scalar"):
-                        dr.backward_from(dr.dot(found, d_colour * weight))
+                        dr.backward_from(dr.dot(found, d_colour * weight), ANY)
                     else:
-                        d_colour += weight * dr.forward_to(found)
+                        d_colour += weight * dr.forward_to(found, flags=ANY)
                 colour = dr.detach(found)
             rest -= weight * dr.select(shown, colour, 0)
             rest_depth -= weight * (near + at)
@@ -159,10 +162,10 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
             if dr.hint(adjoint is not None, mode="scalar"):
                 slope = dr.dot(d_colour, step_colour) + d_depth * step_depth - d_through * total
                 with dr.resume_grad():
-                    dr.backward_from(dr.select(here, density * (length * slope), 0))
+                    dr.backward_from(dr.select(here, density * (length * slope), 0), ANY)
             else:
                 with dr.resume_grad():
-                    rate = length * dr.forward_to(dr.select(here, density, 0))
+                    rate = length * dr.forward_to(dr.select(here, density, 0), flags=ANY)
                 d_colour += rate * step_colour
                 d_depth += rate * step_depth
                 d_through -= rate * total
