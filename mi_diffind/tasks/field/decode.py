@@ -160,8 +160,10 @@ def _openvdb(output: Path):
 def _write_vdb(module, path: Path, content: dict[str, np.ndarray]) -> None:
     """Grids whose voxels are the nodes; those with nothing are not active."""
     voxel, found = float(content["voxel"]), []
-    transform = module.createLinearTransform(voxelSize=voxel)
-    transform.postTranslate([float(x) for x in content["lower"]])
+    # Rows are multiplied from the left
+    matrix = np.diag([voxel, voxel, voxel, 1.0])
+    matrix[3, :3] = content["lower"]
+    transform = module.createLinearTransform(matrix.tolist())
     something = content["density"][..., None] > 0
     for name, kind, array in (
         ("density", module.FloatGrid, content["density"]),
