@@ -185,6 +185,21 @@ def test_objects_are_what_it_is_about(mi_rgb, scene, tmp_path, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
+    """Mitsuba makes one mesh of them, where it may."""
+    from mi_diffind import capture, scenes
+
+    path, cube = tmp_path / "cubes.xml", '<shape type="cube" id="{}"><ref id="grey"/><transform name="to_world">{}'
+    cubes = [cube.format(name, f'<translate x="{x}"/></transform></shape>') for name, x in (("a", -2), ("b", 3))]
+    path.write_text(f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{"".join(cubes)}</scene>')
+    assert len(scenes.load(path).shapes()) == 1
+    loaded = capture._load(path, None)
+    assert capture.bounds(loaded).tolist() == [[-3, -1, -1], [4, 1, 1]]
+    assert capture.bounds(loaded, ("b",)).tolist() == [[2, -1, -1], [4, 1, 1]]
+    # As far as their vertices, which is nearer than the corners of a box around both
+    assert capture._reach(loaded, ("b",), np.array([3.0, 0, 0])) == pytest.approx(np.sqrt(3))
+
+
 def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
     inside = ("--centre", "0", "0", "0", "--radius", "0.1", "--views", "2", "--test", "0")
     assert run(scene, tmp_path / "views", *inside) == 0
