@@ -200,6 +200,18 @@ def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
     assert capture._reach(loaded, ("b",), np.array([3.0, 0, 0])) == pytest.approx(np.sqrt(3))
 
 
+def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_path):
+    """And further channels are none of the image's."""
+    from mi_diffind.tasks.field.views import load_views
+
+    nested = '<integrator type="aov"><string name="aovs" value="d:depth"/><integrator type="direct"/></integrator>'
+    other = tmp_path / "other.xml"
+    other.write_text(scene.read_text().replace('<integrator type="direct"/>', nested))
+    assert run(scene, tmp_path / "plain") == run(other, tmp_path / "nested") == 0
+    plain, found = (load_views(tmp_path / name).images for name in ("plain", "nested"))
+    assert not found[:, 0, 0].any() and np.abs(found - plain).mean() < 0.01
+
+
 def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
     inside = ("--centre", "0", "0", "0", "--radius", "0.1", "--views", "2", "--test", "0")
     assert run(scene, tmp_path / "views", *inside) == 0
