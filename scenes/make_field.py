@@ -24,7 +24,7 @@ def main() -> None:
     at = next(i for i, item in enumerate(content) if item.tag == "integrator")
     content[at] = plugin("integrator", "neural_field", plugin("integrator", "path", max_depth=Whole("$max_depth")),
                          filename="$file")  # fmt: skip
-    mirror = plugin("bsdf", "conductor", id="mirror", material="Ag")
+    mirror = plugin("bsdf", "twosided", plugin("bsdf", "conductor", material="Ag"), id="mirror")
     glass = plugin("bsdf", "dielectric", id="glass", int_ior=1.5)
     gold = plugin("bsdf", "roughconductor", material="Au", alpha=0.15)
     jar = principled(base_color=(0.6, 0.58, 0.52), roughness=0.35, specular=0.5)
@@ -45,7 +45,7 @@ def main() -> None:
         "Meshes: a knot before the field, a jar behind, a ball of glass",
         mesh("knot", gold, scale={"value": 0.5}, rotate=turn("y", 20), translate=place(0.35, 0, 1.85)),
         mesh("jar", jar, scale={"value": 1.2}, translate=place(-0.55, 0, -1.75)),
-        plugin("shape", "sphere", transform(scale={"value": 0.36}, translate=place(-1.15, 0.35, 1.55)),
+        plugin("shape", "sphere", transform(scale={"value": 0.36}, translate=place(-0.8, 0.37, 1.85)),
                element("ref", id="glass"), id="ball"),
     ]  # fmt: skip
     write(FOLDER / "field.xml", ABOUT, content)

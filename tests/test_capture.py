@@ -3,12 +3,15 @@
 import contextlib
 import json
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from mi_diffind import cli
+
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
 #: Centre, radius and colour of three spheres of which no two can be taken for another.
 SPHERES = (
@@ -247,6 +250,26 @@ def test_scenes_that_are_refused(mi_rgb, scene, tmp_path, capsys):
     scene.write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
     assert run(scene, tmp_path / "views") == 2
     assert "the scene has no surfaces but lights, there is nothing to capture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["group", "thin", "glossy"])
+def test_scenes_that_ship_are_wholly_in_sight(mi_rgb, tmp_path, name):
+    """From below, from the side and from above, from the distance that is taken by default."""
+    from mi_diffind.tasks.field.views import load_views
+
+    options = ("--views", "3", "--test", "0", "--resolution", "40", "--spp", "4")
+    assert cli.main(["capture", str(SCENES / f"capture_{name}.xml"), "-o", str(tmp_path / "views"), *options]) == 0
+    content = json.loads((tmp_path / "views" / "transforms_train.json").read_text())
+    write = {**content, "frames": content["frames"] + content["frames"][:1]}
+    (tmp_path / "views" / "transforms_train.json").write_text(json.dumps(write))
+    images = load_views(tmp_path / "views").images
+    alpha = images[..., 3]
+    border = np.concatenate([alpha[:, [0, -1]].ravel(), alpha[:, :, [0, -1]].ravel()])
+    assert border.max() < 1 and border.mean() < 0.03  # touched, not crossed
+    assert 0.1 < alpha.mean() < 0.6
+    rows, columns = np.nonzero(alpha.any(axis=0))
+    assert np.ptp(rows) > 28 and np.ptp(columns) > 28  # and they fill the images
+    assert 0.02 < images[..., :3].mean() < 0.5
 
 
 # -- places -----------------------------------------------------------------------------------------------------------
