@@ -1,0 +1,88 @@
+"""Where something may be, before any training: the box of a capture, and the visual hull of its silhouettes."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from .views import Views, ViewsError
+
+#: Nodes along the sides of the grid in which the box is looked for.
+SEARCH = 64
+
+#: The share of the views that have to see a place, lest what lies out of sight counts as full.
+SIGHTED = 0.34
+
+#: By how many voxels a box that silhouettes were found in is larger.
+MARGIN = 2
+
+
+def box_of(views: Views) -> tuple[np.ndarray, np.ndarray]:
+    """
+    The box of what the views show: the capture's own (``aabb``), cut to the visual hull if there is alpha. Without an
+    ``aabb``, one looks around the point that the cameras look at, as far as the nearest of them. Raises
+    :class:`.ViewsError` if nothing is in sight.
+    """
+    if views.box is not None:
+        lower, upper = np.asarray(views.box, np.float64)
+    else:
+        middle, reach = _looked_at(views)
+        lower, upper = middle - reach, middle + reach
+    if not views.has_alpha:
+        return lower, upper
+    for _ in range(2):  # the second time, in a finer grid
+        spacing = float((upper - lower).max()) / (SEARCH - 1)
+        shape = np.ceil((upper - lower) / spacing).astype(int) + 1
+        inside = hull(views, lower, spacing, shape)
+        if not inside.any():
+            raise ViewsError(f"{views.path}: the views show nothing that all of them could see: the alphas do not meet")
+        found = np.argwhere(inside)
+        first, last = found.min(axis=0) - MARGIN, found.max(axis=0) + MARGIN
+        lower, upper = np.maximum(lower, lower + first * spacing), np.minimum(upper, lower + last * spacing)
+    return lower, upper
+
+
+def _looked_at(views: Views) -> tuple[np.ndarray, float]:
+    """The point nearest to all axes of view, and the distance from there to the nearest camera."""
+    axes = -views.poses[:, :3, 2]
+    # Σ (I − a aᵀ) (x − o) = 0; a little weight on the cameras' mean if all look the same way
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    ahead = views.origins + axes * np.linalg.norm(views.origins - views.origins.mean(axis=0), axis=1).max()
+    matrix = across.sum(axis=0) + 1e-3 * len(axes) * np.eye(3)
+    point = np.linalg.solve(
+        matrix, np.einsum("nij,nj->i", across, views.origins) + 1e-3 * len(axes) * ahead.mean(axis=0)
+    )
+    reach = np.linalg.norm(views.origins - point, axis=1).min()
+    return point, float(max(reach, 1e-3))
+
+
+def hull(views: Views, lower, spacing: float, shape) -> np.ndarray:
+    """
+    The nodes, ``lower + spacing · (i, j, k)`` below ``shape``, that no view sees empty and :data:`SIGHTED` of them see:
+    which lie, with a voxel around them, on something with alpha or out of each image. bool of this shape.
+    """
+    lower = np.asarray(lower, np.float64)
+    axes = [a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    numbers, sights = np.arange(len(points)), np.zeros(len(points), np.int32)
+    needed = max(1, int(SIGHTED * len(views)))
+    for v in range(len(views)):
+        local = (points - views.origins[v]) @ views.poses[v, :3, :3]
+        ahead = -local[:, 2]
+        front = ahead > 1e-6
+        scale = views.focal[v] / np.where(front, ahead, 1)[:, None]
+        x = views.centre[v, 0] + scale[:, 0] * local[:, 0] - 0.5
+        y = views.centre[v, 1] - scale[:, 1] * local[:, 1] - 0.5
+        # As wide as a voxel seems, at its widest
+        reach = int(np.ceil(0.87 * spacing * scale.max(axis=1)[front].max())) if front.any() else 0
+        covered = maximum_filter(views.images[v, :, :, 3] > 0, size=2 * min(reach, 16) + 1)
+        height, width = covered.shape
+        i, j = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
+        sighted = front & (i >= 0) & (i < width) & (j >= 0) & (j < height)
+        sights += sighted
+        kept = sights + (len(views) - 1 - v) >= needed
+        kept[sighted] &= covered[j[sighted], i[sighted]]
+        points, numbers, sights = points[kept], numbers[kept], sights[kept]
+    inside = np.zeros(tuple(shape), bool)
+    inside.reshape(-1)[numbers] = True
+    return inside
