@@ -129,8 +129,9 @@ def visibility(field: GridField, images, every: int = 2) -> np.ndarray:
     the derivative of what is seen with respect to colours that are all the same.
     """
     types, views = field.types, images.views
-    arrays = {"density": field.arrays["density"], "colour": dr.zeros(types.TensorXf, field.arrays["colour"].shape)}
-    dr.enable_grad(arrays["colour"])
+    arrays = {"density": types.TensorXf(dr.detach(field.arrays["density"]))}
+    arrays["colour"] = dr.zeros(types.TensorXf, field.arrays["colour"].shape)
+    dr.enable_grad(arrays)
     white = field.with_arrays(arrays)
     columns, rows = views.width // every, views.height // every
     lane = dr.arange(types.UInt32, columns * rows)
@@ -140,7 +141,7 @@ def visibility(field: GridField, images, every: int = 2) -> np.ndarray:
         seen = march(white, o, d, 0, dr.inf)
         dr.eval(seen.colour, seen.transmittance, seen.depth)
         replay(white, o, d, 0, dr.inf, True, 0.5, seen, types.Array3f(1, 0, 0))
-        dr.eval(dr.grad(arrays["colour"]))
+        dr.eval(dr.grad(arrays))
     return dr.grad(arrays["colour"]).numpy().reshape(-1, field.arrays["colour"].shape[-1])[:, 0] * every**2
 
 
@@ -154,7 +155,7 @@ class NodesFit:
     """
 
     #: What a parameter is multiplied by: densities change faster than colours.
-    DENSITY = 6.0
+    DENSITY = 20.0
 
     def __init__(self, nodes: Nodes, density, colour, steps: tuple[Steps, Steps], matrix=None, rows=None, step=None):
         self.nodes, self.steps, self.rows, self.step = nodes, steps, rows, step
