@@ -304,6 +304,17 @@ def replay_integrator() -> type:
     return mi.ad.integrators.common.RBIntegrator
 
 
+def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
+    """
+    Put samples into an image block, with further channels ``aovs``: what Mitsuba's integrators in Python do in a
+    function of their own, for all variants and films (``ADIntegrator._splat_to_block``).
+    """
+    import mitsuba as mi
+
+    put = mi.ad.integrators.common.ADIntegrator._splat_to_block
+    put(block, film, place, value=light, weight=1.0, alpha=alpha, aovs=aovs, wavelengths=wavelengths)
+
+
 # -- Mitsuba: scenes ---------------------------------------------------------------------------------------------------
 
 
@@ -324,6 +335,11 @@ def instantiate(config, state):
 
     mi.parser.transform_all(config, state)
     return mi.parser.instantiate(config, state)
+
+
+def keep_meshes(config) -> None:
+    """Have a parsed scene built with all its meshes apart, where Mitsuba joins those of one material by default."""
+    config.merge_meshes = False
 
 
 def properties_of(state, kind=None) -> list:

@@ -41,6 +41,7 @@ def load(
     defines: dict[str, str] | None = None,
     against: str = "exact",
     change: Callable[[object], object] | None = None,
+    merge: bool = True,
 ):
     """
     Load a scene as :func:`load_file` does; with ``exact``, every learned plugin is replaced by its exact counterpart,
@@ -48,10 +49,13 @@ def load(
 
     ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
     infinite), and ``defines`` (name → value) the scene's ``<default>`` values. ``change(state)`` may change the parsed
-    scene (``mi.parser.ParserState``) before anything else does. Raises :class:`SceneError`.
+    scene (``mi.parser.ParserState``) before anything else does. Without ``merge``, no meshes are made one, and each
+    keeps its id. Raises :class:`SceneError`.
     """
     with scene_errors(path), _resolving(path):
         config, state = _parse(path, defines)
+        if not merge:
+            compat.keep_meshes(config)
         if change is not None:
             change(state)
         if exact:

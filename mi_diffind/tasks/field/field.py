@@ -14,6 +14,9 @@ import numpy as np
 
 from .nodes import Nodes
 
+#: The optical depth of a voxel that counts as none.
+FAINT = 2e-3
+
 #: Most that the logarithm of a radiance may be.
 BRIGHTEST = 12.0
 
@@ -53,13 +56,17 @@ class RadianceField:
 
 
 def density_of(raw, voxel: float):
-    """σ of a raw number: softplus(raw), per voxel, so that about −8 is nothing and 10 is opaque."""
-    return (dr.maximum(raw, 0) + dr.log(1 + dr.exp(-dr.abs(raw)))) * (1 / voxel)
+    """
+    σ of a raw number: softplus(raw) less :data:`FAINT`, per voxel, never negative. About −6 and less is nothing,
+    exactly, 10 is opaque.
+    """
+    soft = dr.maximum(raw, 0) + dr.log(1 + dr.exp(-dr.abs(raw)))
+    return dr.maximum(soft - FAINT, 0) * (1 / voxel)
 
 
 def raw_of(density: np.ndarray, voxel: float) -> np.ndarray:
-    """The reverse, in NumPy: raw numbers of densities, at least those of 1e-6 per voxel."""
-    y = np.maximum(np.asarray(density, np.float64) * voxel, 1e-6)
+    """The reverse, in NumPy: raw numbers of densities."""
+    y = np.asarray(density, np.float64) * voxel + FAINT
     return y + np.log(-np.expm1(-y))
 
 

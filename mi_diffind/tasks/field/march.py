@@ -1,7 +1,8 @@
 """
 Rays through a field: emission and absorption, from front to back, and the derivatives of what they see.
 
-A ray is divided into steps of a fixed length from where it enters the box, the last one cut where it ends; each is of one
+A ray is divided into steps of a fixed length from where it enters the box, from where distances are counted (from afar,
+a step might be too short to change them at all), the last one cut where it ends; each is of one
 density and radiance, so that a medium that is the same everywhere is Beer–Lambert, exactly. Steps in which there is
 certainly nothing are skipped, which changes nothing; no radiance is read where density is nothing; and the ray ends when
 it is opaque (:data:`OPAQUE`).
@@ -15,10 +16,10 @@ from __future__ import annotations
 import drjit as dr
 
 #: The transmittance at which a ray ends.
-OPAQUE = 1e-3
+OPAQUE = 1e-4
 
 #: The weight of a step below which its radiance is not read.
-NOTHING = 1e-4
+NOTHING = 1e-6
 
 
 class Marched:
@@ -37,7 +38,10 @@ class Marched:
 
 
 def box(field, o, d, near, far, active):
-    """The part of each ray that lies in the field's box: its ends, and where there is one. NaN is nowhere."""
+    """
+    The part of each ray that lies in the field's box: the place where it begins, the distance to there, its length, and
+    where there is one. NaN is nowhere.
+    """
     types = field.types
     near, far = types.Float(near), types.Float(far)
     active = types.Bool(active)
@@ -50,7 +54,8 @@ def box(field, o, d, near, far, active):
         far = dr.select(moves, dr.minimum(far, dr.maximum(first, second)), far)
         active &= moves | ((x >= a) & (x <= b))
     # Comparisons with NaN are false
-    return near, far, active & (near < far) & dr.isfinite(near) & dr.isfinite(far)
+    active &= (near < far) & dr.isfinite(near) & dr.isfinite(far)
+    return types.Array3f(dr.fma(d, near, o)), near, far - near, active
 
 
 @dr.syntax
@@ -61,8 +66,8 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     """
     types = field.types
     with dr.suspend_grad():
-        t, far, active = box(field, o, d, near, far, active)
-        step = dr.opaque(types.Float, field.step)
+        o, near, far, active = box(field, o, d, near, far, active)
+        t, step = types.Float(0), dr.opaque(types.Float, field.step)
         seen, depth, through = types.Array3f(0), types.Float(0), types.Float(1)
         offset = types.Float(offset)
         while active:
@@ -78,7 +83,7 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
             if shown:
                 colour = types.Array3f(*field.colour(latent, p, d, shown))
             seen += dr.select(shown, weight * colour, 0)
-            depth += weight * at
+            depth += weight * (near + at)
             through = dr.select(here, passed, through)
             t += step
             active &= here & (t < far) & (through > OPAQUE)
@@ -119,8 +124,8 @@ def tangent(field, o, d, near, far, active, offset, marched: Marched) -> tuple:
 def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
     types = field.types
     with dr.suspend_grad():
-        t, far, active = box(field, o, d, near, far, active)
-        step = dr.opaque(types.Float, field.step)
+        o, near, far, active = box(field, o, d, near, far, active)
+        t, step = types.Float(0), dr.opaque(types.Float, field.step)
         through = types.Float(1)
         offset = types.Float(offset)
         total = dr.detach(marched.transmittance)
@@ -150,9 +155,9 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
                         d_colour += weight * dr.forward_to(found)
                 colour = dr.detach(found)
             rest -= weight * dr.select(shown, colour, 0)
-            rest_depth -= weight * at
+            rest_depth -= weight * (near + at)
             step_colour = passed * dr.select(shown, colour, 0) - rest
-            step_depth = passed * at - rest_depth
+            step_depth = passed * (near + at) - rest_depth
             if dr.hint(adjoint is not None, mode="scalar"):
                 slope = dr.dot(d_colour, step_colour) + d_depth * step_depth - d_through * total
                 with dr.resume_grad():
@@ -177,8 +182,8 @@ def visibility(field, o, d, near, far, active, target) -> None:
     """
     types = field.types
     with dr.suspend_grad():
-        t, far, active = box(field, o, d, near, far, active)
-        step = dr.opaque(types.Float, field.step)
+        o, near, far, active = box(field, o, d, near, far, active)
+        t, step = types.Float(0), dr.opaque(types.Float, field.step)
         through = types.Float(1)
         while active:
             t, here = _next(field, o, d, t, far, step, types.Float(0.5), active)

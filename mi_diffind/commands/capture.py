@@ -1,0 +1,80 @@
+"""``mi-diffind capture``: a scene from all sides, as images with poses that radiance fields are made from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import UsageError
+from ..files import writable_folder
+from .common import defines_of, natural, positive, require_scene, scene_options, set_variant, verb
+
+HELP = "render views of a scene from all sides, with their poses"
+
+
+def add(commands) -> None:
+    """Add the verb and its options to ``commands``, the subparsers of the command line."""
+    sub = verb(commands, "capture", run, HELP)
+    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument(
+        "-o", "--output", required=True, metavar="FOLDER", help="of the views; gone on with if it is there"
+    )
+    sub.add_argument("--views", type=positive, default=60, help="views for training (default: 60)")
+    sub.add_argument("--test", type=natural, default=20, help="test views between them (default: 20)")
+    sub.add_argument("--resolution", type=positive, default=160, metavar="N", help="side in pixels (default: 160)")
+    sub.add_argument("--path", choices=["sphere", "orbit"], default="sphere", help="of the cameras (default: sphere)")
+    sub.add_argument(
+        "--elevation", type=float, nargs=2, metavar=("LOW", "HIGH"),
+        help="degrees above the horizon (default: -90 90 for a sphere, 20 20 for an orbit, which swings between both)",
+    )  # fmt: skip
+    sub.add_argument("--radius", type=float, metavar="R", help="distance of the cameras (default: all is in sight)")
+    sub.add_argument(
+        "--centre", type=float, nargs=3, metavar=("X", "Y", "Z"),
+        help="what they look at (default: the middle of the box)",
+    )  # fmt: skip
+    sub.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), default=(0, 1, 0), help="default: 0 1 0")
+    sub.add_argument("--fov", type=float, default=40.0, help="field of view in degrees (default: 40)")
+    sub.add_argument(
+        "--objects", nargs="+", metavar="ID", default=(),
+        help="shapes whose box is what it is about (default: all that are no lights); others are seen, too",
+    )  # fmt: skip
+    sub.add_argument("--format", choices=["png", "exr"], default="png", help="8 bits, or linear (default: png)")
+    scene_options(sub, rendering=False)
+    sub.add_argument("--spp", type=positive, default=256, help="samples per pixel (default: 256)")
+    sub.add_argument("--seed", type=natural, default=0, help="of the random numbers (default: 0)")
+
+
+def run(arguments) -> dict:
+    """
+    Render what is missing of the views. Returns what is printed; after Ctrl-C, of the views that there are. Raises
+    :class:`UsageError`, and as :mod:`mi_diffind.capture` does.
+    """
+    require_scene(arguments.scene)
+    writable_folder(Path(arguments.output).parent)
+    set_variant(arguments.variant)
+    from .. import capture
+
+    given = {
+        name: getattr(arguments, name)
+        for name in ("views", "test", "resolution", "spp", "fov", "radius", "path", "seed", "format")
+    }
+    tuples = {name: getattr(arguments, name) for name in ("centre", "elevation", "up", "objects")}
+    given |= {name: value if value is None else tuple(value) for name, value in tuples.items()}
+    settings = capture.Settings(**given)
+    try:
+        settings.check()
+    except ValueError as e:
+        raise UsageError(f"--{e}") from None
+    found = capture.capture(arguments.scene, arguments.output, settings, defines_of(arguments))
+    print("\n".join(capture.lines(found)))
+    return {
+        "interrupted": len(found.files) < found.total,
+        "scene": arguments.scene,
+        "output": str(found.folder),
+        "files": found.files,
+        "views": found.total,
+        "rendered": found.rendered,
+        "seconds": found.seconds,
+        "radius": found.radius,
+        "centre": found.centre.tolist(),
+        "box": found.box.tolist(),
+    }

@@ -1,0 +1,546 @@
+from __future__ import annotations  # Delayed parsing of type annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_diffind import compat
+from mi_diffind.tasks.field.march import OPAQUE
+
+from . import Plugin, path_footprint, path_sdf
+from .path_footprint import relative
+from .support import properties
+from .support import solids as sdf
+from .support.fields import Light, PlacedField
+
+#: What the default inner integrator takes of the properties.
+INNER = ("max_depth", "rr_depth", "hide_emitters", "jitter")
+
+#: Channels that may be asked for.
+AOVS = ("depth", "opacity")
+
+#: How many smooth surfaces a ray is followed across, by default.
+SMOOTH = 8
+
+MANUAL = r"""
+.. _integrator-neural_field:
+
+Radiance field among surfaces (:monosp:`neural_field`)
+------------------------------------------------------
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - A radiance field, as written by ``mi-diffind fit field``.
+   - --
+
+ * - to_world
+   - |transform|
+   - From the place and size of the capture to the world: rotations, uniform scales and translations; reflections, too.
+     (Default: none)
+   - --
+
+ * - (nested plugin)
+   - |integrator|
+   - For the surfaces: any that follows rays from a camera. (Default: :monosp:`path_footprint`, with the
+     ``max_depth``, ``rr_depth``, ``hide_emitters`` and ``jitter`` given here)
+   - --
+
+ * - smooth_depth
+   - |int|
+   - How many smooth mirrors and panes a ray is followed across to meet the field, 0 to 64. (Default: 8)
+   - --
+
+ * - aovs
+   - |string|
+   - More channels of the film, separated by commas: ``opacity``, that of the field before the first surface;
+     ``depth``, the distance to field and first surface, each times its share of what is seen. Where emitters are
+     hidden, ``depth`` divided by alpha is the mean distance. (Default: none)
+   - --
+
+ * - storage
+   - |string|
+   - ``uint8``, as in the file; ``float32``, which can be optimised. (Default: ``uint8``)
+   - --
+
+ * - tables.*
+   - |tensor|
+   - The arrays of the field; with ``storage`` ``float32`` they can be optimised.
+   - |exposed|, |differentiable|
+
+A captured radiance field (Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH
+Asia 2023, task 7) among ordinary surfaces. Each camera ray is marched through the field up to the first surface; what
+the field emits is added up from front to back, and the radiance of the inner integrator is added, times the
+transmittance that is left. A ray that the field makes opaque (a transmittance below :math:`10^{-3}`) never sees a
+surface, one that misses the field's box is the inner integrator's alone. On the film, alpha is one minus the
+transmittance where there is nothing behind.
+
+**Mirrors and glass.** Rays are followed across surfaces that are smooth throughout (:monosp:`conductor`,
+:monosp:`dielectric`, :monosp:`thindielectric`, :monosp:`null`, what they are nested in, no medium inside), and marched
+through the field between them. Other surfaces, those with a smooth lobe and another one among them
+(:monosp:`plastic`, :monosp:`mask`), are the inner integrator's, to which there is no field: it is not seen in
+them and through them, casts no light and no shadow, and is not seen in rough mirrors. Paths of a limited ``max_depth``
+may be longer by the smooth surfaces before. Participating media count as being behind the field.
+
+**Spectral variants** take radiance for that of an emitter of this colour: upsampled, times D65. ``mono`` takes the
+luminance. Not for polarised variants. One field; a nested one is refused.
+
+**Derivatives** with respect to the field's arrays replay the rays (Vicini et al., *Path Replay Backpropagation*,
+SIGGRAPH 2021), of the radiance, of alpha and of the channels of ``aovs``. An inner integrator that replays paths, too
+(:monosp:`path_footprint`, :monosp:`path_sdf`, :monosp:`prb`, …) adds those of materials, textures and emitters; any
+other one is a constant, and so is the geometry.
+
+Mitsuba's own base classes write an alpha of 0 or 1 and fail with AOVs in the backward pass, because they multiply AOVs,
+which are numbers, by the ray's weight, which is a spectrum. This integrator has passes of its own. Within another
+integrator, such as :monosp:`aov`, alpha is 0 or 1.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: neural_field
+
+        <integrator type="neural_field">
+            <string name="filename" value="group.npz"/>
+            <integrator type="path_footprint">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+        </integrator>
+
+    .. code-tab:: python
+
+        'type': 'neural_field',
+        'filename': 'group.npz',
+        'surfaces': {'type': 'path_footprint', 'max_depth': 8}
+"""
+
+
+@dataclass  # which is what loops of Dr.Jit take for state
+class Followed:
+    """
+    Rays of a wavefront on their way: ``ray``, whether it goes on (``active``) or has ended where the inner integrator
+    takes over (``handed``), its ``throughput``, the product of the transmittances as long as nothing but them changed
+    it (``clear``), whether it has been ``turned`` by a surface, of how many smooth ones there were (``count``).
+    ``light``: what was seen so far; in the differential phases, what is still to come. ``change``: its derivative;
+    ``change_clear``, ``change_aovs``: those of ``clear`` (over ``clear``) and of the further channels.
+    """
+
+    ray: mi.Ray3f
+    active: mi.Bool
+    handed: mi.Bool
+    throughput: mi.Spectrum
+    clear: mi.Float
+    turned: mi.Bool
+    count: mi.UInt32
+    light: mi.Spectrum
+    opacity: mi.Float
+    depth: mi.Float
+    change: mi.Spectrum
+    change_clear: mi.Float
+    change_opacity: mi.Float
+    change_depth: mi.Float
+
+
+def is_smooth(bsdf):
+    """Is it a mirror or a pane, and nothing else, wherever it is?"""
+    flags = bsdf.flags()
+    return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
+
+
+def has_smooth(scene: mi.Scene) -> bool:
+    """Is there a surface in the scene across which rays are followed? One that is instanced counts in any case."""
+    for shape in scene.shapes():
+        bsdf = shape.bsdf()
+        if shape.class_name() == "Instance":
+            return True
+        if bsdf is not None and is_smooth(bsdf) and not shape.is_medium_transition():
+            return True
+    return False
+
+
+@cache
+def integrator() -> type:
+    """The class, in the variant that is set."""
+    Replay = compat.replay_integrator()
+
+    class NeuralField(Replay):
+        __doc__ = MANUAL
+
+        def __init__(self, props: mi.Properties, field=None):
+            """``field``, a ``RadianceField``, takes the place of a file's."""
+            if mi.is_polarized:
+                raise RuntimeError("neural_field: does not run in polarised variants")
+            super().__init__(props)
+            self.surfaces = self._inner(props)
+            self.smooth_depth = props.get("smooth_depth", SMOOTH)
+            if not isinstance(self.smooth_depth, int) or not 0 <= self.smooth_depth <= 64:
+                raise RuntimeError(
+                    f'parameter "smooth_depth": found {self.smooth_depth}, allowed are whole numbers from 0 to 64'
+                )
+            self.aovs = self._asked(str(props.get("aovs", "")))
+            self.model = None
+            if field is None:
+                self.model = open_model(props)
+                field = self.model.field
+            self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
+            self.light = Light()
+            self._shapes = {name: tuple(values.shape) for name, values in field.arrays.items()}
+
+        @staticmethod
+        def _inner(props: mi.Properties):
+            """The integrator of surfaces. Raises ``RuntimeError`` if it cannot be one."""
+            given = [child for _, child in props.objects() if isinstance(child, mi.Integrator)]
+            own = [name for name in INNER if name in props]
+            if not given:
+                inner = mi.Properties("path_footprint")
+                for name in own:
+                    inner[name] = props[name]
+                return path_footprint.integrator()(inner)
+            if len(given) > 1:
+                raise RuntimeError(f"found {len(given)} nested integrators, allowed is one, for the surfaces")
+            if own:
+                raise RuntimeError(f'parameter "{own[0]}": belongs to the nested integrator')
+            found = given[0]
+            if isinstance(found, NeuralField):
+                raise RuntimeError("a nested neural_field: found a second field, allowed is one")
+            if not isinstance(found, mi.SamplingIntegrator):
+                raise RuntimeError(
+                    f"the nested integrator {found.class_name()}: does not follow rays from a camera, as path does"
+                )
+            if found.aov_names():
+                raise RuntimeError(
+                    f"the nested integrator {found.class_name()}: has AOVs of its own, which are not passed on; put "
+                    f"neural_field into it"
+                )
+            return found
+
+        @staticmethod
+        def _asked(text: str) -> list[str]:
+            names = [name.strip() for name in text.split(",") if name.strip()]
+            for name in names:
+                if name not in AOVS or names.count(name) > 1:
+                    raise RuntimeError(f'parameter "aovs": found "{text}", allowed are {", ".join(AOVS)}, each once')
+            return names
+
+        # -- as an object of Mitsuba ------------------------------------------------------------------------------
+
+        def traverse(self, cb: mi.TraversalCallback) -> None:
+            for name, values in self.placed.field.arrays.items():
+                cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
+            cb.put("surfaces", self.surfaces, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys=()) -> None:
+            for name, values in self.placed.field.arrays.items():
+                found, expected = tuple(values.shape), self._shapes[name]
+                if found != expected:
+                    raise RuntimeError(f'parameter "tables.{name}": has the shape {found}, expected {expected}')
+
+        def aov_names(self) -> list[str]:
+            return list(self.aovs)
+
+        def report(self) -> dict:
+            field = self.placed.field
+            said = {"voxel": field.voxel * self.placed.placement.size, "surfaces": self.surfaces.class_name()}
+            if self.model is None:
+                return said
+            return {
+                "preset": self.model.table.preset,
+                "storage": self.model.storage,
+                "table_bytes": self.model.nbytes,
+                **said,
+            }
+
+        def to_string(self) -> str:
+            path = self.model.table.path if self.model is not None else ""
+            inner = str(self.surfaces).replace("\n", "\n  ")
+            return (
+                f'NeuralField[\n  filename = "{path}",\n  smooth_depth = {self.smooth_depth},\n'
+                f'  aovs = "{",".join(self.aovs)}",\n  surfaces = {inner}\n]'
+            )
+
+        # -- the film ---------------------------------------------------------------------------------------------
+
+        def sample_rays(self, scene, sensor, sampler):
+            """As the inner integrator does."""
+            if isinstance(self.surfaces, mi.ad.integrators.common.ADIntegrator):
+                return self.surfaces.sample_rays(scene, sensor, sampler)
+            return super().sample_rays(scene, sensor, sampler)
+
+        def _begin(self, scene, sensor, seed, spp) -> tuple:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
+            ray, weight, place = self.sample_rays(scene, sensor, sampler)
+            return sensor.film(), sampler, spp, ray, weight, place
+
+        @staticmethod
+        def _developed(film, spp, place, light, alpha, aovs, wavelengths):
+            """The image of these samples. AOVs are no light: the weight of a ray has nothing to do with them."""
+            block = film.create_block()
+            block.set_coalesce(block.coalesce() and spp >= 4)
+            compat.splat(block, film, place, light, alpha, aovs, wavelengths)
+            film.put_block(block)
+            return film.develop()
+
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            if not develop:
+                raise RuntimeError("neural_field: renders with develop=True only")
+            with dr.suspend_grad():
+                film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
+                light, alpha, aovs, _ = self.primal(scene, sampler, ray)
+                return self._developed(film, spp, place, light * weight, alpha, aovs, ray.wavelengths)
+
+        def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+            with dr.suspend_grad():
+                film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
+                surfaces = self._surfaces_optimised(scene)
+                _, _, _, state = self.primal(scene, sampler.clone(), ray)
+                light, alpha, aovs = self.replayed(dr.ADMode.Forward, scene, sampler, ray, state, surfaces)
+                return self._developed(film, spp, place, light * weight, alpha, aovs, ray.wavelengths)
+
+        def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+            with dr.suspend_grad():
+                film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
+                surfaces = self._surfaces_optimised(scene)
+                # What reaches the film is linear in these, so that their values do not matter
+                with dr.resume_grad():
+                    count = dr.width(ray)
+                    light, alpha = dr.full(mi.Spectrum, 1, count), dr.full(mi.Float, 1, count)
+                    aovs = [dr.full(mi.Float, 1, count) for _ in self.aovs]
+                    dr.enable_grad(light, alpha, aovs)
+                    image = self._developed(film, spp, place, light * weight, alpha, aovs, ray.wavelengths)
+                    dr.set_grad(image, grad_in)
+                    dr.enqueue(dr.ADMode.Backward, image)
+                    dr.traverse(dr.ADMode.Backward)
+                    adjoint = dr.grad(light), dr.grad(alpha), dict(zip(self.aovs, dr.grad(aovs), strict=True))
+                film.clear()
+                _, _, _, state = self.primal(scene, sampler.clone(), ray)
+                self.replayed(dr.ADMode.Backward, scene, sampler, ray, state, surfaces, adjoint)
+                dr.eval()
+
+        def _surfaces_optimised(self, scene) -> bool:
+            """Is a derivative with respect to anything but the field asked for?"""
+            own = {compat.identity(values) for values in self.placed.field.arrays.values()}
+            params = mi.traverse(scene)
+            values = [params[key] for key in params.keys()]
+            attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
+            return any(compat.identity(v) not in own for v in attached)
+
+        def sample(self, mode, scene, sampler, ray, δL=None, δaovs=None, state_in=None, active=True, **kwargs):
+            """See ``ADIntegrator.sample``; for integrators that this one is nested in, which derive nothing."""
+            if mode != dr.ADMode.Primal:
+                raise RuntimeError("neural_field: has passes of its own for derivatives, and cannot be nested for them")
+            light, alpha, aovs, state = self.primal(scene, sampler, ray, active)
+            return light, alpha > 0, aovs, state
+
+        # -- rays -------------------------------------------------------------------------------------------------
+
+        def primal(self, scene, sampler, ray, active=True) -> tuple:
+            """
+            Light, alpha and the further channels of camera rays, and what the differential phases need to know: all of
+            the light, the share of alpha that is none, and the state of the inner integrator.
+            """
+            path = self._start(ray, active)
+            sampler, path = self._follow(None, scene, sampler, path, None)
+            inner, valid, state = self._surfaces(dr.ADMode.Primal, scene, sampler, ray, path)
+            light = path.light + dr.select(path.handed, path.throughput * inner, 0)
+            clear = dr.select(path.handed & valid, 0, path.clear)
+            aovs = {"depth": path.depth, "opacity": path.opacity}
+            return light, 1 - clear, [aovs[name] for name in self.aovs], (light, clear, state)
+
+        def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
+            """
+            For ``Forward``, the derivatives of light, alpha and channels; for ``Backward``, those with respect to these
+            are given (``adjoint``, the channels as a dictionary), and carried on to the parameters.
+            """
+            light, clear, inner_state = state
+            path = self._start(ray, True)
+            path.light = mi.Spectrum(light)
+            more = dr.zeros(mi.Float), dr.zeros(mi.Float)
+            if mode == dr.ADMode.Backward:
+                # Of alpha, that of the logarithm of a transmittance is the same at all of them
+                aovs = adjoint[2]
+                path.change = mi.Spectrum(adjoint[0])
+                path.change_clear = mi.Float(-adjoint[1] * clear)
+                path.change_opacity = mi.Float(aovs.get("opacity", more[0]))
+                path.change_depth = mi.Float(aovs.get("depth", more[1]))
+            sampler, path = self._follow(mode, scene, sampler, path, surfaces)
+            change = path.change
+            if surfaces and isinstance(self.surfaces, Replay):
+                δ = None
+                if mode == dr.ADMode.Backward:
+                    δ = dr.select(path.handed, path.change * path.throughput, 0)
+                inner, _, _ = self._surfaces(mode, scene, sampler, ray, path, δ, inner_state)
+                if mode == dr.ADMode.Forward:
+                    change = change + dr.select(path.handed, path.throughput * inner, 0)
+            aovs = {"depth": path.change_depth, "opacity": path.change_opacity}
+            return change, -clear * path.change_clear, [aovs[name] for name in self.aovs]
+
+        def _start(self, ray, active) -> Followed:
+            path = dr.zeros(Followed)
+            path.ray = mi.Ray3f(dr.detach(ray))
+            path.active, path.handed, path.turned = mi.Bool(active), mi.Bool(False), mi.Bool(False)
+            path.throughput, path.clear = mi.Spectrum(1), mi.Float(1)
+            return path
+
+        def _surfaces(self, mode, scene, sampler, ray, path, δL=None, state=None) -> tuple:
+            """What the inner integrator says of the rays that are handed to it: light, whether it is valid, state."""
+            onward = mi.RayDifferential3f(path.ray)
+            if bool(getattr(ray, "has_differentials", False)):
+                # Beyond a smooth surface, samples are points to textures
+                onward.has_differentials = True
+                same = path.count == 0
+                for name in ("o_x", "o_y"):
+                    setattr(onward, name, dr.select(same, getattr(ray, name), path.ray.o))
+                for name in ("d_x", "d_y"):
+                    setattr(onward, name, dr.select(same, getattr(ray, name), path.ray.d))
+            if not isinstance(self.surfaces, mi.ad.integrators.common.ADIntegrator):
+                light, valid, _ = self.surfaces.sample(scene, sampler, onward, None, path.handed)
+                return light, valid, None
+            light, valid, _, state = self.surfaces.sample(
+                mode=mode, scene=scene, sampler=sampler, ray=onward, depth=mi.UInt32(0), δL=δL, δaovs=None,
+                state_in=state, active=mi.Bool(path.handed),
+            )  # fmt: skip
+            return light, valid, state
+
+        def _follow(self, mode, scene, sampler, path, surfaces) -> tuple:
+            """
+            Rays up to where the inner integrator takes over: the primal phase if there is no ``mode``. One piece is
+            enough where nothing is smooth.
+            """
+            solids = sdf.solids_of(scene) if isinstance(self.surfaces, path_sdf.integrator()) else []
+            if self.smooth_depth == 0 or not has_smooth(scene):
+                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False)
+
+            def body(sampler, path):
+                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, True)
+
+            label = "neural_field" if mode is None else f"neural_field ({mode.name})"
+            return dr.while_loop(
+                (sampler, path), lambda _, path: path.active, body, max_iterations=self.smooth_depth + 1, label=label
+            )
+
+        def _piece(self, mode, scene, sampler, path, solids, surfaces, onward: bool) -> Followed:
+            """A piece of each ray, up to a surface; if ``onward``, beyond it where that is smooth."""
+            ray, active = path.ray, path.active
+            first = path.count == 0
+            crossed = self.placed.crossed(ray, ray.maxt, active)
+            met = active if onward or "depth" in self.aovs else crossed
+            pi, far, solid = self._meet(scene, solids, ray, met, path.turned)
+            marched = self.placed.march(ray, far, crossed)
+            through = dr.select(marched.transmittance > OPAQUE, marched.transmittance, 0)
+            colour = self.light.of(marched.colour, ray.wavelengths, crossed)
+            distance = dr.select(met & (pi.is_valid() | solid), far, 0)
+
+            if mode is None:
+                light = path.light + dr.select(crossed, path.throughput * colour, 0)
+                path.opacity = dr.select(first, 1 - through, path.opacity)
+                depth = marched.depth * self.placed.size + through * distance
+                path.depth = dr.select(first, depth, path.depth)
+            else:
+                light = path.light - dr.select(crossed, path.throughput * colour, 0)
+                if self.placed.optimised():
+                    self._derive(mode, path, ray, far, crossed, marched, through, distance, light)
+            passed = path.throughput * through
+            path.clear = path.clear * through
+            path.active, path.handed = mi.Bool(False), path.handed | (active & (through > 0))
+            path.light, path.throughput = light, passed
+            if not onward:
+                return path
+
+            # Across a smooth surface
+            arrived = active & (through > 0) & ~solid
+            si = pi.compute_surface_interaction(ray, ray_flags=mi.RayFlags.All, active=arrived)
+            bsdf = si.bsdf(ray)
+            going = arrived & si.is_valid() & (path.count < self.smooth_depth)
+            going &= is_smooth(bsdf) & ~si.shape.is_medium_transition()
+            shining = mi.Bool(going)
+            if self.surfaces.hide_emitters:
+                # The inner integrator would hide them in mirrors, too
+                emitter = si.emitter(scene, arrived)
+                ended = arrived & path.turned & ~going & (emitter != None)  # noqa: E711  (lane by lane)
+                shining |= ended
+                path.handed &= ~ended
+            with dr.resume_grad(when=bool(mode is not None and surfaces)):
+                emitted = passed * si.emitter(scene, shining).eval(si, shining)
+                bs, weight = bsdf.sample(
+                    mi.BSDFContext(), si, sampler.next_1d(going), sampler.next_2d(going), going
+                )  # fmt: skip
+            beyond = dr.detach(weight)
+            emitted_now = dr.select(shining, dr.detach(emitted), 0)
+            path.light = light + emitted_now if mode is None else light - emitted_now
+            if mode is not None and surfaces:
+                with dr.resume_grad():
+                    both = dr.select(shining, emitted, 0) + dr.select(going, path.light * relative(weight), 0)
+                    if mode == dr.ADMode.Backward:
+                        dr.backward_from(path.change * both, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+                    else:
+                        path.change += dr.forward_to(both, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            bs = dr.detach(bs)
+            turned = going & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            path.ray = dr.select(going, si.spawn_ray(si.to_world(bs.wo)), ray)
+            path.throughput = dr.select(going, passed * beyond, passed)
+            path.clear = dr.select(turned, 0, path.clear)
+            path.turned |= turned
+            path.handed &= ~going
+            path.active = going & (dr.max(path.throughput) > 0)
+            path.count = dr.select(going, path.count + 1, path.count)
+            return path
+
+        def _meet(self, scene, solids, ray, active, turned) -> tuple:
+            """What rays meet first, its distance (``maxt`` if nothing), and whether that is a solid of ``path_sdf``."""
+            pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+            if self.surfaces.hide_emitters:
+                # As the inner integrator does with what it sees first
+                hidden = active & ~turned & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
+                at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
+                after = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
+                after.t += at.t
+                pi[hidden] = after
+            far = dr.minimum(pi.t, ray.maxt)
+            if not solids:
+                return pi, far, mi.Bool(False)
+            met = sdf.meet(solids, ray.o, ray.d, far, active)
+            pi.t = dr.select(met.which > 0, dr.inf, pi.t)
+            return pi, met.t, met.which > 0
+
+        def _derive(self, mode, path, ray, far, crossed, marched, through, distance, light) -> None:
+            """The derivatives of a piece, of which ``light`` is still to come behind it."""
+            first = path.count == 0
+            inverse = dr.select(through > 0, dr.rcp(through), 0)
+            if mode == dr.ADMode.Backward:
+                d_colour = self.light.adjoint(marched.colour, ray.wavelengths, path.change * path.throughput, crossed)
+                d_through = (dr.sum(path.change * light) + path.change_clear) * inverse
+                own = path.change_depth * distance - path.change_opacity
+                d_through += dr.select(first & (through > 0), own, 0)
+                self.placed.replay(
+                    ray, far, crossed, marched, d_colour, d_through, dr.select(first, path.change_depth, 0)
+                )
+                return
+            colour, transmittance, depth = self.placed.tangent(ray, far, crossed, marched)
+            transmittance = dr.select(through > 0, transmittance, 0)
+            seen = self.light.tangent(marched.colour, colour, ray.wavelengths, crossed)
+            share = transmittance * inverse
+            path.change += dr.select(crossed, path.throughput * seen + light * share, 0)
+            path.change_clear += share
+            path.change_opacity -= dr.select(first, transmittance, 0)
+            path.change_depth += dr.select(first, depth + transmittance * distance, 0)
+
+    return NeuralField
+
+
+def open_model(props: mi.Properties):
+    """The model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    from mi_diffind.tables import TableError
+    from mi_diffind.tasks.field import TASK
+
+    path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
+    if not path:
+        raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
+    try:
+        return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
+    except (TableError, ValueError) as e:
+        raise RuntimeError(str(e)) from None
+
+
+PLUGIN = Plugin("neural_field", "integrator", lambda props: integrator()(props), task="field")

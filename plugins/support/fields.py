@@ -1,0 +1,101 @@
+"""Radiance fields in a scene: where they are put, what rays see of them in the world, and as which light."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_diffind import compat
+from mi_diffind.tasks.field import march as marching
+
+from . import upsampling
+from .solids import Placement
+
+#: Luminance of linear sRGB, as Mitsuba has it.
+LUMINANCE = (0.212671, 0.715160, 0.072169)
+
+
+class PlacedField:
+    """
+    A radiance field (:class:`mi_diffind.tasks.field.field.RadianceField`) that ``to_world``, a similarity, puts into
+    the world. It looks the same from everywhere, whatever its size: densities are per length of its own frame.
+    """
+
+    def __init__(self, field, to_world):
+        self.field, self.placement = field, Placement.of(to_world, 1.0, (0, 0, 0))
+        self.axes = mi.Frame3f(*(mi.Vector3f(column.tolist()) for column in self.placement.rotation.T))
+        dr.make_opaque(self.axes)
+        self.origin = dr.opaque(mi.Point3f, self.placement.origin.tolist())
+        self.size = dr.opaque(mi.Float, self.placement.size)
+
+    def optimised(self) -> bool:
+        """Is a derivative with respect to the field's arrays asked for?"""
+        return any(compat.has_gradient(values) for values in self.field.arrays.values())
+
+    def _local(self, ray, far, active) -> tuple:
+        """What the functions of :mod:`.march` take, after the field."""
+        o = mi.Point3f(self.axes.to_local(mi.Vector3f(ray.o - self.origin)) / self.size)
+        return o, self.axes.to_local(ray.d), mi.Float(0), far / self.size, active
+
+    def crossed(self, ray, far, active=True):
+        """Whether rays are in the field's box somewhere before the distance ``far``."""
+        with dr.suspend_grad():
+            return marching.box(self.field, *self._local(ray, far, active))[-1]
+
+    def march(self, ray, far, active=True) -> marching.Marched:
+        """What rays see of the field before the distance ``far``; ``depth`` in units of the field's own frame."""
+        return marching.march(self.field, *self._local(ray, far, active))
+
+    def replay(self, ray, far, active, marched, d_colour, d_transmittance, d_depth) -> None:
+        """See :func:`.march.replay`; ``depth`` is that of the world."""
+        local = self._local(ray, far, active)
+        marching.replay(self.field, *local, 0.5, marched, d_colour, d_transmittance, d_depth * self.size)
+
+    def tangent(self, ray, far, active, marched) -> tuple:
+        """See :func:`.march.tangent`; ``depth`` is that of the world."""
+        colour, transmittance, depth = marching.tangent(self.field, *self._local(ray, far, active), 0.5, marched)
+        return colour, transmittance, depth * self.size
+
+
+class Light:
+    """
+    Linear RGB radiance as light of the variant that is set: itself, its luminance, or a spectrum, which is that of
+    Mitsuba's emitters, the upsampled colour of at most ½ times that of the illuminant D65.
+    """
+
+    def __init__(self):
+        self.illuminant = mi.load_dict({"type": "d65"}) if mi.is_spectral else None
+
+    def of(self, colour, wavelengths, active=True):
+        """The light of RGB ``colour`` (three floats)."""
+        if mi.is_monochromatic:
+            return mi.Spectrum(sum(w * c for w, c in zip(LUMINANCE, colour, strict=True)))
+        if not mi.is_spectral:
+            return mi.Spectrum(*colour)
+        scale = 2 * dr.maximum(dr.max(mi.Array3f(*colour)), 1e-20)
+        at = dr.zeros(mi.SurfaceInteraction3f)
+        at.wavelengths = wavelengths
+        spectrum = upsampling.spectrum([c / scale for c in colour], wavelengths)
+        return mi.Spectrum(spectrum * scale * self.illuminant.eval(at, active))
+
+    def adjoint(self, colour, wavelengths, weight, active=True):
+        """The derivative of ``dot(weight, of(colour))`` with respect to ``colour``: three floats."""
+        if mi.is_monochromatic:
+            return mi.Array3f(*(w * weight.x for w in LUMINANCE))
+        if not mi.is_spectral:
+            return mi.Array3f(*weight)
+        with dr.resume_grad():
+            free = mi.Array3f(dr.detach(colour))
+            dr.enable_grad(free)
+            dr.backward_from(dr.dot(weight, self.of(free, wavelengths, active)))
+            return dr.select(active, dr.grad(free), 0)
+
+    def tangent(self, colour, change, wavelengths, active=True):
+        """How the light of ``colour`` changes with its ``change``."""
+        if not mi.is_spectral:
+            return self.of(change, wavelengths, active)
+        with dr.resume_grad():
+            free = mi.Array3f(dr.detach(colour))
+            dr.enable_grad(free)
+            dr.set_grad(free, mi.Array3f(change))
+            return dr.select(active, dr.forward_to(self.of(free, wavelengths, active)), 0)

@@ -1,0 +1,274 @@
+"""``mi-diffind capture``: where the cameras are, what their images show, and going on with a folder."""
+
+import contextlib
+import json
+import threading
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_diffind import cli
+
+#: Centre, radius and colour of three spheres of which no two can be taken for another.
+SPHERES = (
+    ((0, 0, 0), 0.5, "0.8, 0.05, 0.05"),
+    ((1, 0.3, 0), 0.3, "0.05, 0.8, 0.05"),
+    ((0, 1, 0.4), 0.4, "0.05, 0.05, 0.8"),
+)
+
+SCENE = """
+<scene version="3.0.0">
+    <default name="red" value="0.8"/>
+    <integrator type="direct"/>
+    <emitter type="constant"/>
+    SPHERES
+    <shape type="rectangle"><transform name="to_world"><scale value="3"/><translate z="-9"/></transform>
+        <emitter type="area"/></shape>
+</scene>
+"""
+
+
+def sphere(centre, radius, colour, name):
+    return (
+        f'<shape type="sphere" id="{name}"><point name="center" value="{", ".join(map(str, centre))}"/>'
+        f'<float name="radius" value="{radius}"/><bsdf type="diffuse"><rgb name="reflectance" value="{colour}"/>'
+        f"</bsdf></shape>"
+    )
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.xml"
+    spheres = [sphere(*s, name=f"s{i}") for i, s in enumerate(SPHERES)]
+    path.write_text(SCENE.replace("SPHERES", "".join(spheres)).replace("0.8, 0.05, 0.05", "$red, 0.05, 0.05"))
+    return path
+
+
+def run(scene, folder, *options):
+    """Capture few small views; the exit code."""
+    small = ("--views", "4", "--test", "2", "--resolution", "24", "--spp", "16")
+    return cli.main(["capture", str(scene), "-o", str(folder), *small, *options])
+
+
+def nearest(origin, direction):
+    """The number of the sphere that rays ``(…, 3)`` meet first, −1: none."""
+    found, number = np.full(direction.shape[:-1], np.inf), np.full(direction.shape[:-1], -1)
+    for i, (centre, radius, _) in enumerate(SPHERES):
+        to = np.array(centre) - origin
+        along = (to * direction).sum(axis=-1)
+        inside = radius**2 - ((to**2).sum(axis=-1) - along**2)
+        t = np.where((inside > 0) & (along > 0), along - np.sqrt(np.maximum(inside, 0)), np.inf)
+        number[t < found] = i
+        found = np.minimum(found, t)
+    return number
+
+
+def test_images_show_what_rays_of_their_poses_meet(mi_rgb, scene, tmp_path, capsys):
+    """Against spheres met by formulas: colours and alpha, from the files alone. Lights are hidden."""
+    from mi_diffind.tasks.field.views import load_views
+
+    folder = tmp_path / "views"
+    assert run(scene, folder) == 0
+    assert "views: 6 of 6 views, 6 rendered now" in capsys.readouterr().out
+    for split, count in (("train", 4), ("test", 2)):
+        views = load_views(folder, split)
+        assert len(views) == count and views.has_alpha and (views.height, views.width) == (24, 24)
+        edges = np.arange(25) - 0.5
+        numbers = np.stack([nearest(*views.rays(v, *np.meshgrid(edges, edges))) for v in range(count)])
+        corners = np.stack([numbers[:, :-1, :-1], numbers[:, 1:, :-1], numbers[:, :-1, 1:], numbers[:, 1:, 1:]])
+        same = (corners == corners[0]).all(axis=0)
+        for i in range(3):  # the colour that a sphere is of is the largest, nowhere else
+            seen = views.images[same & (corners[0] == i)]
+            assert len(seen) > 20 and (seen[:, :3].argmax(axis=1) == i).all() and seen[:, 3].min() == 1
+        nothing = views.images[same & (corners[0] == -1)]
+        assert len(nothing) > 200 and nothing.max() < 0.3 and np.mean(nothing == 0) > 0.97
+        assert not views.images[:, 0, 0].any()
+        assert views.box[0] == pytest.approx([-0.5 - 0.018, -0.5 - 0.019, -0.5 - 0.018], abs=0.003)
+        assert views.box[1] == pytest.approx([1.3 + 0.018, 1.4 + 0.019, 0.8 + 0.018], abs=0.003)
+
+
+def test_formats_agree(mi_rgb, scene, tmp_path):
+    from mi_diffind.tasks.field.views import load_views
+
+    assert run(scene, tmp_path / "png") == run(scene, tmp_path / "exr", "--format", "exr") == 0
+    png, exr = (load_views(tmp_path / name) for name in ("png", "exr"))
+    assert exr.names[0] == "train/r_000.exr" and np.array_equal(png.poses, exr.poses)
+    assert np.abs(png.images - np.minimum(exr.images, exr.images[..., 3:])).max() < 0.006
+    assert len(np.unique(exr.images)) > len(np.unique(png.images))
+
+
+def test_what_is_there_is_kept(mi_rgb, scene, tmp_path, capsys):
+    folder = tmp_path / "views"
+    assert run(scene, folder) == 0
+    images = sorted(folder.glob("*/*.png"))
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in images}
+    lists = (folder / "transforms_train.json").read_text()
+    images[2].unlink()
+    capsys.readouterr()
+    assert run(scene, folder) == 0
+    assert "6 of 6 views, 1 rendered now" in capsys.readouterr().out
+    assert sorted(folder.glob("*/*.png")) == images and (folder / "transforms_train.json").read_text() == lists
+    assert [p for p in images if p.stat().st_mtime_ns != before[p][1]] == [images[2]]
+    assert images[2].read_bytes() == before[images[2]][0]  # the same view, and the same random numbers
+
+
+def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
+    folder = tmp_path / "views"
+    assert run(scene, folder, "--seed", "3") == 0
+    record = (folder / "capture.json").read_text()
+    for options, message in (
+        (("--seed", "4"), "holds a capture with other settings (seed: 3, now 4): take those, or another folder"),
+        (("--seed", "3", "--fov", "30"), "(fov: 40.0, now 30.0)"),
+        (("--seed", "3", "-D", "red=0.5"), "(red: None, now 0.5)"),
+        (("--seed", "3", "--variant", "llvm_ad_mono"), "(variant: llvm_ad_rgb, now llvm_ad_mono)"),
+    ):
+        assert run(scene, folder, *options) == 2
+        assert message in capsys.readouterr().err
+    scene.write_text(scene.read_text().replace('"0.3"', '"0.2"'))
+    assert run(scene, folder, "--seed", "3") == 2 and "(the scene's files have changed)" in capsys.readouterr().err
+    assert (folder / "capture.json").read_text() == record
+    (folder / "capture.json").write_text("{")
+    assert run(scene, folder) == 2 and "capture.json: cannot be read" in capsys.readouterr().err
+    (folder / "capture.json").unlink()
+    assert run(scene, folder) == 2
+    assert "holds views that were not captured here, a folder of its own is needed" in capsys.readouterr().err
+
+
+def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeypatch, capsys):
+    from mi_diffind import capture
+    from mi_diffind.tasks.field.views import load_views
+
+    stop, render = threading.Event(), capture._Camera.render
+
+    def third(self, *arguments):
+        third.calls += 1
+        if third.calls == 3:
+            stop.set()
+        return render(self, *arguments)
+
+    third.calls = 0
+    with monkeypatch.context() as patch:
+        patch.setattr(capture, "interruptible", lambda: contextlib.nullcontext(stop))
+        patch.setattr(capture._Camera, "render", third)
+        assert run(scene, tmp_path / "views") == 130
+    assert "3 of 6 views, 3 rendered now" in capsys.readouterr().out
+    assert len(load_views(tmp_path / "views")) == 3  # what there is can be used
+    with monkeypatch.context() as patch:  # and a failure on the way leaves no half image
+
+        def failing(path, image):
+            raise capture.CaptureError("disk")
+
+        patch.setattr(capture, "_write", failing)
+        assert run(scene, tmp_path / "views") == 2
+    assert run(scene, tmp_path / "views") == 0 and "3 rendered now" in capsys.readouterr().out
+    assert run(scene, tmp_path / "whole") == 0
+    for path in (tmp_path / "whole").glob("*/*.png"):
+        assert path.read_bytes() == (tmp_path / "views" / path.relative_to(tmp_path / "whole")).read_bytes()
+
+
+def test_objects_are_what_it_is_about(mi_rgb, scene, tmp_path, capsys):
+    options = ("--objects", "s1", "--views", "2", "--test", "0", "--resolution", "32")
+    assert run(scene, tmp_path / "one", *options, "--elevation", "20", "60") == 0
+    content = json.loads((tmp_path / "one" / "transforms_train.json").read_text())
+    assert not (tmp_path / "one" / "transforms_test.json").exists()
+    assert content["aabb"] == [pytest.approx([0.694, -0.006, -0.306]), pytest.approx([1.306, 0.606, 0.306])]
+    for frame in content["frames"]:  # it is in the middle, and fills the image
+        matrix = np.array(frame["transform_matrix"])
+        away = np.array([1, 0.3, 0]) - matrix[:3, 3]
+        assert -matrix[:3, 2] == pytest.approx(away / np.linalg.norm(away), abs=1e-6)
+        assert 20 < np.degrees(np.arcsin(-away[1] / np.linalg.norm(away))) < 60
+        with Image.open(tmp_path / "one" / frame["file_path"]) as image:
+            assert np.array(image)[16, 16].argmax() in (1, 3)
+    assert run(scene, tmp_path / "two", "--objects", "s1", "other") == 2
+    message = 'objects: found "other", the ids of the scene\'s shapes are: s0, s1, s2'
+    assert message in capsys.readouterr().err
+
+
+def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
+    inside = ("--centre", "0", "0", "0", "--radius", "0.1", "--views", "2", "--test", "0")
+    assert run(scene, tmp_path / "views", *inside) == 0
+    assert "alpha is 1 everywhere" in capsys.readouterr().out
+    assert run(scene, tmp_path / "away", "--centre", "50", "0", "0", "--radius", "1", "--views", "2") == 0
+    with Image.open(tmp_path / "away" / "train" / "r_000.png") as image:
+        assert not np.array(image).any()
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (("--radius", "0"), "--radius: found 0, allowed are numbers > 0"),
+        (("--radius", "nan"), "--radius: found nan, allowed are numbers > 0"),
+        (("--fov", "180"), "--fov: found 180, allowed are degrees between 0 and 170"),
+        (
+            ("--elevation", "30", "20"),
+            "--elevation: found 30 to 20, allowed are degrees from −90 to 90, the lower first",
+        ),
+        (("--up", "0", "0", "0"), "--up: found no direction"),
+        (("--centre", "0", "inf", "0"), "--centre: found NaN or infinity"),
+    ],
+)
+def test_options_that_are_refused(mi_rgb, scene, tmp_path, capsys, options, message):
+    assert run(scene, tmp_path / "views", *options) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "views").exists()
+
+
+def test_scenes_that_are_refused(mi_rgb, scene, tmp_path, capsys):
+    assert run(tmp_path / "missing.xml", tmp_path / "views") == 2
+    assert "missing.xml: no such scene file" in capsys.readouterr().err
+    assert run(scene, tmp_path / "no" / "views") == 2 and "does not exist" in capsys.readouterr().err
+    scene.write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
+    assert run(scene, tmp_path / "views") == 2
+    assert "the scene has no surfaces but lights, there is nothing to capture" in capsys.readouterr().err
+
+
+# -- places -----------------------------------------------------------------------------------------------------------
+
+
+def angles(a, b):
+    return np.degrees(np.arccos(np.clip(a @ b.T, -1, 1)))
+
+
+def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
+    from mi_diffind.capture import Settings, directions
+
+    train, test = directions(Settings(seed=1))
+    assert train.shape == (60, 3) and test.shape == (20, 3)
+    assert np.allclose(np.linalg.norm(train, axis=1), 1)
+    apart = angles(train, train) + 360 * np.eye(60)
+    even = np.degrees(np.sqrt(4 * np.pi / 60))  # the side of a square that each has for itself
+    assert apart.min() > 0.7 * even and np.abs(train.mean(axis=0)).max() < 0.02
+    assert angles(test, train).min() > 0.2 * even
+    assert angles(test, train).min(axis=1).max() < 0.9 * even
+    other = directions(Settings(seed=2))[0]
+    assert np.abs(other - train).max() > 0.1 and np.allclose(other[:, 2], train[:, 2])
+    upper = np.degrees(np.arcsin(directions(Settings(elevation=(10.0, 50.0)))[0][:, 2]))
+    assert upper.min() > 10 and upper.max() < 50 and upper.min() < 12 and upper.max() > 48
+
+
+def test_an_orbit_closes_and_swings(mi_rgb):
+    from mi_diffind.capture import Settings, directions
+
+    train, test = directions(Settings(path="orbit", views=12, test=6, elevation=(0.0, 60.0)))
+    azimuth = np.degrees(np.arctan2(train[:, 1], train[:, 0])) % 360
+    assert np.allclose(azimuth, np.arange(12) * 30)
+    elevation = np.degrees(np.arcsin(train[:, 2]))
+    assert elevation[0] == pytest.approx(0) and elevation[6] == pytest.approx(60) and elevation[3] == pytest.approx(30)
+    between = np.degrees(np.arctan2(test[:, 1], test[:, 0])) % 360
+    assert np.allclose(between % 30, 15) and len(np.unique(between.round())) == 6
+    assert np.allclose(directions(Settings(path="orbit"))[0][:, 2], np.sin(np.radians(20)))
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 2), (1, 1, -1)])
+def test_poses_are_rigid_and_upright(mi_rgb, up):
+    from mi_diffind.capture import frame_of, pose
+
+    frame = frame_of(up)
+    axis = np.array(up) / np.linalg.norm(up)
+    assert np.allclose(frame.T @ frame, np.eye(3)) and np.allclose(frame[:, 2], axis)
+    target = np.array([0.2, -1, 3])
+    for offset in (np.array([1.0, 2, 3]), np.array([-2.0, 0.1, 0.5]), 2 * axis, -3 * axis):
+        found = pose(target + offset, target, up)
+        assert np.allclose(found[:3, :3].T @ found[:3, :3], np.eye(3)) and np.linalg.det(found[:3, :3]) > 0
+        assert np.allclose(found[:3, 2] * np.linalg.norm(offset), offset)
+        assert found[:3, 1] @ axis > -1e-9 and abs(found[:3, 0] @ axis) < 1e-9
