@@ -198,35 +198,6 @@ def visibility(field, o, d, near, far, active, target) -> None:
             active &= here & (t < far) & (through > OPAQUE)
 
 
-@dr.syntax
-def _counts(field, o, d):
-    types = field.types
-    with dr.suspend_grad():
-        o, _, far, active = box(field, o, d, 0, dr.inf, True)
-        t, step = types.Float(0), dr.opaque(types.Float, field.step)
-        through = types.Float(1)
-        steps = dr.select(active, dr.ceil(far / step), 0)
-        skipped, looks, colours = types.Float(0), types.Float(0), types.Float(0)
-        while active:
-            before = types.Float(t)
-            t, here = _next(field, o, d, t, far, step, types.Float(0.5), active)
-            skipped += dr.select(active, dr.round((dr.minimum(t, dr.ceil(far / step) * step) - before) / step), 0)
-            end = dr.minimum(t + step, far)
-            density, _ = field.look(dr.fma(d, dr.fma(0.5, end - t, t), o), here)
-            passed = through * dr.exp(-density * (end - t))
-            looks += dr.select(here, 1, 0)
-            colours += dr.select(here & (through - passed > NOTHING), 1, 0)
-            through = dr.select(here, passed, through)
-            t += step
-            active &= here & (t < far) & (through > OPAQUE)
-    return steps, skipped, looks, colours
-
-
-def counted(field, o, d) -> list[float]:
-    """Of rays: the steps of their ways through the box, those that are skipped, looked at, and read a colour of."""
-    return [float(dr.sum(v)[0]) for v in _counts(field, o, d)]
-
-
 class _March(dr.CustomOp):
     def eval(self, arrays, field, o, d, near, far, active, offset):
         self.field, self.arguments = field, (o, d, near, far, active, offset)

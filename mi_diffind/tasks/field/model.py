@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import UsageError
 from ..task import Model
 from .files import field_of
 from .presets import NODE_BYTES
 
-#: Views around the box that rays are counted in, and pixels along their sides.
-COUNTED, PIXELS = 6, 96
+#: Rays along each side of the box in which what they leave out is counted.
+PIXELS = 96
 
 
 class FieldModel(Model):
@@ -77,43 +76,30 @@ class FieldModel(Model):
         ]
         if file_bytes:
             lines.append(f"{file_bytes:,} bytes on disk, {self.dense_nbytes / file_bytes:.0f} times less")
+        steps, looks = max(1, counts["steps"]), max(1, counts["looks"])
         lines.append(
-            f"of {counts['steps_per_ray']:.0f} steps of a ray through the box, {100 * counts['skipped']:.1f}% are "
-            f"skipped as empty and {100 * counts['behind']:.1f}% lie behind what is opaque; of the "
-            f"{counts['looks_per_ray']:.1f} that are looked at, {100 * counts['without_colour']:.0f}% read no colour"
+            f"of {steps / counts['crossing']:.0f} steps of a ray through the box, "
+            f"{100 * counts['skipped'] / steps:.1f}% are skipped as empty and {100 * counts['hidden'] / steps:.1f}% lie "
+            f"behind what is opaque; of {looks / counts['crossing']:.1f} that are looked at, "
+            f"{100 * (1 - counts['colours'] / looks):.0f}% read no colour"
         )
         return figures, lines
 
-    def counts(self) -> dict[str, float]:
-        """
-        What rays leave out, of parallel ones along the axes through the middles of pixels: of the steps in the box, the
-        share that is ``skipped`` and that lies ``behind``; of those that are looked at, the share ``without_colour``.
-        """
-        from .march import counted
+    def counts(self) -> dict[str, int]:
+        """What rays leave out (:class:`.counting.Counts`): parallel ones, along the axes, in both directions."""
+        from .counting import count
 
-        field, types = self.field, self.types
-        lower, upper = np.array(field.lower), np.array(field.upper)
-        total = np.zeros(4)
+        lower, upper = np.array(self.field.lower), np.array(self.field.upper)
+        u = (np.arange(PIXELS) + 0.5) / PIXELS
+        place = np.stack(np.meshgrid(u, u, [-1.0], indexing="ij"), axis=-1).reshape(-1, 3)
+        origins, directions = [], []
         for axis in range(3):
             for sign in (1, -1):
-                u = (np.arange(PIXELS) + 0.5) / PIXELS
-                place = np.stack(np.meshgrid(u, u, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-                place = np.roll(place, axis + 1, axis=1)
-                if sign < 0:
-                    place[:, axis] = 1
-                d = np.zeros(3)
-                d[axis] = sign
-                o = types.Array3f(np.float32((lower + place * (upper - lower) - d * (upper - lower)).T))
-                total += counted(field, o, types.Array3f(*map(float, d)))
-        steps, skipped, looks, colours = total
-        rays = COUNTED * PIXELS**2
-        return {
-            "steps_per_ray": steps / rays,
-            "looks_per_ray": looks / rays,
-            "skipped": skipped / steps,
-            "behind": (steps - skipped - looks) / steps,
-            "without_colour": 1 - colours / max(looks, 1),
-        }
+                at = np.roll(place * [1, 1, 1] if sign > 0 else place * [1, 1, -2], axis + 1, axis=1)
+                origins.append(lower + at * (upper - lower))
+                directions.append(np.broadcast_to(sign * np.eye(3)[axis], at.shape))
+        o, d = (self.types.Array3f(np.float32(np.concatenate(v).T)) for v in (origins, directions))
+        return count(self.field, o, d, 0, np.inf).asdict()
 
     def measure(self, capture=None):
         """
@@ -131,9 +117,6 @@ class FieldModel(Model):
 
     def decode(self, output: Path, resolution: int | None = None):
         """Density and colour on a dense grid (:mod:`.decode`)."""
-        from . import decode
+        from .decode import decode
 
-        if output.suffix.lower() not in decode.FORMATS:
-            allowed = ", ".join(decode.FORMATS)
-            raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are {allowed}')
-        return decode.write(self.field, output, resolution)
+        return decode(self.field, output, resolution)
