@@ -119,7 +119,9 @@ class PlanesField(RadianceField):
         matrix = self.arrays["matrix"].array
 
         def line(i: int):
-            return [v for j in range(3) for v in dr.gather(self.types.Array4f, matrix, self.types.UInt32(3 * i + j), active)]
+            return [
+                v for j in range(3) for v in dr.gather(self.types.Array4f, matrix, self.types.UInt32(3 * i + j), active)
+            ]
 
         found, count = line(3 * self.ranks[1]), 0
         for four in self._products(1, self._cell(p), active):
@@ -257,7 +259,9 @@ class HashFit:
     def field_of(self, net) -> HashField:
         n = self.nodes
         arrays = {"entries": net["entries"], "weights": net["weights"]}
-        return HashField(n.types, n.lower, n.upper, n.spacing, arrays, self.encoding, self.network, self.occupancy, self.step)
+        return HashField(
+            n.types, n.lower, n.upper, n.spacing, arrays, self.encoding, self.network, self.occupancy, self.step
+        )
 
     def halved(self) -> dict[str, np.ndarray]:
         """All numbers in half precision, in which they are stored."""
