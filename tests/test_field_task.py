@@ -326,8 +326,6 @@ def test_views_without_alpha(tmp_path, capsys):
     write_views(tmp_path, "train", 3, alpha=False)
     file = tmp_path / "transforms_train.json"
     content = json.loads(file.read_text()) | {"aabb": [[-0.6, -0.8, -0.8], [1, 0.8, 0.8]]}
-        "aabb": [[-0.6, -0.8, -0.8], [1, 0.8, 0.8]]
-    }
     file.write_text(json.dumps(content))
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--steps", "5", *SHORT]) == 0
     assert "no alpha" in capsys.readouterr().err
