@@ -56,6 +56,7 @@ class GridProblem(ImagesProblem):
         self.nodes, types = grid.nodes, grid.nodes.types
         tensor = types.TensorXf
         net = {"density": tensor(np.float32(grid.density / DENSITY_SCALE)), "colour": tensor(np.float32(grid.colour))}
+        self.count = dr.opaque(types.UInt32, grid.nodes.count)
         self.neighbours = types.UInt32(neighbours(grid.nodes).reshape(-1))
         super().__init__(types, net, self.field_of, views, held)
 
@@ -67,8 +68,8 @@ class GridProblem(ImagesProblem):
     def loss(self, net, rng, size: int):
         types = self.types
         density = net["density"].array
-        node = types.UInt32(rng.random(types.TensorXf, (VARIED,)).array * self.nodes.count)
-        node = dr.minimum(node, self.nodes.count - 1)
+        node = types.UInt32(rng.random(types.TensorXf, (VARIED,)).array * types.Float(self.count))
+        node = dr.minimum(node, self.count - 1)
         here, variation = dr.gather(types.Float, density, node + 1) * DENSITY_SCALE, types.Float(0)
         for axis in range(3):
             other = dr.gather(types.UInt32, self.neighbours, node * 3 + axis)
