@@ -101,7 +101,7 @@ class Light:
     """
 
     def __init__(self):
-        self.illuminant = mi.load_dict({"type": "d65"}) if mi.is_spectral else None
+        self.illuminant = mi.load_dict({"type": "d65"}, parallel=False) if mi.is_spectral else None
 
     def of(self, colour, wavelengths, active=True):
         """The light of RGB ``colour`` (three floats)."""
