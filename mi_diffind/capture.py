@@ -297,7 +297,9 @@ def _load(path, defines: dict[str, str] | None):
 
     def hide(state) -> None:
         for props in compat.properties_of(state, mi.ObjectType.Integrator):
-            props["hide_emitters"] = True
+            # One that nests another leaves it to that one
+            if not any(compat.property_kind(props, key) == "object" for key in props):
+                props["hide_emitters"] = True
 
     return scenes.load(path, defines=defines, change=hide, merge=False)
 

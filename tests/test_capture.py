@@ -3,12 +3,15 @@
 import contextlib
 import json
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from mi_diffind import cli
+
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
 #: Centre, radius and colour of three spheres of which no two can be taken for another.
 SPHERES = (
@@ -185,6 +188,33 @@ def test_objects_are_what_it_is_about(mi_rgb, scene, tmp_path, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
+    """Mitsuba makes one mesh of them, where it may."""
+    from mi_diffind import capture, scenes
+
+    path, cube = tmp_path / "cubes.xml", '<shape type="cube" id="{}"><ref id="grey"/><transform name="to_world">{}'
+    cubes = [cube.format(name, f'<translate x="{x}"/></transform></shape>') for name, x in (("a", -2), ("b", 3))]
+    path.write_text(f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{"".join(cubes)}</scene>')
+    assert len(scenes.load(path).shapes()) == 1
+    loaded = capture._load(path, None)
+    assert capture.bounds(loaded).tolist() == [[-3, -1, -1], [4, 1, 1]]
+    assert capture.bounds(loaded, ("b",)).tolist() == [[2, -1, -1], [4, 1, 1]]
+    # As far as their vertices, which is nearer than the corners of a box around both
+    assert capture._reach(loaded, ("b",), np.array([3.0, 0, 0])) == pytest.approx(np.sqrt(3))
+
+
+def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_path):
+    """And further channels are none of the image's."""
+    from mi_diffind.tasks.field.views import load_views
+
+    nested = '<integrator type="aov"><string name="aovs" value="d:depth"/><integrator type="direct"/></integrator>'
+    other = tmp_path / "other.xml"
+    other.write_text(scene.read_text().replace('<integrator type="direct"/>', nested))
+    assert run(scene, tmp_path / "plain") == run(other, tmp_path / "nested") == 0
+    plain, found = (load_views(tmp_path / name).images for name in ("plain", "nested"))
+    assert not found[:, 0, 0].any() and np.abs(found - plain).mean() < 0.01
+
+
 def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
     inside = ("--centre", "0", "0", "0", "--radius", "0.1", "--views", "2", "--test", "0")
     assert run(scene, tmp_path / "views", *inside) == 0
@@ -220,6 +250,26 @@ def test_scenes_that_are_refused(mi_rgb, scene, tmp_path, capsys):
     scene.write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
     assert run(scene, tmp_path / "views") == 2
     assert "the scene has no surfaces but lights, there is nothing to capture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["group", "thin", "glossy"])
+def test_scenes_that_ship_are_wholly_in_sight(mi_rgb, tmp_path, name):
+    """From below, from the side and from above, from the distance that is taken by default."""
+    from mi_diffind.tasks.field.views import load_views
+
+    options = ("--views", "3", "--test", "0", "--resolution", "40", "--spp", "4")
+    assert cli.main(["capture", str(SCENES / f"capture_{name}.xml"), "-o", str(tmp_path / "views"), *options]) == 0
+    content = json.loads((tmp_path / "views" / "transforms_train.json").read_text())
+    write = {**content, "frames": content["frames"] + content["frames"][:1]}
+    (tmp_path / "views" / "transforms_train.json").write_text(json.dumps(write))
+    images = load_views(tmp_path / "views").images
+    alpha = images[..., 3]
+    border = np.concatenate([alpha[:, [0, -1]].ravel(), alpha[:, :, [0, -1]].ravel()])
+    assert border.max() < 1 and border.mean() < 0.03  # touched, not crossed
+    assert 0.1 < alpha.mean() < 0.6
+    rows, columns = np.nonzero(alpha.any(axis=0))
+    assert np.ptp(rows) > 28 and np.ptp(columns) > 28  # and they fill the images
+    assert 0.02 < images[..., :3].mean() < 0.5
 
 
 # -- places -----------------------------------------------------------------------------------------------------------

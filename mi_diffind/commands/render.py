@@ -18,7 +18,20 @@ def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
     sub = verb(commands, "render", run, HELP)
     sub.add_argument("scene", metavar="SCENE.xml")
-    sub.add_argument("-o", "--output", metavar="FILE", help="image, .exr or .png (default: SCENE.exr)")
+    sub.add_argument(
+        "-o", "--output", metavar="FILE",
+        help="image, .exr or .png, or with --orbit a film, .webp or .gif (default: SCENE.exr)",
+    )  # fmt: skip
+    sub.add_argument(
+        "--orbit",
+        type=positive,
+        metavar="N",
+        help="N frames of a camera that goes once around the scene: as a film, or side by side in an image",
+    )
+    sub.add_argument(
+        "--centre", type=float, nargs=3, metavar=("X", "Y", "Z"),
+        help="what --orbit goes around, about the vertical y (default: the middle of all that is no light)",
+    )  # fmt: skip
     sub.add_argument(
         "--depth",
         type=_depth,
@@ -45,8 +58,12 @@ def run(arguments) -> dict:
 
     require_scene(arguments.scene)
     output = Path(arguments.output or Path(arguments.scene).with_suffix(".exr").name)
-    if output.suffix.lower() not in (".exr", ".png"):
-        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are .exr and .png')
+    films = (".webp", ".gif") if arguments.orbit else ()
+    if output.suffix.lower() not in (".exr", ".png", *films):
+        allowed = " and ".join((".exr", ".png")) if not films else ", ".join((".exr", ".png", *films))
+        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are {allowed}')
+    if arguments.centre is not None and not arguments.orbit:
+        raise UsageError("--centre needs --orbit")
     if arguments.depth_tolerance is not None and arguments.depth != "auto":
         raise UsageError("--depth-tolerance needs --depth auto")
     writable_file(output)
@@ -63,6 +80,8 @@ def run(arguments) -> dict:
     scene = scenes.load(arguments.scene, longest_path=depth["chosen"] if changed else None, defines=defines)
     loaded = time.perf_counter()
     spp = arguments.spp or scene.sensors()[0].sampler().sample_count()
+    if arguments.orbit:
+        return _orbit(arguments, output, scene, spp)
     passes = max(1, spp // 16)
     with interruptible() as stop, tqdm(total=passes, desc="render", unit="pass", disable=None) as bar:
         image, seconds = scenes.render(scene, spp, arguments.seed, passes, bar.update, stop)
@@ -87,6 +106,37 @@ def run(arguments) -> dict:
         "learned_plugins": learned,
         "reports": scenes.reports(scene) if arguments.json is not None else [],
         "table_bytes": scenes.table_bytes(arguments.scene, learned),
+    }
+
+
+def _orbit(arguments, output: Path, scene, spp: int) -> dict:
+    """Render and write the frames of an orbit; after Ctrl-C, of those that are done."""
+    import mitsuba as mi
+    from tqdm import tqdm
+
+    from .. import orbit
+
+    start = time.perf_counter()
+    with interruptible() as stop, tqdm(total=arguments.orbit, desc="orbit", unit="frame", disable=None) as bar:
+        frames = orbit.orbit(
+            scene, arguments.orbit, arguments.centre, spp=spp, seed=arguments.seed, on_frame=bar.update, stop=stop
+        )
+    seconds = time.perf_counter() - start
+    orbit.write(output, frames)
+    height, width = frames[0].shape[:2]
+    kept = f"interrupted, kept {len(frames)} of {arguments.orbit}" if len(frames) < arguments.orbit else len(frames)
+    print(f"{output}: {kept} frames of {width} x {height}, {spp} spp, {seconds:.1f} s in {mi.variant()}")
+    return {
+        "interrupted": len(frames) < arguments.orbit,
+        "scene": arguments.scene,
+        "output": str(output),
+        "variant": mi.variant(),
+        "width": width,
+        "height": height,
+        "spp": spp,
+        "seed": arguments.seed,
+        "frames": len(frames),
+        "seconds_render": seconds,
     }
 
 

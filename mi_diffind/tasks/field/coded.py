@@ -17,8 +17,8 @@ from .nodes import Nodes
 
 class CodedField(RadianceField):
     """
-    ``share`` ``(n,)``: coordinates in [0, 1] in ``curve`` ``(K,)``, raw densities; ``codes`` (uint32, ``(n,)``): entries
-    of ``palette`` ``(P, 12)``. The first of n stands for no node (:class:`.nodes.Nodes`).
+    ``share`` ``(n,)``: coordinates in [0, 1] in ``curve`` ``(K,)``, raw densities; ``codes`` (uint32, ``(n,)``):
+    entries of ``palette`` ``(P, 12)``. The first of n stands for no node (:class:`.nodes.Nodes`).
     """
 
     def __init__(self, nodes: Nodes, share, curve, codes, palette, step: float | None = None):

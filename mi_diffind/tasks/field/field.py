@@ -47,7 +47,7 @@ class RadianceField:
         raise NotImplementedError
 
     def colour(self, latent: list, p, d, active=True) -> list:
-        """The radiance [r, g, b] that leaves the point towards −``d``, which has unit length, of what was found there."""
+        """The radiance [r, g, b] that leaves the point towards −``d``, of unit length, by what was found there."""
         raise NotImplementedError
 
     def skip(self, p, d, active=True):
@@ -89,7 +89,9 @@ class GridField(RadianceField):
     """
 
     def __init__(self, nodes: Nodes, density, colour, step: float | None = None):
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, {"density": density, "colour": colour}, step)
+        super().__init__(
+            nodes.types, nodes.lower, nodes.upper, nodes.spacing, {"density": density, "colour": colour}, step
+        )
         self.nodes = nodes
 
     def look(self, p, active=True):

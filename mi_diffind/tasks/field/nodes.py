@@ -24,11 +24,11 @@ COLUMN = 31
 
 class Nodes:
     """
-    Nodes at ``lower + spacing · (i, j, k)``, ``(i, j, k)`` below ``shape``. With ``stored`` (bool, of this shape), those
-    that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0 on.
+    Nodes at ``lower + spacing · (i, j, k)``, ``(i, j, k)`` below ``shape``. With ``stored`` (bool, of this shape),
+    those that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0.
 
-    Numbers are found in an index with a word for each node of the grid or, if ``packed``, in bit masks and their ranks,
-    which take a tenth of that memory.
+    Numbers are found in an index with a word for each node of the grid or, if ``packed``, by bit masks and ranks, which
+    take a tenth of that memory.
     """
 
     def __init__(self, types, lower, spacing: float, shape, stored: np.ndarray | None = None, packed: bool = False):
@@ -90,8 +90,8 @@ class Nodes:
 
     def corners(self, p, active=True) -> tuple[list, object]:
         """
-        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell that
-        is not may be 0.
+        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell
+        that is not may be 0.
         """
         cell, fraction = self._place(p)
         active = self.types.Bool(active)

@@ -1,0 +1,55 @@
+"""
+Write field.xml: a radiance field among meshes, captured from capture_group.xml and compressed (``mi-diffind capture``,
+``mi-diffind fit field``), see README.md.
+"""
+
+from pathlib import Path
+
+from make_captures import mesh, place, principled, turn
+from scene_xml import Whole, element, environment, head, lying, plugin, transform, write
+
+ABOUT = """A radiance field among meshes: Suzanne, a vase, a knot and a pear, captured in the same light, on a mirror
+that shows them from below. A golden knot before them and a jar behind are meshes; a mirror shows their other side, and
+a ball of glass is there to see them through. The field casts no shadow and is not lit. Written by make_field.py:
+change that file.
+
+"-D file=…" takes another field."""
+
+FOLDER = Path(__file__).resolve().parent
+
+
+def main() -> None:
+    camera = {"origin": (2.2, 2.4, 6.5), "target": (0.02, 0.68, 0), "up": (0, 1, 0)}
+    content = head(960, 540, {"file": "assets/group.npz"}, fov=41.0, camera=camera)
+    at = next(i for i, item in enumerate(content) if item.tag == "integrator")
+    content[at] = plugin("integrator", "neural_field", plugin("integrator", "path", max_depth=Whole("$max_depth")),
+                         filename="$file")  # fmt: skip
+    mirror = plugin("bsdf", "twosided", plugin("bsdf", "conductor", material="Ag"), id="mirror")
+    glass = plugin("bsdf", "dielectric", id="glass", int_ior=1.5)
+    gold = plugin("bsdf", "roughconductor", material="Au", alpha=0.15)
+    jar = principled(base_color=(0.6, 0.58, 0.52), roughness=0.35, specular=0.5)
+    planks = plugin("texture", "bitmap", transform("to_uv", scale={"x": 3, "y": 3}), name="reflectance",
+                    filename="assets/wood_color.png")  # fmt: skip
+    wood = plugin("bsdf", "diffuse", planks)
+    content += [
+        "The light that the field was captured in",
+        environment("forest.exr", 0.8, 40.0),
+        "Mirrors and glass", mirror, glass,
+        "A table, and a mirror on it that the field stands on",
+        lying(5, 5, wood, y=-0.03),
+        plugin("shape", "disk", transform(scale={"value": 1.75}, rotate=turn("x", -90), translate=place(0, -0.01, 0.1)),
+               element("ref", id="mirror")),
+        "A mirror behind the field, turned towards the camera",
+        plugin("shape", "rectangle", transform(scale={"x": 1.1, "y": 1.0}, rotate=turn("y", 42),
+               translate=place(-2.1, 1.0, -1.5)), element("ref", id="mirror")),
+        "Meshes: a knot before the field, a jar behind, a ball of glass",
+        mesh("knot", gold, scale={"value": 0.5}, rotate=turn("y", 20), translate=place(0.35, 0, 1.85)),
+        mesh("jar", jar, scale={"value": 1.2}, translate=place(-0.55, 0, -1.75)),
+        plugin("shape", "sphere", transform(scale={"value": 0.36}, translate=place(-0.8, 0.37, 1.85)),
+               element("ref", id="glass"), id="ball"),
+    ]  # fmt: skip
+    write(FOLDER / "field.xml", ABOUT, content)
+
+
+if __name__ == "__main__":
+    main()

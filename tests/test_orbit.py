@@ -1,0 +1,107 @@
+"""``mi-diffind render --orbit``: a camera that goes once around a scene."""
+
+import contextlib
+import json
+import threading
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_diffind import cli
+
+SCENE = """
+<scene version="3.0.0">
+    <integrator type="direct"><boolean name="hide_emitters" value="true"/></integrator>
+    <emitter type="constant"/>
+    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="32"/>
+        <integer name="height" value="24"/><string name="pixel_format" value="rgba"/><rfilter type="box"/></film>
+        <sampler type="independent"><integer name="sample_count" value="8"/></sampler>
+        <transform name="to_world"><lookat origin="1,1,6" target="1,0,2" up="0,1,0"/></transform></sensor>
+    <shape type="sphere"><point name="center" value="1, 0, 3"/><float name="radius" value="0.4"/>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.1, 0.1"/></bsdf></shape>
+    <shape type="sphere"><point name="center" value="1, 0, 1"/><float name="radius" value="0.4"/>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.1, 0.1, 0.8"/></bsdf></shape>
+    <shape type="sphere"><point name="center" value="40, 0, 1"/><emitter type="area"/></shape>
+</scene>
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    file = tmp_path / "scene.xml"
+    file.write_text(SCENE)
+    return file
+
+
+def place_of(image, channel):
+    """The mean column, from the middle, of pixels in which a channel is the largest of those that are not empty."""
+    where = (image[..., :3].argmax(axis=-1) == channel) & (image[..., 3] > 0.5)
+    return np.argwhere(where)[:, 1].mean() - 15.5, np.count_nonzero(where)
+
+
+def test_the_camera_goes_around(mi_rgb, path):
+    """Two spheres about the axis: after half a turn, the far one is the near one; a quarter shows both."""
+    from mi_diffind import orbit, scenes
+
+    scene = scenes.load(path)
+    assert orbit.middle(scene) == pytest.approx([1, 0, 2])  # the light is none of it
+    frames = orbit.orbit(scene, 4)
+    assert len(frames) == 4 and frames[0].shape == (24, 32, 4)
+    (x0, near), (x2, far) = place_of(frames[0], 0), place_of(frames[2], 0)
+    assert abs(x0) < 0.5 and near > 1.3 * far and abs(x2) < 0.5
+    # From +x, what has the larger z is on the left
+    assert place_of(frames[1], 0)[0] < -3 and place_of(frames[1], 2)[0] > 3
+    assert place_of(frames[3], 0)[0] > 3 and place_of(frames[3], 2)[0] < -3
+    # The colours change places, nothing else does
+    assert np.abs(frames[0][..., 3] - frames[2][..., 3]).mean() < 0.02
+    again = scenes.render(scene, 8)[0]
+    assert np.abs(again - frames[0]).max() < 1e-6  # the camera is where it was
+
+
+def test_films_and_strips(mi_rgb, path, tmp_path, capsys):
+    for name, count in (("film.webp", 3), ("film.gif", 3), ("strip.png", 8)):
+        report = tmp_path / f"{name}.json"
+        options = ("--orbit", str(count), "--spp", "4", "-o", str(tmp_path / name), "--json", str(report))
+        assert cli.main(["render", str(path), *options]) == 0
+        assert f"{name}: {count} frames of 32 x 24, 4 spp" in capsys.readouterr().out
+        assert json.loads(report.read_text())["frames"] == count
+    for name in ("film.webp", "film.gif"):
+        with Image.open(tmp_path / name) as film:
+            assert film.n_frames == 3 and film.size == (32, 24) and film.info["loop"] == 0
+            film.seek(1)
+            assert np.array(film.convert("RGBA"))[0, 0, 3] == 0
+    with Image.open(tmp_path / "strip.png") as strip:
+        assert strip.size == (6 * 32, 2 * 24)
+        pixels = np.array(strip.convert("RGBA"))
+    assert pixels[24:, : 2 * 32, 3].any() and not pixels[24:, 2 * 32 :].any()
+
+
+def test_an_interrupted_orbit_keeps_its_frames(mi_rgb, path, tmp_path, monkeypatch, capsys):
+    from mi_diffind.commands import render
+
+    stop = threading.Event()
+    stop.set()
+    monkeypatch.setattr(render, "interruptible", lambda: contextlib.nullcontext(stop))
+    assert cli.main(["render", str(path), "--orbit", "5", "--spp", "1", "-o", str(tmp_path / "strip.png")]) == 130
+    assert "interrupted, kept 1 of 5 frames" in capsys.readouterr().out
+    with Image.open(tmp_path / "strip.png") as strip:
+        assert strip.size == (32, 24)
+
+
+def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
+    for options, message in (
+        (("--orbit", "3", "-o", str(tmp_path / "film.mp4")), "allowed are .exr, .png, .webp, .gif"),
+        (("-o", str(tmp_path / "film.webp")), "allowed are .exr and .png"),
+        (("--centre", "0", "0", "0"), "--centre needs --orbit"),
+    ):
+        assert cli.main(["render", str(path), *options]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_a_rotation_leaves_its_axis_in_place():
+    from mi_diffind.orbit import turned
+
+    matrix = turned((1, 2, 3), (0, 1, 0), 90)
+    assert matrix @ [1, 7, 3, 1] == pytest.approx([1, 7, 3, 1])
+    assert matrix @ [1, 2, 5, 1] == pytest.approx([3, 2, 3, 1])  # z goes to x
