@@ -60,3 +60,27 @@ def fraction(text: str) -> float:
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from 0 to 1")
     return value
+
+
+def checked(parse):
+    """A parser that raises ``ValueError``, as a type of ``argparse``, which shows only messages of its own."""
+
+    def parsed(text: str):
+        try:
+            parse(text)
+        except ValueError as e:
+            raise argparse.ArgumentTypeError(str(e)) from None
+        return text
+
+    return parsed
+
+
+def decibels(text: str) -> float:
+    """A PSNR. Raises ``ValueError``."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 120:
+        raise ValueError(f"{text!r} is no PSNR, allowed are numbers of dB between 0 and 120")
+    return value

@@ -304,6 +304,22 @@ def replay_integrator() -> type:
     return mi.ad.integrators.common.RBIntegrator
 
 
+def written_in_python(integrator) -> bool:
+    """
+    Is it an integrator written in Python upon Mitsuba's base classes, whose ``sample`` takes a mode? These are loaded
+    anew with a variant, so that they cannot be asked for by themselves; ``CppADIntegrator``, of which they all are, is
+    an inner class.
+    """
+    import mitsuba as mi
+
+    return isinstance(integrator, mi.CppADIntegrator)
+
+
+def replays_paths(integrator) -> bool:
+    """Is it one that :func:`replay_integrator` is the base of, by the name of that?"""
+    return any(kind.__name__ == "RBIntegrator" for kind in type(integrator).__mro__)
+
+
 def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
     """
     Put samples into an image block, with further channels ``aovs``: what Mitsuba's integrators in Python do in a

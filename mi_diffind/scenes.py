@@ -25,7 +25,7 @@ from .tasks.task import tasks
 
 #: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
 MAX_DEPTHS = {
-    **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer", "path_footprint", "path_sdf"), -1),
+    **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer", "path_footprint", "path_sdf", "neural_field"), -1),
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
 }
 
@@ -101,8 +101,9 @@ def load_file(path: str | os.PathLike, **defines):
         if integrator is None:
             name = "path"  # as mi.render has it
         else:
-            said = plugins.origin(integrator)
-            name = said["plugin"] if said else integrator.class_name()
+            nested = getattr(integrator, "surfaces", integrator)  # of neural_field
+            said = plugins.origin(nested)
+            name = said["plugin"] if said else nested.class_name()
         unseen = _unseen(loaded, [name])
         if unseen:  # another integrator may be meant
             mi.Log(mi.LogLevel.Warn, unseen)
@@ -174,7 +175,8 @@ def reports(scene) -> list[dict]:
     What each learned plugin of a loaded scene does: ``plugin``, ``kind``, ``id`` and ``parameters`` as in
     :func:`learned_plugins`; what it reports, ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
     ``evaluated_once``, ``storage``, ``table_bytes`` and more; and for a BSDF the ``operations`` of ``eval``, ``pdf``
-    and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name).
+    and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance
+    field, how many steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.field.counting.Counts`).
     """
     found = []
     for made in learned_instances(scene):
@@ -184,6 +186,7 @@ def reports(scene) -> list[dict]:
             "id": made.id(),
             **(plugins.report(made) or {}),
             "operations": {method: n.asdict() for method, n in counts.items()},
+            **({"rays": made.counts(scene)} if hasattr(made, "counts") and scene.sensors() else {}),
         })  # fmt: skip
     return found
 
@@ -282,6 +285,8 @@ def _parse(path, defines: dict[str, str] | None) -> tuple:
 def _path_integrator(state):
     integrators = compat.properties_of(state, mi.ObjectType.Integrator)
     found = [props for props in integrators if props.plugin_name() in MAX_DEPTHS]
+    # One that may have another integrator for its paths leaves the depth to that
+    found = [props for props in found if props.plugin_name() != "neural_field" or len(found) == 1]
     if len(found) != 1:
         names = ", ".join(props.plugin_name() for props in integrators) or "none"
         raise RuntimeError(f"a depth needs one integrator of {', '.join(MAX_DEPTHS)}; found {names}")

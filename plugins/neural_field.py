@@ -7,12 +7,15 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import compat
+from mi_diffind.tables import TableError
 from mi_diffind.tasks.field.march import OPAQUE
 
-from . import Plugin, path_footprint, path_sdf
+from . import Plugin
+from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
 from .support import properties
 from .support import solids as sdf
+from .support.differentials import Differentials
 from .support.fields import Light, PlacedField
 
 #: What the default inner integrator takes of the properties.
@@ -74,16 +77,17 @@ Radiance field among surfaces (:monosp:`neural_field`)
 A captured radiance field (Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH
 Asia 2023, task 7) among ordinary surfaces. Each camera ray is marched through the field up to the first surface; what
 the field emits is added up from front to back, and the radiance of the inner integrator is added, times the
-transmittance that is left. A ray that the field makes opaque (a transmittance below :math:`10^{-3}`) never sees a
+transmittance that is left. A ray that the field makes opaque (a transmittance below :math:`10^{-4}`) never sees a
 surface, one that misses the field's box is the inner integrator's alone. On the film, alpha is one minus the
 transmittance where there is nothing behind.
 
 **Mirrors and glass.** Rays are followed across surfaces that are smooth throughout (:monosp:`conductor`,
-:monosp:`dielectric`, :monosp:`thindielectric`, :monosp:`null`, what they are nested in, no medium inside), and marched
-through the field between them. Other surfaces, those with a smooth lobe and another one among them
+:monosp:`dielectric`, :monosp:`thindielectric`, :monosp:`null`, no medium inside), and marched through the field between
+them. Other surfaces, those with a smooth lobe and another one among them
 (:monosp:`plastic`, :monosp:`mask`), are the inner integrator's, to which there is no field: it is not seen in
 them and through them, casts no light and no shadow, and is not seen in rough mirrors. Paths of a limited ``max_depth``
-may be longer by the smooth surfaces before. Participating media count as being behind the field.
+may be longer by the smooth surfaces before. Participating media count as being behind the field. Footprints go with the
+rays, over mirrors, too.
 
 **Spectral variants** take radiance for that of an emitter of this colour: upsampled, times D65. ``mono`` takes the
 luminance. Not for polarised variants. One field; a nested one is refused.
@@ -123,7 +127,8 @@ class Followed:
     takes over (``handed``), its ``throughput``, the product of the transmittances as long as nothing but them changed
     it (``clear``), whether it has been ``turned`` by a surface, of how many smooth ones there were (``count``).
     ``light``: what was seen so far; in the differential phases, what is still to come. ``change``: its derivative;
-    ``change_clear``, ``change_aovs``: those of ``clear`` (over ``clear``) and of the further channels.
+    ``change_clear``: that of ``clear``, over ``clear``; and those of the further channels. ``differentials``: those of
+    the rays, where textures ask for footprints.
     """
 
     ray: mi.Ray3f
@@ -140,6 +145,12 @@ class Followed:
     change_clear: mi.Float
     change_opacity: mi.Float
     change_depth: mi.Float
+    differentials: Differentials
+
+
+def carries(ray) -> bool:
+    """Does it carry differentials, for textures that ask for footprints?"""
+    return bool(getattr(ray, "has_differentials", False))
 
 
 def is_smooth(bsdf):
@@ -159,12 +170,28 @@ def has_smooth(scene: mi.Scene) -> bool:
     return False
 
 
+def named(integrator) -> str:
+    """The name of an integrator's class, in Python or C++."""
+    return type(integrator).__name__ if compat.written_in_python(integrator) else integrator.class_name()
+
+
+def with_holes(scene: mi.Scene) -> list[str]:
+    """Names of shapes whose material is a surface in part and nothing in part, as a ``mask`` makes it."""
+    found = []
+    for shape in scene.shapes():
+        bsdf = shape.bsdf()
+        if bsdf is not None:
+            flags = bsdf.flags()
+            if mi.has_flag(flags, mi.BSDFFlags.Null) and mi.has_flag(flags, mi.BSDFFlags.Smooth):
+                found.append(shape.id())
+    return found
+
+
 @cache
 def integrator() -> type:
     """The class, in the variant that is set."""
-    Replay = compat.replay_integrator()
 
-    class NeuralField(Replay):
+    class NeuralField(compat.replay_integrator()):
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties, field=None):
@@ -185,7 +212,9 @@ def integrator() -> type:
                 field = self.model.field
             self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
             self.light = Light()
-            self._shapes = {name: tuple(values.shape) for name, values in field.arrays.items()}
+            self.held = self.placed.held()
+            self._warned = False
+            self._shapes = {name: tuple(values.shape) for name, values in self.placed.exposed.items()}
 
         @staticmethod
         def _inner(props: mi.Properties):
@@ -196,21 +225,21 @@ def integrator() -> type:
                 inner = mi.Properties("path_footprint")
                 for name in own:
                     inner[name] = props[name]
-                return path_footprint.integrator()(inner)
+                return path_footprint()(inner)
             if len(given) > 1:
                 raise RuntimeError(f"found {len(given)} nested integrators, allowed is one, for the surfaces")
             if own:
                 raise RuntimeError(f'parameter "{own[0]}": belongs to the nested integrator')
             found = given[0]
-            if isinstance(found, NeuralField):
+            if type(found).__name__ == NeuralField.__name__:
                 raise RuntimeError("a nested neural_field: found a second field, allowed is one")
             if not isinstance(found, mi.SamplingIntegrator):
                 raise RuntimeError(
-                    f"the nested integrator {found.class_name()}: does not follow rays from a camera, as path does"
+                    f"the nested integrator {named(found)}: does not follow rays from a camera, as path does"
                 )
             if found.aov_names():
                 raise RuntimeError(
-                    f"the nested integrator {found.class_name()}: has AOVs of its own, which are not passed on; put "
+                    f"the nested integrator {named(found)}: has AOVs of its own, which are not passed on; put "
                     f"neural_field into it"
                 )
             return found
@@ -226,12 +255,12 @@ def integrator() -> type:
         # -- as an object of Mitsuba ------------------------------------------------------------------------------
 
         def traverse(self, cb: mi.TraversalCallback) -> None:
-            for name, values in self.placed.field.arrays.items():
+            for name, values in self.placed.exposed.items():
                 cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
             cb.put("surfaces", self.surfaces, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys=()) -> None:
-            for name, values in self.placed.field.arrays.items():
+            for name, values in self.placed.exposed.items():
                 found, expected = tuple(values.shape), self._shapes[name]
                 if found != expected:
                     raise RuntimeError(f'parameter "tables.{name}": has the shape {found}, expected {expected}')
@@ -241,7 +270,7 @@ def integrator() -> type:
 
         def report(self) -> dict:
             field = self.placed.field
-            said = {"voxel": field.voxel * self.placed.placement.size, "surfaces": self.surfaces.class_name()}
+            said = {"voxel": field.voxel * self.placed.placement.size, "surfaces": named(self.surfaces)}
             if self.model is None:
                 return said
             return {
@@ -259,15 +288,27 @@ def integrator() -> type:
                 f'  aovs = "{",".join(self.aovs)}",\n  surfaces = {inner}\n]'
             )
 
+        def counts(self, scene, sensor=0) -> dict:
+            """What the camera's rays, one through each pixel, read of the field (:class:`.counting.Counts`)."""
+            with dr.suspend_grad():
+                _, _, _, ray, _, _ = self._begin(scene, sensor, 0, 1)
+                pi = scene.ray_intersect_preliminary(ray, coherent=True, active=True)
+                return self.placed.count(ray, dr.minimum(pi.t, ray.maxt)).asdict()
+
         # -- the film ---------------------------------------------------------------------------------------------
 
         def sample_rays(self, scene, sensor, sampler):
             """As the inner integrator does."""
-            if isinstance(self.surfaces, mi.ad.integrators.common.ADIntegrator):
+            if compat.written_in_python(self.surfaces):
                 return self.surfaces.sample_rays(scene, sensor, sampler)
             return super().sample_rays(scene, sensor, sampler)
 
         def _begin(self, scene, sensor, seed, spp) -> tuple:
+            if not self._warned:
+                self._warned = True
+                holes = with_holes(scene)
+                if holes:
+                    mi.Log(mi.LogLevel.Warn, f'neural_field: no field is seen through the holes of "{holes[0]}"')
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
             ray, weight, place = self.sample_rays(scene, sensor, sampler)
@@ -320,7 +361,7 @@ def integrator() -> type:
 
         def _surfaces_optimised(self, scene) -> bool:
             """Is a derivative with respect to anything but the field asked for?"""
-            own = {compat.identity(values) for values in self.placed.field.arrays.values()}
+            own = {compat.identity(values) for values in self.placed.exposed.values()}
             params = mi.traverse(scene)
             values = [params[key] for key in params.keys()]
             attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
@@ -341,7 +382,7 @@ def integrator() -> type:
             the light, the share of alpha that is none, and the state of the inner integrator.
             """
             path = self._start(ray, active)
-            sampler, path = self._follow(None, scene, sampler, path, None)
+            sampler, path = self._follow(None, scene, sampler, path, None, carries(ray))
             inner, valid, state = self._surfaces(dr.ADMode.Primal, scene, sampler, ray, path)
             light = path.light + dr.select(path.handed, path.throughput * inner, 0)
             clear = dr.select(path.handed & valid, 0, path.clear)
@@ -364,9 +405,9 @@ def integrator() -> type:
                 path.change_clear = mi.Float(-adjoint[1] * clear)
                 path.change_opacity = mi.Float(aovs.get("opacity", more[0]))
                 path.change_depth = mi.Float(aovs.get("depth", more[1]))
-            sampler, path = self._follow(mode, scene, sampler, path, surfaces)
+            sampler, path = self._follow(mode, scene, sampler, path, surfaces, carries(ray))
             change = path.change
-            if surfaces and isinstance(self.surfaces, Replay):
+            if surfaces and compat.replays_paths(self.surfaces):
                 δ = None
                 if mode == dr.ADMode.Backward:
                     δ = dr.select(path.handed, path.change * path.throughput, 0)
@@ -381,20 +422,18 @@ def integrator() -> type:
             path.ray = mi.Ray3f(dr.detach(ray))
             path.active, path.handed, path.turned = mi.Bool(active), mi.Bool(False), mi.Bool(False)
             path.throughput, path.clear = mi.Spectrum(1), mi.Float(1)
+            path.differentials = Differentials.of(ray)
             return path
 
         def _surfaces(self, mode, scene, sampler, ray, path, δL=None, state=None) -> tuple:
             """What the inner integrator says of the rays that are handed to it: light, whether it is valid, state."""
             onward = mi.RayDifferential3f(path.ray)
-            if bool(getattr(ray, "has_differentials", False)):
-                # Beyond a smooth surface, samples are points to textures
-                onward.has_differentials = True
-                same = path.count == 0
-                for name in ("o_x", "o_y"):
-                    setattr(onward, name, dr.select(same, getattr(ray, name), path.ray.o))
-                for name in ("d_x", "d_y"):
-                    setattr(onward, name, dr.select(same, getattr(ray, name), path.ray.d))
-            if not isinstance(self.surfaces, mi.ad.integrators.common.ADIntegrator):
+            onward.has_differentials = carries(ray)
+            if onward.has_differentials:
+                found = path.differentials
+                onward.o_x, onward.o_y = onward.o + found.ox, onward.o + found.oy
+                onward.d_x, onward.d_y = onward.d + found.dx, onward.d + found.dy
+            if not compat.written_in_python(self.surfaces):
                 light, valid, _ = self.surfaces.sample(scene, sampler, onward, None, path.handed)
                 return light, valid, None
             light, valid, _, state = self.surfaces.sample(
@@ -403,25 +442,28 @@ def integrator() -> type:
             )  # fmt: skip
             return light, valid, state
 
-        def _follow(self, mode, scene, sampler, path, surfaces) -> tuple:
+        def _follow(self, mode, scene, sampler, path, surfaces, carried: bool) -> tuple:
             """
             Rays up to where the inner integrator takes over: the primal phase if there is no ``mode``. One piece is
             enough where nothing is smooth.
             """
-            solids = sdf.solids_of(scene) if isinstance(self.surfaces, path_sdf.integrator()) else []
+            solids = sdf.solids_of(scene) if hasattr(self.surfaces, "sample_solids") else []
             if self.smooth_depth == 0 or not has_smooth(scene):
-                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False)
+                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False, False)
 
             def body(sampler, path):
-                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, True)
+                return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, True, carried)
 
             label = "neural_field" if mode is None else f"neural_field ({mode.name})"
             return dr.while_loop(
                 (sampler, path), lambda _, path: path.active, body, max_iterations=self.smooth_depth + 1, label=label
             )
 
-        def _piece(self, mode, scene, sampler, path, solids, surfaces, onward: bool) -> Followed:
-            """A piece of each ray, up to a surface; if ``onward``, beyond it where that is smooth."""
+        def _piece(self, mode, scene, sampler, path, solids, surfaces, onward: bool, carried: bool) -> Followed:
+            """
+            A piece of each ray, up to a surface; if ``onward``, beyond it where that is smooth. ``carried``: with
+            differentials.
+            """
             ray, active = path.ray, path.active
             first = path.count == 0
             crossed = self.placed.crossed(ray, ray.maxt, active)
@@ -450,7 +492,8 @@ def integrator() -> type:
 
             # Across a smooth surface
             arrived = active & (through > 0) & ~solid
-            si = pi.compute_surface_interaction(ray, ray_flags=mi.RayFlags.All, active=arrived)
+            flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if carried else mi.RayFlags.All
+            si = pi.compute_surface_interaction(ray, ray_flags=flags, active=arrived)
             bsdf = si.bsdf(ray)
             going = arrived & si.is_valid() & (path.count < self.smooth_depth)
             going &= is_smooth(bsdf) & ~si.shape.is_medium_transition()
@@ -478,7 +521,13 @@ def integrator() -> type:
                         path.change += dr.forward_to(both, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
             bs = dr.detach(bs)
             turned = going & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-            path.ray = dr.select(going, si.spawn_ray(si.to_world(bs.wo)), ray)
+            out = si.to_world(bs.wo)
+            path.ray = dr.select(going, si.spawn_ray(out), ray)
+            if carried:
+                edges = compat.normal_edges(pi, si, ray, going)
+                found = path.differentials.at(ray, si)
+                found = found.bounced(ray, si, out, bs.eta, bs.pdf, mi.Bool(True), mi.Float(1), edges)
+                path.differentials = dr.select(going, found, path.differentials)
             path.throughput = dr.select(going, passed * beyond, passed)
             path.clear = dr.select(turned, 0, path.clear)
             path.turned |= turned
@@ -531,12 +580,11 @@ def integrator() -> type:
 
 def open_model(props: mi.Properties):
     """The model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
-    from mi_diffind.tables import TableError
-    from mi_diffind.tasks.field import TASK
-
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
+    from mi_diffind.tasks.field import TASK
+
     try:
         return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")
     except (TableError, ValueError) as e:

@@ -1,10 +1,9 @@
 """Radiance fields that are formulas, for tests, and how a scene gets them."""
 
-import sys
-
 import drjit as dr
 import numpy as np
 
+from mi_diffind import plugins
 from mi_diffind.tasks.field.field import RadianceField
 
 
@@ -71,5 +70,6 @@ class Bumps(RadianceField):
 
 def register(mi, fields: dict, name: str = "test_field") -> None:
     """An integrator ``name``: ``neural_field``, of which ``field`` is the key of one in ``fields``."""
-    plugin = sys.modules["mi_diffind.plugins.neural_field"]
-    mi.register_integrator(name, lambda props: plugin.integrator()(props, fields[props["field"]]))
+    # The module is another one in each variant
+    made = plugins.declared()["neural_field"].factory.__globals__["integrator"]()
+    mi.register_integrator(name, lambda props: made(props, fields[props["field"]]))

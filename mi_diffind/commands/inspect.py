@@ -96,6 +96,16 @@ def _inspect_table(arguments) -> dict:
     }
 
 
+def _print_rays(n: dict) -> None:
+    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.field.counting.Counts`)."""
+    total = max(1, n["steps"])
+    print(
+        f"    rays      {n['crossing']:,} of {n['rays']:,} cross the field, {n['opaque']:,} of them end opaque\n"
+        f"    steps     {n['steps']:,}: {n['hidden'] / total:.0%} hidden, {n['skipped'] / total:.0%} skipped as empty, "
+        f"{n['looks'] / total:.0%} read; the radiance at {n['colours'] / total:.0%}"
+    )
+
+
 def _inspect_scene(arguments) -> dict:
     set_variant(arguments.variant)
     from .. import scenes
@@ -112,7 +122,9 @@ def _inspect_scene(arguments) -> dict:
         stored = f", {found['table_bytes']:,} bytes as {found['storage']}" if found.get("storage") else ""
         print(f"  {found['id'] or '(no id)'}: {found['plugin']}, {', '.join(given) or 'defaults'}")
         print(f"    preset    {found.get('preset') or '(unknown)'}{stored}")
-        if found["kind"] == "shape":
+        if "rays" in found:
+            _print_rays(found["rays"])
+        elif found["kind"] == "shape":
             print("    rays      " + ", ".join(f"{text} {found[key]}" for key, text in _RAYS.items() if key in found))
         else:
             print(f"    in use    {', '.join(found.get('effects_in_use', ())) or 'grazing reflection only'}")

@@ -2,49 +2,23 @@
 
 from __future__ import annotations
 
-import argparse
-
 from .. import sizes
-from ..arguments import Argument, positive
+from ..arguments import Argument, checked, decibels, positive
 from ..errors import UsageError
 from ..maps.source import NONFINITE, Source
-
-
-def _checked(parse):
-    """A parser of ours as a type of ``argparse``, which shows the message of its own exception only."""
-
-    def parsed(text: str):
-        try:
-            parse(text)
-        except ValueError as e:
-            raise argparse.ArgumentTypeError(str(e)) from None
-        return text
-
-    return parsed
-
-
-def _decibels(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < 120:
-        raise ValueError(f"{text!r} is no PSNR, allowed are numbers of dB between 0 and 120")
-    return value
-
 
 _SIZES = (
     ("compression", sizes.parse_compression, "how many times smaller than the source, uncompressed (default: 12x)"),
     ("bytes", sizes.parse_bytes, "size of the arrays, as in 256k or 1.5M"),
     ("bpp", sizes.parse_bpp, "bits a texel of the image, all channels together"),
-    ("psnr", _decibels, "the smallest file that reaches so many dB (several trainings)"),
+    ("psnr", decibels, "the smallest file that reaches so many dB (several trainings)"),
 )
 
 SOURCE = Argument("source", metavar="IMAGE|MATERIAL.json", help="an image, or a manifest of the maps of a material")
 
 #: The size of the arrays, in one way or another.
 SIZES = tuple(
-    Argument(f"--{name}", group="size", type=_checked(kind), metavar="N", help=text) for name, kind, text in _SIZES
+    Argument(f"--{name}", group="size", type=checked(kind), metavar="N", help=text) for name, kind, text in _SIZES
 )
 
 #: How a source is read.

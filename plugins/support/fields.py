@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import compat
+from mi_diffind.tasks.field import counting
 from mi_diffind.tasks.field import march as marching
 
 from . import upsampling
@@ -28,9 +31,21 @@ class PlacedField:
         self.origin = dr.opaque(mi.Point3f, self.placement.origin.tolist())
         self.size = dr.opaque(mi.Float, self.placement.size)
 
+    def held(self) -> list:
+        """
+        All arrays that rays read. An instance of a plugin that has them as an attribute of its own can be part of a
+        frozen function (``dr.freeze``), which does not look into other objects.
+        """
+        return [self.axes, self.origin, self.size, *_arrays_of(self.field, set())]
+
+    @property
+    def exposed(self) -> dict:
+        """Those of the field's arrays that can be optimised: name → tensor."""
+        return {name: values for name, values in self.field.arrays.items() if dr.is_float_v(values)}
+
     def optimised(self) -> bool:
         """Is a derivative with respect to the field's arrays asked for?"""
-        return any(compat.has_gradient(values) for values in self.field.arrays.values())
+        return any(compat.has_gradient(values) for values in self.exposed.values())
 
     def _local(self, ray, far, active) -> tuple:
         """What the functions of :mod:`.march` take, after the field."""
@@ -46,6 +61,10 @@ class PlacedField:
         """What rays see of the field before the distance ``far``; ``depth`` in units of the field's own frame."""
         return marching.march(self.field, *self._local(ray, far, active))
 
+    def count(self, ray, far, active=True) -> counting.Counts:
+        """What :meth:`march` reads."""
+        return counting.count(self.field, *self._local(ray, far, active))
+
     def replay(self, ray, far, active, marched, d_colour, d_transmittance, d_depth) -> None:
         """See :func:`.march.replay`; ``depth`` is that of the world."""
         local = self._local(ray, far, active)
@@ -57,6 +76,24 @@ class PlacedField:
         return colour, transmittance, depth * self.size
 
 
+def _arrays_of(value, known: set) -> list:
+    """The Dr.Jit arrays in an object of ours and in what it refers to."""
+    if id(value) in known:
+        return []
+    known.add(id(value))
+    if isinstance(value, dr.ArrayBase):
+        return [value] if dr.is_jit_v(value) else []
+    if isinstance(value, dict):
+        inside = value.values()
+    elif isinstance(value, (list, tuple)):
+        inside = value
+    else:
+        inside = (
+            vars(value).values() if hasattr(value, "__dict__") and not isinstance(value, (type, ModuleType)) else ()
+        )
+    return [array for one in inside for array in _arrays_of(one, known)]
+
+
 class Light:
     """
     Linear RGB radiance as light of the variant that is set: itself, its luminance, or a spectrum, which is that of
@@ -64,7 +101,7 @@ class Light:
     """
 
     def __init__(self):
-        self.illuminant = mi.load_dict({"type": "d65"}) if mi.is_spectral else None
+        self.illuminant = mi.load_dict({"type": "d65"}, parallel=False) if mi.is_spectral else None
 
     def of(self, colour, wavelengths, active=True):
         """The light of RGB ``colour`` (three floats)."""
@@ -88,7 +125,7 @@ class Light:
             free = mi.Array3f(dr.detach(colour))
             dr.enable_grad(free)
             dr.backward_from(dr.dot(weight, self.of(free, wavelengths, active)))
-            return dr.select(active, dr.grad(free), 0)
+            return dr.select(active & _coloured(colour), dr.grad(free), 0)
 
     def tangent(self, colour, change, wavelengths, active=True):
         """How the light of ``colour`` changes with its ``change``."""
@@ -98,4 +135,9 @@ class Light:
             free = mi.Array3f(dr.detach(colour))
             dr.enable_grad(free)
             dr.set_grad(free, mi.Array3f(change))
-            return dr.select(active, dr.forward_to(self.of(free, wavelengths, active)), 0)
+            return dr.select(active & _coloured(colour), dr.forward_to(self.of(free, wavelengths, active)), 0)
+
+
+def _coloured(colour):
+    """Black has no derivative, since the spectrum of a colour depends on its hue alone."""
+    return dr.max(mi.Array3f(dr.detach(colour))) > 0

@@ -1,14 +1,14 @@
 """
 Rays through a field: emission and absorption, from front to back, and the derivatives of what they see.
 
-A ray is divided into steps of a fixed length from where it enters the box, from where distances are counted (from afar,
-a step might be too short to change them at all), the last one cut where it ends; each is of one
-density and radiance, so that a medium that is the same everywhere is Beer–Lambert, exactly. Steps in which there is
-certainly nothing are skipped, which changes nothing; no radiance is read where density is nothing; and the ray ends when
-it is opaque (:data:`OPAQUE`).
+A ray is divided into steps of a fixed length from where it enters the box, from where distances are counted (from
+afar, a step might be too short to change them at all), the last one cut where it ends. Each is of one density and
+radiance, so that a medium that is the same everywhere is Beer–Lambert, exactly. Steps in which there is certainly
+nothing are skipped, which changes nothing; no radiance is read where density is nothing; and the ray ends when it is
+opaque (:data:`OPAQUE`).
 
-Derivatives replay the ray (Vicini et al., *Path Replay Backpropagation*, SIGGRAPH 2021): with what is seen from a step on,
-R, and the transmittance T behind it, ∂L/∂σ = δ (T c − R). Nothing is divided by.
+Derivatives replay the ray (Vicini et al., *Path Replay Backpropagation*, SIGGRAPH 2021): with what is seen from a step
+on, R, and the transmittance T behind it, ∂L/∂σ = δ (T c − R). Nothing is divided by.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ OPAQUE = 1e-4
 #: The weight of a step below which its radiance is not read.
 NOTHING = 1e-6
 
+#: Not all arrays have to be differentiated.
+ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+
 
 class Marched:
     """
-    What a ray saw: ``colour`` (premultiplied), ``transmittance``, ``depth`` (Σ w t: divide by the opacity for the mean).
+    What a ray saw: ``colour`` (premultiplied), ``transmittance``, and ``depth``, Σ w t: by the opacity, a mean.
     """
-
-    DRJIT_STRUCT: dict = {}  # noqa: RUF012
 
     def __init__(self, colour=None, transmittance=None, depth=None):
         self.colour, self.transmittance, self.depth = colour, transmittance, depth
@@ -45,7 +46,7 @@ def box(field, o, d, near, far, active):
     types = field.types
     near, far = types.Float(near), types.Float(far)
     active = types.Bool(active)
-    for x, v, a, b in zip(o, d, field.lower, field.upper, strict=True):
+    for x, v, a, b in zip(o, d, *field.box, strict=True):
         # Along a face of the box, 0 · inf would be NaN
         moves = v != 0
         inverse = dr.rcp(dr.select(moves, v, 1))
@@ -150,9 +151,9 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
                 with dr.resume_grad():
                     found = types.Array3f(*field.colour(latent, p, d, shown))
                     if dr.hint(adjoint is not None, mode="scalar"):
-                        dr.backward_from(dr.dot(found, d_colour * weight))
+                        dr.backward_from(dr.dot(found, d_colour * weight), ANY)
                     else:
-                        d_colour += weight * dr.forward_to(found)
+                        d_colour += weight * dr.forward_to(found, flags=ANY)
                 colour = dr.detach(found)
             rest -= weight * dr.select(shown, colour, 0)
             rest_depth -= weight * (near + at)
@@ -161,10 +162,10 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
             if dr.hint(adjoint is not None, mode="scalar"):
                 slope = dr.dot(d_colour, step_colour) + d_depth * step_depth - d_through * total
                 with dr.resume_grad():
-                    dr.backward_from(dr.select(here, density * (length * slope), 0))
+                    dr.backward_from(dr.select(here, density * (length * slope), 0), ANY)
             else:
                 with dr.resume_grad():
-                    rate = length * dr.forward_to(dr.select(here, density, 0))
+                    rate = length * dr.forward_to(dr.select(here, density, 0), flags=ANY)
                 d_colour += rate * step_colour
                 d_depth += rate * step_depth
                 d_through -= rate * total

@@ -15,28 +15,49 @@ from scipy.ndimage import distance_transform_cdt
 #: Cells along a side of a cell of the grid of distances.
 COARSE = 2
 
+#: The largest distance that is told, in cells of that grid: 4 bits.
+FARTHEST = 15
+
+#: Cells along z of a column: its 32 nodes have a bit each, the last one also in the next column.
+COLUMN = 31
+
 
 class Nodes:
     """
-    Nodes at ``lower + spacing · (i, j, k)``, ``(i, j, k)`` below ``shape``. With ``stored`` (bool, of this shape), those
-    that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0 on.
+    Nodes at ``lower + spacing · (i, j, k)``, ``(i, j, k)`` below ``shape``. With ``stored`` (bool, of this shape),
+    those that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0.
+
+    Numbers are found in an index with a word for each node of the grid or, if ``packed``, by bit masks and ranks, which
+    take a tenth of that memory.
     """
 
-    def __init__(self, types, lower, spacing: float, shape, stored: np.ndarray | None = None):
+    def __init__(self, types, lower, spacing: float, shape, stored: np.ndarray | None = None, packed: bool = False):
         self.types = types
         self.lower, self.spacing = tuple(map(float, lower)), float(spacing)
         self.shape = tuple(int(n) for n in shape)
         self.stored = stored
-        self.index = self.distances = None
+        # Not part of kernels, so that those of one grid serve another
+        self._inverse = dr.opaque(types.Float, 1 / self.spacing)
+        self._offset = dr.opaque(types.Array3f, [-a / self.spacing for a in self.lower])
+        self._last = dr.opaque(types.Array3f, [float(n - 2) for n in self.shape])
+        self._sides = dr.opaque(types.Array3u, self.shape)
+        self.index = self.columns = self.filled = self.distances = None
         if stored is not None:
-            numbers = np.zeros(self.shape, np.uint32)
-            numbers[stored] = np.arange(1, np.count_nonzero(stored) + 1)
-            # Of the nodes that are not stored, or whose neighbour is not, nothing is asked
-            numbers[:, :, :-1][~stored[:, :, 1:]] = 0
-            numbers[:, :, -1] = 0
-            self.index = types.UInt32(numbers.reshape(-1))
             self.far = distances(cells_of(stored))
-            self.distances = types.UInt32(packed(self.far))
+            self.distances = types.UInt32(nibbles(self.far))
+            self._coarse = dr.opaque(types.Array3u, self.far.shape)
+            if packed:
+                filled, columns = column_words(stored)
+                self._columns = dr.opaque(types.UInt32, columns_of(self.shape[2]))
+                self.filled, self.columns = types.UInt32(filled.reshape(-1)), types.UInt32(columns.reshape(-1))
+            else:
+                self.index = types.UInt32(numbered(stored).reshape(-1))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the index and of the distances, in memory."""
+        words = [self.index, self.columns, self.filled, self.distances]
+        return sum(4 * dr.width(w) for w in words if w is not None)
 
     @property
     def count(self) -> int:
@@ -61,9 +82,9 @@ class Nodes:
     def _place(self, p) -> tuple:
         """The first corner of the cell that holds ``p``, along each axis, and the place in that cell."""
         cell, fraction = [], []
-        for x, a, n in zip(p, self.lower, self.shape, strict=True):
-            u = dr.fma(x, 1 / self.spacing, -a / self.spacing)
-            i = dr.clip(dr.floor(u), 0, n - 2)
+        for x, offset, last in zip(p, self._offset, self._last, strict=True):
+            u = dr.fma(x, self._inverse, offset)
+            i = dr.clip(dr.floor(u), 0, last)
             # A point that rounding has put out of the box, or NaN, stays within its cell
             fraction.append(dr.clip(u - i, 0, 1))
             cell.append(self.types.UInt32(i))
@@ -72,21 +93,23 @@ class Nodes:
     def cell(self, p):
         """The cell that holds ``p``: the place of its first corner in the grid, in lexicographic order."""
         (x, y, z), _ = self._place(p)
-        return dr.fma(dr.fma(x, self.shape[1], y), self.shape[2], z)
+        return dr.fma(dr.fma(x, self._sides.y, y), self._sides.z, z)
 
     def corners(self, p, active=True) -> tuple[list, object]:
         """
-        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell that
-        is not may be 0.
+        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell
+        that is not may be 0.
         """
         cell, fraction = self._place(p)
         active = self.types.Bool(active)
-        _, height, depth = self.shape
-        first = dr.fma(dr.fma(cell[0], height, cell[1]), depth, cell[2])
         found = []
         for x in (0, 1):
             for y in (0, 1):
-                at = first + (x * height + y) * depth
+                line = dr.fma(cell[0] + x, self._sides.y, cell[1] + y)
+                if self.columns is not None:
+                    at, active = self._ranked(line, cell[2], active)
+                else:
+                    at = dr.fma(line, self._sides.z, cell[2])
                 if self.index is not None:
                     # A word for both: of nodes that are neighbours along z, and stored, one number follows the other
                     at = dr.gather(self.types.UInt32, self.index, at, active)
@@ -96,21 +119,31 @@ class Nodes:
                 found += [(across - upper, at), (upper, at + 1)]
         return found, active
 
+    def _ranked(self, line, z, active) -> tuple:
+        """The number of the node ``z`` of a line, and whether it and the next one are stored, by masks."""
+        Array2u, UInt32 = self.types.Array2u, self.types.UInt32
+        part = z // COLUMN
+        bit = z - part * COLUMN
+        column = dr.fma(line, self._columns, part)
+        filled = dr.gather(Array2u, self.filled, column >> 5, active)
+        here = column & 31
+        active = active & (((filled[0] >> here) & 1) != 0)
+        rank = filled[1] + dr.popcnt(filled[0] & ((UInt32(1) << here) - 1))
+        found = dr.gather(Array2u, self.columns, rank, active)
+        active &= ((found[0] >> bit) & 3) == 3
+        return found[1] + dr.popcnt(found[0] & ((UInt32(1) << bit) - 1)), active
+
     def skip(self, p, d, active=True):
         """A length from ``p`` along ``d`` without a cell that is looked at, or 0."""
         if self.distances is None:
             return self.types.Float(0)
-        side = COARSE * self.spacing
-        place, sides = [], self.far.shape
-        for x, a, n in zip(p, self.lower, sides, strict=True):
-            u = dr.clip(dr.floor(dr.fma(x, 1 / side, -a / side)), 0, n - 1)
-            place.append(self.types.UInt32(u))
-        at = dr.fma(dr.fma(place[0], sides[1], place[1]), sides[2], place[2])
-        word = dr.gather(self.types.UInt32, self.distances, at >> 2, active)
-        steps = (word >> ((at & 3) << 3)) & 255
+        (x, y, z), _ = self._place(p)
+        at = dr.fma(dr.fma(x // COARSE, self._coarse.y, y // COARSE), self._coarse.z, z // COARSE)
+        word = dr.gather(self.types.UInt32, self.distances, at >> 3, active)
+        steps = (word >> ((at & 7) << 2)) & FARTHEST
         fastest = dr.maximum(dr.maximum(dr.abs(d.x), dr.abs(d.y)), dr.abs(d.z))
         # From anywhere in this cell, one less; a neighbour (1) is still worth not looking
-        length = dr.maximum(self.types.Float(steps) - 1, 1e-6) * side / fastest
+        length = dr.maximum(self.types.Float(steps) - 1, 1e-6) * COARSE / (self._inverse * fastest)
         return dr.select(active & (steps > 0), length, 0)
 
 
@@ -133,17 +166,56 @@ def corners_of(cells: np.ndarray) -> np.ndarray:
 def distances(cells: np.ndarray) -> np.ndarray:
     """
     For each cell of the coarser grid, how many of its cells away, in the maximum norm, the nearest with a cell that is
-    looked at is; at most 255. uint8.
+    looked at is; at most :data:`FARTHEST`. uint8.
     """
     padded = np.pad(cells, [(0, -n % COARSE) for n in cells.shape])
     x, y, z = (n // COARSE for n in padded.shape)
     occupied = padded.reshape(x, COARSE, y, COARSE, z, COARSE).any(axis=(1, 3, 5))
     if not occupied.any():
-        return np.full(occupied.shape, 255, np.uint8)
-    return np.minimum(distance_transform_cdt(~occupied, "chessboard"), 255).astype(np.uint8)
+        return np.full(occupied.shape, FARTHEST, np.uint8)
+    return np.minimum(distance_transform_cdt(~occupied, "chessboard"), FARTHEST).astype(np.uint8)
 
 
-def packed(values: np.ndarray) -> np.ndarray:
-    """Bytes, four to a word of 32 bits, the lowest first."""
+def nibbles(values: np.ndarray) -> np.ndarray:
+    """Numbers of 4 bits, eight to a word of 32, the lowest first."""
     flat = values.reshape(-1)
-    return np.pad(flat, (0, -len(flat) % 4)).view("<u4")
+    pairs = np.pad(flat, (0, -len(flat) % 8)).reshape(-1, 2)
+    return (pairs[:, 0] | (pairs[:, 1] << 4)).astype(np.uint8).view("<u4")
+
+
+def numbered(stored: np.ndarray) -> np.ndarray:
+    """The number of each node that is stored, as its neighbour along z is, 0 of the others. uint32."""
+    numbers = np.zeros(stored.shape, np.uint32)
+    numbers[stored] = np.arange(1, np.count_nonzero(stored) + 1)
+    numbers[:, :, :-1][~stored[:, :, 1:]] = 0
+    numbers[:, :, -1] = 0
+    return numbers
+
+
+def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    The same as masks and ranks: ``(w, 2)``, a bit for each column that has nodes, 32 to a word, and how many came
+    before; ``(c, 2)``, for each of these the bits of its nodes, and the number of the first. uint32.
+    """
+    x, y, z = stored.shape
+    count = columns_of(z)
+    padded = np.pad(stored, [(0, 0), (0, 0), (0, count * COLUMN + 1 - z)])
+    bits = np.stack([padded[:, :, c * COLUMN : c * COLUMN + 32] for c in range(count)], axis=2).reshape(-1, 32)
+    own = bits[:, :COLUMN].sum(axis=1)  # the last node is the next column's first
+    own.reshape(x * y, count)[:, -1] += bits.reshape(x * y, count, 32)[:, -1, -1]
+    first = 1 + np.cumsum(own) - own
+    filled = bits.any(axis=1)
+    columns = np.stack([words_of(bits[filled]), first[filled].astype(np.uint32)], axis=1)
+    masks = np.pad(filled, (0, -len(filled) % 32)).reshape(-1, 32)
+    before = np.cumsum(masks.sum(axis=1)) - masks.sum(axis=1)
+    return np.stack([words_of(masks), before.astype(np.uint32)], axis=1), columns
+
+
+def columns_of(nodes: int) -> int:
+    """Columns along a line of so many nodes."""
+    return -(-(nodes - 1) // COLUMN)
+
+
+def words_of(bits: np.ndarray) -> np.ndarray:
+    """Bits (n, 32) as words (n,), the lowest first."""
+    return np.packbits(bits, axis=1, bitorder="little").view("<u4")[:, 0]

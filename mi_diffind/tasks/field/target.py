@@ -2,7 +2,7 @@
 The field that is compressed: a sparse grid of plain numbers, from coarse to fine.
 
 Training begins in the visual hull at a quarter of the nodes along each side, goes on at half of them and ends with
-all: each time, cells that no ray sees are left out (:func:`visible`), and the others are divided.
+all: each time, cells that no ray sees are left out (:func:`weights`), and the others are divided.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import binary_dilation, map_coordinates
 
-from .field import GridField
+from .field import GridField, RadianceField
 from .hull import box_of, hull
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
-from .training import Images
+from .training import Images, ImagesProblem
 from .views import Views
 
 #: Of a raw number of density, per unit of what is trained: so that one rate suits density and colour.
@@ -25,6 +25,9 @@ DENSITY_SCALE = 20.0
 
 #: What training begins with: nearly empty, and dark.
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
+
+#: The weight of the total variation of raw densities, the square below which a step counts less, and nodes a step.
+SMOOTH, ROUND, VARIED = 2e-4, 1e-2, 2**15
 
 #: The largest weight in a ray below which a cell is left out.
 VISIBLE = 0.02
@@ -42,19 +45,49 @@ class Grid:
         tensor = self.nodes.types.TensorXf
         return GridField(self.nodes, tensor(np.float32(self.density)), tensor(np.float32(self.colour)))
 
-    def net(self) -> dict:
-        """What is trained."""
-        tensor = self.nodes.types.TensorXf
-        return {"density": tensor(np.float32(self.density / DENSITY_SCALE)), "colour": tensor(np.float32(self.colour))}
+
+class GridProblem(ImagesProblem):
+    """
+    The training of a :class:`Grid` through images, with a little total variation of its densities (:data:`SMOOTH`):
+    neighbours that no image tells apart agree. That is worth half a decibel in views that were not trained by.
+    """
+
+    def __init__(self, grid: Grid, views: Views, held: Views | None = None):
+        self.nodes, types = grid.nodes, grid.nodes.types
+        tensor = types.TensorXf
+        net = {"density": tensor(np.float32(grid.density / DENSITY_SCALE)), "colour": tensor(np.float32(grid.colour))}
+        self.count = dr.opaque(types.UInt32, grid.nodes.count)
+        self.neighbours = types.UInt32(neighbours(grid.nodes).reshape(-1))
+        super().__init__(types, net, self.field_of, views, held)
 
     def field_of(self, net) -> GridField:
         """The field of what is trained."""
         density = net["density"]
         return GridField(self.nodes, type(density)(density.array * DENSITY_SCALE), net["colour"])
 
-    def trained(self, net) -> Grid:
+    def loss(self, net, rng, size: int):
+        types = self.types
+        density = net["density"].array
+        node = types.UInt32(rng.random(types.TensorXf, (VARIED,)).array * types.Float(self.count))
+        node = dr.minimum(node, self.count - 1)
+        here, variation = dr.gather(types.Float, density, node + 1) * DENSITY_SCALE, types.Float(0)
+        for axis in range(3):
+            other = dr.gather(types.UInt32, self.neighbours, node * 3 + axis)
+            step = here - dr.gather(types.Float, density, other) * DENSITY_SCALE
+            variation += dr.select(other != 0, dr.sqrt(dr.square(step) + ROUND), 0)
+        return [super().loss(net, rng, size), variation * (SMOOTH / VARIED)]
+
+    def trained(self) -> Grid:
         """The grid with what was trained."""
-        return Grid(self.nodes, net["density"].numpy() * DENSITY_SCALE, net["colour"].numpy())
+        return Grid(self.nodes, self.net["density"].numpy() * DENSITY_SCALE, self.net["colour"].numpy())
+
+
+def neighbours(nodes: Nodes) -> np.ndarray:
+    """The numbers of the next nodes along x, y and z of each stored one, 0 of those that are not: ``(n, 3)``."""
+    places = nodes.positions()
+    numbers = np.zeros(np.array(nodes.shape) + 1, np.uint32)
+    numbers[tuple(places.T)] = np.arange(1, len(places) + 1)
+    return np.stack([numbers[tuple((places + axis).T)] for axis in np.eye(3, dtype=int)], axis=1)
 
 
 def begin(types, views: Views, nodes: int, box=None) -> Grid:
@@ -72,8 +105,11 @@ def begin(types, views: Views, nodes: int, box=None) -> Grid:
     return Grid(grid, np.full(grid.entries, BEGIN_DENSITY, np.float32), colour)
 
 
-def visible(field: GridField, images: Images, least: float = VISIBLE) -> np.ndarray:
-    """The cells that have at least that weight in a ray of the views, ``(X − 1, Y − 1, Z − 1)`` bool."""
+def weights(field: RadianceField, images: Images) -> np.ndarray:
+    """
+    The largest weight, transmittance times opacity, that each cell has in a ray of the views:
+    ``(X − 1, Y − 1, Z − 1)``.
+    """
     nodes, types, views = field.nodes, field.types, images.views
     largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
     lane = dr.arange(types.UInt32, views.height * views.width)
@@ -81,7 +117,7 @@ def visible(field: GridField, images: Images, least: float = VISIBLE) -> np.ndar
         o, d = images.rays(dr.opaque(types.UInt32, view), lane % views.width, lane // views.width)
         visibility(field, o, d, 0, dr.inf, True, largest)
         dr.eval(largest)
-    return (largest.numpy().reshape(nodes.shape) >= least)[:-1, :-1, :-1]
+    return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]
 
 
 def divided(grid: Grid, images: Images, factor: float, wide: int = 1, least: float = VISIBLE) -> Grid:
@@ -90,14 +126,17 @@ def divided(grid: Grid, images: Images, factor: float, wide: int = 1, least: flo
     coarser ones, around these.
     """
     nodes = grid.nodes
-    cells = visible(grid.field(), images, least)
+    cells = weights(grid.field(), images) >= least
     if wide:
         cells = binary_dilation(cells, np.ones((3, 3, 3), bool), wide)
     cells &= cells_of(nodes.stored)
     spacing = nodes.spacing / factor
     shape = np.maximum(2, np.ceil((np.asarray(nodes.shape) - 1) * factor - 1e-6).astype(int) + 1)
     # A finer cell is kept if its middle lies in one that is
-    middle = [np.minimum(((np.arange(n - 1) + 0.5) / factor).astype(int), m - 2) for n, m in zip(shape, nodes.shape, strict=True)]
+    middle = [
+        np.minimum(((np.arange(n - 1) + 0.5) / factor).astype(int), m - 2)
+        for n, m in zip(shape, nodes.shape, strict=True)
+    ]
     fine = Nodes(nodes.types, nodes.lower, spacing, shape, corners_of(cells[np.ix_(*middle)]))
     at = fine.positions().T / factor
 

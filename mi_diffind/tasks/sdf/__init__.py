@@ -15,21 +15,13 @@ import argparse
 import dataclasses
 
 from ... import sizes
-from ...arguments import Argument, positive
+from ...arguments import Argument, checked, positive
 from ...errors import UsageError
 from ..task import Request, Task
 from .presets import PRESETS
 
 #: Bits of a pointer that go into words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
 BITS = (4, 5, 6, 8, 10, 16)
-
-
-def _bytes(text: str) -> str:
-    try:
-        sizes.parse_bytes(text)
-    except ValueError as e:
-        raise argparse.ArgumentTypeError(str(e)) from None
-    return text
 
 
 def _ratio(text: str) -> float:
@@ -52,7 +44,10 @@ class Sdf(Task):
     storages = ()
     arguments = (
         Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
-        Argument("--bytes", type=_bytes, metavar="N", help="size in memory, as in 256k or 1.5M (default: 1M)"),
+        Argument(
+            "--bytes", type=checked(sizes.parse_bytes), metavar="N",
+            help="size in memory, as in 256k or 1.5M (default: 1M)",
+        ),
         Argument(
             "--bits", type=int, choices=BITS, default=10,
             help="bits of a pointer of the sparse layout (default: 10)",
