@@ -223,9 +223,8 @@ def capture(
     radius = settings.radius or _reach(loaded, settings.objects, centre) / math.sin(math.radians(settings.fov) / 2)
     if not radius > 0:
         raise CaptureError(f"{scene}: what is captured has no extent, --radius has to be given")
-    write_json(folder / RECORD, record)
-
     camera = _Camera(loaded, settings)
+    write_json(folder / RECORD, record)
     splits, left = _plan(settings, centre, radius), []
     for split, views in splits.items():
         writable_folder(folder / split, create=True)
@@ -279,8 +278,10 @@ def _reach(scene, objects: tuple[str, ...], centre: np.ndarray) -> float:
     """How far shapes reach from a point: the vertices of meshes, the corners of the boxes of others."""
     found = 0.0
     for shape in shapes_of(scene, objects):
-        if isinstance(shape, mi.Mesh) and shape.vertex_count():
-            points = np.array(mi.traverse(shape)["vertex_positions"], np.float64).reshape(-1, 3)
+        vertices = "vertex_positions"
+        parameters = mi.traverse(shape) if isinstance(shape, mi.Mesh) and shape.vertex_count() else {}
+        if vertices in parameters:
+            points = np.array(parameters[vertices], np.float64).reshape(-1, 3)
         else:
             points = np.array(list(itertools.product(*_box(shape).T)))
         found = max(found, float(np.linalg.norm(points - centre, axis=1).max()))
@@ -359,8 +360,12 @@ def _only(inner, shapes: list):
     An integrator to which camera rays see but these ``shapes``: they pass through all others, up to :data:`THROUGH`
     surfaces. ``inner``, which it hands the rays to right before the surface that they meet, knows all.
     """
-    if any(hasattr(shape, "seen_by") for shape in shapes):
-        raise CaptureError("objects: found a neural_sdf, which path_sdf alone sees; take trace=grid and another one")
+    for shape in shapes:
+        if hasattr(shape, "seen_by"):
+            raise CaptureError(
+                f'objects: found "{shape.id()}", whose arrays {" and ".join(shape.seen_by)} traces; allowed are meshes '
+                f"and Mitsuba's own shapes"
+            )
     if not isinstance(inner, mi.SamplingIntegrator):
         raise CaptureError(f"objects: the integrator {inner.class_name()} follows no rays from a camera, as path does")
     replays = isinstance(inner, mi.ad.integrators.common.ADIntegrator)

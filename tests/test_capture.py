@@ -228,6 +228,22 @@ def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_pat
     assert not found[:, 0, 0].any() and np.abs(found - plain).mean() < 0.01
 
 
+def test_a_field_of_distances_is_captured_whole_only(mi_rgb, scene, tmp_path, capsys):
+    """Its shape in the scene is a box, which the integrator alone knows what to do with."""
+    from mi_diffind.tasks.field.views import load_views
+
+    knot = (
+        f'<shape type="neural_sdf" id="knot"><string name="filename" value="{SCENES / "assets" / "knot.npz"}"/></shape>'
+    )
+    spheres = scene.read_text()
+    first, last = spheres.index('<shape type="sphere"'), spheres.index('<shape type="rectangle"')
+    scene.write_text((spheres[:first] + knot + spheres[last:]).replace("direct", "path_sdf"))
+    assert run(scene, tmp_path / "views", "--objects", "knot") == 2
+    assert 'objects: found "knot", ' in capsys.readouterr().err
+    assert run(scene, tmp_path / "views", "--spp", "1") == 0
+    assert 0.05 < load_views(tmp_path / "views").images[..., 3].mean() < 0.4
+
+
 def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
     inside = ("--centre", "0", "0", "0", "--radius", "0.1", "--views", "2", "--test", "0")
     assert run(scene, tmp_path / "views", *inside) == 0
