@@ -10,12 +10,13 @@ from mi_diffind import compat
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.field.march import OPAQUE
 
-from . import Plugin
+from . import Counterpart, Plugin
 from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
 from .support import properties
 from .support import solids as sdf
 from .support.differentials import Differentials
+from .support.field_grids import to_grid
 from .support.fields import Light, PlacedField
 
 #: What the default inner integrator takes of the properties.
@@ -636,4 +637,10 @@ def open_model(props: mi.Properties):
         raise RuntimeError(str(e)) from None
 
 
-PLUGIN = Plugin("neural_field", "integrator", lambda props: integrator()(props), task="field")
+PLUGIN = Plugin(
+    "neural_field",
+    "integrator",
+    lambda props: integrator()(props),
+    task="field",
+    exact=Counterpart("neural_field", convert=to_grid),
+)

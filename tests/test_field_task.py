@@ -324,10 +324,9 @@ def test_nothing_in_view_is_said(tmp_path, capsys):
 def test_views_without_alpha(tmp_path, capsys):
     """They are trained in the whole box, and what cannot be known is said."""
     write_views(tmp_path, "train", 3, alpha=False)
-    content = json.loads((tmp_path / "transforms_train.json").read_text()) | {
-        "aabb": [[-0.6, -0.8, -0.8], [1, 0.8, 0.8]]
-    }
-    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
+    file = tmp_path / "transforms_train.json"
+    content = json.loads(file.read_text()) | {"aabb": [[-0.6, -0.8, -0.8], [1, 0.8, 0.8]]}
+    file.write_text(json.dumps(content))
     assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--steps", "5", *SHORT]) == 0
     assert "no alpha" in capsys.readouterr().err
 

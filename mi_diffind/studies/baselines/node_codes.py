@@ -75,10 +75,6 @@ class Steps:
         most = types.TensorXf(np.asarray(self.levels - 1, np.float32)[None])
         return tensor + (dr.minimum(dr.maximum(code, 0), most) * own[2] + own[0] - exact)
 
-    @property
-    def nbytes(self) -> int:
-        return 9 * len(self.low)
-
 
 def deflated(data: bytes) -> bytes:
     """``data`` after zlib, at its best."""

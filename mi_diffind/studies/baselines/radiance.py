@@ -9,11 +9,8 @@ that reads bytes: :class:`ByteField` for all that lie on nodes.
 
 from __future__ import annotations
 
-import copy
-
 import drjit as dr
 import numpy as np
-from drjit import nn
 
 from ...tasks.field.field import RadianceField, colour_of, density_of
 from ...tasks.field.nodes import Nodes
@@ -24,81 +21,6 @@ RAW = (-8.0, 12.0)
 
 #: The density of what is nowhere stored, as a raw number.
 EMPTY = -30.0
-
-
-# -- where nodes are --------------------------------------------------------------------------------------------------
-
-#: Nodes along a side of a block.
-BLOCK = 4
-
-
-class BlockNodes(Nodes):
-    """
-    The same nodes by masks and ranks: 16 bits (32, of more than 65,534 blocks) for each block of 4 × 4 × 4 nodes, 64
-    bits and a rank for each that has any. ``nbytes`` counts these and the distances that rays cross empty space by.
-    """
-
-    def __init__(self, nodes: Nodes):
-        super().__init__(nodes.types, nodes.lower, nodes.spacing, nodes.shape, nodes.stored)
-        if self.stored is None:
-            self.nbytes = 0
-            return
-        self.index = None
-        padded = np.pad(self.stored, [(0, -n % BLOCK) for n in self.shape])
-        self.blocks = tuple(n // BLOCK for n in padded.shape)
-        x, y, z = self.blocks
-        bits = padded.reshape(x, BLOCK, y, BLOCK, z, BLOCK).transpose(0, 2, 4, 1, 3, 5).reshape(-1, BLOCK**3)
-        kept = bits.any(axis=1)
-        roots = np.zeros(len(bits), np.uint32)
-        roots[kept] = np.arange(1, kept.sum() + 1)
-        self.narrow = kept.sum() < 2**16 - 1
-        words = np.packbits(bits[kept], axis=1, bitorder="little").view("<u4")
-        counts = bits[kept].sum(axis=1)
-        # Nodes are numbered block by block here: the place of each in the order of the arrays
-        self.order = np.concatenate([[0], 1 + np.argsort(self._by_block())])
-        records = np.concatenate([words, (np.cumsum(counts) - counts + 1)[:, None]], axis=1).astype(np.uint32)
-        if self.narrow:
-            roots = np.pad(roots.astype("<u2"), (0, len(roots) % 2)).view("<u4")
-        self.roots, self.records = self.types.UInt32(roots), self.types.UInt32(records.reshape(-1))
-        self.nbytes = 4 * (dr.width(self.roots) + dr.width(self.records) + dr.width(self.distances))
-
-    def _by_block(self) -> np.ndarray:
-        """For each node in lexicographic order, a number that grows block by block and within blocks."""
-        place = np.argwhere(self.stored)
-        block = np.ravel_multi_index((place // BLOCK).T, self.blocks)
-        return block * BLOCK**3 + np.ravel_multi_index((place % BLOCK).T, (BLOCK,) * 3)
-
-    def corners(self, p, active=True):
-        if self.stored is None:
-            return super().corners(p, active)
-        UInt32, (_, height, depth) = self.types.UInt32, self.blocks
-        cell, fraction = [], []
-        for x, a, n in zip(p, self.lower, self.shape, strict=True):
-            u = dr.fma(x, 1 / self.spacing, -a / self.spacing)
-            i = dr.clip(dr.floor(u), 0, n - 2)
-            fraction.append(dr.clip(u - i, 0, 1))
-            cell.append(UInt32(i))
-        active = self.types.Bool(active)
-        weights, numbers = [], []
-        for corner in np.ndindex(2, 2, 2):
-            x, y, z = (i + e for i, e in zip(cell, corner, strict=True))
-            block = dr.fma(dr.fma(x >> 2, height, y >> 2), depth, z >> 2)
-            bit = ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)
-            root = dr.gather(UInt32, self.roots, block >> 1 if self.narrow else block, active)
-            if self.narrow:
-                root = (root >> ((block & 1) << 4)) & 0xFFFF
-            # A corner that is missing ends the cell
-            active &= root != 0
-            record = 3 * root - 3
-            low, high, first = (dr.gather(UInt32, self.records, record + k, active) for k in range(3))
-            upper = bit >= 32
-            word, below = dr.select(upper, high, low), UInt32(1) << (bit & 31)
-            active &= (word & below) != 0
-            number = first + dr.popcnt(word & (below - 1)) + dr.select(upper, dr.popcnt(low), 0)
-            f = [v if e else 1 - v for v, e in zip(fraction, corner, strict=True)]
-            weights.append(f[0] * f[1] * f[2])
-            numbers.append(number)
-        return list(zip(weights, numbers, strict=True)), active
 
 
 # -- fields on nodes --------------------------------------------------------------------------------------------------
@@ -112,8 +34,8 @@ class CoefficientField(RadianceField):
     rows of the nodes (default: their own).
     """
 
-    def __init__(self, nodes: Nodes, arrays: dict, rows=None, step: float | None = None):
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays, step)
+    def __init__(self, nodes: Nodes, arrays: dict, rows=None):
+        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
         self.nodes, self.rows = nodes, rows
 
     def look(self, p, active=True):
@@ -160,23 +82,24 @@ class ByteField(RadianceField):
     none. ``nbytes``: all that is read, in memory.
     """
 
-    def __init__(self, nodes: Nodes, density, colour, steps: tuple[Steps, Steps], matrix=None, rows=None, step=None):
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, {}, step)
+    def __init__(self, nodes: Nodes, density, colour, steps: tuple[Steps, Steps], matrix=None, rows=None):
+        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, {})
         types = self.types
-        self.nodes, self.density_steps, self.colour_steps = BlockNodes(nodes), *steps
-        self.state = {"density": density, "colour": colour, "matrix": matrix, "rows": rows}
-        order = np.arange(len(density)) if nodes.stored is None else self.nodes.order[1:] - 1
-        first = int(nodes.stored is not None)  # blocks count from one on, since 0 stands for none
-        self.density = types.UInt8(np.pad(density[order], (first, 0)))
+        self.nodes = (
+            nodes if nodes.stored is None else Nodes(types, nodes.lower, nodes.spacing, nodes.shape, nodes.stored, True)
+        )
+        self.density_steps, self.colour_steps = steps
+        first = int(nodes.stored is not None)  # 0 stands for no node
+        self.density = types.UInt8(np.pad(density, (first, 0)))
         self.words = -(-colour.shape[1] // 4)
-        table = colour if rows is not None else np.pad(colour[order], ((first, 0), (0, 0)))
+        table = colour if rows is not None else np.pad(colour, ((first, 0), (0, 0)))
         table = np.pad(table, ((0, 0), (0, 4 * self.words - colour.shape[1])))
         self.table = types.UInt32(np.ascontiguousarray(table).view("<u4").reshape(-1))
         self.channels = colour.shape[1]
         self.nbytes = self.nodes.nbytes + dr.width(self.density) + 4 * dr.width(self.table)
         self.row_words = None
         if rows is not None:
-            numbers = np.pad(rows[order].astype("<u2"), (first, 0))
+            numbers = np.pad(rows.astype("<u2"), (first, 0))
             self.row_words = types.UInt32(np.pad(numbers, (0, len(numbers) % 2)).view("<u4"))
             self.nbytes += 4 * dr.width(self.row_words)
         self.matrix = None

@@ -13,8 +13,9 @@ import numpy as np
 from drjit import nn
 
 from ...tasks.field.field import RadianceField, colour_of, density_of
-from ...tasks.field.nodes import COARSE, Nodes, cells_of, corners_of
+from ...tasks.field.nodes import COARSE, FARTHEST, Nodes, cells_of, corners_of, distances
 from .node_codes import Steps, deflated, mask_bytes
+from .radiance_fits import HEADER, Grid, nodes_of, nodes_state
 
 #: Raw density of a field that is not trained yet.
 BEGIN = -4.0
@@ -23,41 +24,46 @@ BEGIN = -4.0
 WIDER = 2
 
 
+def wide_cells(stored: np.ndarray | None, shape) -> np.ndarray:
+    """The cells :data:`WIDER` times as wide as those of a grid, of nodes ``stored`` of this shape, that have some."""
+    cells = cells_of(stored) if stored is not None else np.ones([n - 1 for n in shape], bool)
+    padded = np.pad(cells, [(0, -n % WIDER) for n in cells.shape])
+    x, y, z = (n // WIDER for n in padded.shape)
+    return padded.reshape(x, WIDER, y, WIDER, z, WIDER).any(axis=(1, 3, 5))
+
+
 class Occupancy:
-    """Where something may be: cells of the coarse grid of distances of ``nodes``, each a byte."""
+    """Where something may be: cells of the coarse grid of distances of nodes :data:`WIDER` times as far apart."""
 
     def __init__(self, nodes: Nodes):
-        """Of nodes :data:`WIDER` times as far apart as ``nodes``, whose cells are taken in."""
-        shape = [-(-(n - 1) // WIDER) for n in nodes.shape]
-        cells = cells_of(nodes.stored) if nodes.stored is not None else np.ones([n - 1 for n in nodes.shape], bool)
-        padded = np.pad(cells, [(0, WIDER * m - n) for m, n in zip(shape, cells.shape, strict=True)])
-        x, y, z = shape
-        cells = padded.reshape(x, WIDER, y, WIDER, z, WIDER).any(axis=(1, 3, 5))
-        self.nodes = Nodes(nodes.types, nodes.lower, WIDER * nodes.spacing, [n + 1 for n in shape], corners_of(cells))
+        stored = corners_of(wide_cells(nodes.stored, nodes.shape))
+        self.nodes = Nodes(nodes.types, nodes.lower, WIDER * nodes.spacing, stored.shape, stored)
         self.nodes.index = None
-        self.occupied = self.nodes.far == 0
-        self.types = nodes.types
-        self.nbytes = 4 * dr.width(self.nodes.distances)
+        self.types, self.nbytes = nodes.types, self.nodes.nbytes
 
     def __call__(self, p, active=True):
         """Whether a cell is occupied."""
         side = COARSE * self.nodes.spacing
         at = self.types.UInt32(0)
-        for x, a, n in zip(p, self.nodes.lower, self.occupied.shape, strict=True):
+        for x, a, n in zip(p, self.nodes.lower, self.nodes.far.shape, strict=True):
             u = dr.clip(dr.floor(dr.fma(x, 1 / side, -a / side)), 0, n - 1)
             at = dr.fma(at, n, self.types.UInt32(u))
-        word = dr.gather(self.types.UInt32, self.nodes.distances, at >> 2, active)
-        return active & (((word >> ((at & 3) << 3)) & 255) == 0)
+        word = dr.gather(self.types.UInt32, self.nodes.distances, at >> 3, active)
+        return active & (((word >> ((at & 7) << 2)) & FARTHEST) == 0)
 
     def skip(self, p, d, active=True):
         return self.nodes.skip(p, d, active)
 
-    @property
-    def file_bytes(self) -> int:
-        return len(mask_bytes(self.occupied))
+
+def occupied_bytes(state: dict) -> int:
+    """Bytes on disk of an occupancy of the nodes of a state."""
+    cells = cells_of(corners_of(wide_cells(state.get("stored"), state["shape"])))
+    return len(mask_bytes(distances(cells) == 0))
 
 
 # -- planes and lines -------------------------------------------------------------------------------------------------
+
+TABLES = ("density_planes", "colour_planes")
 
 #: Axes of a plane, and of the line that goes with it.
 PLANES = (((0, 1), 2), ((0, 2), 1), ((1, 2), 0))
@@ -71,8 +77,8 @@ class PlanesField(RadianceField):
     first two hold words of four bytes.
     """
 
-    def __init__(self, types, lower, upper, voxel, shape, arrays: dict, ranks, occupancy, steps=None, step=None):
-        super().__init__(types, lower, upper, voxel, arrays, step)
+    def __init__(self, nodes: Nodes, shape, arrays: dict, ranks, occupancy: Occupancy, steps=None):
+        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
         self.shape, self.ranks, self.occupancy, self.steps = tuple(shape), tuple(ranks), occupancy, steps
         self.starts = starts_of(self.shape)
 
@@ -85,7 +91,7 @@ class PlanesField(RadianceField):
         return found
 
     def _four(self, which: int, row, packet: int, active):
-        name, count = ("density_planes", "colour_planes")[which], self.ranks[which] // 4
+        name, count = TABLES[which], self.ranks[which] // 4
         at = dr.fma(row, count, packet)
         if self.steps is None:
             return list(dr.gather(self.types.Array4f, self.arrays[name].array, at, active))
@@ -119,7 +125,9 @@ class PlanesField(RadianceField):
         matrix = self.arrays["matrix"].array
 
         def line(i: int):
-            return [v for j in range(3) for v in dr.gather(self.types.Array4f, matrix, self.types.UInt32(3 * i + j), active)]
+            return [
+                v for j in range(3) for v in dr.gather(self.types.Array4f, matrix, self.types.UInt32(3 * i + j), active)
+            ]
 
         found, count = line(3 * self.ranks[1]), 0
         for four in self._products(1, self._cell(p), active):
@@ -144,15 +152,15 @@ class PlanesFit:
     #: Of the numbers that are trained: a product of two of them is what counts.
     SCALE = 3.0
 
-    def __init__(self, grid, ranks: tuple[int, int], spacing: float, seed: int = 1, step: float | None = None):
+    def __init__(self, grid: Grid, ranks: tuple[int, int], spacing: float, seed: int = 1):
         nodes = self.nodes = grid.nodes
-        self.types, self.ranks, self.step = nodes.types, ranks, step
+        self.types, self.ranks = nodes.types, tuple(ranks)
         self.occupancy = Occupancy(nodes)
         self.shape = [max(2, math.ceil((b - a) / spacing) + 1) for a, b in zip(nodes.lower, nodes.upper, strict=True)]
         rows = int(sum(self.shape[a] * self.shape[b] for (a, b), _ in PLANES) + sum(self.shape))
         rng = np.random.default_rng(seed)
         self.net = {}
-        for name, rank in zip(("density_planes", "colour_planes"), ranks, strict=True):
+        for name, rank in zip(TABLES, ranks, strict=True):
             begin = rng.normal(scale=0.1, size=(rows, rank))
             self.net[name] = self.types.TensorXf(begin.astype(np.float32))
         mean = np.average(grid.colour, axis=0, weights=grid.seen + 1e-9)
@@ -161,10 +169,10 @@ class PlanesFit:
         self.steps = None
 
     def _scaled(self, net, index: int):
-        value = net[("density_planes", "colour_planes")[index]]
+        value = net[TABLES[index]]
         return value * self.SCALE if index == 0 else value
 
-    def rounding(self) -> None:
+    def round(self) -> None:
         """From here on, numbers are rounded to 8 bits of their range."""
         self.steps = []
         for k in (0, 1):
@@ -172,29 +180,39 @@ class PlanesFit:
             step = (high - low) / 255
             self.steps.append(Steps(np.float32([low]), np.float32([step]), np.array([256])))
 
-    def _field(self, arrays, steps=None) -> PlanesField:
-        n = self.nodes
-        return PlanesField(n.types, n.lower, n.upper, n.spacing, self.shape, arrays, self.ranks, self.occupancy, steps,
-                           self.step)  # fmt: skip
-
     def field_of(self, net) -> PlanesField:
         values = [self._scaled(net, k) for k in (0, 1)]
         if self.steps is not None:
             values = [s.rounded(self.types, v) for s, v in zip(self.steps, values, strict=True)]
-        return self._field({"density_planes": values[0], "colour_planes": values[1], "matrix": net["matrix"]})
+        arrays = dict(zip(TABLES, values, strict=True), matrix=net["matrix"])
+        return PlanesField(self.nodes, self.shape, arrays, self.ranks, self.occupancy)
 
-    def codes(self) -> list[np.ndarray]:
-        return [self.steps[k].codes(self._scaled(self.net, k).numpy()) for k in (0, 1)]
+    def state(self) -> dict[str, np.ndarray]:
+        """All that a file has to hold, by name; after :meth:`round`."""
+        found = {**nodes_state(self.nodes), "ranks": np.array(self.ranks), "sides": np.array(self.shape)}
+        for k, name in enumerate(TABLES):
+            found |= {name: self.steps[k].codes(self._scaled(self.net, k).numpy()), f"{name}_low": self.steps[k].low}
+            found[f"{name}_step"] = self.steps[k].step
+        return found | {"matrix": self.net["matrix"].numpy()}
 
-    def stored(self) -> PlanesField:
-        found = self._field({"matrix": self.net["matrix"]}, self.steps)
-        found.words = [self.types.UInt32(np.ascontiguousarray(c).view("<u4").reshape(-1)) for c in self.codes()]
-        found.nbytes = 4 * (sum(map(dr.width, found.words)) + dr.width(self.net["matrix"])) + self.occupancy.nbytes
+    @staticmethod
+    def field(types, state: dict) -> PlanesField:
+        """The field that reads what :meth:`state` returned."""
+        nodes = nodes_of(types, state)
+        occupancy = Occupancy(nodes)
+        matrix = types.TensorXf(np.ascontiguousarray(state["matrix"], np.float32))
+        steps = [Steps(state[f"{n}_low"], state[f"{n}_step"], np.array([256])) for n in TABLES]
+        shape, ranks = map(tuple, (state["sides"].tolist(), state["ranks"].tolist()))
+        found = PlanesField(nodes, shape, {"matrix": matrix}, ranks, occupancy, steps)
+        found.words = [types.UInt32(np.ascontiguousarray(state[n]).view("<u4").reshape(-1)) for n in TABLES]
+        found.nbytes = 4 * (sum(map(dr.width, found.words)) + dr.width(matrix)) + occupancy.nbytes
         return found
 
-    def file_bytes(self, predict: bool = True) -> int:
-        packed = sum(len(deflated(np.ascontiguousarray(c.T).tobytes())) for c in self.codes())
-        return 64 + packed + 4 * dr.width(self.net["matrix"]) + self.occupancy.file_bytes
+    @staticmethod
+    def file_bytes(state: dict, predict: bool = True) -> int:
+        """Bytes on disk, after zlib."""
+        packed = sum(len(deflated(np.ascontiguousarray(state[n].T).tobytes())) for n in TABLES)
+        return HEADER + packed + state["matrix"].nbytes + occupied_bytes(state)
 
 
 # -- hash grid and network --------------------------------------------------------------------------------------------
@@ -209,8 +227,8 @@ class HashField(RadianceField):
     ``entries`` and ``weights``, flat.
     """
 
-    def __init__(self, types, lower, upper, voxel, arrays: dict, encoding, network, occupancy, step=None):
-        super().__init__(types, lower, upper, voxel, arrays, step)
+    def __init__(self, nodes: Nodes, arrays: dict, encoding, network, occupancy: Occupancy):
+        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
         self.encoding, self.network, self.occupancy = encoding, network, occupancy
 
     def look(self, p, active=True):
@@ -234,41 +252,58 @@ class HashField(RadianceField):
 class HashFit:
     """A hash grid of at most ``entries`` a level, as fine as ``finest`` cells along the longest side."""
 
-    def __init__(self, grid, entries: int, finest: float, seed: int = 1, step: float | None = None):
-        self.nodes, self.step = grid.nodes, step
+    def __init__(self, grid: Grid, entries: int, finest: float, seed: int = 1):
+        self.nodes, self.sizes = grid.nodes, (entries, finest)
         types = self.types = grid.nodes.types
         self.occupancy = Occupancy(grid.nodes)
-        scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
-        self.encoding = nn.HashGridEncoding(
-            types.Float, 3, n_levels=LEVELS, n_features_per_level=FEATURES, hashmap_size=entries // 16 * 16,
-            base_resolution=COARSEST, per_level_scale=scale, align_corners=True, init_scale=1e-2,
-            rng=dr.rng(seed=seed),
-        )  # fmt: skip
-        layers = nn.Sequential(nn.Linear(-1, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 13))
-        layers = layers.alloc(types.TensorXf, LEVELS * FEATURES, dr.rng(seed=seed + 1))
+        self.encoding, self.network = modules(types, entries, finest, seed)
+        weights = types.TensorXf(dr.detach(self.network["weights"]))
+        # What the last layer begins with: nothing, of the mean colour
+        bias = self.network.layers[-1].bias
         mean = np.average(grid.colour, axis=0, weights=grid.seen + 1e-9)
-        layers.layers[-1].bias = types.TensorXf(np.concatenate([[0.0], mean]).astype(np.float32))
-        self.network = nn.pack(layers, layout="training")
-        self.net = {
-            "entries": types.TensorXf(dr.detach(self.encoding.params)),
-            "weights": types.TensorXf(dr.detach(self.network["weights"])),
-        }
+        begin = weights.numpy().copy()
+        begin[bias.offset : bias.offset + 13 * bias.stride : bias.stride] = [0.0, *mean]
+        self.net = {"entries": types.TensorXf(dr.detach(self.encoding.params)), "weights": types.TensorXf(begin)}
 
     def field_of(self, net) -> HashField:
-        n = self.nodes
         arrays = {"entries": net["entries"], "weights": net["weights"]}
-        return HashField(n.types, n.lower, n.upper, n.spacing, arrays, self.encoding, self.network, self.occupancy, self.step)
+        return HashField(self.nodes, arrays, self.encoding, self.network, self.occupancy)
 
-    def halved(self) -> dict[str, np.ndarray]:
-        """All numbers in half precision, in which they are stored."""
-        return {name: value.numpy().astype(np.float16) for name, value in self.net.items()}
+    def state(self) -> dict[str, np.ndarray]:
+        """All that a file has to hold, by name: numbers in half precision."""
+        half = {name: self.net[name].numpy().astype(np.float16) for name in ("entries", "weights")}
+        return {**nodes_state(self.nodes), "sizes": np.array(self.sizes), **half}
 
-    def stored(self) -> HashField:
-        half = {name: self.types.TensorXf(v.astype(np.float32)) for name, v in self.halved().items()}
-        found = self.field_of(half)
-        found.nbytes = sum(v.nbytes for v in self.halved().values()) + self.occupancy.nbytes
+    @staticmethod
+    def field(types, state: dict) -> HashField:
+        """The field of what :meth:`state` returned, which computes in single precision."""
+        nodes = nodes_of(types, state)
+        arrays = {name: types.TensorXf(state[name].astype(np.float32)) for name in ("entries", "weights")}
+        encoding, network = modules(types, int(state["sizes"][0]), float(state["sizes"][1]), 1)
+        found = HashField(nodes, arrays, encoding, network, Occupancy(nodes))
+        found.nbytes = state["entries"].nbytes + state["weights"].nbytes + found.occupancy.nbytes
         return found
 
-    def file_bytes(self, predict: bool = True) -> int:
-        packed = sum(len(deflated(v.tobytes())) for v in self.halved().values())
-        return 64 + packed + self.occupancy.file_bytes
+    @staticmethod
+    def file_bytes(state: dict, predict: bool = True) -> int:
+        """Bytes on disk, after zlib."""
+        return HEADER + sum(len(deflated(state[n].tobytes())) for n in ("entries", "weights")) + occupied_bytes(state)
+
+
+def modules(types, entries: int, finest: float, seed: int) -> tuple:
+    """The hash grid and the network, untrained."""
+    scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
+    encoding = nn.HashGridEncoding(
+        types.Float, 3, n_levels=LEVELS, n_features_per_level=FEATURES, hashmap_size=entries // 16 * 16,
+        base_resolution=COARSEST, per_level_scale=scale, align_corners=True, init_scale=1e-2, rng=dr.rng(seed=seed),
+    )  # fmt: skip
+    layers = nn.Sequential(nn.Linear(-1, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 13))
+    layers = layers.alloc(types.TensorXf, LEVELS * FEATURES, dr.rng(seed=seed + 1))
+    return encoding, nn.pack(layers, layout="training")
+
+
+def parameters(entries: int, finest: float) -> int:
+    """Numbers of a hash grid and its network, about."""
+    scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
+    levels = sum(min(entries, (math.ceil(COARSEST * scale**k) + 1) ** 3) for k in range(LEVELS))
+    return FEATURES * levels + WIDTH * (LEVELS * FEATURES + 1) + 13 * (WIDTH + 1)

@@ -12,11 +12,13 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
-from ...tasks.field.field import GridField
+from ...tasks.field.field import FAINT, GridField, raw_of
 from ...tasks.field.march import march, replay
 from ...tasks.field.nodes import Nodes, cells_of, corners_of
-from .node_codes import Steps, coded_bytes
+from ...tasks.field.target import DENSITY_SCALE
+from .node_codes import Steps, coded_bytes, deflated
 from .radiance import EMPTY, RAW, ByteField, CoefficientField
 
 #: Colours of nodes that nothing is seen of have this weight, so that they are known, too.
@@ -61,66 +63,44 @@ class Grid:
         stored = self.nodes.stored
         return cells_of(stored) if stored is not None else np.ones([n - 1 for n in self.nodes.shape], bool)
 
-    def pruned(self, least: float) -> Grid:
-        """Without the cells of which no corner is :attr:`seen` as much as ``least`` rays."""
-        seen = self.dense(self.seen) > least
-        cells = np.zeros([n - 1 for n in self.nodes.shape], bool)
+    def coarser(self, scale: float) -> np.ndarray:
+        """Nodes, bool, ``scale`` times as far apart: the corners of cells that those of this grid reach into."""
+        shape = [int(np.ceil((n - 1) / scale - 1e-6)) + 1 for n in self.nodes.shape]
+        old, last = np.argwhere(self.cells()), np.array(shape) - 2
+        cells = np.zeros([n - 1 for n in shape], bool)
         for corner in np.ndindex(2, 2, 2):
-            cells |= seen[tuple(slice(c, n - 1 + c) for c, n in zip(corner, seen.shape, strict=True))]
-        return self.kept(cells)
+            new = ((old + np.array(corner) * (1 - 1e-6)) / scale).astype(int)
+            cells[tuple(np.minimum(new, last).T)] = True
+        return corners_of(cells)
 
-    def resampled(self, spacing: float, sparse: bool = True) -> Grid:
+    def resampled(self, scale: float, sparse: bool = True) -> Grid:
         """
-        On nodes that are ``spacing`` apart: means of density and, weighted by what is seen, of colour; on all of them,
-        or on the corners of the cells in which this grid has some.
+        On nodes that are ``scale`` times as far apart: means of density and, weighted by what is seen, of colour. With
+        ``sparse`` those of :meth:`coarser`, otherwise all.
         """
-        nodes = self.nodes
-        scale = spacing / nodes.spacing
-        if sparse and abs(scale - 1) < 1e-6:
-            return self
-        shape = [int(np.ceil((n - 1) / scale - 1e-6)) + 1 for n in nodes.shape]
-        density = np.logaddexp(0, self.dense(self.density, EMPTY)) / nodes.spacing
-        seen = self.dense(self.seen) + LEAST * self.dense(np.ones(len(self.seen), np.float32))
-        weighted = self.dense(self.colour) * seen[..., None]
-        # Means over as many places of the new cell around a node as the old grid needs
-        count = max(2, int(np.ceil(scale)) + 1)
-        offsets = (np.arange(count) + 0.5) / count - 0.5
-        totals = np.zeros((14, *shape))
+        nodes, stored = self.nodes, self.coarser(scale)
+        spacing, chosen = scale * nodes.spacing, stored if sparse else np.ones_like(stored)
+        soft = np.logaddexp(0, self.dense(self.density, EMPTY).astype(np.float64))
+        known = self.dense(np.ones(len(self.seen), np.float32))
+        seen = self.dense(self.seen) + LEAST * known
+        values = [
+            np.maximum(soft - FAINT, 0) / nodes.spacing,
+            seen,
+            *np.moveaxis(self.dense(self.colour) * seen[..., None], -1, 0),
+        ]
+        # Means over as many places of the cell around a node as the old grid needs
+        count, place = int(np.ceil(scale - 1e-6)) + 1, np.argwhere(chosen).T
+        totals = np.zeros((14, place.shape[1]))
         for offset in np.ndindex(count, count, count):
-            axes = [(np.arange(n) + offsets[o]) * scale for n, o in zip(shape, offset, strict=True)]
-            place = np.stack(np.meshgrid(*axes, indexing="ij"))
-            for k, values in enumerate((density, seen, *np.moveaxis(weighted, -1, 0))):
-                totals[k] += map_coordinates(values, place, order=1, mode="constant", cval=0.0, prefilter=False)
+            at = (place + ((np.array(offset) + 0.5) / count - 0.5)[:, None]) * scale
+            for total, v in zip(totals, values, strict=True):
+                total += map_coordinates(v, at, order=1, mode="constant", cval=0.0, prefilter=False)
         totals /= count**3
-        raw = totals[0] * spacing
-        raw = np.where(raw > 1e-6, np.maximum(raw, 1e-6) + np.log(-np.expm1(-np.maximum(raw, 1e-6))), RAW[0])
-        colour = np.moveaxis(totals[2:] / np.maximum(totals[1], 1e-12), 0, -1)
-        types, stored = nodes.types, None
-        if sparse:
-            old = np.argwhere(self.cells())
-            cells = np.zeros([n - 1 for n in shape], bool)
-            for corner in np.ndindex(2, 2, 2):  # every new cell that an old one reaches into
-                cells[
-                    tuple(
-                        np.minimum(((old + np.array(corner) * (1 - 1e-6)) / scale).astype(int), np.array(shape) - 2).T
-                    )
-                ] = True
-            stored = corners_of(cells)
-        found = Nodes(types, nodes.lower, spacing, shape, stored)
-        chosen = stored if stored is not None else np.ones(shape, bool)
-        colour = filled(colour, totals[1] > 1e-9)
-        return Grid(found, raw[chosen].astype(np.float32), colour[chosen].astype(np.float32),
-                    (totals[1] * scale**3)[chosen].astype(np.float32))  # fmt: skip
-
-
-def filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """``values`` (X, Y, Z, C), of which those not ``known`` are replaced by the nearest that are."""
-    from scipy.ndimage import distance_transform_edt
-
-    if known.all() or not known.any():
-        return values
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return values[tuple(nearest)]
+        mean = np.average(self.colour, axis=0, weights=self.seen + LEAST)
+        colour = np.where(totals[1] > 1e-9, totals[2:] / np.maximum(totals[1], 1e-12), mean[:, None]).T
+        raw = np.maximum(raw_of(totals[0], spacing), RAW[0])
+        found = Nodes(nodes.types, nodes.lower, spacing, stored.shape, stored if sparse else None)
+        return Grid(found, *(v.astype(np.float32) for v in (raw, colour, totals[1] * scale**3)))
 
 
 def visibility(field: GridField, images, every: int = 2) -> np.ndarray:
@@ -154,153 +134,162 @@ class NodesFit:
     their own; ``matrix`` makes twelve numbers of them, if there is one.
     """
 
-    #: What a parameter is multiplied by: densities change faster than colours.
-    DENSITY = 20.0
-
-    def __init__(self, nodes: Nodes, density, colour, steps: tuple[Steps, Steps], matrix=None, rows=None, step=None):
-        self.nodes, self.steps, self.rows, self.step = nodes, steps, rows, step
+    def __init__(self, nodes: Nodes, density, colour, steps: tuple[Steps, Steps], matrix=None, rows=None):
+        self.nodes, self.rows, self.steps = nodes, rows, steps
         types = self.types = nodes.types
         self.first = int(nodes.stored is not None)
-        own = 0 if rows is not None else self.first
-        colour = np.pad(colour, ((own, 0), (0, -colour.shape[1] % 4)))
+        self.channels = colour.shape[1]
+        # Colours are read four numbers at a time
+        spare = -self.channels % 4
+        colour = np.pad(colour, ((0 if rows is not None else self.first, 0), (0, spare)))
+        ones = {"constant_values": 1}
+        padded = [np.pad(steps[1].low, (0, spare)), np.pad(steps[1].step, (0, spare), **ones)]
+        self.rounding = Steps(*padded, np.pad(steps[1].levels, (0, spare), **ones))
         self.net = {
-            "density": types.TensorXf(np.pad(density, (self.first, 0)).astype(np.float32)[:, None] / self.DENSITY),
+            "density": types.TensorXf(np.pad(density, (self.first, 0)).astype(np.float32)[:, None] / DENSITY_SCALE),
             "colour": types.TensorXf(colour.astype(np.float32)),
         }
-        self.channels = len(steps[1].low)
-        if colour.shape[1] > self.channels:
-            pad = (0, colour.shape[1] - self.channels)
-            self.padded = Steps(np.pad(steps[1].low, pad), np.pad(steps[1].step, pad, constant_values=1),
-                                np.pad(steps[1].levels, pad, constant_values=1))  # fmt: skip
-        else:
-            self.padded = steps[1]
         if matrix is not None:
-            grown = np.concatenate([matrix[:-1], np.zeros((colour.shape[1] - self.channels, 12)), matrix[-1:]])
+            grown = np.insert(matrix, [self.channels] * spare, 0.0, axis=0)
             self.net["matrix"] = types.TensorXf(grown.astype(np.float32))
-        self.row_numbers = None
+        self.numbers = None
         if rows is not None:
-            self.row_numbers = types.UInt32(np.pad(rows, (self.first, 0)).astype(np.uint32))
+            self.numbers = types.UInt32(np.pad(rows, (self.first, 0)).astype(np.uint32))
 
     def field_of(self, net) -> CoefficientField:
-        types = self.types
-        arrays = {"density": self.steps[0].rounded(types, net["density"] * self.DENSITY),
-                  "colour": self.padded.rounded(types, net["colour"])}  # fmt: skip
+        """The field of what is trained, rounded as it will be stored."""
+        arrays = {
+            "density": self.steps[0].rounded(self.types, net["density"] * DENSITY_SCALE),
+            "colour": self.rounding.rounded(self.types, net["colour"]),
+        }
         if "matrix" in self.net:
             arrays["matrix"] = net["matrix"]
-        return CoefficientField(self.nodes, arrays, self.row_numbers, self.step)
+        return CoefficientField(self.nodes, arrays, self.numbers)
 
-    def codes(self) -> tuple[np.ndarray, np.ndarray]:
-        density = self.steps[0].codes(self.net["density"].numpy() * self.DENSITY)[self.first :]
+    def grid(self, seen: np.ndarray | None = None) -> Grid:
+        """The numbers as they are now, of a fit that has neither ``rows`` nor a ``matrix``."""
+        density = self.net["density"].numpy()[self.first :, 0] * DENSITY_SCALE
+        colour = self.net["colour"].numpy()[self.first :, : self.channels]
+        return Grid(self.nodes, density, colour, np.ones(len(density)) if seen is None else seen)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that a file has to hold, by name."""
+        density = self.steps[0].codes(self.net["density"].numpy() * DENSITY_SCALE)[self.first :]
         colour = self.net["colour"].numpy()[0 if self.rows is not None else self.first :, : self.channels]
-        return density, self.steps[1].codes(colour)
+        found = {"density": density, "colour": self.steps[1].codes(colour), **nodes_state(self.nodes)}
+        for name, steps in zip(("density", "colour"), self.steps, strict=True):
+            found |= {f"{name}_low": steps.low, f"{name}_step": steps.step, f"{name}_levels": steps.levels}
+        if "matrix" in self.net:
+            matrix = self.net["matrix"].numpy()
+            found["matrix"] = np.concatenate([matrix[: self.channels], matrix[-1:]])
+        if self.rows is not None:
+            found["rows"] = self.rows.astype(np.uint16)
+        return found
 
-    def matrix(self) -> np.ndarray | None:
-        if "matrix" not in self.net:
-            return None
-        found = self.net["matrix"].numpy()
-        return np.concatenate([found[: self.channels], found[-1:]])
+    @staticmethod
+    def field(types, state: dict) -> ByteField:
+        """The field that reads what :meth:`state` returned."""
+        names = ("low", "step", "levels")
+        steps = tuple(Steps(*(state[f"{kind}_{n}"] for n in names)) for kind in ("density", "colour"))
+        return ByteField(nodes_of(types, state), state["density"][:, 0], state["colour"], steps, state.get("matrix"),
+                         state.get("rows"))  # fmt: skip
 
-    def stored(self) -> ByteField:
-        density, colour = self.codes()
-        return ByteField(self.nodes, density[:, 0], colour, self.steps, self.matrix(), self.rows, self.step)
-
-    def file_bytes(self, predict: bool = True) -> int:
+    @staticmethod
+    def file_bytes(state: dict, predict: bool = True) -> int:
         """Bytes on disk, after zlib."""
-        density, colour = self.codes()
-        stored = self.nodes.stored if self.nodes.stored is not None else np.ones(self.nodes.shape, bool)
-        matrix = self.matrix()
-        fixed = 64 + sum(s.nbytes for s in self.steps) + (0 if matrix is None else 4 * matrix.size)
-        if self.rows is None:
+        rows, colour, density = state.get("rows"), state["colour"], state["density"]
+        stored = state.get("stored", np.ones(state["shape"], bool))
+        fixed = HEADER + sum(state[n].nbytes for n in state if n.endswith(("_low", "_step")) or n == "matrix")
+        if rows is None:
             return fixed + coded_bytes(stored, np.concatenate([density, colour], axis=1), predict)
-        from .node_codes import deflated
-
-        packed = min(len(deflated(_bits(self.rows, len(colour)))), len(deflated(self.rows.astype("<u2").tobytes())))
+        packed = min(len(deflated(bits_of(rows, len(colour)))), len(deflated(rows.astype("<u2").tobytes())))
         return fixed + coded_bytes(stored, density, predict) + packed + len(deflated(colour.tobytes()))
 
 
-def _bits(numbers: np.ndarray, count: int) -> bytes:
+#: Bytes of a file beside its arrays.
+HEADER = 64
+
+
+def nodes_state(nodes: Nodes) -> dict[str, np.ndarray]:
+    """What :func:`nodes_of` makes nodes of."""
+    found = {"lower": np.array(nodes.lower), "spacing": np.array(nodes.spacing), "shape": np.array(nodes.shape)}
+    return found if nodes.stored is None else found | {"stored": nodes.stored}
+
+
+def nodes_of(types, state: dict) -> Nodes:
+    return Nodes(types, state["lower"], float(state["spacing"]), state["shape"], state.get("stored"))
+
+
+def bits_of(numbers: np.ndarray, count: int) -> bytes:
     """Numbers below ``count`` in as many bits as they need."""
     width = max(1, int(count - 1).bit_length())
     return np.packbits((numbers[:, None] >> np.arange(width)) & 1, bitorder="little").tobytes()
 
 
-def plain(grid: Grid, levels: int = 256, step: float | None = None) -> NodesFit:
-    """Thirteen bytes a node."""
-    steps = (Steps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / 255]), np.array([256])),
-             Steps.over(grid.colour, levels, grid.seen + LEAST, 1e-3))  # fmt: skip
-    return NodesFit(grid.nodes, np.clip(grid.density, *RAW), grid.colour, steps, step=step)
+def density_steps(levels: int = 256) -> Steps:
+    return Steps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / (levels - 1)]), np.array([levels]))
 
 
-def display(colour: np.ndarray) -> np.ndarray:
+def plain(grid: Grid, levels: int = 256) -> NodesFit:
+    """Thirteen numbers a node, those of colour in so many equal steps."""
+    steps = density_steps(), Steps.over(grid.colour, levels, grid.seen + LEAST, 1e-3)
+    return NodesFit(grid.nodes, np.clip(grid.density, *RAW), grid.colour, steps)
+
+
+def display(grid: Grid) -> np.ndarray:
     """
-    Twelve numbers of colour as what they change on a screen, to first order: each of the four of a channel times the
-    slope of sRGB there, (n, 12).
+    How much each of twelve numbers of colour changes what is shown on a screen, to first order, as the root mean square
+    of what is seen, (12,): the slope of sRGB times the radiance.
     """
-    radiance = np.exp(np.clip(colour[:, ::4], -12, 1.5))
+    radiance = np.exp(np.clip(grid.colour[:, ::4], -12, 1.5))
     slope = np.where(radiance <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(radiance, 0.0031308) ** (1 / 2.4 - 1))
-    return np.repeat(slope * radiance, 4, axis=1)
+    squared = np.average((slope * radiance) ** 2, axis=0, weights=grid.seen + LEAST)
+    return np.repeat(np.sqrt(squared), 4)
 
 
-def components(
-    grid: Grid, count: int, width: float, levels: int = 256, density_levels: int = 256, step=None
-) -> NodesFit:
-    """
-    So many principal components of the colours, in equal steps of ``width``, of what they change on a screen; the
-    spread of what is seen counts.
-    """
-    seen = grid.seen.astype(np.float64) + LEAST
-    scale = np.sqrt(np.average(display(grid.colour) ** 2, axis=0, weights=seen))
+def components(grid: Grid, width: float, count: int = 12) -> NodesFit:
+    """So many principal components of what is seen of the colours, in equal steps that change a screen by ``width``."""
+    seen, scale = grid.seen.astype(np.float64) + LEAST, display(grid)
     mean = np.average(grid.colour, axis=0, weights=seen)
     centred = (grid.colour - mean) * scale
-    low, high = np.quantile(centred, (0.001, 0.999), axis=0)
-    centred = np.clip(centred, low, high)
+    centred = np.clip(centred, *np.quantile(centred, (0.001, 0.999), axis=0))
     values, vectors = np.linalg.eigh(np.cov(centred.T, aweights=seen))
     vectors = vectors[:, np.argsort(values)[::-1][:count]]
     found = centred @ vectors
+    steps = density_steps(), Steps.of_width(found, np.full(count, width))
     matrix = np.concatenate([vectors.T / scale, mean[None]])
-    steps = (Steps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / (density_levels - 1)]), np.array([density_levels])),
-             Steps.of_width(found, np.full(count, width), levels))  # fmt: skip
-    return NodesFit(grid.nodes, np.clip(grid.density, *RAW), found, steps, matrix, step=step)
+    return NodesFit(grid.nodes, np.clip(grid.density, *RAW), found, steps, matrix)
 
 
-def codebook(grid: Grid, count: int, seed: int = 1, rounds: int = 12, step=None) -> NodesFit:
+def codebook(grid: Grid, count: int, seed: int = 1, rounds: int = 10) -> NodesFit:
     """Colours from a list of ``count``, found by k-means of what is seen."""
-    seen = grid.seen.astype(np.float64) + LEAST
-    # The slope of each node's own would move centres: the spread on a screen as a whole
-    scale = np.sqrt(np.average(display(grid.colour) ** 2, axis=0, weights=seen))
-    points = (grid.colour * scale).astype(np.float32)
-    centres, rows = k_means(points, seen, count, seed, rounds)
+    scale = display(grid)
+    centres, rows = k_means((grid.colour * scale).astype(np.float32), grid.seen + LEAST, count, seed, rounds)
     colour = centres / scale
-    steps = (Steps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / 255]), np.array([256])),
-             Steps.over(colour, 256))  # fmt: skip
-    return NodesFit(grid.nodes, np.clip(grid.density, *RAW), colour, steps, None, rows, step)
+    steps = density_steps(), Steps.over(colour)
+    return NodesFit(grid.nodes, np.clip(grid.density, *RAW), colour, steps, None, rows)
 
 
-def k_means(points: np.ndarray, weights: np.ndarray, count: int, seed: int, rounds: int, most: int = 2**16):
-    """Centres ``(count, D)`` of weighted ``points`` (n, D), from ``most`` of them, and the nearest to each (n,)."""
+#: Points that centres are moved by, at most.
+SAMPLE = 2**16
+
+
+def k_means(points: np.ndarray, weights: np.ndarray, count: int, seed: int, rounds: int):
+    """Centres ``(count, D)`` of weighted ``points`` (n, D), and the number of the nearest for each (n,)."""
     rng = np.random.default_rng(seed)
     count = min(count, len(points))
     share = weights / weights.sum()
-    chosen = rng.choice(len(points), min(most, len(points)), replace=False, p=None)
-    centres = points[rng.choice(len(points), count, replace=False, p=0.5 * share + 0.5 / len(points))].copy()
+    centres = points[rng.choice(len(points), count, replace=False, p=0.5 * share + 0.5 / len(points))]
+    chosen = rng.choice(len(points), min(SAMPLE, len(points)), replace=False)
     sample, mass = points[chosen], weights[chosen]
     for _ in range(rounds):
-        own = nearest(sample, centres)
+        own = cKDTree(centres).query(sample)[1]
         total = np.bincount(own, mass, count)
-        for k in range(points.shape[1]):
-            centres[:, k] = np.where(
-                total > 0, np.bincount(own, mass * sample[:, k], count) / np.maximum(total, 1e-30), centres[:, k]
-            )
-        empty = np.flatnonzero(np.bincount(own, minlength=count) == 0)
-        if len(empty):
-            far = np.sum((sample - centres[own]) ** 2, axis=1) * mass
-            centres[empty] = sample[np.argsort(far)[::-1][: len(empty)]]
-    return centres, nearest(points, centres)
-
-
-def nearest(points: np.ndarray, centres: np.ndarray, part: int = 4096) -> np.ndarray:
-    """The number of the nearest of ``centres`` to each of ``points``."""
-    half = 0.5 * np.sum(centres**2, axis=1)
-    return np.concatenate(
-        [np.argmax(p @ centres.T - half, axis=1) for p in np.split(points, range(part, len(points), part))]
-    )
+        sums = np.stack([np.bincount(own, mass * v, count) for v in sample.T], axis=1)
+        centres = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-30)[:, None], centres).astype(np.float32)
+        idle = np.flatnonzero(total == 0)
+        if len(idle):  # to where most is missing
+            missing = np.sum((sample - centres[own]) ** 2, axis=1) * mass
+            worst = np.argsort(missing)[::-1][: len(idle)]
+            centres[idle[: len(worst)]] = sample[worst]
+    return centres, cKDTree(centres).query(points)[1]

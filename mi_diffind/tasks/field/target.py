@@ -27,7 +27,7 @@ DENSITY_SCALE = 20.0
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 
 #: The weight of the total variation of raw densities, the square below which a step counts less, and nodes a step.
-SMOOTH, ROUND, VARIED = 1e-4, 1e-2, 2**15
+SMOOTH, ROUND, VARIED = 2e-4, 1e-2, 2**15
 
 #: The largest weight in a ray below which a cell is left out.
 VISIBLE = 0.02
