@@ -235,7 +235,8 @@ def save_table(path: str | os.PathLike, table: Table) -> None:
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
             # A fixed date: numpy.savez stamps the current one, and equal content would give unequal files.
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), buffer.getvalue())
+            info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            archive.writestr(info, buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
 
 
 def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[str, tuple] | None = None) -> Table:

@@ -10,12 +10,13 @@ from mi_diffind import compat
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.field.march import OPAQUE
 
-from . import Plugin
+from . import Counterpart, Plugin
 from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
 from .support import properties
 from .support import solids as sdf
 from .support.differentials import Differentials
+from .support.field_grids import to_grid
 from .support.fields import Light, PlacedField
 
 #: What the default inner integrator takes of the properties.
@@ -170,6 +171,11 @@ def has_smooth(scene: mi.Scene) -> bool:
     return False
 
 
+def named(integrator) -> str:
+    """The name of an integrator's class, in Python or C++."""
+    return type(integrator).__name__ if compat.written_in_python(integrator) else integrator.class_name()
+
+
 def with_holes(scene: mi.Scene) -> list[str]:
     """Names of shapes whose material is a surface in part and nothing in part, as a ``mask`` makes it."""
     found = []
@@ -209,7 +215,7 @@ def integrator() -> type:
             self.light = Light()
             self.held = self.placed.held()
             self._warned = False
-            self._shapes = {name: tuple(values.shape) for name, values in field.arrays.items()}
+            self._shapes = {name: tuple(values.shape) for name, values in self.placed.exposed.items()}
 
         @staticmethod
         def _inner(props: mi.Properties):
@@ -230,11 +236,11 @@ def integrator() -> type:
                 raise RuntimeError("a nested neural_field: found a second field, allowed is one")
             if not isinstance(found, mi.SamplingIntegrator):
                 raise RuntimeError(
-                    f"the nested integrator {found.class_name()}: does not follow rays from a camera, as path does"
+                    f"the nested integrator {named(found)}: does not follow rays from a camera, as path does"
                 )
             if found.aov_names():
                 raise RuntimeError(
-                    f"the nested integrator {found.class_name()}: has AOVs of its own, which are not passed on; put "
+                    f"the nested integrator {named(found)}: has AOVs of its own, which are not passed on; put "
                     f"neural_field into it"
                 )
             return found
@@ -250,12 +256,12 @@ def integrator() -> type:
         # -- as an object of Mitsuba ------------------------------------------------------------------------------
 
         def traverse(self, cb: mi.TraversalCallback) -> None:
-            for name, values in self.placed.field.arrays.items():
+            for name, values in self.placed.exposed.items():
                 cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
             cb.put("surfaces", self.surfaces, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys=()) -> None:
-            for name, values in self.placed.field.arrays.items():
+            for name, values in self.placed.exposed.items():
                 found, expected = tuple(values.shape), self._shapes[name]
                 if found != expected:
                     raise RuntimeError(f'parameter "tables.{name}": has the shape {found}, expected {expected}')
@@ -265,7 +271,7 @@ def integrator() -> type:
 
         def report(self) -> dict:
             field = self.placed.field
-            said = {"voxel": field.voxel * self.placed.placement.size, "surfaces": self.surfaces.class_name()}
+            said = {"voxel": field.voxel * self.placed.placement.size, "surfaces": named(self.surfaces)}
             if self.model is None:
                 return said
             return {
@@ -356,7 +362,7 @@ def integrator() -> type:
 
         def _surfaces_optimised(self, scene) -> bool:
             """Is a derivative with respect to anything but the field asked for?"""
-            own = {compat.identity(values) for values in self.placed.field.arrays.values()}
+            own = {compat.identity(values) for values in self.placed.exposed.values()}
             params = mi.traverse(scene)
             values = [params[key] for key in params.keys()]
             attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
@@ -586,4 +592,10 @@ def open_model(props: mi.Properties):
         raise RuntimeError(str(e)) from None
 
 
-PLUGIN = Plugin("neural_field", "integrator", lambda props: integrator()(props), task="field")
+PLUGIN = Plugin(
+    "neural_field",
+    "integrator",
+    lambda props: integrator()(props),
+    task="field",
+    exact=Counterpart("neural_field", convert=to_grid),
+)

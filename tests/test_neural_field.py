@@ -478,6 +478,89 @@ def test_what_is_refused(mi_rgb, fields, more, message):
     assert message in compat.one_sentence(raised.value)
 
 
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """A small field: a ball that is red to the left and blue to the right, in half precision."""
+    import drjit.llvm as types
+
+    from mi_diffind.tables import save_table
+    from mi_diffind.tasks.field import files, nodes
+
+    side, spacing = 25, 0.1
+    place = np.stack(np.meshgrid(*[spacing * np.arange(side) - 1.2] * 3, indexing="ij"), -1)
+    radius = np.linalg.norm(place, axis=-1)
+    stored = nodes.Nodes(types, (-1.2,) * 3, spacing, (side,) * 3, radius < 1)
+    raw = np.clip(12 * (0.8 - radius), -6, 4)[stored.stored]
+    colour = np.zeros((stored.count, 12))
+    colour[:, 0], colour[:, 4], colour[:, 8] = -place[stored.stored][:, 0], -1, place[stored.stored][:, 0]
+    table = files.grid_table(stored, np.append(-9, raw), np.concatenate([np.zeros((1, 12)), colour]))
+    path = tmp_path_factory.mktemp("field") / "ball.npz"
+    save_table(path, table)
+    return path
+
+
+def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
+    """As the field that it holds; depths and what is nested are known to the commands."""
+    from mi_diffind import plugins, scenes
+    from mi_diffind.tasks.field import TASK
+
+    mi = mi_rgb
+    text = """<scene version="3.0.0">
+        <integrator type="neural_field" id="it"><string name="filename" value="ball.npz"/>INNER</integrator>
+        <sensor type="perspective"><float name="fov" value="40"/>
+            <transform name="to_world"><lookat origin="0,-4,0" target="0,0,0" up="0,0,1"/></transform>
+            <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
+                <string name="pixel_format" value="rgba"/><rfilter type="box"/></film></sensor>
+    </scene>"""
+    (tmp_path / "ball.npz").write_bytes(file.read_bytes())
+    (tmp_path / "scene.xml").write_text(text.replace("INNER", ""))
+    inner = '<integrator type="prb"><integer name="max_depth" value="3"/></integrator>'
+    (tmp_path / "nested.xml").write_text(text.replace("INNER", inner))
+    assert scenes.integrator_of(tmp_path / "scene.xml") == ("neural_field", -1)
+    assert scenes.integrator_of(tmp_path / "nested.xml") == ("prb", 3)
+    loaded = scenes.load(tmp_path / "scene.xml", longest_path=2)
+    assert loaded.integrator().surfaces.max_depth == 2
+    image = render(mi, loaded, 4)
+    assert image[8, 8, 3] > 0.99 and image[0, 0, 3] == 0
+    assert image[8, 5, 0] > 2 * image[8, 5, 2] > 0 and image[8, 10, 2] > 2 * image[8, 10, 0] > 0
+    assert np.abs(render(mi, scenes.load(tmp_path / "nested.xml"), 4) - image).max() < 1e-5
+    report = plugins.report(loaded.integrator())
+    assert report["table_bytes"] > 0 and report["surfaces"] == "PathFootprint"
+    register(mi, {"file": TASK.open(mi.TensorXf, file).field})
+    same = mi.load_dict({"type": "test_field", "field": "file"})
+    assert np.abs(render(mi, loaded, 4, integrator=same) - image).max() < 1e-6
+
+
+def test_arrays_of_a_file_can_be_optimised(mi_rgb, fields, file):
+    mi = mi_rgb
+    made = scene(mi, size=(16, 12))
+    integrator = mi.load_dict({"type": "neural_field", "filename": str(file), "storage": "float32", "id": "it"})
+    params = mi.traverse(integrator)
+    assert set(params.keys()) == {"tables.density", "tables.colour"}
+    before = render(mi, made, integrator=integrator)
+    dr.enable_grad(params["tables.colour"])
+    image = mi.render(made, params, spp=1, integrator=integrator)
+    dr.backward(dr.sum(image, axis=None))
+    gradient = np.array(dr.grad(params["tables.colour"]))
+    assert (gradient[1:, [0, 4, 8]] >= 0).all() and gradient[1:, [0, 4, 8]].max() > 1e-3
+    params["tables.colour"] = mi.TensorXf(np.array(params["tables.colour"]) + np.float32(np.log(2)) * (gradient != 0))
+    params.update()
+    after = render(mi, made, integrator=integrator)
+    assert after[..., :3].sum() > 1.3 * before[..., :3].sum() and np.abs(after - before)[..., 3].max() < 1e-6
+
+
+def test_a_damaged_file_is_refused(mi_rgb, file, tmp_path):
+    content = file.read_bytes()
+    (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
+    for name, message in (("cut.npz", "cut.npz"), ("missing.npz", "missing.npz")):
+        with pytest.raises(RuntimeError) as raised:
+            mi_rgb.load_dict({"type": "neural_field", "filename": str(tmp_path / name)})
+        assert message in compat.one_sentence(raised.value)
+
+
 def test_a_file_is_needed(mi_rgb):
     with pytest.raises(RuntimeError, match='parameter "filename": not given'):
         mi_rgb.load_dict({"type": "neural_field"})

@@ -38,9 +38,14 @@ class PlacedField:
         """
         return [self.axes, self.origin, self.size, *_arrays_of(self.field, set())]
 
+    @property
+    def exposed(self) -> dict:
+        """Those of the field's arrays that can be optimised: name → tensor."""
+        return {name: values for name, values in self.field.arrays.items() if dr.is_float_v(values)}
+
     def optimised(self) -> bool:
         """Is a derivative with respect to the field's arrays asked for?"""
-        return any(compat.has_gradient(values) for values in self.field.arrays.values())
+        return any(compat.has_gradient(values) for values in self.exposed.values())
 
     def _local(self, ray, far, active) -> tuple:
         """What the functions of :mod:`.march` take, after the field."""
@@ -96,7 +101,7 @@ class Light:
     """
 
     def __init__(self):
-        self.illuminant = mi.load_dict({"type": "d65"}) if mi.is_spectral else None
+        self.illuminant = mi.load_dict({"type": "d65"}, parallel=False) if mi.is_spectral else None
 
     def of(self, colour, wavelengths, active=True):
         """The light of RGB ``colour`` (three floats)."""

@@ -44,7 +44,7 @@ class CoefficientField(RadianceField):
         for weight, number in corners:
             raw = dr.fma(weight, dr.gather(self.types.Float, density, number, active), raw)
         latent = [w for w, _ in corners] + [n for _, n in corners]
-        return dr.select(active, density_of(raw, self.voxel), 0), latent
+        return dr.select(active, density_of(raw, self.per_voxel), 0), latent
 
     def colour(self, latent, p, d, active=True):
         table, types = self.arrays["colour"], self.types
@@ -118,7 +118,7 @@ class ByteField(RadianceField):
         s = self.density_steps
         raw = dr.fma(raw, float(s.step[0]), float(s.low[0]))
         latent = [w for w, _ in corners] + [n for _, n in corners]
-        return dr.select(active, density_of(raw, self.voxel), 0), latent
+        return dr.select(active, density_of(raw, self.per_voxel), 0), latent
 
     def colour(self, latent, p, d, active=True):
         types, UInt32 = self.types, self.types.UInt32

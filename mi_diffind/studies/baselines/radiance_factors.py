@@ -119,7 +119,7 @@ class PlanesField(RadianceField):
         raw = self.types.Float(BEGIN)
         for four in self._products(0, self._cell(p), active):
             raw += four[0] + four[1] + four[2] + four[3]
-        return dr.select(active, density_of(raw, self.voxel), 0), []
+        return dr.select(active, density_of(raw, self.per_voxel), 0), []
 
     def colour(self, latent, p, d, active=True):
         matrix = self.arrays["matrix"].array
@@ -250,7 +250,7 @@ class HashField(RadianceField):
                 layer.weights.buffer = layer.bias.buffer = self.arrays["weights"].array
         features = self.encoding([(x - a) * (1 / longest) for x, a in zip(p, self.lower, strict=True)], active)
         raw, *numbers = self.network(nn.CoopVec(*features))
-        return dr.select(active, density_of(raw + BEGIN, self.voxel), 0), numbers
+        return dr.select(active, density_of(raw + BEGIN, self.per_voxel), 0), numbers
 
     def colour(self, latent, p, d, active=True):
         return colour_of(latent, d)

@@ -37,7 +37,7 @@ class CodedField(RadianceField):
             first = dr.minimum(UInt32(dr.detach(at)), last - 1)
             low, high = dr.gather(Float, curve, first, active), dr.gather(Float, curve, first + 1, active)
             raw = dr.fma(weight, dr.lerp(low, high, at - Float(first)), raw)
-        return dr.select(active, density_of(raw, self.voxel), 0), [w for w, _ in corners] + [s for _, s in corners]
+        return dr.select(active, density_of(raw, self.per_voxel), 0), [w for w, _ in corners] + [s for _, s in corners]
 
     def colour(self, latent, p, d, active=True):
         entries = [dr.gather(self.types.UInt32, self.codes, slot, active) for slot in latent[8:]]
@@ -84,7 +84,7 @@ class PackedField(RadianceField):
                 word |= (following << (31 - shift)) << 1
             raw = dr.fma(weight, dr.gather(Float, self.curve, word & (2**self.share_bits - 1), active), raw)
             codes.append((word >> self.share_bits) & (2**self.code_bits - 1))
-        return dr.select(active, density_of(raw, self.voxel), 0), [w for w, _ in corners] + codes
+        return dr.select(active, density_of(raw, self.per_voxel), 0), [w for w, _ in corners] + codes
 
     def colour(self, latent, p, d, active=True):
         types = self.types

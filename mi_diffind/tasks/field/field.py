@@ -32,6 +32,9 @@ class RadianceField:
         self.lower, self.upper = tuple(map(float, lower)), tuple(map(float, upper))
         self.voxel, self.step = float(voxel), float(step if step is not None else 0.5 * voxel)
         self.arrays = dict(arrays)
+        # Not part of kernels, so that those of one field serve another
+        self.box = tuple(dr.opaque(types.Array3f, corner) for corner in (self.lower, self.upper))
+        self.per_voxel = dr.opaque(types.Float, 1 / self.voxel)
 
     def with_arrays(self, arrays: dict) -> RadianceField:
         """The same field with other numbers in its arrays."""
@@ -55,13 +58,13 @@ class RadianceField:
         return self.types.Float(0)
 
 
-def density_of(raw, voxel: float):
+def density_of(raw, per_voxel):
     """
-    σ of a raw number: softplus(raw) less :data:`FAINT`, per voxel, never negative. About −6 and less is nothing,
-    exactly, 10 is opaque.
+    σ of a raw number: softplus(raw) less :data:`FAINT`, per voxel, never negative; ``per_voxel`` is one over its side.
+    About −6 and less is nothing, exactly, 10 is opaque.
     """
     soft = dr.maximum(raw, 0) + dr.log(1 + dr.exp(-dr.abs(raw)))
-    return dr.maximum(soft - FAINT, 0) * (1 / voxel)
+    return dr.maximum(soft - FAINT, 0) * per_voxel
 
 
 def raw_of(density: np.ndarray, voxel: float) -> np.ndarray:
@@ -100,7 +103,7 @@ class GridField(RadianceField):
         raw = self.types.Float(0)
         for weight, slot in corners:
             raw = dr.fma(weight, dr.gather(self.types.Float, density, slot, active), raw)
-        return dr.select(active, density_of(raw, self.voxel), 0), [w for w, _ in corners] + [s for _, s in corners]
+        return dr.select(active, density_of(raw, self.per_voxel), 0), [w for w, _ in corners] + [s for _, s in corners]
 
     def colour(self, latent, p, d, active=True):
         weights, slots = latent[:8], latent[8:]

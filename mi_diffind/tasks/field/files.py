@@ -52,11 +52,11 @@ def palette_table(nodes: Nodes, stored: dict, code_bits: int) -> Table:
     return Table("field", arrays, settings={"layout": "sparse", "code_bits": code_bits, **settings})
 
 
-def grid_table(nodes: Nodes, density: np.ndarray, colour: np.ndarray) -> Table:
-    """The table of a grid, in half precision; the first entry stands for no node."""
+def grid_table(nodes: Nodes, density: np.ndarray, colour: np.ndarray, dtype=np.float16) -> Table:
+    """The table of a grid, in half precision by default; the first entry stands for no node."""
     arrays, settings = stored_nodes(nodes)
-    arrays["density"] = StoredArray(np.clip(density, -1e4, 1e4)[:, None].astype(np.float16))
-    arrays["colour"] = StoredArray(np.clip(colour, -1e3, 1e3).astype(np.float16))
+    arrays["density"] = StoredArray(np.clip(density, -1e4, 1e4)[:, None].astype(dtype))
+    arrays["colour"] = StoredArray(np.clip(colour, -1e3, 1e3).astype(dtype))
     return Table("field", arrays, settings={"layout": "grid", **settings})
 
 

@@ -180,7 +180,7 @@ def trained_grid(request: Request, views: Views, held: Views) -> tuple[Grid, Fit
         if result.interrupted:
             return grid, result
         if kept is not None:
-            table = files.grid_table(grid.nodes, grid.density, grid.colour)
+            table = files.grid_table(grid.nodes, grid.density, grid.colour, np.float32)
             table.settings |= {"source": views.digest, "nodes": nodes, "stages": number + 1}
             table.measured = result.measured
             save_table(kept, table)

@@ -73,9 +73,11 @@ def hull(views: Views, lower, spacing: float, shape) -> np.ndarray:
         scale = views.focal[v] / np.where(front, ahead, 1)[:, None]
         x = views.centre[v, 0] + scale[:, 0] * local[:, 0] - 0.5
         y = views.centre[v, 1] - scale[:, 1] * local[:, 1] - 0.5
-        # As wide as a voxel seems, at its widest
-        reach = int(np.ceil(0.87 * spacing * scale.max(axis=1)[front].max())) if front.any() else 0
-        covered = maximum_filter(views.images[v, :, :, 3] > 0, size=2 * min(reach, 16) + 1)
+        # As wide as a voxel seems; what is so near that it would cover the image is left to other views
+        near = 0.5 * np.median(ahead[front]) if front.any() else np.inf
+        front &= ahead >= near
+        reach = int(np.ceil(0.87 * spacing * views.focal[v].max() / near))
+        covered = maximum_filter(views.images[v, :, :, 3] > 0, size=2 * reach + 1)
         height, width = covered.shape
         i, j = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
         sighted = front & (i >= 0) & (i < width) & (j >= 0) & (j < height)

@@ -46,7 +46,7 @@ def box(field, o, d, near, far, active):
     types = field.types
     near, far = types.Float(near), types.Float(far)
     active = types.Bool(active)
-    for x, v, a, b in zip(o, d, field.lower, field.upper, strict=True):
+    for x, v, a, b in zip(o, d, *field.box, strict=True):
         # Along a face of the box, 0 · inf would be NaN
         moves = v != 0
         inverse = dr.rcp(dr.select(moves, v, 1))

@@ -77,10 +77,10 @@ class FieldModel(Model):
         if file_bytes:
             lines.append(f"{file_bytes:,} bytes on disk, {self.dense_nbytes / file_bytes:.0f} times less")
         steps, looks = max(1, counts["steps"]), max(1, counts["looks"])
+        skipped, hidden = (100 * counts[name] / steps for name in ("skipped", "hidden"))
         lines.append(
-            f"of {steps / counts['crossing']:.0f} steps of a ray through the box, "
-            f"{100 * counts['skipped'] / steps:.1f}% are skipped as empty and {100 * counts['hidden'] / steps:.1f}% lie "
-            f"behind what is opaque; of {looks / counts['crossing']:.1f} that are looked at, "
+            f"of {steps / counts['crossing']:.0f} steps of a ray through the box, {skipped:.1f}% are skipped as empty "
+            f"and {hidden:.1f}% lie behind what is opaque; of {looks / counts['crossing']:.1f} that are looked at, "
             f"{100 * (1 - counts['colours'] / looks):.0f}% read no colour"
         )
         return figures, lines

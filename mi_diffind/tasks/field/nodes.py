@@ -36,12 +36,19 @@ class Nodes:
         self.lower, self.spacing = tuple(map(float, lower)), float(spacing)
         self.shape = tuple(int(n) for n in shape)
         self.stored = stored
+        # Not part of kernels, so that those of one grid serve another
+        self._inverse = dr.opaque(types.Float, 1 / self.spacing)
+        self._offset = dr.opaque(types.Array3f, [-a / self.spacing for a in self.lower])
+        self._last = dr.opaque(types.Array3f, [float(n - 2) for n in self.shape])
+        self._sides = dr.opaque(types.Array3u, self.shape)
         self.index = self.columns = self.filled = self.distances = None
         if stored is not None:
             self.far = distances(cells_of(stored))
             self.distances = types.UInt32(nibbles(self.far))
+            self._coarse = dr.opaque(types.Array3u, self.far.shape)
             if packed:
                 filled, columns = column_words(stored)
+                self._columns = dr.opaque(types.UInt32, columns_of(self.shape[2]))
                 self.filled, self.columns = types.UInt32(filled.reshape(-1)), types.UInt32(columns.reshape(-1))
             else:
                 self.index = types.UInt32(numbered(stored).reshape(-1))
@@ -75,9 +82,9 @@ class Nodes:
     def _place(self, p) -> tuple:
         """The first corner of the cell that holds ``p``, along each axis, and the place in that cell."""
         cell, fraction = [], []
-        for x, a, n in zip(p, self.lower, self.shape, strict=True):
-            u = dr.fma(x, 1 / self.spacing, -a / self.spacing)
-            i = dr.clip(dr.floor(u), 0, n - 2)
+        for x, offset, last in zip(p, self._offset, self._last, strict=True):
+            u = dr.fma(x, self._inverse, offset)
+            i = dr.clip(dr.floor(u), 0, last)
             # A point that rounding has put out of the box, or NaN, stays within its cell
             fraction.append(dr.clip(u - i, 0, 1))
             cell.append(self.types.UInt32(i))
@@ -86,7 +93,7 @@ class Nodes:
     def cell(self, p):
         """The cell that holds ``p``: the place of its first corner in the grid, in lexicographic order."""
         (x, y, z), _ = self._place(p)
-        return dr.fma(dr.fma(x, self.shape[1], y), self.shape[2], z)
+        return dr.fma(dr.fma(x, self._sides.y, y), self._sides.z, z)
 
     def corners(self, p, active=True) -> tuple[list, object]:
         """
@@ -98,11 +105,11 @@ class Nodes:
         found = []
         for x in (0, 1):
             for y in (0, 1):
-                line = dr.fma(cell[0] + x, self.shape[1], cell[1] + y)
+                line = dr.fma(cell[0] + x, self._sides.y, cell[1] + y)
                 if self.columns is not None:
                     at, active = self._ranked(line, cell[2], active)
                 else:
-                    at = dr.fma(line, self.shape[2], cell[2])
+                    at = dr.fma(line, self._sides.z, cell[2])
                 if self.index is not None:
                     # A word for both: of nodes that are neighbours along z, and stored, one number follows the other
                     at = dr.gather(self.types.UInt32, self.index, at, active)
@@ -115,10 +122,9 @@ class Nodes:
     def _ranked(self, line, z, active) -> tuple:
         """The number of the node ``z`` of a line, and whether it and the next one are stored, by masks."""
         Array2u, UInt32 = self.types.Array2u, self.types.UInt32
-        count = -(-(self.shape[2] - 1) // COLUMN)
         part = z // COLUMN
         bit = z - part * COLUMN
-        column = dr.fma(line, count, part)
+        column = dr.fma(line, self._columns, part)
         filled = dr.gather(Array2u, self.filled, column >> 5, active)
         here = column & 31
         active = active & (((filled[0] >> here) & 1) != 0)
@@ -131,17 +137,13 @@ class Nodes:
         """A length from ``p`` along ``d`` without a cell that is looked at, or 0."""
         if self.distances is None:
             return self.types.Float(0)
-        side = COARSE * self.spacing
-        place, sides = [], self.far.shape
-        for x, a, n in zip(p, self.lower, sides, strict=True):
-            u = dr.clip(dr.floor(dr.fma(x, 1 / side, -a / side)), 0, n - 1)
-            place.append(self.types.UInt32(u))
-        at = dr.fma(dr.fma(place[0], sides[1], place[1]), sides[2], place[2])
+        (x, y, z), _ = self._place(p)
+        at = dr.fma(dr.fma(x // COARSE, self._coarse.y, y // COARSE), self._coarse.z, z // COARSE)
         word = dr.gather(self.types.UInt32, self.distances, at >> 3, active)
         steps = (word >> ((at & 7) << 2)) & FARTHEST
         fastest = dr.maximum(dr.maximum(dr.abs(d.x), dr.abs(d.y)), dr.abs(d.z))
         # From anywhere in this cell, one less; a neighbour (1) is still worth not looking
-        length = dr.maximum(self.types.Float(steps) - 1, 1e-6) * side / fastest
+        length = dr.maximum(self.types.Float(steps) - 1, 1e-6) * COARSE / (self._inverse * fastest)
         return dr.select(active & (steps > 0), length, 0)
 
 
@@ -196,7 +198,7 @@ def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     before; ``(c, 2)``, for each of these the bits of its nodes, and the number of the first. uint32.
     """
     x, y, z = stored.shape
-    count = -(-(z - 1) // COLUMN)
+    count = columns_of(z)
     padded = np.pad(stored, [(0, 0), (0, 0), (0, count * COLUMN + 1 - z)])
     bits = np.stack([padded[:, :, c * COLUMN : c * COLUMN + 32] for c in range(count)], axis=2).reshape(-1, 32)
     own = bits[:, :COLUMN].sum(axis=1)  # the last node is the next column's first
@@ -207,6 +209,11 @@ def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     masks = np.pad(filled, (0, -len(filled) % 32)).reshape(-1, 32)
     before = np.cumsum(masks.sum(axis=1)) - masks.sum(axis=1)
     return np.stack([words_of(masks), before.astype(np.uint32)], axis=1), columns
+
+
+def columns_of(nodes: int) -> int:
+    """Columns along a line of so many nodes."""
+    return -(-(nodes - 1) // COLUMN)
 
 
 def words_of(bits: np.ndarray) -> np.ndarray:

@@ -52,14 +52,14 @@ class PairsField(RadianceField):
         return result
 
     def _read(self, kind: str, p, active) -> list:
-        u = [dr.clip((x - a) / (b - a), 0, 1) for x, a, b in zip(p, self.lower, self.upper, strict=True)]
+        u = [dr.clip((x - a) / (b - a), 0, 1) for x, a, b in zip(p, *self.box, strict=True)]
         return self.modules[f"{kind}_cascaded"](self.modules[f"{kind}_primary"](u, active), active)
 
     def look(self, p, active=True):
         _, active = self.nodes.corners(p, active)
         (found,) = self._read("density", p, active)
         raw = dr.fma(found, self.high[0] - self.low[0], self.low[0])
-        return dr.select(active, density_of(raw, self.voxel), 0), []
+        return dr.select(active, density_of(raw, self.per_voxel), 0), []
 
     def colour(self, latent, p, d, active=True):
         found = self._read("colour", p, active)

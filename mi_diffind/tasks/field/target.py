@@ -27,7 +27,7 @@ DENSITY_SCALE = 20.0
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 
 #: The weight of the total variation of raw densities, the square below which a step counts less, and nodes a step.
-SMOOTH, ROUND, VARIED = 1e-4, 1e-2, 2**15
+SMOOTH, ROUND, VARIED = 2e-4, 1e-2, 2**15
 
 #: The largest weight in a ray below which a cell is left out.
 VISIBLE = 0.02
@@ -56,6 +56,7 @@ class GridProblem(ImagesProblem):
         self.nodes, types = grid.nodes, grid.nodes.types
         tensor = types.TensorXf
         net = {"density": tensor(np.float32(grid.density / DENSITY_SCALE)), "colour": tensor(np.float32(grid.colour))}
+        self.count = dr.opaque(types.UInt32, grid.nodes.count)
         self.neighbours = types.UInt32(neighbours(grid.nodes).reshape(-1))
         super().__init__(types, net, self.field_of, views, held)
 
@@ -67,8 +68,8 @@ class GridProblem(ImagesProblem):
     def loss(self, net, rng, size: int):
         types = self.types
         density = net["density"].array
-        node = types.UInt32(rng.random(types.TensorXf, (VARIED,)).array * self.nodes.count)
-        node = dr.minimum(node, self.nodes.count - 1)
+        node = types.UInt32(rng.random(types.TensorXf, (VARIED,)).array * types.Float(self.count))
+        node = dr.minimum(node, self.count - 1)
         here, variation = dr.gather(types.Float, density, node + 1) * DENSITY_SCALE, types.Float(0)
         for axis in range(3):
             other = dr.gather(types.UInt32, self.neighbours, node * 3 + axis)
