@@ -44,7 +44,7 @@ def views(setting, result: dict):
     tall = 1.6 * wanted[crop].shape[0] / wanted[crop].shape[1]
     found = plot.sheet(f"{result['title']}, {ratio_text(first)} above", caption, 1.6 * columns, 2 * tall + 4.6)
     grid = found.add_gridspec(3, 6 * columns, height_ratios=[tall, tall, 3.8])
-, job in enumerate([None, *shown_jobs]):
+    for k, job in enumerate([None, *shown_jobs]):
         axes = found.add_subplot(grid[0, 6 * k : 6 * k + 6])
         axes.set_axis_off()
         if job is None:
