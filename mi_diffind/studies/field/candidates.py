@@ -82,10 +82,10 @@ AGAINST = ("sparse", "codebook", "paper")
 GRID, LONGER = "grid", "grid, trained on"
 
 #: How a field is trained through images.
-SETTINGS = FitSettings(seed=1, batch=8192, lr=1e-2, loss="mse", schedule="cosine", check_every=50, deterministic=False)
+SETTINGS = FitSettings(seed=1, batch=8192, lr=5e-3, loss="mse", schedule="cosine", check_every=50, deterministic=False)
 
 #: Rates of what does not begin near its end, or has few numbers that all rays share.
-RATES = {"planes": 2e-2, "hash": 1e-2, "codebook": 5e-3}
+RATES = {"planes": 2e-2, "hash": 1e-2}
 
 #: What a coarser grid is expected to lose of its bytes when cells that are not seen are left out.
 SHRINK = 0.8
