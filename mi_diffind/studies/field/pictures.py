@@ -43,9 +43,9 @@ def views(setting, result: dict):
     wanted = shown(truth)
     tall = 1.6 * wanted[crop].shape[0] / wanted[crop].shape[1]
     found = plot.sheet(f"{result['title']}, {ratio_text(first)} above", caption, 1.6 * columns, 2 * tall + 4.6)
-    grid = found.add_gridspec(3, 6 * columns, height_ratios=[tall, tall, 3.8])
+    grid = found.add_gridspec(3, 2 * columns, height_ratios=[tall, tall, 3.8])
     for k, job in enumerate([None, *shown_jobs]):
-        axes = found.add_subplot(grid[0, 6 * k : 6 * k + 6])
+        axes = found.add_subplot(grid[0, 2 * k : 2 * k + 2])
         axes.set_axis_off()
         if job is None:
             axes.imshow(wanted[crop], interpolation="nearest")
@@ -58,19 +58,18 @@ def views(setting, result: dict):
         axes.set_title(
             f"{c['label']}\n{c['errors'][WHITE]:.2f} / {c['errors'][FOREGROUND]:.2f} dB", fontsize=7.5, **bold
         )
-        below = found.add_subplot(grid[1, 6 * k : 6 * k + 6])
+        below = found.add_subplot(grid[1, 2 * k : 2 * k + 2])
         below.set_axis_off()
         error = np.abs(picture - wanted).mean(axis=-1)
         drawn = below.imshow(error[crop], vmin=0, vmax=WORST, cmap="inferno_r", interpolation="nearest")
     if shown_jobs:
-        cell = found.add_subplot(grid[1, :6])
+        cell = found.add_subplot(grid[1, :2])
         cell.set_axis_off()
         bar = found.colorbar(drawn, cax=cell.inset_axes([0.1, 0.5, 0.8, 0.08]), orientation="horizontal")
         bar.set_label("difference, sRGB", fontsize=7)
         bar.ax.tick_params(labelsize=6)
-    half = 3 * columns
-    _curves(found.add_subplot(grid[2, : half - 1]), result)
-    axes = found.add_subplot(grid[2, half + 1 :])
+    _curves(found.add_subplot(grid[2, :columns]), result)
+    axes = found.add_subplot(grid[2, columns:])
     labels = _against_time(axes, result)
     plot.fix(found)
     plot.place(axes, labels, [label.at for label in labels])
