@@ -27,7 +27,7 @@ def to_grid(props: mi.Properties) -> None:
     found = table.settings.get("grid_path")
     if not found:
         raise RuntimeError(
-            f'parameter "filename": {path} was fitted without "--grid FILE": the grid that it could be compared with was '
+            f'parameter "filename": {path} was fitted without "--grid FILE": the grid to compare it with was '
             f"not kept"
         )
     grid = path.resolve().parent / found
