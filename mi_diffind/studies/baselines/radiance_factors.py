@@ -146,6 +146,16 @@ def starts_of(shape) -> list[int]:
     return [0, *np.cumsum(sizes).tolist()][:6]
 
 
+def sides_of(nodes: Nodes, spacing: float) -> list[int]:
+    """Texels along the axes of the box of ``nodes`` that are ``spacing`` apart."""
+    return [max(2, math.ceil((b - a) / spacing) + 1) for a, b in zip(nodes.lower, nodes.upper, strict=True)]
+
+
+def rows_of(shape) -> int:
+    """Texels of all planes and lines."""
+    return int(sum(shape[a] * shape[b] for (a, b), _ in PLANES) + sum(shape))
+
+
 class PlanesFit:
     """Planes and lines of ``shape`` texels along the axes of a ``grid`` (:class:`.radiance_fits.Grid`)."""
 
@@ -156,8 +166,8 @@ class PlanesFit:
         nodes = self.nodes = grid.nodes
         self.types, self.ranks = nodes.types, tuple(ranks)
         self.occupancy = Occupancy(nodes)
-        self.shape = [max(2, math.ceil((b - a) / spacing) + 1) for a, b in zip(nodes.lower, nodes.upper, strict=True)]
-        rows = int(sum(self.shape[a] * self.shape[b] for (a, b), _ in PLANES) + sum(self.shape))
+        self.shape = sides_of(nodes, spacing)
+        rows = rows_of(self.shape)
         rng = np.random.default_rng(seed)
         self.net = {}
         for name, rank in zip(TABLES, ranks, strict=True):

@@ -1,0 +1,59 @@
+"""Captures of two balls by formulas, written as Blender's data are."""
+
+import json
+import math
+
+import numpy as np
+from PIL import Image
+
+ANGLE = 0.7
+
+
+def look_at(eye):
+    """Camera to world: at ``eye``, looking at the origin."""
+    z = eye / np.linalg.norm(eye)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+    return pose
+
+
+def picture(pose, side):
+    """sRGB and alpha, uint8: a red ball with stripes, and a blue one."""
+    focal = side / 2 / math.tan(ANGLE / 2)
+    v, u = np.mgrid[:side, :side] + 0.5
+    d = np.stack([(u - side / 2) / focal, (side / 2 - v) / focal, -np.ones_like(u)], -1) @ pose[:3, :3].T
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    image, nearest = np.zeros((side, side, 4)), np.full((side, side), np.inf)
+    for centre, radius, colour in (([-0.25, 0, 0.1], 0.35, [0.9, 0.3, 0.2]), ([0.3, 0.1, -0.1], 0.25, [0.2, 0.4, 0.9])):
+        to = pose[:3, 3] - centre
+        b, c = d @ to, to @ to - radius**2
+        hit = b * b > c
+        t = np.where(hit, -b - np.sqrt(np.maximum(b * b - c, 0)), np.inf)
+        n = (to + np.where(hit, t, 0)[..., None] * d) / radius
+        shade = (
+            0.35 + 0.65 * np.clip(n @ [0.5, 0.7, 0.5], 0, 1) * (0.7 + 0.3 * np.sign(np.sin(9 * n[..., 1:2])))[..., 0]
+        )
+        closer = hit & (t < nearest)
+        image[closer] = np.concatenate([shade[..., None] * colour, np.ones((side, side, 1))], -1)[closer]
+        nearest = np.minimum(nearest, t)
+    return np.uint8(np.rint(255 * image))
+
+
+def write(folder, views=12, test=3, side=24):
+    """Views all around, and others to test by, in ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for split, count, turn in (("train", views, 0.0), ("test", test, 1.1)):
+        frames = []
+        for k in range(count):
+            height = 1 - 2 * (k + 0.5) / count
+            angle = turn + k * math.pi * (1 + math.sqrt(5))
+            flat = math.sqrt(1 - height * height)
+            pose = look_at(2.2 * np.array([flat * math.cos(angle), height, flat * math.sin(angle)]))
+            name = f"{split}_{k}.png"
+            Image.fromarray(picture(pose, side)).save(folder / name)
+            frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+        content = {"camera_angle_x": ANGLE, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content), encoding="utf-8")
+    return folder
