@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from radiance_fields import Bumps, Fog, register
 
-from mi_diffind import compat
+from mi_diffind import compat, plugins
 
 #: Density and radiance of the fog.
 DENSITY, HUE = 0.8, np.array([0.2, 0.5, 0.8])
@@ -166,6 +166,29 @@ def test_field_in_a_mirror(mi_rgb, fields):
     short = render(mi, scene(mi, integrator={"smooth_depth": 0}, glass=glass, **surfaces(mi))).reshape(-1, 4)
     differs = np.abs(short - image).max(1) > 1e-3
     assert differs[met].mean() > 0.5 and not differs[~met].any()
+
+
+def test_mirrors_of_a_group(mi_rgb, fields):
+    mi = mi_rgb
+    group = {"type": "shapegroup", "id": "group", "glass": mirror(mi, {"type": "conductor"})}
+    one = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    expected = render(mi, scene(mi, glass=group["glass"]))
+    assert np.abs(render(mi, scene(mi, group=group, one=one)) - expected).max() < 1e-5
+
+
+def test_shapes_with_holes_are_known(mi_rgb, fields):
+    """No field is seen through them, which a warning says."""
+    of = plugins.declared()["neural_field"].factory.__globals__
+    diffuse = {"type": "diffuse"}
+    things = {
+        "leaf": mirror(mi_rgb, {"type": "mask", "opacity": 0.5, "nested": diffuse}),
+        "pane": mirror(mi_rgb, {"type": "null"}, place=(0, 3, 0)),
+        "wall": mirror(mi_rgb, diffuse, place=(0, 4, 0)),
+    }
+    made = scene(mi_rgb, **things)
+    assert of["with_holes"](made) == ["leaf"] and of["has_smooth"](made)
+    del things["pane"]
+    assert not of["has_smooth"](scene(mi_rgb, **things))
 
 
 @pytest.mark.parametrize("bsdf", ["null", "dielectric"])
@@ -556,7 +579,7 @@ def file(tmp_path_factory):
 
 def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
     """As the field that it holds; depths and what is nested are known to the commands."""
-    from mi_diffind import plugins, scenes
+    from mi_diffind import scenes
     from mi_diffind.tasks.field import TASK
 
     mi = mi_rgb
