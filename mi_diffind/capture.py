@@ -18,6 +18,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
@@ -36,6 +37,9 @@ PASS = 1 << 23
 
 #: By so much of its longest side the box of what is captured is enlarged on each side, for what is written with it.
 MARGIN = 0.01
+
+#: Surfaces of others that a camera ray passes through to reach the objects that are asked for.
+THROUGH = 8
 
 #: The angle between neighbours on a Fibonacci lattice: the golden one.
 GOLDEN = math.pi * (3 - math.sqrt(5))
@@ -57,11 +61,12 @@ class Settings:
     How a scene is captured: ``views`` for training and ``test`` views, square images of ``resolution`` pixels and a
     field of view ``fov`` (degrees), ``spp`` samples a pixel.
 
-    Cameras look at ``centre`` (default: of the box of ``objects``, ids of shapes; none: of all surfaces that do not
-    shine) from a distance ``radius`` (default: from where a sphere around that box fills the image). ``path``:
-    "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and the highest, degrees
-    above the plane that ``up`` is normal to; an orbit swings from the one to the other (default: −90, 90 for a sphere,
-    20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats.
+    Of ``objects``, ids of shapes, others only cast light and shadow on them; none: all surfaces that do not shine.
+    Cameras look at ``centre`` (default: that of their box) from a distance ``radius`` (default: from where a sphere
+    around them fills the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``.
+    ``elevation``: the lowest and the highest, degrees above the plane that ``up`` is normal to; an orbit swings from
+    the one to the other (default: −90, 90 for a sphere, 20, 20 for an orbit). ``format``: "png", as displayed, 8 bits,
+    or "exr", linear half floats.
     """
 
     views: int = 60
@@ -218,9 +223,8 @@ def capture(
     radius = settings.radius or _reach(loaded, settings.objects, centre) / math.sin(math.radians(settings.fov) / 2)
     if not radius > 0:
         raise CaptureError(f"{scene}: what is captured has no extent, --radius has to be given")
-    write_json(folder / RECORD, record)
-
     camera = _Camera(loaded, settings)
+    write_json(folder / RECORD, record)
     splits, left = _plan(settings, centre, radius), []
     for split, views in splits.items():
         writable_folder(folder / split, create=True)
@@ -274,8 +278,10 @@ def _reach(scene, objects: tuple[str, ...], centre: np.ndarray) -> float:
     """How far shapes reach from a point: the vertices of meshes, the corners of the boxes of others."""
     found = 0.0
     for shape in shapes_of(scene, objects):
-        if isinstance(shape, mi.Mesh) and shape.vertex_count():
-            points = np.array(mi.traverse(shape)["vertex_positions"], np.float64).reshape(-1, 3)
+        vertices = "vertex_positions"
+        parameters = mi.traverse(shape) if isinstance(shape, mi.Mesh) and shape.vertex_count() else {}
+        if vertices in parameters:
+            points = np.array(parameters[vertices], np.float64).reshape(-1, 3)
         else:
             points = np.array(list(itertools.product(*_box(shape).T)))
         found = max(found, float(np.linalg.norm(points - centre, axis=1).max()))
@@ -320,9 +326,11 @@ class _Camera:
             "sampler": {"type": "multijitter", "sample_count": settings.spp},
         })  # fmt: skip
         self.parameters = mi.traverse(self.sensor)
-        self.integrator = (
-            None if scene.integrator() is not None else mi.load_dict({"type": "path", "hide_emitters": True})
-        )
+        self.integrator = scene.integrator()
+        if self.integrator is None:
+            self.integrator = mi.load_dict({"type": "path", "hide_emitters": True})
+        if settings.objects:
+            self.integrator = _only(self.integrator, shapes_of(scene, settings.objects))
 
     def render(self, pose: np.ndarray, seed: int) -> np.ndarray:
         """``(height, width, 4)``, float32: linear colours, multiplied by alpha, and alpha."""
@@ -345,6 +353,47 @@ class _Camera:
         colours = 1 if mi.is_monochromatic else 3
         alpha = np.clip(image[..., colours : colours + 1], 0, 1)
         return np.concatenate([image[..., :colours].repeat(3 // colours, axis=-1), alpha], axis=-1).astype(np.float32)
+
+
+def _only(inner, shapes: list):
+    """
+    An integrator to which camera rays see but these ``shapes``: they pass through all others, up to :data:`THROUGH`
+    surfaces. ``inner``, which it hands the rays to right before the surface that they meet, knows all.
+    """
+    for shape in shapes:
+        if hasattr(shape, "seen_by"):
+            raise CaptureError(
+                f'objects: found "{shape.id()}", whose arrays {" and ".join(shape.seen_by)} traces; allowed are meshes '
+                f"and Mitsuba's own shapes"
+            )
+    if not isinstance(inner, mi.SamplingIntegrator):
+        raise CaptureError(f"objects: the integrator {inner.class_name()} follows no rays from a camera, as path does")
+    replays = isinstance(inner, mi.ad.integrators.common.ADIntegrator)
+
+    class Only(mi.SamplingIntegrator):
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            ray, found = mi.Ray3f(ray), mi.Bool(False)
+            left = mi.Bool(active)
+            for _ in range(THROUGH):
+                si = scene.ray_intersect(ray, left)
+                wanted = mi.Bool(False)
+                for shape in shapes:
+                    wanted |= (si.shape == mi.ShapePtr(shape)) | (si.instance == mi.ShapePtr(shape))
+                left &= si.is_valid()
+                found |= left & wanted
+                left &= ~wanted
+                ray.o = dr.select(left, si.spawn_ray(ray.d).o, ray.o)
+            beginning = mi.RayDifferential3f(ray)
+            if replays:
+                light, valid, *_ = inner.sample(
+                    mode=dr.ADMode.Primal, scene=scene, sampler=sampler, ray=beginning,
+                    δL=None, δaovs=None, state_in=None, active=found,
+                )  # fmt: skip
+            else:
+                light, valid, _ = inner.sample(scene, sampler, beginning, medium, found)
+            return dr.select(found, light, 0), valid & found, []
+
+    return Only(mi.Properties("only"))
 
 
 # -- files ------------------------------------------------------------------------------------------------------------

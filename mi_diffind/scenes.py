@@ -285,8 +285,13 @@ def _parse(path, defines: dict[str, str] | None) -> tuple:
 def _path_integrator(state):
     integrators = compat.properties_of(state, mi.ObjectType.Integrator)
     found = [props for props in integrators if props.plugin_name() in MAX_DEPTHS]
-    # One that may have another integrator for its paths leaves the depth to that
-    found = [props for props in found if props.plugin_name() != "neural_field" or len(found) == 1]
+    # One that has another integrator for its paths leaves the depth to that
+    found = [
+        props
+        for props in found
+        if props.plugin_name() != "neural_field"
+        or not any(compat.property_kind(props, key) == "object" for key in props)
+    ]
     if len(found) != 1:
         names = ", ".join(props.plugin_name() for props in integrators) or "none"
         raise RuntimeError(f"a depth needs one integrator of {', '.join(MAX_DEPTHS)}; found {names}")

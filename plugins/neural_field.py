@@ -25,6 +25,9 @@ INNER = ("max_depth", "rr_depth", "hide_emitters", "jitter")
 #: Channels that may be asked for.
 AOVS = ("depth", "opacity")
 
+#: How many fields there may be: each may be met at each place of a sequence.
+MOST = 4
+
 #: How many smooth surfaces a ray is followed across, by default.
 SMOOTH = 8
 
@@ -91,7 +94,10 @@ may be longer by the smooth surfaces before. Participating media count as being 
 rays, over mirrors, too.
 
 **Spectral variants** take radiance for that of an emitter of this colour: upsampled, times D65. ``mono`` takes the
-luminance. Not for polarised variants. One field; a nested one is refused.
+luminance. Not for polarised variants.
+
+**Several fields** are nested in one another, the integrator for surfaces in the last; ``smooth_depth`` and ``aovs`` are
+those of the outermost. Up to four, the boxes of which may not overlap.
 
 **Derivatives** with respect to the field's arrays replay the rays (Vicini et al., *Path Replay Backpropagation*,
 SIGGRAPH 2021), of the radiance, of alpha and of the channels of ``aovs``. An inner integrator that replays paths, too
@@ -127,7 +133,8 @@ class Followed:
     Rays of a wavefront on their way: ``ray``, whether it goes on (``active``) or has ended where the inner integrator
     takes over (``handed``), its ``throughput``, the product of the transmittances as long as nothing but them changed
     it (``clear``), whether it has been ``turned`` by a surface, of how many smooth ones there were (``count``).
-    ``light``: what was seen so far; in the differential phases, what is still to come. ``change``: its derivative;
+    ``light`` and ``depth``: what was seen so far; in the differential phases, what is still to come, and ``opacity`` is
+    the whole there. ``change``: the derivative of ``light``;
     ``change_clear``: that of ``clear``, over ``clear``; and those of the further channels. ``differentials``: those of
     the rays, where textures ask for footprints.
     """
@@ -171,6 +178,26 @@ def has_smooth(scene: mi.Scene) -> bool:
     return False
 
 
+def in_order(fields: list, entered: list) -> list:
+    """
+    The fields, in the order in which rays enter them, with the rays that enter one at this place: ``entered`` holds the
+    distance to each, and whether it is crossed.
+    """
+    if len(fields) == 1:
+        return [(fields[0], entered[0][1])]
+    ranks = []
+    for i, (near, _) in enumerate(entered):
+        rank = mi.UInt32(0)
+        for j, (other, crossed) in enumerate(entered):
+            if j != i:
+                rank += dr.select(crossed & ((other < near) | ((other == near) & (j < i))), mi.UInt32(1), 0)
+        ranks.append(rank)
+    found = []
+    for place in range(len(fields)):
+        found += [(field, entered[i][1] & (ranks[i] == place)) for i, field in enumerate(fields)]
+    return found
+
+
 def named(integrator) -> str:
     """The name of an integrator's class, in Python or C++."""
     return type(integrator).__name__ if compat.written_in_python(integrator) else integrator.class_name()
@@ -200,7 +227,7 @@ def integrator() -> type:
             if mi.is_polarized:
                 raise RuntimeError("neural_field: does not run in polarised variants")
             super().__init__(props)
-            self.surfaces = self._inner(props)
+            self.nested = self.surfaces = self._inner(props)
             self.smooth_depth = props.get("smooth_depth", SMOOTH)
             if not isinstance(self.smooth_depth, int) or not 0 <= self.smooth_depth <= 64:
                 raise RuntimeError(
@@ -214,6 +241,15 @@ def integrator() -> type:
             self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
             self.light = Light()
             self.held = self.placed.held()
+            self.fields = [self.placed]
+            if isinstance(self.nested, NeuralField):
+                self.fields += self.nested.fields
+                self.surfaces = self.nested.surfaces
+            if len(self.fields) > MOST:
+                raise RuntimeError(f"found {len(self.fields)} nested fields, allowed are {MOST}")
+            for other in self.fields[1:]:
+                if self.placed.overlaps(other):
+                    raise RuntimeError("the boxes of two fields overlap, where their order along a ray is not known")
             self._warned = False
             self._shapes = {name: tuple(values.shape) for name, values in self.placed.exposed.items()}
 
@@ -232,8 +268,6 @@ def integrator() -> type:
             if own:
                 raise RuntimeError(f'parameter "{own[0]}": belongs to the nested integrator')
             found = given[0]
-            if type(found).__name__ == NeuralField.__name__:
-                raise RuntimeError("a nested neural_field: found a second field, allowed is one")
             if not isinstance(found, mi.SamplingIntegrator):
                 raise RuntimeError(
                     f"the nested integrator {named(found)}: does not follow rays from a camera, as path does"
@@ -258,7 +292,7 @@ def integrator() -> type:
         def traverse(self, cb: mi.TraversalCallback) -> None:
             for name, values in self.placed.exposed.items():
                 cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
-            cb.put("surfaces", self.surfaces, mi.ParamFlags.Differentiable)
+            cb.put("surfaces", self.nested, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys=()) -> None:
             for name, values in self.placed.exposed.items():
@@ -362,7 +396,7 @@ def integrator() -> type:
 
         def _surfaces_optimised(self, scene) -> bool:
             """Is a derivative with respect to anything but the field asked for?"""
-            own = {compat.identity(values) for values in self.placed.exposed.values()}
+            own = {compat.identity(values) for placed in self.fields for values in placed.exposed.values()}
             params = mi.traverse(scene)
             values = [params[key] for key in params.keys()]
             attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
@@ -379,8 +413,8 @@ def integrator() -> type:
 
         def primal(self, scene, sampler, ray, active=True) -> tuple:
             """
-            Light, alpha and the further channels of camera rays, and what the differential phases need to know: all of
-            the light, the share of alpha that is none, and the state of the inner integrator.
+            Light, alpha and the further channels of camera rays, and what the differential phases need to know: the
+            light, one minus alpha, depth and opacity, and the state of the inner integrator.
             """
             path = self._start(ray, active)
             sampler, path = self._follow(None, scene, sampler, path, None, carries(ray))
@@ -388,16 +422,17 @@ def integrator() -> type:
             light = path.light + dr.select(path.handed, path.throughput * inner, 0)
             clear = dr.select(path.handed & valid, 0, path.clear)
             aovs = {"depth": path.depth, "opacity": path.opacity}
-            return light, 1 - clear, [aovs[name] for name in self.aovs], (light, clear, state)
+            state = light, clear, path.depth, path.opacity, state
+            return light, 1 - clear, [aovs[name] for name in self.aovs], state
 
         def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
             """
             For ``Forward``, the derivatives of light, alpha and channels; for ``Backward``, those with respect to these
             are given (``adjoint``, the channels as a dictionary), and carried on to the parameters.
             """
-            light, clear, inner_state = state
+            light, clear, depth, opacity, inner_state = state
             path = self._start(ray, True)
-            path.light = mi.Spectrum(light)
+            path.light, path.depth, path.opacity = mi.Spectrum(light), mi.Float(depth), mi.Float(opacity)
             more = dr.zeros(mi.Float), dr.zeros(mi.Float)
             if mode == dr.ADMode.Backward:
                 # Of alpha, that of the logarithm of a transmittance is the same at all of them
@@ -467,29 +502,24 @@ def integrator() -> type:
             """
             ray, active = path.ray, path.active
             first = path.count == 0
-            crossed = self.placed.crossed(ray, ray.maxt, active)
-            met = active if onward or "depth" in self.aovs else crossed
+            entered = [placed.enters(ray, ray.maxt, active) for placed in self.fields]
+            met = active
+            if not onward and "depth" not in self.aovs:
+                met = mi.Bool(False)
+                for _, crossed in entered:
+                    met |= crossed
             pi, far, solid = self._meet(scene, solids, ray, met, path.turned)
-            marched = self.placed.march(ray, far, crossed)
-            through = dr.select(marched.transmittance > OPAQUE, marched.transmittance, 0)
-            colour = self.light.of(marched.colour, ray.wavelengths, crossed)
-            distance = dr.select(met & (pi.is_valid() | solid), far, 0)
-
+            through = mi.Float(1)
+            for placed, crossed in in_order(self.fields, entered):
+                through = self._see(mode, path, placed, ray, far, crossed, first, through)
             if mode is None:
-                light = path.light + dr.select(crossed, path.throughput * colour, 0)
+                distance = dr.select(met & (pi.is_valid() | solid), far, 0)
                 path.opacity = dr.select(first, 1 - through, path.opacity)
-                depth = marched.depth * self.placed.size + through * distance
-                path.depth = dr.select(first, depth, path.depth)
-            else:
-                light = path.light - dr.select(crossed, path.throughput * colour, 0)
-                if self.placed.optimised():
-                    self._derive(mode, path, ray, far, crossed, marched, through, distance, light)
-            passed = path.throughput * through
-            path.clear = path.clear * through
+                path.depth += dr.select(first, through * distance, 0)
             path.active, path.handed = mi.Bool(False), path.handed | (active & (through > 0))
-            path.light, path.throughput = light, passed
             if not onward:
                 return path
+            light, passed = path.light, path.throughput
 
             # Across a smooth surface
             arrived = active & (through > 0) & ~solid
@@ -554,27 +584,42 @@ def integrator() -> type:
             pi.t = dr.select(met.which > 0, dr.inf, pi.t)
             return pi, met.t, met.which > 0
 
-        def _derive(self, mode, path, ray, far, crossed, marched, through, distance, light) -> None:
-            """The derivatives of a piece, of which ``light`` is still to come behind it."""
-            first = path.count == 0
+        def _see(self, mode, path, placed, ray, far, crossed, first, before):
+            """
+            What a field adds to a piece, of which ``before`` is transmitted up to there; returns what is, beyond it.
+            """
+            marched = placed.march(ray, far, crossed)
+            through = dr.select(marched.transmittance > OPAQUE, marched.transmittance, 0)
+            light = dr.select(crossed, path.throughput * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
+            depth = dr.select(first, before * marched.depth * placed.size, 0)
+            if mode is None:
+                path.light, path.depth = path.light + light, path.depth + depth
+            else:
+                path.light, path.depth = path.light - light, path.depth - depth
+                if placed.optimised():
+                    self._derive(mode, path, placed, ray, far, crossed, first, before, marched, through)
+            path.throughput, path.clear = path.throughput * through, path.clear * through
+            return before * through
+
+        def _derive(self, mode, path, placed, ray, far, crossed, first, before, marched, through) -> None:
+            """The derivatives of what a field adds to a piece, with what is still to come behind it in ``path``."""
             inverse = dr.select(through > 0, dr.rcp(through), 0)
+            # Of the logarithm of a transmittance: all that is transmitted
+            behind, clear = dr.select(first, path.depth, 0), dr.select(first, 1 - path.opacity, 0)
             if mode == dr.ADMode.Backward:
                 d_colour = self.light.adjoint(marched.colour, ray.wavelengths, path.change * path.throughput, crossed)
-                d_through = (dr.sum(path.change * light) + path.change_clear) * inverse
-                own = path.change_depth * distance - path.change_opacity
-                d_through += dr.select(first & (through > 0), own, 0)
-                self.placed.replay(
-                    ray, far, crossed, marched, d_colour, d_through, dr.select(first, path.change_depth, 0)
-                )
+                d_through = dr.sum(path.change * path.light) + path.change_clear
+                d_through += path.change_depth * behind - path.change_opacity * clear
+                d_depth = dr.select(first, path.change_depth * before, 0)
+                placed.replay(ray, far, crossed, marched, d_colour, d_through * inverse, d_depth)
                 return
-            colour, transmittance, depth = self.placed.tangent(ray, far, crossed, marched)
-            transmittance = dr.select(through > 0, transmittance, 0)
+            colour, transmittance, depth = placed.tangent(ray, far, crossed, marched)
             seen = self.light.tangent(marched.colour, colour, ray.wavelengths, crossed)
             share = transmittance * inverse
-            path.change += dr.select(crossed, path.throughput * seen + light * share, 0)
+            path.change += dr.select(crossed, path.throughput * seen + path.light * share, 0)
             path.change_clear += share
-            path.change_opacity -= dr.select(first, transmittance, 0)
-            path.change_depth += dr.select(first, depth + transmittance * distance, 0)
+            path.change_opacity -= clear * share
+            path.change_depth += dr.select(first, before * depth, 0) + behind * share
 
     return NeuralField
 

@@ -22,8 +22,8 @@ def main() -> None:
     camera = {"origin": (2.2, 2.4, 6.5), "target": (0.02, 0.68, 0), "up": (0, 1, 0)}
     content = head(960, 540, {"file": "assets/group.npz"}, fov=41.0, camera=camera)
     at = next(i for i, item in enumerate(content) if item.tag == "integrator")
-    content[at] = plugin("integrator", "neural_field", plugin("integrator", "path", max_depth=Whole("$max_depth")),
-                         filename="$file")  # fmt: skip
+    surfaces = plugin("integrator", "path", name="surfaces", max_depth=Whole("$max_depth"))
+    content[at] = plugin("integrator", "neural_field", surfaces, filename="$file")
     mirror = plugin("bsdf", "twosided", plugin("bsdf", "conductor", material="Ag"), id="mirror")
     glass = plugin("bsdf", "dielectric", id="glass", int_ior=1.5)
     gold = plugin("bsdf", "roughconductor", material="Au", alpha=0.15)
@@ -45,7 +45,7 @@ def main() -> None:
         "Meshes: a knot before the field, a jar behind, a ball of glass",
         mesh("knot", gold, scale={"value": 0.5}, rotate=turn("y", 20), translate=place(0.35, 0, 1.85)),
         mesh("jar", jar, scale={"value": 1.2}, translate=place(-0.55, 0, -1.75)),
-        plugin("shape", "sphere", transform(scale={"value": 0.36}, translate=place(-0.8, 0.37, 1.85)),
+        plugin("shape", "sphere", transform(scale={"value": 0.36}, translate=place(-0.62, 0.37, 2.1)),
                element("ref", id="glass"), id="ball"),
     ]  # fmt: skip
     write(FOLDER / "field.xml", ABOUT, content)

@@ -170,19 +170,32 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
         assert path.read_bytes() == (tmp_path / "views" / path.relative_to(tmp_path / "whole")).read_bytes()
 
 
-def test_objects_are_what_it_is_about(mi_rgb, scene, tmp_path, capsys):
-    options = ("--objects", "s1", "--views", "2", "--test", "0", "--resolution", "32")
-    assert run(scene, tmp_path / "one", *options, "--elevation", "20", "60") == 0
-    content = json.loads((tmp_path / "one" / "transforms_train.json").read_text())
+@pytest.mark.parametrize("integrator", ["direct", "prb"])
+def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
+    """One of three, in the middle of the images, wholly, wherever the others stand; in their shadow."""
+    from mi_diffind.tasks.field.views import load_views
+
+    wall = '<shape type="cube"><transform name="to_world"><scale x="0.1"/><translate x="1.5"/></transform></shape>'
+    scene.write_text(scene.read_text().replace("</scene>", f"{wall}</scene>").replace("direct", integrator))
+    options = ("--objects", "s1", "--views", "8", "--test", "0", "--resolution", "32", "--elevation", "-50", "60")
+    assert run(scene, tmp_path / "one", *options) == 0
     assert not (tmp_path / "one" / "transforms_test.json").exists()
+    content = json.loads((tmp_path / "one" / "transforms_train.json").read_text())
     assert content["aabb"] == [pytest.approx([0.694, -0.006, -0.306]), pytest.approx([1.306, 0.606, 0.306])]
-    for frame in content["frames"]:  # it is in the middle, and fills the image
-        matrix = np.array(frame["transform_matrix"])
-        away = np.array([1, 0.3, 0]) - matrix[:3, 3]
+    (tmp_path / "one" / "transforms_test.json").write_text("{}")
+    views, centre, inside = load_views(tmp_path / "one"), np.array([1, 0.3, 0]), []
+    for i, matrix in enumerate(views.poses):
+        away = centre - matrix[:3, 3]
         assert -matrix[:3, 2] == pytest.approx(away / np.linalg.norm(away), abs=1e-6)
-        assert 20 < np.degrees(np.arcsin(-away[1] / np.linalg.norm(away))) < 60
-        with Image.open(tmp_path / "one" / frame["file_path"]) as image:
-            assert np.array(image)[16, 16].argmax() in (1, 3)
+        assert -50 < np.degrees(np.arcsin(-away[1] / np.linalg.norm(away))) < 60
+        origin, direction = views.rays(i, *np.meshgrid(np.arange(32), np.arange(32)))
+        beside = np.linalg.norm(np.cross(direction, centre - origin), axis=-1)
+        assert (views.images[i, ..., 3][beside < 0.27] > 0.99).all()  # half a pixel within
+        assert not views.images[i][beside > 0.33].any()
+        inside.append(views.images[i][beside < 0.2])
+        assert (inside[-1][:, :3].argmax(axis=1) == 1).mean() > 0.97  # but where nothing arrived
+    # Beside a wall, and below another sphere, it is not as bright everywhere as alone in this light
+    assert np.concatenate(inside)[:, 1].min() < 0.6 < np.concatenate(inside)[:, 1].max()
     assert run(scene, tmp_path / "two", "--objects", "s1", "other") == 2
     message = 'objects: found "other", the ids of the scene\'s shapes are: s0, s1, s2'
     assert message in capsys.readouterr().err
@@ -213,6 +226,22 @@ def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_pat
     assert run(scene, tmp_path / "plain") == run(other, tmp_path / "nested") == 0
     plain, found = (load_views(tmp_path / name).images for name in ("plain", "nested"))
     assert not found[:, 0, 0].any() and np.abs(found - plain).mean() < 0.01
+
+
+def test_a_field_of_distances_is_captured_whole_only(mi_rgb, scene, tmp_path, capsys):
+    """Its shape in the scene is a box, which the integrator alone knows what to do with."""
+    from mi_diffind.tasks.field.views import load_views
+
+    knot = (
+        f'<shape type="neural_sdf" id="knot"><string name="filename" value="{SCENES / "assets" / "knot.npz"}"/></shape>'
+    )
+    spheres = scene.read_text()
+    first, last = spheres.index('<shape type="sphere"'), spheres.index('<shape type="rectangle"')
+    scene.write_text((spheres[:first] + knot + spheres[last:]).replace("direct", "path_sdf"))
+    assert run(scene, tmp_path / "views", "--objects", "knot") == 2
+    assert 'objects: found "knot", ' in capsys.readouterr().err
+    assert run(scene, tmp_path / "views", "--spp", "1") == 0
+    assert 0.05 < load_views(tmp_path / "views").images[..., 3].mean() < 0.4
 
 
 def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):

@@ -246,6 +246,18 @@ def test_parsed_scenes(mi_rgb):
             assert not possible
 
 
+def test_meshes_that_are_kept_apart(mi_rgb, tmp_path):
+    with hook("mi.parser.ParserConfig.merge_meshes"):
+        path, cube = tmp_path / "cubes.xml", '<shape type="cube" id="{}"><ref id="grey"/></shape>'
+        cubes = "".join(map(cube.format, "ab"))
+        path.write_text(f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{cubes}</scene>')
+        for keep, ids in ((False, 1), (True, 2)):
+            config, state = compat.parse_file(path)
+            if keep:
+                compat.keep_meshes(config)
+            assert len({shape.id() for shape in compat.instantiate(config, state).shapes()}) == ids
+
+
 def test_properties(mi_rgb):
     with hook("mi.Properties: types of parameters"):
         props = mi_rgb.Properties("diffuse")

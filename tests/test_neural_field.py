@@ -219,6 +219,57 @@ def test_hidden_emitters(mi_rgb, fields):
     assert np.abs(image[rest, 3] - opacity[rest]).max() < 1e-4
 
 
+def beside(mi, place, angle=0.0, **more):
+    """Bumps, half as large, and what is nested in them."""
+    to_world = mi.ScalarTransform4f().translate(place).rotate([0, 0, 1], angle).scale(0.45)
+    return {"type": "test_field", "field": "bumps", "to_world": to_world, **more}
+
+
+def test_several_fields(mi_rgb, fields):
+    """One after the other, whichever is in front, as seen one at a time."""
+    mi = mi_rgb
+    inner = {"type": "path_footprint", "jitter": False}
+    alone = {"aovs": "depth,opacity", "c": inner}
+    front, back = beside(mi, [0.3, -1.7, 0.5], 20), beside(mi, [-0.9, 2.0, -0.6], 50, c=inner)
+    fog = {"type": "test_field", "field": "fog", "c": back}
+    things = surfaces(mi)
+    found = scene(mi, "bumps", integrator={"to_world": front["to_world"], "aovs": "depth,opacity", "c": fog}, **things)
+    image = render(mi, found)
+    front, back = (scene(mi, "bumps", integrator={**alone, "to_world": f["to_world"]}) for f in (front, back))
+    front, back = (render(mi, made) for made in (front, back))
+    middle = render(mi, scene(mi, "fog", integrator=alone, **things))
+    # The last field is seen where no surface is
+    nowhere, before = hits_of(mi, found)
+    back = np.where(nowhere[..., None], back, 0)
+    through = (1 - front[..., 5:]) * (1 - middle[..., 5:])
+    assert (back[..., 5] > 0.05).sum() > 5 and front[..., 5].max() > 0.3 and before.sum() < 400
+    expected = front[..., :3] + (1 - front[..., 5:]) * middle[..., :3] + through * back[..., :3]
+    assert np.abs(image[..., :3] - expected)[~before].max() < 1e-4
+    opacity = 1 - through[..., 0] * (1 - back[..., 5])
+    assert np.abs(image[..., 5] - opacity)[~before].max() < 1e-4
+    depth = front[..., 4] + (1 - front[..., 5]) * middle[..., 4] + through[..., 0] * back[..., 4]
+    assert np.abs(image[..., 4] - depth)[~before].max() < 2e-3
+
+
+def test_derivatives_of_several_fields(mi_rgb, fields):
+    fog = {
+        "type": "test_field",
+        "field": "fog",
+        "to_world": mi_rgb.ScalarTransform4f().translate([0, 2.0, 0]).scale(0.8),
+    }
+    made = scene(mi_rgb, "bumps", size=(16, 12), integrator={"aovs": "depth,opacity", "c": fog})
+    for ending in ("it.tables.density", "surfaces.tables.density"):
+        check(mi_rgb, made, ending)
+
+
+def hits_of(mi, made):
+    """The pixels in which no surface is, and those in which there is one before y = −1, ``(height, width)``."""
+    width, height = (int(n) for n in made.sensors()[0].film().size())
+    si = made.ray_intersect(pixel_rays(mi, made))
+    hit, y = np.array(si.is_valid()), np.array(si.p.y)
+    return ~hit.reshape(height, width), (hit & (y < -1)).reshape(height, width)
+
+
 def test_solids_of_path_sdf(mi_rgb, fields):
     import sdf_fields
 
@@ -464,7 +515,8 @@ def test_frozen(mi_rgb, fields, no_garbage_collection):
         ({"max_depth": 3, "c": {"type": "path"}}, 'parameter "max_depth": belongs to the nested integrator'),
         ({"c": {"type": "path"}, "d": {"type": "path"}}, "found 2 nested integrators"),
         ({"c": {"type": "ptracer"}}, "does not follow rays from a camera"),
-        ({"c": {"type": "test_field", "field": "fog"}}, "found a second field"),
+        ({"c": {"type": "test_field", "field": "fog"}}, "the boxes of two fields overlap"),
+        ({"c": {"type": "test_field", "field": "fog", "aovs": "depth"}}, "has AOVs of its own"),
         ({"c": {"type": "aov", "aovs": "dd:depth"}}, "has AOVs of its own"),
         ({"to_world": [1.0, 1.0, 2.0]}, 'parameter "to_world": found'),
         ({"mistake": 1}, "mistake"),
@@ -519,6 +571,11 @@ def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
     (tmp_path / "scene.xml").write_text(text.replace("INNER", ""))
     inner = '<integrator type="prb"><integer name="max_depth" value="3"/></integrator>'
     (tmp_path / "nested.xml").write_text(text.replace("INNER", inner))
+    inner = """<integrator type="neural_field"><string name="filename" value="ball.npz"/>
+        <transform name="to_world"><translate y="4"/></transform></integrator>"""
+    (tmp_path / "two.xml").write_text(text.replace("INNER", inner))
+    assert scenes.integrator_of(tmp_path / "two.xml") == ("neural_field", -1)
+    assert len(scenes.load(tmp_path / "two.xml", longest_path=3).integrator().fields) == 2
     assert scenes.integrator_of(tmp_path / "scene.xml") == ("neural_field", -1)
     assert scenes.integrator_of(tmp_path / "nested.xml") == ("prb", 3)
     loaded = scenes.load(tmp_path / "scene.xml", longest_path=2)

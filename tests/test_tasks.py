@@ -24,7 +24,7 @@ from mi_diffind.tasks import task as task_module
 from mi_diffind.tasks.task import Model, Task, fit, task_of, tasks
 
 ROOT = Path(__file__).resolve().parents[1]
-BUILT_IN = ("disney", "ggx", "image", "sdf", "shading", "texture")
+BUILT_IN = ("disney", "field", "ggx", "image", "sdf", "shading", "texture")
 
 
 # -- what is found ----------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ def add(commands) -> None:
     sub.add_argument("--fov", type=float, default=40.0, help="field of view in degrees (default: 40)")
     sub.add_argument(
         "--objects", nargs="+", metavar="ID", default=(),
-        help="shapes whose box is what it is about (default: all that are no lights); others are seen, too",
+        help="shapes that are captured (default: all that are no lights); others only light and shade them",
     )  # fmt: skip
     sub.add_argument("--format", choices=["png", "exr"], default="png", help="8 bits, or linear (default: png)")
     scene_options(sub, rendering=False)

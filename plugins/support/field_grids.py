@@ -27,8 +27,8 @@ def to_grid(props: mi.Properties) -> None:
     found = table.settings.get("grid_path")
     if not found:
         raise RuntimeError(
-            f'parameter "filename": {path} was fitted without "--grid FILE", so that the grid was not kept that it could '
-            f"be compared with"
+            f'parameter "filename": {path} was fitted without "--grid FILE": the grid to compare it with was '
+            f"not kept"
         )
     grid = path.resolve().parent / found
     if not grid.is_file():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import product
 from types import ModuleType
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mi_diffind import compat
 from mi_diffind.tasks.field import counting
@@ -52,10 +54,23 @@ class PlacedField:
         o = mi.Point3f(self.axes.to_local(mi.Vector3f(ray.o - self.origin)) / self.size)
         return o, self.axes.to_local(ray.d), mi.Float(0), far / self.size, active
 
-    def crossed(self, ray, far, active=True):
-        """Whether rays are in the field's box somewhere before the distance ``far``."""
+    def enters(self, ray, far, active=True) -> tuple:
+        """The distance at which rays enter the field's box, and whether they do, before the distance ``far``."""
         with dr.suspend_grad():
-            return marching.box(self.field, *self._local(ray, far, active))[-1]
+            _, near, _, crossing = marching.box(self.field, *self._local(ray, far, active))
+            return near * self.size, crossing
+
+    def overlaps(self, other: PlacedField) -> bool:
+        """Do the boxes of two fields have a volume in common? By the theorem of separating axes."""
+        corners = [np.array(list(product(*zip(f.field.lower, f.field.upper, strict=True)))) for f in (self, other)]
+        points = [f.placement.world(c) for f, c in zip((self, other), corners, strict=True)]
+        axes = [self.placement.rotation.T, other.placement.rotation.T]
+        crossed = np.cross(axes[0][:, None], axes[1][None]).reshape(-1, 3)
+        for axis in (*axes[0], *axes[1], *crossed[np.linalg.norm(crossed, axis=1) > 1e-6]):
+            a, b = (p @ axis for p in points)
+            if min(a.max(), b.max()) - max(a.min(), b.min()) <= 1e-5 * (a.max() - a.min()):
+                return False
+        return True
 
     def march(self, ray, far, active=True) -> marching.Marched:
         """What rays see of the field before the distance ``far``; ``depth`` in units of the field's own frame."""

@@ -45,8 +45,9 @@ def grid(field: RadianceField, resolution: int | None = None) -> dict[str, np.nd
 
     With ``resolution`` nodes along the longest side, by default the field's own voxels. Where the radiance is no such
     exponential, it is right in the mean of the logarithms of opposite directions, along the axes. Where there is
-    nothing, the colour is the nearest one. Raises :class:`~mi_diffind.errors.UsageError` for a resolution out of
-    2 … 512.
+    nothing, the colour is the nearest one. A cell that a sparse field does not look at, beside one that it does, fades
+    out in a dense grid: one that is twice as fine is nearer to the field. Raises
+    :class:`~mi_diffind.errors.UsageError` for a resolution out of 2 … 512.
     """
     lower, extent = np.array(field.lower), np.array(field.upper) - np.array(field.lower)
     if resolution is None:
