@@ -254,7 +254,7 @@ def folder(tmp_path_factory):
 
 def command(folder, *more):
     left_out = [x for kind in candidates.KINDS if kind not in MADE for x in ("--without", kind)]
-    sizes = ["--quick", "--compression", "30", "--resolution", "16", "--steps", "10"]
+    sizes = ["--quick", "--compression", "60", "--resolution", "16", "--steps", "10"]
     return ["tradeoff", "field", str(folder / "balls"), *sizes, *left_out, "--out", str(folder / "out"),
             "--variant", "llvm_ad_rgb", *more]  # fmt: skip
 
@@ -262,7 +262,7 @@ def command(folder, *more):
 def test_what_is_written(folder):
     result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
     made = {n: c for n, c in result["candidates"].items() if not c["is_reference"]}
-    assert set(made) == {"sparse grid, 8 bits 30×", "ours 30×"}
+    assert set(made) == {"sparse grid, 8 bits 60×", "ours 60×"}
     assert set(result["candidates"]) - set(made) == {"grid", "grid, trained on"}
     for name, c in result["candidates"].items():
         e = c["errors"]
@@ -271,13 +271,13 @@ def test_what_is_written(folder):
         d = c["details"]
         assert c["bytes"] == d["memory_bytes" if name.startswith("ours") else "file_bytes"]
         assert d.get("coarser", 2) > 1
-        assert 0.1 * d["dense_bytes"] / 30 < c["bytes"] <= 1.02 * d["dense_bytes"] / 30, name
+        assert 0.1 * d["dense_bytes"] / 60 < c["bytes"] <= 1.02 * d["dense_bytes"] / 60, name
     assert set(result["cases"]["reads"]["queries"]) == {"density", "both"}
     assert set(result["cases"]["reads"]["passes"]["render"]) == {"grid", *made}
     out = folder / "out"
     assert (out / "tradeoff_field_views.png").stat().st_size > 20_000
     assert len(list((out / "tradeoff_field_models").glob("*.npz"))) == 4
-    assert result["conclusions"][0].startswith("30×: ours is ")
+    assert result["conclusions"][0].startswith("60×: ours is ")
 
 
 def test_what_was_made_is_known(folder):
@@ -286,7 +286,7 @@ def test_what_was_made_is_known(folder):
     result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
     without = tuple(k for k in candidates.KINDS if k not in MADE)
     source = str(folder / "balls")
-    request = candidates.Request((30.0,), without)
+    request = candidates.Request((60.0,), without)
     plan = candidates.plan(load_views(source, "train"), load_views(source, "test"), source, request)
     assert [job.name for job in plan.jobs] == list(result["jobs"])
     models = folder / "out" / "tradeoff_field_models"
@@ -294,7 +294,7 @@ def test_what_was_made_is_known(folder):
         record = result["jobs"][job.name]
         assert job.known(models, None) is None and job.known(None, record) is None
         assert job.known(models, record) == record
-    for name in ("sparse grid, 8 bits 30×", "grid, trained on"):
+    for name in ("sparse grid, 8 bits 60×", "grid, trained on"):
         job = next(job for job in plan.jobs if job.name == name)
         found = job.setting.errors(job.field)
         assert found == pytest.approx(result["candidates"][name]["errors"], abs=0.01)

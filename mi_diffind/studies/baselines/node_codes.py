@@ -117,9 +117,10 @@ class Neighbours:
         codes, found = codes.astype(np.int64), []
         everything = np.arange(len(codes))
         for kind in PREDICTIONS:
-            rest = (codes - self._predicted(codes, kind, everything)).astype(np.uint8)
-            found.append((deflated(rest.tobytes()), kind))
-        return min(found, key=lambda f: len(f[0]))
+            rest = (codes - self._predicted(codes, kind, everything)).astype(np.uint8).tobytes()
+            found.append((len(zlib.compress(rest, 6)), kind, rest))
+        _, kind, rest = min(found)
+        return deflated(rest), kind
 
     def unpacked(self, data: bytes, kind: str) -> np.ndarray:
         """The reverse: uint8 ``(n,)``."""
