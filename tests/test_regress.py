@@ -16,7 +16,10 @@ from mi_diffind.cli import main
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
 STORED = [
-    *(SCENES / f"{name}.xml" for name in ("horizon", "materials", "metals", "rust", "solids", "still_life", "tiles")),
+    *(
+        SCENES / f"{name}.xml"
+        for name in ("field", "horizon", "materials", "metals", "rust", "solids", "still_life", "tiles")
+    ),
     TESTS / "lamp.xml",
 ]
 
@@ -156,6 +159,8 @@ def test_passes_of_references_repeat_to_the_last_bit(regress):
 
 #: What other variants of the same scenes show already, and what takes longest.
 SLOW = {
+    ("field", "llvm_ad_mono"),
+    ("field", "llvm_ad_spectral"),
     ("horizon", "llvm_ad_mono"),
     ("rust", "llvm_ad_mono"),
     ("rust", "llvm_ad_spectral"),
