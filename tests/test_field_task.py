@@ -1,6 +1,10 @@
 """``fit field``, ``inspect`` and ``decode``: presets, sizes, interruptions, damaged files, and how they refuse."""
 
+import dataclasses
+import gc
 import json
+import resource
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -360,3 +364,33 @@ def test_sizes(folder, ad):
         problem = compression.PaletteProblem(coding, load_views(folder, "train"))
         table = files.palette_table(grid.nodes, problem.stored(), bits)
         assert files.field_of(table, ad).nbytes == pytest.approx(compression.packed_bytes(grid, bits), rel=0.01)
+
+
+@pytest.mark.slow
+def test_ten_thousand_steps_take_no_more_memory(folder, ad):
+    def resident() -> float:
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+
+    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    problem = target.GridProblem(grid, load_views(folder, "train"))
+    settings = FitSettings(steps=1000, batch=256, lr=1e-3, measure_every=1000, check_every=100)
+    train(problem, settings, progress=False)
+    before = resident()
+    result = train(problem, dataclasses.replace(settings, steps=10_000), progress=False)
+    assert resident() - before < 30
+    assert result.restarts == 0 and np.isfinite(result.measured["psnr_white_db"])
+
+
+def test_a_view_that_sees_nothing(folder):
+    """An empty view that looks elsewhere takes nothing from the hull."""
+    views = load_views(folder, "train")
+    away = look_at([0, 2.0, 0.1])
+    away[:3, :3] = away[:3, :3] @ np.diag([-1, 1, -1])
+    more = dataclasses.replace(
+        views, images=np.concatenate([views.images, np.zeros_like(views.images[:1])]),
+        poses=np.concatenate([views.poses, away[None]]), focal=np.concatenate([views.focal, views.focal[:1]]),
+        centre=np.concatenate([views.centre, views.centre[:1]]), names=(*views.names, "away.png"),
+    )  # fmt: skip
+    made = [hull.hull(v, (-0.5, -0.7, -0.7), 0.07, (18, 20, 20)) for v in (views, more)]
+    assert made[0].sum() > 500 and (made[0] & ~made[1]).sum() < 0.02 * made[0].sum()

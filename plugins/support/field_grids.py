@@ -27,8 +27,7 @@ def to_grid(props: mi.Properties) -> None:
     found = table.settings.get("grid_path")
     if not found:
         raise RuntimeError(
-            f'parameter "filename": {path} was fitted without "--grid FILE": the grid to compare it with was '
-            f"not kept"
+            f'parameter "filename": {path} was fitted without "--grid FILE": the grid to compare it with was not kept'
         )
     grid = path.resolve().parent / found
     if not grid.is_file():
