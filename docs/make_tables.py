@@ -250,6 +250,49 @@ def sdf_times(study: str) -> str:
     return table(head, rows)
 
 
+def field_errors(study: str) -> str:
+    """Radiance fields, by how many times smaller they are than a dense grid: PSNR before white, and of the foreground."""
+    from mi_diffind.studies.field.conclusions import by_ratio, ratio_text, references
+
+    result = measured(study)
+    rows = []
+    for found in (references(result), *by_ratio(result).values()):
+        for c in found.values():
+            e, d = c["errors"], c["details"]
+            rows.append([
+                c["label"], ratio_text(d["asked"]) if d.get("asked") else "", f"{d['memory_bytes'] / 1e6:.2f}",
+                f"{d['file_bytes'] / 1e6:.2f}", f"{e['psnr_white_db']:.2f}", f"{e['psnr_foreground_db']:.2f}",
+            ])  # fmt: skip
+    return table(["", "asked for", "MB in memory", "MB on disk", "dB, white", "dB, foreground"], rows)
+
+
+def field_times(study: str) -> str:
+    """Radiance fields of one size: seconds of training, a sample, a picture."""
+    result = measured(study)
+    reads = result["cases"]["reads"]
+    both, passes = reads["queries"]["both"], next(iter(reads["passes"].values()), {})
+    rows = []
+    for name, c in result["candidates"].items():
+        if name in both or name in passes:
+            cells = [both.get(name), passes.get(name)]
+            texts = ["" if t is None else f"{t['time']:.3g}" for t in cells]
+            rows.append([c["label"], "" if c["is_reference"] else f"{c['training_seconds']:.0f}", *texts])
+    side = result["details"]["request"]["film"]
+    return table(["", "seconds", "a sample, ns", f"{side}², ms"], rows)
+
+
+def field_parts() -> str:
+    """What the parts of compressing a radiance field are worth."""
+    rows = [
+        [
+            row["name"], f"{row['bytes'] / 1e6:.2f}" if "bytes" in row else "", f"{row['psnr_white_db']:.2f}",
+            f"{row['psnr_foreground_db']:.2f}",
+        ]
+        for row in measured("bench_field")["rows"]
+    ]  # fmt: skip
+    return table(["", "MB in memory", "dB, white", "dB, foreground"], rows)
+
+
 def mean(values) -> float:
     """The mean of an iterable."""
     values = list(values)
@@ -266,6 +309,10 @@ for source in ("", "_boombox"):
 for source in ("suzanne", "armadillo", "bunny"):
     for make in (sdf_errors, sdf_times):
         TABLES[f"{make.__name__}_{source}"] = lambda make=make, source=source: make(f"tradeoff_sdf_{source}")
+TABLES |= {
+    "field_errors": lambda: field_errors("tradeoff_field"), "field_times": lambda: field_times("tradeoff_field"),
+    "field_parts": field_parts,
+}  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
 
