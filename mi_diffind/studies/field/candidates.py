@@ -119,7 +119,7 @@ class Request:
     without: tuple[str, ...] = ()
     resolution: int = 128
     grid_steps: int = 0
-    steps: int = 1000
+    steps: int = 500
     seconds: float = 90.0
     film: int = 200
 
