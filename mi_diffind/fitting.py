@@ -117,6 +117,7 @@ class FitResult:
     interrupted: bool
     restarts: int
     history: list[dict] = field(default_factory=list)
+    asked_to_stop: bool = False  # by Ctrl-C, which may have come too late to interrupt it
 
     @property
     def outcome(self) -> str:
@@ -269,7 +270,7 @@ def fit(
         raise FittingError("the training was stopped before its first measurement: there is nothing to keep")
     trainer.load_parameters(best)
     spent = time.perf_counter() - start
-    return FitResult(best_measured, best_step, trainer.step, spent, interrupted, restarts, history)
+    return FitResult(best_measured, best_step, trainer.step, spent, interrupted, restarts, history, stop.is_set())
 
 
 class _Bar:

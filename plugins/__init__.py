@@ -78,8 +78,8 @@ class Plugin:
     def described(self, props) -> dict:
         """
         What properties (``mi.Properties``) say: ``plugin``, ``kind``, ``id``, ``parameters`` (numbers, text, colours
-        and matrices as lists, ``"texture"`` for any object), and by themselves those that only the learned plugin has,
-        and the file that it reads.
+        and matrices as lists, ``"texture"`` for any object with a name), and by themselves those that only the learned
+        plugin has, and the file that it reads.
         """
         learned_only = self.exact.learned_only if self.exact else ()
         if self.task and "filename" not in learned_only:
@@ -88,7 +88,9 @@ class Plugin:
             "plugin": self.name,
             "kind": self.kind,
             "id": props.id(),
-            "parameters": {key: _plain(props, key) for key in props if key not in learned_only},
+            "parameters": {
+                key: _plain(props, key) for key in props if key not in learned_only and not key.startswith("_arg_")
+            },
             **{key: str(props[key]) for key in learned_only if key in props},
         }
 

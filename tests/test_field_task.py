@@ -185,6 +185,28 @@ def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
     np.testing.assert_array_equal(again.arrays["density"].values, whole.arrays["density"].values)
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
+    """In the first stage of the grid, or too late for it; resumed, the training goes on with the grid."""
+    stages = []
+
+    def stopping(problem, settings, *args, **kwargs):
+        stages.append(settings.steps)
+        result = train(problem, settings, *args, **kwargs)
+        result.interrupted, result.asked_to_stop = not late, True
+        return result
+
+    checkpoint = tmp_path / "state"
+    options = {"source": str(folder), "resolution": 24, "batch": 512, "steps": 4, "variant": "llvm_ad_rgb"}
+    with monkeypatch.context() as patch:
+        patch.setattr(field_fit, "train", stopping)
+        found = fit("field", progress=False, checkpoint=checkpoint, **options)
+    assert len(stages) == 1 and found.result.interrupted and found.table.settings["layout"] == "sparse"
+    assert not checkpoint.exists()
+    assert not fit("field", progress=False, checkpoint=checkpoint, resume=True, **options).result.interrupted
+    assert checkpoint.exists()
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [

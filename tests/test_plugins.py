@@ -143,7 +143,14 @@ def test_plugins_of_this_package_say_what_they_are(mi_rgb):
         "neural_field": "integrator", "neural_image": "texture", "neural_sdf": "shape", "neural_texture": "texture", "path_footprint": "integrator",
         "path_sdf": "integrator",
     }  # fmt: skip
-    assert plugins.with_counterpart() == ("neural_disney", "neural_field", "neural_ggx", "neural_image", "neural_sdf", "neural_texture")
+    assert plugins.with_counterpart() == (
+        "neural_disney",
+        "neural_field",
+        "neural_ggx",
+        "neural_image",
+        "neural_sdf",
+        "neural_texture",
+    )
     assert plugins.with_counterpart("mipmap") == ("neural_texture",)
     assert plugins.with_counterpart("principled") == ("disney", "neural_disney")
 

@@ -71,7 +71,7 @@ def load(path) -> Table:
     """Read and check a file. Raises :class:`~mi_diffind.tables.TableError`."""
     table = load_table(path, "field")
     layout = table.settings.get("layout")
-    if layout not in LAYOUTS:
+    if not isinstance(layout, str) or layout not in LAYOUTS:
         raise TableError(f"{path}: has the layout {layout!r}, allowed are {', '.join(LAYOUTS)}")
     for name, (dims, channels) in LAYOUTS[layout].items():
         array = table.arrays.get(name)

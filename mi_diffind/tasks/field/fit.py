@@ -14,6 +14,7 @@ from ... import sizes
 from ...errors import UsageError
 from ...fitting import FitResult, FittingError
 from ...fitting import fit as train
+from ...interrupt import interruptible
 from ...tables import StoredArray, Table, save_table
 from ..task import Fitted, Request
 from . import compression, files, pairs, target
@@ -83,7 +84,8 @@ def fit(request: Request) -> Fitted:
         table, result, field = _finished_grid(grid, grid_result, views)
     else:
         make = _sparse if recipe.layout == "sparse" else _pairs
-        table, result, field = make(request, grid, views, held)
+        stopped = grid_result is not None and grid_result.interrupted
+        table, result, field = make(request, grid, views, held, stopped)
     found = evaluate(field, Images(request.types, held))
     table.preset, table.seed = request.preset, request.settings.seed
     folder = (request.output or Path("x")).resolve().parent
@@ -158,10 +160,13 @@ def trained_grid(request: Request, views: Views, held: Views) -> tuple[Grid, Fit
     for number, (share, part) in enumerate(STAGES):
         if number < done:
             continue
-        if grid is None:
-            grid = target.begin(request.types, views, max(8, round(nodes * share)))
-        else:
-            grid = target.divided(grid, images, share / STAGES[number - 1][0])
+        with interruptible() as stop:
+            if grid is None:
+                grid = target.begin(request.types, views, max(8, round(nodes * share)))
+            else:
+                grid = target.divided(grid, images, share / STAGES[number - 1][0])
+        if stop.is_set() and result is not None:
+            return grid, dataclasses.replace(result, interrupted=True)
         if grid.nodes.count == 0:
             raise FittingError(f"{views.path}: there is nothing in the views, or the training has lost it")
         last = number == len(STAGES) - 1
@@ -177,8 +182,8 @@ def trained_grid(request: Request, views: Views, held: Views) -> tuple[Grid, Fit
             seconds=None if request.seconds is None or request.preset != "grid" else request.seconds * part,
         )  # fmt: skip
         grid = problem.trained()
-        if result.interrupted:
-            return grid, result
+        if result.interrupted or (result.asked_to_stop and not last):
+            return grid, dataclasses.replace(result, interrupted=True)
         if kept is not None:
             table = files.grid_table(grid.nodes, grid.density, grid.colour, np.float32)
             table.settings |= {"source": views.digest, "nodes": nodes, "stages": number + 1}
@@ -210,34 +215,50 @@ def wanted_bytes(options, grid: Grid) -> int | None:
     return None
 
 
-def _train(request: Request, problem: ImagesProblem) -> FitResult:
+def _train(request: Request, problem: ImagesProblem, stopped: bool) -> FitResult:
+    """
+    The training; if that of the grid was ``stopped``, none, so that what there is is kept, and one that is resumed goes
+    on with the grid.
+    """
+    if stopped:
+        return FitResult(problem.measure(problem.net), 0, 0, 0.0, True, 0)
+    checkpoint = request.checkpoint
+    if request.resume and checkpoint is not None and not os.path.exists(checkpoint):
+        # What was stopped may have been the grid
+        begun = any(os.path.exists(f"{checkpoint}.{name}") for name in ("stage0", "grid.npz"))
+        request = dataclasses.replace(request, resume=not begun)
     return request.train(problem, title="through the images")
 
 
-def _sparse(request: Request, grid: Grid, views: Views, held: Views):
+def _sparse(request: Request, grid: Grid, views: Views, held: Views, stopped: bool):
     images = Images(request.types, views)
     if request.options["psnr"] is not None:
-        return _reaching(request, grid, images, views, held)
+        return _reaching(request, grid, images, views, held, stopped)
     try:
         smaller, bits = compression.sized(grid, images, wanted_bytes(request.options, grid))
     except ValueError as e:
         raise UsageError(f"--bytes: {e}") from None
-    return _coded(request, smaller, bits, images, views, held)
+    return _coded(request, smaller, bits, images, views, held, stopped)
 
 
-def _coded(request: Request, grid: Grid, bits: int, images: Images, views: Views, held: Views):
+def _coded(request: Request, grid: Grid, bits: int, images: Images, views: Views, held: Views, stopped: bool):
     problem = compression.PaletteProblem(compression.coded(grid, images, bits, request.settings.seed), views, held)
-    result = _train(request, problem)
+    result = _train(request, problem, stopped)
     table = files.palette_table(grid.nodes, problem.stored(), bits)
     return table, result, files.field_of(table, request.types)
 
 
-def _reaching(request: Request, grid: Grid, images: Images, views: Views, held: Views):
+def _reaching(request: Request, grid: Grid, images: Images, views: Views, held: Views, stopped: bool):
     """The first size of the ladder that reaches the PSNR that is asked for, or the last one."""
     wanted, found = float(request.options["psnr"]), None
-    for share, bits in LADDER:
+    for number, (share, bits) in enumerate(LADDER):
         smaller = target.divided(grid, images, share, 0)
-        found = _coded(request, smaller, bits, images, views, held)
+        if request.checkpoint is not None:
+            path = f"{request.checkpoint}.size{number}"
+            one = dataclasses.replace(request, checkpoint=path, resume=request.resume and os.path.exists(path))
+        else:
+            one = request
+        found = _coded(one, smaller, bits, images, views, held, stopped)
         reached = evaluate(found[2], Images(request.types, held))["psnr_white_db"]
         print(f"{found[2].nbytes:,} bytes: {reached:.2f} dB over white", file=sys.stderr)
         if reached >= wanted or found[1].interrupted:
@@ -246,11 +267,11 @@ def _reaching(request: Request, grid: Grid, images: Images, views: Views, held: 
     return found
 
 
-def _pairs(request: Request, grid: Grid, views: Views, held: Views):
+def _pairs(request: Request, grid: Grid, views: Views, held: Views, stopped: bool):
     seen = target.divided(grid, Images(request.types, views), 1, 0)
     nbytes = wanted_bytes(request.options, grid) or NODE_BYTES * int(np.prod(grid.nodes.shape)) / COMPRESSION
-    problem = pairs_problem(seen, nbytes, views, held, request)
-    result = _train(request, problem)
+    problem = pairs_problem(seen, nbytes, views, held, request, 0 if stopped else VALUE_STEPS)
+    result = _train(request, problem, stopped)
     net = problem.net
     arrays = {}
     for kind in ("density", "colour"):
@@ -261,8 +282,10 @@ def _pairs(request: Request, grid: Grid, views: Views, held: Views):
     return table, result, files.field_of(table, request.types)
 
 
-def pairs_problem(grid: Grid, nbytes: float, views: Views, held: Views, request: Request) -> pairs.PairsProblem:
-    """The supplement's arrays of so many bytes, fitted to the grid's numbers."""
+def pairs_problem(
+    grid: Grid, nbytes: float, views: Views, held: Views, request: Request, steps: int
+) -> pairs.PairsProblem:
+    """The supplement's arrays of so many bytes, fitted to the grid's numbers in so many steps."""
     types = request.types
     ratio = NODE_BYTES * int(np.prod(grid.nodes.shape)) / nbytes
     extent = np.array(grid.nodes.upper) - np.array(grid.nodes.lower)
@@ -273,8 +296,9 @@ def pairs_problem(grid: Grid, nbytes: float, views: Views, held: Views, request:
     net = pairs.PairsNet(density, colour)
     field = pairs.PairsField(grid.nodes, density, colour, low, high)
     values = pairs.ValuesProblem(net, field, grid)
-    settings = dataclasses.replace(
-        request.settings, steps=VALUE_STEPS, batch=VALUE_BATCH, lr=VALUE_RATE, measure_every=VALUE_STEPS
-    )
-    train(values, settings, progress=request.progress, title="the grid's numbers")
+    if steps:
+        settings = dataclasses.replace(
+            request.settings, steps=steps, batch=VALUE_BATCH, lr=VALUE_RATE, measure_every=steps
+        )
+        train(values, settings, progress=request.progress, title="the grid's numbers")
     return pairs.PairsProblem(net, grid.nodes, low, high, views, held)

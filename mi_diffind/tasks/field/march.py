@@ -19,7 +19,7 @@ import drjit as dr
 OPAQUE = 1e-4
 
 #: The weight of a step below which its radiance is not read.
-NOTHING = 1e-6
+NOTHING = 2e-7
 
 #: Not all arrays have to be differentiated.
 ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad

@@ -37,7 +37,7 @@ class Recipe:
 PRESETS = {
     "sparse": Recipe("sparse", FitSettings(steps=1000, batch=8192, lr=5e-3, loss="mse", check_every=50)),
     "paper": Recipe("pairs", FitSettings(steps=1000, batch=8192, lr=5e-3, loss="mse", check_every=50)),
-    "grid": Recipe("grid", FitSettings(steps=2300, batch=8192, lr=1.5e-2, loss="mse", check_every=50)),
+    "grid": Recipe("grid", FitSettings(steps=2300, batch=8192, lr=2.5e-2, loss="mse", check_every=50)),
 }
 
 

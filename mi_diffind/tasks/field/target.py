@@ -21,7 +21,7 @@ from .training import Images, ImagesProblem
 from .views import Views
 
 #: Of a raw number of density, per unit of what is trained: so that one rate suits density and colour.
-DENSITY_SCALE = 20.0
+DENSITY_SCALE = 10.0
 
 #: What training begins with: nearly empty, and dark.
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
