@@ -140,22 +140,24 @@ def test_file_bytes_are_of_all_that_is_stored(grid):
     assert sizes["6 bits"] < 0.9 * sizes["sparse"] and sizes["codebook"] < 0.4 * sizes["sparse"]
 
 
-def test_coarser_grids_hold_the_same_medium():
-    """Of a block of one density, resampling keeps density and colour inside, and has nothing outside."""
+def test_coarser_grids_are_read_from_finer_ones():
+    """Numbers that are linear in the place are met where nodes are inside; there is nothing outside."""
     cells = np.zeros((15, 15, 15), bool)
     cells[3:12, 3:12, 3:12] = True
     nodes = Nodes(T, LOWER, SPACING, (16, 16, 16), corners_of(cells))
-    count = nodes.count
-    grid = radiance_fits.Grid(nodes, np.full(count, 2.0), np.tile(np.arange(12.0), (count, 1)), np.ones(count))
-    found = grid.resampled(1.5)
-    sigma = np.maximum(np.logaddexp(0, found.dense(found.density, -30)) - FAINT, 0) / found.nodes.spacing
-    assert found.nodes.spacing == pytest.approx(1.5 * SPACING) and found.nodes.shape == (11, 11, 11)
-    expected = (np.logaddexp(0, 2.0) - FAINT) / SPACING
-    assert sigma[4:7, 4:7, 4:7] == pytest.approx(expected, rel=1e-3)
-    assert sigma[0].max() == 0 and found.nodes.count < 0.7 * 11**3
-    assert np.abs(found.colour - np.arange(12)).max() < 1e-3
-    dense = grid.resampled(1.5, sparse=False)
-    assert dense.nodes.stored is None and len(dense.density) == 11**3
+    place = nodes.positions()
+    colour = np.stack([place @ [k, 1, 2] for k in range(12)], axis=1)
+    grid = radiance_fits.Grid(nodes, 0.3 * place[:, 0] - 0.1 * place[:, 2], colour, np.ones(len(place)))
+    found = grid.resampled(1.4)
+    assert found.nodes.spacing == pytest.approx(1.4 * SPACING) and found.nodes.shape == (12, 12, 12)
+    place = 1.4 * found.nodes.positions()
+    inside = ((place >= 3) & (place <= 12)).all(axis=1)
+    assert inside.sum() == 6**3
+    assert np.abs(found.density - 0.3 * place[:, 0] + 0.1 * place[:, 2])[inside].max() < 1e-4
+    assert np.abs(found.colour - np.stack([place @ [k, 1, 2] for k in range(12)], axis=1))[inside].max() < 1e-3
+    assert found.density[~inside].max() < 1.0 and not inside.all()
+    dense = grid.resampled(1.4, sparse=False)
+    assert dense.nodes.stored is None and len(dense.density) == 12**3 and dense.density[0] == radiance_fits.RAW[0]
 
 
 @pytest.mark.parametrize("kind", ["planes", "hash"])

@@ -19,9 +19,6 @@ from .node_codes import Steps
 #: Raw numbers of density that are told apart: below is nothing, above is opaque.
 RAW = (-8.0, 12.0)
 
-#: The density of what is nowhere stored, as a raw number.
-EMPTY = -30.0
-
 
 # -- fields on nodes --------------------------------------------------------------------------------------------------
 

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from ...tasks.field.field import FAINT, GridField, raw_of
+from ...tasks.field.field import GridField
 from ...tasks.field.march import march, replay
 from ...tasks.field.nodes import Nodes, cells_of, corners_of
 from ...tasks.field.target import DENSITY_SCALE
 from .node_codes import Steps, coded_bytes, deflated
-from .radiance import EMPTY, RAW, ByteField, CoefficientField
+from .radiance import RAW, ByteField, CoefficientField
 
 #: Colours of nodes that nothing is seen of have this weight, so that they are known, too.
 LEAST = 1e-6
@@ -75,32 +75,22 @@ class Grid:
 
     def resampled(self, scale: float, sparse: bool = True) -> Grid:
         """
-        On nodes that are ``scale`` times as far apart: means of density and, weighted by what is seen, of colour. With
-        ``sparse`` those of :meth:`coarser`, otherwise all.
+        On nodes that are ``scale`` times as far apart: raw densities as they are interpolated there, and colours,
+        weighted by what is seen. With ``sparse`` the nodes of :meth:`coarser`, otherwise all. (Means of densities over
+        cells instead leave walls that are transparent: 3 dB worse, and 1.6 dB after 200 steps of training.)
         """
         nodes, stored = self.nodes, self.coarser(scale)
-        spacing, chosen = scale * nodes.spacing, stored if sparse else np.ones_like(stored)
-        soft = np.logaddexp(0, self.dense(self.density, EMPTY).astype(np.float64))
-        known = self.dense(np.ones(len(self.seen), np.float32))
-        seen = self.dense(self.seen) + LEAST * known
-        values = [
-            np.maximum(soft - FAINT, 0) / nodes.spacing,
-            seen,
-            *np.moveaxis(self.dense(self.colour) * seen[..., None], -1, 0),
-        ]
-        # Means over as many places of the cell around a node as the old grid needs
-        count, place = int(np.ceil(scale - 1e-6)) + 1, np.argwhere(chosen).T
-        totals = np.zeros((14, place.shape[1]))
-        for offset in np.ndindex(count, count, count):
-            at = (place + ((np.array(offset) + 0.5) / count - 0.5)[:, None]) * scale
-            for total, v in zip(totals, values, strict=True):
-                total += map_coordinates(v, at, order=1, mode="constant", cval=0.0, prefilter=False)
-        totals /= count**3
+        chosen = stored if sparse else np.ones_like(stored)
+        seen = self.dense(self.seen) + LEAST * self.dense(np.ones(len(self.seen), np.float32))
+        values = [np.maximum(self.dense(self.density, RAW[0]), RAW[0]), seen]
+        values += [v * seen for v in np.moveaxis(self.dense(self.colour), -1, 0)]
+        at = np.argwhere(chosen).T * scale
+        raw, weight, *sums = (map_coordinates(v, at, order=1, mode="nearest", prefilter=False) for v in values)
         mean = np.average(self.colour, axis=0, weights=self.seen + LEAST)
-        colour = np.where(totals[1] > 1e-9, totals[2:] / np.maximum(totals[1], 1e-12), mean[:, None]).T
-        raw = np.maximum(raw_of(totals[0], spacing), RAW[0])
-        found = Nodes(nodes.types, nodes.lower, spacing, stored.shape, stored if sparse else None)
-        return Grid(found, *(v.astype(np.float32) for v in (raw, colour, totals[1] * scale**3)))
+        known = weight > 1e-9
+        colour = np.where(known[:, None], np.stack(sums, axis=1) / np.maximum(weight, 1e-12)[:, None], mean)
+        found = Nodes(nodes.types, nodes.lower, scale * nodes.spacing, stored.shape, stored if sparse else None)
+        return Grid(found, *(v.astype(np.float32) for v in (raw, colour, weight * scale**3)))
 
 
 def visibility(field: GridField, images, every: int = 2) -> np.ndarray:

@@ -42,7 +42,7 @@ class FieldStudy(Study):
             help="nodes of the grid that all begin with, of a cube of the same volume (default: 128; --quick: 24)",
         )  # fmt: skip
         parser.add_argument(
-            "--steps", type=int, default=0, metavar="N", help="of each training through the images (default: 1000)"
+            "--steps", type=int, default=0, metavar="N", help="of each training through the images (default: 500)"
         )
 
     def check(self, arguments) -> None:
@@ -75,7 +75,7 @@ class FieldStudy(Study):
             without=tuple(arguments.without),
             resolution=arguments.resolution or (24 if quick else 128),
             grid_steps=60 if quick else 0,
-            steps=arguments.steps or (40 if quick else 1000),
+            steps=arguments.steps or (40 if quick else 500),
             seconds=3.0 if quick else 90.0,
             film=48 if quick else 200,
         )

@@ -84,8 +84,8 @@ GRID, LONGER = "grid", "grid, trained on"
 #: How a field is trained through images.
 SETTINGS = FitSettings(seed=1, batch=8192, lr=2e-3, loss="mse", schedule="cosine", check_every=50, deterministic=False)
 
-#: Rates of what does not begin near its end. At twice the rate of others, a trained grid gets worse in test views.
-RATES = {"coarser": 5e-3, "planes": 2e-2, "hash": 1e-2}
+#: Rates of what does not begin near its end. At them, a trained grid gets worse in test views.
+RATES = {"coarser": 1e-2, "coarser, stored": 5e-3, "planes": 2e-2, "hash": 1e-2}
 
 #: What training is expected to leave room for: numbers that are trained deflate less.
 ROOM, ROOM_COMPONENTS = 0.97, 0.84
@@ -119,7 +119,7 @@ class Request:
     without: tuple[str, ...] = ()
     resolution: int = 128
     grid_steps: int = 0
-    steps: int = 1000
+    steps: int = 500
     seconds: float = 90.0
     film: int = 200
 
@@ -441,7 +441,7 @@ class OnNodes(Fitted):
                     break
         else:
             made = make(grid)
-        if setting.train(made, self.kind, rest, progress, self.name).interrupted:
+        if setting.train(made, "coarser, stored" if scale > 1 else "", rest, progress, self.name).interrupted:
             return None
         colours = len(made.state()["colour"]) if self.kind == "codebook" else 0
         return self.finish(
