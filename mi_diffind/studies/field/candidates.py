@@ -85,7 +85,7 @@ GRID, LONGER = "grid", "grid, trained on"
 SETTINGS = FitSettings(seed=1, batch=8192, lr=2e-3, loss="mse", schedule="cosine", check_every=50, deterministic=False)
 
 #: Rates of what does not begin near its end. At them, a trained grid gets worse in test views.
-RATES = {"coarser": 1e-2, "coarser, stored": 5e-3, "planes": 2e-2, "hash": 1e-2}
+RATES = {"coarser": 5e-3, "coarser, stored": 5e-3, "planes": 2e-2, "hash": 1e-2}
 
 #: What training is expected to leave room for: numbers that are trained deflate less.
 ROOM, ROOM_COMPONENTS = 0.97, 0.84
@@ -93,8 +93,8 @@ ROOM, ROOM_COMPONENTS = 0.97, 0.84
 #: What a coarser grid is expected to lose of its bytes when cells that are not seen are left out.
 SHRINK = 0.8
 
-#: Weights in a ray below which cells may be left out of a grid that has become larger than was expected.
-LADDER = (1.0, 1.5, 2.5, 4.0, 6.0, 9.0)
+#: Weights in a ray, in units of the usual one, below which cells of a coarser grid are left out: the first that fits.
+LADDER = (0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.5, 4.0, 6.0, 9.0)
 
 #: Entries of a codebook, and steps of components, in the order in which they are tried.
 COUNTS, WIDTHS = (2**14, 2**12, 2**10), (0.03, 0.05, 0.08)
