@@ -89,7 +89,9 @@ class Plugin:
             "kind": self.kind,
             "id": props.id(),
             "parameters": {
-                key: _plain(props, key) for key in props if key not in learned_only and not key.startswith("_arg_")
+                key: _plain(props, key, self.kind)
+                for key in props
+                if key not in learned_only and not key.startswith("_arg_")
             },
             **{key: str(props[key]) for key in learned_only if key in props},
         }
@@ -250,14 +252,14 @@ def report(made) -> dict | None:
     return None if entry is None or entry[2] is None else entry[2]()
 
 
-def _plain(props, key: str):
+def _plain(props, key: str, owner: str):
     kind, types = props.type(key), type(props).Type
     if kind in (types.Float, types.Integer):
         return float(props[key])
     if kind == types.Color:
         return [float(v) for v in props[key]]
     if kind in (types.Reference, types.ResolvedReference, types.Object):
-        return "texture"
+        return "nested" if owner == "integrator" else "texture"
     if kind == types.Transform:
         m = props[key].matrix
         return [[float(m[i, j]) for j in range(4)] for i in range(4)]
