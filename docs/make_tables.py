@@ -251,7 +251,7 @@ def sdf_times(study: str) -> str:
 
 
 def field_errors(study: str) -> str:
-    """Radiance fields, by how many times smaller they are than a dense grid: PSNR before white, and of the foreground."""
+    """Radiance fields, by how many times smaller than a dense grid: PSNR before white, and of the foreground."""
     from mi_diffind.studies.field.conclusions import by_ratio, ratio_text, references
 
     result = measured(study)
@@ -293,6 +293,24 @@ def field_parts() -> str:
     return table(["", "MB in memory", "dB, white", "dB, foreground"], rows)
 
 
+def field_captures() -> str:
+    """Three captures: the grid, and what it was compressed to."""
+    rows = []
+    for name, what in (
+        ("group", "Suzanne, a painted vase, a knot, a pear"), ("thin", "a plant in a globe of wires"),
+        ("glossy", "clear-coated, golden, steel and plastic things"),
+    ):  # fmt: skip
+        grid, own = measured(f"inspect_field_{name}_grid"), measured(f"inspect_field_{name}")
+        figures = [
+            f"{f['measured']['psnr_white_db']:.2f} / {f['measured']['psnr_foreground_db']:.2f}" for f in (grid, own)
+        ]
+        sizes = [
+            f"{own[key] / 1e6:.2f} ({own['dense_bytes'] / own[key]:.0f}x)" for key in ("memory_bytes", "file_bytes")
+        ]  # fmt: skip
+        rows.append([f"{name}: {what}", *figures, *sizes])
+    return table(["", "grid, dB", "compressed, dB", "MB in memory", "MB on disk"], rows)
+
+
 def mean(values) -> float:
     """The mean of an iterable."""
     values = list(values)
@@ -311,7 +329,7 @@ for source in ("suzanne", "armadillo", "bunny"):
         TABLES[f"{make.__name__}_{source}"] = lambda make=make, source=source: make(f"tradeoff_sdf_{source}")
 TABLES |= {
     "field_errors": lambda: field_errors("tradeoff_field"), "field_times": lambda: field_times("tradeoff_field"),
-    "field_parts": field_parts,
+    "field_parts": field_parts, "field_captures": field_captures,
 }  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))
