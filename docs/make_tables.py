@@ -328,7 +328,8 @@ for source in ("suzanne", "armadillo", "bunny"):
     for make in (sdf_errors, sdf_times):
         TABLES[f"{make.__name__}_{source}"] = lambda make=make, source=source: make(f"tradeoff_sdf_{source}")
 TABLES |= {
-    "field_errors": lambda: field_errors("tradeoff_field"), "field_times": lambda: field_times("tradeoff_field"),
+    "field_errors": lambda: field_errors("tradeoff_field"),
+    "field_errors_50": lambda: field_errors("tradeoff_field_50"), "field_times": lambda: field_times("tradeoff_field"),
     "field_parts": field_parts, "field_captures": field_captures,
 }  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
