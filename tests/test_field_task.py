@@ -204,7 +204,9 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
     options = {"source": str(folder), "resolution": 24, "batch": 512, "steps": 4, "variant": "llvm_ad_rgb"}
     with monkeypatch.context() as patch:
         patch.setattr(field_fit, "train", stopping)
-        found = fit("field", progress=False, checkpoint=checkpoint, **options)
+        kept = tmp_path / "grid.npz"
+        found = fit("field", progress=False, checkpoint=checkpoint, grid=str(kept), **options)
+    assert not kept.exists()
     assert len(stages) == 1 and found.result.interrupted and found.table.settings["layout"] == "sparse"
     assert not checkpoint.exists()
     assert not fit("field", progress=False, checkpoint=checkpoint, resume=True, **options).result.interrupted
@@ -216,7 +218,8 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
     [
         (["--preset", "grid", "--bytes", "1M"], "--bytes is of the presets sparse and paper, found grid"),
         (["--preset", "paper", "--psnr", "30"], "--psnr is of the preset sparse, found paper"),
-        (["--bytes", "100"], "100 bytes are fewer than the smallest field needs"),
+        (["--bytes", "100"], "--bytes: 100 bytes are fewer than the smallest field needs"),
+        (["--compression", "1e5"], "--compression: "),
         (["--bytes", "many"], "many"),
     ],
 )

@@ -121,7 +121,7 @@ def _grid(request: Request, views: Views, held: Views) -> tuple[Grid, FitResult 
             raise UsageError(f"--grid: {path} was fitted to other views than those in {views.path}")
         return grid_of(table, request.types), None, time.perf_counter() - start
     grid, result = trained_grid(request, views, held)
-    if path:
+    if path and not result.interrupted:  # or the next training would take it for a finished one
         table = files.grid_table(*_stored_grid(grid, views))
         table.preset, table.settings["source"] = "grid", views.digest
         table.measured = {k: float(f"{v:.5g}") for k, v in result.measured.items()}
@@ -237,7 +237,8 @@ def _sparse(request: Request, grid: Grid, views: Views, held: Views, stopped: bo
     try:
         smaller, bits = compression.sized(grid, images, wanted_bytes(request.options, grid))
     except ValueError as e:
-        raise UsageError(f"--bytes: {e}") from None
+        given = "bytes" if request.options["bytes"] is not None else "compression"
+        raise UsageError(f"--{given}: {e}") from None
     return _coded(request, smaller, bits, images, views, held, stopped)
 
 

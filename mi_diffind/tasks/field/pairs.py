@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from ...fitting import Problem
 from ...indirection import DifferentiableArray, Indirection, ramp
-from .field import RadianceField, colour_of, density_of
+from .field import RadianceField, blended, colour_of, density_of
 from .nodes import Nodes
 from .target import Grid
 from .training import ImagesProblem
@@ -157,8 +157,6 @@ class ValuesProblem(Problem):
         )
         corners, active = nodes.corners(p)
         raw = sum(w * dr.gather(types.Float, self.grid.arrays["density"].array, s, active) for w, s in corners)
-        from .field import blended
-
         flat = self.grid.arrays["colour"].array
         truth = [raw, *blended(types, flat, 3, [w for w, _ in corners], [s for _, s in corners], active)]
         u = [dr.clip((x - a) / (b - a), 0, 1) for x, a, b in zip(p, box.lower, box.upper, strict=True)]
