@@ -325,7 +325,7 @@ def test_scores_of_a_known_error(folder):
 def test_divided_grids_are_what_they_were(folder, ad, rng):
     grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
     images = Images(ad, load_views(folder, "train"))
-    finer = target.divided(grid, images, 2, 1)
+    finer = target.divided(grid, target.visible(grid, images), 2, 1)
     cells = nodes.cells_of(finer.nodes.stored)
     places = np.argwhere(cells)[rng.choice(cells.sum(), 500)] + 0.5
     p = ad.Array3f((np.array(finer.nodes.lower) + finer.nodes.spacing * places).T.astype(np.float32))

@@ -52,7 +52,7 @@ def main() -> None:
     views, held = load_views(arguments.source, "train"), load_views(arguments.source, "test")
     images, tests = Images(types, views), Images(types, held)
     whole = fit.grid_of(files.load(arguments.grid), types)
-    seen = target.divided(whole, images, 1, 0)
+    seen = target.divided(whole, target.visible(whole, images), 1, 0)
     dense = NODE_BYTES * int(np.prod(whole.nodes.shape))
     rows = [{"name": "grid", **evaluate(seen.field(), tests)}]
     print(json.dumps(rows[0]), flush=True)

@@ -136,7 +136,8 @@ def sized(grid: Grid, images: Images, nbytes: int | None) -> tuple[Grid, int]:
     The visible part of a grid, as fine as fits in ``nbytes`` (``None``: as it is), and the bits of its indices: the
     most that fit at the full resolution, 10 at a lower one. Raises ``ValueError`` if nothing fits.
     """
-    whole = target.divided(grid, images, 1, 0)
+    cells = target.visible(grid, images)
+    whole = target.divided(grid, cells, 1, 0)
     if nbytes is None:
         return whole, DEFAULT_BITS
     for bits in sorted(CODE_BITS, reverse=True):
@@ -145,14 +146,14 @@ def sized(grid: Grid, images: Images, nbytes: int | None) -> tuple[Grid, int]:
     low, high, found = SMALLEST, 1.0, None
     for _ in range(7):
         middle = (low + high) / 2
-        smaller = target.divided(grid, images, middle, 0)
+        smaller = target.divided(grid, cells, middle, 0)
         bits = 10 if packed_bytes(smaller, 10) <= nbytes else 8
         if packed_bytes(smaller, bits) <= nbytes:
             low, found = middle, (smaller, bits)
         else:
             high = middle
     if found is None:
-        smallest = packed_bytes(target.divided(grid, images, SMALLEST, 0), 6)
+        smallest = packed_bytes(target.divided(grid, cells, SMALLEST, 0), 6)
         raise ValueError(f"{nbytes:,} bytes are fewer than the smallest field needs, about {smallest:,}")
     return found
 

@@ -164,7 +164,7 @@ def trained_grid(request: Request, views: Views, held: Views) -> tuple[Grid, Fit
             if grid is None:
                 grid = target.begin(request.types, views, max(8, round(nodes * share)))
             else:
-                grid = target.divided(grid, images, share / STAGES[number - 1][0])
+                grid = target.divided(grid, target.visible(grid, images), share / STAGES[number - 1][0])
         if stop.is_set() and result is not None:
             return grid, dataclasses.replace(result, interrupted=True)
         if grid.nodes.count == 0:
@@ -194,7 +194,7 @@ def trained_grid(request: Request, views: Views, held: Views) -> tuple[Grid, Fit
 
 def _stored_grid(grid: Grid, views: Views) -> tuple:
     """Nodes, densities and colours of the visible part."""
-    seen = target.divided(grid, Images(grid.nodes.types, views), 1, 0)
+    seen = target.divided(grid, target.visible(grid, Images(grid.nodes.types, views)), 1, 0)
     return seen.nodes, seen.density, seen.colour
 
 
@@ -252,8 +252,9 @@ def _coded(request: Request, grid: Grid, bits: int, images: Images, views: Views
 def _reaching(request: Request, grid: Grid, images: Images, views: Views, held: Views, stopped: bool):
     """The first size of the ladder that reaches the PSNR that is asked for, or the last one."""
     wanted, found = float(request.options["psnr"]), None
+    cells = target.visible(grid, images)
     for number, (share, bits) in enumerate(LADDER):
-        smaller = target.divided(grid, images, share, 0)
+        smaller = target.divided(grid, cells, share, 0)
         if request.checkpoint is not None:
             path = f"{request.checkpoint}.size{number}"
             one = dataclasses.replace(request, checkpoint=path, resume=request.resume and os.path.exists(path))
@@ -269,7 +270,7 @@ def _reaching(request: Request, grid: Grid, images: Images, views: Views, held: 
 
 
 def _pairs(request: Request, grid: Grid, views: Views, held: Views, stopped: bool):
-    seen = target.divided(grid, Images(request.types, views), 1, 0)
+    seen = target.divided(grid, target.visible(grid, Images(request.types, views)), 1, 0)
     nbytes = wanted_bytes(request.options, grid) or NODE_BYTES * int(np.prod(grid.nodes.shape)) / COMPRESSION
     problem = pairs_problem(seen, nbytes, views, held, request, 0 if stopped else VALUE_STEPS)
     result = _train(request, problem, stopped)

@@ -120,16 +120,20 @@ def weights(field: RadianceField, images: Images) -> np.ndarray:
     return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]
 
 
-def divided(grid: Grid, images: Images, factor: float, wide: int = 1, least: float = VISIBLE) -> Grid:
+def visible(grid: Grid, images: Images) -> np.ndarray:
+    """The cells that some ray of the views sees, ``(X − 1, Y − 1, Z − 1)`` bool."""
+    return weights(grid.field(), images) >= VISIBLE
+
+
+def divided(grid: Grid, cells: np.ndarray, factor: float, wide: int = 1) -> Grid:
     """
-    The grid at ``factor`` times as many nodes along each side, of the cells that are visible and ``wide`` cells, of the
-    coarser ones, around these.
+    The grid at ``factor`` times as many nodes along each side, of these ``cells`` (:func:`visible`) and ``wide`` more,
+    of the coarser ones, around them.
     """
     nodes = grid.nodes
-    cells = weights(grid.field(), images) >= least
     if wide:
         cells = binary_dilation(cells, np.ones((3, 3, 3), bool), wide)
-    cells &= cells_of(nodes.stored)
+    cells = cells & cells_of(nodes.stored)
     spacing = nodes.spacing / factor
     shape = np.maximum(2, np.ceil((np.asarray(nodes.shape) - 1) * factor - 1e-6).astype(int) + 1)
     # A finer cell is kept if its middle lies in one that is
