@@ -222,7 +222,8 @@ def shading_shares(study: str) -> str:
 
 def sdf_errors(study: str) -> str:
     """Distance fields in equal bytes: IoU, IoU near the surface, normals."""
-    from mi_diffind.studies.sdf.conclusions import by_size, size_text
+    from mi_diffind.measure.kinds import by_size
+    from mi_diffind.studies.sdf.conclusions import size_text
 
     sizes = by_size(measured(study))
     rows: dict[str, dict[int, str]] = {}
@@ -252,11 +253,12 @@ def sdf_times(study: str) -> str:
 
 def field_errors(study: str) -> str:
     """Radiance fields, by how many times smaller than a dense grid: PSNR before white, and of the foreground."""
-    from mi_diffind.studies.field.conclusions import by_ratio, ratio_text, references
+    from mi_diffind.measure.kinds import by_size
+    from mi_diffind.studies.field.conclusions import ratio_text, references
 
     result = measured(study)
     rows = []
-    for found in (references(result), *by_ratio(result).values()):
+    for found in (references(result), *by_size(result).values()):
         for c in found.values():
             e, d = c["errors"], c["details"]
             rows.append([

@@ -1,29 +1,41 @@
 """
-A ray through the arrays of a signed distance field, beside Embree on its mesh and Mitsuba's ``sdfgrid``.
+A ray through the arrays of signed distance fields, beside Embree on their meshes and Mitsuba's ``sdfgrid``:
 
-    mi-diffind fit sdf armadillo.off -o armadillo.npz
-    python tests/benchmarks/bench_sdf.py armadillo.npz [--grid 256] [--threads 1]
+    mi-diffind fit sdf armadillo.off -o out/armadillo.npz
+    python tests/benchmarks/bench_sdf.py out/armadillo.npz --json docs/measured/bench_sdf.json
 
-Primary rays of a camera (512², coherent) and random ones through the box; the median of interleaved runs, in
-nanoseconds a ray, and the median of the ratios to Embree. The mesh has to be where it was when it was fitted.
+Of several files, one after the other.
+
+Primary rays of a camera (512², coherent) and random ones through the box: the median of interleaved runs of the
+kernels, in nanoseconds a ray, and the median of the ratios to Embree. Meshes have to be where they were when they were
+fitted.
 """
 
-from __future__ import annotations
-
 import argparse
+import functools
+import json
 import statistics
-import time
+import sys
+import tempfile
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 import mi_diffind  # noqa: F401
+from mi_diffind.files import write_json
+from mi_diffind.measure.clock import machine, timed
+from mi_diffind.tasks.sdf import TASK, decode, tracing
+from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SIDE = 512
 
+#: Names of rows: the mesh, which ratios refer to; ``sdfgrid``; the field.
+MESH, GRID, ARRAYS = "Embree, the mesh", "sdfgrid {}³", "the arrays"
 
-def rays(mi, kind: str):
+
+def rays(kind: str):
     """Origins and directions in the unit frame."""
     count = SIDE * SIDE
     if kind == "primary":
@@ -45,43 +57,34 @@ def rays(mi, kind: str):
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("file", type=Path)
-    parser.add_argument(
-        "--grid", type=int, default=256, help="cells of sdfgrid along the longest side; 0: leave it out"
-    )
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--rounds", type=int, default=11)
-    arguments = parser.parse_args()
-
-    import mitsuba as mi
+def scene_of_mesh(mesh):
+    """A scene of the mesh alone, in the unit frame."""
     import trimesh
 
-    mi.set_variant("llvm_ad_rgb")
-    dr.set_thread_count(arguments.threads)
-    from mi_diffind.tasks.sdf import TASK, decode, tracing
-    from mi_diffind.tasks.sdf.mesh import load_mesh
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mesh.ply"
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file)
+        return mi.load_dict({"type": "scene", "shape": {"type": "ply", "filename": str(file)}})
 
-    model = TASK.open(mi.TensorXf, arguments.file)
-    settings = model.table.settings
-    mesh = load_mesh(arguments.file.resolve().parent / settings["mesh_path"])
-    ply = Path(f"{arguments.file}.bench.ply")
-    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(ply)
-    shapes = {"Embree, the mesh": {"type": "ply", "filename": str(ply)}}
-    if arguments.grid:
-        values, lower, _ = decode.grid(model.field, arguments.grid)
-        side = max(values.shape)
-        values = np.pad(values, [(0, side - n) for n in values.shape], constant_values=values.max())
-        size = (model.field.upper[0] - model.field.lower[0]) / max(
-            1, round((model.field.upper[0] - model.field.lower[0]) / (max(
-                b - a for a, b in zip(model.field.lower, model.field.upper, strict=True)) / arguments.grid))
-        )  # fmt: skip
-        box = mi.ScalarTransform4f().translate(lower.tolist()).scale(size * (side - 1))
-        grid = mi.TensorXf(np.ascontiguousarray(values[..., None]))
-        shapes[f"sdfgrid, {arguments.grid}"] = {"type": "sdfgrid", "grid": grid, "to_world": box}
-    scenes = {name: mi.load_dict({"type": "scene", "shape": shape}) for name, shape in shapes.items()}
-    ply.unlink()
+
+def scene_of_grid(field, resolution: int):
+    """A scene of Mitsuba's ``sdfgrid`` with so many cells along the longest side."""
+    from mi_diffind.plugins.support.solids import cube_of
+
+    values, lower, upper = decode.grid(field, resolution)
+    values, upper = cube_of(values, lower, upper)
+    box = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
+    grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
+    return mi.load_dict({"type": "scene", "shape": {"type": "sdfgrid", "grid": grid, "to_world": box}})
+
+
+def measured(file: Path, resolution: int, rounds: int) -> dict:
+    """What the rows of one file are, and how large it is."""
+    model = TASK.open(mi.TensorXf, file)
+    mesh = load_mesh(file.resolve().parent / model.table.settings["mesh_path"])
+    scenes = {MESH: scene_of_mesh(mesh)}
+    if resolution:
+        scenes[GRID.format(resolution)] = scene_of_grid(model.field, resolution)
 
     def native(scene):
         def run(o, d, coherent):
@@ -91,26 +94,46 @@ def main() -> None:
         return run
 
     runs = {name: native(scene) for name, scene in scenes.items()}
-    runs["the arrays"] = lambda o, d, coherent: tracing.trace(model.field, o, d, dr.inf)
-    print(f"{arguments.file.name}: {model.nbytes:,} bytes, and {tracing.index_of(model.field):,} to find the way")
+    runs[ARRAYS] = lambda o, d, coherent: tracing.trace(model.field, o, d, dr.inf)
+    rows = []
     for kind in ("primary", "random"):
-        o, d = rays(mi, kind)
+        o, d = rays(kind)
         times, hits = {name: [] for name in runs}, {}
-        for _ in range(arguments.rounds + 2):
+        for _ in range(rounds + 2):
             for name, run in runs.items():
-                start = time.perf_counter()
-                t, found = run(o, d, kind == "primary")
-                dr.eval(t, found)
-                dr.sync_thread()
-                times[name].append(time.perf_counter() - start)
-                hits[name] = np.array(found)
-        first = times["Embree, the mesh"][2:]
+                found = timed(functools.partial(run, o, d, kind == "primary"))
+                times[name].append(found.seconds)
+                hits[name] = np.array(found.value[1])
+        first = times[MESH][2:]
         for name, values in times.items():
-            ratio = statistics.median(b / a for a, b in zip(first, values[2:], strict=True))
-            differ = 100 * (hits[name] != hits["Embree, the mesh"]).mean()
-            ns = 1e9 * statistics.median(values[2:]) / SIDE**2
-            print(f"{kind:9}{name:18}{ns:>8.0f} ns a ray{ratio:>7.2f}x{differ:>9.3f}% of hits differ")
+            ratios = [b / a for a, b in zip(first, values[2:], strict=True)]
+            rows.append({
+                "rays": kind, "name": name, "ns": 1e9 * statistics.median(values[2:]) / SIDE**2,
+                "ratio": statistics.median(ratios), "ratio_quartiles": statistics.quantiles(ratios)[::2],
+                "hits_differ": float((hits[name] != hits[MESH]).mean()),
+            })  # fmt: skip
+            print(json.dumps(rows[-1]), flush=True)
+    return {
+        "name": Path(model.table.settings["mesh_path"]).stem, "triangles": len(mesh.faces), "bytes": model.nbytes,
+        "index_bytes": tracing.index_of(model.field), "rows": rows,
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="as fit sdf made it; may be several")
+    parser.add_argument("--grid", type=int, default=256, help="cells of sdfgrid along the longest side; 0: none")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=11)
+    parser.add_argument("--json", metavar="FILE")
+    arguments = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    dr.set_thread_count(arguments.threads)
+    found = [measured(file, arguments.grid, arguments.rounds) for file in arguments.files]
+    if arguments.json:
+        given = {"threads": arguments.threads, "rounds": arguments.rounds, "grid": arguments.grid}
+        write_json(arguments.json, {**given, "machine": machine(mi.variant()), "files": found})
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

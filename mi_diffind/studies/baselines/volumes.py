@@ -493,17 +493,17 @@ def distance_nodes(
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def save(path: Path | str, field: ByteGrid | Bricks | DistanceNodes) -> None:
-    """Write a field, which :func:`load` reads."""
+def save(path: Path | str, field: Field) -> None:
+    """Write a field with a ``state``, the arguments of its class beside ``types``, which :func:`load` reads."""
     with replacing(path) as temporary:
         temporary.write_bytes(_packed(field))
 
 
-def load(path: Path | str, types) -> ByteGrid | Bricks | DistanceNodes:
-    """What :func:`save` wrote, for the module ``types``."""
+def load(path: Path | str, types, *more: type[Field]) -> Field:
+    """What :func:`save` wrote, of one of these classes or of ``more``, for the module ``types``."""
     with np.load(path, allow_pickle=False) as file:
         state = {name: file[name] if file[name].ndim else file[name].item() for name in file}
-    kind = {c.__name__: c for c in (ByteGrid, Bricks, DistanceNodes)}[state.pop("kind")]
+    kind = {c.__name__: c for c in (ByteGrid, Bricks, DistanceNodes, *more)}[state.pop("kind")]
     parts = {name: state.pop(name) for name in list(state) if name.startswith("structure_")}
     if parts:
         parts = {name.removeprefix("structure_"): v for name, v in parts.items()}
@@ -511,7 +511,7 @@ def load(path: Path | str, types) -> ByteGrid | Bricks | DistanceNodes:
     return kind(types, **state)
 
 
-def file_bytes(field: ByteGrid | Bricks | DistanceNodes) -> int:
+def file_bytes(field: Field) -> int:
     """How large the file is, whose arrays are compressed (zlib)."""
     return len(_packed(field))
 

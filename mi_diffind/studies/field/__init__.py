@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 
+from ...measure.kinds import add_without, check_without
 from ...measure.study import Plan, Study
 
 #: What is asked for unless something else is: how many times smaller than a dense grid of float32. At the first one all
@@ -33,10 +34,7 @@ class FieldStudy(Study):
             help="how many times smaller than a dense grid of float32; may be repeated (default: "
             f"{', '.join(f'{r:g}' for r in RATIOS)}; --quick: 75); all kinds are made and timed at the first one",
         )  # fmt: skip
-        parser.add_argument(
-            "--without", action="append", default=[], metavar="KIND",
-            help="leave out a kind, as it is named in the table without its size; may be repeated",
-        )  # fmt: skip
+        add_without(parser)
         parser.add_argument(
             "--resolution", type=int, default=0, metavar="N",
             help="nodes of the grid that all begin with, of a cube of the same volume (default: 128; --quick: 24)",
@@ -55,9 +53,7 @@ class FieldStudy(Study):
 
         default = ("75",) if arguments.quick else map(str, RATIOS)
         arguments.ratios = tuple(dict.fromkeys(map(parse_compression, arguments.compression or default)))
-        unknown = [name for name in arguments.without if name not in KINDS]
-        if unknown:
-            raise ValueError(f'--without: found "{unknown[0]}", allowed are {", ".join(KINDS)}')
+        check_without(arguments.without, KINDS)
         for name, least in (("resolution", 8), ("steps", 2)):
             value = getattr(arguments, name)
             if value and value < least:

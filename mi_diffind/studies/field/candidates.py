@@ -31,11 +31,10 @@ import numpy as np
 
 from ...files import replacing
 from ...fitting import FitSettings, fit
-from ...measure.store import file_name, fingerprint
-from ...measure.study import FLOOR, Candidate, Case, Job, Plan
+from ...measure import kinds
+from ...measure.store import fingerprint
+from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...runtime import array_module
-from ...tables import save_table
-from ...tasks import task
 from ...tasks.field import target
 from ...tasks.field.field import RadianceField
 from ...tasks.field.files import load
@@ -196,13 +195,11 @@ def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
     jobs = setting.jobs
     jobs[GRID] = Gridded("grid", 1.0, setting, GRID)
     jobs[LONGER] = Longer("longer", 1.0, setting, LONGER)
-    for ratio in request.ratios:
-        for kind in KINDS:
-            if kind not in request.without and (ratio == first or kind not in ONCE):
-                made = Made.of(kind, ratio, setting)
-                jobs[made.name] = made
+    for kind, ratio in kinds.chosen(KINDS, request.ratios, ONCE, request.without):
+        made = Made.of(kind, ratio, setting)
+        jobs[made.name] = made
     candidates = [job.candidate() for job in jobs.values()]
-    shown = [name for name, job in jobs.items() if job.ratio == first and job.kind in KINDS]
+    shown = [name for name, job in jobs.items() if job.size == first and job.kind in KINDS]
     ours = next((n for n in shown if jobs[n].kind == "ours"), "")
     timed = tuple([GRID, *shown])
     cases = [
@@ -210,7 +207,7 @@ def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
              query_names=("density", "both")),
     ]  # fmt: skip
     package = Path(__file__).resolve().parents[2]
-    made_by = [*(package / "tasks" / "field").glob("*.py"), package / "fitting.py", Path(__file__)]
+    made_by = [*(package / "tasks" / "field").glob("*.py"), package / "fitting.py", Path(__file__), kinds.__file__]
     made_by += (package / "studies" / "baselines").glob("radiance*.py")
     made_by.append(package / "studies" / "baselines" / "node_codes.py")
     return Plan(
@@ -243,39 +240,15 @@ def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
 # -- jobs -------------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Made(Job):
-    """A field of a ``kind``, ``ratio`` times smaller: after :meth:`known` or :meth:`run`, it has its ``field``."""
+class Made(kinds.Made):
+    """A field of a kind, so many times smaller than a dense grid."""
 
-    kind: str
-    ratio: float
-    setting: Setting
-    name: str = ""
-    file: Path | None = None
+    labels, families, text = KINDS, FAMILIES, staticmethod(ratio_text)
 
     @staticmethod
     def of(kind: str, ratio: float, setting: Setting) -> Made:
         own = {"planes": Planes, "hash": Hashed}.get(kind, Preset if kind in PRESETS else OnNodes)
-        return own(kind, ratio, setting, f"{KINDS[kind]} {ratio_text(ratio)}")
-
-    def candidate(self) -> Candidate:
-        return Candidate(
-            self.name, FAMILIES[self.kind], ratio_text(self.ratio), job=self.name, label=KINDS[self.kind],
-            details={"kind": self.kind, "asked": self.ratio},
-        )  # fmt: skip
-
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
-        self.file = folder / f"{file_name(self.name)}.npz" if folder else None
-        self.__dict__.pop("field", None)
-        return record if record and self.file is not None and self.file.is_file() else None
-
-    @functools.cached_property
-    def field(self) -> RadianceField:
-        """The field, from the file of the models' folder if it was not just made."""
-        return self.load(self.file)
-
-    def load(self, path: Path) -> RadianceField:
-        raise NotImplementedError
+        return own(kind, ratio, setting)
 
     def record(self, nbytes: int, file_bytes: int, seconds: float, **details) -> dict:
         details |= {"memory_bytes": nbytes, "file_bytes": file_bytes, "dense_bytes": self.setting.dense_bytes}
@@ -284,13 +257,34 @@ class Made(Job):
 
     @property
     def asked(self) -> int:
-        return self.setting.asked(self.ratio)
+        return self.setting.asked(self.size)
 
 
-class Gridded(Made):
+class Preset(kinds.ByPreset, Made):
+    """By a preset of ``fit field``, from the grid."""
+
+    task_name = "field"
+
+    @property
+    def preset(self) -> str:
+        return PRESETS[self.kind]
+
+    def arguments(self) -> dict:
+        setting = self.setting
+        return {
+            "source": setting.source, "grid": str(setting.jobs[GRID].file), "bytes": str(self.asked),
+            "steps": setting.request.steps,
+        }  # fmt: skip
+
+    def fitted(self, model, fitted, seconds: float) -> dict:
+        details = {"steps": fitted.result.steps, "nodes": model.field.nodes.count}
+        return self.record(model.memory_nbytes, self.file.stat().st_size, seconds, **details)
+
+
+class Gridded(Preset):
     """The grid that all begin with."""
 
-    PRESET = "grid"
+    preset = "grid"
 
     def candidate(self) -> Candidate:
         return Candidate(self.name, "reference", job=self.name, is_reference=True, details={"kind": self.kind})
@@ -298,45 +292,7 @@ class Gridded(Made):
     def arguments(self) -> dict:
         request = self.setting.request
         steps = {"steps": request.grid_steps} if request.grid_steps else {}
-        return {"resolution": request.resolution, **steps}
-
-    def run(self, folder: Path | None, progress: bool) -> dict | None:
-        if not self.file:
-            raise ValueError("presets are measured from files: give a folder")
-        start = time.perf_counter()
-        fitted = task.fit(
-            "field", self.PRESET, mi.variant(), progress=progress, output=self.file, deterministic=False,
-            source=self.setting.source, **self.arguments(),
-        )  # fmt: skip
-        if fitted.result.interrupted:
-            return None
-        save_table(self.file, fitted.table)
-        self.__dict__.pop("field", None)
-        model = self.model(self.file)
-        self.field = model.field
-        seconds = time.perf_counter() - start
-        details = {"steps": fitted.result.steps, "nodes": model.field.nodes.count}
-        return self.record(model.memory_nbytes, self.file.stat().st_size, seconds, **details)
-
-    def model(self, path: Path):
-        return task.tasks()["field"].open(self.setting.types.TensorXf, str(path))
-
-    def load(self, path: Path) -> RadianceField:
-        return self.model(path).field
-
-
-class Preset(Gridded):
-    """By a preset of ``fit field``, from the same grid."""
-
-    candidate = Made.candidate
-
-    @property
-    def PRESET(self) -> str:
-        return PRESETS[self.kind]
-
-    def arguments(self) -> dict:
-        setting = self.setting
-        return {"grid": str(setting.jobs[GRID].file), "bytes": str(self.asked), "steps": setting.request.steps}
+        return {"source": self.setting.source, "resolution": request.resolution, **steps}
 
 
 class Longer(Gridded):

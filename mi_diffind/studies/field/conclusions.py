@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ...measure.frame import PASS
+from ...measure.kinds import by_size, ours_of, times_that_of
 from ...measure.words import duration, enumeration, grid
 
 #: The two figures that are always given together.
@@ -18,15 +19,6 @@ def ratio_text(ratio: float) -> str:
     return f"{ratio:g}×"
 
 
-def by_ratio(result: dict) -> dict[float, dict[str, dict]]:
-    """Ratio that was asked for → name → candidate."""
-    found: dict[float, dict[str, dict]] = {}
-    for name, c in result["candidates"].items():
-        if c["details"].get("asked") and c["errors"]:
-            found.setdefault(c["details"]["asked"], {})[name] = c
-    return dict(sorted(found.items()))
-
-
 def references(result: dict) -> dict[str, dict]:
     """The grids that all are made of, and that is trained for as long."""
     return {name: c for name, c in result["candidates"].items() if c["is_reference"] and c["errors"]}
@@ -35,7 +27,7 @@ def references(result: dict) -> dict[str, dict]:
 def table(result: dict) -> list[str]:
     """All candidates: bytes in memory and on disk, seconds, steps and errors."""
     cells = [["", "MB in memory", "MB on disk", "times smaller", "nodes", "seconds", "steps", "white", "foreground"]]
-    made = [references(result), *by_ratio(result).values()]
+    made = [references(result), *by_size(result).values()]
     for name, c in ((n, c) for found in made for n, c in found.items()):
         e, d = c["errors"], c["details"]
         cells.append([
@@ -57,7 +49,7 @@ def conclusions(result: dict) -> list[str]:
     """Ours against the grid, the sparse grid and the best of the others at each size; times against those."""
     lines = []
     longer = next((c["errors"] for name, c in references(result).items() if c["details"]["kind"] == "longer"), None)
-    for ratio, made in by_ratio(result).items():
+    for ratio, made in by_size(result).items():
         kinds = {c["details"]["kind"]: (name, c) for name, c in made.items()}
         if "ours" not in kinds or len(kinds) < 2:
             continue
@@ -89,8 +81,7 @@ def _kind(name: str, ratio: float) -> str:
 def _times(result: dict) -> list[str]:
     """Sentences about reads and renders, of the first size."""
     lines, reads = [], result["cases"].get("reads", {})
-    first = by_ratio(result).get(result["details"]["first"], {})
-    ours = next((name for name, c in first.items() if c["details"]["kind"] == "ours"), "")
+    ours = ours_of(result)
     side = result["details"]["request"]["film"]
     timings = reads.get("queries", {}).get("both", {})
     if ours in timings:
@@ -100,9 +91,7 @@ def _times(result: dict) -> list[str]:
         lines.append(f"A sample of {ours}, density and colour, takes {timings[ours]['time']:.3g} ns{text}.")
     passes = reads.get("passes", {}).get(PASS, {})
     if ours in passes:
-        pairs = reads["ratios"].get(PASS, {})
-        found = [(pair.removeprefix(f"{ours} / "), r["median"]) for pair, r in pairs.items() if pair.startswith(ours)]
-        texts = [f"{value:.2f} times that of {name}" for name, value in found if value == value]
+        texts = times_that_of(reads["ratios"].get(PASS, {}), ours)
         text = f": {enumeration(texts)}" if texts else ""
         lines.append(f"A picture of {side}² with {ours} takes {duration(passes[ours]['time'] / 1e3)}{text}.")
     return lines

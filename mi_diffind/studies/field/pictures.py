@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from ...measure import plot
+from ...measure.kinds import by_size
 from ...measure.words import machine_line, state
 from ...tasks.field.training import rendered, shown
-from .conclusions import FOREGROUND, WHITE, by_ratio, ratio_text, references
+from .conclusions import FOREGROUND, WHITE, ratio_text, references
 
 #: The difference of sRGB values that is as dark as it gets.
 WORST = 0.25
@@ -33,7 +34,7 @@ def views(setting, result: dict):
     errors of all sizes against bytes, and of the first against the time of a picture.
     """
     first = result["details"]["first"]
-    shown_jobs = [job for job in setting.jobs.values() if job.ratio == first and job.kind in STYLES]
+    shown_jobs = [job for job in setting.jobs.values() if job.size == first and job.kind in STYLES]
     columns = max(4, len(shown_jobs) + 1)
     caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
     truth = setting.held.images[0]
@@ -78,7 +79,7 @@ def views(setting, result: dict):
 
 def _curves(axes, result: dict) -> None:
     """PSNR of the foreground against bytes, a line for each kind; the grids as lines across."""
-    made = [c for found in by_ratio(result).values() for c in found.values()]
+    made = [c for found in by_size(result).values() for c in found.values()]
     for kind, (colour, marker, line) in STYLES.items():
         own = [c for c in made if c["details"]["kind"] == kind]
         points = sorted((c["bytes"] / 1e6, c["errors"][FOREGROUND]) for c in own)

@@ -7,7 +7,10 @@ more.
 from __future__ import annotations
 
 import argparse
+import json
+from pathlib import Path
 
+from ...measure.kinds import add_without, check_without
 from ...measure.study import Plan, Study
 
 #: Sizes unless asked otherwise, and the one at which everything is made and timed, if it is among them.
@@ -30,23 +33,29 @@ class SdfStudy(Study):
             help=f"in memory; may be repeated (default: {', '.join(SIZES)}; --quick: 64k); of the first that is named "
             "(default: 1M) all kinds are made, and reads, rays and renders are timed",
         )  # fmt: skip
+        add_without(parser)
         parser.add_argument(
-            "--without", action="append", default=[], metavar="KIND",
-            help="leave out a kind, as it is named in the table without its size; may be repeated",
+            "--ablation", action="store_true",
+            help=f"in place of other kinds, what the parts of ours are worth (default: of {FIRST} alone)",
+        )  # fmt: skip
+        parser.add_argument(
+            "--errors-of", metavar="FILE",
+            help="what --json wrote of an earlier run: its errors are taken over but for the size at which reads, rays "
+            "and renders are timed, which are timed anew",
         )  # fmt: skip
 
     def check(self, arguments) -> None:
         """Also reads the mesh; raises :class:`~mi_diffind.tasks.sdf.mesh.MeshError`."""
         from ...sizes import parse_bytes
         from ...tasks.sdf.mesh import load_mesh
-        from .candidates import KINDS
+        from .candidates import KINDS, PARTS
 
-        default = ("64k",) if arguments.quick else (FIRST, *(s for s in SIZES if s != FIRST))
+        every = (FIRST,) if arguments.ablation else (FIRST, *(s for s in SIZES if s != FIRST))
+        default = ("64k",) if arguments.quick else every
         arguments.sizes = tuple(dict.fromkeys(map(parse_bytes, arguments.bytes or default)))
-        unknown = [name for name in arguments.without if name not in KINDS]
-        if unknown:
-            raise ValueError(f'--without: found "{unknown[0]}", allowed are {", ".join(KINDS)}')
+        check_without(arguments.without, PARTS if arguments.ablation else KINDS)
         arguments.loaded = load_mesh(arguments.source)
+        arguments.before = earlier(arguments.errors_of, arguments.loaded) if arguments.errors_of else {}
 
     def plan(self, arguments) -> Plan:
         from .candidates import Request, plan
@@ -55,6 +64,7 @@ class SdfStudy(Study):
         request = Request(
             sizes=arguments.sizes,
             without=tuple(arguments.without),
+            ablation=arguments.ablation,
             points=2**14 if quick else 2**20,
             steps=20 if quick else 0,
             hash_steps=(40, 80) if quick else (500, 4000),
@@ -63,7 +73,19 @@ class SdfStudy(Study):
             decoded=96 if quick else 768,
             spp=1 if quick else 4,
         )
-        return plan(arguments.loaded, arguments.source, request)
+        return plan(arguments.loaded, arguments.source, request, arguments.before)
+
+
+def earlier(path: str, mesh) -> dict[str, dict]:
+    """The records of an earlier run about ``mesh``, name → record. Raises ``ValueError`` with a sentence."""
+    try:
+        found = json.loads(Path(path).read_text(encoding="utf-8"))
+        digest, records = found["details"]["source_digest"], dict(found["jobs"])
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise ValueError(f"--errors-of: {path} is not what --json wrote of this study: {e!r}") from None
+    if digest != mesh.digest:
+        raise ValueError(f"--errors-of: {path} is of another mesh than {mesh.path}")
+    return records
 
 
 STUDY = SdfStudy()

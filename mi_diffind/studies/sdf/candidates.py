@@ -10,6 +10,8 @@ the others (:mod:`mi_diffind.tasks.sdf`). *Hash grid + network* is that of ``drj
 grids are trained by least squares, so that there is nothing left to gain; the network until twice as many steps gain
 little. Each kind is as fine as the bytes allow; to find that out is part of the seconds.
 
+Or else, what the *parts* of ours are worth, each left out or changed in turn: :mod:`.parts`.
+
 Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.Evaluation`; all lengths are in units of the longest side.
 Times: reads at random points within 0.01 of the surface; primary rays, beside Embree on the mesh itself and Mitsuba's
 ``sdfgrid``; a whole render.
@@ -29,12 +31,11 @@ import mitsuba as mi
 import numpy as np
 
 from ...fitting import FitSettings
-from ...measure.store import file_name, fingerprint
-from ...measure.study import FLOOR, Candidate, Case, Job, Plan
+from ...measure import kinds
+from ...measure.store import fingerprint
+from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...measure.training import Training
 from ...runtime import array_module
-from ...tables import save_table
-from ...tasks import task
 from ...tasks.sdf import decode
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.evaluation import Evaluation
@@ -60,18 +61,42 @@ KINDS = {
 }
 ONCE = ("indirection", "paper", "hash")
 
+#: The same of ours and its parts.
+PARTS = {
+    "ours": "ours",
+    "bits6": "6 bits a pointer",
+    "bits8": "8 bits a pointer",
+    "bits16": "16 bits a pointer",
+    "at-once": "pointers all at the end",
+    "untrained": "not trained",
+    "direct": "16 bits a node, no indirection",
+    "direct-untrained": "16 bits a node, not trained",
+    "distances-trained": "sparse distances, trained",
+    "paper": "paper",
+    "paper-constant": "paper, from a constant",
+}
+LABELS = KINDS | PARTS
+
 #: Kind → what it is a kind of, for pictures.
 FAMILIES = {
     "dense": "dense grid", "dense-trained": "dense grid", "bricks8": "bricks", "bricks4": "bricks",
     "bricks4-shared": "bricks", "distances": "sparse distances", "distances-trained": "sparse distances",
     "ours": "ours", "indirection": "supplement's arrays", "paper": "supplement's arrays", "hash": "network",
+    "paper-constant": "supplement's arrays", **dict.fromkeys(PARTS.keys() - KINDS.keys() - {"paper-constant"}, "parts"),
 }  # fmt: skip
 
 #: Kinds that the times of ours are divided by.
-AGAINST = ("dense-trained", "bricks4", "distances-trained")
+AGAINST = ("dense-trained", "bricks4", "distances-trained", "direct")
 
-#: Kind → preset, of those that ``fit sdf`` makes.
-PRESETS = {"ours": "", "indirection": "dense", "paper": "paper"}
+#: Kind → preset and arguments, of those that ``fit sdf`` makes.
+PRESETS = {
+    "ours": ("", {}), "indirection": ("dense", {}), "paper": ("paper", {}),
+    "paper-constant": ("paper", {"constant": True}),
+    **{f"bits{n}": ("", {"bits": n}) for n in (6, 8, 16)}, "at-once": ("", {}), "untrained": ("", {}),
+}  # fmt: skip
+
+#: Modules of the task that fields, once made, do not depend on.
+RAYS = ("marching", "tracing", "decode")
 
 #: What renders and rays are compared with.
 MESH, GRID = "mesh (Embree)", "sdfgrid"
@@ -93,14 +118,16 @@ HASH_SETTINGS = FitSettings(seed=1, schedule="cosine", deterministic=False, lr=1
 @dataclass(frozen=True)
 class Request:
     """
-    ``sizes`` in bytes, the first of which is shown most; kinds left out (``without``); held-out ``points``; ``steps``
-    of trainings by presets (0: the preset's own); ``hash_steps`` of the network's first and longest training; ``film``,
-    width and height of pictures; ``grid``, cells of ``sdfgrid`` along the longest side; ``decoded``, the most of the
-    surface that the Chamfer distance is measured of; ``spp`` of the render.
+    ``sizes`` in bytes, the first of which is shown most; kinds left out (``without``); ``ablation``: parts of ours in
+    place of other kinds, no rays; held-out ``points``; ``steps`` of trainings by presets (0: the preset's own);
+    ``hash_steps`` of the network's first and longest training; ``film``, width and height of pictures; ``grid``, cells
+    of ``sdfgrid`` along the longest side; ``decoded``, the most of the surface that the Chamfer distance is measured
+    of; ``spp`` of the render.
     """
 
     sizes: tuple[int, ...]
     without: tuple[str, ...] = ()
+    ablation: bool = False
     points: int = 2**20
     steps: int = 0
     hash_steps: tuple[int, int] = (500, 4000)
@@ -112,12 +139,16 @@ class Request:
 
 @dataclass
 class Setting:
-    """What all candidates share: the ``mesh``, of the file ``name``, its distances, held-out points and the view."""
+    """
+    What all candidates share: the ``mesh``, of the file ``name``, its distances, held-out points and the view.
+    ``before`` has records of an earlier run, name → record, which count for what is not timed.
+    """
 
     mesh: Mesh
     name: str
     request: Request
     types: object
+    before: dict[str, dict] = field(default_factory=dict)
     jobs: dict[str, Made] = field(default_factory=dict)
     _sparse: dict[int, tuple[volumes.DistanceNodes, float]] = field(default_factory=dict)
 
@@ -159,45 +190,53 @@ class Setting:
         return errors
 
 
-def plan(mesh: Mesh, name: str, request: Request) -> Plan:
-    """What is measured of ``mesh``, of the file ``name``, in the variant that is set."""
-    setting = Setting(mesh, name, request, array_module(mi.variant()))
-    first = request.sizes[0]
-    for size in request.sizes:
-        for kind in KINDS:
-            if kind not in request.without and (size == first or kind not in ONCE):
-                made = Made.of(kind, size, setting)
-                setting.jobs[made.name] = made
-    jobs = setting.jobs
+def plan(mesh: Mesh, name: str, request: Request, before: dict[str, dict] | None = None) -> Plan:
+    """
+    What is measured of ``mesh``, of the file ``name``, in the variant that is set. ``before``: the records of an
+    earlier run, which are taken over but for the first size.
+    """
+    setting = Setting(mesh, name, request, array_module(mi.variant()), before or {})
+    first, jobs = request.sizes[0], setting.jobs
+    for kind, size in kinds.chosen(PARTS if request.ablation else KINDS, request.sizes, ONCE, request.without):
+        made = Made.of(kind, size, setting)
+        jobs[made.name] = made
+    shown = [name for name, job in jobs.items() if job.size == first]
+    ours = next((n for n in shown if jobs[n].kind == "ours"), "")
     candidates = [job.candidate() for job in jobs.values()]
-    grid = f"{GRID} {request.grid}³"
-    reference = {"is_reference": True, "in_passes": True}
-    candidates.append(Candidate(MESH, "mesh", bytes=12 * (len(mesh.vertices) + len(mesh.faces)), **reference))
-    candidates.append(Candidate(grid, "sdfgrid", bytes=4 * request.grid**3, **reference))
-    shown = [name for name, job in jobs.items() if job.nbytes == first]
-    traced = [name for name in shown if jobs[name].kind != "hash"]
-    stage_of = functools.cache(lambda: stage.Stage(mesh, request.film))
     cases = [
         Case("reads", lambda lanes: _reads(setting, shown, lanes), candidates=tuple(shown),
              query_names=("value", "normal")),
-        Case("rays", lambda lanes: _rays(setting, stage_of(), traced, grid, lanes),
-             lambda: _renders(setting, stage_of(), traced, grid), candidates=(*traced, MESH, grid),
-             query_names=("ray",)),
     ]  # fmt: skip
-    ours = next((n for n in shown if jobs[n].kind == "ours"), "")
+    compared, drawn = [n for n in shown if jobs[n].kind in AGAINST], {}
+    if not request.ablation:
+        grid = f"{GRID} {request.grid}³"
+        reference = {"is_reference": True, "in_passes": True}
+        candidates.append(Candidate(MESH, "mesh", bytes=12 * (len(mesh.vertices) + len(mesh.faces)), **reference))
+        candidates.append(Candidate(grid, "sdfgrid", bytes=4 * request.grid**3, **reference))
+        traced = [name for name in shown if jobs[name].kind != "hash"]
+        stage_of = functools.cache(lambda: stage.Stage(mesh, request.film))
+        cases.append(
+            Case("rays", lambda lanes: _rays(setting, stage_of(), traced, grid, lanes),
+                 lambda: _renders(setting, stage_of(), traced, grid), candidates=(*traced, MESH, grid),
+                 query_names=("ray",))
+        )  # fmt: skip
+        compared += [MESH, grid]
+        drawn = pictures.of(setting, stage_of)
     package = Path(__file__).resolve().parents[2]
-    made_by = [*(package / "tasks" / "sdf").glob("*.py"), package / "fitting.py", package / "indirection.py"]
-    made_by += [package / "studies" / "baselines" / f"{n}.py" for n in ("volumes", "hash_grids", "networks")]
+    made_by = [p for p in (package / "tasks" / "sdf").glob("*.py") if p.stem not in RAYS]
+    made_by += [package / "fitting.py", package / "indirection.py", package / "studies" / "sdf" / "parts.py"]
+    baselines = ("volumes", "direct_nodes", "hash_grids", "networks")
+    made_by += [package / "studies" / "baselines" / f"{n}.py" for n in baselines]
     return Plan(
         study="sdf",
-        title=f"Signed distance field: {Path(name).stem}",
+        title=f"Signed distance field: {Path(name).stem}" + ", parts of ours" * request.ablation,
         variant=mi.variant(),
         candidates=candidates,
         cases=cases,
         queries=("value",),
         accuracy="iou_near_db",
         accuracy_label="near the surface, −10 log₁₀(1 − IoU), dB",
-        ratios=[(ours, n) for n in (*(n for n in traced if jobs[n].kind in AGAINST), MESH, grid)] if ours else [],
+        ratios=[(ours, n) for n in compared] if ours else [],
         details={
             "source": name, "source_digest": mesh.digest, "triangles": len(mesh.faces), "request": asdict(request),
             "first": first, "film": list(request.film),
@@ -209,7 +248,7 @@ def plan(mesh: Mesh, name: str, request: Request) -> Plan:
         ],
         jobs=list(jobs.values()),
         jobs_fingerprint=fingerprint(made_by) + mesh.digest[:16],
-        pictures=pictures.of(setting, stage_of),
+        pictures=drawn,
         table=table,
         conclusions=conclusions,
     )  # fmt: skip
@@ -224,43 +263,29 @@ def _sentence(said: str, mesh: Mesh) -> str:
 # -- jobs -------------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Made(Job):
-    """A field of a ``kind`` in at most ``nbytes``: after :meth:`known` or :meth:`run`, ``field`` is what it became."""
+class Made(kinds.Made):
+    """A field of a kind in at most so many bytes."""
 
-    kind: str
-    nbytes: int
-    setting: Setting
-    name: str = ""
-    file: Path | None = None
+    labels, families, text = LABELS, FAMILIES, staticmethod(size_text)
 
     @staticmethod
     def of(kind: str, nbytes: int, setting: Setting) -> Made:
+        from . import parts
+
         own = Fitted if kind in PRESETS else Hashed if kind == "hash" else Sampled
-        return own(kind, nbytes, setting, f"{KINDS[kind]} {size_text(nbytes)}")
+        return parts.MADE.get(kind, own)(kind, nbytes, setting)
 
     def candidate(self) -> Candidate:
-        return Candidate(
-            self.name, FAMILIES[self.kind], size_text(self.nbytes), job=self.name, label=KINDS[self.kind],
-            in_passes=self.kind in RENDERED, details={"kind": self.kind, "asked": self.nbytes},
-        )  # fmt: skip
+        return super().candidate(in_passes=self.kind in RENDERED)
 
     def known(self, folder: Path | None, record: dict | None) -> dict | None:
-        self.file = folder / f"{file_name(self.name)}.npz" if folder else None
-        self.__dict__.pop("field", None)
-        return record if record and self.file is not None and self.file.is_file() else None
-
-    @functools.cached_property
-    def field(self) -> Field:
-        """The field, from the file of the models' folder if it was not just made."""
-        return self.load(self.file)
-
-    def load(self, path: Path) -> Field:
-        raise NotImplementedError
+        before = self.setting.before.get(self.name)
+        found = super().known(folder, record or before)
+        return found if self.size == self.setting.request.sizes[0] else found or before
 
     def record(self, found: Field, nbytes: int, seconds: float, file_bytes: int, **details) -> dict:
         self.field = found
-        if nbytes > self.nbytes:
+        if nbytes > self.size:
             raise AssertionError(f"{self.name}: takes {nbytes:,} bytes")
         details |= {"file_bytes": file_bytes, "spacing": found.spacing, "slope": found.slope}
         details |= {"bits": found.bits} if isinstance(found, volumes.DistanceNodes) else {}
@@ -274,7 +299,7 @@ class Sampled(Made):
         """The field, and how many seconds it took."""
         start, before = time.perf_counter(), 0.0
         setting, train = self.setting, volumes.Training() if self.kind.endswith("-trained") else None
-        types, distances, mesh, nbytes = setting.types, setting.distances, setting.mesh, self.nbytes
+        types, distances, mesh, nbytes = setting.types, setting.distances, setting.mesh, self.size
         name = self.kind.removesuffix("-trained")
         if name == "dense":
             found = volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
@@ -298,32 +323,26 @@ class Sampled(Made):
         return volumes.load(path, self.setting.types)
 
 
-class Fitted(Made):
+class Fitted(kinds.ByPreset, Made):
     """By a preset of ``fit sdf``."""
 
-    def run(self, folder: Path | None, progress: bool) -> dict | None:
-        request = self.setting.request
-        given = {"steps": request.steps} if request.steps else {}
-        if not self.file:
-            raise ValueError("ours is measured from a file: give a folder")
-        fitted = task.fit(
-            "sdf", PRESETS[self.kind], mi.variant(), progress=progress, output=self.file, deterministic=False,
-            source=self.setting.name, bytes=str(self.nbytes), **given,
-        )  # fmt: skip
-        if fitted.result.interrupted:
-            return None
-        save_table(self.file, fitted.table)
-        model, seconds = self.model(self.file), fitted.result.seconds
+    task_name = "sdf"
+
+    @property
+    def preset(self) -> str:
+        return PRESETS[self.kind][0]
+
+    def arguments(self) -> dict:
+        setting = self.setting
+        given = {"steps": setting.request.steps} if setting.request.steps else {}
+        return {"source": setting.name, "bytes": str(self.size), **given, **PRESETS[self.kind][1]}
+
+    def fitted(self, model, fitted, seconds: float) -> dict:
+        trained = fitted.result.seconds
         return self.record(
-            model.field, model.nbytes, fitted.figures["prepared_seconds"] + seconds, self.file.stat().st_size,
-            steps=fitted.result.steps, trained_seconds=seconds,
+            model.field, model.nbytes, fitted.figures["prepared_seconds"] + trained, self.file.stat().st_size,
+            steps=fitted.result.steps, trained_seconds=trained,
         )  # fmt: skip
-
-    def model(self, path: Path):
-        return task.tasks()["sdf"].open(self.setting.types.TensorXf, str(path))
-
-    def load(self, path: Path) -> Field:
-        return self.model(path).field
 
 
 class Hashed(Made):
@@ -334,7 +353,7 @@ class Hashed(Made):
         setting, (steps, longest) = self.setting, self.setting.request.hash_steps
 
         def problem():
-            net = hash_grids.network(self.nbytes)
+            net = hash_grids.network(self.size)
             return hash_grids.HashProblem(net, setting.types, setting.mesh, *setting.pools)
 
         settings = FitSettings(**{**asdict(HASH_SETTINGS), "steps": steps})
@@ -342,6 +361,7 @@ class Hashed(Made):
 
     def known(self, folder: Path | None, record: dict | None) -> dict | None:
         super().known(folder, record)
+        record = record or self.setting.before.get(self.name)
         return record if record and self.training.known(folder, record) else None
 
     def load(self, path: Path) -> Field:
@@ -395,7 +415,6 @@ def _renders(setting: Setting, view: stage.Stage, names: list[str], grid: str) -
 
 
 def _grid_field(setting: Setting) -> Field:
-    """What ``sdfgrid`` is decoded from: the field with the least error of solids."""
-    jobs = setting.jobs.values()
-    best = min((job for job in jobs if job.kind != "hash"), key=lambda job: (job.kind != "ours", -job.nbytes))
-    return best.field
+    """What ``sdfgrid`` is decoded from: ours of the first size, or else another one."""
+    shown = (job for job in setting.jobs.values() if job.kind != "hash" and job.size == setting.request.sizes[0])
+    return min(shown, key=lambda job: job.kind != "ours").field

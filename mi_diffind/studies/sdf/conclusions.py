@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ...measure.frame import PASS
+from ...measure.kinds import by_size, ours_of, times_that_of
 from ...measure.words import enumeration, grid
 
 #: What verdicts are about: its name, the error, how it is written, whether more is better.
@@ -22,15 +23,6 @@ DECISIVE = ("iou", "iou_near", "normal_deg")
 def size_text(nbytes: int) -> str:
     """``262144`` → ``"256 KiB"``."""
     return f"{nbytes / 2**20:g} MiB" if nbytes >= 2**20 else f"{nbytes / 2**10:g} KiB"
-
-
-def by_size(result: dict) -> dict[int, dict[str, dict]]:
-    """Bytes that were asked for → name → candidate."""
-    found: dict[int, dict[str, dict]] = {}
-    for name, c in result["candidates"].items():
-        if c["details"].get("asked") and c["errors"]:
-            found.setdefault(c["details"]["asked"], {})[name] = c
-    return dict(sorted(found.items()))
 
 
 def table(result: dict) -> list[str]:
@@ -84,13 +76,11 @@ def _kind(name: str, size: int) -> str:
 def _times(result: dict) -> list[str]:
     """Sentences about rays, reads and renders."""
     lines = []
-    first = by_size(result).get(result["details"]["first"], {})
-    ours = next((name for name, c in first.items() if c["details"]["kind"] == "ours"), "")
+    ours = ours_of(result)
     rays = result["cases"].get("rays", {})
     for query, what in (("ray", "A primary ray"), (PASS, "A render")):
         pairs = rays.get("ratios", {}).get(query, {})
-        found = [(pair.removeprefix(f"{ours} / "), r["median"]) for pair, r in pairs.items() if pair.startswith(ours)]
-        texts = [f"{value:.2f} times that of {name}" for name, value in found if value == value]
+        texts = times_that_of(pairs, ours)
         if ours and texts:
             timings = rays["queries"][query] if query in rays["queries"] else rays["passes"][query]
             unit = "ns" if query == "ray" else "ms"

@@ -8,9 +8,10 @@ import drjit as dr
 import numpy as np
 
 from ...measure import plot
+from ...measure.kinds import by_size
 from ...measure.words import machine_line, state
 from . import stage
-from .conclusions import by_size, size_text
+from .conclusions import size_text
 
 #: The error of normals that is as dark as it gets, in degrees.
 WORST = 15.0
@@ -44,7 +45,7 @@ def shapes(setting, view: stage.Stage, result: dict):
     errors of all sizes against bytes, and of the first against the time of a ray.
     """
     first = result["details"]["first"]
-    kinds = {job.kind: job for job in setting.jobs.values() if job.nbytes == first}
+    kinds = {job.kind: job for job in setting.jobs.values() if job.size == first}
     shown = [kinds[k] for k in SHOWN if k in kinds]
     columns = max(3, len(shown) + 1)
     caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"

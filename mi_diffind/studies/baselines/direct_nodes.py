@@ -1,0 +1,130 @@
+"""
+What is left of our sparse signed distance fields without indirection: a distance and a normal in the 16 bits of each
+node, trained as ours are, and read by the same blend.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import drjit as dr
+import numpy as np
+
+from ...tasks.sdf import codes, encoding
+from ...tasks.sdf.nodes import SparseNodes, slope_bound
+from ...tasks.sdf.structure import Structure
+from .volumes import NEAREST
+
+#: Steps of a distance between ± :data:`.volumes.NEAREST`, and of each of the normal's octahedral coordinates: of all
+#: that 16 bits can tell apart, those with the best normals.
+LEVELS, SIDE = 128, 22
+
+
+def to_octahedral(normals: np.ndarray) -> np.ndarray:
+    """The whole numbers (n, 2) below :data:`SIDE` whose unit vectors are nearest to ``normals`` (n, 3)."""
+    n = normals / np.maximum(np.abs(normals).sum(axis=1, keepdims=True), 1e-30)
+    folded = (1 - np.abs(n[:, 1::-1])) * np.where(n[:, :2] >= 0, 1, -1)
+    top = SIDE - 1
+    below = np.floor((np.where(n[:, 2:] < 0, folded, n[:, :2]) + 1) / 2 * top)
+    candidates = np.clip(below[:, None] + [[0, 0], [0, 1], [1, 0], [1, 1]], 0, top).astype(np.uint32)
+    near = np.einsum("nkc,nc->nk", octahedral(candidates), normals)
+    return np.take_along_axis(candidates, near.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+
+
+def octahedral(numbers: np.ndarray) -> np.ndarray:
+    """The unit vectors (…, 3) that whole numbers (…, 2) stand for."""
+    x, y = np.moveaxis(numbers * (2 / (SIDE - 1)) - 1, -1, 0)
+    z = 1 - np.abs(x) - np.abs(y)
+    t = np.maximum(-z, 0)
+    found = np.stack([x - np.copysign(t, x), y - np.copysign(t, y), z], axis=-1)
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+
+
+def _distances(numbers: np.ndarray) -> np.ndarray:
+    """The distances, in spacings, of what nodes hold."""
+    return (numbers % LEVELS + 0.5 * (1 - LEVELS)) * (2 * NEAREST / LEVELS)
+
+
+def _normals(numbers: np.ndarray) -> np.ndarray:
+    """The whole numbers (n, 2) of the normals of what nodes hold."""
+    return np.stack([numbers // LEVELS % SIDE, numbers // (LEVELS * SIDE)], axis=-1).astype(np.uint32)
+
+
+class DirectNodes(SparseNodes):
+    """The nodes of a sparse ``structure`` as ``numbers`` (n,), uint16, in its order."""
+
+    def __init__(self, types, structure: Structure, numbers: np.ndarray, slope: float):
+        words = codes.pointer_words(numbers, 16)
+        super().__init__(types, structure, slope, pointers=words, bits=16)
+        self.state = {"numbers": numbers, "slope": slope}
+        self.state |= {f"structure_{f.name}": getattr(structure, f.name) for f in dataclasses.fields(structure)}
+        self.kept = 4 * len(words)
+
+    def _node(self, number, record, i, j, k, active):
+        Float, number = self.types.Float, codes.pointer_at(self._pointers, number, 16, active)
+        normal = number // LEVELS
+        distance = (Float(number - normal * LEVELS) + 0.5 * (1 - LEVELS)) * (2 * NEAREST / LEVELS)
+        y = normal // SIDE
+        x, y = (dr.fma(Float(v), 2 / (SIDE - 1), -1) for v in (normal - y * SIDE, y))
+        z = 1 - dr.abs(x) - dr.abs(y)
+        t = dr.maximum(-z, 0)
+        x, y = x - dr.copysign(t, x), y - dr.copysign(t, y)
+        inverse = dr.rsqrt(dr.fma(x, x, dr.fma(y, y, z * z)))
+        return distance, (x * inverse, y * inverse, z * inverse)
+
+    @property
+    def nbytes(self) -> int:
+        return self.structure.nbytes + self.kept
+
+
+class DirectCoding(encoding.Coding):
+    """
+    In place of frames, a cascaded array and pointers: the ``pointers`` are numbers that say it all. Decided on as those
+    are: half of the nodes first; no node changes its side; the surface stays within the cells.
+    """
+
+    def __init__(self, sampled: encoding.Sampled, seed: int = 0):
+        super().__init__(sampled, 16, seed)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the field."""
+        structure = self.sampled.structure
+        return structure.nbytes + 4 * -(-structure.nodes // 2)
+
+    def commit(self, values: np.ndarray, share: float) -> None:
+        order = np.random.default_rng([self.seed, 1]).random(len(values))
+        now = np.flatnonzero((order < share) & ~self.done)
+        self._write(now, values[now, 0], to_octahedral(values[now, 1:]))
+        self.done[now] = True
+        self._keep_sides(values, now)
+        for _ in range(encoding.REPAIRS if share >= 1 else 0):
+            self._keep_sides(values, self._hold_borders())
+
+    def _write(self, nodes: np.ndarray, distances: np.ndarray, normals: np.ndarray) -> None:
+        d = np.floor(distances * (LEVELS / 2 / NEAREST)) + LEVELS // 2
+        inside = self.side[nodes] < 0
+        d = np.clip(d, np.where(inside, 0, LEVELS // 2), np.where(inside, LEVELS // 2 - 1, LEVELS - 1))
+        self.pointers[nodes] = d.astype(np.uint32) + LEVELS * (normals[:, 0] + SIDE * normals[:, 1])
+
+    def _distances(self, nodes: np.ndarray, pointers: np.ndarray) -> np.ndarray:
+        return self.side[nodes, None] * _distances(pointers)
+
+    def _keep_sides(self, wanted: np.ndarray, nodes: np.ndarray) -> None:
+        wrong = nodes[self._distances(nodes, self.pointers[nodes, None])[:, 0] < self.least[nodes]]
+        # Up to the next step
+        least = self.least[wrong] + NEAREST / LEVELS
+        self._write(wrong, self.side[wrong] * least, _normals(self.pointers[wrong]))
+
+    def values(self) -> np.ndarray:
+        normals = octahedral(_normals(self.pointers))
+        return np.concatenate([_distances(self.pointers)[:, None], normals], axis=1).astype(np.float32)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {"pointers": self.pointers, "done": self.done}
+
+    def field(self, types) -> DirectNodes:
+        """What it decided on."""
+        told = self.values().astype(np.float64)
+        slope = slope_bound(told[:, 0], told[:, 1:], self.sampled.corners)
+        return DirectNodes(types, self.sampled.structure, self.pointers.astype(np.uint16), slope)
