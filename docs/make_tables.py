@@ -251,6 +251,34 @@ def sdf_times(study: str) -> str:
     return table(head, rows)
 
 
+def sdf_parts(study: str) -> str:
+    """What the parts of our distance fields are worth, in equal bytes."""
+    rows = []
+    for c in measured(study)["candidates"].values():
+        e = c["errors"]
+        pieces = f"{e['components']:,}" if "components" in e else ""
+        rows.append([
+            c["label"], f"{c['bytes']:,}", f"{e['iou']:.4f} / {e['iou_near']:.4f}",
+            f"{e['normal_deg']:.2f}° / {e['normal_p95_deg']:.1f}°", pieces,
+        ])  # fmt: skip
+    return table(["", "bytes", "IoU / within 0.01", "normals: mean / 95%", "pieces"], rows)
+
+
+def sdf_rays() -> str:
+    """Rays through the arrays of distance fields, and through ``sdfgrid``, beside Embree."""
+    rows = []
+    for file in measured("bench_sdf")["files"]:
+        for kind in ("primary", "random"):
+            mesh, *others = (row for row in file["rows"] if row["rays"] == kind)
+            arrays = others.pop()
+            rows.append([
+                f"{file['name']}, {file['triangles']:,} triangles", kind, f"{mesh['ns']:.0f}", f"{arrays['ratio']:.1f}",
+                *(f"{row['ratio']:.1f}" for row in others), f"{100 * arrays['hits_differ']:.3f}%",
+            ])  # fmt: skip
+    times = (f"{row['name']}, times that" for row in (arrays, *others))
+    return table(["mesh", "rays", "Embree, ns", *times, "hits that differ"], rows)
+
+
 def field_errors(study: str) -> str:
     """Radiance fields, by how many times smaller than a dense grid: PSNR before white, and of the foreground."""
     from mi_diffind.measure.kinds import by_size
@@ -329,6 +357,7 @@ for source in ("", "_boombox"):
 for source in ("suzanne", "armadillo", "bunny"):
     for make in (sdf_errors, sdf_times):
         TABLES[f"{make.__name__}_{source}"] = lambda make=make, source=source: make(f"tradeoff_sdf_{source}")
+TABLES |= {"sdf_parts": lambda: sdf_parts("tradeoff_sdf_parts_armadillo"), "sdf_rays": sdf_rays}
 TABLES |= {
     "field_errors": lambda: field_errors("tradeoff_field"),
     "field_errors_50": lambda: field_errors("tradeoff_field_50"), "field_times": lambda: field_times("tradeoff_field"),

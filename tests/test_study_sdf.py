@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import solids
 
+from mi_diffind import fitting
 from mi_diffind.cli import main
 from mi_diffind.measure import frame
-from mi_diffind.studies.baselines import hash_grids, volumes
-from mi_diffind.studies.sdf import candidates, conclusions
+from mi_diffind.studies.baselines import direct_nodes, hash_grids, volumes
+from mi_diffind.studies.sdf import candidates, conclusions, parts
+from mi_diffind.tasks import task
+from mi_diffind.tasks.sdf import encoding, nodes, training
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
 CORNERS = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)])
@@ -181,7 +184,8 @@ def test_training_leaves_what_is_exact():
 class Ball(Torus):
     """A ball's distances, with a mesh."""
 
-    mesh = make_mesh(*solids.sphere(24), "ball.ply")
+    mesh = surface = make_mesh(*solids.sphere(24), "ball.ply")
+    warnings = ()
 
     def signed(self, p, limit=math.inf):
         return np.clip(np.linalg.norm(p, axis=1) - 0.5, -limit, limit).astype(np.float32)
@@ -213,6 +217,52 @@ def test_files_of_fields(fields, tmp_path, rng):
         assert np.array_equal(found.value(points).numpy(), field.value(points).numpy()), name
         assert (found.nbytes, found.slope) == (field.nbytes, field.slope)
         assert path.stat().st_size == volumes.file_bytes(field)
+
+
+def test_normals_are_the_nearest_that_can_be_stored(rng):
+    normals = rng.normal(size=(500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    side = direct_nodes.SIDE
+    every = direct_nodes.octahedral(np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2))
+    assert np.abs(np.linalg.norm(every, axis=1) - 1).max() < 1e-12
+    assert direct_nodes.LEVELS * side**2 <= 2**16
+    found = np.sum(direct_nodes.octahedral(direct_nodes.to_octahedral(normals)) * normals, axis=1)
+    best = (normals @ every.T).max(axis=1)
+    assert np.mean(found < best - 1e-9) < 0.02 and np.degrees(np.arccos(found)).mean() < 90 / side
+
+
+def test_nodes_without_indirection(rng, tmp_path):
+    """What they say is what was stored, by NumPy; no node changes its side; files; bytes."""
+    sampled = encoding.sample(Ball(), 1 / 24)
+    coding = direct_nodes.DirectCoding(sampled)
+    count = sampled.structure.nodes
+    off = np.concatenate([sampled.distances[:, None] + rng.normal(0, 0.3, (count, 1)), sampled.normals], axis=1)
+    coding.commit(off, 0.5)
+    assert 0.4 < coding.done.mean() < 0.6
+    coding.commit(off, 1.0)
+    assert coding.done.all()
+    values = coding.values().astype(np.float64)
+    assert np.array_equal(values[:, 0] < 0, sampled.distances < 0)
+    assert (np.abs(values[:, 0]) >= coding.least - 1e-6).mean() > 0.99
+    step, kept = 2 * volumes.NEAREST / direct_nodes.LEVELS, np.abs(off[:, 0]) < volumes.NEAREST
+    kept &= ((off[:, 0] < 0) == (sampled.distances < 0)) & (coding.least == encoding.LEAST)
+    assert kept.mean() > 0.5 and np.abs(values - off)[kept, 0].max() < 0.51 * step
+    field = coding.field(T)
+    assert field.nbytes == coding.nbytes == sampled.structure.nbytes + 4 * -(-count // 2)
+    cells = sampled.corners[rng.integers(len(sampled.corners), size=2000)]
+    place = rng.random((len(cells), 3))
+    h, lower = field.spacing, np.array(sampled.structure.lower)
+    points = lower + (sampled.positions[cells[:, 0]] + place) * h
+    expected = 0
+    for n, corner in enumerate(CORNERS):
+        d, g = values[cells[:, n], 0], values[cells[:, n], 1:]
+        weight = np.prod(np.where(corner == 1, place, 1 - place), axis=1)
+        expected = expected + weight * (d + 0.5 * np.sum(g * (place - corner), axis=1))
+    found = field.value(arrays(points)).numpy()
+    assert np.abs(found - h * expected.clip(-2, 2)).max() < 1e-5
+    volumes.save(tmp_path / "a.npz", field)
+    again = volumes.load(tmp_path / "a.npz", T, direct_nodes.DirectNodes)
+    assert np.array_equal(again.value(arrays(points)).numpy(), found) and again.slope == field.slope
 
 
 def test_hash_grid(rng):
@@ -329,6 +379,55 @@ def test_fields_and_meshes_are_in_one_place(folder):
         assert np.median(np.abs(t[both] - expected[both])) < 5e-3
 
 
+def test_trained_in_other_ways():
+    """No pointer before the end; nothing trained; and the usual way."""
+    settings, coded, moved = fitting.FitSettings(steps=10, batch=2**10, lr=1e-2, measure_every=10), {}, {}
+    for way in (task.Request, parts.AtOnce, parts.Untrained):
+        coding = encoding.Coding(encoding.sample(Ball(), 1 / 12), 10)
+        field = nodes.SparseNodes(T, coding.sampled.structure, 1.0)
+        problem = training.NodeProblem(field, Ball.mesh, coding, SimpleNamespace(measure=lambda field: {"x": 0.0}))
+        way("sparse", settings, T, progress=False).train(problem)
+        coded[way] = coding.done.mean()
+        moved[way] = np.abs(problem.net.values.numpy()[:, 0] - coding.sampled.distances).max() > 1e-3
+    assert list(moved.values()) == [True, True, False]
+    assert 0.7 < coded[task.Request] < 0.9 and coded[parts.AtOnce] == coded[parts.Untrained] == 0
+
+
+def test_parts_are_jobs(tmp_path):
+    """Which there are; those without indirection are made and known again."""
+    made = ("untrained", "direct", "direct-untrained")
+    without = tuple(kind for kind in candidates.PARTS if kind not in made)
+    plan = candidates.plan(Ball.mesh, "ball.ply", candidates.Request((24576,), without, True, 2**10, 10))
+    assert [c.details["kind"] for c in plan.candidates] == list(made) and [c.name for c in plan.cases] == ["reads"]
+    assert (plan.jobs[0].preset, isinstance(plan.jobs[0], parts.Changed)) == ("", True)
+    records = []
+    for job in plan.jobs[1:]:
+        job.setting.distances, job.setting.errors = Ball(), lambda field: {}
+        assert job.known(tmp_path, None) is None
+        records.append(job.run(tmp_path, False))
+        assert 0.9 * 24576 < records[-1]["bytes"] <= 24576
+        field = job.field
+        assert job.known(tmp_path, records[-1]) == records[-1] and job.field is not field
+        assert (job.field.nbytes, job.field.slope) == (field.nbytes, field.slope)
+    assert [r["details"]["steps"] for r in records] == [10, 0]
+    assert not np.array_equal(*(job.field.state["numbers"] for job in plan.jobs[1:]))
+
+
+def test_errors_of_an_earlier_run(folder):
+    """They stand for what is not timed; what is timed is made unless its file is there."""
+    from mi_diffind.tasks.sdf.mesh import load_mesh
+
+    request = candidates.Request((24576, 32768), tuple(LEFT_OUT))
+    mesh, models = load_mesh(folder / "dent.ply"), folder / "out" / "tradeoff_sdf_models"
+    plan = candidates.plan(mesh, str(folder / "dent.ply"), request)
+    assert [job.known(models, None) for job in plan.jobs] == [None] * 4
+    before = {job.name: {"name": job.name} for job in plan.jobs}
+    plan = candidates.plan(mesh, str(folder / "dent.ply"), request, before)
+    assert [job.known(models, None) for job in plan.jobs] == list(before.values())
+    assert [job.known(None, None) for job in plan.jobs] == [None, None, *list(before.values())[2:]]
+    assert plan.jobs[0].known(models, {"own": 1}) == {"own": 1}
+
+
 def result_of(**errors):
     """A result with candidates of 1 MiB: kind → errors."""
     made = {
@@ -377,6 +476,8 @@ def test_sentences_about_times():
     [
         (["--bytes", "0"], "0"),
         (["--without", "bricks"], '--without: found "bricks", allowed are dense, dense-trained'),
+        (["--ablation", "--without", "hash"], '--without: found "hash", allowed are ours, bits6'),
+        (["--errors-of", "none.json"], "--errors-of: none.json is not what --json wrote of this study"),
     ],
 )
 def test_bad_options(tmp_path, options, message, capsys):
@@ -384,6 +485,12 @@ def test_bad_options(tmp_path, options, message, capsys):
     assert main(["tradeoff", "sdf", str(tmp_path / "ball.ply"), "--out", str(tmp_path / "out"), *options]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_errors_of_another_mesh(folder, tmp_path, capsys):
+    solids.write(tmp_path / "ball.ply", solids.sphere(8))
+    assert main(["tradeoff", "sdf", str(tmp_path / "ball.ply"), "--errors-of", str(folder / "r.json")]) == 2
+    assert "is of another mesh than" in capsys.readouterr().err
 
 
 def test_no_mesh(tmp_path, capsys):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...measure import plot
+from ...measure.curves import against_time, curves, finish
 from ...measure.kinds import by_size
 from ...measure.words import machine_line, state
 from ...tasks.field.training import rendered, shown
@@ -80,13 +81,7 @@ def views(setting, result: dict):
 def _curves(axes, result: dict) -> None:
     """PSNR of the foreground against bytes, a line for each kind; the grids as lines across."""
     made = [c for found in by_size(result).values() for c in found.values()]
-    for kind, (colour, marker, line) in STYLES.items():
-        own = [c for c in made if c["details"]["kind"] == kind]
-        points = sorted((c["bytes"] / 1e6, c["errors"][FOREGROUND]) for c in own)
-        if points:
-            axes.plot(*zip(*points, strict=True), color=colour, marker=marker, markersize=5, linestyle=line,
-                      label=own[0]["label"], linewidth=2.0 if kind == "ours" else 1.0,
-                      markerfacecolor="white" if line == ":" else colour)  # fmt: skip
+    curves(axes, made, STYLES, lambda c: (c["bytes"] / 1e6, c["errors"][FOREGROUND]), 5)
     for name, c in references(result).items():
         axes.axhline(c["errors"][FOREGROUND], color="0.55", linestyle=(0, (1, 1.5)))
         axes.text(0.99, c["errors"][FOREGROUND], name, transform=axes.get_yaxis_transform(), fontsize=7, ha="right",
@@ -96,38 +91,14 @@ def _curves(axes, result: dict) -> None:
     plot.log_ticks(axes.xaxis, low, high, plot.plain)
     axes.set_xlabel("megabytes: ours and dense grids in memory, the others on disk, deflated", fontsize=8)
     axes.legend(fontsize=7, frameon=False, loc="lower right")
-    _finish(axes, "PSNR of the foreground, dB")
+    finish(axes, "PSNR of the foreground, dB")
 
 
 def _against_time(axes, result: dict) -> list[plot.Label]:
     """PSNR of the foreground against the time of a picture, of the first size."""
-    labels, timings = [], result["cases"].get("reads", {}).get("passes", {}).get("render", {})
-    for name, t in timings.items():
-        c = result["candidates"][name]
-        if c["is_reference"]:
-            axes.axvline(t["time"], color="0.55", linestyle=(0, (1, 1.5)))
-            axes.text(t["time"], 0.98, c["label"], transform=axes.get_xaxis_transform(), fontsize=7, rotation=90,
-                      va="top", ha="right", color="0.4")  # fmt: skip
-            continue
-        colour, marker, line = STYLES[c["details"]["kind"]]
-        at = (t["time"], c["errors"][FOREGROUND])
-        axes.plot(*at, color=colour, marker=marker, markersize=5, linestyle="none",
-                  markerfacecolor="white" if line == ":" else colour)  # fmt: skip
-        labels.append(plot.Label(c["label"], at, colour, "bold" if c["label"] == "ours" else "normal"))
-    if timings:
-        axes.set_xscale("log")
-        low, high = axes.get_xlim()
-        axes.set_xlim(low / 1.5, high * 1.5)
-        plot.log_ticks(axes.xaxis, low / 1.5, high * 1.5, plot.plain)
+    timings = result["cases"].get("reads", {}).get("passes", {}).get("render", {})
     side = result["details"]["request"]["film"]
-    axes.set_xlabel(f"ms a picture of {side}², {ratio_text(result['details']['first'])}", fontsize=8)
-    _finish(axes, "PSNR of the foreground, dB")
+    axis = f"ms a picture of {side}², {ratio_text(result['details']['first'])}"
+    labels = against_time(axes, result, timings, STYLES, FOREGROUND, axis)
+    finish(axes, "PSNR of the foreground, dB")
     return labels
-
-
-def _finish(axes, label: str) -> None:
-    axes.set_ylabel(label, fontsize=8)
-    axes.tick_params(labelsize=7)
-    axes.minorticks_off()
-    axes.grid(color="0.92", linewidth=0.5)
-    axes.set_axisbelow(True)

@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 
 from ...measure import plot
+from ...measure.curves import against_time, curves, finish
 from ...measure.kinds import by_size
 from ...measure.words import machine_line, state
 from . import stage
@@ -117,13 +118,7 @@ def _shaded(normals: np.ndarray, hit: np.ndarray) -> np.ndarray:
 def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
     """An error against bytes, a line for each kind."""
     made = [c for found in by_size(result).values() for c in found.values()]
-    for kind, (colour, marker, line) in STYLES.items():
-        own = [c for c in made if c["details"]["kind"] == kind]
-        points = sorted((c["bytes"], 1 - c["errors"][key] if missing else c["errors"][key]) for c in own)
-        if points:
-            axes.plot(*zip(*points, strict=True), color=colour, marker=marker, markersize=4, linestyle=line,
-                      label=own[0]["label"], linewidth=2.0 if kind == "ours" else 1.0,
-                      markerfacecolor="white" if line == ":" else colour)  # fmt: skip
+    curves(axes, made, STYLES, lambda c: (c["bytes"], 1 - c["errors"][key] if missing else c["errors"][key]))
     sizes = sorted({c["details"]["asked"] for c in made})
     axes.set_xscale("log", base=2)
     axes.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
@@ -133,7 +128,7 @@ def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
     plot.log_ticks(axes.yaxis, low, high, lambda v: f"{v:.2g}")
     axes.xaxis.set_major_formatter(lambda value, _: size_text(round(value)))
     axes.set_xlabel("memory", fontsize=8)
-    _finish(axes, label)
+    finish(axes, label)
 
 
 def _legend(found, above: float) -> None:
@@ -147,32 +142,8 @@ def _legend(found, above: float) -> None:
 
 def _against_time(axes, result: dict) -> list[plot.Label]:
     """The error of normals against the time of a ray; the times of the mesh and of ``sdfgrid`` as lines."""
-    labels, timings = [], result["cases"].get("rays", {}).get("queries", {}).get("ray", {})
-    for name, t in timings.items():
-        c = result["candidates"][name]
-        if c["is_reference"]:
-            axes.axvline(t["time"], color="0.55", linestyle=(0, (1, 1.5)))
-            axes.text(t["time"], 0.98, c["label"], transform=axes.get_xaxis_transform(), fontsize=7, rotation=90,
-                      va="top", ha="right", color="0.4")  # fmt: skip
-            continue
-        colour, marker, line = STYLES[c["details"]["kind"]]
-        at = (t["time"], c["errors"]["normal_deg"])
-        axes.plot(*at, color=colour, marker=marker, markersize=5, linestyle="none",
-                  markerfacecolor="white" if line == ":" else colour)  # fmt: skip
-        labels.append(plot.Label(c["label"], at, colour, "bold" if c["label"] == "ours" else "normal"))
-    if timings:
-        axes.set_xscale("log")
-        low, high = axes.get_xlim()
-        axes.set_xlim(low / 1.5, high * 1.5)
-        plot.log_ticks(axes.xaxis, low / 1.5, high * 1.5, plot.plain)
-    axes.set_xlabel(f"ns a primary ray, {size_text(result['details']['first'])}", fontsize=8)
-    _finish(axes, "normals, mean error in degrees")
+    timings = result["cases"].get("rays", {}).get("queries", {}).get("ray", {})
+    axis = f"ns a primary ray, {size_text(result['details']['first'])}"
+    labels = against_time(axes, result, timings, STYLES, "normal_deg", axis)
+    finish(axes, "normals, mean error in degrees")
     return labels
-
-
-def _finish(axes, label: str) -> None:
-    axes.set_ylabel(label, fontsize=8)
-    axes.tick_params(labelsize=7)
-    axes.minorticks_off()
-    axes.grid(color="0.92", linewidth=0.5)
-    axes.set_axisbelow(True)
