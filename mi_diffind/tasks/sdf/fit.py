@@ -27,8 +27,9 @@ FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 8
 #: How much smaller than asked for a sparse field may be.
 TOLERANCE = 0.02
 
-#: What a cell that the surface passes through takes, at least.
-BYTES_PER_CELL = 3
+#: Bytes that a cell that the surface passes through takes, at least: of masks and frames, and of pointers if each had a
+#: word of its own.
+BYTES_PER_CELL, WORDS_PER_CELL = 1, 6
 
 #: Samples of the dense arrays, and the share that is uniform in the box.
 SAMPLES, UNIFORM = 2**20, 0.2
@@ -107,7 +108,8 @@ def sampled_for(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
         # Nodes, blocks and their words grow with the square. Where a solid is thinner than cells, so do those that its
         # surface passes through
         fixed = 4 * entries_for(sampled, bits)
-        expected = max(size - fixed, BYTES_PER_CELL * sampled.cells)
+        least = BYTES_PER_CELL + WORDS_PER_CELL / codes.POINTERS[bits]
+        expected = max(size - fixed, least * sampled.cells)
         aim = spacing * np.sqrt(expected / max((1 - TOLERANCE / 2) * nbytes - fixed, 1))
         following = float(np.clip(aim, FINEST, COARSEST))
         if following in tried:
