@@ -47,9 +47,9 @@ class Marcher:
         self.cells, self.beside, self.regions, self.words = (
             UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (words, beside, regions, blocks)
         )
-        self.slabs = None
-        if field.nodes is None:
-            self.slabs = UInt32(slabs_of(crossed, inside, node, field.decoded(), field.frames()))
+        self.slabs, nodes = None, field.decoded()
+        if nodes is not None:
+            self.slabs = UInt32(slabs_of(crossed, inside, node, nodes, field.frames()))
 
     @property
     def nbytes(self) -> int:

@@ -242,8 +242,10 @@ class SparseNodes(Field):
         """The words of the blocks' frames, ``(B,)``."""
         return np.array(self._blocks).reshape(-1, 4)[:, 3]
 
-    def decoded(self) -> np.ndarray:
-        """What the nodes of a field that is not trained hold: distances in spacings and gradients, ``(n, 4)``."""
+    def decoded(self) -> np.ndarray | None:
+        """What nodes hold: distances in spacings and gradients, ``(n, 4)``; none if they may be trained."""
+        if self._entries is None:
+            return None
         pointers = codes.pointers_of(np.array(self._pointers), self.bits, self.structure.nodes)
         entries = codes.entries_numpy(np.array(self._entries), *self._affine)
         return decoded_nodes(self.structure, self.frames(), entries[pointers])
