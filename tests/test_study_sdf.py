@@ -17,7 +17,7 @@ from mi_diffind.measure import frame
 from mi_diffind.studies.baselines import direct_nodes, hash_grids, volumes
 from mi_diffind.studies.sdf import candidates, conclusions, parts
 from mi_diffind.tasks import task
-from mi_diffind.tasks.sdf import encoding, nodes, training
+from mi_diffind.tasks.sdf import encoding, nodes, tracing, training
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
 CORNERS = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)])
@@ -260,6 +260,12 @@ def test_nodes_without_indirection(rng, tmp_path):
         expected = expected + weight * (d + 0.5 * np.sum(g * (place - corner), axis=1))
     found = field.value(arrays(points)).numpy()
     assert np.abs(found - h * expected.clip(-2, 2)).max() < 1e-5
+    away = rng.normal(size=(3000, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    t, hit = tracing.trace(field, arrays(0.9 * away), arrays(-away), math.inf)
+    met = (0.9 - t.numpy()[:, None]) * away
+    assert hit.numpy().all() and np.abs(np.linalg.norm(met, axis=1) - 0.5).max() < 1.5 * h
+    assert np.abs(field.value(arrays(met)).numpy()).max() < 1e-4
     volumes.save(tmp_path / "a.npz", field)
     again = volumes.load(tmp_path / "a.npz", T, direct_nodes.DirectNodes)
     assert np.array_equal(again.value(arrays(points)).numpy(), found) and again.slope == field.slope

@@ -207,7 +207,7 @@ def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
              query_names=("density", "both")),
     ]  # fmt: skip
     package = Path(__file__).resolve().parents[2]
-    made_by = [*(package / "tasks" / "field").glob("*.py"), package / "fitting.py", Path(__file__), kinds.__file__]
+    made_by = [*(package / "tasks" / "field").glob("*.py"), package / "fitting.py", Path(__file__)]
     made_by += (package / "studies" / "baselines").glob("radiance*.py")
     made_by.append(package / "studies" / "baselines" / "node_codes.py")
     return Plan(

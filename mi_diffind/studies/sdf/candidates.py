@@ -96,7 +96,7 @@ PRESETS = {
 }  # fmt: skip
 
 #: Modules of the task that fields, once made, do not depend on.
-RAYS = ("marching", "tracing", "decode")
+RAYS = ("index", "marching", "tracing", "decode")
 
 #: What renders and rays are compared with.
 MESH, GRID = "mesh (Embree)", "sdfgrid"
