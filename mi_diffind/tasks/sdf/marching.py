@@ -16,7 +16,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from .codes import frames
+from . import codes
 from .index import EMPTY, INSIDE, MIDDLE, SLAB, STEPS, cells_of, slabs_of, words_of
 from .nodes import CORNERS
 from .structure import _words
@@ -35,7 +35,7 @@ class Marcher:
     """
     What rays go by, in memory: for each region, and each block of those with nodes, a word that says how many around it
     are empty and their sign, or its number; for each block with crossed cells, which these are, the signs of the
-    others, the numbers of the blocks beside it, and its slab.
+    others, the numbers of the blocks beside it, and its plane and slab.
     """
 
     def __init__(self, field):
@@ -49,7 +49,9 @@ class Marcher:
         )
         self.slabs, nodes = None, field.decoded()
         if nodes is not None:
-            self.slabs = UInt32(slabs_of(crossed, inside, node, nodes, field.frames()))
+            frames = field.frames()
+            slabs = np.stack([frames, slabs_of(crossed, inside, node, nodes, frames)], axis=1)
+            self.slabs = UInt32(slabs.reshape(-1))
 
     @property
     def nbytes(self) -> int:
@@ -113,9 +115,9 @@ class Marcher:
         Where a ray enters and leaves the slab of the block with this number, which holds ``cell``, and whether it is
         below the slab at ``t``.
         """
-        UInt32, Float = self.field.types.UInt32, self.field.types.Float
-        n, d, _ = frames(dr.gather(UInt32, self.field._blocks, number * 4 + 3, active), self.field.types)
-        word = dr.gather(UInt32, self.slabs, number, active)
+        Float = self.field.types.Float
+        frame, word = dr.gather(self.field.types.Array2u, self.slabs, number, active)
+        n, d, _ = codes.frames(frame, self.field.types)
         low, high = (dr.fma(Float(v), 2 * SLAB / STEPS, -SLAB) for v in (word & 0xFFFF, word >> 16))
         # The height above the plane is at + slope t
         at, slope = d, Float(0)
