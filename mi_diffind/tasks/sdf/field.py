@@ -31,6 +31,8 @@ class Field:
     slope: float = 1.0
     spacing: float
     band: float
+    #: Whether rays go from cell to cell, by masks (:mod:`.marching`). If not, they are sphere-traced (:meth:`look`).
+    marched = False
 
     def __init__(self, types: ModuleType, lower, upper, spacing: float, band: float):
         self.types = types
@@ -67,8 +69,8 @@ class Field:
 
     def look(self, p, d, active=True):
         """
-        The value at ``p`` and how far a ray from there in the direction ``d`` (of length 1) goes without the sign
-        changing: ``(Float, Float)``, the second one finite and ≥ 0. Of the value, the sign counts.
+        For sphere tracing: the value at ``p`` and how far a ray from there in the direction ``d`` (of length 1) goes
+        without the sign changing, ``(Float, Float)``, the second one finite and ≥ 0. Of the value, the sign counts.
         """
         value = self.value(p, active)
         return value, dr.abs(value) / self.slope
