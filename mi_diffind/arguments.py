@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 
 
 class Argument:
@@ -51,15 +52,23 @@ def natural(text: str) -> int:
     return value
 
 
-def fraction(text: str) -> float:
-    """A number from 0 to 1. Raises ``ArgumentTypeError``."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from 0 to 1")
-    return value
+def between(low: float, high: float):
+    """A parser of numbers from ``low`` to ``high``, which raises ``ArgumentTypeError``."""
+
+    def parsed(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"found {text!r}, allowed are numbers from {low:g} to {high:g}")
+        return value
+
+    return parsed
+
+
+#: A number from 0 to 1.
+fraction = between(0, 1)
 
 
 def proper_fraction(text: str) -> float:

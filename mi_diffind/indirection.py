@@ -496,6 +496,21 @@ def unfolded(net):
     return result
 
 
+def rounded(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
+    """
+    A copy of ``net`` as training sees it that takes rounding into account (:meth:`.DifferentiableArray.rounded`): the
+    entries of each primary to its ``bits`` (default: 8), the cascaded array's to 8.
+    """
+    widths = zip(net.primary, bits or [8] * len(net.primary), strict=True)
+    return Indirection([array.rounded(width) for array, width in widths], net.cascaded.rounded(8), net.inputs)
+
+
+def stored_form(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
+    """The arrays of ``net`` as they are stored: what :func:`rounded` stands for, as bytes."""
+    widths = zip(net.primary, bits or [8] * len(net.primary), strict=True)
+    return Indirection([array.quantised(width) for array, width in widths], net.cascaded.quantised(8), net.inputs)
+
+
 def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.ndarray:
     """Entries equal to their own position, ``(N_1, …, N_d, channels)``; channel ``k`` runs along axis ``k mod d``."""
     grids = np.meshgrid(

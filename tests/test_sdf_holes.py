@@ -60,8 +60,7 @@ def vectors(types, values):
 
 def test_wrong_nodes_make_no_floaters(types, sampled):
     """
-    Nodes whose distances are lost have a part in the cells that the surface crosses only: all others keep their signs,
-    by ``value`` and by ``look``.
+    Nodes whose distances are lost have a part in the cells that the surface crosses only: all others keep their signs.
     """
     distances, s = sampled
     rng = np.random.default_rng(4)
@@ -74,10 +73,8 @@ def test_wrong_nodes_make_no_floaters(types, sampled):
     corners = (cell[:, None] + np.array(nodes.CORNERS)).tolist()
     count = np.array([sum(tuple(c) in stored for c in eight) for eight in corners])
     inside = distances.inside(points)
-    p = vectors(types, points)
-    for told in (field.value(p), field.look(p, vectors(types, np.tile([[0.6, 0, 0.8]], (len(points), 1))))[0]):
-        wrong = (told.numpy() < 0) != inside
-        assert not wrong[count < 8].any() and wrong[count == 8].any()
+    wrong = (field.value(vectors(types, points)).numpy() < 0) != inside
+    assert not wrong[count < 8].any() and wrong[count == 8].any()
     assert np.any((count > 0) & (count < 8) & inside) and np.any((count > 0) & (count < 8) & ~inside)
 
 

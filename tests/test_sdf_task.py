@@ -11,6 +11,7 @@ import trimesh
 from solids import box, sphere, together, write
 
 from mi_diffind.cli import main
+from mi_diffind.indirection import DifferentiableArray, Indirection, ramp
 from mi_diffind.runtime import array_module
 from mi_diffind.settings import FitSettings
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
@@ -142,6 +143,25 @@ def test_start_from_nearest_samples(rng):
         place = np.array(index) / (np.array([4, 3, 3]) - 1)
         nearest = np.argmin(np.linalg.norm(samples - place, axis=1))
         assert entries[index][0] == pytest.approx(np.clip(distances[nearest] / 0.1, -1, 1) / 2 + 0.5, abs=1e-6)
+
+
+def test_the_bound_of_the_slope_follows_entries(ad, rng):
+    """Against small steps all over the box, for arrays as they are made and after a change."""
+    arrays = ramp((6, 5, 4), 3, ("clamp",) * 3) + 0.05 * rng.random((6, 5, 4, 3)), rng.random((4, 7, 3, 1))
+    net = Indirection(*(DifferentiableArray(a.shape[:3], a.shape[3], a) for a in arrays)).alloc(ad.TensorXf)
+    field = pair.PairField(ad, net, (-0.5, -0.4, -0.3), (0.5, 0.4, 0.3), 0.2, 1.0)
+    p = rng.uniform(field.lower, field.upper, (100000, 3))
+    d = rng.normal(size=p.shape)
+    p, d = (ad.Array3f(*v.T.astype(np.float32)) for v in (p, 1e-4 * d / np.linalg.norm(d, axis=1, keepdims=True)))
+    bounds = []
+    for factor in (1, 3):
+        net.cascaded.data = net.cascaded.data * factor
+        field.changed()
+        steps = dr.abs(field.value(p + d) - field.value(p - d)) / 2e-4
+        steepest = dr.max(dr.select(field.inside(p + d) & field.inside(p - d), steps, 0))[0]
+        bounds.append(field.slope[0])
+        assert 0.3 * bounds[-1] < steepest <= 1.01 * bounds[-1]
+    assert bounds[1] == pytest.approx(3 * bounds[0])
 
 
 def test_decoded_nodes_are_the_field(folder, ad, rng):

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import drjit as dr
 import numpy as np
 
 from ... import lookup
 from ...fitting import FitResult, Problem
-from ...indirection import Indirection
+from ...indirection import rounded, stored_form
 from ...maps import components
 from ...maps.layout import Layout
 from ...maps.source import Source
@@ -243,15 +242,3 @@ def _name_of(size: Size) -> str:
     """The structure of a size, "" if it is none of those that are known."""
     known = (name for name, s in STRUCTURES.items() if s == (size.bits, size.coarse) and size.paged == (name in PAGED))
     return next(known, "")
-
-
-def stored_form(net: Indirection, bits: Sequence[int]) -> Indirection:
-    """The arrays as they are stored: the entries of each primary rounded to its ``bits``, the cascaded array's to 8."""
-    primary = [array.quantised(width) for array, width in zip(net.primary, bits, strict=True)]
-    return Indirection(primary, net.cascaded.quantised(8), net.inputs)
-
-
-def rounded(net: Indirection, bits: Sequence[int]) -> Indirection:
-    """A copy of ``net`` as training sees it that takes rounding into account (:meth:`.DifferentiableArray.rounded`)."""
-    primary = [array.rounded(width) for array, width in zip(net.primary, bits, strict=True)]
-    return Indirection(primary, net.cascaded.rounded(8), net.inputs)

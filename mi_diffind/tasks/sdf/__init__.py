@@ -11,27 +11,16 @@ Task 6: signed distance fields of meshes.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 
 from ... import sizes
-from ...arguments import Argument, checked, positive
+from ...arguments import Argument, between, checked, positive
 from ...errors import UsageError
 from ..task import Request, Task
 from .presets import PRESETS
 
 #: Bits of a pointer that go into words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
 BITS = (4, 5, 6, 8, 10, 16)
-
-
-def _ratio(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 1 <= value <= 16:
-        raise argparse.ArgumentTypeError(f"found {text}, allowed are ratios from 1 to 16")
-    return value
 
 
 class Sdf(Task):
@@ -52,7 +41,7 @@ class Sdf(Task):
             "--bits", type=int, choices=BITS, default=10,
             help="bits of a pointer of the sparse layout (default: 10)",
         ),
-        Argument("--ratio", type=_ratio, help="of dense and paper: primary's side over cascaded array's side"),
+        Argument("--ratio", type=between(1, 16), help="of dense and paper: primary's side over cascaded array's side"),
         Argument(
             "--constant", action="store_true",
             help="of paper: begin with a constant cascaded array, not with the nearest samples",

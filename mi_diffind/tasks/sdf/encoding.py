@@ -56,9 +56,7 @@ def sample(distances: Distances, spacing: float) -> Sampled:
     used, corners = np.unique(corners[keep], return_inverse=True)
     corners = corners.reshape(-1, 8)
     nodes, d, normals = nodes[used], d[used], normals[used]
-    structure = build(
-        nodes, d < 0, shape + 1, lower, spacing, distances.inside, lambda p: distances.unsigned(p).astype(np.float64)
-    )
+    structure = build(nodes, d < 0, shape + 1, lower, spacing, distances.inside, distances.unsigned)
     # In the order of the structure
     positions, block = structure.node_positions()
 
@@ -148,23 +146,11 @@ class Coding:
         at = replace(self.sampled, distances=values[:, 0], normals=values[:, 1:])
         if self.frames is None:
             self.frames = fit_frames(at)
-            count = max(1, min(2**self.bits, len(values)))
-            wanted = targets(at, self.frames)
-            entries = cluster(wanted, count, self.seed)
-            # As far as nodes have to go that no entry would keep on their side
-            block = self.sampled.block
-            n, d, scale = (v[block] for v in codes.frames_numpy(self.frames))
-            plane = d + np.sum(n * middles(self.sampled.positions), axis=1)
-            furthest = np.where(self.side < 0, entries[:, 0].min(), entries[:, 0].max())
-            short = self.side * (plane + scale * furthest) < 2 * LEAST
-            needed = (2 * LEAST * self.side - plane)[short] / scale[short]
-            for extreme, reach in ((np.argmin, np.minimum), (np.argmax, np.maximum)):
-                which = extreme(entries[:, 0])
-                entries[which, 0] = reach.reduce(needed, initial=entries[which, 0])
-            self.entries = rounded_entries(entries)
+        wanted = targets(at, self.frames)
+        if self.entries is None:
+            self.entries = self._chosen(wanted)
         order = np.random.default_rng([self.seed, 1]).random(len(values))
         now = np.flatnonzero((order < share) & ~self.done)
-        wanted = targets(at, self.frames)
         self.pointers[now] = assign(wanted[now], self.entries)
         self.done[now] = True
         self._keep_sides(wanted, now)
@@ -177,16 +163,29 @@ class Coding:
                 self._keep_sides(wanted, moved)
                 before = moved
 
+    def _chosen(self, wanted: np.ndarray) -> np.ndarray:
+        """The entries for nodes that ought to have the ``wanted`` ones (n, 3): (K, 3), float32."""
+        entries = cluster(wanted, max(1, min(2**self.bits, len(wanted))), self.seed)
+        # As far as nodes have to go that no entry would keep on their side
+        plane, scale = self._planes
+        furthest = np.where(self.side < 0, entries[:, 0].min(), entries[:, 0].max())
+        short = self.side * (plane + scale * furthest) < 2 * LEAST
+        needed = (2 * LEAST * self.side - plane)[short] / scale[short]
+        for extreme, reach in ((np.argmin, np.minimum), (np.argmax, np.maximum)):
+            which = extreme(entries[:, 0])
+            entries[which, 0] = reach.reduce(needed, initial=entries[which, 0])
+        return rounded_entries(entries)
+
+    @functools.cached_property
+    def _planes(self) -> tuple[np.ndarray, np.ndarray]:
+        """How far each node is from the plane of its block, in spacings, and the block's scale: (n,) twice."""
+        n, d, scale = (v[self.sampled.block] for v in codes.frames_numpy(self.frames))
+        return d + np.sum(n * middles(self.sampled.positions), axis=1), scale
+
     def _distances(self, nodes: np.ndarray, pointers: np.ndarray) -> np.ndarray:
         """Distances of ``nodes`` (m,), on their side positive, if they had the ``pointers`` (m, k). (m, k)."""
-        block = self.sampled.block[nodes]
-        n, d, scale = (v[block] for v in self._decoded_frames)
-        plane = d + np.sum(n * middles(self.sampled.positions[nodes]), axis=1)
-        return self.side[nodes, None] * (plane[:, None] + scale[:, None] * self.entries[pointers, 0])
-
-    @property
-    def _decoded_frames(self):
-        return codes.frames_numpy(self.frames)
+        plane, scale = (v[nodes, None] for v in self._planes)
+        return self.side[nodes, None] * (plane + scale * self.entries[pointers, 0])
 
     def _keep_sides(self, wanted: np.ndarray, nodes: np.ndarray) -> None:
         """Give ``nodes`` that are not far enough on their side the nearest entry with which they are."""
@@ -270,6 +269,7 @@ class Coding:
         return {"frames": self.frames, "entries": self.entries, "pointers": self.pointers, "done": self.done}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
+        vars(self).pop("_planes", None)
         for name, value in state.items():
             setattr(self, name, value.copy())
 
@@ -278,6 +278,4 @@ def rounded_entries(entries: np.ndarray) -> np.ndarray:
     """Entries as words hold them, float32, so that rounding them again changes nothing."""
     entries = entries.astype(np.float32)
     offset, step = codes.entry_scale(entries)
-    top = 2 ** np.array(codes.ENTRY_BITS) - 1
-    whole = np.clip(np.round((entries - offset) / step), 0, top)
-    return (offset + whole * step).astype(np.float32)
+    return codes.entries_numpy(codes.entry_words(entries, offset, step), offset, step).astype(np.float32)

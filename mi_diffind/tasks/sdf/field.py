@@ -31,11 +31,16 @@ class Field:
     slope: float = 1.0
     spacing: float
     band: float
+    #: Whether rays go from cell to cell, by masks (:mod:`.marching`). If not, they are sphere-traced (:meth:`look`).
+    marched = False
 
     def __init__(self, types: ModuleType, lower, upper, spacing: float, band: float):
         self.types = types
         self.lower, self.upper = tuple(map(float, lower)), tuple(map(float, upper))
         self.spacing, self.band = float(spacing), float(band)
+
+    def changed(self):
+        """To be called when entries were changed from outside, by an optimiser say: bounds follow."""
 
     def inside(self, p):
         """Whether points lie in the box. False for NaN."""
@@ -64,8 +69,8 @@ class Field:
 
     def look(self, p, d, active=True):
         """
-        The value at ``p`` and how far a ray from there in the direction ``d`` (of length 1) goes without the sign
-        changing: ``(Float, Float)``, the second one finite and ≥ 0. Of the value, the sign counts.
+        For sphere tracing: the value at ``p`` and how far a ray from there in the direction ``d`` (of length 1) goes
+        without the sign changing, ``(Float, Float)``, the second one finite and ≥ 0. Of the value, the sign counts.
         """
         value = self.value(p, active)
         return value, dr.abs(value) / self.slope
@@ -142,18 +147,20 @@ class DenseField(Field):
         return dr.select(active, dr.lerp(lines[0], lines[1], u), self.band), dr.select(active, slope, 0)
 
 
+def edge_steps(values: np.ndarray, axis: int) -> np.ndarray:
+    """The largest of the four differences along ``axis`` in every cell of a grid of ``values`` (X, Y, Z)."""
+    steps = np.abs(np.diff(values, axis=axis))
+    for other in {0, 1, 2} - {axis}:
+        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+        ahead[other], behind[other] = slice(1, None), slice(None, -1)
+        steps = np.maximum(steps[tuple(ahead)], steps[tuple(behind)])
+    return steps
+
+
 def trilinear_slope(values: np.ndarray, size) -> float:
     """
     A bound of the gradient's length of the trilinear interpolation of ``values`` (X, Y, Z) in cells of the sides
     ``size``: in each cell, every component lies between its four differences along the edges.
     """
-    total = 0.0
-    for axis, h in enumerate(size):
-        steps = np.abs(np.diff(values, axis=axis)) / h
-        for other in {0, 1, 2} - {axis}:
-            ahead = [slice(None)] * 3
-            behind = [slice(None)] * 3
-            ahead[other], behind[other] = slice(1, None), slice(None, -1)
-            steps = np.maximum(steps[tuple(ahead)], steps[tuple(behind)])
-        total = total + steps.astype(np.float64) ** 2
-    return float(np.sqrt(total.max()))
+    steps = [edge_steps(values, axis) / h for axis, h in enumerate(size)]
+    return float(np.sqrt(sum(s.astype(np.float64) ** 2 for s in steps).max()))

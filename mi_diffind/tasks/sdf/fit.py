@@ -12,6 +12,7 @@ import numpy as np
 from ... import sizes
 from ...errors import UsageError
 from ...fitting import FitResult
+from ...indirection import stored_form
 from ...settings import FittingError
 from ...tables import StoredArray, Table
 from ..task import Fitted, Request
@@ -147,7 +148,6 @@ def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: R
     held_out = training.HeldOut(distances, request.types, structure.spacing)
     coding = encoding.Coding(sampled, bits, request.settings.seed)
     problem = training.NodeProblem(field, distances.surface, coding, held_out)
-    problem.identity["source"] = mesh.digest
     result = request.train(problem)
     coding.commit(problem.net.unit(request.types).numpy().astype(np.float64), 1.0)
     words = codes.pointer_words(coding.pointers, bits)
@@ -208,9 +208,9 @@ def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Req
     net = net.alloc(request.types.TensorXf)
     field = pair.PairField(request.types, net, lower, upper, band, 1.0)
     held_out = training.HeldOut(distances, request.types, spacing / 2)
-    problem = training.PairProblem(field, mesh, unit, d, held_out, True)
+    problem = training.PairProblem(field, mesh, unit, d, held_out)
     result: FitResult = request.train(problem)
-    kept = pair.Indirection([problem.net.primary[0].quantised(8)], problem.net.cascaded.quantised(8))
+    kept = stored_form(problem.net)
     slope = pair.slope_of(kept, lower, upper, band)
     arrays = {"primary": StoredArray.of(kept.primary[0]), "cascaded": StoredArray.of(kept.cascaded)}
     table = Table("sdf", arrays)

@@ -6,8 +6,7 @@ dense arrays only; this is ours):
 
     f(x) = Σ wᵢ (dᵢ + ½ gᵢ · (x − xᵢ))
 
-with trilinear weights w, which is exact for quadratic functions. Everywhere else the sign is known, and how far a ray
-may go until it reaches another cell.
+with trilinear weights w, which is exact for quadratic functions. Everywhere else the sign is known.
 """
 
 from __future__ import annotations
@@ -31,6 +30,8 @@ class SparseNodes(Field):
     spacings and gradients, which can be trained; or held as ``pointers`` (words, with ``bits`` bits each) into
     ``entries`` (words), relative to the ``frames`` of their blocks (words), as :mod:`.codes` says.
     """
+
+    marched = True
 
     def __init__(self, types, structure: Structure, slope: float, *, nodes=None, frames=None, pointers=None, bits=0,
                  entries=None, offset=None, step=None):  # fmt: skip
@@ -71,10 +72,7 @@ class SparseNodes(Field):
         return cell, place
 
     def _block(self, i, j, k, active):
-        """
-        Of the block that holds node (i, j, k): its number, whether it has nodes, whether it is inside if not, and how
-        far away (in spacings) the surface is at least.
-        """
+        """Of the block that holds node (i, j, k): its number, whether it has nodes, and whether it is inside if not."""
         UInt32 = self.types.UInt32
         _, ny, nz = self.structure.regions.shape
         word = dr.gather(UInt32, self._regions, UInt32(((i >> 4) * ny + (j >> 4)) * nz + (k >> 4)), active)
@@ -85,8 +83,7 @@ class SparseNodes(Field):
         inside = dr.select(has, _bit(masks[2], masks[3], bit), (word & 1) == 1)
         has_nodes = has & in_mask
         number = dr.gather(UInt32, self._first_blocks, word, has_nodes) + rank
-        free = dr.select(has | ~active, 0, self.types.Float(word >> 1 & 127))
-        return number, has_nodes, inside, has, free
+        return number, has_nodes, inside
 
     def _record(self, number, active):
         return dr.gather(dr.uint32_array_t(self.types.Array4f), self._blocks, number, active)
@@ -126,7 +123,7 @@ class SparseNodes(Field):
             if a or b or c:
                 # In the block of the first corner, mostly
                 other = active & (((at[0] ^ i) | (at[1] ^ j) | (at[2] ^ k)) >> 2 != 0)
-                number_, has_, inside_, *_ = self._block(*at, other)
+                number_, has_, inside_ = self._block(*at, other)
                 own_ = self._record(number_, has_)
                 has, inside = dr.select(other, has_, has), dr.select(other, inside_, inside)
                 own = [dr.select(other, p, q) for p, q in zip(own_, record, strict=True)]
@@ -214,29 +211,7 @@ class SparseNodes(Field):
 
         return dr.select(active, value, self.band), vector(slope), vector(smooth)
 
-    # -- how far a ray may go -----------------------------------------------------------------------------------------
-
-    def look(self, p, d, active=True):
-        Float = self.types.Float
-        inside_box = self.inside(p) & active
-        cell, _ = self._grid(p)
-        number, has, inside, region, free = self._block(*cell, inside_box)
-        record = self._record(number, has)
-        stored, _, sign = self._in_block(record, *cell)
-        stored = stored & has
-        # To the end of the region, of the block, of the cell
-        shift = dr.select(region, dr.select(has, 0, 2), 4)
-        step = self.cell_exit(p, d, [i >> shift for i in cell], Float(1 << shift) * self.spacing)
-        step = dr.maximum(step, free * self.spacing)
-        value = dr.select(dr.select(has, sign, inside), -1.0, 1.0) * self.spacing
-
-        def near(p, value, step, stored):
-            told, *_, complete, _, inside = self._blend(p, stored, False)
-            told = dr.select(complete, told * self.spacing, dr.select(inside, -1.0, 1.0) * self.spacing)
-            return told, dr.select(complete, dr.abs(told) / self.slope, step)
-
-        arguments = self.types.Array3f(p), value, step, stored
-        return dr.if_stmt(arguments, stored, near, lambda p, value, step, stored: (value, step))
+    # -- what is stored ------------------------------------------------------------------------------------------------
 
     def frames(self) -> np.ndarray:
         """The words of the blocks' frames, ``(B,)``."""
@@ -330,6 +305,3 @@ def decoded_nodes(structure: Structure, frames: np.ndarray, entries: np.ndarray)
         tuple(entries.astype(np.float64).T), tuple(n.T), d, scale, tuple(middles(positions).T)
     )
     return np.stack([distance, *normal], axis=1).astype(np.float32)
-
-
-__all__ = ["BAND", "SparseNodes", "decoded_nodes", "middles", "slope_bound"]

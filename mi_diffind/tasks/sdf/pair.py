@@ -10,11 +10,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...indirection import DifferentiableArray, Indirection, ramp
-from .field import Field
+from .field import Field, edge_steps
 
 #: Of the spacing of the primary array: how far distances are told. At least :data:`LEAST_BAND` of the longest side.
 BAND = 2.5
 LEAST_BAND = 0.02
+
+#: Cells of the cascaded array along an axis, beyond the first, that a bound of the slope looks at one by one.
+NARROW = 3
 
 
 class PairField(Field):
@@ -28,6 +31,10 @@ class PairField(Field):
         size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, primary.resolution, strict=True)]
         super().__init__(types, lower, upper, min(size), band)
         self.net, self.slope = net, float(slope)
+
+    def changed(self):
+        # Not a literal of the kernels that rays run: another one would compile them anew
+        self.slope = dr.opaque(self.types.Float, slope_of(self.net, self.lower, self.upper, self.band))
 
     def _coordinates(self, p):
         return [(x - a) / (b - a) for x, a, b in zip(p, self.lower, self.upper, strict=True)]
@@ -93,52 +100,31 @@ def slope_of(net: Indirection, lower, upper, band: float) -> float:
     """
     pointers, values = net.primary[0].numpy().astype(np.float64), net.cascaded.numpy()[..., 0].astype(np.float64)
     size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, pointers.shape, strict=False)]
-    steepest = [np.abs(np.diff(values, axis=c)).max() * (values.shape[c] - 1) for c in range(3)]
-    ranges = [_ranges(pointers[..., c]) for c in range(3)]
-    # The steepest slope along each axis within the cells that a cell's pointers reach; where that is many, anywhere
-    local = [np.full(ranges[0][0].shape, s) for s in steepest]
-    first = [
-        np.clip(np.floor(ranges[c][0] * (values.shape[c] - 1)).astype(int), 0, values.shape[c] - 2) for c in range(3)
-    ]
-    last = [
-        np.clip(np.floor(ranges[c][1] * (values.shape[c] - 1)).astype(int), 0, values.shape[c] - 2) for c in range(3)
-    ]
-    narrow = np.all([b - a <= 3 for a, b in zip(first, last, strict=True)], axis=0)
-    for c in range(3):
-        cells = _cell_slopes(values, c)
-        found = np.zeros(narrow.sum())
-        for offset in np.ndindex(4, 4, 4):
-            at = tuple(np.minimum(a[narrow] + o, b[narrow]) for a, b, o in zip(first, last, offset, strict=True))
-            found = np.maximum(found, cells[at])
-        local[c][narrow] = found
+    last = np.array(values.shape) - 1
+    # The cells that a cell's pointers reach: the first along each axis, and how many follow
+    ends = np.stack([np.stack(_ends(pointers[..., c]), axis=-1) * last[c] for c in range(3)], axis=-2)
+    reach = np.clip(np.floor(ends).astype(int), 0, last[:, None] - 1)
+    first, more = reach[..., 0], reach[..., 1] - reach[..., 0]
+    cells = np.stack([edge_steps(values, c) * last[c] for c in range(3)], axis=-1)
+    # Where these are many, the steepest slope of all
+    local = np.empty_like(first, dtype=np.float64)
+    local[...] = cells.max(axis=(0, 1, 2))
+    narrow = np.flatnonzero(np.all(more <= NARROW, axis=-1))
+    first, more, found = first.reshape(-1, 3)[narrow], more.reshape(-1, 3)[narrow], np.zeros((len(narrow), 3))
+    for offset in np.ndindex((NARROW + 1,) * 3):
+        some = np.flatnonzero(np.all(more >= offset, axis=1))
+        at = first[some] + offset
+        found[some] = np.maximum(found[some], cells[tuple(at.T)])
+    local.reshape(-1, 3)[narrow] = found
     square = 0.0
     for axis in range(3):
-        along = sum(_ranges_of_steps(pointers[..., c], axis) / size[axis] * local[c] for c in range(3))
+        along = sum(edge_steps(pointers[..., c], axis) / size[axis] * local[..., c] for c in range(3))
         square = square + along**2
     return max(1.0, float(2 * band * np.sqrt(square.max())))
 
 
-def _corners_of(values: np.ndarray):
-    """The eight corner values of every cell."""
-    ends = slice(None, -1), slice(1, None)
-    return [values[ends[a], ends[b], ends[c]] for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-
-
-def _ranges(values: np.ndarray):
-    corners = _corners_of(values)
+def _ends(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest of the eight corners of every cell."""
+    sides = slice(None, -1), slice(1, None)
+    corners = [values[sides[a], sides[b], sides[c]] for a in (0, 1) for b in (0, 1) for c in (0, 1)]
     return np.minimum.reduce(corners), np.maximum.reduce(corners)
-
-
-def _cell_slopes(values: np.ndarray, axis: int) -> np.ndarray:
-    """The steepest slope along ``axis`` in every cell, per unit of [0, 1]."""
-    return _ranges_of_steps(values, axis) * (values.shape[axis] - 1)
-
-
-def _ranges_of_steps(values: np.ndarray, axis: int) -> np.ndarray:
-    """The largest of the four differences along the edges of every cell."""
-    steps = np.abs(np.diff(values, axis=axis))
-    for other in {0, 1, 2} - {axis}:
-        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
-        ahead[other], behind[other] = slice(1, None), slice(None, -1)
-        steps = np.maximum(steps[tuple(ahead)], steps[tuple(behind)])
-    return steps

@@ -7,7 +7,7 @@ import numpy as np
 from drjit import nn
 
 from ...fitting import Problem
-from ...indirection import Indirection
+from ...indirection import rounded
 from . import samples
 from .distances import Distances
 from .encoding import Coding
@@ -145,7 +145,7 @@ class NodeProblem(Problem):
 class PairProblem(Problem):
     """The supplement's: truncated distances, mostly near the surface, in units of the band."""
 
-    def __init__(self, field: PairField, mesh: Mesh, points: np.ndarray, distances: np.ndarray, held_out, bits: bool):
+    def __init__(self, field: PairField, mesh: Mesh, points: np.ndarray, distances: np.ndarray, held_out):
         self.field, self.types, self.net = field, field.types, field.net
 
         def flat(v):
@@ -154,7 +154,7 @@ class PairProblem(Problem):
         self.points = [flat(v) for v in points.T]
         self.targets = flat(np.clip(distances / field.band, -1, 1) / 2 + 0.5)
         self.identity = {"source": mesh.digest, "resolution": list(self.net.primary[0].resolution)}
-        self.held_out, self.rounded = held_out, bits
+        self.held_out = held_out
 
     def batch(self, rng, size: int):
         Float, UInt32 = self.types.Float, self.types.UInt32
@@ -163,19 +163,14 @@ class PairProblem(Problem):
         return [dr.gather(Float, v, which) for v in self.points], {"d": [dr.gather(Float, self.targets, which)]}
 
     def predict(self, net, inputs):
-        return {"d": (as_stored(net) if self.rounded else net)(inputs)}
+        return {"d": rounded(net)(inputs)}
 
     def measure(self, net):
         with dr.suspend_grad():
-            self.field.net = as_stored(net)
+            self.field.net = rounded(net)
             found = self.held_out.measure(self.field)
             self.field.net = net
             return found
-
-
-def as_stored(net: Indirection) -> Indirection:
-    """A copy as training sees it that takes rounding to 8 bits into account."""
-    return Indirection([array.rounded(8) for array in net.primary], net.cascaded.rounded(8), net.inputs)
 
 
 class HeldOut:
