@@ -24,8 +24,11 @@ CHUNK = 2**22
 #: The finest grid that is decoded.
 MAX_RESOLUTION = 1024
 
-#: Points of a surface: how often 2^17 places are drawn at most, Newton's steps, what is near enough, of a cell.
-DRAWS, NEWTON, ON_SURFACE = 32, 6, 1e-3
+#: Points of a surface: places drawn at once, how often at most, Newton's steps, what is near enough, of a cell.
+DRAWN, DRAWS, NEWTON, ON_SURFACE = 2**15, 64, 6, 1e-3
+
+#: Parts along the longest side of a box, of which those that the surface may pass through are drawn from.
+PARTS = 16
 
 #: Of its value: what is left of a node's that is to change its sign.
 NEARER = 0.1
@@ -325,9 +328,13 @@ def surface_points(field: Field, count: int, seed: int = 0) -> np.ndarray:
     that go where their gradient leads. None if there is no surface.
     """
     rng = np.random.default_rng(seed)
+    side = float(np.max(np.array(field.upper) - np.array(field.lower))) / PARTS
+    blocks = np.ceil((np.array(field.upper) - np.array(field.lower)) / side - 1e-6).astype(int)
+    parts = np.argwhere(crossed_blocks(field, np.array(field.lower), side / BLOCK, BLOCK * blocks))
     found, have = [np.zeros((0, 3))], 0
-    for _ in range(DRAWS):
-        p = rng.uniform(field.lower, field.upper, (CHUNK // 32, 3))
+    for _ in range(DRAWS if len(parts) else 0):
+        p = parts[rng.integers(len(parts), size=DRAWN)] + rng.random((DRAWN, 3))
+        p = np.array(field.lower) + side * p
         p = p[np.abs(_values(field, p)) < 0.9 * field.band][:count]
         for _ in range(NEWTON if len(p) else 0):
             with dr.suspend_grad():
