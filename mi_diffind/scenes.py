@@ -68,7 +68,7 @@ def load(
             swap(state, against)
         if longest_path is not None:
             _path_integrator(state)["max_depth"] = longest_path
-        integrators = _integrators(state) or ["path"]
+        integrators = _integrators(state) or ["path"]  # which commands take that need none in the scene
         decoded = _decode_unseen(state, integrators)
         loaded = compat.instantiate(config, state)
         if not isinstance(loaded, mi.Scene):
@@ -113,14 +113,13 @@ def _say_decoded(scene, ids: list[str], integrators: list[str]) -> None:
 def _unseen(scene, integrators: list[str]) -> str:
     """A sentence about a shape that is seen by none of the ``integrators`` (names of plugins), "" if there is none."""
     for made in instances(scene):
-        seen_by = getattr(made, "seen_by", integrators)
-        if not set(seen_by) & set(integrators):
+        seen_by = getattr(made, "seen_by", None)
+        if seen_by and not set(seen_by) & set(integrators):
             allowed = " or ".join(f'"{name}"' for name in seen_by)
-            found = ", ".join(f'"{name}"' for name in integrators)
+            found = ", ".join(f'"{name}"' for name in integrators) or "none"
             return (
                 f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} '
-                f"alone, "
-                f'found {found}: take that one, or trace="grid"'
+                f'alone, found {found}: take that one, or trace="grid"'
             )
     return ""
 
@@ -143,7 +142,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
         decoded = _decode_unseen(state, integrators) if integrators else []
         loaded = compat.instantiate(config, state)
     if isinstance(loaded, mi.Scene):
-        unseen = _unseen(loaded, integrators or ["path"])  # as mi.render has it
+        unseen = _unseen(loaded, integrators)
         if unseen:
             mi.Log(mi.LogLevel.Warn, unseen)
         _say_decoded(loaded, decoded, integrators)

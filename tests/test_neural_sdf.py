@@ -346,6 +346,16 @@ def test_grids_of_files_that_tell_no_error(mi_rgb, upright_files):
     assert said["error"] <= said["arrays_error"] and "about" in said["decoded"]
 
 
+def test_images_of_grids_are_those_of_arrays(mi_rgb, folder):
+    """At the resolution that is found by itself and with the same random numbers, most of the noise cancels."""
+    images = []
+    for trace in ("arrays", "grid"):
+        made = scene(mi_rgb, {"torus": shape(folder, trace=trace)})
+        images.append(np.array(mi_rgb.render(made, spp=64, seed=1)))
+    assert scenes.reports(made)[0]["resolution"] < 80
+    assert np.abs(images[0] - images[1]).mean() < 1e-3 < np.abs(images[0] - images[0].mean()).mean() / 20
+
+
 def test_grids_without_anything_inside(mi_rgb):
     from mi_diffind.plugins.support import solids
 
@@ -448,12 +458,12 @@ def test_our_integrator_sees_arrays(mi_rgb, folder, tmp_path, monkeypatch, xml):
 
 
 def test_scenes_without_an_integrator(mi_rgb, folder, tmp_path, monkeypatch):
-    """Commands render them with ``path``; in Python, another one may be meant."""
+    """Commands that need none take ``path``; in Python, another one may be meant."""
     warned = warnings_of(mi_rgb, monkeypatch)
     path = written(folder, tmp_path)
     assert scenes.reports(scenes.load(path))[0]["trace"] == "grid" and len(warned) == 1
     assert scenes.reports(scenes.load_file(path))[0]["trace"] == "arrays"
-    assert 'is seen by the integrator "path_sdf" alone' in warned[1]
+    assert 'is seen by the integrator "path_sdf" alone, found none' in warned[1]
 
 
 @pytest.mark.parametrize("more", [EXPLICIT, '<string name="storage" value="float32"/>'])
