@@ -53,8 +53,10 @@ def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndar
     """
     from mi_diffind.tasks.sdf import decode
 
-    field, measured = model.field, model.table.measured.get("mae_surface")
-    wanted = TYPICAL_ERROR * field.spacing if measured is None else measured
+    field, wanted = model.field, model.table.measured.get("mae_surface")
+    measured = isinstance(wanted, (int, float)) and 0 < wanted < math.inf
+    if not measured:
+        wanted = TYPICAL_ERROR * field.spacing
     if resolution:
         error = decode.trilinear_error(field, decode.surface_points(field, 2**12), resolution)
     else:
@@ -63,24 +65,20 @@ def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndar
     values, lower, upper = decode.grid(field, resolution)
     decode.interpolable(values, field.band)
     values, lower, upper = fitted(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
-    return (
-        values,
-        lower,
-        upper,
-        {
-            "preset": model.table.preset,
-            "storage": model.storage,
-            "table_bytes": model.nbytes,
-            "trace": "grid",
-            "resolution": resolution,
-            "cells": [n - 1 for n in values.shape[::-1]],
-            "grid_bytes": values.nbytes,
-            "memory_bytes": CELL_BYTES * math.prod(n - 1 for n in values.shape),
-            "error": float(error),
-            "arrays_error": float(wanted),
-            "arrays_error_measured": measured is not None,
-        },
-    )
+    said = {
+        "preset": model.table.preset,
+        "storage": model.storage,
+        "table_bytes": model.nbytes,
+        "trace": "grid",
+        "resolution": resolution,
+        "cells": [n - 1 for n in values.shape[::-1]],
+        "grid_bytes": values.nbytes,
+        "memory_bytes": CELL_BYTES * math.prod(n - 1 for n in values.shape),
+        "error": float(error),
+        "arrays_error": float(wanted),
+        "arrays_error_measured": measured,
+    }
+    return values, lower, upper, said
 
 
 def sentence(said: dict) -> str:

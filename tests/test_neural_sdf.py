@@ -315,6 +315,20 @@ def test_grids_are_cut_to_what_is_inside(mi_rgb, upright_files):
     assert np.median(np.abs(t[both] - expected[both])) < 1e-3
 
 
+def test_grids_of_sparse_fields(mi_rgb, upright_files):
+    """Where no node is stored, one value of a block stands for all: as if each had been asked for."""
+    from mi_diffind.tasks.sdf import TASK, decode
+
+    field = TASK.open(mi_rgb.TensorXf, upright_files[None]).field
+    for resolution in (70, 150):
+        values, lower, upper = decode.grid(field, resolution)
+        shape = values.shape[::-1]
+        expected = decode.node_values(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape).transpose(2, 1, 0)
+        assert np.abs(values - expected).max() < 1e-6
+        crossed = decode.crossed_blocks(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape)
+        assert crossed.any() and (resolution < 100 or crossed.mean() < 0.9)
+
+
 def warnings_of(mi, monkeypatch):
     """What Mitsuba is told to warn of from here on."""
     said = []
