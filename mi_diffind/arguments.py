@@ -62,6 +62,25 @@ def fraction(text: str) -> float:
     return value
 
 
+def proper_fraction(text: str) -> float:
+    """A number between 0 and 1. Raises ``ArgumentTypeError``."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1:
+        raise argparse.ArgumentTypeError(f"found {text}, allowed is more than 0 and less than 1")
+    return value
+
+
+def define(text: str) -> tuple[str, str]:
+    """``NAME=VALUE``, a ``<default>`` of a scene. Raises ``ArgumentTypeError``."""
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f'found {text!r}, expected NAME=VALUE, as in "-D width=320"')
+    return name, value
+
+
 def checked(parse):
     """A parser that raises ``ValueError``, as a type of ``argparse``, which shows only messages of its own."""
 

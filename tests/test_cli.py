@@ -458,7 +458,9 @@ def test_bad_options(tmp_path, capsys):
     assert 'does not run in the variant "scalar_rgb"; use one of' in refused(
         capsys, "render", path, "--variant", "scalar_rgb"
     )
-    assert "expected NAME=VALUE" in refused(capsys, "render", path, "-D", "width")
+    with pytest.raises(SystemExit) as caught:
+        main(["render", path, "-D", "width"])
+    assert caught.value.code == 2 and "expected NAME=VALUE" in capsys.readouterr().err
     assert "nothing" in refused(capsys, "render", path, "-D", "nothing=1")
     assert "allowed are .exr and .png" in refused(capsys, "render", path, "-o", str(tmp_path / "image.tiff"))
     assert "allowed is .npz" in refused(capsys, "fit", "disney", "-o", str(tmp_path / "t.bin"))

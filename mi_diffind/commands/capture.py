@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..files import writable_folder
-from .common import defines_of, natural, positive, require_scene, scene_options, set_variant, verb
+from .common import natural, positive, require_scene, scene_options, set_variant, verb
 
 HELP = "render views of a scene from all sides, with their poses"
 
@@ -64,7 +64,7 @@ def run(arguments) -> dict:
         settings.check()
     except ValueError as e:
         raise UsageError(f"--{e}") from None
-    found = capture.capture(arguments.scene, arguments.output, settings, defines_of(arguments))
+    found = capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
     print("\n".join(capture.lines(found)))
     return {
         "interrupted": len(found.files) < found.total,

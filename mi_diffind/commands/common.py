@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from .. import runtime
-from ..arguments import natural, positive
+from ..arguments import define, natural, positive
 from ..errors import UsageError
 
 # -- parsers ----------------------------------------------------------------------------------------------------------
@@ -42,12 +42,13 @@ def variant_option(sub: argparse.ArgumentParser) -> None:
 
 
 def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
-    """``--variant``, ``-D`` (for :func:`defines_of`) and, with ``rendering``, ``--spp`` and ``--seed``."""
+    """``--variant``, ``-D`` (``defines``: pairs of strings) and, with ``rendering``, ``--spp`` and ``--seed``."""
     variant_option(sub)
     sub.add_argument(
         "-D",
         dest="defines",
         action="append",
+        type=define,
         default=[],
         metavar="NAME=VALUE",
         help="set a <default> of the scene",
@@ -81,17 +82,6 @@ def set_variant(name: str | None) -> None:
     except ImportError as e:
         raise UsageError(f'the variant "{name}" cannot run here: {e}') from None
     mi.set_log_level(mi.LogLevel.Error)
-
-
-def defines_of(arguments) -> dict[str, str]:
-    """What ``-D`` sets: name → value. Raises :class:`UsageError`."""
-    result = {}
-    for text in arguments.defines:
-        name, equals, value = text.partition("=")
-        if not (name and equals):
-            raise UsageError(f'-D {text}: expected NAME=VALUE, as in "-D width=320"')
-        result[name] = value
-    return result
 
 
 def require_scene(path: str) -> None:

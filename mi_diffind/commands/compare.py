@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..files import writable_folder
-from .common import defines_of, positive, require_scene, scene_options, set_variant, verb
+from .common import positive, require_scene, scene_options, set_variant, verb
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
 
@@ -34,7 +34,13 @@ def run(arguments) -> dict:
     from .. import compare
 
     comparison = compare.compare(
-        arguments.scene, arguments.spp, arguments.seed, arguments.passes, True, defines_of(arguments), arguments.against
+        arguments.scene,
+        arguments.spp,
+        arguments.seed,
+        arguments.passes,
+        True,
+        dict(arguments.defines),
+        arguments.against,
     )
     paths = compare.write(comparison, arguments.out)
     print("\n".join(compare.summary(comparison.figures)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..files import writable_folder
-from .common import defines_of, positive, require_scene, scene_options, set_variant, verb
+from .common import positive, require_scene, scene_options, set_variant, verb
 
 HELP = "turn the parameter textures of a material into latent textures"
 
@@ -39,7 +39,7 @@ def run(arguments) -> dict:
         arguments.output,
         arguments.storage,
         arguments.resolution,
-        defines_of(arguments),
+        dict(arguments.defines),
     )
     layout = [found["layout"][i : i + 3] for i in range(0, len(found["layout"]), 3)]
     print(f"{found['files'][0]}: {found['width']} x {found['height']}, preset {found['preset']}")

@@ -7,7 +7,7 @@ from pathlib import Path
 from ..errors import UsageError
 from ..runtime import array_module
 from ..tasks.task import task_of
-from .common import defines_of, scene_options, set_variant, verb
+from .common import scene_options, set_variant, verb
 
 #: What there is to say about how rays meet a shape: keys of its report.
 _RAYS = {
@@ -109,7 +109,7 @@ def _inspect_scene(arguments) -> dict:
     set_variant(arguments.variant)
     from .. import scenes
 
-    defines = defines_of(arguments)
+    defines = dict(arguments.defines)
     learned = scenes.learned_plugins(arguments.file, defines=defines)
     tables = scenes.tables_of(arguments.file, learned)
     reports = scenes.reports(scenes.load(arguments.file, defines=defines))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..files import writable_folder
-from .common import UsageError, defines_of, natural, positive, require_scene, scene_options, set_variant, verb
+from .common import UsageError, natural, positive, require_scene, scene_options, set_variant, verb
 
 HELP = "check that scenes render as their stored references do"
 
@@ -38,7 +38,7 @@ def run(arguments) -> dict:
     set_variant(arguments.variant)
     from .. import regress
 
-    defines, results = defines_of(arguments), []
+    defines, results = dict(arguments.defines), []
     options = {"spp": arguments.spp, "seed": arguments.seed, "defines": defines}
     if arguments.update:
         for path in arguments.scenes:

@@ -7,9 +7,10 @@ import contextlib
 import time
 from pathlib import Path
 
+from ..arguments import proper_fraction
 from ..files import writable_file
 from ..interrupt import interruptible
-from .common import UsageError, defines_of, positive, require_scene, scene_options, set_variant, verb
+from .common import UsageError, positive, require_scene, scene_options, set_variant, verb
 
 HELP = "render a scene that names learned plugins"
 
@@ -42,7 +43,7 @@ def add(commands) -> None:
     )
     sub.add_argument(
         "--depth-tolerance",
-        type=_fraction,
+        type=proper_fraction,
         metavar="T",
         help="part of the scattered light that --depth auto may leave out (default: 0.005)",
     )
@@ -72,7 +73,7 @@ def run(arguments) -> dict:
 
     from .. import scenes
 
-    defines = defines_of(arguments)
+    defines = dict(arguments.defines)
     depth = _choose_depth(arguments, defines)
     start = time.perf_counter()
     learned = scenes.learned_plugins(arguments.scene, defines=defines)
@@ -164,13 +165,3 @@ def _depth(text: str) -> int | str:
         return positive(text)
     except argparse.ArgumentTypeError:
         raise argparse.ArgumentTypeError(f"found {text}, allowed are auto, scene and whole numbers ≥ 1") from None
-
-
-def _fraction(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < 1:
-        raise argparse.ArgumentTypeError(f"found {text}, allowed is more than 0 and less than 1")
-    return value

@@ -8,7 +8,6 @@ from ..studies import studies
 from .common import (
     alternative,
     alternatives,
-    defines_of,
     require_scene,
     scene_options,
     set_variant,
@@ -43,7 +42,7 @@ def run(arguments) -> dict:
     study = studies()[arguments.study]
     if study.of_scene:
         require_scene(arguments.scene)
-        arguments.defines = dict(defines_of(arguments))
+        arguments.defines = dict(arguments.defines)
     try:
         study.check(arguments)
     except ValueError as e:

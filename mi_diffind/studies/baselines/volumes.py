@@ -27,7 +27,7 @@ from ...tasks.sdf.cells import CORNERS, surface_cells
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import Field
 from ...tasks.sdf.mesh import Mesh
-from ...tasks.sdf.nodes import SparseNodes
+from ...tasks.sdf.nodes import SparseNodes, middles
 from ...tasks.sdf.structure import Structure
 
 #: No corner of a cell that the surface crosses is further from it than this, in cells.
@@ -460,6 +460,23 @@ class DistanceNodes(SparseNodes):
 
     def normal(self, p, active=True):
         return self.gradient(p, active)[1]
+
+    def decoded(self) -> np.ndarray:
+        distances = restored(self.state["numbers"], self.told, self.bits)
+        return np.stack([distances, *[np.zeros_like(distances)] * 3], axis=1)
+
+    def frames(self) -> np.ndarray:
+        """Of each block the plane that is nearest to the distances of its nodes: rays know where it may end."""
+        positions, block = self.structure.node_positions()
+        ones = np.ones((len(positions), 1))
+        terms = np.concatenate([ones, middles(positions)], axis=1)
+        told = np.concatenate([terms, self.decoded()[:, :1]], axis=1)
+        sums = np.zeros((self.structure.blocks, 4, 5))
+        np.add.at(sums, block, terms[:, :, None] * told[:, None])
+        found = np.linalg.solve(sums[..., :4] + 1e-3 * np.eye(4), sums[..., 4:])[..., 0]
+        length = np.linalg.norm(found[:, 1:], axis=1, keepdims=True)
+        normals = np.where(length > 0, found[:, 1:] / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
+        return codes.frame_words(normals, found[:, 0], np.ones(len(found)))
 
     @property
     def nbytes(self) -> int:

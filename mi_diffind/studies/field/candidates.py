@@ -41,7 +41,7 @@ from ...tasks.field.field import RadianceField
 from ...tasks.field.files import load
 from ...tasks.field.fit import grid_of
 from ...tasks.field.march import march
-from ...tasks.field.presets import NODE_BYTES
+from ...tasks.field.presets import dense_bytes
 from ...tasks.field.training import Images, ImagesProblem, evaluate
 from ...tasks.field.views import Views
 from ..baselines import radiance_factors as factors
@@ -163,7 +163,7 @@ class Setting:
     @functools.cached_property
     def dense_bytes(self) -> int:
         """What ratios refer to."""
-        return NODE_BYTES * math.prod(self.target.nodes.shape)
+        return dense_bytes(self.target.nodes.shape)
 
     def asked(self, ratio: float) -> int:
         return round(self.dense_bytes / ratio)

@@ -18,7 +18,7 @@ from ...interrupt import interruptible
 from ...tables import StoredArray, Table, save_table
 from ..task import Fitted, Request
 from . import compression, files, pairs, target
-from .presets import COMPRESSION, NODE_BYTES, PRESETS, RESOLUTION, STAGES, ratio_for
+from .presets import COMPRESSION, PRESETS, RESOLUTION, STAGES, dense_bytes, ratio_for
 from .target import Grid
 from .training import Images, ImagesProblem, evaluate
 from .views import Views, ViewsError, load_views
@@ -98,7 +98,7 @@ def fit(request: Request) -> Fitted:
         **table.settings,
     }
     table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
-    dense = NODE_BYTES * int(np.prod(grid.nodes.shape))
+    dense = dense_bytes(grid.nodes.shape)
     lines = [f"{grid_seconds:.1f} s for the grid, {time.perf_counter() - start - grid_seconds:.1f} s from it on"]
     size = getattr(field, "nbytes", None)
     if size:
@@ -211,7 +211,7 @@ def wanted_bytes(options, grid: Grid) -> int | None:
     if options["bytes"] is not None:
         return sizes.parse_bytes(options["bytes"])
     if options["compression"] is not None:
-        return round(NODE_BYTES * int(np.prod(grid.nodes.shape)) / sizes.parse_compression(options["compression"]))
+        return round(dense_bytes(grid.nodes.shape) / sizes.parse_compression(options["compression"]))
     return None
 
 
@@ -271,7 +271,7 @@ def _reaching(request: Request, grid: Grid, images: Images, views: Views, held: 
 
 def _pairs(request: Request, grid: Grid, views: Views, held: Views, stopped: bool):
     seen = target.divided(grid, target.visible(grid, Images(request.types, views)), 1, 0)
-    nbytes = wanted_bytes(request.options, grid) or NODE_BYTES * int(np.prod(grid.nodes.shape)) / COMPRESSION
+    nbytes = wanted_bytes(request.options, grid) or dense_bytes(grid.nodes.shape) / COMPRESSION
     problem = pairs_problem(seen, nbytes, views, held, request, 0 if stopped else VALUE_STEPS)
     result = _train(request, problem, stopped)
     net = problem.net
@@ -289,7 +289,7 @@ def pairs_problem(
 ) -> pairs.PairsProblem:
     """The supplement's arrays of so many bytes, fitted to the grid's numbers in so many steps."""
     types = request.types
-    ratio = NODE_BYTES * int(np.prod(grid.nodes.shape)) / nbytes
+    ratio = dense_bytes(grid.nodes.shape) / nbytes
     extent = np.array(grid.nodes.upper) - np.array(grid.nodes.lower)
     shapes = {}
     for kind, channels, share in (("density", 1, DENSITY_SHARE), ("colour", 12, 1 - DENSITY_SHARE)):

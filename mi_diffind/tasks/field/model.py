@@ -9,7 +9,7 @@ import numpy as np
 
 from ..task import Model
 from .files import field_of
-from .presets import NODE_BYTES
+from .presets import dense_bytes
 
 #: Rays along each side of the box in which what they leave out is counted.
 PIXELS = 96
@@ -50,7 +50,7 @@ class FieldModel(Model):
     @property
     def dense_nbytes(self) -> int:
         """Bytes of a grid of thirteen float32 numbers at every node of the box: what ratios refer to."""
-        return NODE_BYTES * math.prod(self.table.settings["shape"])
+        return dense_bytes(self.table.settings["shape"])
 
     def describe(self):
         field, settings = self.field, self.table.settings

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from ...settings import FitSettings
@@ -23,6 +24,11 @@ COMPRESSION = 50.0
 
 #: Bytes of a node of the uncompressed grid: a density and twelve numbers of colour, float32.
 NODE_BYTES = 52
+
+
+def dense_bytes(shape) -> int:
+    """Bytes of an uncompressed grid of so many nodes along each axis, to which compressions refer."""
+    return NODE_BYTES * math.prod(map(int, shape))
 
 
 @dataclass(frozen=True)

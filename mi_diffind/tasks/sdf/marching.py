@@ -1,21 +1,25 @@
 """
 Rays through a sparse grid (:class:`.nodes.SparseNodes`), from cell to cell.
 
-A ray goes from one empty region, block or cell to the next, as bit masks say; only in the cells that the surface
-crosses is anything read, all corners at once, and evaluated at :data:`SAMPLES` places along the ray. What a cell of the
-spacing h is missed by that enters and leaves the solid between two places, no more than h·√3 / :data:`SAMPLES` apart.
+A ray goes from one empty region or block to the next, as words say that are made of the masks (:mod:`.index`). In a
+block with crossed cells it goes to where the block's *slab* begins: between two planes, parallel to the one of its
+frame, beyond which the sign is known. There it goes from cell to cell; only in those that the surface may cross is
+anything read, all corners at once, and evaluated at :data:`SAMPLES` places along the ray. What enters and leaves the
+solid between two places in a cell of the spacing h, no more than h·√3 / :data:`SAMPLES` apart, may be missed.
 
-Lengths are in spacings here, as the structure's.
+Nodes that are trained may move the surface anywhere in their cells: there are no slabs then. Lengths are in spacings
+here, as the structure's.
 """
 
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
-from scipy.ndimage import distance_transform_cdt
 
+from . import codes
+from .index import EMPTY, INSIDE, MIDDLE, SLAB, STEPS, cells_of, slabs_of, words_of
 from .nodes import CORNERS
-from .structure import ACTIVE, BLOCK, _bits, _words
+from .structure import _words
 
 #: Places along the ray at which a cell is looked at, and steps by false position from there.
 SAMPLES, ROOTS = 3, 3
@@ -23,44 +27,44 @@ SAMPLES, ROOTS = 3, 3
 #: How far a ray goes beyond the side of a cell, so that it is in the next one.
 HAIR = 1e-3
 
-#: A word of a block without crossed cells: this, the sign, and how far the next one that has some is, in blocks.
-EMPTY, INSIDE = 1 << 31, 1 << 30
-
 #: Components of a direction below this count as zero.
 TINY = 1e-12
-
-#: Eight blocks: the one of a cell's lowest corner, and those that its others may lie in.
-NEIGHBOURS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
 
 class Marcher:
     """
-    What is made of a field's masks, once: how many regions around an empty one are empty, and their sign; for each
-    block of the others its number, or the same; for each block with crossed cells, which these are, the signs of the
-    others, and the numbers of the blocks beside it.
+    What rays go by, in memory: for each region, and each block of those with nodes, a word that says how many around it
+    are empty and their sign, or its number; for each block with crossed cells, which these are, the signs of the
+    others, the numbers of the blocks beside it, and its plane and slab.
     """
 
     def __init__(self, field):
         self.field = field
         structure, UInt32 = field.structure, field.types.UInt32
-        crossed, inside, beside, empty = cells_of(structure)
+        crossed, inside, beside, empty, node = cells_of(structure)
         regions, blocks = words_of(structure, crossed, inside, empty)
         words = np.concatenate([_words(crossed), _words(inside)], axis=1)
         self.cells, self.beside, self.regions, self.words = (
             UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (words, beside, regions, blocks)
         )
+        self.slabs, nodes = None, field.decoded()
+        if nodes is not None:
+            frames = field.frames()
+            slabs = np.stack([frames, slabs_of(crossed, inside, node, nodes, frames)], axis=1)
+            self.slabs = UInt32(slabs.reshape(-1))
 
     @property
     def nbytes(self) -> int:
         """Bytes of it."""
-        return 4 * sum(map(dr.width, (self.regions, self.words, self.cells, self.beside)))
+        made = [self.regions, self.words, self.cells, self.beside, *([] if self.slabs is None else [self.slabs])]
+        return 4 * sum(map(dr.width, made))
 
     # -- where a ray is -----------------------------------------------------------------------------------------------
 
-    def locate(self, course, t, active):
+    def block(self, course, t, active):
         """
-        Of the cell at ``t`` of a ray: whether it is crossed; the number of its block; where the ray leaves it, or what
-        is empty around it; its sign (of no meaning if it is crossed).
+        Of the block at ``t`` of a ray: whether cells of it are crossed; its number if so; where the ray leaves what is
+        empty around it; whether that is inside.
         """
         i, j, k = cell = course.cell(t)
         types = self.field.types
@@ -71,34 +75,72 @@ class Marcher:
         place = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
         word = dr.gather(UInt32, self.words, region * 64 + place, active & ~wide)
         word = dr.select(wide, region, word)
-        empty = word >= EMPTY
-        low, high, low_sign, high_sign = dr.gather(types.Array4u, self.cells, word, active & ~empty)
-        x, y, z = UInt32(i & 3), UInt32(j & 3), UInt32(k & 3)
-        upper = x >= 2
-        half, signs = dr.select(upper, high, low), dr.select(upper, high_sign, low_sign)
+        end = course.end(cell, dr.select(wide, Int32(4), 2), Int32(word & 0xFFFF))
+        return active & (word < EMPTY), word, dr.maximum(end, t), (word & INSIDE) != 0
+
+    def cell(self, course, t, number, active):
+        """
+        From the place ``t`` of a ray, in the block with this number: whether there is a crossed cell before the ray
+        leaves the block; where that begins; where the ray leaves it, or what is not crossed; whether the sign at ``t``
+        is known, and whether it is inside.
+        """
+        types = self.field.types
+        UInt32, Int32, Float, Bool = types.UInt32, types.Int32, types.Float, types.Bool
+        cell, start, last = course.cell(t), t, Float(dr.inf)
+        off, below, within = Bool(False), Bool(False), active
+        if self.slabs is not None:
+            first, last, below = self.slab(course, t, number, cell, active)
+            off, start = (t < first) | (t > last), dr.maximum(t, first)
+            # Not if that is behind, or not in this block
+            there, out = course.cell(start), Int32(0)
+            for v, w in zip(cell, there, strict=True):
+                out |= (v ^ w) >> 2
+            within = active & (t <= last) & (out == 0)
+            start = dr.select(within, start, t)
+            cell = [dr.select(within, w, v) for v, w in zip(cell, there, strict=True)]
+        low, high, low_signs, high_signs = dr.gather(types.Array4u, self.cells, number, within)
+        x, y, z = (UInt32(v & 3) for v in cell)
+        half, signs = dr.select(x < 2, low, high), dr.select(x < 2, low_signs, high_signs)
         bit = (x & 1) * 16 + y * 4 + z
-        crossed = active & ~empty & (((half >> bit) & 1) == 1)
+        crossed = within & (((half >> bit) & 1) == 1)
         # The cell and its seven neighbours in a cube of 2 × 2 × 2 are bits of one word
         alone = (half & (UInt32(0x330033) << ((y & 2) * 4 + (z & 2)))) == 0
-        shift = dr.select(wide, Int32(4), dr.select(empty, 2, dr.select(alone, 1, 0)))
-        reach = dr.select(empty, Int32(word & 0xFFFF), 1)
-        sign = dr.select(empty, (word & INSIDE) != 0, ((signs >> bit) & 1) == 1)
-        return crossed, word, dr.maximum(course.end(cell, shift, reach), t), sign
+        shift = dr.select(within, dr.select(alone, Int32(1), 0), 2)
+        end = dr.maximum(course.end(cell, shift, 1), start)
+        end = dr.select(crossed, dr.maximum(dr.minimum(end, last), start), end)
+        return crossed, start, end, off | ~crossed, dr.select(off, below, ((signs >> bit) & 1) == 1)
 
-    def corners(self, number, i, j, k, active):
+    def slab(self, course, t, number, cell, active):
+        """
+        Where a ray enters and leaves the slab of the block with this number, which holds ``cell``, and whether it is
+        below the slab at ``t``.
+        """
+        Float = self.field.types.Float
+        frame, word = dr.gather(self.field.types.Array2u, self.slabs, number, active)
+        n, d, _ = codes.frames(frame, self.field.types)
+        low, high = (dr.fma(Float(v), 2 * SLAB / STEPS, -SLAB) for v in (word & 0xFFFF, word >> 16))
+        # The height above the plane is at + slope t
+        at, slope = d, Float(0)
+        for v, x, o, e in zip(n, cell, course.o, course.d, strict=True):
+            at, slope = dr.fma(v, o - Float(x & ~3) - MIDDLE, at), dr.fma(v, e, slope)
+        inverse = dr.rcp(dr.select(dr.abs(slope) < TINY, TINY, slope))
+        one, other = (low - at) * inverse, (high - at) * inverse
+        return dr.minimum(one, other), dr.maximum(one, other), dr.fma(slope, t, at) < low
+
+    def corners(self, number, cell, active=True):
         """Distance and gradient, in spacings, of the eight nodes of a crossed cell, in the order of ``CORNERS``."""
-        field, UInt32 = self.field, self.field.types.UInt32
+        field, Words = self.field, dr.uint32_array_t(self.field.types.Array4f)
+        owners = [w for n in (0, 1) for w in dr.gather(Words, self.beside, number * 2 + n, active)]
+        # Which of the blocks beside it a corner lies in, axis by axis
+        for v, m in zip(cell, (4, 2, 1), strict=True):
+            last = (v & 3) == 3
+            owners = [dr.select(last, w, owners[n - m]) if n & m else w for n, w in enumerate(owners)]
         found = []
-        far = [dr.select((v & 3) == 3, UInt32(m), 0) for v, m in zip((i, j, k), (4, 2, 1), strict=True)]
-        for a, b, c in CORNERS:
-            x, y, z = i + a, j + b, k + c
-            n = number * 8
-            for e, m in zip((a, b, c), far, strict=True):
-                n = n + m if e else n
-            own = number if not (a or b or c) else dr.gather(UInt32, self.beside, n, active)
+        for own, corner in zip(owners, CORNERS, strict=True):
+            at = [v + e for v, e in zip(cell, corner, strict=True)]
             record = field._record(own, active)
-            _, node, _ = field._in_block(record, x, y, z)
-            found.append(field._node(node, record, x, y, z, active))
+            _, node, _ = field._in_block(record, *at)
+            found.append(field._node(node, record, *at, active))
         return found
 
 
@@ -109,16 +151,26 @@ def of(field) -> Marcher:
     return field._marcher
 
 
-def blend(corners, place):
-    """The field's value in spacings at ``place`` in a cell, 0 to 1 along each axis, from its corners."""
-    x, y, z = place
-    # One axis after the other: what corners say of the place, blended along z, y and x
+def along(corners, start, d):
+    """
+    The field's value, in spacings, on the ray ``start + t·d`` through a cell, 0 to 1 along each axis, as a function of
+    ``t``: what each corner says is linear in t, and blended along z, y and x.
+    """
     said = []
-    for (a, b, c), (d, g) in zip(CORNERS, corners, strict=True):
-        said.append(d + 0.5 * (g[0] * (x - a) + g[1] * (y - b) + g[2] * (z - c)))
-    for t in (z, y, x):
-        said = [dr.fma(t, q - p, p) for p, q in zip(said[::2], said[1::2], strict=True)]
-    return said[0]
+    for corner, (distance, g) in zip(CORNERS, corners, strict=True):
+        offset = [x - e for x, e in zip(start, corner, strict=True)]
+        there = dr.fma(g[0], offset[0], dr.fma(g[1], offset[1], g[2] * offset[2]))
+        change = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
+        said.append((dr.fma(0.5, there, distance), 0.5 * change))
+
+    def value(t):
+        values = [dr.fma(change, t, there) for there, change in said]
+        for axis in (2, 1, 0):
+            w = dr.fma(d[axis], t, start[axis])
+            values = [dr.fma(w, q - p, p) for p, q in zip(values[::2], values[1::2], strict=True)]
+        return values[0]
+
+    return value
 
 
 def cross(marcher, course, low, end, number, leaving, fresh):
@@ -127,11 +179,8 @@ def cross(marcher, course, low, end, number, leaving, fresh):
     the start. ``(found, t, leaving)``.
     """
     cell = course.cell(low)
-    corners = marcher.corners(number, *cell, True)
-    to = [x - course.types.Float(c) for x, c in zip(course.o, cell, strict=True)]
-
-    def value(t):
-        return blend(corners, [dr.fma(v, t, x) for x, v in zip(to, course.d, strict=True)])
+    start = [x - course.types.Float(c) for x, c in zip(course.o, cell, strict=True)]
+    value = along(marcher.corners(number, cell), start, course.d)
 
     step = (end - low) * (1 / SAMPLES)
     start, high = low, low
@@ -199,17 +248,31 @@ def march(marcher, o, d, length, fresh, active):
     while dr.hint(active, label="cells that are crossed"):
         # All rays of a packet go on until each has found one: reading it is what costs
         seeking, number, end = types.Bool(active), types.UInt32(0), t
-        while dr.hint(seeking, label="cells that are not"):
-            crossed, word, following, sign = marcher.locate(course, t, seeking)
-            leaving = dr.select(fresh & seeking & ~crossed, sign, leaving)
-            fresh &= crossed | ~seeking
-            jumped = seeking & ~crossed & (sign != leaving)
-            number, end = dr.select(crossed, word, number), dr.select(crossed, following, end)
-            found |= jumped
-            seeking &= ~crossed & ~jumped
-            t = dr.select(seeking, following + HAIR, t)
-            active &= ~jumped & (t < length)
+        while dr.hint(seeking, label="blocks with cells that are"):
+            far = types.Bool(seeking)
+            while dr.hint(far, label="blocks without"):
+                some, word, following, sign = marcher.block(course, t, far)
+                empty = far & ~some
+                number = dr.select(some, word, number)
+                leaving = dr.select(empty & fresh, sign, leaving)
+                fresh &= ~empty
+                jumped = empty & (sign != leaving)
+                found |= jumped
+                t = dr.select(empty & ~jumped, following + HAIR, t)
+                active &= ~jumped & (t < length)
+                far &= ~some & active
             seeking &= active
+            crossed, start, following, known, sign = marcher.cell(course, t, number, seeking)
+            known &= seeking
+            leaving = dr.select(fresh & known, sign, leaving)
+            fresh &= ~known
+            jumped = known & (sign != leaving)
+            crossed &= ~jumped
+            end = dr.select(crossed, following, end)
+            found |= jumped
+            t = dr.select(seeking & ~jumped, dr.select(crossed, start, following + HAIR), t)
+            active &= ~jumped & (t < length)
+            seeking &= ~crossed & active
         hit, place, leaving = dr.if_stmt(
             (t, end, number, leaving, fresh),
             active,
@@ -222,73 +285,3 @@ def march(marcher, o, d, length, fresh, active):
         t = dr.select(hit, place, dr.select(active, end + HAIR, t))
         active &= ~hit & (t < length)
     return found & (t <= length), t, leaving
-
-
-def cells_of(structure) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    For each block with nodes: whether each of its 64 cells is crossed, that is, all its corners are stored; whether the
-    others are inside, ``(B, 64)``; and the blocks that their corners lie in, ``(B, 8)``, the block itself where there
-    is none. And the signs of blocks without nodes, at their places in the grid.
-    """
-    at = structure.block_positions() // BLOCK
-    number = np.full([n // BLOCK + 1 for n in structure.shape], -1)
-    number[tuple(at.T)] = np.arange(len(at))
-    beside = np.stack([number[tuple((at + n).T)] for n in NEIGHBOURS], axis=1)
-
-    # The signs of blocks without nodes, beyond the grid outside
-    empty = np.zeros(number.shape, bool)
-    coarse = (structure.regions & 1).astype(bool)
-    for x, y, z in np.ndindex(4, 4, 4):
-        part = coarse.copy()
-        part[structure.regions == ACTIVE] = _bits(structure.region_signs)[:, x * 16 + y * 4 + z]
-        empty[x : x + 4 * coarse.shape[0] : 4, y : y + 4 * coarse.shape[1] : 4, z : z + 4 * coarse.shape[2] : 4][
-            : coarse.shape[0], : coarse.shape[1], : coarse.shape[2]
-        ] = part
-
-    nodes = np.concatenate([_bits(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)])
-    groups = (structure.block_signs[:, None] >> np.arange(8) & 1).astype(bool).reshape(-1, 2, 2, 2)
-    signs = groups.repeat(2, 1).repeat(2, 2).repeat(2, 3)
-    stored, inside = np.zeros((2, len(at), 5, 5, 5), bool)
-    for which, n in enumerate(NEIGHBOURS):
-        to = (slice(None), *(slice(4 * e, 4 + e) for e in n))
-        of = (slice(None), *(slice(0, 1 if e else 4) for e in n))
-        there = beside[:, which]
-        stored[to] = nodes[there][of]
-        known = np.where(there[:, None, None, None] >= 0, signs[there], empty[tuple((at + n).T)][:, None, None, None])
-        inside[to] = known[of]
-    crossed, within = np.ones((len(at), 4, 4, 4), bool), np.zeros((len(at), 4, 4, 4), bool)
-    for a, b, c in CORNERS:
-        corner = (slice(None), slice(a, a + 4), slice(b, b + 4), slice(c, c + 4))
-        crossed &= stored[corner]
-        within |= ~stored[corner] & inside[corner]
-    beside = np.where(beside < 0, np.arange(len(at))[:, None], beside)
-    return crossed.reshape(-1, 64), within.reshape(-1, 64), beside, empty[:-1, :-1, :-1]
-
-
-def words_of(structure, crossed, inside, empty) -> tuple[np.ndarray, np.ndarray]:
-    """
-    For each region the number of its blocks' words, or what is said of empty ones (:data:`EMPTY`), uint32; for each
-    block of those that are not empty, ``(R, 64)``, its number, or the same.
-    """
-    number, full = np.zeros(empty.shape, np.uint32), np.zeros(empty.shape, bool)
-    at = tuple((structure.block_positions() // BLOCK).T)
-    full[at] = crossed.any(axis=1)
-    number[at] = np.arange(len(crossed))
-    sign = empty.copy()
-    sign[at] = inside[:, 0]  # where no cell is crossed, all have the same
-    shape = structure.regions.shape
-
-    def parts(v):
-        return v.reshape(np.stack([shape, (4, 4, 4)], 1).ravel()).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 64)
-
-    blocks = parts(np.where(full, number, _free(full, sign)).astype(np.uint32))
-    some = parts(full).any(axis=1)
-    regions = _free(some.reshape(shape), parts(sign)[:, 0].reshape(shape)).ravel()
-    regions[some] = np.arange(some.sum())
-    return regions.astype(np.uint32), blocks[some]
-
-
-def _free(full: np.ndarray, sign: np.ndarray) -> np.ndarray:
-    """What is said of empty parts of a grid, of which ``full`` ones are not."""
-    far = distance_transform_cdt(~full, "chessboard") if full.any() else np.full(full.shape, max(full.shape))
-    return np.int64(EMPTY) | np.where(sign, INSIDE, 0) | far

@@ -238,6 +238,18 @@ class SparseNodes(Field):
         arguments = self.types.Array3f(p), value, step, stored
         return dr.if_stmt(arguments, stored, near, lambda p, value, step, stored: (value, step))
 
+    def frames(self) -> np.ndarray:
+        """The words of the blocks' frames, ``(B,)``."""
+        return np.array(self._blocks).reshape(-1, 4)[:, 3]
+
+    def decoded(self) -> np.ndarray | None:
+        """What nodes hold: distances in spacings and gradients, ``(n, 4)``; none if they may be trained."""
+        if self._entries is None:
+            return None
+        pointers = codes.pointers_of(np.array(self._pointers), self.bits, self.structure.nodes)
+        entries = codes.entries_numpy(np.array(self._entries), *self._affine)
+        return decoded_nodes(self.structure, self.frames(), entries[pointers])
+
     @property
     def nbytes(self) -> int:
         """Bytes of everything that a read needs, as it is held."""
@@ -269,30 +281,40 @@ def slope_bound(values: np.ndarray, gradients: np.ndarray, corners: np.ndarray, 
     """
     A bound Λ of |∇f| in all cells: values (n,) in spacings, gradients (n, 3), corners (K, 8), z fastest.
 
-    In a cell f is a polynomial of degree 2 along each axis, its derivatives lie between their Bernstein coefficients.
+    The derivatives lie between their own Bernstein coefficients, twice the differences of those of f.
     """
-    worst = 0.0
+    told, worst = np.concatenate([values[:, None], gradients], axis=1), 0.0
     for first in range(0, len(corners), part):
-        which = corners[first : first + part]
-        v, g = values[which].reshape(-1, 2, 2, 2), gradients[which].reshape(-1, 2, 2, 2, 3)
-        # f's Bernstein coefficients, (k, 3, 3, 3): products of w (linear) and the offsets (linear)
-        b = np.zeros((len(which), 3, 3, 3))
-        total = np.zeros((len(which), 3, 3, 3))
-        for i, j, k in CORNERS:
-            ends = [(np.array([0.0, 0.5, 1.0]) if e else np.array([1.0, 0.5, 0.0])) for e in (i, j, k)]
-            # w·(t − e) is −t(1 − t) for e = 1 and t(1 − t) for e = 0: coefficients 0, ± ½, 0
-            bump = [np.array([0.0, -0.5 if e else 0.5, 0.0]) for e in (i, j, k)]
-            plain = np.einsum("x,y,z->xyz", *ends)
-            total += v[:, i, j, k, None, None, None] * plain
-            for axis in range(3):
-                curve = np.einsum("x,y,z->xyz", *[bump[o] if o == axis else ends[o] for o in range(3)])
-                b += 0.5 * g[:, i, j, k, axis, None, None, None] * curve
-        total += b
+        total = bernstein(told[corners[first : first + part]]).reshape(-1, 3, 3, 3)
         square = 0.0
         for axis in range(3):
             square = square + np.abs(2 * np.diff(total, axis=1 + axis)).max(axis=(1, 2, 3)) ** 2
         worst = max(worst, float(np.sqrt(square.max(initial=0.0))))
     return max(1.0, worst)
+
+
+def _bernstein() -> np.ndarray:
+    """What :func:`bernstein` multiplies with, ``(32, 27)``."""
+    ends, bump = np.array([[1, 0.5, 0], [0, 0.5, 1]]), np.array([[0, 0.5, 0], [0, -0.5, 0]])
+    rows = []
+    for corner in CORNERS:
+        rows.append(np.einsum("x,y,z->xyz", *(ends[e] for e in corner)))
+        for axis in range(3):
+            # w·(t − e) is t(1 − t) for e = 0 and its negative for e = 1: coefficients 0, ± ½, 0
+            curves = [(bump if other == axis else ends)[e] for other, e in enumerate(corner)]
+            rows.append(0.5 * np.einsum("x,y,z->xyz", *curves))
+    return np.array(rows).reshape(32, 27)
+
+
+_BERNSTEIN = _bernstein()
+
+
+def bernstein(told: np.ndarray) -> np.ndarray:
+    """
+    In a cell f is a polynomial of degree 2 along each axis: its Bernstein coefficients, ``(K, 27)``, z fastest, of what
+    the eight corners say, value in spacings and gradient, ``(K, 8, 4)``. Its values lie between them.
+    """
+    return told.reshape(-1, 32) @ _BERNSTEIN
 
 
 def middles(positions: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
-from ...arguments import Argument, positive
+from ...arguments import Argument, define, positive
 from .scene_recipe import STARTS, SceneRecipe, Views
 
 
@@ -45,14 +45,6 @@ def bound(text: str) -> float | None:
     if found <= 0:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a positive number or none")
     return found
-
-
-def define(text: str) -> tuple[str, str]:
-    """``NAME=VALUE``. Raises ``ArgumentTypeError``."""
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected NAME=VALUE")
-    return name, value
 
 
 _OWN = SceneRecipe()
