@@ -358,6 +358,11 @@ def keep_meshes(config) -> None:
     config.merge_meshes = False
 
 
+def build_as(config, parallel: bool, optimize: bool) -> None:
+    """Have a parsed scene built as ``mi.load_file`` does with these arguments."""
+    config.parallel, config.merge_equivalent, config.merge_meshes = parallel, optimize, optimize
+
+
 def properties_of(state, kind=None) -> list:
     """
     The properties (``mi.Properties``) of all objects of a parsed scene, or of those of a ``kind``, an

@@ -29,6 +29,9 @@ MAX_DEPTHS = {
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
 }
 
+#: Shapes that only integrators of ours see as they are stored → these, and what makes all others see them.
+TRACED = {"neural_sdf": (("path_sdf",), ("trace", "grid"))}
+
 
 class SceneError(DiffindError, RuntimeError):
     """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
@@ -50,7 +53,10 @@ def load(
     ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
     infinite), and ``defines`` (name → value) the scene's ``<default>`` values. ``change(state)`` may change the parsed
     scene (``mi.parser.ParserState``) before anything else does. Without ``merge``, no meshes are made one, and each
-    keeps its id. Raises :class:`SceneError`.
+    keeps its id.
+
+    Shapes that the scene's integrator does not see as they are stored are decoded to what it does see, unless the scene
+    says that they are not to be; a warning says what that takes. Raises :class:`SceneError`.
     """
     with scene_errors(path), _resolving(path):
         config, state = _parse(path, defines)
@@ -62,51 +68,84 @@ def load(
             swap(state, against)
         if longest_path is not None:
             _path_integrator(state)["max_depth"] = longest_path
+        integrators = _integrators(state) or ["path"]  # which commands take that need none in the scene
+        decoded = _decode_unseen(state, integrators)
         loaded = compat.instantiate(config, state)
         if not isinstance(loaded, mi.Scene):
             raise RuntimeError(f"{path}: holds a {type(loaded).__name__}, a scene is expected")
-        found = [props.plugin_name() for props in compat.properties_of(state, mi.ObjectType.Integrator)]
-        unseen = _unseen(loaded, found or ["path"])
+        unseen = _unseen(loaded, integrators)
         if unseen:
             raise RuntimeError(unseen)
+        _say_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
         return loaded
+
+
+def _integrators(state) -> list[str]:
+    """The names of all integrators of a parsed scene, those within others, too."""
+    return [props.plugin_name() for props in compat.properties_of(state, mi.ObjectType.Integrator)]
+
+
+def _decode_unseen(state, integrators: list[str]) -> list[str]:
+    """
+    Have the shapes of :data:`TRACED` that none of the ``integrators`` sees decoded if the parsed scene does not say how
+    they are traced, nor that their arrays are optimised; returns their ids.
+    """
+    found = []
+    for props in compat.properties_of(state):
+        seen_by, (key, value) = TRACED.get(props.plugin_name(), ((), ("", "")))
+        optimised = "storage" in props and props["storage"] == "float32"
+        if seen_by and key not in props and not optimised and not set(seen_by) & set(integrators):
+            props[key] = value
+            found.append(props.id())
+    return found
+
+
+def _say_decoded(scene, ids: list[str], integrators: list[str]) -> None:
+    """A warning for each shape that was decoded so that the ``integrators`` see it."""
+    names = ", ".join(f'"{name}"' for name in integrators)
+    for made in instances(scene) if ids else ():
+        origin, said = plugins.origin(made), plugins.report(made) or {}
+        if origin["plugin"] in TRACED and origin["id"] in ids and "decoded" in said:
+            mi.Log(mi.LogLevel.Warn, f"{origin['filename']}, whose arrays {names} does not see, is {said['decoded']}")
 
 
 def _unseen(scene, integrators: list[str]) -> str:
     """A sentence about a shape that is seen by none of the ``integrators`` (names of plugins), "" if there is none."""
     for made in instances(scene):
-        seen_by = getattr(made, "seen_by", integrators)
-        if not set(seen_by) & set(integrators):
+        seen_by = getattr(made, "seen_by", None)
+        if seen_by and not set(seen_by) & set(integrators):
             allowed = " or ".join(f'"{name}"' for name in seen_by)
-            found = ", ".join(f'"{name}"' for name in integrators)
+            found = ", ".join(f'"{name}"' for name in integrators) or "none"
             return (
                 f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} '
-                f"alone, "
-                f'found {found}: take that one, or trace="grid"'
+                f'alone, found {found}: take that one, or trace="grid"'
             )
     return ""
 
 
-def load_file(path: str | os.PathLike, **defines):
+def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = True, **defines):
     """
-    Load a scene file as ``mi.load_file`` does, which this calls, with ``defines`` for its ``<default>`` values (and
-    ``optimize`` and ``parallel``, which are Mitsuba's own); and tell textures that filter themselves which sensor sees
-    them, the first one of the scene, at the samples of its sampler: ``mi.load_file`` itself does not
-    (:func:`.plugins.support.footprint.attach`). Raises what ``mi.load_file`` raises.
+    Load a scene file as ``mi.load_file`` does, with ``defines`` for its ``<default>`` values (and ``parallel`` and
+    ``optimize``, which are Mitsuba's own), and do what that does not: tell textures that filter themselves which sensor
+    sees them, the first one of the scene, at the samples of its sampler (:func:`.plugins.support.footprint.attach`);
+    decode shapes that the scene's integrator does not see as they are stored, if the scene does not say that they are
+    not to be, with a warning that says what that takes. Where it says so, and in a scene without an integrator (another
+    one may be meant), a warning says that they are left out. Raises what ``mi.load_file`` raises.
     """
-    loaded = mi.load_file(str(path), **defines)
+    if not Path(path).is_file():
+        return mi.load_file(str(path))
+    with _resolving(path):
+        config, state = compat.parse_file(path, defines)
+        compat.build_as(config, parallel, optimize)
+        integrators = _integrators(state)
+        decoded = _decode_unseen(state, integrators) if integrators else []
+        loaded = compat.instantiate(config, state)
     if isinstance(loaded, mi.Scene):
-        integrator = loaded.integrator()
-        if integrator is None:
-            name = "path"  # as mi.render has it
-        else:
-            nested = getattr(integrator, "surfaces", integrator)  # of neural_field
-            said = plugins.origin(nested)
-            name = said["plugin"] if said else nested.class_name()
-        unseen = _unseen(loaded, [name])
-        if unseen:  # another integrator may be meant
+        unseen = _unseen(loaded, integrators)
+        if unseen:
             mi.Log(mi.LogLevel.Warn, unseen)
+        _say_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
     return loaded
 

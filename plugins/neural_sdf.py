@@ -1,5 +1,6 @@
 from __future__ import annotations  # Delayed parsing of type annotations
 
+import math
 import threading
 import time
 from pathlib import Path
@@ -16,18 +17,17 @@ from mi_diffind.tasks.task import stamp
 from . import Counterpart, Plugin, reports_as, shown_as
 from .support import properties, tables
 from .support.sdf_meshes import to_mesh
-from .support.solids import Placement, Solid, native_grid
+from .support.solids import CELL_BYTES, Placement, Solid, finest, fitted, native_grid
 
 #: Whose arrays cannot be optimised are shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()
 _lock = threading.RLock()  # Mitsuba makes the shapes of a scene at once; who waits for a kernel may make another one
 
-#: Cells of a grid per cell of the field, along a side. At 0.75, a grid differs from a sparse field by 4% of the field's
-#: cells near the surface, on average (armadillo, 1 MB), at 0.6 by 5%, at 0.3 by 18%.
-CELLS = 0.75
+#: A grid that ``trace="grid"`` takes by itself has so many cells along the longest side and bytes in Mitsuba, at most.
+FINEST, LARGEST = 512, 3 * 2**30
 
-#: The finest grid that ``trace="grid"`` takes by itself, along the longest side: 1.5 GB in Mitsuba.
-FINEST = 256
+#: The error of arrays whose file does not tell, in cells of the field: sparse ones have 0.002 to 0.007.
+TYPICAL_ERROR = 0.005
 
 
 def open_model(props: mi.Properties):
@@ -44,6 +44,51 @@ def open_model(props: mi.Properties):
             return model if model is not None else _shared.setdefault(key, TASK.open(mi.TensorXf, path))
     except (TableError, ValueError) as e:
         raise RuntimeError(str(e)) from None
+
+
+def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
+    """
+    The grid of a model's field that ``sdfgrid`` takes, its corners in the unit frame, and what is to be said of it:
+    with ``resolution`` cells along the longest side, or 0, as many as it takes for an error below that of the arrays.
+    """
+    from mi_diffind.tasks.sdf import decode
+
+    field, wanted = model.field, model.table.measured.get("mae_surface")
+    measured = isinstance(wanted, (int, float)) and 0 < wanted < math.inf
+    if not measured:
+        wanted = TYPICAL_ERROR * field.spacing
+    if resolution:
+        error = decode.trilinear_error(field, decode.surface_points(field, 2**12), resolution)
+    else:
+        most = min(FINEST, finest(np.subtract(field.upper, field.lower), LARGEST))
+        resolution, error = decode.resolution_for(field, wanted, most)
+    values, lower, upper = decode.grid(field, resolution)
+    decode.interpolable(values, field.band)
+    values, lower, upper = fitted(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
+    said = {
+        "preset": model.table.preset,
+        "storage": model.storage,
+        "table_bytes": model.nbytes,
+        "trace": "grid",
+        "resolution": resolution,
+        "cells": [n - 1 for n in values.shape[::-1]],
+        "grid_bytes": values.nbytes,
+        "memory_bytes": CELL_BYTES * math.prod(n - 1 for n in values.shape),
+        "error": float(error),
+        "arrays_error": float(wanted),
+        "arrays_error_measured": measured,
+    }
+    return values, lower, upper, said
+
+
+def sentence(said: dict) -> str:
+    """What is said of a grid, in short."""
+    about = "" if said["arrays_error_measured"] else "about "
+    return (
+        f"decoded to a grid of {said['resolution']} cells along the longest side, {said['memory_bytes'] / 1e6:,.0f} MB "
+        f"in Mitsuba, {said['seconds']:.1f} s; on average, its surface is {said['error']:.2g} of that side off the "
+        f"arrays', which is {about}{said['arrays_error']:.2g} off the mesh's"
+    )
 
 
 class NeuralSDF(Solid):
@@ -81,12 +126,14 @@ class NeuralSDF(Solid):
        - |string|
        - ``arrays``: rays are traced through the arrays themselves, by the integrator :monosp:`path_sdf`. ``grid``: the
          distances are decoded to Mitsuba's :monosp:`sdfgrid` when the scene is loaded, which any integrator sees.
-         (Default: ``arrays``)
+         (Default: ``arrays``; in a scene that ``mi-diffind`` or ``mi_diffind.load_file`` loads, ``grid`` if its
+         integrator is another one)
        - --
 
      * - resolution
        - |int|
-       - Of ``grid``: cells along the longest side, 4 to 512. (Default: three quarters of the field's own, at most 256)
+       - Of ``grid``: cells along the longest side of the field's box, 4 to 512. (Default: as few as it takes for an
+         error below that of the arrays, as far as 512 cells and 3 GB allow)
        - --
 
      * - storage
@@ -106,12 +153,20 @@ class NeuralSDF(Solid):
     outside. The exact counterpart is the mesh that the file was made from.
 
     **With** ``arrays``, nothing is decoded. Mitsuba 3.9 knows of no shapes written in Python but meshes, so this one is
-    a mesh without area: other integrators than :monosp:`path_sdf` do not see it, and the commands of ``mi-diffind``
-    refuse to render a scene with one of these. Several shapes of one file share its arrays. There are no texture
+    a mesh without area: other integrators than :monosp:`path_sdf` do not see it. The commands of ``mi-diffind`` and
+    ``mi_diffind.load_file`` decode it for them unless ``trace`` is given or ``storage`` is ``float32``: then, commands
+    refuse the scene, and ``mi_diffind.load_file`` warns. ``mi.load_file`` and ``mi.load_dict`` cannot: the shape is
+    missing in what other integrators render. Several shapes of one file share its arrays. There are no texture
     coordinates (they are 0), no emitters and no media, and it cannot be in a :monosp:`shapegroup`.
 
-    **With** ``grid``, a rotation makes of it an instance. 256³ cells take 1.5 GB and some seconds; the derivatives and
-    parameters are those of :monosp:`sdfgrid`.
+    **With** ``grid``, the resolution is found when the scene is loaded: grids are tried at 4096 places on the surface,
+    and the coarsest one is taken that is off the arrays' surface by no more than that was off the mesh when it was
+    fitted, both on average. Values beside the surface are changed a little, which takes a quarter to a third off the
+    error: what lies between nodes would be too large where the field is convex. Mitsuba takes 40 bytes for each cell of
+    the box around the surface, crossed or not: of a field of 256 kB 440 MB or less, of one of 1 MB 2.5 GB and more, and
+    ten seconds; ``resolution`` says how coarse it is to be instead. Where 512 cells or 3 GB do not suffice, a warning
+    says what the errors are; ``mi-diffind inspect`` says it of any scene. Each shape has a grid of its own. A rotation
+    makes of it an instance; the derivatives and parameters are those of :monosp:`sdfgrid`.
 
     .. tabs::
         .. code-tab:: xml
@@ -186,31 +241,25 @@ def factory(props: mi.Properties):
         return NeuralSDF(props)
     if properties.one_of(props, "storage", ("uint8", "float32")) == "float32":
         raise RuntimeError('parameter "storage": found "float32", trace="grid" has no arrays that can be optimised')
-    from mi_diffind.tasks.sdf import decode
-
     start, model = time.perf_counter(), open_model(props)
     resolution = props.get("resolution", 0)
     if not isinstance(resolution, int) or ("resolution" in props and not 4 <= resolution <= 512):
         raise RuntimeError(f'parameter "resolution": found {resolution}, allowed are whole numbers from 4 to 512')
     to_world = props.get("to_world", mi.ScalarTransform4f())
     Placement.of(to_world, model.scale, model.centre)  # refuses what is none
-    longest = max(b - a for a, b in zip(model.field.lower, model.field.upper, strict=True))
-    resolution = resolution or min(FINEST, max(8, round(CELLS * longest / model.field.spacing)))
-    values, lower, upper = decode.grid(model.field, resolution)
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
+    try:
+        values, lower, upper, said = decoded(model, resolution)
+    except RuntimeError as e:
+        raise RuntimeError(f"{model.table.path}: {e}") from None
     to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)
     to_world = mi.ScalarTransform4f(np.array(to_world.matrix))
     made, kept = native_grid(props, values, lower, upper, to_world @ to_unit, normals)
-    seconds = time.perf_counter() - start
-    said = {
-        "preset": model.table.preset,
-        "storage": model.storage,
-        "table_bytes": model.nbytes,
-        "trace": "grid",
-        "resolution": list(values.shape[::-1]),
-        "grid_bytes": 4 * max(values.shape) ** 3,
-        "seconds": round(seconds, 2),
-    }
+    said["seconds"] = round(time.perf_counter() - start, 2)
+    said["decoded"] = sentence(said)
+    if not resolution and said["error"] > said["arrays_error"]:
+        finer = f'finer than {FINEST} cells or {LARGEST / 1e9:.1f} GB a grid is only if "resolution" says so'
+        mi.Log(mi.LogLevel.Warn, f"{model.table.path}: {said['decoded']}; {finer}")
     if kept is not made:
         shown_as(made, kept)
     reports_as(kept, lambda: said)

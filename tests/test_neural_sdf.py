@@ -157,7 +157,9 @@ def test_reports(mi_rgb, folder):
     found = {entry["trace"] + str("to_world" in entry["parameters"]): entry for entry in scenes.reports(made)}
     assert set(found) == {"arraysFalse", "gridFalse", "gridTrue"}
     assert found["arraysFalse"]["table_bytes"] < 100_000 and found["arraysFalse"]["index_bytes"] > 0
-    assert found["gridTrue"]["grid_bytes"] == 4 * max(found["gridTrue"]["resolution"]) ** 3
+    turned = found["gridTrue"]
+    assert turned["resolution"] == 24 and turned["grid_bytes"] == 4 * np.prod(np.add(turned["cells"], 1))
+    assert turned["memory_bytes"] == 40 * np.prod(turned["cells"]) and "24 cells" in turned["decoded"]
     json.dumps(list(found.values()))
 
 
@@ -225,6 +227,156 @@ def test_derivatives_reach_the_nodes(mi_rgb, folder):
     assert found == pytest.approx(differences, rel=0.03)
 
 
+# -- how fine a grid is ------------------------------------------------------------------------------------------------
+
+
+def upright(p):
+    """The torus around the y axis, in whose box Y is the short side."""
+    d, n = torus(p[:, [0, 2, 1]])
+    return d, n[:, [0, 2, 1]]
+
+
+@pytest.fixture(scope="module")
+def upright_files(tmp_path_factory):
+    """Error of the arrays that a file tells (``None``: it does not) → the file."""
+    path = tmp_path_factory.mktemp("grids")
+    table = sparse_table(upright, scale=SCALE, centre=CENTRE)
+    files = {}
+    for error in (None, 3e-4, 1e-4, 1e-6):
+        files[error] = path / f"{error}.npz"
+        table.measured.pop("mae_surface", None)
+        if error is not None:
+            table.measured["mae_surface"] = error
+        save_table(files[error], table)
+    return files
+
+
+def as_grid(mi, file, **more):
+    shape = {"type": "neural_sdf", "filename": str(file), "trace": "grid", **more}
+    return mi.load_dict({"type": "scene", "a": shape})
+
+
+def grid_of(mi, file, **more):
+    """What a shape that is a grid reports, its values (Z, Y, X), and its box."""
+    made = as_grid(mi, file, **more)
+    values = np.array(mi.traverse(made)["a.grid"])[..., 0]
+    box = made.bbox()
+    (said,) = scenes.reports(made)
+    return said, values, np.array(box.min), np.array(box.max)
+
+
+def off_the_field(mi, file, values, lower, upper):
+    """How much a grid in the world differs from the field of a file, on the torus, on average."""
+    from scipy.ndimage import map_coordinates
+
+    from mi_diffind.tasks.sdf import TASK
+
+    field = TASK.open(mi.TensorXf, file).field
+    a, b = np.random.default_rng(3).uniform(0, 2 * np.pi, (2, 30000))
+    p = np.stack([(0.38 + 0.12 * np.cos(b)) * np.cos(a), 0.12 * np.sin(b), (0.38 + 0.12 * np.cos(b)) * np.sin(a)], 1)
+    place = (SCALE * p + CENTRE - lower) / (upper - lower) * (np.array(values.shape[::-1]) - 1)
+    found = map_coordinates(values.astype(np.float64), place.T[::-1], order=1)
+    return np.abs(found - field.value(mi.Point3f(p.T.astype(np.float32))).numpy()).mean()
+
+
+@pytest.mark.parametrize("error", [3e-4, 1e-4])
+def test_grids_are_as_coarse_as_the_error_of_the_arrays_allows(mi_rgb, upright_files, error):
+    """By brute force: the chosen grid keeps below that error, one that is 6% coarser does not."""
+    said, *grid = grid_of(mi_rgb, upright_files[error])
+    assert said["arrays_error"] == error and said["arrays_error_measured"] and said["error"] <= error
+    assert said["error"] == pytest.approx(off_the_field(mi_rgb, upright_files[error], *grid), rel=0.06)
+    coarser, *grid = grid_of(mi_rgb, upright_files[error], resolution=int(said["resolution"] / 1.06))
+    assert off_the_field(mi_rgb, upright_files[error], *grid) > 0.97 * error
+    assert coarser["error"] > 0.97 * error
+
+
+def test_grids_are_cut_to_what_is_inside(mi_rgb, upright_files):
+    """As many bytes as there are nodes; Y is shorter than X and Z, and the torus is hit where it is all the same."""
+    mi = mi_rgb
+    said, values, lower, upper = grid_of(mi, upright_files[3e-4], normals="analytic")
+    z, y, x = values.shape
+    assert z == x > 2.5 * y and said["cells"] == [x - 1, y - 1, z - 1]
+    assert said["grid_bytes"] == 4 * x * y * z and said["memory_bytes"] == 40 * (x - 1) * (y - 1) * (z - 1)
+    half, cell = SCALE * np.array([0.5, 0.12, 0.5]), (upper - lower) / np.array([x - 1, y - 1, z - 1])
+    assert np.allclose(cell, cell[0], rtol=1e-4)
+    assert (
+        (lower < CENTRE - half).all() and (CENTRE + half < upper).all() and (upper - lower < 2 * half + 6 * cell).all()
+    )
+    o, d = rays(np.random.default_rng(4))
+    o, d = o[:, [0, 2, 1]], d[:, [0, 2, 1]]
+    expected = analytic(o[:, [0, 2, 1]], d[:, [0, 2, 1]])
+    made = mi.load_dict(
+        {"type": "scene", "a": {"type": "neural_sdf", "filename": str(upright_files[3e-4]), "trace": "grid"}}
+    )
+    ray = mi.Ray3f(mi.Point3f((SCALE * o + CENTRE).T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
+    t = np.array(made.ray_intersect(ray).t) / SCALE
+    both = np.isfinite(expected) & np.isfinite(t)
+    assert (np.isfinite(expected) == np.isfinite(t)).mean() > 0.995 and both.mean() > 0.3
+    assert np.median(np.abs(t[both] - expected[both])) < 1e-3
+
+
+def test_grids_of_sparse_fields(mi_rgb, upright_files):
+    """Where no node is stored, one value of a block stands for all: as if each had been asked for."""
+    from mi_diffind.tasks.sdf import TASK, decode
+
+    field = TASK.open(mi_rgb.TensorXf, upright_files[None]).field
+    for resolution in (70, 150):
+        values, lower, upper = decode.grid(field, resolution)
+        shape = values.shape[::-1]
+        expected = decode.node_values(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape).transpose(2, 1, 0)
+        assert np.abs(values - expected).max() < 1e-6
+        crossed = decode.crossed_blocks(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape)
+        assert crossed.any() and (resolution < 100 or crossed.mean() < 0.9)
+
+
+def warnings_of(mi, monkeypatch):
+    """What Mitsuba is told to warn of from here on."""
+    said = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: said.append(text) if level == mi.LogLevel.Warn else None)
+    return said
+
+
+def test_grids_are_no_larger_than_allowed(mi_rgb, upright_files, monkeypatch):
+    """A warning says what the errors are then; a resolution that was asked for is not limited."""
+    from mi_diffind.plugins import neural_sdf as plugin
+
+    warned = warnings_of(mi_rgb, monkeypatch)
+    monkeypatch.setattr(plugin, "LARGEST", 2_000_000)
+    said, *_ = grid_of(mi_rgb, upright_files[1e-6])
+    assert said["memory_bytes"] < 2_000_000 and said["error"] > 10 * said["arrays_error"]
+    assert len(warned) == 1 and said["decoded"] in warned[0] and "1e-06 off the mesh" in warned[0]
+    asked, *_ = grid_of(mi_rgb, upright_files[1e-6], resolution=80)
+    assert asked["memory_bytes"] > 2_000_000 and len(warned) == 1
+    monkeypatch.setattr(plugin, "FINEST", 20)
+    assert grid_of(mi_rgb, upright_files[1e-6])[0]["resolution"] == 20
+    box = [1.0, 0.3, 0.6]
+    n = plugin.finest(box, 10**8)
+    assert 40 * n * 0.3 * n * n <= 10**8 < 40 * (n + 1) * 0.3 * (n + 1) ** 2
+
+
+def test_grids_of_files_that_tell_no_error(mi_rgb, upright_files):
+    said, *_ = grid_of(mi_rgb, upright_files[None])
+    assert not said["arrays_error_measured"] and said["arrays_error"] == pytest.approx(0.005 / 40)
+    assert said["error"] <= said["arrays_error"] and "about" in said["decoded"]
+
+
+def test_images_of_grids_are_those_of_arrays(mi_rgb, folder):
+    """At the resolution that is found by itself and with the same random numbers, most of the noise cancels."""
+    images = []
+    for trace in ("arrays", "grid"):
+        made = scene(mi_rgb, {"torus": shape(folder, trace=trace)})
+        images.append(np.array(mi_rgb.render(made, spp=64, seed=1)))
+    assert scenes.reports(made)[0]["resolution"] < 80
+    assert np.abs(images[0] - images[1]).mean() < 1e-3 < np.abs(images[0] - images[0].mean()).mean() / 20
+
+
+def test_grids_without_anything_inside(mi_rgb):
+    from mi_diffind.plugins.support import solids
+
+    with pytest.raises(RuntimeError, match="nothing is inside at 6 cells"):
+        solids.fitted(np.ones((5, 6, 7)), np.zeros(3), 0.1)
+
+
 # -- what cannot be ----------------------------------------------------------------------------------------------------
 
 
@@ -279,19 +431,84 @@ def test_damaged_files(mi_rgb, folder, tmp_path, fault):
     assert len(sentence) < 400
 
 
-def test_other_integrators_are_refused(mi_rgb, folder, tmp_path):
-    """Rather than an image in which the shape is missing."""
-    text = f"""<scene version="3.0.0"><shape type="neural_sdf" id="ring">
-        <string name="filename" value="{folder}/torus.npz"/></shape>
-        <integrator type="path"/><sensor type="perspective"/></scene>"""
+def written(folder, tmp_path, parameters="", integrator=""):
     path = tmp_path / "scene.xml"
-    path.write_text(text)
-    with pytest.raises(SceneError, match=r'"ring".*"path_sdf".*found "path"'):
+    path.write_text(f"""<scene version="3.0.0"><shape type="neural_sdf" id="ring">
+        <string name="filename" value="{folder}/torus.npz"/>{parameters}</shape>
+        {integrator}<sensor type="perspective"/></scene>""")
+    return path
+
+
+def integrator(name, inner=""):
+    return f'<integrator type="{name}">{inner}</integrator>'
+
+
+EXPLICIT = '<string name="trace" value="arrays"/>'
+TRACED = integrator("path_sdf")
+STOCK = [integrator("path"), integrator("moment", integrator("path")), integrator("prb")]
+OURS = [TRACED, integrator("aov", '<string name="aovs" value="d:depth"/>' + TRACED), integrator("moment", TRACED)]
+
+
+@pytest.mark.parametrize("xml", STOCK)
+def test_other_integrators_see_a_grid(mi_rgb, folder, tmp_path, monkeypatch, xml):
+    """If the scene says nothing; one line tells what that takes."""
+    warned = warnings_of(mi_rgb, monkeypatch)
+    path = written(folder, tmp_path, '<integer name="resolution" value="40"/>', xml)
+    for load in (scenes.load, scenes.load_file):
+        made = load(path)
+        (said,) = scenes.reports(made)
+        assert said["trace"] == "grid" and warned.pop().endswith(said["decoded"]) and not warned
+        ray = mi_rgb.Ray3f(mi_rgb.Point3f(CENTRE[0] + 0.76, CENTRE[1], 5), mi_rgb.Vector3f(0, 0, -1))
+        assert dr.all(made.ray_test(ray))
+
+
+@pytest.mark.parametrize("xml", OURS)
+def test_our_integrator_sees_arrays(mi_rgb, folder, tmp_path, monkeypatch, xml):
+    """Also within another one."""
+    warned = warnings_of(mi_rgb, monkeypatch)
+    for load in (scenes.load, scenes.load_file):
+        (said,) = scenes.reports(load(written(folder, tmp_path, "", xml)))
+        assert said["trace"] == "arrays" and not warned
+
+
+def test_scenes_without_an_integrator(mi_rgb, folder, tmp_path, monkeypatch):
+    """Commands that need none take ``path``; in Python, another one may be meant."""
+    warned = warnings_of(mi_rgb, monkeypatch)
+    path = written(folder, tmp_path)
+    assert scenes.reports(scenes.load(path))[0]["trace"] == "grid" and len(warned) == 1
+    assert scenes.reports(scenes.load_file(path))[0]["trace"] == "arrays"
+    assert 'is seen by the integrator "path_sdf" alone, found none' in warned[1]
+
+
+@pytest.mark.parametrize("more", [EXPLICIT, '<string name="storage" value="float32"/>'])
+@pytest.mark.parametrize("xml", STOCK[:2])
+def test_arrays_that_other_integrators_do_not_see(mi_rgb, folder, tmp_path, monkeypatch, more, xml):
+    """Asked for, they are refused rather than left out of an image; ``load_file`` warns."""
+    warned = warnings_of(mi_rgb, monkeypatch)
+    path = written(folder, tmp_path, more, xml)
+    with pytest.raises(SceneError, match=r'"ring".*"path_sdf".*found.*"path"'):
         scenes.load(path)
-    path.write_text(text.replace('type="path"', 'type="path_sdf"'))
-    assert len(scenes.load(path).shapes()) == 1
+    assert scenes.reports(scenes.load_file(path))[0]["trace"] == "arrays" and len(warned) == 1
+    made = scenes.load(written(folder, tmp_path, more, TRACED))
+    assert len(made.shapes()) == 1
     mesh = scenes.load(path, exact=True).shapes()[0]
     assert mesh.face_count() == 96 * 48 * 2 and type(mesh) is mi_rgb.Mesh
+
+
+def test_load_file_takes_what_mitsuba_takes(mi_rgb, folder, tmp_path):
+    path = written(
+        folder,
+        tmp_path,
+        EXPLICIT,
+        '<default name="n" value="3"/>' + integrator("path_sdf", '<integer name="max_depth" value="$n"/>'),
+    )
+    for parallel in (True, False):
+        made = scenes.load_file(path, parallel=parallel, optimize=False, n=7)
+        assert made.integrator().max_depth == 7
+    with pytest.raises(RuntimeError, match=r"none\.xml"):
+        scenes.load_file(tmp_path / "none.xml")
+    with pytest.raises(RuntimeError, match="unused"):
+        scenes.load_file(path, unused=1)
 
 
 def test_plugin_is_declared(mi_rgb):

@@ -7,6 +7,7 @@ import drjit.llvm.ad as T
 import numpy as np
 import pytest
 import solids
+from scipy.ndimage import map_coordinates
 
 from mi_diffind.errors import DiffindError
 from mi_diffind.tasks.sdf import decode, evaluation
@@ -267,17 +268,42 @@ def test_grid():
 def test_how_fine_a_grid_has_to_be():
     """A ball's trilinear error goes with the square of the cells; a coarse grid is found for a large error."""
     field = Ball(0.3, band=0.2)
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(20000, 3))
-    points *= 0.3 / np.linalg.norm(points, axis=1)[:, None]
-    errors = [decode.trilinear_error(field, points, n) for n in (25, 50, 100)]
-    # ½ Σ w(1 − w) h² f″ with curvatures 1/r in two directions: h²/6 · 1/r on average
-    assert errors[1] == pytest.approx((1.1 / 50) ** 2 / 6 / 0.3, rel=0.05)
-    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1) and errors[1] / errors[2] == pytest.approx(4, rel=0.1)
-    chosen = [decode.resolution_for(field, e) for e in (1e-3, 1e-4, 2e-5, 0)]
-    assert chosen == sorted(chosen) and chosen[0] < chosen[1] < chosen[2] and chosen[-1] == 512
-    needed = 1.1 * math.sqrt(1 / (6 * 0.3 * 1e-4))
-    assert needed <= chosen[1] < 1.5 * needed
+    points = decode.surface_points(field, 20000)
+    length = np.linalg.norm(points, axis=1)
+    assert len(points) == 20000 and np.abs(length - 0.3).max() < 1e-4 and np.abs(points.mean(axis=0)).max() < 0.005
+    errors = [decode.trilinear_error(field, points, n) for n in (50, 100, 200)]
+    # ½ Σ w(1 − w) h² f″ with curvatures 1/r in two directions, whose average is taken off: E |Σ nᵢ (1/6 − w(1 − w))|
+    rng = np.random.default_rng(1)
+    w = rng.random((10**6, 3))
+    n = rng.normal(size=w.shape)
+    share = 1 - n**2 / (n**2).sum(axis=1, keepdims=True)
+    expected = np.abs(0.5 * ((w * (1 - w) - 1 / 6) * share).sum(axis=1)).mean()
+    for n, error, rel in zip((50, 100, 200), errors, (0.15, 0.05, 0.03), strict=True):
+        assert error == pytest.approx(expected * (1.1 / n) ** 2 / 0.3, rel=rel)
+    for error in (1e-3, 1e-4, 2e-5):
+        chosen, found = decode.resolution_for(field, error)
+        assert found <= error and decode.trilinear_error(field, points, chosen) == pytest.approx(found, rel=0.05)
+        assert decode.trilinear_error(field, points, int(chosen / 1.04)) > 0.98 * error
+    chosen, found = decode.resolution_for(field, 2e-5, finest=60)
+    assert chosen == 60 and found == pytest.approx(decode.trilinear_error(field, points, 60), rel=0.05) and found > 2e-5
+    assert decode.resolution_for(field, 0, finest=60)[0] == 60
+    assert decode.resolution_for(Ball(-0.1), 1e-3) == (8, 0)  # no surface
+
+
+def test_interpolable_grids():
+    """Nodes beside the surface move and no others, none to the other side, and interpolation errs less."""
+    field = Ball(0.3, (0.1, 0, 0), band=0.1)
+    values, lower, _ = decode.grid(field, 24)
+    moved = values.copy()
+    decode.interpolable(moved, field.band)
+    assert ((moved < 0) == (values < 0)).all()
+    changed = np.abs(moved - values) > 1e-7
+    assert changed.mean() > 0.05 and np.abs(values[changed]).max() < field.band
+    points = decode.surface_points(field, 10000)
+    place = ((points - lower) / (1.1 / 24)).T[::-1]
+    errors = [np.abs(map_coordinates(v.astype(np.float64), place, order=1)).mean() for v in (values, moved)]
+    assert errors[1] < 0.6 * errors[0]
+    assert errors[1] == pytest.approx(decode.trilinear_error(field, points, 24), rel=1e-3)
 
 
 # -- chamfer ----------------------------------------------------------------------------------------------------------

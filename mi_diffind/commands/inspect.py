@@ -11,8 +11,7 @@ from .common import scene_options, set_variant, verb
 
 #: What there is to say about how rays meet a shape: keys of its report.
 _RAYS = {
-    "trace": "traced through", "index_bytes": "bytes of index beside the arrays:", "resolution": "of",
-    "grid_bytes": "bytes:", "seconds": "seconds to decode:",
+    "trace": "traced through", "index_bytes": "bytes of index beside the arrays:", "decoded": "",
 }  # fmt: skip
 
 HELP = "say what is in a table file, or which learned plugins a scene uses"
@@ -125,7 +124,8 @@ def _inspect_scene(arguments) -> dict:
         if "rays" in found:
             _print_rays(found["rays"])
         elif found["kind"] == "shape":
-            print("    rays      " + ", ".join(f"{text} {found[key]}" for key, text in _RAYS.items() if key in found))
+            said = (f"{text} {found[key]}".strip() for key, text in _RAYS.items() if key in found)
+            print("    rays      " + ", ".join(said))
         else:
             print(f"    in use    {', '.join(found.get('effects_in_use', ())) or 'grazing reflection only'}")
             left_out = ", ".join(f"{k} ({v})" for k, v in found.get("effects_left_out", {}).items())

@@ -27,6 +27,9 @@ OFFSET = 3 * tracing.EPSILON
 #: Below this cosine between ray and normal, a hit moves with the field's entries as at it.
 GRAZING = 1e-2
 
+#: What Mitsuba's ``sdfgrid`` takes for each cell, crossed or not: its value, a number, and a box of 32 bytes.
+CELL_BYTES = 40
+
 #: Triangles without area, and an attribute that keeps Mitsuba from merging them with others' meshes.
 CORNERS, UNMERGED = 8, "face_solid"
 
@@ -177,25 +180,51 @@ def solids_of(scene: mi.Scene) -> list[Solid]:
 
 
 def cube_of(values: np.ndarray, lower, upper) -> tuple[np.ndarray, np.ndarray]:
-    """
-    A grid of ``values`` (Z, Y, X) in a box with these corners, filled with outside to a cube, and its upper corner:
-    in grids whose sides differ, the ``sdfgrid`` of Mitsuba 3.9 finds next to no hits, and reads beyond their end.
-    """
+    """A grid of ``values`` (Z, Y, X) in a box with these corners, filled with outside to a cube; its upper corner."""
     side = max(values.shape)
     spacing = (upper[0] - lower[0]) / (values.shape[2] - 1)
     values = np.pad(values, [(0, side - n) for n in values.shape], constant_values=float(values.max()))
     return values, np.asarray(lower, np.float64) + spacing * (side - 1)
 
 
+def fitted(values: np.ndarray, lower, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Of a grid of ``values`` (Z, Y, X), from the corner ``lower`` on, what its surface needs, with its corners: cut to
+    two cells around what is inside, then filled with outside until X and Z are the same. Where they are not, the
+    ``sdfgrid`` of Mitsuba 3.9 finds next to no hits, and reads beyond its end; Y may be any. Raises ``RuntimeError`` if
+    nothing is inside.
+    """
+    parts = []
+    for axis, count in enumerate(values.shape):
+        inside = np.flatnonzero((values < 0).any(axis=tuple({0, 1, 2} - {axis})))
+        if not len(inside):
+            raise RuntimeError(f"nothing is inside at {max(values.shape) - 1} cells along the longest side")
+        parts.append(slice(max(0, inside[0] - 2), min(count, inside[-1] + 3)))
+    values = values[tuple(parts)]
+    lower = np.asarray(lower, np.float64) + spacing * np.array([part.start for part in reversed(parts)])
+    side = max(values.shape[0], values.shape[2])
+    fill = [(0, side - values.shape[0]), (0, 0), (0, side - values.shape[2])]
+    values = np.pad(values, fill, constant_values=float(values.max()))
+    return values, lower, lower + spacing * (np.array(values.shape[::-1]) - 1)
+
+
+def finest(sides, nbytes: int) -> int:
+    """
+    Cells along the longest side of the finest grid in a box with these ``sides`` (X, Y, Z) that takes ``nbytes`` bytes
+    in Mitsuba.
+    """
+    x, y, z = np.asarray(sides, np.float64) / max(sides)
+    return int((nbytes / (CELL_BYTES * y * max(x, z) ** 2)) ** (1 / 3))
+
+
 def native_grid(props: mi.Properties, values: np.ndarray, lower, upper, to_world, normals: str):
     """
-    Mitsuba's ``sdfgrid`` of ``values`` (Z, Y, X) in a box with these corners, which ``to_world`` moves; with the
-    material of ``props``. Rotated, it is an instance, in a ``merge`` with its group. Returns the shape, and what a
-    scene keeps of it.
+    Mitsuba's ``sdfgrid`` of ``values`` (Z, Y, X), X and Z the same, in a box with these corners, which ``to_world``
+    moves; with the material of ``props``. Rotated, it is an instance, in a ``merge`` with its group. Returns the shape,
+    and what a scene keeps of it.
     """
-    values, upper = cube_of(values, lower, upper)
     at = mi.ScalarTransform4f
-    box = at().translate(list(map(float, lower))).scale(float(upper[0] - lower[0]))
+    box = at().translate(list(map(float, lower))).scale(list(map(float, np.asarray(upper) - lower)))
     grid = {
         "type": "sdfgrid",
         "id": props.id() or "grid",

@@ -24,6 +24,15 @@ CHUNK = 2**22
 #: The finest grid that is decoded.
 MAX_RESOLUTION = 1024
 
+#: Points of a surface: places drawn at once, how often at most, Newton's steps, what is near enough, of a cell.
+DRAWN, DRAWS, NEWTON, ON_SURFACE = 2**15, 64, 6, 1e-3
+
+#: Parts along the longest side of a box, of which those that the surface may pass through are drawn from.
+PARTS = 16
+
+#: Of its value: what is left of a node's that is to change its sign.
+NEARER = 0.1
+
 #: Of a cell: values nearer to zero are moved so far away from it, so that no vertex falls on a node.
 OFF_NODE = 1e-3
 
@@ -70,15 +79,56 @@ def grid(field: Field, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndar
     """
     spacing = _spacing(field, resolution)
     lower = np.array(field.lower)
-    cells = np.ceil((np.array(field.upper) - lower) / spacing - 1e-6).astype(int)
-    values = np.empty(tuple(cells[::-1] + 1), np.float32)
-    step = max(1, CHUNK // int(np.prod(cells[1:] + 1)))
-    for first in range(0, cells[0] + 1, step):
-        last = min(first + step, cells[0] + 1)
-        start = lower + spacing * np.array([first, 0, 0])
-        found = node_values(field, start, spacing, (last - first, *(cells[1:] + 1)))
-        values[:, :, first:last] = found.transpose(2, 1, 0)
-    return values, lower, lower + spacing * cells
+    nodes = np.ceil((np.array(field.upper) - lower) / spacing - 1e-6).astype(int) + 1
+    values = np.empty(tuple(nodes[::-1]), np.float32)
+    crossed = crossed_blocks(field, lower, spacing, nodes)
+    # Where no stored node is near, all of a block's nodes say the same
+    same = node_values(field, lower, BLOCK * spacing, crossed.shape)
+    for x in range(0, nodes[0], BLOCK):
+        last = min(x + BLOCK, nodes[0])
+        shape = (last - x, *nodes[1:])
+        slab = _of_blocks(same[x // BLOCK], shape)
+        where = np.flatnonzero(_of_blocks(crossed[x // BLOCK], shape))
+        slab.reshape(-1)[where] = node_values(field, lower + spacing * np.array([x, 0, 0]), spacing, shape, where)
+        values[:, :, x:last] = slab.transpose(2, 1, 0)
+    return values, lower, lower + spacing * (nodes - 1)
+
+
+def _of_blocks(values: np.ndarray, shape) -> np.ndarray:
+    """What is known of blocks (Y, Z) at the nodes of a layer of them, of the ``shape`` (x, y, z)."""
+    for axis in range(2):
+        values = np.repeat(values, BLOCK, axis=axis)
+    return np.broadcast_to(values[: shape[1], : shape[2]], shape).copy()
+
+
+def interpolable(values: np.ndarray, band: float) -> None:
+    """
+    Change a :func:`grid` of a field that tells distances up to ``band``, in place, so that its trilinear interpolation
+    is nearer to the field (:func:`_interpolable`). Signs stay.
+    """
+    flat = values.reshape(-1)
+    told = np.abs(values) < band
+    for axis in range(3):
+        np.moveaxis(told, axis, 0)[[0, -1]] = False
+    where = np.flatnonzero(told)
+    steps = (1, values.shape[2], values.shape[2] * values.shape[1])
+    around = (flat[where + sign * step] for step in steps for sign in (1, -1))
+    flat[where] = _interpolable(flat[where], around, band)
+
+
+def _interpolable(values: np.ndarray, around, band: float) -> np.ndarray:
+    """
+    Values at nodes, with those of their six neighbours, as interpolation wants them. It is larger than what it
+    interpolates where that is convex, by a twelfth of the second differences along the three axes on average over a
+    cell (of a quadratic function). So much less, but for the sign; unless one of the seven tells no distance.
+    """
+    total, told = -6 * values, np.abs(values) < band
+    for other in around:
+        total += other
+        told &= np.abs(other) < band
+    moved = values - total / 12
+    moved = np.where((moved < 0) == (values < 0), moved, NEARER * values)
+    return np.where(told, moved, values)
 
 
 def crossed_blocks(field: Field, lower, spacing: float, cells) -> np.ndarray:
@@ -215,46 +265,95 @@ def components(mesh) -> np.ndarray:
 
 # -- how fine ---------------------------------------------------------------------------------------------------------
 
+#: The coarsest grid that is thought of, and by how much one may be finer than needed.
+COARSEST, FINER = 8, 1.03
 
-def resolution_for(field: Field, error: float, seed: int = 0, finest: int = 512, count: int = 2**15) -> int:
+
+def resolution_for(field: Field, error: float, finest: int = MAX_RESOLUTION, seed: int = 0) -> tuple[int, float]:
     """
-    The coarsest grid (cells along the longest side, at most ``finest``) whose trilinear interpolation differs from the
-    field by less than ``error`` on average near the surface; ``error`` is meant to be the field's own (``mae_near``).
+    The coarsest grid (cells along the longest side, from 8 to ``finest``) whose trilinear interpolation differs from
+    the field by no more than ``error`` on average on the field's surface, within 3%, and by how much it does: by more
+    than ``error`` if ``finest`` is too coarse. ``error`` is meant to be the field's own (``mae_surface``).
+
+    Grids are tried at places of the surface only.
     """
-    points = _near_surface(field, count, seed)
-    n = 32
-    while n < finest:
-        if trilinear_error(field, points, n) < error:
-            return n
-        n = min(finest, 8 * round(n * 1.2 / 8 + 0.5))
-    return finest
+    points = surface_points(field, 2**12, seed)
+    low, high = min(COARSEST, finest) - 1, finest
+    found = trilinear_error(field, points, high)
+    while found <= error and high > max(low + 1, FINER * low):
+        # Errors go with the square of the cells, or fall less steeply: this is fine enough, mostly
+        guess = round(high * math.sqrt(max(found, 1e-3 * error) / error)) if error > 0 else low
+        if low >= COARSEST:
+            guess = max(guess, round(math.sqrt(low * high)))
+        elif guess * FINER > high:
+            guess = math.floor(high / FINER)
+        guess = min(max(guess, low + 1), high - 1)
+        tried = trilinear_error(field, points, guess)
+        if tried <= error:
+            high, found = guess, tried
+        else:
+            low = guess
+    return high, found
 
 
 def trilinear_error(field: Field, points: np.ndarray, resolution: int) -> float:
-    """The mean difference between the field and its trilinear interpolation on a grid, at points ``(N, 3)``."""
-    spacing = _spacing(field, resolution)
-    lower = np.array(field.lower)
-    with dr.suspend_grad():
-        t = field.types
-        p = t.Array3f(np.ascontiguousarray(points.T, dtype=np.float32))
-        q = [(x - float(a)) / spacing for x, a in zip(p, lower, strict=True)]
-        i = [dr.floor(x) for x in q]
-        w = [x - j for x, j in zip(q, i, strict=True)]
-        total = t.Float(0)
-        for corner in range(8):
-            bits = [corner >> axis & 1 for axis in range(3)]
-            at = t.Array3f(*[(j + b) * spacing + float(a) for j, b, a in zip(i, bits, lower, strict=True)])
-            weight = math.prod((x if b else 1 - x for x, b in zip(w, bits, strict=True)), start=t.Float(1))
-            total += weight * field.value(at)
-        return float(np.mean(np.abs((total - field.value(p)).numpy()), dtype=np.float64))
+    """
+    The mean difference between the field and the trilinear interpolation of a grid that is :func:`interpolable`, at
+    points ``(N, 3)``; 0 for none.
+    """
+    if not len(points):
+        return 0.0
+    place = (points - np.array(field.lower)) / _spacing(field, resolution)
+    cell = np.floor(place).astype(np.int64)
+    weights = place - cell
+    corners = np.stack(np.meshgrid(*[(0, 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    # Each node once; further out than a box, they are all the same
+    side = resolution + 4
+    numbers = (cell[:, None] + corners + 1).clip(0, side - 1) @ np.array([side**2, side, 1])
+    numbers, which = np.unique(numbers, return_inverse=True)
+    nodes = np.stack(np.unravel_index(numbers, (side,) * 3), -1) - 1
+
+    def told(nodes):
+        return _values(field, np.array(field.lower) + _spacing(field, resolution) * nodes)
+
+    around = (told(nodes + sign * step) for step in np.eye(3, dtype=int) for sign in (1, -1))
+    values = _interpolable(told(nodes), around, field.band)[which.reshape(len(points), 8)]
+    blend = np.prod(np.where(corners == 1, weights[:, None], 1 - weights[:, None]), axis=2)
+    return float(np.mean(np.abs((blend * values).sum(axis=1) - _values(field, points))))
 
 
-def _near_surface(field: Field, count: int, seed: int) -> np.ndarray:
-    """Points near the field's surface, within a cell of it."""
+def surface_points(field: Field, count: int, seed: int = 0) -> np.ndarray:
+    """
+    About ``count`` points of the field's surface, ``(N, 3)``: nearly uniform over its area, as they are points near it
+    that go where their gradient leads. None if there is no surface.
+    """
     rng = np.random.default_rng(seed)
-    surface = np.asarray(extract(field, 128).vertices)
-    if not len(surface):
-        return rng.uniform(field.lower, field.upper, (count, 3))
-    points = surface[rng.integers(len(surface), size=count)]
-    points = points + rng.uniform(-field.spacing, field.spacing, points.shape)
-    return np.clip(points, field.lower, field.upper)
+    side = float(np.max(np.array(field.upper) - np.array(field.lower))) / PARTS
+    blocks = np.ceil((np.array(field.upper) - np.array(field.lower)) / side - 1e-6).astype(int)
+    parts = np.argwhere(crossed_blocks(field, np.array(field.lower), side / BLOCK, BLOCK * blocks))
+    found, have = [np.zeros((0, 3))], 0
+    for _ in range(DRAWS if len(parts) else 0):
+        p = parts[rng.integers(len(parts), size=DRAWN)] + rng.random((DRAWN, 3))
+        p = np.array(field.lower) + side * p
+        p = p[np.abs(_values(field, p)) < 0.9 * field.band][:count]
+        for _ in range(NEWTON if len(p) else 0):
+            with dr.suspend_grad():
+                value, slope = (np.asarray(v.numpy(), np.float64) for v in field.gradient(_array(field, p)))
+            p = p - np.where((slope**2).sum(0) > 0.01, value / np.maximum((slope**2).sum(0), 0.01) * slope, 0).T
+        found.append(p[np.abs(_values(field, p)) < ON_SURFACE * field.spacing])
+        have += len(found[-1])
+        if have >= count:
+            break
+    return np.concatenate(found)[:count]
+
+
+def _values(field: Field, points: np.ndarray) -> np.ndarray:
+    """The field's values at points ``(N, 3)``: ``(N,)`` float64."""
+    if not len(points):
+        return np.zeros(0)
+    with dr.suspend_grad():
+        return field.value(_array(field, points)).numpy().astype(np.float64)
+
+
+def _array(field: Field, points: np.ndarray):
+    return field.types.Array3f(np.ascontiguousarray(points.T, dtype=np.float32))
