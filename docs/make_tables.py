@@ -253,17 +253,14 @@ def sdf_times(study: str) -> str:
 
 def sdf_parts(study: str) -> str:
     """What the parts of our distance fields are worth, in equal bytes."""
-    result = measured(study)
-    times = result["cases"]["reads"]["queries"]["value"]
     rows = []
-    for name, c in result["candidates"].items():
+    for c in measured(study)["candidates"].values():
         e = c["errors"]
         rows.append([
             c["label"], f"{c['bytes']:,}", f"{e['iou']:.4f} / {e['iou_near']:.4f}",
             f"{e['normal_deg']:.2f}° / {e['normal_p95_deg']:.1f}°", f"{e['components']:,}" if "components" in e else "",
-            f"{times[name]['time']:.3g}",
         ])  # fmt: skip
-    return table(["", "bytes", "IoU / within 0.01", "normals: mean / 95%", "pieces", "a distance, ns"], rows)
+    return table(["", "bytes", "IoU / within 0.01", "normals: mean / 95%", "pieces"], rows)
 
 
 def sdf_rays() -> str:

@@ -497,6 +497,8 @@ def test_errors_of_another_mesh(folder, tmp_path, capsys):
     solids.write(tmp_path / "ball.ply", solids.sphere(8))
     assert main(["tradeoff", "sdf", str(tmp_path / "ball.ply"), "--errors-of", str(folder / "r.json")]) == 2
     assert "is of another mesh than" in capsys.readouterr().err
+    assert main(["tradeoff", "sdf", str(folder / "dent.ply"), "--errors-of", str(folder / "r.json")]) == 2
+    assert "is of a run with --quick" in capsys.readouterr().err
 
 
 def test_no_mesh(tmp_path, capsys):

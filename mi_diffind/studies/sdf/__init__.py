@@ -55,7 +55,7 @@ class SdfStudy(Study):
         arguments.sizes = tuple(dict.fromkeys(map(parse_bytes, arguments.bytes or default)))
         check_without(arguments.without, PARTS if arguments.ablation else KINDS)
         arguments.loaded = load_mesh(arguments.source)
-        arguments.before = earlier(arguments.errors_of, arguments.loaded) if arguments.errors_of else {}
+        arguments.before = earlier(arguments) if arguments.errors_of else {}
 
     def plan(self, arguments) -> Plan:
         from .candidates import Request, plan
@@ -76,15 +76,18 @@ class SdfStudy(Study):
         return plan(arguments.loaded, arguments.source, request, arguments.before)
 
 
-def earlier(path: str, mesh) -> dict[str, dict]:
-    """The records of an earlier run about ``mesh``, name → record. Raises ``ValueError`` with a sentence."""
+def earlier(arguments) -> dict[str, dict]:
+    """The records of the earlier run, name → record. Raises ``ValueError`` with a sentence."""
+    path, mesh = arguments.errors_of, arguments.loaded
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
-        digest, records = found["details"]["source_digest"], dict(found["jobs"])
+        digest, quick, records = found["details"]["source_digest"], found["settings"]["quick"], dict(found["jobs"])
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise ValueError(f"--errors-of: {path} is not what --json wrote of this study: {e!r}") from None
     if digest != mesh.digest:
         raise ValueError(f"--errors-of: {path} is of another mesh than {mesh.path}")
+    if quick != arguments.quick:
+        raise ValueError(f"--errors-of: {path} is of a run {'with' if quick else 'without'} --quick, found the other")
     return records
 
 
