@@ -90,7 +90,13 @@ def test_points(held_out):
     assert np.allclose(octants, 1 / 8, atol=4 * math.sqrt(0.11 / 2**16))
 
 
-def test_points_are_seeded(ball, held_out):
+@pytest.fixture
+def wide_band(monkeypatch):
+    """Fewer cells to be found, where points near the surface are not what is tested."""
+    monkeypatch.setattr(evaluation, "BAND", 0.04)
+
+
+def test_points_are_seeded(ball, wide_band):
     again = Evaluation(*ball, count=2**10, seed=3)
     other = Evaluation(*ball, count=2**10, seed=4)
     assert np.array_equal(again.near, Evaluation(*ball, count=2**10, seed=3).near)
@@ -231,7 +237,7 @@ def test_values_on_nodes_make_no_cracks():
         n = np.array(values.shape)
         field = DenseField(T.TensorXf(values.astype(np.float32)), [0, 0, 0], (n - 1) / 8, 1.0)
         mesh = decode.extract(field, int(n.max()) - 1)
-        count = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)[1]
+        count = np.unique(np.sort(mesh.edges, axis=1) @ [len(mesh.vertices), 1], return_counts=True)[1]
         assert np.all(count % 2 == 0) and mesh.is_winding_consistent and mesh.volume > 0
 
 
@@ -331,7 +337,7 @@ def test_chamfer(ball, held_out):
     assert held_out.chamfer(nothing) == {"chamfer": math.inf, "components": 0, "components_mesh": 1}
 
 
-def test_components_of_overlapping_pieces():
+def test_components_of_overlapping_pieces(wide_band):
     """Two balls that overlap and one apart: two solids, however many pieces the mesh has."""
     mesh = make_mesh(
         *solids.together(solids.sphere(12), solids.sphere(12, 1, (1, 0, 0)), solids.sphere(12, 0.5, (4, 0, 0)))

@@ -111,7 +111,7 @@ def shoot(types, distances, field, count, seed):
 
     rng = np.random.default_rng(seed)
     h = field.spacing
-    pool = samples.far(distances.mesh.lower - 3 * h, distances.mesh.upper + 3 * h, 400_000, rng)
+    pool = samples.far(distances.mesh.lower - 3 * h, distances.mesh.upper + 3 * h, min(4 * count, 400_000), rng)
     d = distances.signed(pool, 4 * h)
     deep, free = pool[d < -1.5 * h], pool[d > 1.5 * h]
     missed = astray = 0

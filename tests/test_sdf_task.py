@@ -21,6 +21,7 @@ from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.evaluation import Evaluation
 from mi_diffind.tasks.sdf.field import DenseField
 from mi_diffind.tasks.sdf.mesh import load_mesh
+from mi_diffind.tasks.sdf.model import SdfModel
 from mi_diffind.tasks.task import fit, tasks
 
 BYTES = 96 * 1024
@@ -39,6 +40,7 @@ def few_points():
     patch.setattr(sdf_fit, "MEASURED", 2**14)
     patch.setattr(sdf_fit, "SAMPLES", 2**16)
     patch.setattr(training, "HELD_OUT", 2**12)
+    patch.setattr(SdfModel.measure, "__defaults__", (None, 2**14))
     yield
     patch.undo()
 
@@ -91,12 +93,6 @@ def test_size_and_accuracy(folder, evaluation, ad):
     assert 1 - found["iou_near"] < 0.5 * (1 - dense["iou_near"])
     assert found["normal_deg"] < 0.7 * dense["normal_deg"]
     assert found["iou"] > 0.997 and found["normal_deg"] < 2
-
-
-def test_the_same_command_gives_the_same_file(folder):
-    command = ["fit", "sdf", str(folder / "solids.ply"), "--bytes", str(BYTES), *SHORT]
-    assert main([*command, "-o", str(folder / "again.npz")]) == 0
-    assert (folder / "again.npz").read_bytes() == (folder / "solids.npz").read_bytes()
 
 
 def test_training_earns_its_place(folder, evaluation, ad):
@@ -191,7 +187,10 @@ def test_decode_and_inspect(folder, tmp_path, capsys):
 
 
 def test_resumed_equals_uninterrupted(folder, tmp_path, monkeypatch):
-    """Ctrl-C after codes were given to half of the nodes; what the problem decided is in the checkpoint."""
+    """
+    Ctrl-C after codes were given to half of the nodes; what the problem decided is in the checkpoint. And the same
+    command gives the same file.
+    """
     whole = folder / "solids.npz"
     command = ["fit", "sdf", str(folder / "solids.ply"), "--bytes", str(BYTES), *SHORT]
     own, calls = training.NodeProblem.loss, []
@@ -320,8 +319,8 @@ def test_one_triangle_and_thin_solids(tmp_path):
 
 
 def test_a_long_training_stays_finite(folder, ad):
-    """1,500 steps at ten times the rate."""
-    done = fit("sdf", source=str(folder / "solids.ply"), bytes="16k", steps=1500, batch=1024, lr=0.2,
+    """Twice as many steps as by default, at ten times the rate."""
+    done = fit("sdf", source=str(folder / "solids.ply"), bytes="16k", steps=500, batch=1024, lr=0.2,
                variant="llvm_ad_rgb", progress=False)  # fmt: skip
     assert np.isfinite(list(done.table.measured.values())).all() and done.table.measured["iou"] > 0.97
     assert done.result.restarts == 0 and FitSettings().lr != 0.2
