@@ -161,9 +161,9 @@ class NeuralSDF(Solid):
 
     **With** ``grid``, the resolution is found when the scene is loaded: grids are tried at 4096 places on the surface,
     and the coarsest one is taken that is off the arrays' surface by no more than that was off the mesh when it was
-    fitted, both on average. Values beside the surface are changed a little, which takes a quarter to a third off the
+    fitted, both on average. Values beside the surface are changed a little, which takes a fifth to a third off the
     error: what lies between nodes would be too large where the field is convex. Mitsuba takes 40 bytes for each cell of
-    the box around the surface, crossed or not: of a field of 256 kB 440 MB or less, of one of 1 MB 2.5 GB and more, and
+    the box around the surface, crossed or not: for a field of 256 kB 400 MB, for one of 1 MB more than 2.5 GB and
     ten seconds; ``resolution`` says how coarse it is to be instead. Where 512 cells or 3 GB do not suffice, a warning
     says what the errors are; ``mi-diffind inspect`` says it of any scene. Each shape has a grid of its own. A rotation
     makes of it an instance; the derivatives and parameters are those of :monosp:`sdfgrid`.
