@@ -220,6 +220,7 @@ class NeuralSDF(Solid):
                 f"{(self.model.field.structure.nodes, 4)}"
             )
         tables.check_shapes(tables.exposed(self.model.arrays))
+        self.model.field.changed()
 
     def report(self) -> dict:
         return {

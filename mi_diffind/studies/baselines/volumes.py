@@ -30,6 +30,9 @@ from ...tasks.sdf.mesh import Mesh
 from ...tasks.sdf.nodes import SparseNodes, middles
 from ...tasks.sdf.structure import Structure
 
+#: Components of a direction below this count as zero.
+TINY = 1e-12
+
 #: No corner of a cell that the surface crosses is further from it than this, in cells.
 NEAREST = 1.75
 
@@ -269,6 +272,19 @@ class Bricks(_Cells):
             stored &= found[0]
         return [[corners[4 * a + 2 * b : 4 * a + 2 * b + 2] for b in (0, 1)] for a in (0, 1)], stored
 
+    def _exit(self, p, d, index, size):
+        """
+        How far it is from ``p`` in the direction ``d`` to the side of the cell with the whole-numbered position
+        ``index`` (three arrays) in a grid of cells of the side ``size``; a hair beyond it.
+        """
+        nearest = self.types.Float(math.inf)
+        for x, v, i, a in zip(p, d, index, self.lower, strict=True):
+            side = dr.fma(self.types.Float(i) + dr.select(v > 0, 1, 0), size, a)
+            t = (side - x) / dr.select(dr.abs(v) > TINY, v, TINY)
+            nearest = dr.minimum(nearest, dr.select(dr.abs(v) > TINY, t, math.inf))
+        nearest = dr.select(dr.isfinite(nearest), nearest, 0)
+        return dr.maximum(nearest, 0) + 1e-3 * self.spacing
+
     def look(self, p, d, active=True):
         active = self.inside(p) & active
         cell = self._cell(p)
@@ -280,11 +296,11 @@ class Bricks(_Cells):
         bricks = [i // self.side for i in index]
         base, _, _, mixed = self._find(bricks, active)
         wide = dr.select(mixed, self.side * self.size, _GROUP * self.side * self.size)
-        leave = self.cell_exit(p, d, [dr.select(mixed, b, b // _GROUP) for b in bricks], wide)
+        leave = self._exit(p, d, [dr.select(mixed, b, b // _GROUP) for b in bricks], wide)
         # The bound of the slope holds where all corners are stored, so not beyond this brick
         step = dr.select(stored, dr.minimum(dr.abs(value) / self.slope, leave), leave)
         if not self.apron:
-            step = dr.select(base & ~stored, self.cell_exit(p, d, index, self.size), step)
+            step = dr.select(base & ~stored, self._exit(p, d, index, self.size), step)
         return value, step
 
 

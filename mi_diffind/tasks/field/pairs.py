@@ -13,7 +13,7 @@ from drjit import nn
 from scipy.ndimage import map_coordinates
 
 from ...fitting import Problem
-from ...indirection import DifferentiableArray, Indirection, ramp
+from ...indirection import DifferentiableArray, Indirection, ramp, rounded
 from .field import RadianceField, blended, colour_of, density_of
 from .nodes import Nodes
 from .target import Grid
@@ -130,11 +130,6 @@ class PairsNet(nn.Module):
 
     def __init__(self, density=None, colour=None):
         self.density, self.colour = density, colour
-
-
-def rounded(net: Indirection) -> Indirection:
-    """As bytes will hold it."""
-    return Indirection([net.primary[0].rounded(8)], net.cascaded.rounded(8))
 
 
 class ValuesProblem(Problem):

@@ -7,16 +7,12 @@ Distances are negative inside.
 
 from __future__ import annotations
 
-import math
 from types import ModuleType
 
 import drjit as dr
 import numpy as np
 
 from ...lookup import clamp
-
-#: Bits by which a direction's component is kept away from zero, where it is divided by.
-TINY = 1e-12
 
 
 class Field:
@@ -74,19 +70,6 @@ class Field:
         """
         value = self.value(p, active)
         return value, dr.abs(value) / self.slope
-
-    def cell_exit(self, p, d, index, size, lower=None):
-        """
-        How far it is from ``p`` in the direction ``d`` to the side of the cell with the whole-numbered position
-        ``index`` (three arrays) in a grid of cells of the side ``size``; a hair beyond it.
-        """
-        nearest = self.types.Float(math.inf)
-        for x, v, i, a in zip(p, d, index, lower or self.lower, strict=True):
-            side = dr.fma(self.types.Float(i) + dr.select(v > 0, 1, 0), size, a)
-            t = (side - x) / dr.select(dr.abs(v) > TINY, v, TINY)
-            nearest = dr.minimum(nearest, dr.select(dr.abs(v) > TINY, t, math.inf))
-        nearest = dr.select(dr.isfinite(nearest), nearest, 0)
-        return dr.maximum(nearest, 0) + 1e-3 * self.spacing
 
 
 class DenseField(Field):

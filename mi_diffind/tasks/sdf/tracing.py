@@ -78,7 +78,7 @@ def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
         # From here on, numbers are small. Rounding must not leave a ray outside, where the field says nothing
         start = Point(dr.clip(dr.fma(d, near, o), Point(*field.lower), Point(*field.upper)))
         length = far - near
-        if hasattr(field, "structure"):
+        if field.marched:
             found, t, leaving = march(field, start, d, length, near == 0, active)
         else:
             found, t, leaving = spheres(field, start, d, length, near == 0, active, exact)
@@ -159,4 +159,4 @@ def occluded(field, o, d, maxt, active=True):
 
 def index_of(field) -> int:
     """Bytes of what tracing makes of a field, once."""
-    return marching.of(field).nbytes if hasattr(field, "structure") else 0
+    return marching.of(field).nbytes if field.marched else 0
