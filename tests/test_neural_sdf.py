@@ -338,19 +338,18 @@ def warnings_of(mi, monkeypatch):
 
 def test_grids_are_no_larger_than_allowed(mi_rgb, upright_files, monkeypatch):
     """A warning says what the errors are then; a resolution that was asked for is not limited."""
-    from mi_diffind.plugins import neural_sdf as plugin
-
+    plugin = plugins.declared()["neural_sdf"].factory.__globals__  # each variant has modules of its own
     warned = warnings_of(mi_rgb, monkeypatch)
-    monkeypatch.setattr(plugin, "LARGEST", 2_000_000)
+    monkeypatch.setitem(plugin, "LARGEST", 2_000_000)
     said, *_ = grid_of(mi_rgb, upright_files[1e-6])
     assert said["memory_bytes"] < 2_000_000 and said["error"] > 10 * said["arrays_error"]
     assert len(warned) == 1 and said["decoded"] in warned[0] and "1e-06 off the mesh" in warned[0]
     asked, *_ = grid_of(mi_rgb, upright_files[1e-6], resolution=80)
     assert asked["memory_bytes"] > 2_000_000 and len(warned) == 1
-    monkeypatch.setattr(plugin, "FINEST", 20)
+    monkeypatch.setitem(plugin, "FINEST", 20)
     assert grid_of(mi_rgb, upright_files[1e-6])[0]["resolution"] == 20
     box = [1.0, 0.3, 0.6]
-    n = plugin.finest(box, 10**8)
+    n = plugin["finest"](box, 10**8)
     assert 40 * n * 0.3 * n * n <= 10**8 < 40 * (n + 1) * 0.3 * (n + 1) ** 2
 
 
