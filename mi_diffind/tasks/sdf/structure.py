@@ -5,7 +5,8 @@ Nodes lie at ``lower + spacing · (i, j, k)``. 4 × 4 × 4 of them make a *block
 grid says which regions have nodes, a mask in each of these which blocks have, a mask in each of these which nodes are
 stored: the corners of all cells in which the sign changes. Of all others only the sign is known:
 
-- of a region without nodes, with a lower bound of the distance to the surface;
+- of a region without nodes, with a lower bound of the distance to the surface (for who steps from place to place; rays
+  go by :mod:`.index`);
 - of a block without nodes;
 - of 2 × 2 × 2 nodes in a block with nodes: they are the corners of a cell, so that, if their signs differ, all of them
   are stored. One bit for eight nodes is therefore all that has to be kept.
