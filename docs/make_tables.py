@@ -222,7 +222,7 @@ def shading_shares(study: str) -> str:
 
 def sdf_errors(study: str) -> str:
     """Distance fields in equal bytes: IoU, IoU near the surface, normals."""
-    from mi_diffind.measure.kinds import by_size
+    from mi_diffind.studies.kinds import by_size
     from mi_diffind.studies.sdf.conclusions import size_text
 
     sizes = by_size(measured(study))
@@ -280,8 +280,8 @@ def sdf_rays() -> str:
 
 def field_errors(study: str) -> str:
     """Radiance fields, by how many times smaller than a dense grid: PSNR before white, and of the foreground."""
-    from mi_diffind.measure.kinds import by_size
     from mi_diffind.studies.field.conclusions import ratio_text, references
+    from mi_diffind.studies.kinds import by_size
 
     result = measured(study)
     rows = []

@@ -74,10 +74,10 @@ fraction = between(0, 1)
 def proper_fraction(text: str) -> float:
     """A number between 0 and 1. Raises ``ArgumentTypeError``."""
     try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < 1:
+        value = fraction(text)
+    except argparse.ArgumentTypeError:
+        value = 0.0
+    if value in (0, 1):
         raise argparse.ArgumentTypeError(f"found {text}, allowed is more than 0 and less than 1")
     return value
 

@@ -107,7 +107,7 @@ def _say_decoded(scene, ids: list[str], integrators: list[str]) -> None:
     for made in instances(scene) if ids else ():
         origin, said = plugins.origin(made), plugins.report(made) or {}
         if origin["plugin"] in TRACED and origin["id"] in ids and "decoded" in said:
-            mi.Log(mi.LogLevel.Warn, f"{origin['filename']}, whose arrays {names} does not see, is {said['decoded']}")
+            plugins.warn(f"{origin['filename']}, whose arrays {names} does not see, is {said['decoded']}")
 
 
 def _unseen(scene, integrators: list[str]) -> str:
@@ -144,7 +144,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
     if isinstance(loaded, mi.Scene):
         unseen = _unseen(loaded, integrators)
         if unseen:
-            mi.Log(mi.LogLevel.Warn, unseen)
+            plugins.warn(unseen)
         _say_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
     return loaded

@@ -206,6 +206,16 @@ class _Origin:
         self.said = said
 
 
+def warn(text: str) -> None:
+    """Warn by Mitsuba's log; on stderr where that is told to be quiet, as commands tell it."""
+    import mitsuba as mi
+
+    if mi.log_level() <= mi.LogLevel.Warn:
+        mi.Log(mi.LogLevel.Warn, text)
+    else:
+        print(f"warning: {text}", file=sys.stderr)
+
+
 def reports_as(made, report: Callable[[], dict]) -> None:
     """
     For a factory that is about to return ``made``, an object of Mitsuba's own: ``report()`` says what it does, as the

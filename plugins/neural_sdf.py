@@ -14,7 +14,7 @@ from mi_diffind.tables import TableError
 from mi_diffind.tasks.sdf import TASK
 from mi_diffind.tasks.task import stamp
 
-from . import Counterpart, Plugin, reports_as, shown_as
+from . import Counterpart, Plugin, reports_as, shown_as, warn
 from .support import properties, tables
 from .support.sdf_meshes import to_mesh
 from .support.solids import CELL_BYTES, Placement, Solid, finest, fitted, native_grid
@@ -133,7 +133,7 @@ class NeuralSDF(Solid):
      * - resolution
        - |int|
        - Of ``grid``: cells along the longest side of the field's box, 4 to 512. (Default: as few as it takes for an
-         error below that of the arrays, as far as 512 cells and 3 GB allow)
+         error below that of the arrays, as far as 512 cells and 3.2 GB allow)
        - --
 
      * - storage
@@ -164,9 +164,9 @@ class NeuralSDF(Solid):
     fitted, both on average. Values beside the surface are changed a little, which takes a fifth to a third off the
     error: what lies between nodes would be too large where the field is convex. Mitsuba takes 40 bytes for each cell of
     the box around the surface, crossed or not: for a field of 256 kB 400 MB, for one of 1 MB more than 2.5 GB and
-    ten seconds; ``resolution`` says how coarse it is to be instead. Where 512 cells or 3 GB do not suffice, a warning
-    says what the errors are; ``mi-diffind inspect`` says it of any scene. Each shape has a grid of its own. A rotation
-    makes of it an instance; the derivatives and parameters are those of :monosp:`sdfgrid`.
+    up to 20 seconds; ``resolution`` says how coarse it is to be instead. Where 512 cells or 3.2 GB do not suffice, a
+    warning says what the errors are; ``mi-diffind inspect`` says it of any scene. Each shape has a grid of its own. A
+    rotation makes of it an instance; the derivatives and parameters are those of :monosp:`sdfgrid`.
 
     .. tabs::
         .. code-tab:: xml
@@ -188,8 +188,9 @@ class NeuralSDF(Solid):
         self.model = open_model(props)
         smooth = properties.one_of(props, "normals", ("analytic", "smooth")) == "smooth"
         properties.one_of(props, "trace", ("arrays", "grid"))
-        if "resolution" in props:
+        if "trace" in props and "resolution" in props:
             raise RuntimeError('parameter "resolution": has no effect with trace="arrays"')
+        props.get("resolution", 0)  # of a grid, if other integrators are to see one
         to_world = props.get("to_world", mi.ScalarTransform4f())
         super().__init__(props, self.model.field, Placement.of(to_world, self.model.scale, self.model.centre), smooth)
 
@@ -220,7 +221,8 @@ class NeuralSDF(Solid):
                 f"{(self.model.field.structure.nodes, 4)}"
             )
         tables.check_shapes(tables.exposed(self.model.arrays))
-        self.model.field.changed()
+        if not keys or any(key.startswith("tables.") for key in keys):
+            self.model.field.changed()
 
     def report(self) -> dict:
         return {
@@ -260,7 +262,7 @@ def factory(props: mi.Properties):
     said["decoded"] = sentence(said)
     if not resolution and said["error"] > said["arrays_error"]:
         finer = f'finer than {FINEST} cells or {LARGEST / 1e9:.1f} GB a grid is only if "resolution" says so'
-        mi.Log(mi.LogLevel.Warn, f"{model.table.path}: {said['decoded']}; {finer}")
+        warn(f"{model.table.path}: {said['decoded']}; {finer}")
     if kept is not made:
         shown_as(made, kept)
     reports_as(kept, lambda: said)

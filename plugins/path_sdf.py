@@ -27,9 +27,9 @@ all emitters, both sampled and weighted by the power heuristic. Ordinary shapes 
 nearest hit wins, light is blocked by either, rays are reflected and refracted by either. A scene without such a field
 is rendered as by :monosp:`path_footprint`, footprints included; in a scene with one, textures see no footprints.
 
-**Rays** go from one empty region to the next, as the masks of a sparse field say, and read only the cells that the
-surface crosses. Fields of the other layouts are sphere-traced (Hart, *Sphere Tracing*, The Visual Computer 1996): a
-step is the distance divided by a bound of the field's slope, at least :math:`10^{-4}` of the longest side. A hit is
+**Rays** go from one empty region to the next, as the masks of a sparse field say, in a block to where its surface may
+begin, and read only cells that the surface crosses from there. Fields of the other layouts are sphere-traced (Hart,
+*Sphere Tracing*, The Visual Computer 1996): a step is the distance divided by a bound of the field's slope, at least :math:`10^{-4}` of the longest side. A hit is
 where the sign differs from that at the start, so cameras may be within a solid, and a place between the last sign and
 the next is found by false position. Secondary rays start :math:`3 \cdot 10^{-4}` of the longest side off the surface:
 walls thinner than that are not reliable. From :math:`10^3` times the size away, single precision leaves :math:`10^{-4}`

@@ -332,6 +332,7 @@ def test_grids_of_sparse_fields(mi_rgb, upright_files):
 def warnings_of(mi, monkeypatch):
     """What Mitsuba is told to warn of from here on."""
     said = []
+    mi.set_log_level(mi.LogLevel.Warn)  # commands that ran before may have asked for less
     monkeypatch.setattr(mi, "Log", lambda level, text: said.append(text) if level == mi.LogLevel.Warn else None)
     return said
 
@@ -394,7 +395,7 @@ def refused(mi, folder, message, **more):
         ({"normals": "flat"}, 'parameter "normals": found "flat"'),
         ({"storage": "float16"}, 'parameter "storage": found "float16"'),
         ({"storage": "float32", "trace": "grid"}, 'parameter "storage": found "float32"'),
-        ({"resolution": 64}, 'parameter "resolution": has no effect'),
+        ({"resolution": 64, "trace": "arrays"}, 'parameter "resolution": has no effect'),
         ({"resolution": 2, "trace": "grid"}, 'parameter "resolution": found 2'),
         ({"resolution": 0.5, "trace": "grid"}, 'parameter "resolution": found 0.5'),
         ({"filename": ""}, 'parameter "filename": not given'),
@@ -468,6 +469,16 @@ def test_our_integrator_sees_arrays(mi_rgb, folder, tmp_path, monkeypatch, xml):
     for load in (scenes.load, scenes.load_file):
         (said,) = scenes.reports(load(written(folder, tmp_path, "", xml)))
         assert said["trace"] == "arrays" and not warned
+
+
+def test_commands_tell_what_a_grid_takes(mi_rgb, folder, tmp_path, capsys):
+    """Once, on stderr, where they keep Mitsuba's log quiet."""
+    from mi_diffind.cli import main
+
+    path = written(folder, tmp_path, '<integer name="resolution" value="40"/>', STOCK[0])
+    assert main(["render", str(path), "-o", str(tmp_path / "a.exr"), "--spp", "1", "--variant", mi_rgb.variant()]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "decoded to a grid" in line]
+    assert len(said) == 1 and said[0].startswith("warning: ") and "MB in Mitsuba" in said[0]
 
 
 def test_scenes_without_an_integrator(mi_rgb, folder, tmp_path, monkeypatch):

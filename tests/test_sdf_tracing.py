@@ -222,3 +222,24 @@ def test_slabs_change_no_hit(types, coded, rng):
     assert (found != met).mean() < 1e-3 and (leaving != left).mean() < 1e-3
     both = found & met
     assert np.quantile(np.abs(t[both] - slow[both]), 0.995) < 2e-5
+
+
+def test_rays_along_the_plane_of_a_block(coded, rng):
+    """They enter its slab, if ever, at a distance of which there is a cell."""
+    types, marcher, structure = coded.types, marching.of(coded), coded.structure
+    normals, middles, _ = codes.frames_numpy(coded.frames())
+    block = rng.choice(np.flatnonzero(index.cells_of(structure)[0].any(axis=1)), COUNT)
+    aside = unit(np.cross(normals[block], rng.normal(size=(COUNT, 3))))
+    middle = structure.block_positions()[block] + index.MIDDLE
+    height = rng.uniform(-4, 4, COUNT) - middles[block]
+    o = types.Array3f((middle + height[:, None] * normals[block]).T.astype(np.float32))
+    course = marching.Course(coded, o, types.Array3f(aside.T.astype(np.float32)))
+    number, t = types.UInt32(block.astype(np.uint32)), types.Float(0)
+    cell = [types.Int32(v) for v in (structure.block_positions()[block].T + 1).astype(np.int32)]
+    first, last, below = marcher.slab(course, t, number, cell, True)
+    assert np.abs(np.array(first)).max() < 2**31 and np.abs(np.array(last)).max() < 2**31
+    low = (np.array(marcher.slabs)[1::2] & 0xFFFF)[block] * (2 * index.SLAB / index.STEPS) - index.SLAB
+    off = (np.array(first) > 0) | (np.array(last) < 0)
+    above = middles[block] + height
+    clear = off & (np.abs(above - low) > 1e-3)
+    assert clear.mean() > 0.2 and (np.array(below) == (above < low))[clear].all()

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import argparse
 
-from ...measure.kinds import add_without, check_without
 from ...measure.study import Plan, Study
+from ..kinds import add_without, check_without
 
 #: What is asked for unless something else is: how many times smaller than a dense grid of float32. At the first one all
 #: kinds are made, and reads and renders are timed.

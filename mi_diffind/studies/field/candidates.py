@@ -31,7 +31,6 @@ import numpy as np
 
 from ...files import replacing
 from ...fitting import FitSettings, fit
-from ...measure import kinds
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...runtime import array_module
@@ -43,6 +42,7 @@ from ...tasks.field.march import march
 from ...tasks.field.presets import dense_bytes
 from ...tasks.field.training import Images, ImagesProblem, evaluate
 from ...tasks.field.views import Views
+from .. import kinds
 from ..baselines import radiance_factors as factors
 from ..baselines import radiance_fits as fits
 from . import pictures

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ...measure.frame import PASS
-from ...measure.kinds import by_size, ours_of, times_that_of
 from ...measure.words import duration, enumeration, grid
+from ..kinds import by_size, ours_of, times_that_of
 
 #: The two figures that are always given together.
 FOREGROUND, WHITE = "psnr_foreground_db", "psnr_white_db"

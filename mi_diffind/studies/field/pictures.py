@@ -8,9 +8,9 @@ import numpy as np
 
 from ...measure import plot
 from ...measure.curves import against_time, curves, finish
-from ...measure.kinds import by_size
 from ...measure.words import machine_line, state
 from ...tasks.field.training import rendered, shown
+from ..kinds import by_size
 from .conclusions import FOREGROUND, WHITE, ratio_text, references
 
 #: The difference of sRGB values that is as dark as it gets.

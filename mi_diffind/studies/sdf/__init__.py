@@ -10,8 +10,8 @@ import argparse
 import json
 from pathlib import Path
 
-from ...measure.kinds import add_without, check_without
 from ...measure.study import Plan, Study
+from ..kinds import add_without, check_without
 
 #: Sizes unless asked otherwise, and the one at which everything is made and timed, if it is among them.
 SIZES, FIRST = ("256k", "512k", "1M", "2M", "4M"), "1M"

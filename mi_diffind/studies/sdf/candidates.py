@@ -31,7 +31,6 @@ import mitsuba as mi
 import numpy as np
 
 from ...fitting import FitSettings
-from ...measure import kinds
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...measure.training import Training
@@ -41,6 +40,7 @@ from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.evaluation import Evaluation
 from ...tasks.sdf.field import Field
 from ...tasks.sdf.mesh import Mesh
+from .. import kinds
 from ..baselines import hash_grids, volumes
 from . import pictures, stage
 from .conclusions import conclusions, size_text, table
@@ -247,7 +247,7 @@ def plan(mesh: Mesh, name: str, request: Request, before: dict[str, dict] | None
             *(_sentence(said, mesh) for said in (*mesh.warnings, *setting.distances.warnings)),
         ],
         jobs=list(jobs.values()),
-        jobs_fingerprint=fingerprint(made_by) + mesh.digest[:16],
+        jobs_fingerprint=f"{fingerprint(made_by)}{mesh.digest[:16]}-{request.steps}-{request.hash_steps[-1]}-{request.points}",
         pictures=drawn,
         table=table,
         conclusions=conclusions,

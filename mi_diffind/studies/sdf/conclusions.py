@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ...measure.frame import PASS
-from ...measure.kinds import by_size, ours_of, times_that_of
 from ...measure.words import enumeration, grid
+from ..kinds import by_size, ours_of, times_that_of
 
 #: What verdicts are about: its name, the error, how it is written, whether more is better.
 MEASURES = (

@@ -9,8 +9,8 @@ import numpy as np
 
 from ...measure import plot
 from ...measure.curves import against_time, curves, finish
-from ...measure.kinds import by_size
 from ...measure.words import machine_line, state
+from ..kinds import by_size
 from . import stage
 from .conclusions import size_text
 

@@ -1,5 +1,6 @@
 """
-What a signed distance field offers, whatever it is stored as: values, gradients, and how far a ray may go.
+What a signed distance field offers, whatever it is stored as: values, gradients, and, if it is
+sphere-traced, how far a ray may go.
 
 Everything is in the *unit frame*: the bounding box of the mesh is centred at the origin and its longest side is 1.
 Distances are negative inside.
@@ -35,8 +36,13 @@ class Field:
         self.lower, self.upper = tuple(map(float, lower)), tuple(map(float, upper))
         self.spacing, self.band = float(spacing), float(band)
 
+    @property
+    def bound(self):
+        """The ``slope`` as rays take it: a number, or an array of one if it may change."""
+        return self.slope
+
     def changed(self):
-        """To be called when entries were changed from outside, by an optimiser say: bounds follow."""
+        """To be called when entries were changed from outside, by an optimiser say: the bound of the slope follows."""
 
     def inside(self, p):
         """Whether points lie in the box. False for NaN."""
@@ -69,7 +75,7 @@ class Field:
         without the sign changing, ``(Float, Float)``, the second one finite and ≥ 0. Of the value, the sign counts.
         """
         value = self.value(p, active)
-        return value, dr.abs(value) / self.slope
+        return value, dr.abs(value) / self.bound
 
 
 class DenseField(Field):

@@ -30,6 +30,10 @@ HAIR = 1e-3
 #: Components of a direction below this count as zero.
 TINY = 1e-12
 
+#: The least rise of a ray above a plane, per spacing: less would be out of whole numbers' range, more beyond a slab's
+#: margin in the longest grid.
+LEVEL = 1e-7
+
 
 class Marcher:
     """
@@ -123,9 +127,11 @@ class Marcher:
         at, slope = d, Float(0)
         for v, x, o, e in zip(n, cell, course.o, course.d, strict=True):
             at, slope = dr.fma(v, o - Float(x & ~3) - MIDDLE, at), dr.fma(v, e, slope)
-        inverse = dr.rcp(dr.select(dr.abs(slope) < TINY, TINY, slope))
+        slope = dr.select(dr.abs(slope) < LEVEL, LEVEL, slope)
+        inverse = dr.rcp(slope)
         one, other = (low - at) * inverse, (high - at) * inverse
-        return dr.minimum(one, other), dr.maximum(one, other), dr.fma(slope, t, at) < low
+        first, last = dr.minimum(one, other), dr.maximum(one, other)
+        return first, last, (t < first) == (slope > 0)
 
     def corners(self, number, cell, active=True):
         """Distance and gradient, in spacings, of the eight nodes of a crossed cell, in the order of ``CORNERS``."""

@@ -30,11 +30,16 @@ class PairField(Field):
         (primary,) = net.primary
         size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, primary.resolution, strict=True)]
         super().__init__(types, lower, upper, min(size), band)
-        self.net, self.slope = net, float(slope)
+        self.net, self.slope, self._bound = net, float(slope), None
+
+    @property
+    def bound(self):
+        return self.slope if self._bound is None else self._bound
 
     def changed(self):
+        self.slope = slope_of(self.net, self.lower, self.upper, self.band)
         # Not a literal of the kernels that rays run: another one would compile them anew
-        self.slope = dr.opaque(self.types.Float, slope_of(self.net, self.lower, self.upper, self.band))
+        self._bound = dr.opaque(self.types.Float, self.slope)
 
     def _coordinates(self, p):
         return [(x - a) / (b - a) for x, a, b in zip(p, self.lower, self.upper, strict=True)]

@@ -119,7 +119,7 @@ def spheres(field, start, d, length, fresh, active, exact: bool = True, epsilon:
             other = (value < 0) != leaving
             size = dr.abs(value)
             # Too far ahead: between what both places vouch for, the sign may have changed twice
-            back = ~other & ~found & (t - dr.minimum(step, size / field.slope) > safe)
+            back = ~other & ~found & (t - dr.minimum(step, size / field.bound) > safe)
             found |= other
             # Where the value will be zero if it goes on as it did
             ahead = dr.select(back | found, 0, size * (t - low) / (dr.abs(low_value) - size))

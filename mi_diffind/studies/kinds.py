@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from ..measure.study import Candidate, Job
 from ..tasks import task
-from .study import Candidate, Job
 
 # -- which ------------------------------------------------------------------------------------------------------------
 
@@ -79,7 +79,7 @@ class Made(Job):
         )  # fmt: skip
 
     def known(self, folder: Path | None, record: dict | None) -> dict | None:
-        from .store import file_name
+        from ..measure.store import file_name
 
         self.file = folder / f"{file_name(self.name)}.npz" if folder else None
         self.__dict__.pop("field", None)
