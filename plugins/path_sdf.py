@@ -29,11 +29,11 @@ is rendered as by :monosp:`path_footprint`, footprints included; in a scene with
 
 **Rays** go from one empty region to the next, as the masks of a sparse field say, in a block to where its surface may
 begin, and read only cells that the surface crosses from there. Fields of the other layouts are sphere-traced (Hart,
-*Sphere Tracing*, The Visual Computer 1996): a step is the distance divided by a bound of the field's slope, at least :math:`10^{-4}` of the longest side. A hit is
-where the sign differs from that at the start, so cameras may be within a solid, and a place between the last sign and
-the next is found by false position. Secondary rays start :math:`3 \cdot 10^{-4}` of the longest side off the surface:
-walls thinner than that are not reliable. From :math:`10^3` times the size away, single precision leaves :math:`10^{-4}`
-of it.
+*Sphere Tracing*, The Visual Computer 1996): a step is the distance divided by a bound of the field's slope, at least
+:math:`10^{-4}` of the longest side. A hit is where the sign differs from that at the start, so cameras may be within a
+solid, and a place between the last sign and the next is found by false position. Secondary rays start
+:math:`3 \cdot 10^{-4}` of the longest side off the surface: walls thinner than that are not reliable. From
+:math:`10^3` times the size away, single precision leaves :math:`10^{-4}` of it.
 
 **Derivatives** are computed by path replay with respect to materials, textures, emitters and, with ``storage``
 ``float32``, the arrays of fields: hits move along their rays by the implicit function theorem, and normals, cosines and

@@ -218,7 +218,7 @@ class SparseNodes(Field):
         return np.array(self._blocks).reshape(-1, 4)[:, 3]
 
     def decoded(self) -> np.ndarray | None:
-        """What nodes hold: distances in spacings and gradients, ``(n, 4)``; none if they may be trained or it cannot say."""
+        """What nodes hold: distances in spacings and gradients, ``(n, 4)``; none if they may be trained."""
         if self._entries is None:
             return None
         pointers = codes.pointers_of(np.array(self._pointers), self.bits, self.structure.nodes)
