@@ -159,7 +159,8 @@ def test_the_bound_of_the_slope_follows_entries(ad, rng):
         field.changed()
         steps = dr.abs(field.value(p + d) - field.value(p - d)) / 2e-4
         steepest = dr.max(dr.select(field.inside(p + d) & field.inside(p - d), steps, 0))[0]
-        bounds.append(field.slope[0])
+        bounds.append(field.slope)
+        assert field.bound[0] == np.float32(field.slope)
         assert 0.3 * bounds[-1] < steepest <= 1.01 * bounds[-1]
     assert bounds[1] == pytest.approx(3 * bounds[0])
 
