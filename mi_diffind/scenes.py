@@ -29,9 +29,6 @@ MAX_DEPTHS = {
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
 }
 
-#: Shapes that only integrators of ours see as they are stored → these, and what makes all others see them.
-TRACED = {"neural_sdf": (("path_sdf",), ("trace", "grid"))}
-
 
 class SceneError(DiffindError, RuntimeError):
     """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
@@ -88,14 +85,16 @@ def _integrators(state) -> list[str]:
 
 def _decode_unseen(state, integrators: list[str]) -> list[str]:
     """
-    Have the shapes of :data:`TRACED` that none of the ``integrators`` sees decoded if the parsed scene does not say how
-    they are traced, nor that their arrays are optimised; returns their ids.
+    Have the shapes that none of the ``integrators`` sees (their plugins' ``seen_by``) decoded, if the parsed scene does
+    not say how they are traced, nor that their arrays are optimised; returns their ids.
     """
     found = []
     for props in compat.properties_of(state):
-        seen_by, (key, value) = TRACED.get(props.plugin_name(), ((), ("", "")))
-        optimised = "storage" in props and props["storage"] == "float32"
-        if seen_by and key not in props and not optimised and not set(seen_by) & set(integrators):
+        plugin = plugins.declared().get(props.plugin_name())
+        if plugin is None or plugin.otherwise is None or set(plugin.seen_by) & set(integrators):
+            continue
+        key, value = plugin.otherwise
+        if key not in props and not ("storage" in props and props["storage"] == "float32"):
             props[key] = value
             found.append(props.id())
     return found
@@ -106,7 +105,7 @@ def _say_decoded(scene, ids: list[str], integrators: list[str]) -> None:
     names = ", ".join(f'"{name}"' for name in integrators)
     for made in instances(scene) if ids else ():
         origin, said = plugins.origin(made), plugins.report(made) or {}
-        if origin["plugin"] in TRACED and origin["id"] in ids and "decoded" in said:
+        if origin["id"] in ids and "decoded" in said:
             plugins.warn(f"{origin['filename']}, whose arrays {names} does not see, is {said['decoded']}")
 
 

@@ -53,7 +53,9 @@ class Plugin:
     """
     A plugin: its ``name`` in a scene; its ``kind`` (:data:`KINDS`); ``factory(props)``, a class or a function, which
     may return an object of Mitsuba's own; the ``task`` whose tables it reads, and their storage form by default ("":
-    the file's). One that has an ``exact`` counterpart is *learned*; ``others`` may stand in its place, too.
+    the file's). One that has an ``exact`` counterpart is *learned*; ``others`` may stand in its place, too. Of a shape
+    that only some integrators see, these (``seen_by``), and the parameter and its value by which all others see it
+    (``otherwise``).
 
     Instances with a method ``report()`` say what they do (:func:`mi_diffind.scenes.reports`); for an object of
     Mitsuba's own, its factory says so with :func:`reports_as`.
@@ -66,6 +68,8 @@ class Plugin:
     storage: str = ""
     exact: Counterpart | None = None
     others: tuple[Counterpart, ...] = ()
+    seen_by: tuple[str, ...] = ()
+    otherwise: tuple[str, str] | None = None
 
     def __post_init__(self):
         if self.kind not in KINDS:

@@ -10,7 +10,7 @@ from mi_diffind import compat
 from mi_diffind.tables import TableError
 from mi_diffind.tasks.field.march import OPAQUE
 
-from . import Counterpart, Plugin
+from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
 from .support import properties
@@ -343,7 +343,7 @@ def integrator() -> type:
                 self._warned = True
                 holes = with_holes(scene)
                 if holes:
-                    mi.Log(mi.LogLevel.Warn, f'neural_field: no field is seen through the holes of "{holes[0]}"')
+                    warn(f'neural_field: no field is seen through the holes of "{holes[0]}"')
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
             ray, weight, place = self.sample_rays(scene, sensor, sampler)

@@ -274,5 +274,7 @@ PLUGIN = Plugin(
     "shape",
     factory,
     task=TASK.name,
+    seen_by=Solid.seen_by,
+    otherwise=("trace", "grid"),
     exact=Counterpart("ply", ("normals", "trace", "resolution", "storage"), convert=to_mesh),
 )

@@ -16,8 +16,6 @@ from mi_diffind.tasks.sdf.evaluation import BAND, PADDING, Evaluation
 from mi_diffind.tasks.sdf.field import DenseField, Field
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
-pytest.importorskip("igl", reason="libigl is not installed")
-
 
 class Ball(Field):
     """The exact distance to a ball, told within ``band``; ``tilt`` turns its gradient about z."""

@@ -21,8 +21,6 @@ from mi_diffind.tasks.sdf.cells import CORNERS, near_nodes, node_distances, surf
 from mi_diffind.tasks.sdf.distances import Distances, DistancesError
 from mi_diffind.tasks.sdf.mesh import Mesh, MeshError, load_mesh, make_mesh
 
-igl = pytest.importorskip("igl", reason="libigl is not installed")
-
 
 def sentence(error):
     text = str(error.value)

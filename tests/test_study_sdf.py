@@ -309,7 +309,6 @@ LEFT_OUT = [k for k in candidates.KINDS if k not in ("bricks4", "ours")]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """What a quick run leaves, and the mesh, a ball that is flat on top."""
-    pytest.importorskip("igl", reason="libigl is not installed")
     folder = tmp_path_factory.mktemp("sdf")
     vertices, faces = solids.sphere(16)
     vertices[:, 2] = np.minimum(vertices[:, 2], 0.64 + 0.2 * vertices[:, 2])

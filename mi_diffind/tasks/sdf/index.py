@@ -22,9 +22,6 @@ SLAB, STEPS, MARGIN = 10.0, 65535, 1e-3
 #: The middle of a block, from its first node.
 MIDDLE = (BLOCK - 1) / 2
 
-#: Eight blocks: the one of a cell's lowest corner, and those that its others may lie in.
-NEIGHBOURS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-
 
 def cells_of(structure) -> tuple[np.ndarray, ...]:
     """
@@ -35,7 +32,7 @@ def cells_of(structure) -> tuple[np.ndarray, ...]:
     at = structure.block_positions() // BLOCK
     number = np.full([n // BLOCK + 1 for n in structure.shape], -1)
     number[tuple(at.T)] = np.arange(len(at))
-    beside = np.stack([number[tuple((at + n).T)] for n in NEIGHBOURS], axis=1)
+    beside = np.stack([number[tuple((at + n).T)] for n in CORNERS], axis=1)
 
     # The signs of blocks without nodes, beyond the grid outside
     empty = np.zeros(number.shape, bool)
@@ -50,17 +47,17 @@ def cells_of(structure) -> tuple[np.ndarray, ...]:
     nodes = np.concatenate([_bits(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)])
     groups = (structure.block_signs[:, None] >> np.arange(8) & 1).astype(bool).reshape(-1, 2, 2, 2)
     signs = groups.repeat(2, 1).repeat(2, 2).repeat(2, 3)
-    stored, inside = np.zeros((2, len(at), 5, 5, 5), bool)
+    inside = np.zeros((len(at), 5, 5, 5), bool)
     numbers, node = np.full((len(at) + 1, 4, 4, 4), -1), np.full((len(at), 5, 5, 5), -1)
     numbers[nodes] = np.arange(nodes.sum())
-    for which, n in enumerate(NEIGHBOURS):
+    for which, n in enumerate(CORNERS):
         to = (slice(None), *(slice(4 * e, 4 + e) for e in n))
         of = (slice(None), *(slice(0, 1 if e else 4) for e in n))
         there = beside[:, which]
-        stored[to] = nodes[there][of]
         node[to] = numbers[there][of]
         known = np.where(there[:, None, None, None] >= 0, signs[there], empty[tuple((at + n).T)][:, None, None, None])
         inside[to] = known[of]
+    stored = node >= 0
     crossed, within = np.ones((len(at), 4, 4, 4), bool), np.zeros((len(at), 4, 4, 4), bool)
     for a, b, c in CORNERS:
         corner = (slice(None), slice(a, a + 4), slice(b, b + 4), slice(c, c + 4))
