@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 import mi_diffind
-from mi_diffind.tasks.task import tasks
+from mi_diffind.task import tasks
 
 DOCS = Path(__file__).resolve().parent
 
@@ -39,7 +39,8 @@ def page_of_tasks() -> str:
         "change those, not this page.\n"
     ]
     for task in tasks().values():
-        parts.append(f"## `{task.name}`: {task.title}\n\nPaper: {task.section}. Page: [{task.name}]({task.name}.md).\n")
+        page = {"scene": "shading"}.get(task.name, task.name)
+        parts.append(f"## `{task.name}`: {task.title}\n\nPaper: {task.section}. Page: [{page}]({page}.md).\n")
         rows = [
             [f"`{name}`" + (" (default)" if i == 0 else ""), s.steps, f"{s.batch:,}", f"{s.lr:g}", s.schedule, s.loss]
             for i, (name, s) in enumerate(task.presets.items())
@@ -222,7 +223,7 @@ def shading_shares(study: str) -> str:
 
 def sdf_errors(study: str) -> str:
     """Distance fields in equal bytes: IoU, IoU near the surface, normals."""
-    from mi_diffind.studies.kinds import by_size
+    from mi_diffind.studies.equal_memory import by_size
     from mi_diffind.studies.sdf.conclusions import size_text
 
     sizes = by_size(measured(study))
@@ -280,8 +281,8 @@ def sdf_rays() -> str:
 
 def field_errors(study: str) -> str:
     """Radiance fields, by how many times smaller than a dense grid: PSNR before white, and of the foreground."""
-    from mi_diffind.studies.field.conclusions import ratio_text, references
-    from mi_diffind.studies.kinds import by_size
+    from mi_diffind.studies.equal_memory import by_size
+    from mi_diffind.studies.radiance.conclusions import ratio_text, references
 
     result = measured(study)
     rows = []

@@ -30,9 +30,9 @@ _NAMES = {
     "TableError": "tables",
     "load_table": "tables",
     "save_table": "tables",
-    "fit": "tasks.task",
+    "fit": "task",
     "load_file": "scenes",
-    "load_model": "tasks.task",
+    "load_model": "task",
 }
 
 __all__ = ["DiffindError", "__version__", *_NAMES]

@@ -82,6 +82,17 @@ def proper_fraction(text: str) -> float:
     return value
 
 
+def positive_or_none(text: str) -> float:
+    """Return a positive number, or infinity for ``none``. Raises ``ArgumentTypeError``."""
+    try:
+        value = math.inf if text == "none" else float(text)
+    except ValueError:
+        value = math.nan
+    if not value > 0 or (math.isinf(value) and text != "none"):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a positive number or none")
+    return value
+
+
 def define(text: str) -> tuple[str, str]:
     """``NAME=VALUE``, a ``<default>`` of a scene. Raises ``ArgumentTypeError``."""
     name, equals, value = text.partition("=")

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from . import metrics, plugins, scenes
 from .files import writable_folder
 from .interrupt import interruptible
-from .measure import sheet
+from .measure import figure_grid
 
 
 @dataclass
@@ -142,12 +142,12 @@ def figure(comparison: Comparison, path: str | os.PathLike) -> None:
     title = "absolute difference, mean of the channels (linear)"
     learned = " (learned tables)" if comparison.figures["learned_plugins"] else ""
     cells = [
-        sheet.picture(f"as written{learned}", comparison.written),
-        sheet.picture(against, comparison.reference),
-        sheet.colour_map(title, error, "max", cmap="magma", vmin=0, vmax=top),
-        sheet.text(summary(comparison.figures)),
+        figure_grid.picture(f"as written{learned}", comparison.written),
+        figure_grid.picture(against, comparison.reference),
+        figure_grid.colour_map(title, error, "max", cmap="magma", vmin=0, vmax=top),
+        figure_grid.text(summary(comparison.figures)),
     ]
-    sheet.write(path, cells, 2, error.shape)
+    figure_grid.write(path, cells, 2, error.shape)
 
 
 def summary(f: dict) -> list[str]:

@@ -30,6 +30,15 @@ from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
 __all__ = ["LOSSES", "SCHEDULES", "FitResult", "FitSettings", "FittingError", "Problem", "fit"]
 
 
+#: Rate of the exponential-like distribution on [0, 1]: half of the samples lie below 0.21.
+EXPONENTIAL_RATE = 3.0
+
+
+def exponential_like(u, rate: float = EXPONENTIAL_RATE):
+    """Return a number in [0, 1] with density ∝ exp(−rate·x), from a uniform number ``u`` in [0, 1)."""
+    return dr.minimum(-dr.log(1 - u * (1 - math.exp(-rate))) / rate, 1)
+
+
 class Problem:
     """
     What is to be trained: the base class, with defaults, of what every task provides.

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from . import __version__, compat, plugins, scenes
 from .files import OutputError, replacing, writable_file, writable_folder
 from .interrupt import interruptible
-from .measure import sheet
+from .measure import figure_grid
 
 #: Chance that a scene in which nothing has changed has a pixel below the threshold, were all pixels independent.
 SIGNIFICANCE = 0.01
@@ -577,13 +577,13 @@ def _figure(path: str, images: dict[str, np.ndarray], test: ZTest, result: dict)
         f"threshold   p = {test.alpha:.2e}, smallest found {result['smallest_p']:.2e}",
     ]
     cells = [
-        sheet.picture("image", images["image"]),
-        sheet.picture("reference", images["reference"]),
-        sheet.text(lines),
-        sheet.colour_map(
+        figure_grid.picture("image", images["image"]),
+        figure_grid.picture("reference", images["reference"]),
+        figure_grid.text(lines),
+        figure_grid.colour_map(
             "absolute difference, mean of the channels (linear)", error, "max", cmap="magma", vmin=0, vmax=top
         ),
-        sheet.colour_map(
+        figure_grid.colour_map(
             f"log10 of p, smallest of the channels (threshold {threshold:.1f})",
             exponent,
             "min",
@@ -591,9 +591,9 @@ def _figure(path: str, images: dict[str, np.ndarray], test: ZTest, result: dict)
             vmin=3 * threshold,
             vmax=0,
         ),
-        sheet.picture("failing pixels, over the reference", marked),
+        figure_grid.picture("failing pixels, over the reference", marked),
     ]
-    sheet.write(path, cells, 3, error.shape)
+    figure_grid.write(path, cells, 3, error.shape)
 
 
 def _colour(image: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from mi_diffind import compat, found
+from mi_diffind import compat, discovery
 
 #: What lies beside the plugins and is none.
 IGNORED = ("support",)
@@ -162,9 +162,9 @@ def register(variant: str) -> None:
 
 def _load() -> list[Plugin]:
     """Execute the modules of plugins afresh, and return what they declare."""
-    for name in found.modules(__name__, IGNORED).values():  # all of them first, since one may build upon another
+    for name in discovery.modules(__name__, IGNORED).values():  # all of them first, since one may build upon another
         sys.modules.pop(name, None)
-    return list(found.load(__name__, "PLUGIN", IGNORED, kind=Plugin).values())
+    return list(discovery.load(__name__, "PLUGIN", IGNORED, kind=Plugin).values())
 
 
 def _refusal(name: str, variant: str):

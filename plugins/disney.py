@@ -10,7 +10,7 @@ from mi_diffind.tasks.disney.model import LOBES
 
 from . import Counterpart, Plugin
 from .support import properties, tables
-from .support.watched import Watched, when_outermost
+from .support.tracked_parameter import TrackedParameter, when_outermost
 
 _DIFFERENTIABLE = mi.ParamFlags.Differentiable
 _DISCONTINUOUS = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
@@ -234,9 +234,9 @@ class Disney(mi.BSDF):
         self.decoder, self.preset = Decoder(), ""
         #: What is known about the parameters of the model.
         self._watched = {
-            "base_color": Watched(self.base_color, colour=True),
-            **{name: Watched(texture) for name, texture in self.scalars.items()},
-            "specular": Watched(self.reflectance, is_eta=self.reflectance_name == "eta"),
+            "base_color": TrackedParameter(self.base_color, colour=True),
+            **{name: TrackedParameter(texture) for name, texture in self.scalars.items()},
+            "specular": TrackedParameter(self.reflectance, is_eta=self.reflectance_name == "eta"),
         }
         self._set_up(props)
         #: Coefficients that depend on constants alone, evaluated, and the effects that they are for.

@@ -13,7 +13,7 @@ from mi_diffind.tasks.disney.model import SPECULAR_SCALE
 from . import Counterpart, Plugin
 from .disney import PRINCIPLED, Disney, Parameters, refuse_latents
 from .support import properties, tables
-from .support.watched import WatchedChannel
+from .support.tracked_parameter import TrackedChannel
 
 #: The fastest form to read; 82 dB or more from the formulas.
 STORAGE = "uint8"
@@ -117,7 +117,7 @@ class NeuralDisney(Disney):
         self.latents: list[mi.Texture] = []
         self._latent_channels: dict[str, tuple[int, int]] = {}
         self._take_latents(props)
-        self._watched |= {name: WatchedChannel(self.latents[i]) for name, (i, _) in self._latent_channels.items()}
+        self._watched |= {name: TrackedChannel(self.latents[i]) for name, (i, _) in self._latent_channels.items()}
 
     def _take_latents(self, props: mi.Properties) -> None:
         names = str(props.get("latents", "")).split()

@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from mi_diffind import compat
 from mi_diffind.tables import TableError
-from mi_diffind.tasks.field.march import OPAQUE
+from mi_diffind.tasks.radiance.march import OPAQUE
 
 from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
@@ -223,7 +223,7 @@ def integrator() -> type:
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties, field=None):
-            """``field``, a ``RadianceField``, takes the place of a file's."""
+            """``field``, a ``VolumeField``, takes the place of a file's."""
             if mi.is_polarized:
                 raise RuntimeError("neural_field: does not run in polarised variants")
             super().__init__(props)
@@ -629,7 +629,7 @@ def open_model(props: mi.Properties):
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')
-    from mi_diffind.tasks.field import TASK
+    from mi_diffind.tasks.radiance import TASK
 
     try:
         return TASK.open(mi.TensorXf, path, storage=storage if storage == "float32" else "")

@@ -8,7 +8,7 @@ from mi_diffind.tasks.ggx.model import Roughness
 
 from . import Counterpart, Plugin
 from .support import properties, tables
-from .support.watched import Watched, when_outermost
+from .support.tracked_parameter import TrackedParameter, when_outermost
 
 
 class NeuralGGX(mi.BSDF):
@@ -136,9 +136,9 @@ class NeuralGGX(mi.BSDF):
         opened = tables.open_tables(props, TASK)
         self.distribution, self.preset = opened.distribution, opened.table.preset
 
-        self._watched_alpha = Watched(self.alpha)
-        self._watched_ior = [Watched(self.eta, colour=True), Watched(self.k, colour=True)]
-        self._watched_factor = Watched(self.specular_reflectance, colour=True) if given else None
+        self._watched_alpha = TrackedParameter(self.alpha)
+        self._watched_ior = [TrackedParameter(self.eta, colour=True), TrackedParameter(self.k, colour=True)]
+        self._watched_factor = TrackedParameter(self.specular_reflectance, colour=True) if given else None
         #: What depends on a constant roughness alone, evaluated.
         self._constant: Roughness | None = None
 
@@ -178,7 +178,7 @@ class NeuralGGX(mi.BSDF):
 
     # -- what is evaluated once ---------------------------------------------------------------------------------------
 
-    def _watched(self) -> list[Watched]:
+    def _watched(self) -> list[TrackedParameter]:
         return [self._watched_alpha, *self._watched_ior, *([self._watched_factor] if self._watched_factor else [])]
 
     def _prepare_constants(self) -> None:

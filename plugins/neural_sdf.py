@@ -11,8 +11,8 @@ import numpy as np
 
 from mi_diffind import compat
 from mi_diffind.tables import TableError
+from mi_diffind.task import stamp
 from mi_diffind.tasks.sdf import TASK
-from mi_diffind.tasks.task import stamp
 
 from . import Counterpart, Plugin, reports_as, shown_as, warn
 from .support import properties, tables

@@ -2,24 +2,9 @@
 
 import gc
 
-import drjit as dr
 import numpy as np
 import pytest
-
-import mi_diffind  # noqa: F401  (chooses LLVM before anything else)
-
-#: Variants that the plugins support, each in its CPU form; the CUDA twins follow where there is a GPU.
-KINDS = ("ad_rgb", "ad_mono", "ad_mono_polarized", "ad_spectral", "ad_spectral_polarized")
-BACKENDS = ("llvm", "cuda") if dr.has_backend(dr.JitBackend.CUDA) else ("llvm",)
-VARIANTS = [f"{backend}_{kind}" for backend in BACKENDS for kind in KINDS]
-
-
-def _set(name):
-    import mitsuba as mi
-
-    mi.set_variant(name)
-    mi.set_log_level(mi.LogLevel.Error)
-    return mi
+from variants import BACKENDS, VARIANTS, set_variant
 
 
 def pytest_collection_modifyitems(items):
@@ -37,13 +22,13 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(params=[f"{backend}_ad_rgb" for backend in BACKENDS])
 def mi_rgb(request):
     """``mitsuba`` with an RGB variant set."""
-    return _set(request.param)
+    return set_variant(request.param)
 
 
 @pytest.fixture(params=VARIANTS)
 def mi_any(request):
     """``mitsuba`` with each supported variant set in turn."""
-    return _set(request.param)
+    return set_variant(request.param)
 
 
 @pytest.fixture

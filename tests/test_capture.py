@@ -69,7 +69,7 @@ def nearest(origin, direction):
 
 def test_images_show_what_rays_of_their_poses_meet(mi_rgb, scene, tmp_path, capsys):
     """Against spheres met by formulas: colours and alpha, from the files alone. Lights are hidden."""
-    from mi_diffind.tasks.field.views import load_views
+    from mi_diffind.tasks.radiance.views import load_views
 
     folder = tmp_path / "views"
     assert run(scene, folder) == 0
@@ -92,7 +92,7 @@ def test_images_show_what_rays_of_their_poses_meet(mi_rgb, scene, tmp_path, caps
 
 
 def test_formats_agree(mi_rgb, scene, tmp_path):
-    from mi_diffind.tasks.field.views import load_views
+    from mi_diffind.tasks.radiance.views import load_views
 
     assert run(scene, tmp_path / "png") == run(scene, tmp_path / "exr", "--format", "exr") == 0
     png, exr = (load_views(tmp_path / name) for name in ("png", "exr"))
@@ -140,7 +140,7 @@ def test_other_settings_are_refused(mi_rgb, scene, tmp_path, capsys):
 
 def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeypatch, capsys):
     from mi_diffind import capture
-    from mi_diffind.tasks.field.views import load_views
+    from mi_diffind.tasks.radiance.views import load_views
 
     stop, render = threading.Event(), capture._Camera.render
 
@@ -173,7 +173,7 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
 @pytest.mark.parametrize("integrator", ["direct", "prb"])
 def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
     """One of three, in the middle of the images, wholly, wherever the others stand; in their shadow."""
-    from mi_diffind.tasks.field.views import load_views
+    from mi_diffind.tasks.radiance.views import load_views
 
     wall = '<shape type="cube"><transform name="to_world"><scale x="0.1"/><translate x="1.5"/></transform></shape>'
     scene.write_text(scene.read_text().replace("</scene>", f"{wall}</scene>").replace("direct", integrator))
@@ -218,7 +218,7 @@ def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
 
 def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_path):
     """And further channels are none of the image's."""
-    from mi_diffind.tasks.field.views import load_views
+    from mi_diffind.tasks.radiance.views import load_views
 
     nested = '<integrator type="aov"><string name="aovs" value="d:depth"/><integrator type="direct"/></integrator>'
     other = tmp_path / "other.xml"
@@ -230,7 +230,7 @@ def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_pat
 
 def test_a_field_of_distances_is_captured_whole_only(mi_rgb, scene, tmp_path, capsys):
     """Its shape in the scene is a box, which the integrator alone knows what to do with."""
-    from mi_diffind.tasks.field.views import load_views
+    from mi_diffind.tasks.radiance.views import load_views
 
     knot = (
         f'<shape type="neural_sdf" id="knot"><string name="filename" value="{SCENES / "assets" / "knot.npz"}"/></shape>'
@@ -284,7 +284,7 @@ def test_scenes_that_are_refused(mi_rgb, scene, tmp_path, capsys):
 @pytest.mark.parametrize("name", ["group", "thin", "glossy"])
 def test_scenes_that_ship_are_wholly_in_sight(mi_rgb, tmp_path, name):
     """From below, from the side and from above, from the distance that is taken by default."""
-    from mi_diffind.tasks.field.views import load_views
+    from mi_diffind.tasks.radiance.views import load_views
 
     options = ("--views", "3", "--test", "0", "--resolution", "40", "--spp", "4")
     assert cli.main(["capture", str(SCENES / f"capture_{name}.xml"), "-o", str(tmp_path / "views"), *options]) == 0

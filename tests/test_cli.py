@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import BACKENDS
+from commands import refused
+from variants import BACKENDS
 
 from mi_diffind.cli import VERBS, main
 from mi_diffind.tables import load_table
-from mi_diffind.tasks.task import tasks
+from mi_diffind.task import tasks
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 SMALL = ["-D", "width=48", "-D", "height=28", "--spp", "4"]
@@ -39,17 +40,6 @@ def scene_file(tmp_path, bsdf='<bsdf type="neural_disney"/>'):
         f'<shape type="sphere"><transform name="to_world"><translate z="4"/></transform>{bsdf}</shape></scene>'
     )
     return str(path)
-
-
-def refused(capsys, *arguments):
-    """Run a command that must fail with exit code 2 and one sentence; returns it."""
-    capsys.readouterr()
-    assert main(list(arguments)) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    lines = [line for line in lines if line.startswith("mi-diffind: error: ")]
-    assert len(lines) == 1, lines
-    assert "Traceback" not in lines[0] and "[parser.cpp" not in lines[0]
-    return lines[0]
 
 
 def test_render(tmp_path, capsys):

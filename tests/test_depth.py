@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import refused
+from commands import refused
 
 from mi_diffind.cli import main
 

@@ -13,9 +13,9 @@ from mi_diffind.maps.source import from_arrays
 from mi_diffind.pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import PAGES, TableError, gathers_of, load_table, save_table
+from mi_diffind.task import Request
 from mi_diffind.tasks.image import TASK, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.task import Request
 
 BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
 

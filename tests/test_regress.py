@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import _set
-from test_cli import refused
+from commands import refused
+from variants import set_variant
 
 from mi_diffind.cli import main
 
@@ -184,7 +184,7 @@ SLOW = {
 )
 def test_scene_renders_as_its_reference(path, variant):
     """If a change is meant, render the references again: scenes/README.md says how."""
-    _set(variant)
+    set_variant(variant)
     from mi_diffind import regress
 
     result = regress.regress(path, progress=False)

@@ -7,7 +7,7 @@ from pathlib import Path
 from ..arguments import add_arguments
 from ..errors import UsageError
 from ..files import writable_file
-from ..tasks.task import load_model, task_of, tasks
+from ..task import load_model, task_of, tasks
 from .common import set_variant, variant_option, verb
 
 HELP = "turn a table file back into ordinary files, as images"

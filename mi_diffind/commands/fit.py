@@ -8,7 +8,7 @@ from ..arguments import add_arguments, natural, positive
 from ..errors import UsageError
 from ..files import writable_file
 from ..settings import LOSSES, SCHEDULES, FittingError
-from ..tasks.task import Task, fit, tasks
+from ..task import Task, fit, tasks
 from .common import alternative, alternatives, set_variant, variant_option, verb
 
 #: Settings of a training that every task has: what they are, and the options of their parsers.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import UsageError
 from ..runtime import array_module
-from ..tasks.task import task_of
+from ..task import task_of
 from .common import scene_options, set_variant, verb
 
 #: What there is to say about how rays meet a shape: keys of its report.
@@ -96,7 +96,7 @@ def _inspect_table(arguments) -> dict:
 
 
 def _print_rays(n: dict) -> None:
-    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.field.counting.Counts`)."""
+    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.radiance.counting.Counts`)."""
     total = max(1, n["steps"])
     print(
         f"    rays      {n['crossing']:,} of {n['rays']:,} cross the field, {n['opaque']:,} of them end opaque\n"

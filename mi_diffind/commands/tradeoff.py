@@ -60,7 +60,7 @@ def run(arguments) -> dict:
 
 
 def _measure(plan, arguments) -> dict:
-    from ..measure import frame, report
+    from ..measure import benchmark, report
 
-    result = frame.measure(plan, frame.Settings.choose(plan.variant, arguments.quick), arguments.out)
+    result = benchmark.measure(plan, benchmark.Settings.choose(plan.variant, arguments.quick), arguments.out)
     return report.publish(result, report.write(result, arguments.out, plan), report.summary(result, plan))

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable
 
 from ..files import replacing, writable_folder, write_json
 from . import plot
-from .frame import PASS, in_competition
+from .benchmark import PASS, in_competition
+from .formatting import grid, machine_line, ratio_cell, state, time_cell
 from .statistics import finite, pareto
 from .store import Store
 from .study import Plan
-from .words import grid, machine_line, ratio_cell, state, time_cell
 
 #: Columns of the table, before those of the errors and of the candidates' details.
 COLUMNS = (

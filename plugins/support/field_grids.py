@@ -7,7 +7,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from mi_diffind.tables import TableError
-from mi_diffind.tasks.field.files import load
+from mi_diffind.tasks.radiance.files import load
 
 from . import properties
 

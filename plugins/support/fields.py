@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import compat
-from mi_diffind.tasks.field import counting
-from mi_diffind.tasks.field import march as marching
+from mi_diffind.tasks.radiance import counting
+from mi_diffind.tasks.radiance import march as marching
 
 from . import upsampling
 from .solids import Placement
@@ -22,7 +22,7 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 class PlacedField:
     """
-    A radiance field (:class:`mi_diffind.tasks.field.field.RadianceField`) that ``to_world``, a similarity, puts into
+    A radiance field (:class:`mi_diffind.tasks.radiance.field.VolumeField`) that ``to_world``, a similarity, puts into
     the world. It looks the same from everywhere, whatever its size: densities are per length of its own frame.
     """
 

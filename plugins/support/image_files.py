@@ -19,7 +19,7 @@ from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
 from mi_diffind.tables import TableError
-from mi_diffind.tasks.task import Task, stamp
+from mi_diffind.task import Task, stamp
 
 from . import properties
 from .tables import exposed

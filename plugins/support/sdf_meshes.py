@@ -12,8 +12,8 @@ import mitsuba as mi
 
 from mi_diffind.errors import DiffindError
 from mi_diffind.tables import TableError
+from mi_diffind.task import stamp
 from mi_diffind.tasks.sdf import TASK
-from mi_diffind.tasks.task import stamp
 
 from . import properties
 

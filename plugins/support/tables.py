@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mi_diffind import compat
-from mi_diffind.tasks.task import Model, Task
+from mi_diffind.task import Model, Task
 
 from . import properties
 

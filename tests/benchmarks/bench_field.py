@@ -16,11 +16,12 @@ import numpy as np
 
 from mi_diffind.files import write_json
 from mi_diffind.runtime import array_module
-from mi_diffind.tasks.field import compression, files, fit, target
-from mi_diffind.tasks.field.presets import NODE_BYTES, PRESETS
-from mi_diffind.tasks.field.training import Images, evaluate
-from mi_diffind.tasks.field.views import load_views
-from mi_diffind.tasks.task import Request, tasks
+from mi_diffind.task import Request, tasks
+from mi_diffind.tasks.radiance import compression, files, fit
+from mi_diffind.tasks.radiance import grid as grids
+from mi_diffind.tasks.radiance.presets import NODE_BYTES, PRESETS
+from mi_diffind.tasks.radiance.training import Images, evaluate
+from mi_diffind.tasks.radiance.views import load_views
 
 #: Name of a row → what is changed.
 ROWS = {
@@ -52,7 +53,7 @@ def main() -> None:
     views, held = load_views(arguments.source, "train"), load_views(arguments.source, "test")
     images, tests = Images(types, views), Images(types, held)
     whole = fit.grid_of(files.load(arguments.grid), types)
-    seen = target.divided(whole, target.visible(whole, images), 1, 0)
+    seen = grids.divided(whole, grids.visible(whole, images), 1, 0)
     dense = NODE_BYTES * int(np.prod(whole.nodes.shape))
     rows = [{"name": "grid", **evaluate(seen.field(), tests)}]
     print(json.dumps(rows[0]), flush=True)

@@ -22,8 +22,8 @@ from mi_diffind.fitting import FitSettings, _Trainer
 from mi_diffind.maps import source
 from mi_diffind.runtime import array_module
 from mi_diffind.tasks.image import training
+from mi_diffind.tasks.image.memory_budget import Size
 from mi_diffind.tasks.image.presets import PRESETS, replaced
-from mi_diffind.tasks.image.sizing import Size
 
 PRIMARY, CASCADED, SAMPLES, SIDE = 496, 12, 2**20, 1024
 

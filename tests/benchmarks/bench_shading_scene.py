@@ -27,17 +27,17 @@ from mi_diffind.compat import use_threads
 from mi_diffind.fitting import fit
 from mi_diffind.indirection import unfolded
 from mi_diffind.maps.source import load_source
+from mi_diffind.scene_training.fit import fit_scene, texture_problem
+from mi_diffind.scene_training.problem import SceneProblem
+from mi_diffind.scene_training.recipe import SceneRecipe, View, Views
+from mi_diffind.scene_training.references import References
+from mi_diffind.scene_training.texture import TrainedScene
 from mi_diffind.tables import save_table
-from mi_diffind.tasks.shading.scene import fit_scene, texture_problem
-from mi_diffind.tasks.shading.scene_problem import SceneProblem
-from mi_diffind.tasks.shading.scene_recipe import SceneRecipe, View, Views
-from mi_diffind.tasks.shading.scene_references import References
-from mi_diffind.tasks.shading.scene_texture import TrainedScene
-from mi_diffind.tasks.task import Request
+from mi_diffind.task import Request
 from mi_diffind.tasks.texture.compressed import load
 from mi_diffind.tasks.texture.training import rounded
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 from shading_scenes import fitted, material, scene_file
 
 NAMES = ("albedo", "normal", "roughness", "metallic")

@@ -13,7 +13,7 @@ import numpy as np
 from ...fitting import Problem
 from ...tasks.sdf import samples
 from ...tasks.sdf.distances import Distances
-from ...tasks.sdf.field import Field
+from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 from .networks import Network
 
@@ -47,7 +47,7 @@ def network(nbytes: int) -> Network:
     return Network(3, WIDTH, LAYERS, grid)
 
 
-class HashField(Field):
+class HashField(DistanceField):
     """The field of a trained ``net``, whose outputs are distances divided by :data:`BAND`. It knows no slope."""
 
     def __init__(self, types, net: Network, mesh: Mesh):

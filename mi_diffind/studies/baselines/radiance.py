@@ -3,7 +3,7 @@ What compressed radiance fields are compared with: grids of 8 bits, dense or spa
 with a codebook (the idea of VQRF, Li et al. 2023), planes and lines (of TensoRF, Chen et al. 2022) and a hash grid with
 a network (of Instant-NGP, Müller et al. 2022).
 
-Each is a :class:`.RadianceField` of float tensors while it is trained, rounded as it will be stored, and becomes one
+Each is a :class:`.VolumeField` of float tensors while it is trained, rounded as it will be stored, and becomes one
 that reads bytes: :class:`ByteField` for all that lie on nodes.
 """
 
@@ -12,8 +12,8 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from ...tasks.field.field import RadianceField, colour_of, density_of
-from ...tasks.field.nodes import Nodes
+from ...tasks.radiance.field import VolumeField, colour_of, density_of
+from ...tasks.radiance.nodes import Nodes
 from .node_codes import Steps
 
 #: Raw numbers of density that are told apart: below is nothing, above is opaque.
@@ -23,9 +23,9 @@ RAW = (-8.0, 12.0)
 # -- fields on nodes --------------------------------------------------------------------------------------------------
 
 
-class CoefficientField(RadianceField):
+class CoefficientField(VolumeField):
     """
-    Trilinear on nodes, as :class:`~mi_diffind.tasks.field.field.GridField`, with colours that are rows of a table:
+    Trilinear on nodes, as :class:`~mi_diffind.tasks.radiance.field.GridField`, with colours that are rows of a table:
     arrays ``density`` ``(n,)``, ``colour`` ``(m, C)``, C a multiple of four, and, if there is one, ``matrix``
     ``(C + 1, 12)``, which makes twelve numbers of a row, the last line being added. ``rows`` (n,), UInt32, are the
     rows of the nodes (default: their own).
@@ -72,7 +72,7 @@ class CoefficientField(RadianceField):
         return self.nodes.skip(p, d, active)
 
 
-class ByteField(RadianceField):
+class ByteField(VolumeField):
     """
     What a :class:`CoefficientField` becomes: ``density`` (n,) and ``colour`` (m, C), uint8, with their :class:`.Steps`,
     ``matrix`` (C + 1, 12) or ``None``, ``rows`` (n,) or ``None``. Nodes come in lexicographic order, without one for

@@ -12,8 +12,8 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ...tasks.field.field import RadianceField, colour_of, density_of
-from ...tasks.field.nodes import COARSE, FARTHEST, Nodes, cells_of, corners_of, distances
+from ...tasks.radiance.field import VolumeField, colour_of, density_of
+from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, corners_of, distances
 from .node_codes import Steps, deflated, mask_bytes
 from .radiance_fits import HEADER, Grid, nodes_of, nodes_state
 
@@ -69,7 +69,7 @@ TABLES = ("density_planes", "colour_planes")
 PLANES = (((0, 1), 2), ((0, 2), 1), ((1, 2), 0))
 
 
-class PlanesField(RadianceField):
+class PlanesField(VolumeField):
     """
     Sums over three planes of products of ``R`` channels of a plane and a line: arrays ``density_planes`` and
     ``colour_planes``, the texels of the three planes and then of the three lines, ``(n, R)`` each, R a multiple of
@@ -231,7 +231,7 @@ class PlanesFit:
 LEVELS, FEATURES, COARSEST, WIDTH = 8, 2, 16, 32
 
 
-class HashField(RadianceField):
+class HashField(VolumeField):
     """
     A hash grid and a network of one hidden layer, which tells a raw density and twelve numbers of colour: arrays
     ``entries`` and ``weights``, flat.

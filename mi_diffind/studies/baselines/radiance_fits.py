@@ -14,10 +14,10 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from ...tasks.field.field import GridField
-from ...tasks.field.march import march, replay
-from ...tasks.field.nodes import Nodes, cells_of, corners_of
-from ...tasks.field.target import DENSITY_SCALE
+from ...tasks.radiance.field import GridField
+from ...tasks.radiance.grid import DENSITY_SCALE
+from ...tasks.radiance.march import march, replay
+from ...tasks.radiance.nodes import Nodes, cells_of, corners_of
 from .node_codes import Steps, coded_bytes, deflated
 from .radiance import RAW, ByteField, CoefficientField
 

@@ -25,7 +25,7 @@ from ...lookup import clamp
 from ...tasks.sdf import codes
 from ...tasks.sdf.cells import CORNERS, surface_cells
 from ...tasks.sdf.distances import Distances
-from ...tasks.sdf.field import Field
+from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 from ...tasks.sdf.nodes import SparseNodes, middles
 from ...tasks.sdf.structure import Structure
@@ -49,7 +49,7 @@ def restored(nodes: np.ndarray, band: float, bits: int = 8) -> np.ndarray:
     return (nodes.astype(np.float32) + np.float32(0.5 - half)) * np.float32(band / half)
 
 
-class _Cells(Field):
+class _Cells(DistanceField):
     """Trilinear interpolation in equal cells, wherever their corners are stored."""
 
     def __init__(self, types, lower, cells, size: float, band: float, bits: int):
@@ -526,13 +526,13 @@ def distance_nodes(
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def save(path: Path | str, field: Field) -> None:
+def save(path: Path | str, field: DistanceField) -> None:
     """Write a field with a ``state``, the arguments of its class beside ``types``, which :func:`load` reads."""
     with replacing(path) as temporary:
         temporary.write_bytes(_packed(field))
 
 
-def load(path: Path | str, types, *more: type[Field]) -> Field:
+def load(path: Path | str, types, *more: type[DistanceField]) -> DistanceField:
     """What :func:`save` wrote, of one of these classes or of ``more``, for the module ``types``."""
     with np.load(path, allow_pickle=False) as file:
         state = {name: file[name] if file[name].ndim else file[name].item() for name in file}
@@ -544,7 +544,7 @@ def load(path: Path | str, types, *more: type[Field]) -> Field:
     return kind(types, **state)
 
 
-def file_bytes(field: Field) -> int:
+def file_bytes(field: DistanceField) -> int:
     """How large the file is, whose arrays are compressed (zlib)."""
     return len(_packed(field))
 
@@ -558,7 +558,7 @@ def _packed(field) -> bytes:
 # -- sizes ------------------------------------------------------------------------------------------------------------
 
 
-def fitted(make: Callable[[float], Field], nbytes: int) -> Field:
+def fitted(make: Callable[[float], DistanceField], nbytes: int) -> DistanceField:
     """
     The field ``make(size)`` with the finest cells that fits into ``nbytes``, within 1.5% if that is soon found.
     Raises ``ValueError`` if nothing fits.

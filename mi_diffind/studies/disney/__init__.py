@@ -15,7 +15,7 @@ class DisneyStudy(Study):
     title = "all forms of the Disney BRDF"
 
     def plan(self, arguments) -> Plan:
-        from .candidates import plan
+        from .plan import plan
 
         return plan(arguments.quick)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from ...measure.formatting import grid
 from ...measure.operations import Operations
-from ...measure.words import grid
 
 #: The paper's count of operations of one evaluation (supplement, 1.2.1).
 PAPER = {

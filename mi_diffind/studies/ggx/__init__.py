@@ -15,7 +15,7 @@ class GGXStudy(Study):
     title = "all forms of the GGX distribution"
 
     def plan(self, arguments) -> Plan:
-        from .candidates import plan
+        from .plan import plan
 
         return plan(arguments.quick)
 

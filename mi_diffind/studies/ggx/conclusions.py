@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from ...lookup import STORAGES
-from ...measure.words import grid
+from ...measure.formatting import grid
 
 #: The reference of the equal-quality comparison: the paper's sizes.
 PRIMARY, CASCADED = 16, 8

@@ -40,13 +40,13 @@ class ImageStudy(Study):
     def check(self, arguments) -> None:
         """Also reads the source, before anything is made of it; raises what :func:`.load_source` does."""
         from ...maps.source import load_source
-        from ...sizes import parse_compression
+        from ...units import parse_compression
 
         arguments.compressions = tuple(map(parse_compression, arguments.compression)) or (12.0,)
         arguments.loaded = load_source(arguments.source)
 
     def plan(self, arguments) -> Plan:
-        from .candidates import Request, plan
+        from .plan import Request, plan
 
         quick = arguments.quick
         seconds = tuple(map(float, arguments.seconds)) or (2.0 if quick else 60.0,)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...measure.words import grid
+from ...measure.formatting import grid
 
 #: What verdicts are about: a name, the error, how it is written, whether more is better.
 MEASURES = (

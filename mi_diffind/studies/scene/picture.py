@@ -10,7 +10,7 @@ import numpy as np
 
 from ...measure import plot
 from ...measure.bias import seconds_of
-from ...measure.words import duration, percent, rounded
+from ...measure.formatting import duration, percent, rounded
 
 #: Colour and marker of each version.
 VERSIONS = {"exact": plot.STYLES[1], "learned": plot.STYLES[0]}

@@ -22,9 +22,9 @@ from tqdm import tqdm
 
 from ... import metrics, plugins, scenes
 from ...interrupt import interruptible
+from ...measure.benchmark import Stopped
 from ...measure.bias import LEAST, crossover, describe, error, estimate, root, weights_of
 from ...measure.clock import machine, timed
-from ...measure.frame import Stopped
 from ...measure.statistics import finite, named, spread
 from ...measure.store import Store, fingerprint, sources
 from .verdict import verdict

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ...measure import report
 from ...measure.bias import practical, root
-from ...measure.words import enumeration, grid, machine_line, percent, rounded, state
+from ...measure.formatting import enumeration, grid, machine_line, percent, rounded, state
 from . import picture
 from .renders import VERSIONS
 

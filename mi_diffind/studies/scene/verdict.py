@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...measure.bias import PRACTICAL, practical
-from ...measure.words import duration, percent, rounded
+from ...measure.formatting import duration, percent, rounded
 
 
 def verdict(result: dict) -> str | None:

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 
 from ...measure.study import Plan, Study
-from ..kinds import add_without, check_without
+from ..equal_memory import add_without, check_without
 
 #: Sizes unless asked otherwise, and the one at which everything is made and timed, if it is among them.
 SIZES, FIRST = ("256k", "512k", "1M", "2M", "4M"), "1M"
@@ -46,9 +46,9 @@ class SdfStudy(Study):
 
     def check(self, arguments) -> None:
         """Also reads the mesh; raises :class:`~mi_diffind.tasks.sdf.mesh.MeshError`."""
-        from ...sizes import parse_bytes
         from ...tasks.sdf.mesh import load_mesh
-        from .candidates import KINDS, PARTS
+        from ...units import parse_bytes
+        from .plan import KINDS, PARTS
 
         every = (FIRST,) if arguments.ablation else (FIRST, *(s for s in SIZES if s != FIRST))
         default = ("64k",) if arguments.quick else every
@@ -58,7 +58,7 @@ class SdfStudy(Study):
         arguments.before = earlier(arguments) if arguments.errors_of else {}
 
     def plan(self, arguments) -> Plan:
-        from .candidates import Request, plan
+        from .plan import Request, plan
 
         quick = arguments.quick
         request = Request(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ...measure.frame import PASS
-from ...measure.words import enumeration, grid
-from ..kinds import by_size, ours_of, times_that_of
+from ...measure.benchmark import PASS
+from ...measure.formatting import enumeration, grid
+from ..equal_memory import by_size, ours_of, times_that_of
 
 #: What verdicts are about: its name, the error, how it is written, whether more is better.
 MEASURES = (

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ... import task
 from ...fitting import FitResult, FitSettings, fit
-from ...tasks import task
 from ...tasks.sdf import training
 from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.nodes import SparseNodes
 from ..baselines import volumes
 from ..baselines.direct_nodes import DirectCoding, DirectNodes
-from .candidates import Fitted, Made
+from .plan import Fitted, Made
 
 #: Our preset.
 SPARSE = "sparse"

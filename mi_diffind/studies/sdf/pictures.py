@@ -9,9 +9,9 @@ import numpy as np
 
 from ...measure import plot
 from ...measure.curves import against_time, curves, finish
-from ...measure.words import machine_line, state
-from ..kinds import by_size
-from . import stage
+from ...measure.formatting import machine_line, state
+from ..equal_memory import by_size
+from . import view as views
 from .conclusions import size_text
 
 #: The error of normals that is as dark as it gets, in degrees.
@@ -40,7 +40,7 @@ def of(setting, stage_of: Callable) -> dict[str, Callable[[dict], object]]:
     return {"shapes": lambda result: shapes(setting, stage_of(), result)}
 
 
-def shapes(setting, view: stage.Stage, result: dict):
+def shapes(setting, view: views.Stage, result: dict):
     """
     Above, the angles between normals of the mesh and those of fields of the first size, where rays meet them; below,
     errors of all sizes against bytes, and of the first against the time of a ray.
@@ -82,7 +82,7 @@ def shapes(setting, view: stage.Stage, result: dict):
     return found
 
 
-def _mesh_normals(view: stage.Stage) -> tuple[np.ndarray, np.ndarray]:
+def _mesh_normals(view: views.Stage) -> tuple[np.ndarray, np.ndarray]:
     """The normals of the mesh's triangles at all pixels ``(height, width, 3)``, and where there are any."""
     import mitsuba as mi
 
@@ -93,11 +93,11 @@ def _mesh_normals(view: stage.Stage) -> tuple[np.ndarray, np.ndarray]:
     return np.array(si.n).T.reshape(height, width, 3), hit
 
 
-def _angles(types, view: stage.Stage, field, truth: np.ndarray, hit: np.ndarray) -> np.ndarray:
+def _angles(types, view: views.Stage, field, truth: np.ndarray, hit: np.ndarray) -> np.ndarray:
     """Angles in degrees between normals; NaN where neither is met, 90 where one of the two is."""
     o, d = view.rays(types)
     with dr.suspend_grad():
-        t = stage.traced(field, o, d)
+        t = view.traced(field, o, d)
         found = dr.isfinite(t)
         g = np.array(field.gradient(types.Array3f(dr.fma(d, dr.select(found, t, 0), o)))[1]).T.astype(np.float64)
     found = found.numpy()

@@ -49,8 +49,8 @@ class ShadingStudy(Study):
 
     def check(self, arguments) -> None:
         """Also reads the materials, before anything is made of them; raises what :func:`.load_source` does."""
-        from ...sizes import parse_compression
-        from .candidates import materials_of
+        from ...units import parse_compression
+        from .plan import materials_of
 
         if (arguments.steps is None) != (arguments.pretrain_steps is None):
             raise ValueError("--steps and --pretrain-steps: one is given, both or none are allowed")
@@ -61,7 +61,7 @@ class ShadingStudy(Study):
                                         arguments.quick)  # fmt: skip
 
     def plan(self, arguments) -> Plan:
-        from .candidates import WAYS, Request, plan
+        from .plan import WAYS, Request, plan
 
         quick = arguments.quick
         ways = {"all": WAYS, "both": (WAYS[0], WAYS[-1]), "on": WAYS[:1]}[arguments.remedies]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...measure.words import enumeration, grid
+from ...measure.formatting import enumeration, grid
 
 #: The way with both remedies, and the one without.
 WITH, WITHOUT = "clip, schedule", "no clip, no schedule"

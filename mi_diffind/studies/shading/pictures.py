@@ -10,7 +10,7 @@ import numpy as np
 
 from ... import metrics
 from ...measure import plot
-from ...measure.words import machine_line, state
+from ...measure.formatting import machine_line, state
 from ..texture.zoom import flicker
 from .conclusions import Curves, curves
 from .motion import GRID

@@ -49,8 +49,8 @@ class TextureStudy(Study):
     def check(self, arguments) -> None:
         """Also reads the source, before anything is made of it; raises what :func:`.load_source` does."""
         from ...maps.source import load_source
-        from ...sizes import parse_compression
-        from .candidates import colour_map, tables_of
+        from ...units import parse_compression
+        from .plan import colour_map, tables_of
 
         given = tuple(map(parse_compression, arguments.compression))
         default = () if arguments.table else (12.0,) if arguments.quick else (12.0, 3.0, 6.0, 24.0)
@@ -60,7 +60,7 @@ class TextureStudy(Study):
         arguments.tables = tables_of(arguments.table, arguments.loaded)
 
     def plan(self, arguments) -> Plan:
-        from .candidates import Request, plan
+        from .plan import Request, plan
 
         quick = arguments.quick
         width = arguments.width or (96 if quick else 480)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 
-from ...measure.frame import PASS
-from ...measure.words import grid
+from ...measure.benchmark import PASS
+from ...measure.formatting import grid
 
 #: The bitmap that gains are over, and the one whose flicker is the measure.
 BASE, STEADY = "bitmap, 1 spp", "bitmap, 4 spp"

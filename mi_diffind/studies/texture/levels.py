@@ -6,7 +6,7 @@ import numpy as np
 
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
-from .stages import decibel
+from .test_scenes import decibel
 
 
 def images(pyramid: Pyramid) -> dict[str, list[np.ndarray]]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from ...measure import plot
-from ...measure.words import machine_line, state
+from ...measure.formatting import machine_line, state
 from .zoom import GRID, flicker
 
 #: Frames of a strip.

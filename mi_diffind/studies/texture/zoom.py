@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from .stages import Reader, Stage, shown
+from .test_scenes import Reader, Stage, shown
 
 #: How much nearer the camera is in the last frame than in the first.
 NEARER = 2.0

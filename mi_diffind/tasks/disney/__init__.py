@@ -13,7 +13,7 @@ Task 2: the Disney BRDF (Burley 2012), exact and as tables.
 from __future__ import annotations
 
 from ...settings import FitSettings
-from ..task import Request, Task
+from ...task import Request, Task
 
 
 class Disney(Task):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from ..known import Known
+from ...bounds import ValueBounds
 from .model import PARAMETERS
 
 
@@ -46,14 +46,14 @@ class Effects:
         return tuple(f.name for f in fields(self) if getattr(self, f.name))
 
 
-def find_effects(known: dict[str, Known]) -> tuple[Effects, dict[str, str]]:
+def find_effects(known: dict[str, ValueBounds]) -> tuple[Effects, dict[str, str]]:
     """
     The effects in use, and for each of the others the reason why it is not, in words.
 
     ``known`` maps ``base_color`` and the names of :data:`.model.PARAMETERS` to what is known; a missing one may be
     anything. Parameters that are being optimised keep their effect, and its derivative, whatever their value.
     """
-    k = {name: known.get(name, Known()) for name in ("base_color", *PARAMETERS)}
+    k = {name: known.get(name, ValueBounds()) for name in ("base_color", *PARAMETERS)}
     reasons: dict[str, str] = {}
 
     def unless(effect: str, *causes: tuple[bool, str]) -> None:

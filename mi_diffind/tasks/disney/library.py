@@ -6,7 +6,7 @@ import os
 
 from ...lookup import STORAGES
 from ...tables import Table, TableError, check_ranges, load_table
-from ..task import Model
+from ...task import Model
 from . import training
 from .arrays import Arrays
 from .decoder import Decoder

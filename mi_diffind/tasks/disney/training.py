@@ -14,8 +14,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...fitting import Problem
-from ..sampling import exponential_like
+from ...fitting import Problem, exponential_like
 from . import model
 from .arrays import Arrays
 from .decoder import Decoder

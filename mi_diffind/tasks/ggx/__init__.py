@@ -6,7 +6,7 @@ import argparse
 
 from ...errors import UsageError
 from ...settings import FitSettings
-from ..task import Argument, Request, Task
+from ...task import Argument, Request, Task
 
 
 def _side(text: str) -> int:

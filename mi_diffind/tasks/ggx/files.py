@@ -7,7 +7,7 @@ import os
 from ...indirection import Indirection
 from ...lookup import STORAGES
 from ...tables import Table, TableError, check_ranges, load_table
-from ..task import Model
+from ...task import Model
 from . import training
 from .model import Encoding, LearnedGGX
 

@@ -9,8 +9,7 @@ from dataclasses import asdict
 import drjit as dr
 import numpy as np
 
-from ...fitting import Problem
-from ..sampling import exponential_like
+from ...fitting import Problem, exponential_like
 from .model import ALPHA_MIN, ENCODINGS, Encoding, LearnedGGX, ggx
 
 #: Bands of roughness for which errors are reported.

@@ -3,7 +3,7 @@ Task 3: images and materials as one primary and one cascaded array.
 
 Sources, and which of their channels are stored: :mod:`mi_diffind.maps`.
 
-- :mod:`.arrays`: initial values; :mod:`.sizing`, :mod:`.search`: how large they are;
+- :mod:`.arrays`: initial values; :mod:`.memory_budget`, :mod:`.search`: how large they are;
 - :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and what ``fit image`` does;
 - :mod:`.compressed`, :mod:`.model`: the result, as an image and as a file.
 """
@@ -13,8 +13,8 @@ from __future__ import annotations
 import dataclasses
 
 from ...arguments import Argument, positive
-from ..map_arguments import DECODED, SIZES, SOURCE, SOURCES
-from ..task import Request, Task
+from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
+from ...task import Request, Task
 from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, without
 
 

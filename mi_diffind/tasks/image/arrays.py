@@ -18,7 +18,7 @@ from ...indirection import DifferentiableArray, Indirection, ramp
 from ...maps import components
 from ...maps.layout import Layout
 from ...pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
-from .sizing import Size
+from .memory_budget import Size
 
 #: Room between the components' range and the ends of [0, 1], and the share of texels beyond the range at either end.
 MARGIN, OUTSIDE = 0.02, 1e-3

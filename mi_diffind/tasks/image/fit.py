@@ -7,13 +7,13 @@ import os
 from pathlib import Path
 
 from ...errors import UsageError
+from ...maps.arguments import asked_bytes
 from ...maps.source import Source, load_source
 from ...pages import most_entries
 from ...settings import FittingError
 from ...tables import MAX_BYTES
-from ..map_arguments import asked_bytes
-from ..task import Fitted, Request
-from . import search, sizing, training
+from ...task import Fitted, Request
+from . import memory_budget, search, training
 from .presets import PAGED, PRESETS, STRUCTURES, Recipe, without
 
 
@@ -109,8 +109,8 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
             f"which is what pages can hold: ask for fewer or take another one"
         )
     table, result = training.fit_image(source, size, recipe, request, border)
-    _, sentence = sizing.explain(size, source.nbytes, asked)
-    if sentence is None and size.paged and table.nbytes < (1 - sizing.TOLERANCE) * asked:
+    _, sentence = memory_budget.explain(size, source.nbytes, asked)
+    if sentence is None and size.paged and table.nbytes < (1 - memory_budget.TOLERANCE) * asked:
         sentence = (
             f"{round(asked):,} bytes were asked for, but at {table.nbytes:,} bytes the pages are as fine as the image"
         )

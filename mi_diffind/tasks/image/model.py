@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...maps.layout import Layout
-from ..mapped import MapsModel
+from ...maps.model import MapsModel
 from .compressed import CompressedImage, joined_of
 
 

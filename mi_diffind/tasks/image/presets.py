@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 
 from ...settings import FitSettings
-from .sizing import Coarse
+from .memory_budget import Coarse
 
 #: How the primary is stored: bits of an entry, and a second primary or none. The fewer bits, the more entries fit.
 #: The resolution of pages follows the image.

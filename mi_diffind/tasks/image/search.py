@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from ...fitting import FitResult
 from ...maps.source import Source
 from ...tables import Table
-from ..task import Request
-from . import sizing
+from ...task import Request
+from . import memory_budget
+from .memory_budget import Coarse, Size
 from .presets import PAGED, STRUCTURES, Recipe, replaced
-from .sizing import Coarse, Size
 from .training import dims_of, fit_image, layout_of, structure_of
 
 #: A candidate of a search is trained for this share of the steps.
@@ -49,15 +49,15 @@ class Found:
 def default_size(source: Source, nbytes: float, recipe: Recipe) -> Size:
     """
     The size of a recipe for so many bytes: the supplement's search, or with ``components`` a cascaded array of
-    :func:`.sizing.cascaded_side` and whatever primary fits beside it.
+    :func:`.memory_budget.cascaded_side` and whatever primary fits beside it.
     """
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
     bits, coarse = STRUCTURES[structure]
     if recipe.components or coarse:
         dims = dims_of(recipe, structure, stored)
-        return sized(source, nbytes, recipe, sizing.cascaded_side(nbytes, stored, dims))
+        return sized(source, nbytes, recipe, memory_budget.cascaded_side(nbytes, stored, dims))
     compression = source.nbytes / nbytes
-    return sizing.search(source.nbytes, compression, stored, source.height, source.width, recipe.dims, bits)
+    return memory_budget.search(source.nbytes, compression, stored, source.height, source.width, recipe.dims, bits)
 
 
 def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
@@ -68,7 +68,7 @@ def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
     (bits, coarse), paged = STRUCTURES[structure], structure in PAGED
     dims = dims_of(recipe, structure, stored)
-    size = sizing.fit_bytes(nbytes, stored, source.height, source.width, cascaded, dims, bits, coarse)
+    size = memory_budget.fit_bytes(nbytes, stored, source.height, source.width, cascaded, dims, bits, coarse)
     return dataclasses.replace(size, paged=paged)
 
 
@@ -92,7 +92,7 @@ def ratio_search(
         size = sized(source, nbytes, recipe, side)
         structure, recipe = structure_of(source, recipe, nbytes), dataclasses.replace(recipe, dims=size.dims)
         known = [t for t in tried if (t["dims"], t["structure"], t["cascaded"]) == (recipe.dims, structure, side)]
-        if known or size.nbytes > nbytes * (1 + sizing.TOLERANCE):
+        if known or size.nbytes > nbytes * (1 + memory_budget.TOLERANCE):
             return False
         table, result = fit_image(source, size, _steps(recipe, SHORT), request, border, _title(size, structure))
         tried.append({

@@ -23,11 +23,11 @@ from ...maps.layout import Layout
 from ...maps.source import Source
 from ...pages import most_entries, page_counts
 from ...tables import Table
-from ..task import Request
-from . import arrays, sizing
+from ...task import Request
+from . import arrays, memory_budget
 from .compressed import CompressedImage, to_table
+from .memory_budget import Size
 from .presets import PAGED, STRUCTURES, Recipe
-from .sizing import Size
 
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
@@ -70,8 +70,8 @@ def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
         # What the cascaded array adds to more channels than it has dimensions needs more precise pointers
         pages = "pages of 6 bits" if k > recipe.dims else "pages of 5 bits"
         dims = dims_of(recipe, pages, k)
-        side = sizing.cascaded_side(nbytes, k, dims)
-        size = sizing.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
+        side = memory_budget.cascaded_side(nbytes, k, dims)
+        size = memory_budget.fit_bytes(nbytes, k, height, width, side, dims, STRUCTURES[pages][0])
         fewest = ENTRIES * math.prod(page_counts((height, width)))
         if fewest <= arrays.page_budget(size, values.shape) <= most_entries(2):
             gain, psnr = arrays.gain_of_pages(values, size, components.borders(values))

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from ... import sizes
+from ... import units
 from ...arguments import Argument, between, checked, positive
 from ...errors import UsageError
-from ..task import Request, Task
+from ...task import Request, Task
 from .presets import PRESETS
 
 #: Bits of a pointer that go into words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
@@ -34,7 +34,7 @@ class Sdf(Task):
     arguments = (
         Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
         Argument(
-            "--bytes", type=checked(sizes.parse_bytes), metavar="N",
+            "--bytes", type=checked(units.parse_bytes), metavar="N",
             help="size in memory, as in 256k or 1.5M (default: 1M)",
         ),
         Argument(

@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 
 from ...errors import UsageError
-from .field import Field
+from .field import DistanceField
 from .structure import BLOCK as NODES
 
 #: Cells along each side of the blocks that marching cubes is run on, if the surface passes through them.
@@ -37,7 +37,7 @@ NEARER = 0.1
 OFF_NODE = 1e-3
 
 
-def extract(field: Field, resolution: int, scale: float = 1.0, centre=(0.0, 0.0, 0.0)):
+def extract(field: DistanceField, resolution: int, scale: float = 1.0, centre=(0.0, 0.0, 0.0)):
     """
     The surface as a ``trimesh.Trimesh``, closed, in units and place of the file: ``vertices · scale + centre``. Without
     vertices if there is nothing inside.
@@ -72,7 +72,7 @@ def extract(field: Field, resolution: int, scale: float = 1.0, centre=(0.0, 0.0,
     return surface_of((lower + spacing * vertices) * scale + np.array(centre), faces)
 
 
-def grid(field: Field, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def grid(field: DistanceField, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     The field at the nodes of a grid, float32 ``(Z, Y, X)``, and the corners of the box that its outermost nodes lie on:
     the field's lower one, and an upper one that no cell is cut by. What lies there is outside.
@@ -131,7 +131,7 @@ def _interpolable(values: np.ndarray, around, band: float) -> np.ndarray:
     return np.where(told, moved, values)
 
 
-def crossed_blocks(field: Field, lower, spacing: float, cells) -> np.ndarray:
+def crossed_blocks(field: DistanceField, lower, spacing: float, cells) -> np.ndarray:
     """
     Which blocks of :data:`BLOCK` cells along each side the surface may pass through, bool (X, Y, Z): of a sparse field,
     those with stored nodes around; of any other, all.
@@ -163,7 +163,7 @@ def crossed_blocks(field: Field, lower, spacing: float, cells) -> np.ndarray:
     return inside > 0
 
 
-def node_values(field: Field, lower, spacing: float, shape, where=None) -> np.ndarray:
+def node_values(field: DistanceField, lower, spacing: float, shape, where=None) -> np.ndarray:
     """
     Values at the nodes ``lower + spacing · (i, j, k)`` of a grid of the ``shape`` (X, Y, Z): float32 of that shape, or
     at the nodes with the numbers ``where``, (N,).
@@ -229,7 +229,7 @@ def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return vertices[first], inverse[faces]
 
 
-def _spacing(field: Field, resolution: int) -> float:
+def _spacing(field: DistanceField, resolution: int) -> float:
     if isinstance(resolution, bool) or not isinstance(resolution, (int, np.integer)) or not (
         4 <= resolution <= MAX_RESOLUTION
     ):  # fmt: skip
@@ -269,7 +269,9 @@ def components(mesh) -> np.ndarray:
 COARSEST, FINER = 8, 1.03
 
 
-def resolution_for(field: Field, error: float, finest: int = MAX_RESOLUTION, seed: int = 0) -> tuple[int, float]:
+def resolution_for(
+    field: DistanceField, error: float, finest: int = MAX_RESOLUTION, seed: int = 0
+) -> tuple[int, float]:
     """
     The coarsest grid (cells along the longest side, from 8 to ``finest``) whose trilinear interpolation differs from
     the field by no more than ``error`` on average on the field's surface, within 3%, and by how much it does: by more
@@ -296,7 +298,7 @@ def resolution_for(field: Field, error: float, finest: int = MAX_RESOLUTION, see
     return high, found
 
 
-def trilinear_error(field: Field, points: np.ndarray, resolution: int) -> float:
+def trilinear_error(field: DistanceField, points: np.ndarray, resolution: int) -> float:
     """
     The mean difference between the field and the trilinear interpolation of a grid that is :func:`interpolable`, at
     points ``(N, 3)``; 0 for none.
@@ -322,7 +324,7 @@ def trilinear_error(field: Field, points: np.ndarray, resolution: int) -> float:
     return float(np.mean(np.abs((blend * values).sum(axis=1) - _values(field, points))))
 
 
-def surface_points(field: Field, count: int, seed: int = 0) -> np.ndarray:
+def surface_points(field: DistanceField, count: int, seed: int = 0) -> np.ndarray:
     """
     About ``count`` points of the field's surface, ``(N, 3)``: nearly uniform over its area, as they are points near it
     that go where their gradient leads. None if there is no surface.
@@ -347,7 +349,7 @@ def surface_points(field: Field, count: int, seed: int = 0) -> np.ndarray:
     return np.concatenate(found)[:count]
 
 
-def _values(field: Field, points: np.ndarray) -> np.ndarray:
+def _values(field: DistanceField, points: np.ndarray) -> np.ndarray:
     """The field's values at points ``(N, 3)``: ``(N,)`` float64."""
     if not len(points):
         return np.zeros(0)
@@ -355,5 +357,5 @@ def _values(field: Field, points: np.ndarray) -> np.ndarray:
         return field.value(_array(field, points)).numpy().astype(np.float64)
 
 
-def _array(field: Field, points: np.ndarray):
+def _array(field: DistanceField, points: np.ndarray):
     return field.types.Array3f(np.ascontiguousarray(points.T, dtype=np.float32))

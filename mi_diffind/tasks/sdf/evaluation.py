@@ -14,7 +14,7 @@ from . import samples
 from .cells import node_distances, surface_cells
 from .decode import OFF_NODE, components, march, surface_of
 from .distances import Distances
-from .field import Field
+from .field import DistanceField
 from .mesh import Mesh
 
 #: Half the width of what counts as near the surface.
@@ -73,7 +73,7 @@ class Evaluation:
         found[found] = self.distances.unsigned(points[found]) < BAND
         return found
 
-    def measure(self, field: Field) -> dict[str, float]:
+    def measure(self, field: DistanceField) -> dict[str, float]:
         """
         ``iou``: intersection over union of the solids, near the surface from the points of the band, elsewhere from the
         uniform ones, so that thin solids are measured as well as thick ones; ``iou_near``: of their parts within 0.01
@@ -143,7 +143,7 @@ class Evaluation:
         return surface_of(self.mesh.to_file_frame(lower + spacing * vertices), faces)
 
 
-def lost_pieces(field: Field, distances: Distances, count: int = 32, seed: int = 2) -> int:
+def lost_pieces(field: DistanceField, distances: Distances, count: int = 32, seed: int = 2) -> int:
     """
     How many pieces of the mesh's surface the field does not know of: at none of ``count`` places on it is the field's
     surface nearer than one of its cells.
@@ -170,19 +170,19 @@ def _ratio(both: float, one: float) -> float:
     return float(both / one) if one else 1.0
 
 
-def _points(field: Field, points: np.ndarray):
+def _points(field: DistanceField, points: np.ndarray):
     points = np.ascontiguousarray(points.T, dtype=np.float32)
     return field.types.Array3f(points)
 
 
-def _values(field: Field, points: np.ndarray) -> np.ndarray:
+def _values(field: DistanceField, points: np.ndarray) -> np.ndarray:
     """The field's values at points ``(N, 3)``: ``(N,)`` float32."""
     parts = [points[i : i + CHUNK] for i in range(0, len(points), CHUNK)]
     with dr.suspend_grad():
         return np.concatenate([field.value(_points(field, part)).numpy() for part in parts])
 
 
-def _angles(field: Field, points: np.ndarray, normals: np.ndarray, direction) -> np.ndarray:
+def _angles(field: DistanceField, points: np.ndarray, normals: np.ndarray, direction) -> np.ndarray:
     """Angles to the ``normals``, in degrees, of what ``direction`` says at points. 90 where it says nothing."""
     found = []
     with dr.suspend_grad():

@@ -16,7 +16,7 @@ import numpy as np
 from ...lookup import clamp
 
 
-class Field:
+class DistanceField:
     """
     A truncated signed distance field: the base class. ``lower`` and ``upper`` are the corners of its box, outside of
     which there is nothing; ``slope`` is a bound Λ ≥ |∇f| wherever the field is continuous, ``spacing`` the side of its
@@ -78,7 +78,7 @@ class Field:
         return value, dr.abs(value) / self.bound
 
 
-class DenseField(Field):
+class DenseField(DistanceField):
     """
     Trilinear interpolation of a grid of ``values``, a tensor of shape ``(X, Y, Z)`` whose first and last entries lie on
     the sides of the box.

@@ -9,9 +9,9 @@ import numpy as np
 from ...indirection import Indirection
 from ...tables import StoredArray, Table, TableError, load_table
 from . import codes
-from .field import Field
+from .field import DistanceField
 from .nodes import SparseNodes, decoded_nodes
-from .pair import PairField
+from .paper import PairField
 from .structure import ACTIVE, Structure, StructureError
 
 #: Of the sparse layout: name of an array → number of its dimensions, and channels (bytes, but of entries).
@@ -106,7 +106,7 @@ def structure_of(table: Table) -> Structure:
     return structure
 
 
-def field_of(table: Table, arrays: dict, types, storage: str = "") -> Field:
+def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceField:
     """
     The field of a checked table. ``arrays`` are those of a pair, allocated. With the ``storage`` ``"float32"``, the
     nodes of a sparse field are decoded: they can then be trained.

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import sizes
+from ... import units
 from ...errors import UsageError
 from ...fitting import FitResult
 from ...indirection import stored_form
 from ...settings import FittingError
 from ...tables import StoredArray, Table
-from ..task import Fitted, Request
-from . import codes, encoding, files, nodes, pair, samples, training
+from ...task import Fitted, Request
+from . import codes, encoding, files, nodes, paper, samples, training
 from .distances import Distances
 from .evaluation import Evaluation, lost_pieces
 from .mesh import Mesh, load_mesh
@@ -45,7 +45,7 @@ THIN = 0.3
 def asked_bytes(options) -> int:
     """The bytes that are asked for. Raises :class:`UsageError`."""
     try:
-        return BYTES if options["bytes"] is None else sizes.parse_bytes(options["bytes"])
+        return BYTES if options["bytes"] is None else units.parse_bytes(options["bytes"])
     except ValueError as e:
         raise UsageError(f"--bytes: {e}") from None
 
@@ -176,7 +176,7 @@ def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Req
     options = request.options
     ratio = options["ratio"] or ratio_for(nbytes)
     extent = mesh.upper - mesh.lower
-    primary, cascaded = pair.resolutions(nbytes, ratio, extent)
+    primary, cascaded = paper.resolutions(nbytes, ratio, extent)
     if 3 * int(np.prod(primary)) + int(np.prod(cascaded)) > nbytes:
         raise UsageError(f"--bytes: {nbytes:,} are fewer than the smallest arrays need")
     # The box ends a cell and a half outside of the mesh
@@ -184,7 +184,7 @@ def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Req
     lower, upper = mesh.lower - padding, mesh.upper + padding
     size = upper - lower
     spacing = float((size / (np.array(primary) - 1)).max())
-    band = max(pair.LEAST_BAND, pair.BAND * spacing)
+    band = max(paper.LEAST_BAND, paper.BAND * spacing)
     uniform = int(UNIFORM * SAMPLES)
     seed = request.settings.seed
     points = np.concatenate([
@@ -202,20 +202,20 @@ def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Req
 
     start = "constant" if options["constant"] else recipe.start
     if start == "constant":
-        net = pair.initial("ramp", primary, cascaded, at, unit[:1], np.zeros(1), band)
+        net = paper.initial("ramp", primary, cascaded, at, unit[:1], np.zeros(1), band)
     else:
-        net = pair.initial(start, primary, cascaded, at, unit, d, band)
+        net = paper.initial(start, primary, cascaded, at, unit, d, band)
     net = net.alloc(request.types.TensorXf)
-    field = pair.PairField(request.types, net, lower, upper, band, 1.0)
+    field = paper.PairField(request.types, net, lower, upper, band, 1.0)
     held_out = training.HeldOut(distances, request.types, spacing / 2)
     problem = training.PairProblem(field, mesh, unit, d, held_out)
     result: FitResult = request.train(problem)
     kept = stored_form(problem.net)
-    slope = pair.slope_of(kept, lower, upper, band)
+    slope = paper.slope_of(kept, lower, upper, band)
     arrays = {"primary": StoredArray.of(kept.primary[0]), "cascaded": StoredArray.of(kept.cascaded)}
     table = Table("sdf", arrays)
     table.settings = {
         "layout": "pair", "lower": lower.tolist(), "upper": upper.tolist(), "band": band, "slope": slope,
         "ratio": primary[0] / cascaded[0], "start": start,
     }  # fmt: skip
-    return table, result, pair.PairField(request.types, kept, lower, upper, band, slope), []
+    return table, result, paper.PairField(request.types, kept, lower, upper, band, slope), []

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import UsageError
-from ..task import Model
+from ...task import Model
 from .files import field_of
 
 #: What meshes are decoded to: trimesh writes them.

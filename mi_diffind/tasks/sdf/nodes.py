@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 
 from . import codes
-from .field import Field
+from .field import DistanceField
 from .structure import ACTIVE, BLOCK, Structure
 
 #: Spacings up to which values are told.
@@ -24,7 +24,7 @@ BAND = 2.0
 CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
 
-class SparseNodes(Field):
+class SparseNodes(DistanceField):
     """
     The field of a ``structure``, whose nodes are either decoded, ``nodes``, a tensor of shape (n, 4) of distances in
     spacings and gradients, which can be trained; or held as ``pointers`` (words, with ``bits`` bits each) into

@@ -13,7 +13,7 @@ from .distances import Distances
 from .encoding import Coding
 from .mesh import Mesh
 from .nodes import SparseNodes
-from .pair import PairField
+from .paper import PairField
 
 #: Weights of the distance (in spacings), of the field's gradient and of the blended normals of nodes.
 DISTANCE, GRADIENT, SMOOTH = 0.3, 0.05, 0.02

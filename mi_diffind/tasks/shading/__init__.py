@@ -8,24 +8,18 @@ are the arrays of task 4, through frozen tables of task 2; the result is a file 
 - :mod:`.reference`: appearance that is filtered; :mod:`.evaluation`: images that no training saw;
 - :mod:`.clip`: derivatives that are limited; :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and
   what ``fit shading`` does; :mod:`.preview`: a picture on the way;
-- :mod:`.scene` and what is called ``scene_…``: the same inside a scene, through renders of it.
+
+Training inside a scene, through renders of it, is :mod:`mi_diffind.scene_training`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 
-from ...arguments import Argument, fraction
-from ..map_arguments import SIZES, SOURCES
-from ..task import Request, Task
+from ...arguments import Argument, fraction, positive_or_none
+from ...maps.arguments import SIZES, SOURCES
+from ...task import Request, Task
 from .presets import PRESETS, REFERENCES
-from .scene_arguments import SCENE_ARGUMENTS, bound
-from .scene_recipe import SceneRecipe
-
-
-def is_scene(source) -> bool:
-    """Is a scene meant, rather than the maps of a material?"""
-    return str(source).lower().endswith(".xml")
 
 
 class Shading(Task):
@@ -38,8 +32,7 @@ class Shading(Task):
     storages = ()
     arguments = (
         Argument(
-            "source", metavar="MATERIAL.json|SCENE.xml",
-            help="a manifest of the maps of a material, or a scene with a neural_texture that is trained in it",
+            "source", metavar="MATERIAL.json", help="a manifest of the maps of a material",
         ),
         *(size for size in SIZES if size.name != "psnr"),
         Argument(
@@ -52,7 +45,7 @@ class Shading(Task):
             f"(default: {', '.join(f'{r.share} for {name}' for name, r in PRESETS.items())})",
         ),
         Argument(
-            "--clip", type=bound, metavar="X",
+            "--clip", type=positive_or_none, metavar="X",
             help="bound of the derivatives of a sample's error through the specular lobe, or none "
             f"(default: {', '.join(f'{r.clip:g} for {name}' for name, r in PRESETS.items())})",
         ),
@@ -62,11 +55,13 @@ class Shading(Task):
             "prefiltered ones (default of paper), or 256 unfiltered ones (converged)",
         ),
         *SOURCES,
-        *SCENE_ARGUMENTS,
+        Argument(
+            "--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"
+        ),
     )  # fmt: skip
 
     def settings(self, preset, given, options):
-        own = SceneRecipe().settings if is_scene(options["source"]) else PRESETS[preset].settings
+        own = PRESETS[preset].settings
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
 

@@ -8,20 +8,18 @@ import os
 from pathlib import Path
 
 from ...errors import UsageError
+from ...maps.arguments import asked_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ...tables import MAX_BYTES, Table
-from ..map_arguments import asked_bytes
-from ..task import Fitted, Request
+from ...task import Fitted, Request
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
 from ..texture import training as textures
 from ..texture.presets import PRESETS as TEXTURES
-from . import is_scene, material, training
+from . import material, training
 from .evaluation import Evaluation
 from .presets import PRESETS, Recipe
-from .scene_arguments import SCENE_ARGUMENTS, views_of
-from .scene_arguments import recipe_of as scene_recipe_of
 
 
 def recipe_of(preset: str, settings, options) -> Recipe:
@@ -37,25 +35,14 @@ def recipe_of(preset: str, settings, options) -> Recipe:
 #: Images that measure: of many views and lights, since a few that are almost mirrors decide what a PSNR is.
 PAIRS, SIDE = 32, 48
 
-#: Arguments that only a material has, and only a scene.
-OF_MATERIALS = ("compression", "bytes", "bpp", "start", "clip", "reference")
-OF_SCENES = tuple(argument for argument in SCENE_ARGUMENTS if argument.name != "preview")
-
 
 def check(request: Request) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     if options["source"] is None:
-        raise UsageError("source: not given, a manifest of the maps of a material or a scene is needed")
-    if is_scene(options["source"]):
-        wrong = [name for name in OF_MATERIALS if options[name] is not None]
-        if request.preset != next(iter(PRESETS)):
-            raise UsageError(f"--preset: found {request.preset}, a scene's texture is trained on as it was made")
-    else:
-        wrong = [a.flags[0].lstrip("-") for a in OF_SCENES if options[a.name] is not None]
-    if wrong:
-        other = "the maps of a material" if is_scene(options["source"]) else "a scene"
-        raise UsageError(f"--{wrong[0]}: is for {other}, found {options['source']}")
+        raise UsageError("source: not given, a manifest of the maps of a material is needed")
+    if str(options["source"]).lower().endswith(".xml"):
+        raise UsageError(f"source: found the scene {options['source']}; fit scene trains a texture inside a scene")
     if options["start"] is not None and any(options[name] for name in ("compression", "bytes", "bpp")):
         raise UsageError("--start: the arrays have their size, leave out --compression, --bytes and --bpp")
 
@@ -66,8 +53,6 @@ def fit(request: Request) -> Fitted:
     to each. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
     :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.fitting.FittingError`.
     """
-    if is_scene(request.options["source"]):
-        return fit_in_scene(request)
     options, folder = request.options, (request.output or Path("x")).resolve().parent
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
@@ -111,28 +96,6 @@ def fit(request: Request) -> Fitted:
         "bits": {name: a.bits for name, a in table.arrays.items()},
     }
     return Fitted(table, result, lines, figures)
-
-
-def fit_in_scene(request: Request) -> Fitted:
-    """Train a texture inside the scene that shows it, in the variant that is set, or was asked for."""
-    import mitsuba as mi
-
-    if mi.variant() is None:
-        mi.set_variant("cuda_ad_rgb" if ".cuda." in request.types.__name__ else "llvm_ad_rgb")
-    from .scene import fit_scene
-
-    options = request.options
-    views, recipe = views_of(options, request.settings.seed), scene_recipe_of(options, request.settings)
-    table, result = fit_scene(
-        options["source"], views, recipe, request, options["texture"], options["references"], preview_of(request),
-        dict(options["defines"] or ()),
-    )  # fmt: skip
-    figures = {
-        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
-        "bits": {name: a.bits for name, a in table.arrays.items()},
-        "views": dataclasses.asdict(views),
-    }
-    return Fitted(table, result, [f"{views.count} views, {recipe.spp} samples a pixel"], figures)
 
 
 def preview_of(request: Request) -> Path | None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import drjit as dr
 
+from ...bounds import ValueBounds
 from ...compat import module_of
 from ...errors import UsageError
 from ...maps.compressed import FilteredMaps
@@ -26,7 +27,6 @@ from ..disney.decoder import Decoder
 from ..disney.effects import Effects, find_effects
 from ..disney.model import PARAMETERS, Material, sanitize
 from ..disney.training import shade
-from ..known import Known
 from .clip import clipped
 
 #: Values of parameters that no map has, as in the plugin ``disney``.
@@ -74,7 +74,7 @@ def left_out(layout: Layout) -> dict[str, str]:
 
 def effects_of(layout: Layout) -> tuple[Effects, dict[str, str]]:
     """The effects that a material makes use of, and the reasons for what is left out (:func:`.find_effects`)."""
-    known = {name: Known(value, value) for name, value in DEFAULTS.items()}
+    known = {name: ValueBounds(value, value) for name, value in DEFAULTS.items()}
     for kind, m in maps_of(layout).items():
         name = "base_color" if kind == "albedo" else kind
         if kind == "normal":
@@ -82,9 +82,9 @@ def effects_of(layout: Layout) -> tuple[Effects, dict[str, str]]:
         constants = [w[1] for w in m.where if isinstance(w, tuple)]
         # What is stored twice is stored once: an albedo of one stored channel is grey
         grey = len({w for w in m.where}) == 1
-        known[name] = Known(grey=grey)
+        known[name] = ValueBounds(grey=grey)
         if len(constants) == m.channels:
-            known[name] = Known(min(constants), max(constants), grey=grey)
+            known[name] = ValueBounds(min(constants), max(constants), grey=grey)
     return find_effects(known)
 
 

@@ -19,8 +19,8 @@ from ...indirection import unfolded
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...tables import Table
+from ...task import Request
 from ..disney.training import random_directions
-from ..task import Request
 from ..texture import training as textures
 from ..texture.compressed import CompressedTexture, to_table
 from ..texture.presets import PRESETS as TEXTURES

@@ -4,7 +4,7 @@ Task 4: textures and materials that are compressed and filtered in one, read at 
 Sources, which of their channels are stored, and the truth, a mip pyramid: :mod:`mi_diffind.maps`.
 
 - :mod:`.nets`: how arrays are read, the paper's layout and ours; :mod:`.arrays`: their initial values;
-- :mod:`.sizing`: how large they are; :mod:`.sampling`: footprints, equations 3 to 9;
+- :mod:`.memory_budget`: how large they are; :mod:`.sampling`: footprints, equations 3 to 9;
 - :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and what ``fit texture`` does;
 - :mod:`.compressed`, :mod:`.model`: the result, as a texture and as a file.
 """
@@ -15,13 +15,13 @@ import argparse
 import dataclasses
 
 from ...arguments import Argument, positive
-from ..map_arguments import DECODED, SIZES, SOURCE, SOURCES
-from ..task import Request, Task
+from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
+from ...task import Request, Task
 from .presets import PRESETS
 
 
 def _structure(text: str) -> str:
-    from .sizing import parse_structure
+    from .memory_budget import parse_structure
 
     try:
         if text not in ("auto", "pages"):

@@ -15,8 +15,8 @@ from ...maps import components
 from ...maps.compressed import taps
 from ...maps.layout import Layout
 from ...pages import PagedArray, page_entries, page_gain, page_positions, page_shift, page_sizes_of
+from .memory_budget import PaperSize, Size
 from .nets import Layer, LayeredForm, LayeredNet, PaperForm, PaperNet
-from .sizing import PaperSize, Size
 
 #: Of the differences of two levels, by bits of an entry (8: and more): the share that lies within its range.
 WITHIN = {1: 0.7, 2: 0.97, 3: 0.99, 4: 0.998, 5: 0.998, 6: 0.998, 7: 0.998, 8: 0.998}

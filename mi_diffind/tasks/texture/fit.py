@@ -8,12 +8,12 @@ from pathlib import Path
 
 from ...errors import UsageError
 from ...maps import components
+from ...maps.arguments import asked_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from ...tables import MAX_BYTES
-from ..map_arguments import asked_bytes
-from ..task import Fitted, Request
-from . import arrays, sizing, training
+from ...task import Fitted, Request
+from . import arrays, memory_budget, training
 from .presets import PRESETS, Recipe
 
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on a texture is smooth.
@@ -41,9 +41,10 @@ def check(request: Request) -> None:
     elif options["axis"] is not None:
         raise UsageError("--axis is for the preset paper: our arrays are read at levels of detail, not at footprints")
     if options["structure"] == "pages" and options["skip"] is not None:
-        raise UsageError(f"--skip is for other structures than pages, which start from level {sizing.PAGES_SKIP}")
+        first = memory_budget.PAGES_SKIP
+        raise UsageError(f"--skip: not for the structure pages, which starts from level {first}")
     if options["structure"] not in (None, "auto", "pages") and options["skip"] is None:
-        fine = sizing.parse_structure(options["structure"])
+        fine = memory_budget.parse_structure(options["structure"])
         options["skip"] = fine[-1].level + 1
 
 
@@ -67,7 +68,7 @@ def fit(request: Request) -> Fitted:
     table.settings["source_path"] = os.path.relpath(Path(options["source"]).resolve(), folder)
     achieved = source.nbytes / table.nbytes if table.nbytes else None
     lines = [f"{achieved:.2f}x ({source.nbytes / asked:.2f}x asked for)" if achieved else "of one colour"]
-    if size is not None and abs(size.nbytes / asked - 1) > sizing.TOLERANCE:
+    if size is not None and abs(size.nbytes / asked - 1) > memory_budget.TOLERANCE:
         lines.append(f"{asked:,} bytes were asked for, but {size.nbytes:,} are the nearest that its arrays allow")
     figures = {
         "source_bytes": source.nbytes,
@@ -83,10 +84,10 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, opt
     """The size of the arrays for so many bytes. Raises :class:`UsageError`."""
     layout = pyramid.layout
     if not recipe.layered:
-        return sizing.paper_size(nbytes, source.nbytes, layout.stored, layout.height, layout.width)
+        return memory_budget.paper_size(nbytes, source.nbytes, layout.stored, layout.height, layout.width)
     fine, skip, levels = None, options["skip"], pyramid.levels
     if options["structure"] in (None, "auto", "pages") and skip is None:
-        size = sizing.paged(layout.height, layout.width, layout.stored, nbytes, options["cascaded"])
+        size = memory_budget.paged(layout.height, layout.width, layout.stored, nbytes, options["cascaded"])
         if options["structure"] == "pages" and size is None:
             raise UsageError('--structure "pages": the texture or its bytes are too small, or too large, for pages')
         if size is not None and (
@@ -95,7 +96,7 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, opt
         ):
             return size
     if options["structure"] not in (None, "auto", "pages"):
-        fine = sizing.parse_structure(options["structure"])
+        fine = memory_budget.parse_structure(options["structure"])
         lowest = fine[-1].level + 1
         if skip < lowest:
             raise UsageError(f"--skip: found {skip}, the structure has a fine array on level {lowest - 1}")
@@ -103,7 +104,7 @@ def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, opt
         raise UsageError(f"--skip: found {skip}, the texture has levels 0 to {levels - 1}")
     try:
         smooth = components.smoothness(pyramid.values[0]) >= SMOOTH_DB
-        return sizing.choose(
+        return memory_budget.choose(
             layout.height, layout.width, layout.stored, nbytes, skip, fine, options["cascaded"], smooth
         )
     except ValueError as e:

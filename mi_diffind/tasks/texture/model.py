@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...errors import UsageError
-from ..mapped import MapsModel
+from ...maps.model import MapsModel
 from .compressed import assembled
 
 

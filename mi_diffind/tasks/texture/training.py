@@ -22,13 +22,13 @@ from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...tables import Table
-from ..task import Request
+from ...task import Request
 from . import arrays
 from .compressed import CompressedTexture, to_table
+from .memory_budget import PaperSize, Size
 from .nets import PaperNet
 from .presets import Recipe
 from .sampling import footprints, level_of
-from .sizing import PaperSize, Size
 
 #: dB that pages have to gain, before training, over one grid of as many bytes. (0.7 on bricks, where they lose 0.4.)
 GAIN_DB = 1.0

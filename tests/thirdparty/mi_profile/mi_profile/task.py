@@ -8,7 +8,7 @@ from pathlib import Path
 from mi_diffind.arguments import Argument, positive
 from mi_diffind.errors import UsageError
 from mi_diffind.settings import FitSettings
-from mi_diffind.tasks.task import Request, Task
+from mi_diffind.task import Request, Task
 
 _FIT = FitSettings(steps=600, batch=4096, lr=3e-2, loss="mse", seed=1)
 

@@ -1,0 +1,140 @@
+"""
+The training problem of a scene: (1 − λ) · the loss of the texture + λ · the difference of renders from references.
+
+*Unbiased.* The derivative of a squared error is 2 (I − R) ∂I: a product of two random numbers if I is a render of few
+samples, right on average only if they are independent. So the value I comes from one set of samples, its derivative
+∂I from another (``seed`` and ``seed_grad`` of ``mi.render``), and the reference R from a third. That does what the loss
+(I₁ − R)(I₂ − R) of two renders does, at the price of one derivative. An error beyond the bound, and an absolute one,
+counts by its sign: a number that noise changes, however its samples are drawn. What the bound is good for: no pixel,
+such as a highlight on metal or a firefly, pulls with more than the bound. (In a scene, a component of the BSDF has no
+gradient of its own that could be clipped; that of the image has.)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .. import scenes
+from ..fitting import Problem
+from ..indirection import unfolded
+from ..tasks.texture.training import TextureProblem, rounded
+from .recipe import SceneRecipe, View
+from .references import SEEDS
+from .texture import TrainedScene
+
+#: Of the references' pixels, the share that may be brighter than white.
+BRIGHTER = 0.05
+
+#: Samples a pixel, at least, of a render that is measured, in two halves.
+MEASURED = 16
+
+#: How much brighter differences are shown than they are.
+SHOWN = 4
+
+
+def exposure_of(references: Sequence[np.ndarray]) -> float:
+    """The factor that makes 1 of the largest channel that :data:`BRIGHTER` of the pixels exceed; 1 for black images."""
+    brightest = np.concatenate([image.max(axis=2).ravel() for image in references])
+    white = float(np.quantile(brightest, 1 - BRIGHTER))
+    return 1 / white if white > 0 else 1.0
+
+
+class SceneProblem(Problem):
+    """
+    The training problem of :mod:`mi_diffind.fitting`. ``texture`` is the problem of the same arrays without a scene,
+    whose ``net`` is trained; ``scene`` the scene that reads them. ``trained`` and ``measured`` are pairs of a view and
+    its reference, ``(height, width, channels)``. ``preview``: a picture that is written at each measurement, of the
+    first view that is measured: reference | render | :data:`SHOWN` times their difference.
+    """
+
+    #: dB of renders.
+    tolerance = 0.02
+
+    def __init__(
+        self,
+        texture: TextureProblem,
+        scene: TrainedScene,
+        trained: Sequence[tuple[View, np.ndarray]],
+        measured: Sequence[tuple[View, np.ndarray]],
+        recipe: SceneRecipe,
+        digest: str = "",
+        preview: Path | None = None,
+    ):
+        self.net, self.texture, self.scene, self.recipe, self.preview = texture.net, texture, scene, recipe, preview
+        self.exposure = recipe.exposure or exposure_of([image for _, image in trained])
+        self.views = [view for view, _ in trained]
+        self.references = [mi.TensorXf(np.ascontiguousarray(self.exposure * image)) for _, image in trained]
+        self.measured = [(view, self.exposure * image) for view, image in measured]
+        own = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
+        self.identity = {**texture.identity, "scene": digest, "shading": own, "exposure": self.exposure}
+        self._view = 0
+
+    def begin(self, step: int, share: float) -> str:
+        """Which view it is: each once, in an order drawn anew each time."""
+        kind, n = self.texture.begin(step, share), len(self.views)
+        order = np.random.default_rng((self.settings.seed, 2, step // n)).permutation(n)
+        self._view = int(order[step % n])
+        return f"{kind}, view {self._view}"
+
+    def loss(self, net, rng, size: int):
+        share, losses = self.recipe.share, []
+        if share < 1:
+            self.texture.settings = self.texture.recipe.settings
+            losses += [(1 - share) * values for values in self.texture.loss(net, rng, size)]
+        if share > 0:
+            losses.append(share * self.image_loss(net, rng))
+        return losses
+
+    def image_loss(self, net, rng):
+        """The loss of the render of the step's view: an array of the shares of all pixels."""
+        seeds = rng.integers(mi.UInt32, 2, 0, SEEDS - 1)
+        value, derivative = (dr.gather(mi.UInt32, seeds, i) for i in range(2))
+        self.scene.hold(self.texture.seen(unfolded(net)))
+        self.scene.place(self.views[self._view])
+        error = self.exposure * self.scene.render(value, derivative) - self.references[self._view]
+        return self.errors(error.array) * (1 / math.prod(error.shape))
+
+    def errors(self, error):
+        """Absolute or squared (``settings.loss``), the latter beyond the bound as the tangent goes on."""
+        size, bound = dr.abs(error), self.recipe.bound
+        if self.settings.loss == "mae":
+            return size
+        if bound is None:
+            return dr.square(error)
+        return dr.select(size < bound, dr.square(error), bound * (2 * size - bound))
+
+    def measure(self, net) -> dict[str, float]:
+        """
+        ``psnr_db`` of renders of the views that are measured, values clipped to [0, 1], with the variance of two halves
+        of their samples taken out, entries rounded; and the PSNR of the texture.
+        """
+        with dr.suspend_grad():
+            self.scene.hold(rounded(unfolded(net)))
+            errors = []
+            for i, (view, reference) in enumerate(self.measured):
+                self.scene.place(view)
+                a, b = (self._sampled(2 * i + half) for half in range(2))
+                truth = np.clip(reference, 0, 1)
+                errors.append(float(np.mean((np.clip(a, 0, 1) - truth) * (np.clip(b, 0, 1) - truth), dtype=np.float64)))
+                if i == 0 and self.preview is not None:
+                    self._write(reference, (a + b) / 2)
+            texture = self.texture.measure(net)
+        decibels = -10 * math.log10(max(float(np.mean(errors)), 1e-12))
+        return {"psnr_db": decibels, **{f"texture_{name}": value for name, value in texture.items()}}
+
+    def _sampled(self, number: int) -> np.ndarray:
+        """A render of half the samples of a measurement, the same for the same number."""
+        spp = max(MEASURED // 2, self.scene.spp)
+        seed = dr.opaque(mi.UInt32, SEEDS - 1 - number)
+        return self.exposure * np.nan_to_num(self.scene.render(seed, seed + SEEDS, spp).numpy())
+
+    def _write(self, reference: np.ndarray, image: np.ndarray) -> None:
+        difference = SHOWN * np.abs(image - reference)
+        scenes.write_image(self.preview, np.concatenate([reference, image, difference], axis=1))

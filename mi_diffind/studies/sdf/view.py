@@ -1,0 +1,121 @@
+"""Where distance fields are looked at: a camera in the unit frame, and scenes with a field, a mesh or a grid in it."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...tasks.sdf import decode, tracing
+from ...tasks.sdf.field import DistanceField
+from ...tasks.sdf.mesh import Mesh
+
+#: Where the camera stands, as a direction from the middle, how far away, and its field of view (degrees, longer side).
+DIRECTION, DISTANCE, FOV = (0.45, 0.3, 1.0), 2.6, 32.0
+
+#: What is not met lies there.
+FAR = 1e3
+
+MATERIAL = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.55, 0.5, 0.45]}}
+
+
+class Stage:
+    """The camera, which sees all of ``mesh``, and the ``film``, width and height."""
+
+    def __init__(self, mesh: Mesh, film: tuple[int, int]):
+        self.mesh, self.film = mesh, film
+        away = np.array(DIRECTION) / np.linalg.norm(DIRECTION)
+        self.origin = DISTANCE * away
+        right = np.cross((0.0, 1.0, 0.0), away)
+        right /= np.linalg.norm(right)
+        self.right, self.up, self.forward = right, np.cross(away, right), -away
+
+    def rays(self, types, count: int | None = None):
+        """
+        The rays of all pixels' centres, row by row from the top, or ``count`` such rays of a film of the same shape:
+        origins and directions, evaluated.
+        """
+        width, height = self.film
+        if count is not None:
+            width = max(1, round(math.sqrt(count * width / height)))
+            height = -(-count // width)
+        index = np.arange(count or width * height)
+        scale = 2 * math.tan(math.radians(FOV) / 2) / max(self.film)
+        x = ((index % width + 0.5) / width - 0.5) * self.film[0] * scale
+        y = (0.5 - (index // width + 0.5) / height) * self.film[1] * scale
+        d = self.forward + x[:, None] * self.right + y[:, None] * self.up
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        found = []
+        for v in (np.broadcast_to(self.origin, d.shape), d):
+            found.append(types.Array3f(*(types.Float(np.ascontiguousarray(c, np.float32)) for c in v.T)))
+        dr.make_opaque(found)
+        return found
+
+    # -- scenes -------------------------------------------------------------------------------------------------------
+
+    def mesh_scene(self, lit: bool = False):
+        """The mesh, alone or ``lit`` on a floor."""
+        shape = mi.Mesh("mesh", len(self.mesh.vertices), len(self.mesh.faces), props=_material())
+        buffers = mi.traverse(shape)
+        buffers["vertex_positions"] = np.ascontiguousarray(self.mesh.vertices, np.float32).ravel()
+        buffers["faces"] = np.ascontiguousarray(self.mesh.faces, np.uint32).ravel()
+        buffers.update()
+        return self._scene(shape, "path", lit)
+
+    def grid_scene(self, field: DistanceField, resolution: int, lit: bool = False):
+        """Mitsuba's ``sdfgrid`` of a field, decoded with ``resolution`` cells along the longest side."""
+        from ...plugins.support.solids import cube_of
+
+        values, lower, upper = decode.grid(field, resolution)
+        values, upper = cube_of(values, lower, upper)
+        to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
+        grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
+        shape = mi.load_dict({"type": "sdfgrid", "grid": grid, "to_world": to_world, "normals": "smooth",
+                              "bsdf": MATERIAL})  # fmt: skip
+        return self._scene(shape, "path", lit)
+
+    def field_scene(self, field: DistanceField, lit: bool = False):
+        """The field, traced by ``path_sdf``."""
+        from ...plugins.support.solids import Placement, Solid
+
+        placement = Placement.of(mi.ScalarTransform4f(), 1.0, (0.0, 0.0, 0.0))
+        return self._scene(Solid(_material(), field, placement, True), "path_sdf", lit)
+
+    def _scene(self, shape, integrator: str, lit: bool):
+        found = {"type": "scene", "shape": shape}
+        if lit:
+            low = float(self.mesh.lower[1])
+            turn = mi.ScalarTransform4f().translate([0, low, 0]).rotate([1, 0, 0], -90).scale(4.0)
+            lamp = mi.ScalarTransform4f().look_at([1.5, 2.5, 1.0], [0, 0, 0], [0, 1, 0]).scale(0.6)
+            target, up = (self.origin + self.forward).tolist(), self.up.tolist()
+            camera = mi.ScalarTransform4f().look_at(self.origin.tolist(), target, up)
+            found |= {
+                "integrator": {"type": integrator, "max_depth": 4},
+                "floor": {"type": "rectangle", "to_world": turn, "bsdf": {"type": "diffuse"}},
+                "sky": {"type": "constant", "radiance": 0.4},
+                "lamp": {"type": "rectangle", "to_world": lamp,
+                         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}}},
+                "sensor": {"type": "perspective", "fov": FOV, "fov_axis": "larger", "to_world": camera,
+                           "sampler": {"type": "independent"},
+                           "film": {"type": "hdrfilm", "width": self.film[0], "height": self.film[1],
+                                    "rfilter": {"type": "box"}}},
+            }  # fmt: skip
+        return mi.load_dict(found)
+
+
+def _material() -> mi.Properties:
+    props = mi.Properties("neural_sdf")
+    props["bsdf"] = mi.load_dict(MATERIAL)
+    return props
+
+
+def traced(field: DistanceField, o, d):
+    """How far rays go until they meet a field, infinite if they do not."""
+    return tracing.trace(field, o, d, FAR)[0]
+
+
+def met(scene, o, d):
+    """The same in a scene of Mitsuba's, which has to live until the result is evaluated."""
+    return scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), coherent=True).t

@@ -1,0 +1,333 @@
+"""
+What a task is: a ground truth, arrays that are fitted to it, and a table file that holds them.
+
+A task declares itself as ``TASK``, a :class:`Task`, in the package ``mi_diffind/tasks/NAME`` or, if it is somebody
+else's, in a module that an entry point of the group ``mi_diffind.tasks`` names. Nothing lists tasks: ``fit``,
+``inspect``, ``decode`` and the documentation ask :func:`tasks`. A declaration is read whenever the command line builds
+its parsers, so it is cheap to import: no Dr.Jit, no Mitsuba; what trains and reads is imported by the methods.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from . import discovery
+from .arguments import Argument
+from .compat import module_of
+from .errors import UsageError
+from .settings import FitSettings
+
+if TYPE_CHECKING:
+    from .fitting import FitResult, Problem
+    from .indirection import DifferentiableArray
+    from .tables import Table
+
+#: Storage forms that a training may end in (:data:`.lookup.STORAGES`, without importing Dr.Jit).
+STORAGES = ("float32", "float16", "uint8")
+
+#: The folder of the tables that ship.
+DATA = Path(__file__).resolve().parent / "data"
+
+
+@dataclass
+class Request:
+    """
+    What a training is asked for: the ``preset`` and its ``settings`` as they were changed, the module of Dr.Jit
+    ``types`` to train with, the ``storage`` form of the result ("": the task's own), and the task's own arguments
+    (``options``, all of them). ``output`` is the file that the result will be written to, if it is known.
+    """
+
+    preset: str
+    settings: FitSettings
+    types: ModuleType
+    storage: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float | None = None
+    checkpoint: str | os.PathLike | None = None
+    resume: bool = False
+    progress: bool = True
+    output: Path | None = None
+
+    def train(self, problem: Problem, title: str | None = None) -> FitResult:
+        """Train a problem as it was asked for."""
+        from .fitting import fit
+
+        return fit(
+            problem, self.settings, self.checkpoint, self.resume, self.progress, title=title, seconds=self.seconds
+        )
+
+    def recorded(self) -> dict:
+        """The settings, as a table file keeps them."""
+        return {**asdict(self.settings), **({"seconds": self.seconds} if self.seconds is not None else {})}
+
+
+@dataclass
+class Fitted:
+    """The ``table`` that a training made, its record, further lines to print and figures for ``--json``."""
+
+    table: Table
+    result: FitResult
+    lines: list[str] = field(default_factory=list)
+    figures: dict = field(default_factory=dict)
+
+
+class Model:
+    """
+    What a table file stands for: the base class. ``table`` is what was read and checked, ``arrays`` what it was
+    allocated as, by name, for the tensor type ``dtype``. A task's own class makes of them what can be evaluated
+    (:meth:`build`).
+    """
+
+    #: Storage forms that ``inspect --measure`` compares; "" means the file's own.
+    forms: tuple[str, ...] = ("",)
+
+    def __init__(self, table: Table, arrays: dict[str, DifferentiableArray], dtype):
+        self.table, self.arrays, self.dtype = table, arrays, dtype
+        self.build()
+
+    @property
+    def types(self) -> ModuleType:
+        """The module of the Dr.Jit types to compute with."""
+        return module_of(self.dtype)
+
+    def copy(self) -> Model:
+        """A model of its own that shares the memory of this one's arrays."""
+        return type(self)(self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype)
+
+    def build(self) -> None:
+        """Make what can be evaluated of ``arrays``."""
+
+    @property
+    def storage(self) -> str:
+        """The storage form of the arrays, those of all with a "/" between them if there are several, "" of none."""
+        return "/".join(dict.fromkeys(array.storage for array in self.arrays.values()))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all entries in their storage forms."""
+        return sum(array.nbytes for array in self.arrays.values())
+
+    @property
+    def memory_nbytes(self) -> int:
+        """Bytes in memory, with padding and repeated entries."""
+        return sum(array.memory_nbytes for array in self.arrays.values())
+
+    def describe(self) -> tuple[dict, list[str]]:
+        """What there is to say beyond its arrays and its training: for ``--json``, and as lines of text."""
+        return {}, []
+
+    def measure(self, **options) -> dict[str, float]:
+        """
+        Errors against the truth (units in the names: ``psnr_db``). Raises
+        :class:`~mi_diffind.tables.TableError` if there is none at hand.
+        """
+        self._refuse("cannot be measured")
+
+    def decode(self, output: Path, **options) -> list[tuple[Path, str]]:
+        """
+        Write what the table stands for, in an ordinary format, and return each file with a line about it. Raises
+        :class:`~mi_diffind.tables.TableError` if there is no such format, and
+        :class:`~mi_diffind.errors.UsageError` for bad options.
+        """
+        self._refuse("stand for nothing that could be decoded")
+
+    def _refuse(self, fault: str):
+        from .tables import TableError
+
+        raise TableError(f'{self.table.path}: holds tables for the task "{self.table.task}", which {fault}')
+
+
+class Task:
+    """
+    A task: the base class. Class attributes say what it is, methods how it is done.
+
+    A task has to have a ``name`` (that of its package), a ``title`` (what it is of, for help texts), its ``section`` in
+    the paper, ``presets`` (the first is the default), :meth:`problem`, :meth:`table` and :meth:`model_class`.
+    """
+
+    #: The word that stands for it on the command line and in table files.
+    name: str
+    #: What its tables stand for: "the GGX distribution of normals".
+    title: str
+    #: Where the paper describes it.
+    section: str = ""
+    #: Named ways to lay out and train its tables; the first is the default.
+    presets: Mapping[str, FitSettings]
+    #: Preset → the table file that ships, relative to ``mi_diffind/data`` unless absolute.
+    shipped: Mapping[str, str | os.PathLike] = {}
+    #: Storage forms of a training's result, the first is the default; none: the task chooses.
+    storages: tuple[str, ...] = STORAGES
+    #: The arguments of ``fit`` and ``decode`` that only this task adds.
+    arguments: tuple[Argument, ...] = ()
+    decode_arguments: tuple[Argument, ...] = ()
+
+    # -- training ---------------------------------------------------------------------------------------------------
+
+    def settings(self, preset: str, given: Mapping, options: Mapping) -> FitSettings:
+        """The settings of a preset with what was ``given`` in place of its own; ``options`` are the task's own."""
+        return dataclasses.replace(self.presets[preset], **given)
+
+    def check(self, request: Request) -> None:
+        """Raise :class:`~mi_diffind.errors.UsageError` for options that do not go together, before any work."""
+
+    def problem(self, request: Request) -> Problem:
+        """What is to be trained, arrays allocated."""
+        raise NotImplementedError
+
+    def table(self, problem: Problem, request: Request) -> Table:
+        """The arrays of a problem, as a file holds them: in single precision, or as the task stores them."""
+        raise NotImplementedError
+
+    def fit(self, request: Request) -> Fitted:
+        """One training, and what is measured of its result in its storage form."""
+        problem = self.problem(request)
+        result = request.train(problem)
+        table = self.table(problem, request)
+        table.preset, table.seed = request.preset, request.settings.seed
+        table.settings = {**request.recorded(), **table.settings}
+        if request.seconds is not None:
+            table.settings["steps"] = result.steps
+        table = table.to(request.storage) if request.storage else table
+        found = self.model(table, request.types.TensorXf).measure()
+        table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
+        return Fitted(table, result)
+
+    # -- files ------------------------------------------------------------------------------------------------------
+
+    def load(self, path: str | os.PathLike) -> Table:
+        """Read and check a file of this task. Raises :class:`~mi_diffind.tables.TableError`."""
+        from .tables import load_table
+
+        return load_table(path, self.name)
+
+    def model_class(self) -> type[Model]:
+        """What a file of this task becomes."""
+        return Model
+
+    def allocate(self, table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
+        """The arrays of a checked table for the tensor type ``dtype``, in a storage form ("": the file's own)."""
+        return {name: array.allocate(dtype, storage) for name, array in table.arrays.items()}
+
+    def model(self, table: Table, dtype, storage: str = "") -> Model:
+        """What a checked table stands for, allocated. Raises :class:`~mi_diffind.tables.TableError`."""
+        return self.model_class()(table, self.allocate(table, dtype, storage), dtype)
+
+    def file(self, filename: str | os.PathLike = "", preset: str = "") -> Path:
+        """The file that is read: ``filename``, or the one that ships for ``preset`` ("": the default)."""
+        if str(filename):
+            return Path(filename)
+        if not self.shipped:
+            raise ValueError('parameter "filename": not given, and no tables ship for this task')
+        if preset and preset not in self.shipped:
+            raise ValueError(f'parameter "preset": found "{preset}", allowed are {", ".join(self.shipped)}')
+        return DATA / self.shipped[preset or next(iter(self.shipped))]
+
+    def open(self, dtype, filename: str | os.PathLike = "", preset: str = "", storage: str = "") -> Model:
+        """
+        The model of ``filename`` ("": the shipped tables of ``preset``) for the tensor type ``dtype``, in a storage
+        form ("": the file's own). Raises :class:`~mi_diffind.tables.TableError` or ``ValueError``.
+
+        A file is read and checked once, and what is returned shares its memory (Dr.Jit arrays are never written in
+        place), yet assigning to the arrays of one model does not change another.
+        """
+        if storage and storage not in STORAGES:
+            raise ValueError(f'parameter "storage": found "{storage}", allowed are {", ".join(STORAGES)}')
+        path = self.file(filename, preset)
+        original = _open(self, path, stamp(path), dtype, storage)
+        if preset and original.table.preset != preset:
+            from .tables import TableError
+
+            raise TableError(f'{path}: holds tables of the preset "{original.table.preset}", "{preset}" was asked for')
+        return original.copy()
+
+
+def stamp(path: Path) -> tuple:
+    """What changes when a file does."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return ()
+    return stat.st_mtime_ns, stat.st_size
+
+
+@functools.lru_cache(maxsize=64)
+def _open(task: Task, path: Path, stamp: tuple, dtype, storage: str) -> Model:
+    return task.model(task.load(path), dtype, storage)
+
+
+@functools.lru_cache
+def tasks() -> dict[str, Task]:
+    """All tasks by name: those of this package, then those that entry points add."""
+    return discovery.load(f"{__package__}.tasks", "TASK", kind=Task)
+
+
+def task_of(table: Table) -> Task:
+    """The task of a table that was read. Raises :class:`~mi_diffind.tables.TableError` if it is not installed."""
+    from .tables import TableError
+
+    if table.task not in tasks():
+        known = ", ".join(tasks())
+        raise TableError(f'{table.path}: holds tables for the task "{table.task}", installed are {known}')
+    return tasks()[table.task]
+
+
+def load_model(path: str | os.PathLike, dtype, storage: str = "") -> Model:
+    """What a table file of any task stands for. Raises :class:`~mi_diffind.tables.TableError`."""
+    from .tables import load_table
+
+    task = task_of(load_table(path))
+    return task.model(task.load(path), dtype, storage)
+
+
+def fit(
+    name: str,
+    preset: str = "",
+    variant: str | None = None,
+    storage: str = "",
+    seconds: float | None = None,
+    checkpoint: str | os.PathLike | None = None,
+    resume: bool = False,
+    progress: bool = True,
+    output: str | os.PathLike | None = None,
+    **given,
+) -> Fitted:
+    """
+    Train the tables of the task ``name`` by one of its presets ("": the default); ``given`` are settings of the
+    training (``steps``, ``lr``, …, see :class:`~mi_diffind.settings.FitSettings`) and the task's own arguments, in
+    place of the preset's. Nothing is written but the ``checkpoint``; ``output`` only says where the table will go.
+
+    Raises :class:`~mi_diffind.errors.UsageError` for what the task does not know, and as the training does.
+    """
+    from .runtime import array_module
+
+    if name not in tasks():
+        raise UsageError(f'found the task "{name}", installed are {", ".join(tasks())}')
+    task = tasks()[name]
+    preset = preset or next(iter(task.presets))
+    if preset not in task.presets:
+        raise UsageError(f'{name}: found the preset "{preset}", allowed are {", ".join(task.presets)}')
+    if storage and storage not in task.storages:
+        raise UsageError(f'{name}: found the storage "{storage}", allowed are {", ".join(task.storages) or "none"}')
+    options = {argument.name: argument.default for argument in task.arguments}
+    fields = {f.name for f in dataclasses.fields(FitSettings)}
+    for key in given:
+        if key not in options and key not in fields:
+            allowed = ", ".join(sorted({*options, *fields}))
+            raise UsageError(f'{name}: found the argument "{key}", allowed are {allowed}')
+    options |= {k: v for k, v in given.items() if k in options}
+    settings = task.settings(preset, {k: v for k, v in given.items() if k in fields}, options)
+    request = Request(preset, settings, None, storage or next(iter(task.storages), ""), options, seconds)
+    request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
+    request.output = None if output is None else Path(output)
+    if resume and seconds is not None:
+        raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
+    task.check(request)
+    request.types = array_module(variant)
+    return task.fit(request)

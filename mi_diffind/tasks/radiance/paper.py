@@ -1,0 +1,177 @@
+"""
+The supplement's layout (§ 1.7): two pairs of dense 3D arrays, one for density, one for the twelve numbers of colour.
+The primary arrays begin as ramps, the cascaded ones as the grid resampled to their size.
+
+Cells that nothing shows in are left out, as in all fields here; the supplement keeps them.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+from drjit import nn
+from scipy.ndimage import map_coordinates
+
+from ...fitting import Problem
+from ...indirection import DifferentiableArray, Indirection, ramp, rounded
+from .field import VolumeField, blended, colour_of, density_of
+from .grid import Grid
+from .nodes import Nodes
+from .training import ImagesProblem
+
+#: The largest raw number of density: beyond, all is opaque.
+DENSEST = 16.0
+
+#: The least, and what empty space has.
+EMPTIEST = -8.0
+
+
+class PairsField(VolumeField):
+    """``density`` and ``colour`` map coordinates of the box, [0, 1]³, to numbers in [0, 1], which ``ranges`` scales."""
+
+    NAMES = ("density_primary", "density_cascaded", "colour_primary", "colour_cascaded")
+
+    def __init__(self, nodes: Nodes, density: Indirection, colour: Indirection, low, high, step=None):
+        self.nodes, self.low, self.high = nodes, [float(v) for v in low], [float(v) for v in high]
+        modules = density.primary[0], density.cascaded, colour.primary[0], colour.cascaded
+        self.modules = dict(zip(self.NAMES, modules, strict=True))
+        arrays = {name: module.data for name, module in self.modules.items()}
+        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays, step)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory, with the index of the nodes."""
+        return sum(module.memory_nbytes for module in self.modules.values()) + self.nodes.nbytes
+
+    def with_arrays(self, arrays):
+        result = super().with_arrays(arrays)
+        result.modules = {}
+        for name, module in self.modules.items():
+            result.modules[name] = module._like()
+            result.modules[name].data = arrays.get(name)
+        return result
+
+    def _read(self, kind: str, p, active) -> list:
+        u = [dr.clip((x - a) / (b - a), 0, 1) for x, a, b in zip(p, *self.box, strict=True)]
+        return self.modules[f"{kind}_cascaded"](self.modules[f"{kind}_primary"](u, active), active)
+
+    def look(self, p, active=True):
+        _, active = self.nodes.corners(p, active)
+        (found,) = self._read("density", p, active)
+        raw = dr.fma(found, self.high[0] - self.low[0], self.low[0])
+        return dr.select(active, density_of(raw, self.per_voxel), 0), []
+
+    def colour(self, latent, p, d, active=True):
+        found = self._read("colour", p, active)
+        numbers = [dr.fma(v, b - a, a) for v, a, b in zip(found, self.low[1:], self.high[1:], strict=True)]
+        return colour_of(numbers, d)
+
+    def skip(self, p, d, active=True):
+        return self.nodes.skip(p, d, active)
+
+
+def sides(nbytes: float, ratio: float, channels: int, extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """
+    Entries of the primary (3 bytes each) and the cascaded array (``channels`` bytes each) along the sides of a box of
+    this ``extent``, as many as ``nbytes`` hold in this ratio.
+    """
+    shape = np.asarray(extent, np.float64) / np.max(extent)
+
+    def of(n: float):
+        return [np.maximum(2, np.round(m * shape).astype(int)) for m in (n, n / ratio)]
+
+    n = 4 + (nbytes / (3 + channels * ratio**-3) / np.prod(shape)) ** (1 / 3)
+    while n > 3 and 3 * of(n)[0].prod() + channels * of(n)[1].prod() > nbytes:
+        n -= 0.5
+    primary, cascaded = of(n)
+    return tuple(primary.tolist()), tuple(cascaded.tolist())
+
+
+def dense(grid: Grid) -> np.ndarray:
+    """The grid's thirteen numbers at every node, ``(X, Y, Z, 13)``; of those that are not stored, nearest ones."""
+    from scipy.ndimage import distance_transform_edt
+
+    values = np.concatenate([np.clip(grid.density, EMPTIEST, DENSEST)[:, None], grid.colour], axis=1)[1:]
+    result = np.zeros((*grid.nodes.shape, 13), np.float32)
+    stored = grid.nodes.stored
+    result[stored] = values
+    nearest = distance_transform_edt(~stored, return_distances=False, return_indices=True)
+    result = result[tuple(nearest)]
+    result[~stored, 0] = EMPTIEST
+    return result
+
+
+def initial(values: np.ndarray, shapes: dict, types) -> tuple[Indirection, Indirection, np.ndarray, np.ndarray]:
+    """The two pairs as they begin, of :func:`dense`, and the ranges of its numbers."""
+    flat = values.reshape(-1, 13)
+    low, high = np.quantile(flat, 0.0005, axis=0), np.quantile(flat, 0.9995, axis=0)
+    low[0], high[0] = EMPTIEST, DENSEST
+    high = np.maximum(high, low + 1e-3)
+
+    def pair(kind: str, part: slice):
+        primary, cascaded = shapes[kind]
+        at = [np.linspace(0, n - 1, m) for n, m in zip(values.shape, cascaded, strict=False)]
+        at = np.stack(np.meshgrid(*at, indexing="ij"))
+        channels = [map_coordinates(values[..., c], at, order=1) for c in range(13)[part]]
+        entries = np.clip((np.stack(channels, axis=-1) - low[part]) / (high - low)[part], 0, 1)
+        net = Indirection(
+            DifferentiableArray(primary, 3, ramp(primary, 3, ("clamp",) * 3), fold=True),
+            DifferentiableArray(cascaded, entries.shape[-1], entries.astype(np.float32), fold=True),
+        )
+        return net.alloc(types.TensorXf)
+
+    return pair("density", slice(0, 1)), pair("colour", slice(1, 13)), low, high
+
+
+class PairsNet(nn.Module):
+    """Both pairs, to be trained."""
+
+    DRJIT_STRUCT = {"density": object, "colour": object}  # noqa: RUF012
+
+    def __init__(self, density=None, colour=None):
+        self.density, self.colour = density, colour
+
+
+class ValuesProblem(Problem):
+    """The pairs against the grid's own numbers, at uniform places in the visible cells: absolute differences."""
+
+    def __init__(self, net: PairsNet, field: PairsField, grid: Grid):
+        self.net, self.grid, self.box = net, grid.field(), field
+        self.positions = grid.nodes.types.Float(grid.nodes.positions().astype(np.float32).reshape(-1))
+        self.types, self.count = grid.nodes.types, grid.nodes.count
+
+    def loss(self, net, rng, size: int):
+        types, nodes, box = self.types, self.grid.nodes, self.box
+        node = dr.minimum(types.UInt32(rng.random(types.TensorXf, (size,)).array * self.count), self.count - 1)
+        first = dr.gather(types.Array3f, self.positions, node)
+        offset = rng.random(types.TensorXf, (3 * size,)).array
+        lane = dr.arange(types.UInt32, size)
+        inside = [dr.gather(types.Float, offset, lane + c * size) for c in range(3)]
+        p = types.Array3f(
+            *(dr.fma(f + i, nodes.spacing, a) for f, i, a in zip(first, inside, nodes.lower, strict=True))
+        )
+        corners, active = nodes.corners(p)
+        raw = sum(w * dr.gather(types.Float, self.grid.arrays["density"].array, s, active) for w, s in corners)
+        flat = self.grid.arrays["colour"].array
+        truth = [raw, *blended(types, flat, 3, [w for w, _ in corners], [s for _, s in corners], active)]
+        u = [dr.clip((x - a) / (b - a), 0, 1) for x, a, b in zip(p, box.lower, box.upper, strict=True)]
+        density, colour = rounded(net.density), rounded(net.colour)
+        found = [*density(u), *colour(u)]
+        total = types.Float(0)
+        for f, t, a, b in zip(found, truth, box.low, box.high, strict=True):
+            total += dr.select(active, dr.abs(f - (dr.clip(t, a, b) - a) / (b - a)), 0)
+        return total * (1 / (13 * size))
+
+    def measure(self, net):
+        return {"step": 0.0}
+
+
+class PairsProblem(ImagesProblem):
+    """The pairs through the images."""
+
+    def __init__(self, net: PairsNet, nodes: Nodes, low, high, views, held=None):
+        self.nodes, self.low, self.high = nodes, low, high
+        super().__init__(nodes.types, net, self.field_of, views, held)
+
+    def field_of(self, net) -> PairsField:
+        return PairsField(self.nodes, rounded(net.density), rounded(net.colour), self.low, self.high)

@@ -1,0 +1,133 @@
+"""
+Footprints by finite differences: rays through a pixel's centre and half a pixel to each side, followed along a whole
+specular chain, and what their uv differ by. And a texture that shows the footprint it is given.
+"""
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind.plugins.support import footprint
+
+ASSETS = Path(__file__).resolve().parents[2] / "scenes" / "assets"
+
+#: Pixels.
+WIDTH, HEIGHT = 48, 32
+
+
+def probe_type():
+    """A texture, in the variant that is set: the side √|det|, the major axis, and 1."""
+
+    class Probe(mi.Texture):
+        def __init__(self, props):
+            super().__init__(props)
+            self.cone = None
+
+        def set_cone(self, cone):
+            self.cone = cone
+
+        def eval(self, si, active=True):
+            ddx, ddy = footprint.footprint(si, self.cone)
+            return mi.Color3f(dr.sqrt(footprint.area(ddx, ddy)), footprint.axes(ddx, ddy)[0], 1)
+
+        def eval_1(self, si, active=True):
+            return mi.Float(0.5)
+
+        def eval_3(self, si, active=True):
+            return self.eval(si, active)
+
+        def mean(self):
+            return mi.Float(0.5)
+
+        def is_spatially_varying(self):
+            return True
+
+        def traverse(self, cb):
+            pass
+
+        def to_string(self):
+            return "Probe[]"
+
+    return Probe
+
+
+def register_probe() -> None:
+    kind = probe_type()
+    mi.register_texture("probe", lambda props: kind(props))
+
+
+def sensor(kind="perspective", to_world=None, **more) -> dict:
+    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
+    found = {"type": kind, "film": film, "sampler": {"type": "independent", "sample_count": 1}}
+    if to_world is not None:
+        found["to_world"] = to_world
+    if kind == "thinlens":
+        found.update(aperture_radius=0.01, focus_distance=2.0)
+    return {**found, **more}
+
+
+def look_at(origin, target, up=(0, 1, 0)):
+    return mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=list(up))
+
+
+def rays(sensor, dx: float, dy: float):
+    """Of all pixels, through their centres moved by that many pixels."""
+    x, y = dr.meshgrid(dr.arange(mi.Float, WIDTH), dr.arange(mi.Float, HEIGHT))
+    place = mi.Point2f((x + 0.5 + dx) / WIDTH, (y + 0.5 + dy) / HEIGHT)
+    return sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))[0]
+
+
+def mirrored(si):
+    """The ray that a mirror reflects."""
+    return si.spawn_ray(si.to_world(mi.reflect(si.wi)))
+
+
+def refracted(ior: float):
+    """What follows the ray through a boundary, outside of which is vacuum."""
+
+    def follow(si):
+        _, cosine, _, ratio = mi.fresnel(mi.Frame3f.cos_theta(si.wi), ior)
+        return si.spawn_ray(si.to_world(mi.refract(si.wi, cosine, ratio)))
+
+    return follow
+
+
+def truth(scene, chain=(), step: float = 0.5) -> tuple:
+    """
+    The hit of the central rays, and ``ddx, ddy`` as NumPy arrays ``(n, 2)``, and where they are to be trusted: all five
+    rays meet the same shapes, and the last within a small piece of the texture. ``chain``: what follows a ray at each
+    hit before the last.
+    """
+
+    def hit(dx, dy):
+        ray, shapes = rays(scene.sensors()[0], dx, dy), []
+        for follow in (*chain, None):
+            si = scene.ray_intersect(ray)
+            shapes.append(np.array(dr.reinterpret_array(mi.UInt32, si.shape)))
+            if follow is not None:
+                ray = follow(si)
+        return si, np.array(si.is_valid()), np.array(si.uv).T, shapes
+
+    centre, valid, _, shapes = hit(0, 0)
+    uv = []
+    for place in ((step, 0), (-step, 0), (0, step), (0, -step)):
+        _, there, found, met = hit(*place)
+        valid &= there & np.all([a == b for a, b in zip(shapes, met, strict=True)], axis=0)
+        uv.append(found)
+    ddx, ddy = (uv[0] - uv[1]) / (2 * step), (uv[2] - uv[3]) / (2 * step)
+    valid &= np.maximum(np.abs(ddx).max(axis=1), np.abs(ddy).max(axis=1)) < 0.3
+    return centre, ddx, ddy, valid
+
+
+def measures(ddx, ddy) -> np.ndarray:
+    """Side and major axis, ``(n, 2)``, of diameters ``(n, 2)`` each, by NumPy alone."""
+    matrix = np.stack([ddx, ddy], axis=-1).astype(np.float64)
+    return np.stack([np.sqrt(np.abs(np.linalg.det(matrix))), np.linalg.svd(matrix)[1][:, 0]], axis=-1)
+
+
+def errors(found: np.ndarray, ddx, ddy, where) -> np.ndarray:
+    """Of the side and the major axis, ``(2, 2)``: the median and the 90th percentile of their relative error."""
+    expected = measures(ddx, ddy)[where]
+    return np.percentile(np.abs(found[where] / expected - 1), (50, 90), axis=0).T

@@ -1,0 +1,118 @@
+"""Signed distance fields that are formulas, for tests, and how a scene gets them as shapes."""
+
+import sys
+
+import drjit as dr
+import numpy as np
+
+from mi_diffind.tasks.sdf.field import DistanceField
+
+
+class Ball(DistanceField):
+    """A ball of the radius ``r`` (a number, or an array that may be optimised) around ``centre``."""
+
+    def __init__(self, types, r=0.4, centre=(0, 0, 0), half=0.5):
+        super().__init__(types, (-half,) * 3, (half,) * 3, 0.01, 1.0)
+        self.r, self.centre = types.Float(r), centre
+
+    def value(self, p, active=True):
+        return self.gradient(p, active)[0]
+
+    def gradient(self, p, active=True):
+        to = self.types.Array3f(*(x - c for x, c in zip(p, self.centre, strict=True)))
+        length = dr.norm(to)
+        inside = self.inside(p) & active
+        unit = dr.select(length > 0, to / dr.select(length > 0, length, 1), 0)
+        return dr.select(inside, length - self.r, self.band), dr.select(inside, unit, 0)
+
+
+class Slab(DistanceField):
+    """What lies within ``thickness`` / 2 of the plane z = 0, up to the sides of the box."""
+
+    def __init__(self, types, thickness, normal=(0.0, 0.0, 1.0)):
+        super().__init__(types, (-0.5,) * 3, (0.5,) * 3, 0.01, 1.0)
+        self.thickness, self.axis = thickness, np.asarray(normal) / np.linalg.norm(normal)
+
+    def value(self, p, active=True):
+        along = sum(x * float(n) for x, n in zip(p, self.axis, strict=True))
+        return dr.select(self.inside(p) & active, dr.abs(along) - self.thickness / 2, self.band)
+
+    def gradient(self, p, active=True):
+        along = sum(x * float(n) for x, n in zip(p, self.axis, strict=True))
+        return self.value(p, active), self.types.Array3f(*map(float, self.axis)) * dr.sign(along)
+
+
+class Steps(Ball):
+    """A ball whose values jump over zero: ± 0.02 of the distance's sign beyond it, and only a third of the distance."""
+
+    def gradient(self, p, active=True):
+        value, slope = super().gradient(p, active)
+        return dr.copysign(dr.abs(value) / 3 + 0.02, value), slope
+
+    def look(self, p, d, active=True):
+        value = self.value(p, active)
+        return value, dr.abs(value) - 0.02
+
+
+def torus(p):
+    """Distance to a torus of radii 0.34 and 0.12 that fills the unit frame, and its gradient, at points (n, 3)."""
+    ring = np.linalg.norm(p[:, :2], axis=1)
+    to = np.stack([ring - 0.38, p[:, 2]], axis=1)
+    length = np.maximum(np.linalg.norm(to, axis=1), 1e-12)
+    flat = p[:, :2] / np.maximum(ring, 1e-12)[:, None] * (to[:, :1] / length[:, None])
+    return length - 0.12, np.concatenate([flat, to[:, 1:] / length[:, None]], axis=1)
+
+
+def sparse_table(shape=torus, spacing=1 / 40, bits=8, scale=2.0, centre=(0.5, -1.0, 0.25)):
+    """The table of a formula's sparse field, as ``fit sdf`` would write it."""
+    from mi_diffind.tables import Table
+    from mi_diffind.tasks.sdf import codes, encoding, files, nodes, structure
+
+    lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
+    n = int(np.ceil((1 + 3 * spacing) / spacing)) + 1
+    index = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = (shape(lower + spacing * index)[0] < 0).reshape(n, n, n)
+    corner = np.stack([inside[a : n - 1 + a, b : n - 1 + b, c : n - 1 + c] for a, b, c in nodes.CORNERS], axis=-1)
+    cells = np.argwhere(corner.any(-1) & ~corner.all(-1))
+    around = cells[:, None] + np.array(nodes.CORNERS)
+    used = np.unique(around.reshape(-1, 3), axis=0)
+
+    def sign(p):
+        return shape(np.asarray(p))[0] < 0
+
+    found = structure.build(used, sign(lower + spacing * used), (n, n, n), lower, spacing, sign,
+                            lambda p: np.abs(shape(np.asarray(p))[0]))  # fmt: skip
+    positions, block = found.node_positions()
+    d, g = shape(np.array(found.lower) + spacing * positions)
+
+    def key(p):
+        return np.ravel_multi_index(p.T, found.shape)
+
+    order = np.argsort(key(positions))
+    corners = order[np.searchsorted(key(positions), key(around.reshape(-1, 3)), sorter=order)].reshape(-1, 8)
+    sampled = encoding.Sampled(found, positions, block, d / spacing, g, corners, len(cells), 0.0)
+    frames = encoding.fit_frames(sampled)
+    wanted = encoding.targets(sampled, frames)
+    entries = encoding.cluster(wanted, 2**bits)
+    pointers = encoding.assign(wanted, entries)
+    table = Table("sdf", files.sparse_arrays(found, frames, codes.pointer_words(pointers, bits), entries))
+    table.preset = "sparse"
+    slope = nodes.slope_bound(d / spacing, g, corners)
+    table.settings = {"layout": "sparse", "lower": list(found.lower), "spacing": spacing, "bits": bits,
+                      "nodes": found.nodes, "slope": slope, "scale": scale, "centre": list(centre)}  # fmt: skip
+    return table
+
+
+def register(mi, fields: dict, name: str = "test_solid") -> None:
+    """A shape ``name`` whose ``field`` is the key of one in ``fields``; its box is as large as in the unit frame."""
+    solids = sys.modules["mi_diffind.plugins.support.solids"]
+
+    def make(props):
+        placement = solids.Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
+        return Held(props, fields[props["field"]], placement, props.get("smooth", False))
+
+    class Held(solids.Solid):
+        def optimised(self):
+            return any(dr.is_diff_v(v) and v.index_ad for v in vars(self.field).values() if isinstance(v, mi.Float))
+
+    mi.register_shape(name, make)

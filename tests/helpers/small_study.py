@@ -1,0 +1,83 @@
+"""A study of three candidates and two cases, with a log of what has been called."""
+
+import os
+import signal
+
+import drjit as dr
+from variants import BACKENDS
+
+from mi_diffind.measure.benchmark import Settings
+from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan
+from mi_diffind.runtime import array_module
+
+SETTINGS = Settings(lanes=1024, rounds=4, passes=3, samples=100)
+
+
+class Log(list):
+    """Names of what has been called, in order; the ``stop_at``-th call presses Ctrl-C."""
+
+    stop_at = None
+
+    def __call__(self, *what):
+        self.append(what)
+        if len(self) == self.stop_at:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def small_plan(log, details=None):
+    """Candidates ``slow`` (20 dB), ``good`` (30 dB), ``exact`` (the truth); a case with passes and one without."""
+    ad = array_module(BACKENDS[0])
+    x = dr.arange(ad.Float, SETTINGS.lanes) + 1
+    dr.make_opaque(x)
+    functions = {
+        FLOOR: lambda: x,
+        "slow": lambda: [dr.sqrt(x) * x, x + 1],
+        "good": lambda: [x * x, x * 2],
+        "exact": lambda: [x * 3, x],
+    }
+
+    def logged(case, query, name):
+        def function():
+            log("query", case, query, name)
+            return functions[name]()
+
+        return function
+
+    def case(name, passes):
+        return Case(
+            name,
+            lambda lanes: {q: {c: logged(name, q, c) for c in functions} for q in ("eval", "pdf")},
+            (lambda: {c: lambda number, c=c: (log("pass", name, c, number), dr.sqrt(x))[1] for c in ("slow", "exact")})
+            if passes
+            else None,
+            {"case": name},
+        )
+
+    def errors(name, db):
+        def measured(samples):
+            log("errors", name)
+            return {"db": db, "samples": samples}
+
+        return measured
+
+    return Plan(
+        study="small",
+        title="A small study",
+        variant=f"{BACKENDS[0]}_ad_rgb",
+        candidates=[
+            Candidate("slow", "a", "x", 10, None, errors("slow", 20.0)),
+            Candidate("good", "b", errors=errors("good", 30.0), in_passes=False),
+            Candidate("exact", "c", is_truth=True, note="the truth"),
+        ],
+        cases=[case("first", True), case("second", False)],
+        queries=("eval", "pdf"),
+        accuracy="db",
+        accuracy_label="PSNR, dB",
+        ratios=[("slow", "good"), ("good", "exact"), ("slow", "nobody")],
+        details=details or {},
+        conclusions=lambda result: [f"{len(result['cases'])} cases done"],
+    )
+
+
+KERNELS = 2 * (3 + 1)  # queries × (candidates and the floor)
+CALLS = 2 + 2 * KERNELS * (1 + SETTINGS.rounds) + 2 * (1 + SETTINGS.passes)

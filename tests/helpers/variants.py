@@ -1,0 +1,19 @@
+"""Mitsuba variants that the tests run in."""
+
+import drjit as dr
+
+import mi_diffind  # noqa: F401  (chooses LLVM before anything else)
+
+#: Variants that the plugins support, each in its CPU form; the CUDA twins follow where there is a GPU.
+COLOUR_MODES = ("ad_rgb", "ad_mono", "ad_mono_polarized", "ad_spectral", "ad_spectral_polarized")
+BACKENDS = ("llvm", "cuda") if dr.has_backend(dr.JitBackend.CUDA) else ("llvm",)
+VARIANTS = [f"{backend}_{kind}" for backend in BACKENDS for kind in COLOUR_MODES]
+
+
+def set_variant(name):
+    """``mitsuba`` with a variant set, quiet."""
+    import mitsuba as mi
+
+    mi.set_variant(name)
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi

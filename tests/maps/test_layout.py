@@ -1,0 +1,364 @@
+"""Layouts of task 3: which channels are stored, how maps come back, and damage that is refused."""
+
+import json
+import math
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from variants import BACKENDS
+
+from mi_diffind.maps.compressed import root
+from mi_diffind.maps.layout import NORMAL_FLOOR_DB, Layout, MapLayout
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.runtime import array_module
+
+
+@pytest.fixture(params=BACKENDS)
+def ad(request):
+    return array_module(request.param)
+
+
+def noise(*shape, seed=0, dtype=np.uint8):
+    rng = np.random.default_rng(seed)
+    return rng.random(shape).astype(dtype) if np.dtype(dtype).kind == "f" else rng.integers(0, 256, shape).astype(dtype)
+
+
+def unit_normals(height=9, width=8, tilt=0.6, seed=0):
+    """Normals in [0, 1]³, of unit length to the precision of floats."""
+    x, y = np.random.default_rng(seed).uniform(-tilt, tilt, (2, height, width))
+    return (0.5 + 0.5 * np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1)).astype(np.float32)
+
+
+def back(layout, source):
+    """The maps that come back from the stored channels, all with NumPy."""
+    stored = layout.encode(source)
+    assert stored.dtype == np.float32 and stored.shape == (source.height, source.width, layout.stored)
+    assert stored.size == 0 or (stored.min() >= 0 and stored.max() <= 1)
+    planes = list(np.moveaxis(stored, -1, 0))
+    shape = (source.height, source.width)
+    return {
+        m.name: np.stack([np.broadcast_to(v, shape) for v in layout.decode(m.name, planes)], axis=-1)
+        for m in source.maps
+    }
+
+
+# -- which channels are stored ----------------------------------------------------------------------------------------
+
+
+def test_colours_are_stored_as_they_are():
+    source = from_arrays({"albedo": noise(5, 4, 3)})
+    layout = Layout.of(source)
+    assert layout.maps[0].where == (0, 1, 2) and layout.groups == ("albedo",) * 3 and layout.initial == (0.5,) * 3
+    assert (layout.width, layout.height, layout.stored, layout.names) == (4, 5, 3, ("albedo",))
+    np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
+
+
+def test_grey_is_stored_once():
+    grey = np.repeat(noise(5, 4, 1), 3, axis=-1)
+    source = from_arrays({"albedo": grey})
+    layout = Layout.of(source)
+    assert layout.maps[0].where == (0, 0, 0) and layout.stored == 1 and layout.needed("albedo") == (0,)
+    np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
+    layout = Layout.of(source, once=False)
+    assert layout.maps[0].where == (0, 1, 2) and layout.stored == 3
+    np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
+
+
+def test_equal_channels_of_different_maps_are_stored_once():
+    albedo = noise(5, 4, 3)
+    source = from_arrays({"albedo": albedo, "height": albedo[..., 2], "other": albedo[..., 2] // 2})
+    layout = Layout.of(source)
+    assert [m.where for m in layout.maps] == [(0, 1, 2), (2,), (3,)]
+    assert layout.groups == ("albedo", "albedo", "albedo", "other") and layout.needed("height") == (2,)
+    found = back(layout, source)
+    for m in source.maps:
+        np.testing.assert_array_equal(found[m.name], m.values)
+
+
+def test_constant_channels_are_numbers():
+    image = noise(5, 4, 3)
+    image[..., 1] = 77
+    source = from_arrays(
+        {"albedo": image, "metallic": np.zeros((5, 4), np.uint8), "ao": np.full((5, 4), 255, np.uint8)}
+    )
+    layout = Layout.of(source)
+    value = float(np.float32(77) / np.float32(255))
+    assert [m.where for m in layout.maps] == [(0, ("constant", value), 1), (("constant", 0.0),), (("constant", 1.0),)]
+    assert layout.needed("albedo") == (0, 1) and layout.needed("ao") == ()
+    found = back(layout, source)
+    for m in source.maps:
+        np.testing.assert_array_equal(found[m.name], m.values)
+    assert Layout.of(source, once=False).stored == 5
+
+
+def test_nothing_is_stored_of_one_colour():
+    source = from_arrays({"albedo": np.full((3, 2, 3), (1, 2, 3), np.uint8)})
+    layout = Layout.of(source)
+    assert layout.stored == 0 and layout.encode(source).shape == (3, 2, 0)
+    np.testing.assert_array_equal(back(layout, source)["albedo"], source.maps[0].values)
+
+
+def test_sixteen_channels():
+    values = noise(5, 4, 16, dtype=np.float16)
+    source = from_arrays({"a": values[..., :7], "b": values[..., 7:]})
+    layout = Layout.of(source)
+    assert layout.stored == 16 and layout.maps[1].where == tuple(range(7, 16))
+    assert layout.source_nbytes == source.nbytes == values.nbytes
+    found = back(layout, source)
+    np.testing.assert_allclose(np.concatenate([found["a"], found["b"]], axis=-1), values, atol=1e-6)
+
+
+def test_initial_values_are_the_supplements():
+    names = {"albedo": 3, "normal": 3, "roughness": 1, "ao": 1, "metallic": 1, "height": 1}
+    source = from_arrays({name: noise(5, 4, c, seed=i) for i, (name, c) in enumerate(names.items())})
+    initial = dict.fromkeys(names, ())
+    layout = Layout.of(source, once=False, two_channel_normals=False)
+    for group, value in zip(layout.groups, layout.initial, strict=True):
+        initial[group] += (value,)
+    assert initial == {
+        "albedo": (0.5, 0.5, 0.5), "normal": (0.5, 0.5, 1.0), "roughness": (0.5,), "ao": (1.0,), "metallic": (0.0,),
+        "height": (0.0,),
+    }  # fmt: skip
+
+
+# -- normals ----------------------------------------------------------------------------------------------------------
+
+
+def test_unit_normals_lose_their_third_component():
+    source = from_arrays({"normal": unit_normals()})
+    layout = Layout.of(source)
+    assert layout.maps[0].where == (0, 1, "z") and layout.stored == 2
+    np.testing.assert_allclose(back(layout, source)["normal"], source.maps[0].values, atol=1e-6)
+    assert Layout.of(source, two_channel_normals=False).stored == 3
+
+
+def test_normals_of_bytes_keep_their_third_component_if_it_says_more():
+    """The floor is on the mean squared error of the third component, on either side of it."""
+    exact = unit_normals(40, 40)
+    for decibel, dropped in ((NORMAL_FLOOR_DB + 1, True), (NORMAL_FLOOR_DB - 1, False)):
+        normals = exact.copy()
+        normals[..., 2] -= np.float32(10 ** (-decibel / 20))
+        assert (Layout.of(from_arrays({"normal": normals})).stored == 2) == dropped
+    short = (0.5 + 0.8 * (exact - 0.5)).astype(np.float32)  # of length 0.8
+    source = from_arrays({"normal": short})
+    assert Layout.of(source).stored == 3
+    np.testing.assert_array_equal(back(Layout.of(source), source)["normal"], short)
+    assert Layout.of(source, two_channel_normals=True).stored == 2
+
+
+def test_other_maps_keep_all_components():
+    for name in ("albedo", "height"):
+        assert Layout.of(from_arrays({name: unit_normals()})).stored == 3
+    below = unit_normals()
+    below[..., 2] = 1 - below[..., 2]  # the lower hemisphere does not follow from x and y
+    assert Layout.of(from_arrays({"normal": below})).stored == 3
+    assert Layout.of(from_arrays({"normal": 2 * unit_normals() - 1})).stored == 3  # signed: not in [0, 1]
+    flat = unit_normals()
+    flat[..., 0] = 0.5
+    source = from_arrays({"normal": flat})
+    found = back(Layout.of(source), source)["normal"]
+    np.testing.assert_allclose(found, flat, atol=1e-6)
+
+
+# -- ranges of values -------------------------------------------------------------------------------------------------
+
+
+def hdr(largest, seed=0):
+    """Values over eight decades, zero among them."""
+    rng = np.random.default_rng(seed)
+    values = (largest * 10 ** rng.uniform(-8, 0, (16, 16, 3))).astype(np.float32)
+    values[0, 0, 0], values[0, 0, 1] = largest, 0
+    return values
+
+
+@pytest.mark.parametrize("largest", [1.5, 1e3, 65504.0, 1e30])
+def test_high_dynamic_range_is_logarithmic(largest):
+    values = hdr(largest)
+    source = from_arrays({"image": values})
+    layout = Layout.of(source)
+    m = layout.maps[0]
+    # Written out again, in double precision: linear below the knee, logarithmic above it
+    knee = max(float(np.median(values)), 1e-3 * largest)
+    expected = np.log1p(values.astype(np.float64) / knee) / math.log1p(largest / knee)
+    encoded = layout.encode(source)
+    np.testing.assert_allclose(encoded, expected, atol=2e-6)
+    assert encoded.min() == 0 and encoded.max() == 1
+    assert np.array_equal(np.argsort(encoded[..., 0], axis=None), np.argsort(values[..., 0], axis=None))
+    # Bytes: within 1/255 as they are compared, and relatively precise above the knee
+    stored = np.rint(encoded * 255) / 255
+    found = np.stack(layout.decode("image", list(np.moveaxis(stored, -1, 0))), axis=-1)
+    assert np.abs(m.encode(found) - encoded).max() <= 0.5001 / 255 + 1e-6
+    step = math.log1p(largest / knee) / 255
+    bright = values > knee
+    assert (np.abs(found / np.maximum(values, 1e-30) - 1)[bright] <= 1.05 * step).all()
+    np.testing.assert_allclose(back(layout, source)["image"], values, rtol=1e-4, atol=1e-5 * knee)
+
+
+def test_ranges_of_values_to_one():
+    """Bytes, colours and normals stand for 0 to 1; other data of more bits for what they reach, if that is little."""
+    values = noise(5, 4, 3, dtype=np.float32)
+    values[0, 0] = 1
+    for name, data, spaces in (
+        ("image", np.rint(255 * values).astype(np.uint8), None),
+        ("albedo", values, {"albedo": "srgb"}),
+        ("height", values, None),
+    ):
+        m = Layout.of(from_arrays({name: data}, spaces)).maps[0]
+        assert (m.low, m.high, m.knee) == (0, 1, 0), name
+        np.testing.assert_array_equal(m.encode(values), values)
+    m = Layout.of(from_arrays({"height": 0.02 * values})).maps[0]
+    assert (m.low, m.high) == pytest.approx((0.02 * values.min(), 0.02)) and m.knee == 0
+
+
+@pytest.mark.parametrize("low, high", [(-1, 1), (-3, -2), (-1e-3, 7), (-1e30, 1e30), (-65504, 0), (-1e-40, 1e-40)])
+def test_negative_values_span_their_range(low, high):
+    values = np.random.default_rng(1).uniform(low, high, (8, 8, 2)).astype(np.float32)
+    values[0, 0] = low, high
+    source = from_arrays({"height": values})
+    layout = Layout.of(source)
+    assert layout.maps[0].low == values.min() and layout.maps[0].knee == 0
+    np.testing.assert_allclose(back(layout, source)["height"], values, atol=1e-6 * max(high - low, 1e-3))
+
+
+@pytest.mark.parametrize("sign", ["positive", "negative", "both"])
+def test_the_largest_floats(sign):
+    """No overflow (a RuntimeWarning is an error here), and nothing that is not finite."""
+    largest = np.finfo(np.float32).max
+    values = np.random.default_rng(1).uniform(0, 1, (8, 8, 3))
+    values = {"positive": values, "negative": -values, "both": 2 * values - 1}[sign]
+    values = (values * largest).astype(np.float32)
+    values[0, 0] = {"positive": largest, "negative": -largest, "both": (largest, -largest, 0)}[sign]
+    source = from_arrays({"image": values})
+    found = back(Layout.of(source), source)["image"]
+    small = np.abs(values) < 1e38
+    assert np.isfinite(found).all() and (np.sign(found[small]) == np.sign(values[small])).mean() > 0.9
+    assert np.abs(found[small] - values[small]).max() < 1e33
+
+
+def test_what_lies_outside_becomes_the_nearest():
+    plain = MapLayout("a", "other", "linear", 1, (0,))
+    wide = replace(plain, low=-2.0, high=6.0)
+    bright = replace(plain, high=8.0, knee=0.5)
+    values = np.float32([-1e30, -2, -1, 0, 1, 8, 1e30])
+    np.testing.assert_array_equal(plain.encode(values), np.float32([0, 0, 0, 0, 1, 1, 1]))
+    np.testing.assert_array_equal(wide.encode(values), np.float32([0, 0, 0.125, 0.25, 0.375, 1, 1]))
+    found = bright.encode(values)
+    assert (found[:4] == 0).all() and 0 < found[4] < 1 and (found[5:] == 1).all()
+
+
+# -- the same with Dr.Jit ---------------------------------------------------------------------------------------------
+
+
+MAPS = (
+    MapLayout("albedo", "albedo", "srgb", 1, (0, 1, 2)),
+    MapLayout("normal", "normal", "linear", 1, (3, 4, "z")),
+    MapLayout("flat", "normal", "linear", 1, (("constant", 0.25), 4, "z")),
+    MapLayout("height", "other", "linear", 4, (2,), -3.0, 5.0),
+    MapLayout("glow", "other", "linear", 2, (1, 0, 0), 0.0, 4000.0, 4.0),
+    MapLayout("black", "other", "linear", 1, (("constant", 0.0),)),
+)
+LAYOUT = Layout(4, 3, MAPS, (0.5,) * 5, ("albedo",) * 3 + ("normal",) * 2)
+
+
+def test_dr_jit_decodes_as_numpy(ad):
+    stored = np.random.default_rng(0).random((5, 500), dtype=np.float32)
+    stored[:, :2] = 0, 1  # corners, where x² + y² is beyond 1
+    for name in LAYOUT.names:
+        expected = LAYOUT.decode(name, list(stored))
+        found = LAYOUT.decode(name, [ad.Float(v.copy()) for v in stored], dr.exp2, root)
+        assert len(found) == len(expected) == LAYOUT[name].channels
+        for a, b in zip(found, expected, strict=True):
+            if isinstance(b, float):
+                assert a == b
+                continue
+            a = a.numpy()
+            assert np.isfinite(a).all()
+            scale = LAYOUT[name].high - LAYOUT[name].low
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6 * scale if "z" not in LAYOUT[name].where else 1e-3)
+
+
+def test_a_normal_is_of_unit_length_or_flat(ad):
+    """Where x² + y² is beyond 1, z is 0; the derivative is finite everywhere."""
+    x, y = np.random.default_rng(2).random((2, 1000), dtype=np.float32)
+    point = [ad.Float(x), ad.Float(y)]
+    dr.enable_grad(point)
+    stored = [None, None, None, *point]  # what a map does not need may be missing
+    found = LAYOUT.decode("normal", stored, dr.exp2, root)
+    normal = np.stack([2 * v.numpy() - 1 for v in found])
+    dr.backward(found[2])
+    inside = (2 * x - 1) ** 2 + (2 * y - 1) ** 2 < 0.999
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=0)[inside], 1, atol=1e-4)
+    assert (normal[2, (2 * x - 1) ** 2 + (2 * y - 1) ** 2 > 1.001] == 0).all()
+    assert all(np.isfinite(v.grad.numpy()).all() for v in point)
+
+
+# -- in a file --------------------------------------------------------------------------------------------------------
+
+
+def test_json_round_trip():
+    text = json.dumps(LAYOUT.to_json(), allow_nan=False)
+    assert Layout.from_json(json.loads(text)) == LAYOUT
+    assert Layout.from_json(LAYOUT.to_json()) == LAYOUT
+    source = from_arrays({"normal": unit_normals(), "height": hdr(1e30)[:9, :8, 0], "ao": np.zeros((9, 8), np.uint8)})
+    layout = Layout.of(source)
+    assert Layout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
+
+
+def test_a_map_that_is_not_there():
+    with pytest.raises(KeyError, match=r'found the map "x", the file holds albedo, normal'):
+        LAYOUT["x"]
+
+
+INFINITY, HUGE = float("inf"), 10**400
+
+#: Where in the JSON (keys and indices), and what stands there instead.
+DAMAGE = [
+    *((("width",), v) for v in (0, -1, None, "x", [], INFINITY, float("nan"))),
+    *((("height",), v) for v in (0, -3, {}, INFINITY, 2**31, HUGE)),
+    *((("maps",), v) for v in ([], None, 3, {}, "maps", [None], [{}], [[]])),
+    *((("maps", 0), v) for v in (None, 7, "albedo", [])),
+    *((("maps", 0, "name"), v) for v in (None, 3, "", "a b", "../albedo", "a/b", "normal", ["albedo"])),
+    *((("maps", 0, "kind"), v) for v in (None, "colour", 3)),
+    *((("maps", 0, "color_space"), v) for v in (None, "rec709", 3)),
+    *((("maps", 0, "depth"), v) for v in (None, 0, 3, 8, "x", INFINITY)),
+    *((("maps", 0, "where"), v) for v in (None, [], 3, [5], [-1], [0.5], [True], ["x"], ["z", 0, 1], [0, 1, 2, "z"])),
+    *((("maps", 1, "where"), v) for v in ([0, "z"], [0, 1, "z", "z"], [[], 1, 2], [["constant"], 1, 2])),
+    *((("maps", 2, "where", 0), ["constant", v]) for v in (None, "x", INFINITY, float("nan"), HUGE)),
+    (("maps", 2, "where", 0), ["variable", 1.0]),
+    *((("maps", 3, "low"), v) for v in (5.0, 6.0, -INFINITY, float("nan"), None, "x", -HUGE, -1e39)),
+    *((("maps", 3, "high"), v) for v in (-3.0, -4, INFINITY, float("nan"), None, [], HUGE, 1e39)),
+    *((("maps", 4, "knee"), v) for v in (-1.0, INFINITY, float("nan"), None, 1e-30, HUGE)),
+    *((("maps", 4, "high"), v) for v in (0.0, -1.0)),
+    *((("initial",), v) for v in (None, [], [0.5] * 4, [0.5] * 6, ["x"] * 5, [HUGE] * 5, 3)),
+    *((("groups",), v) for v in (None, 3, [], ["albedo"] * 4, ["albedo"] * 6)),
+]
+
+
+@pytest.mark.parametrize("place, value", DAMAGE)
+def test_damage_is_refused(place, value):
+    damaged = LAYOUT.to_json()
+    part = damaged
+    for key in place[:-1]:
+        part = part[key]
+    assert part[place[-1]] != value
+    part[place[-1]] = value
+    with pytest.raises((KeyError, TypeError, ValueError, OverflowError)):
+        Layout.from_json(damaged)
+
+
+@pytest.mark.parametrize("key", ["width", "height", "maps", "initial", "groups"])
+def test_incomplete_layouts_are_refused(key):
+    damaged = LAYOUT.to_json()
+    del damaged[key]
+    with pytest.raises(KeyError):
+        Layout.from_json(damaged)
+    for key in ("name", "kind", "color_space", "depth", "where", "low", "high", "knee"):
+        damaged = LAYOUT.to_json()
+        del damaged["maps"][0][key]
+        with pytest.raises(KeyError):
+            Layout.from_json(damaged)
+    for nothing in (None, [], 3, "layout"):
+        with pytest.raises((KeyError, TypeError)):
+            Layout.from_json(nothing)

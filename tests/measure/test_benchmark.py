@@ -1,0 +1,330 @@
+"""The frame for time against accuracy: fronts, rounds, interruption, files, pictures."""
+
+import csv
+import itertools
+import json
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_study import CALLS, KERNELS, SETTINGS, Log, small_plan
+
+from mi_diffind.measure import benchmark, plot, report
+from mi_diffind.measure.benchmark import measure
+from mi_diffind.measure.clock import Timed
+from mi_diffind.measure.operations import Operations
+from mi_diffind.measure.statistics import finite, pareto, spread
+from mi_diffind.measure.study import FLOOR, Job
+
+FILES = ["tradeoff_small.csv", "tradeoff_small.json", "tradeoff_small.png"]
+
+
+# -- the Pareto front -------------------------------------------------------------------------------------------------
+
+
+def brute_force(points):
+    def beats(a, b):
+        return all(x <= y for x, y in zip(a, b, strict=True)) and any(x < y for x, y in zip(a, b, strict=True))
+
+    return [not any(beats(q, p) for q in points) for p in points]
+
+
+@pytest.mark.parametrize("dims", [1, 2, 3])
+def test_front_against_brute_force(rng, dims):
+    for size in (0, 1, 2, 30):
+        points = rng.integers(0, 6, (size, dims)).astype(float).tolist()  # ties included
+        assert pareto(points) == brute_force(points)
+
+
+def test_front_of_known_points():
+    assert pareto([(1, 5), (2, 3), (3, 3), (2, 3), (4, 1), (0.5, 9), (5, 1)]) == [
+        True, True, False, True, True, True, False,
+    ]  # fmt: skip
+    assert pareto([(math.nan, 0), (1, 1), (2, 2)]) == [False, True, False]
+    assert pareto([(math.inf, 0), (1, math.inf), (1, 1)]) == [True, False, True]
+
+
+def test_slack_makes_near_values_equal():
+    points = [(1.00, 5), (0.98, 6), (0.5, 9)]  # the second is hardly faster, and less accurate
+    assert pareto(points) == [True, True, True]
+    assert pareto(points, (0.03, 0)) == [True, False, True]
+    assert pareto([(1.0, 5.0), (1.01, 5.0)], (0.03, 0)) == [True, True]
+
+
+def test_spread():
+    assert spread([3.0, 1.0, 2.0, math.nan, 5.0, 4.0]) == {"median": 3.0, "q1": 2.0, "q3": 4.0}
+    assert math.isnan(spread([math.nan])["median"])
+
+
+# -- a small study ----------------------------------------------------------------------------------------------------
+
+
+def test_everything_is_measured_in_turn(tmp_path):
+    log = Log()
+    result = measure(small_plan(log), SETTINGS, tmp_path, progress=False)
+    assert len(log) == CALLS and not result["interrupted"] and not result["resumed"]
+    rounds = [entry[2:] for entry in log if entry[:2] == ("query", "first")][KERNELS:]
+    for k in range(SETTINGS.rounds):  # each round has each once, every other one backwards
+        this = rounds[k * KERNELS : (k + 1) * KERNELS]
+        assert len(set(this)) == KERNELS
+        assert this == (rounds[:KERNELS] if k % 2 == 0 else rounds[KERNELS - 1 :: -1])
+    for case in ("first", "second"):
+        for timing in result["cases"][case]["queries"]["eval"].values():
+            assert timing["rounds"] == SETTINGS.rounds and timing["with_floor"] > 0
+            assert timing["q1"] <= timing["time"] <= timing["q3"]
+            beyond = timing["with_floor"] - timing["floor"]
+            assert timing["time"] == pytest.approx(max(beyond, 0.2 * timing["floor"]))
+            assert timing["hidden"] == (beyond < 0.2 * timing["floor"])
+    assert list(result["cases"]["first"]["passes"]["render"]) == ["slow", "exact"]
+    assert result["cases"]["second"]["passes"] == {}
+    passes = [e[2] for e in log if e[0] == "pass"]
+    assert passes == ["slow", "exact", "slow", "exact", "exact", "slow", "slow", "exact"]  # the first compiles
+    # A different random number in each pass, the same for all candidates
+    assert [e[3] for e in log if e[0] == "pass" and e[2] == "slow"] == [0, 1, 2, 3]
+    assert os.listdir(tmp_path) == ["tradeoff_small.partial.json"]  # until it is written
+
+
+def test_operations_are_those_of_the_candidate(tmp_path):
+    found = measure(small_plan(Log()), SETTINGS, progress=False)["cases"]["first"]["queries"]["eval"]
+    counts = {name: tuple(found[name]["operations"][k] for k in ("add", "mul", "sqrt")) for name in found}
+    assert counts == {"slow": (1, 1, 1), "good": (0, 2, 0), "exact": (0, 1, 0)}
+    assert found["good"]["operations"]["instructions"] == 2
+
+
+def test_numbers_from_known_times(monkeypatch):
+    """Medians, quartiles, ratios by round, floor, units: with times that are made up."""
+    current = []
+    seconds = {FLOOR: 1.0, "slow": 9.0, "good": 3.0, "exact": 5.0}
+
+    class Recording(Log):
+        def __call__(self, *what):
+            current[:] = what
+            super().__call__(*what)
+
+    log = Recording()
+
+    def made_up(function):
+        function()
+        if current[0] == "pass":
+            return Timed(None, {"slow": 0.004, "exact": 0.002}[current[2]], 0.005, False)
+        round_number = (sum(e[0] == "query" for e in log) - 1) // KERNELS - 1
+        disturbed = 1.0 if current[3] == FLOOR else (1.0, 1.0, 4.0, 1.0)[round_number % 4]
+        return Timed(None, seconds[current[3]] * disturbed * SETTINGS.lanes / 1e9, 1.0, False)
+
+    monkeypatch.setattr(benchmark, "timed", made_up)
+    result = measure(small_plan(log), SETTINGS, progress=False)
+    case = result["cases"]["first"]
+    slow, good = case["queries"]["eval"]["slow"], case["queries"]["eval"]["good"]
+    assert slow["with_floor"] == pytest.approx(9) and slow["floor"] == pytest.approx(1)
+    assert slow["time"] == pytest.approx(8) and slow["q1"] == pytest.approx(8)
+    assert slow["q3"] == pytest.approx(8 + 27 / 4)  # one round of four took 36
+    assert good["time"] == pytest.approx(2)
+    ratio = case["ratios"]["eval"]["slow / good"]
+    assert ratio["median"] == pytest.approx(4) and ratio["with_floor"] == pytest.approx(3)
+    assert "slow / nobody" not in case["ratios"]["eval"]
+    seconds["good"] = 1.1  # hardly more than the floor
+    again = measure(small_plan(Recording()), SETTINGS, progress=False)
+    ratio = again["cases"]["first"]["ratios"]["eval"]["slow / good"]
+    assert math.isnan(ratio["median"]) and ratio["with_floor"] == pytest.approx(9 / 1.1)
+    hidden = again["cases"]["first"]["queries"]["eval"]["good"]
+    assert hidden["hidden"] and hidden["time"] == pytest.approx(0.2) and not good["hidden"]
+    assert "below 0.20" in "\n".join(report.summary(again)) and "-0." not in "\n".join(report.summary(again))
+    assert case["passes"]["render"]["slow"]["time"] == pytest.approx(4)  # ms
+    assert case["passes"]["render, with tracing"]["slow"]["time"] == pytest.approx(5)
+    # `good` is faster and more accurate; the truth is not in competition
+    assert (good["on_front"], slow["on_front"], case["queries"]["eval"]["exact"]["on_front"]) == (True, False, None)
+
+
+def test_files(tmp_path):
+    result = measure(small_plan(Log()), SETTINGS, progress=False)
+    paths = report.write(result, tmp_path / "out")
+    assert sorted(os.listdir(tmp_path / "out")) == FILES
+    with open(paths["csv"], encoding="utf-8", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert list(table[0]) == [*report.COLUMNS, "db", "samples"]
+    assert len(table) == 2 * 2 * 3 + 2 * 2  # queries, and passes of one case, kernels and with tracing
+    first = table[0]
+    assert (first["task"], first["case"], first["query"], first["candidate"]) == ("small", "first", "eval", "slow")
+    assert (first["bytes"], first["training_seconds"], first["unit"], first["db"]) == ("10", "", "ns", "20")
+    assert (first["add"], first["sqrt"], first["reads"], first["flops"]) == ("1", "1", "0", "6")
+    whole = next(row for row in table if row["query"] == "render")
+    assert whole["unit"] == "ms a pass" and whole["floor"] == whole["flops"] == ""
+    assert json.loads(Path(paths["json"]).read_text(encoding="utf-8")) == finite(result)
+    assert Path(paths["png"]).read_bytes()[:4] == b"\x89PNG"
+    text = "\n".join(report.summary(result))
+    assert "2 cases done" in text and "slow / good" in text and "exact: the truth" in text and "20.0 dB" in text
+
+
+def test_json_has_no_nan():
+    tree = finite({"a": math.nan, "b": [1.5, -math.inf], "c": ("x", None, True)})
+    assert tree == {"a": None, "b": [1.5, None], "c": ["x", None, True]}
+
+
+# -- interruption -----------------------------------------------------------------------------------------------------
+
+#: In the errors; while the first case is compiled; in its rounds; in its passes; in the last rounds.
+STOPS = {
+    "errors": 1,
+    "compilation": 2 + 3,
+    "rounds": 2 + KERNELS * 3 + 2,
+    "passes": 2 + KERNELS * 5 + 2 + 3,
+    "last": CALLS - 1,
+}
+
+
+@pytest.mark.parametrize("where", STOPS)
+def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, monkeypatch, where):
+    monkeypatch.setattr(plot, "draw", lambda *arguments: None)
+    monkeypatch.setattr(plot, "save", lambda sheet, path: Path(path).touch())
+    log = Log()
+    log.stop_at = STOPS[where]
+    result = measure(small_plan(log), SETTINGS, tmp_path, progress=False)
+    assert result["interrupted"] and len(log) == STOPS[where]  # it stops at once
+    assert os.listdir(tmp_path) == ["tradeoff_small.partial.json"]
+    if where in ("passes", "last"):
+        assert result["cases"]["first"]["queries"]["eval"]["slow"]["rounds"] == SETTINGS.rounds
+    if where == "rounds":  # one round and a part of the next: the part does not count
+        assert result["cases"]["first"]["queries"]["pdf"]["good"]["rounds"] == 2
+    assert len(report.summary(result)) > 1
+    report.write(result, tmp_path)  # with whatever there is
+
+    again = Log()
+    finished = measure(small_plan(again), SETTINGS, tmp_path, progress=False)
+    assert finished["resumed"] and not finished["interrupted"]
+    done = {e for e in log if e[0] == "errors"}
+    assert not done & set(again)  # an error is not measured twice
+    assert len(log) + len(again) <= CALLS + 2 * KERNELS + 2  # what was begun, and kernels of the case compiled again
+    for case in finished["cases"].values():
+        assert all(t["rounds"] == SETTINGS.rounds for q in case["queries"].values() for t in q.values())
+        assert all(t["rounds"] == SETTINGS.passes for q in case["passes"].values() for t in q.values())
+    report.write(finished, tmp_path)
+    assert not list(tmp_path.glob("*.partial.json"))
+
+
+@pytest.mark.parametrize("change", ["settings", "details", "sources", "damage"])
+def test_a_run_of_something_else_is_not_gone_on_with(tmp_path, change, capsys, monkeypatch):
+    log = Log()
+    log.stop_at = CALLS - 1
+    measure(small_plan(log), SETTINGS, tmp_path, progress=False)
+    study, settings = small_plan(Log()), SETTINGS
+    if change == "settings":
+        settings = replace(SETTINGS, lanes=2048)
+    elif change == "details":
+        study = small_plan(Log(), details={"side": 2})
+    elif change == "sources":  # another plugin, another clock
+        monkeypatch.setattr(benchmark, "sources", lambda: [Path(__file__)])
+    else:
+        (tmp_path / "tradeoff_small.partial.json").write_text('{"key": [1')
+    result = measure(study, settings, tmp_path)
+    assert not result["resumed"] and not result["interrupted"]
+    said = "is damaged" if change == "damage" else f"is of a run with other {change}"
+    assert f"{said}: starting anew" in capsys.readouterr().err
+
+
+def test_nothing_is_measured_again_if_writing_fails(tmp_path):
+    measure(small_plan(Log()), SETTINGS, tmp_path, progress=False)
+    log = Log()
+    result = measure(small_plan(log), SETTINGS, tmp_path, progress=False)
+    assert log == [] and result["resumed"]
+    assert result["cases"]["second"]["queries"]["pdf"]["good"]["rounds"] == SETTINGS.rounds
+
+
+def test_an_error_keeps_what_is_done(tmp_path):
+    study = small_plan(Log())
+    study.cases[1].queries = lambda lanes: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        measure(study, SETTINGS, tmp_path, progress=False)
+    result = measure(small_plan(Log()), SETTINGS, tmp_path, progress=False)
+    assert result["resumed"]
+
+
+# -- the picture ------------------------------------------------------------------------------------------------------
+
+
+def crowd(rng, number):
+    """Points of which many lie close together."""
+    points = []
+    for k in range(number):
+        time, accuracy = float(np.exp(rng.normal(1, 0.6))), float(rng.choice([40, 41, 70, 110]))
+        points.append(plot.Point(f"candidate {k}", time, 0.95 * time, 1.1 * time, accuracy, f"form {k % 5}", k == 0))
+    return plot.Panel("crowd", "ns", points, [plot.Line("exact", 3.0, True), plot.Line("reference", 3.1, False)])
+
+
+def test_labels_do_not_cover_each_other(rng):
+    sheet = plot.draw("title", [crowd(rng, n) for n in (3, 8, 12)], "dB", "A caption of many words. " * 30)
+    sheet.draw_without_rendering()
+    renderer = sheet.canvas.get_renderer()
+    for axes, number in zip(sheet.axes, (3, 8, 12), strict=True):
+        labels = {t.get_text(): t for t in axes.texts}
+        assert set(labels) == {*(f"candidate {k}" for k in range(number)), "exact (exact)", "reference", "Pareto front"}
+        boxes = [t.get_window_extent(renderer) for name, t in labels.items() if name != "Pareto front"]
+        for a, b in itertools.combinations(boxes, 2):
+            assert not a.overlaps(b)
+        inside = axes.get_window_extent(renderer).padded(1)
+        assert all(inside.contains(b.x0, b.y0) and inside.contains(b.x1, b.y1) for b in boxes)
+        assert axes.get_xscale() == "log"
+
+
+def test_a_picture_of_little(tmp_path):
+    alone = plot.Point("alone", 1.0, 0.0, 2.0, 50.0, "a", True)
+    for panel in (plot.Panel("a", "ns", [alone], []), plot.Panel("b", "ns", [], [plot.Line("exact", 2.0, True)])):
+        plot.save(plot.draw("title", [panel], "dB", "caption"), tmp_path / "plot.png")
+        assert (tmp_path / "plot.png").stat().st_size > 5000
+
+
+def test_some_cases_have_fewer_candidates_and_other_queries(tmp_path):
+    study = small_plan(Log())
+    study.cases[1] = replace(study.cases[1], candidates=("good", "exact"), query_names=("pdf",), in_picture=False)
+    result = measure(study, SETTINGS, tmp_path, progress=False)
+    assert list(result["cases"]["second"]["queries"]) == ["pdf"]
+    assert list(result["cases"]["second"]["queries"]["pdf"]) == ["good", "exact"]
+    assert list(result["cases"]["first"]["queries"]["eval"]) == ["slow", "good", "exact"]
+    report.write(result, tmp_path)
+    text = "\n".join(report.summary(result)).split("second")[1]
+    assert "good" in text and "slow  " not in text.split("ratios")[0]
+
+
+def test_operations_of_its_own(tmp_path):
+    """What a kernel does not show, a candidate says itself."""
+    study = small_plan(Log())
+    study.candidates[0].operations = lambda query: Operations(mul=1000 if query == "eval" else 2000)
+    result = measure(study, SETTINGS, tmp_path, progress=False)
+    found = result["cases"]["first"]["queries"]
+    assert [found[q]["slow"]["operations"]["mul"] for q in ("eval", "pdf")] == [1000, 2000]
+    assert found["eval"]["good"]["operations"]["mul"] < 10
+
+
+class FakeTraining(Job):
+    """A training that is interrupted so many times."""
+
+    def __init__(self, log, name="model", interrupted=0):
+        self.log, self.name, self.interrupted = log, name, interrupted
+
+    def run(self, folder, progress):
+        self.log("train", self.name)
+        if self.interrupted:
+            self.interrupted -= 1
+            return None
+        run = {"steps": 2, "seconds": 3.0, "psnr_db": 20.0, "curve_steps": [1, 2], "curve_psnr_db": [10.0, 20.0]}
+        return {"psnr_db": 20.0, "seconds": 3.0, "converged": False, "gain_db": 1.5, "runs": [run]}
+
+
+def test_jobs_come_first_and_can_be_interrupted(tmp_path):
+    log = Log()
+    study = small_plan(log)
+    study.jobs, study.bytes_by_case = [FakeTraining(log, interrupted=1)], True
+    study.candidates[0] = replace(study.candidates[0], job="model", label="s")
+    result = measure(study, SETTINGS, tmp_path, progress=False)
+    assert result["interrupted"] and log == [("train", "model")] and not result["cases"]
+    report.write(result, tmp_path)
+    result = measure(study, SETTINGS, tmp_path, progress=False)
+    assert not result["interrupted"] and log[1:3] == [("train", "model"), ("errors", "slow")]
+    slow = result["candidates"]["slow"]
+    assert (slow["training_seconds"], slow["converged"], slow["label"]) == (3.0, False, "s")
+    assert result["candidates"]["good"]["converged"] is None
+    paths = report.write(result, tmp_path)
+    assert Path(paths["training"]).stat().st_size > 10_000
+    assert "not converged" in "\n".join(report.summary(result))

@@ -1,0 +1,107 @@
+"""Training to convergence: how long, what is kept, and what is done again."""
+
+import json
+import math
+import os
+import signal
+
+import drjit as dr
+import numpy as np
+import pytest
+from variants import BACKENDS
+
+from mi_diffind.fitting import FitSettings, Problem
+from mi_diffind.indirection import DifferentiableArray
+from mi_diffind.measure.training import GAIN, Training
+from mi_diffind.runtime import array_module
+
+SETTINGS = FitSettings(steps=10, batch=64, lr=1e-2, schedule="constant", seed=3, deterministic=False)
+
+
+class Ramp(Problem):
+    """Five numbers that are to become 1: Adam moves each by its rate a step, so 100 steps take them from 0 to there."""
+
+    def __init__(self, log, target=1.0, interrupt=0):
+        self.types = array_module(BACKENDS[0])
+        self.net = DifferentiableArray((5,), 1, "constant", 0.0).alloc(self.types.TensorXf)
+        self.weights, self.target, self.log, self.interrupt = {}, target, log, interrupt
+        self.identity = {"target": target}
+
+    def batch(self, rng, size):
+        self.log.append("batch")
+        if len(self.log) == self.interrupt:
+            os.kill(os.getpid(), signal.SIGINT)
+        return rng.random(self.types.Float, size), {"y": [self.types.Float(self.target)]}
+
+    def predict(self, net, inputs):
+        return {"y": net([inputs])}
+
+    def measure(self, net):
+        error = float(np.abs(net.numpy() - self.target).mean())
+        return {"psnr_db": -20 * math.log10(max(error, 0.01))}
+
+
+def training(log, **options):
+    longest = options.pop("longest", 640)
+    return Training("a ramp", lambda: Ramp(log, **options), SETTINGS, longest)
+
+
+def test_doubles_until_it_gains_nothing():
+    log = []
+    ramp = training(log)
+    record = ramp.run(progress=False)
+    steps = [run["steps"] for run in record["runs"]]
+    assert steps == [10 * 2**k for k in range(len(steps))] and sum(steps) == len(log)
+    gains = np.diff([run["psnr_db"] for run in record["runs"]])
+    assert (gains[:-1] >= GAIN).all() and gains[-1] < GAIN
+    assert record["converged"] and record["gain_db"] == pytest.approx(gains[-1])
+    assert record["steps"] >= 80 and record["entries"] == 5
+    assert np.allclose(ramp.net.numpy(), 1, atol=0.05)
+    for run in record["runs"]:
+        assert run["curve_steps"][-1] == run["steps"] and len(run["curve_steps"]) >= 10
+        assert len(run["curve_psnr_db"]) == len(run["curve_loss"]) == len(run["curve_steps"])
+
+
+def test_says_so_if_it_has_not_converged():
+    record = training([], longest=40).run(progress=False)
+    assert [run["steps"] for run in record["runs"]] == [10, 20, 40]
+    assert not record["converged"] and record["gain_db"] > GAIN
+    only = Training("a ramp", lambda: Ramp([]), SETTINGS, 10).run(progress=False)
+    assert only["gain_db"] is None and not only["converged"]
+
+
+def test_kept_models_are_read_and_not_trained(tmp_path):
+    first = training([])
+    record = first.run(tmp_path, progress=False)
+    assert os.listdir(tmp_path) == ["a_ramp.npz"]  # no checkpoint stays
+    log = []
+    again = training(log)
+    assert again.known(tmp_path) == record and log == []
+    assert np.array_equal(again.net.numpy(), first.net.numpy())
+
+
+def test_models_of_other_settings_are_trained_again(tmp_path):
+    training([]).run(tmp_path, progress=False)
+    for options in ({"longest": 320}, {"target": 0.5}):
+        other = training([], **options)
+        assert other.known(tmp_path) is None
+        other.run(tmp_path, progress=False)
+    assert np.allclose(other.net.numpy(), 0.5, atol=0.05)
+    (tmp_path / "a_ramp.npz").write_bytes(b"damaged")
+    assert training([]).known(tmp_path) is None
+
+
+def test_interrupted_training_goes_on(tmp_path):
+    whole = training([]).run(progress=False)
+    assert training([], interrupt=45).run(tmp_path, progress=False) is None
+    assert len(list(tmp_path.glob("*.checkpoint"))) >= 1 and not list(tmp_path.glob("*.npz"))
+    log = []
+    record = training(log).run(tmp_path, progress=False)
+    assert [r["psnr_db"] for r in record["runs"]][-1] == pytest.approx(whole["runs"][-1]["psnr_db"], abs=0.1)
+    assert record["converged"] and os.listdir(tmp_path) == ["a_ramp.npz"]
+
+
+def test_record_is_json():
+    record = training([], longest=20).run(progress=False)
+    assert json.loads(json.dumps(record)) == record
+    assert dr.width(training([]).problem().net.data) == 5

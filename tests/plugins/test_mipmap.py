@@ -1,0 +1,540 @@
+"""
+The texture ``mipmap`` inside Mitsuba, and with it all that textures which filter themselves share: against ``bitmap``,
+against the pyramid read at footprints that NumPy made something of, against many samples.
+"""
+
+import math
+import subprocess
+import sys
+import textwrap
+
+import drjit as dr
+import numpy as np
+import pytest
+import texture_scenes
+from texture_scenes import WRONG, linear
+from variants import set_variant
+
+from mi_diffind import compat, scenes
+from mi_diffind.compat import module_of
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.measure.operations import count
+
+SIZE = WIDTH, HEIGHT = 24, 16
+
+
+@pytest.fixture(scope="module")
+def image():
+    """Noise and a wave, bytes."""
+    rng = np.random.default_rng(1)
+    x = np.mgrid[0:HEIGHT, 0:WIDTH][1] / WIDTH
+    wave = 0.5 + 0.5 * np.sin(2 * np.pi * np.stack([x, 2 * x, 3 * x], axis=-1))
+    return np.rint(255 * (0.5 * wave + 0.5 * rng.random((HEIGHT, WIDTH, 3)))).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory, image):
+    import mitsuba as mi
+
+    path = tmp_path_factory.mktemp("mipmap") / "wall.png"
+    mi.Bitmap(image).write(str(path))
+    return str(path)
+
+
+def plugin(file, name="trilinear", **more):
+    return {"type": "mipmap", "filename": file, "filter": name, **more}
+
+
+def pyramid(mi, image, border="repeat", color_space="srgb"):
+    source = from_arrays({"image": image}, {"image": color_space})
+    return Pyramid.of(source, types=module_of(mi.TensorXf), border=(border, border))
+
+
+def expected(mi, truth, uv, level):
+    """Linear values of the truth."""
+    u, v, level = (mi.Float(np.ascontiguousarray(x, np.float32)) for x in (*uv, level))
+    return linear(np.stack([x.numpy() for x in truth.filtered(u, v, level)]))
+
+
+# -- what is read ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
+def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
+    """At any place, between texels, too; and so is any filter without a footprint."""
+    mi = mi_rgb
+    si = texture_scenes.hits(mi, rng.uniform(-2, 3, (2, 500)))
+    theirs = mi.load_dict({"type": "bitmap", "filename": file, "wrap_mode": wrap_mode})
+    for name in ("off", "trilinear", "anisotropic", "stochastic") if wrap_mode == "repeat" else ("off",):
+        ours = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode))
+        np.testing.assert_allclose(ours.eval(si).numpy(), theirs.eval(si).numpy(), atol=2e-5, err_msg=name)
+    ours = mi.load_dict(plugin(file, "off", wrap_mode=wrap_mode))
+    np.testing.assert_allclose(ours.eval_1_grad(si).numpy(), theirs.eval_1_grad(si).numpy(), atol=2e-2)
+    assert list(ours.resolution()) == [WIDTH, HEIGHT] and ours.is_spatially_varying()
+    assert float(ours.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-4)
+    assert ours.max() == pytest.approx(linear(image.max() / 255), abs=1e-4)
+
+
+def test_off_ignores_footprints(mi_rgb, file, rng):
+    """They are not even computed: no operation more than without, with a sensor, too."""
+    mi = mi_rgb
+    uv = rng.random((2, 100))
+    si = texture_scenes.hits(mi, uv, *texture_scenes.footprints(rng, 100, SIZE))
+    off, on = (mi.load_dict(plugin(file, name, **SENSOR(mi))) for name in ("off", "trilinear"))
+    np.testing.assert_array_equal(off.eval(si).numpy(), off.eval(texture_scenes.hits(mi, uv)).numpy())
+    assert np.abs(on.eval(si).numpy() - off.eval(si).numpy()).max() > 0.1
+    without = dr.zeros(mi.SurfaceInteraction3f, 100)
+    without.uv = si.uv
+    a, b, c = (count(lambda t=t, s=s: t.eval(s)) for t, s in ((off, si), (off, without), (on, si)))
+    assert (a.gathers, a.instructions) == (b.gathers, b.instructions)
+    assert a.gathers == 4 and c.gathers == 8 + 2 and c.instructions > a.instructions + 100
+
+
+def test_reads_by_filter(mi_rgb, file, rng):
+    """As many as the filter says; one place for all taps of the stochastic one, and one level."""
+    mi = mi_rgb
+    si = texture_scenes.hits(mi, rng.random((2, 100)), *texture_scenes.footprints(rng, 100, SIZE))
+    found = {}
+    for name, taps in (("anisotropic", 1), ("anisotropic", 4), ("anisotropic", 7), ("stochastic", 4)):
+        texture = mi.load_dict(plugin(file, name, max_anisotropy=taps))
+        found[name, taps] = count(lambda t=texture: t.eval(si)).gathers
+        assert texture.report()["taps"] == (taps if name == "anisotropic" else 1)
+    assert list(found.values()) == [8 + 2, 4 * 8 + 2, 7 * 8 + 2, 4 + 1]
+
+
+@pytest.mark.parametrize("wrap_mode", ["repeat", "clamp"])
+def test_trilinear_is_the_pyramid_at_the_level_of_the_area(mi_any, file, image, rng, wrap_mode):
+    mi = mi_any
+    uv, (ddx, ddy) = rng.random((2, 1000)), texture_scenes.footprints(rng, 1000, SIZE)
+    truth = expected(mi, pyramid(mi, image, wrap_mode), uv, texture_scenes.isotropic(ddx, ddy, SIZE))
+    si = texture_scenes.hits(mi, uv, ddx, ddy)
+    texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode))
+    if mi.is_spectral:
+        with pytest.raises(RuntimeError, match="asked for a colour"):
+            texture.eval_3(si)
+        assert np.isfinite(texture.eval(si).numpy()).all()
+        texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode, raw=True))
+        truth = [x.numpy() for x in pyramid(mi, image, wrap_mode, "linear").filtered(
+            *map(mi.Float, uv.astype("f4")), mi.Float(texture_scenes.isotropic(ddx, ddy, SIZE).astype("f4"))
+        )]  # fmt: skip
+    np.testing.assert_allclose(texture.eval_3(si).numpy(), truth, atol=2e-4)
+
+
+@pytest.mark.parametrize("taps", [1, 7])
+def test_anisotropic_is_the_mean_along_the_major_axis(mi_rgb, file, image, rng, taps):
+    """By singular values: ``taps`` places, half a level finer than each is wide."""
+    mi = mi_rgb
+    uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE)
+    major, minor, axis = texture_scenes.ellipse(ddx, ddy, SIZE)
+    level = np.log2(np.maximum(np.maximum(minor, major / taps) / np.sqrt(2), 1))
+    places = [(k + 0.5) / taps - 0.5 for k in range(taps)]
+    truth = np.mean([expected(mi, pyramid(mi, image), uv + x * axis, level) for x in places], axis=0)
+    found = mi.load_dict(plugin(file, "anisotropic", max_anisotropy=taps)).eval(texture_scenes.hits(mi, uv, ddx, ddy))
+    np.testing.assert_allclose(found.numpy(), truth, atol=3e-3)  # single precision where both axes are alike
+
+
+@pytest.mark.parametrize("taps", [1, 4])
+def test_stochastic_is_unbiased(mi_rgb, file, rng, taps):
+    """Over many hits of one place and footprint: linear values have the mean of all taps and both levels."""
+    mi = mi_rgb
+    n, cases = 2**14, 6
+    uv, (ddx, ddy) = rng.random((2, cases)), texture_scenes.footprints(rng, cases, SIZE, 3)
+    one, all_ = (mi.load_dict(plugin(file, x, max_anisotropy=taps)) for x in ("stochastic", "anisotropic"))
+    repeated = [np.repeat(x, n, axis=1) for x in (uv, ddx, ddy)]
+    found = one.eval(texture_scenes.hits(mi, *repeated, rng.normal(size=(3, n * cases)))).numpy().reshape(3, cases, n)
+    truth = all_.eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy()
+    error = found.std(axis=-1) / np.sqrt(n)
+    assert (np.abs(found.mean(axis=-1) - truth) < 4.5 * error + 2e-5).all()
+    assert error.max() > 1e-4
+
+
+def test_random_numbers(mi_rgb, rng):
+    """Uniform, and independent of each other and of where the hits are, for places on a line or in a small patch."""
+    mi = mi_rgb
+    from mi_diffind.plugins.support import filtering
+
+    n = 2**16
+    line = np.linspace(0, 1, n)
+    patch = np.mgrid[0:256, 0:256].reshape(2, -1) * 1e-3
+    for uv, p in ((np.stack([line, 0 * line]), np.stack([line, line, 0 * line])), (patch, np.zeros((3, n)))):
+        a, b = (x.numpy() for x in filtering.random(texture_scenes.hits(mi, uv, p=p)))
+        assert min(a.min(), b.min()) >= 0 and max(a.max(), b.max()) < 1
+        for x, y in ((a, b), (a[:-1], a[1:]), (b[:-1], b[1:]), (a[:-256], a[256:])):
+            counts = np.histogram2d(x, y, bins=16, range=[[0, 1]] * 2)[0]
+            assert ((counts - len(x) / 256) ** 2 / (len(x) / 256)).sum() < 255 + 5 * math.sqrt(2 * 255)
+        again = filtering.random(texture_scenes.hits(mi, uv, p=p))[0].numpy()
+        np.testing.assert_array_equal(again, a)
+
+
+@pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
+def test_to_uv(mi_rgb, file, rng, name):
+    """A scale and a turn: as the texture without, at places and with footprints that went through them."""
+    mi = mi_rgb
+    to_uv = mi.ScalarTransform4f().translate([0.3, -0.2, 0]).rotate([0, 0, 1], 30).scale([1.5, -0.4, 1])
+    m = np.array([[float(to_uv.matrix[i, j]) for j in (0, 1, 3)] for i in (0, 1)])
+    uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE, 4)
+    found = mi.load_dict(plugin(file, name, to_uv=to_uv)).eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy()
+    inside = texture_scenes.hits(mi, m[:, :2] @ uv + m[:, 2:], m[:, :2] @ ddx, m[:, :2] @ ddy)
+    texture = mi.load_dict(plugin(file, name))
+    np.testing.assert_allclose(found, texture.eval(inside).numpy(), atol=2e-3)
+    params = mi.traverse(texture)
+    params["to_uv"] = mi.ScalarTransform3f([[*map(float, row)] for row in [*m, [0, 0, 1]]])
+    params.update()
+    np.testing.assert_allclose(texture.eval(texture_scenes.hits(mi, uv, ddx, ddy)).numpy(), found, atol=1e-5)
+
+
+# -- hard cases --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["trilinear", "anisotropic", "stochastic"])
+@pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
+def test_any_footprint_gives_a_finite_value(mi_rgb, file, rng, name, wrap_mode):
+    mi = mi_rgb
+    parts = np.stack(np.meshgrid(*[WRONG] * 4)).reshape(4, -1)
+    uv = rng.choice([0, 1, 0.3, -7.5, 1e20, math.nan, math.inf], (2, parts.shape[1]))
+    texture = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode))
+    si = texture_scenes.hits(mi, uv, parts[:2], parts[2:])
+    found = texture.eval(si).numpy()
+    assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
+    assert np.isfinite(texture.eval_1_grad(si).numpy()).all()
+
+
+def test_the_largest_footprint_is_the_mean(mi_rgb, file, image, rng):
+    mi = mi_rgb
+    mean = linear(image / 255).mean(axis=(0, 1))
+    for name in ("trilinear", "anisotropic", "stochastic"):
+        si = texture_scenes.hits(mi, rng.uniform(-2, 2, (2, 50)), (1000, 0), (0, 1000))
+        found = mi.load_dict(plugin(file, name)).eval(si).numpy()
+        np.testing.assert_allclose(found, np.broadcast_to(mean[:, None], found.shape), atol=1e-3, err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
+def test_seams(mi_rgb, file, rng, name):
+    """Repeated and mirrored images go on with any footprint; a clamped one knows nothing of its other end."""
+    mi = mi_rgb
+    uv, (ddx, ddy) = rng.random((2, 300)), texture_scenes.footprints(rng, 300, SIZE, 3)
+    texture = {w: mi.load_dict(plugin(file, name, wrap_mode=w)) for w in ("repeat", "mirror")}
+    for mode, x in (("repeat", uv - [[1], [2]]), ("repeat", uv - [[-3], [0]]), ("mirror", uv - [[-2], [2]])):
+        a, b = (texture[mode].eval(texture_scenes.hits(mi, y, ddx, ddy)).numpy() for y in (uv, x))
+        np.testing.assert_allclose(a, b, atol=1e-3)
+    a, b = (texture["mirror"].eval(texture_scenes.hits(mi, s * uv, s * ddx, s * ddy)).numpy() for s in (1, -1))
+    np.testing.assert_allclose(a, b, atol=1e-3)
+    halves = np.zeros((16, 16, 3), np.uint8)
+    halves[:, 8:] = 255
+    for mode in ("mirror", "clamp", "repeat"):
+        tall = mi.load_dict({"type": "mipmap", "bitmap": mi.Bitmap(halves), "filter": name, "wrap_mode": mode})
+        ends = tall.eval(texture_scenes.hits(mi, [[0, 1e-3, 1, 0.999], [0.5] * 4], (1e-4, 0), (0, 0.25))).numpy()[0]
+        assert np.abs(ends - [0, 0, 1, 1]).max() < 1e-4 if mode != "repeat" else (np.abs(ends - 0.5) < 0.1).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 16), (9, 1), (5, 7)])
+def test_odd_sizes(mi_rgb, rng, shape):
+    mi = mi_rgb
+    values = rng.integers(0, 256, (*shape, 3), np.uint8)
+    si = texture_scenes.hits(mi, rng.uniform(-1, 2, (2, 200)), *texture_scenes.footprints(rng, 200, shape[::-1], 6))
+    for name in ("trilinear", "anisotropic"):
+        texture = mi.load_dict({"type": "mipmap", "bitmap": mi.Bitmap(values), "filter": name})
+        found = texture.eval(si).numpy()
+        assert np.isfinite(found).all() and linear(values.min() / 255) - 1e-4 <= found.min()
+        assert found.max() <= linear(values.max() / 255) + 1e-4 and np.isfinite(texture.eval_1_grad(si).numpy()).all()
+
+
+# -- gradients ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["trilinear", "stochastic"])
+def test_gradients_reach_the_coordinate(mi_rgb, file, rng, name):
+    """And are, but for the places between two texels, finite differences."""
+    mi = mi_rgb
+    uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE, 4)
+    texture = mi.load_dict(plugin(file, name))
+    si = texture_scenes.hits(mi, uv, ddx, ddy)
+    dr.enable_grad(si.uv)
+    dr.backward(dr.sum(texture.eval_1(si)))
+    gradient = dr.grad(si.uv).numpy()
+    assert np.isfinite(gradient).all()
+    if name == "stochastic":
+        return
+    for axis in (0, 1):
+        step = 5e-4 * np.eye(2)[:, axis : axis + 1]
+        a, b = (texture.eval_1(texture_scenes.hits(mi, uv + s * step, ddx, ddy)).numpy() for s in (1, -1))
+        error = np.abs((a - b) / 1e-3 - gradient[axis])
+        assert np.quantile(error, 0.8) < 0.02 * np.abs(gradient[axis]).max()
+
+
+def test_gradients_of_wrong_footprints_are_finite(mi_rgb, file):
+    mi = mi_rgb
+    parts = np.stack(np.meshgrid(*[(0, 1, 1e20, math.nan, math.inf, -math.inf)] * 4)).reshape(4, -1)
+    for name in ("trilinear", "anisotropic"):
+        si = texture_scenes.hits(mi, [[0.3], [0.7]], parts[:2], parts[2:])
+        dr.enable_grad(si.uv, si.duv_dx)
+        dr.backward(dr.sum(mi.load_dict(plugin(file, name)).eval_1(si)))
+        assert np.isfinite(dr.grad(si.uv).numpy()).all() and np.isfinite(dr.grad(si.duv_dx).numpy()).all()
+
+
+def test_slope_of_a_filtered_texture(mi_rgb, rng):
+    """``eval_1_grad`` is the slope of a ramp at any level, through ``to_uv``; of the whole image it is 0."""
+    mi = mi_rgb
+    x, y = np.meshgrid((np.arange(64) + 0.5) / 64, (np.arange(32) + 0.5) / 32)
+    bitmap = mi.Bitmap((0.3 * x + 0.5 * y)[..., None].astype(np.float32))
+    uv = rng.uniform(0.4, 0.6, (2, 100))
+    for name in ("trilinear", "anisotropic"):
+        texture = mi.load_dict({"type": "mipmap", "bitmap": bitmap, "raw": True, "filter": name})
+        for scale in (0, 1, 3):
+            si = texture_scenes.hits(mi, uv, (2**scale / 64, 0), (0, 2**scale / 32))
+            found = texture.eval_1_grad(si).numpy()
+            np.testing.assert_allclose(found, np.broadcast_to([[0.3], [0.5]], found.shape), atol=1e-3)
+        assert np.abs(texture.eval_1_grad(texture_scenes.hits(mi, uv, (50, 0), (0, 50))).numpy()).max() < 1e-6
+    turned = {"to_uv": mi.ScalarTransform4f().rotate([0, 0, 1], 90).scale([2, 1, 1])}
+    texture = mi.load_dict({"type": "mipmap", "bitmap": bitmap, "raw": True, "wrap_mode": "mirror", **turned})
+    found = texture.eval_1_grad(texture_scenes.hits(mi, [[0.25], [-0.5]])).numpy()  # at (0.5, 0.5)
+    np.testing.assert_allclose(found.ravel(), [2 * 0.5, -0.3], atol=1e-3)
+
+
+# -- sensors -----------------------------------------------------------------------------------------------------------
+
+
+def SENSOR(mi, spp=1, size=48):
+    """The parameters of a texture for the sensor of :func:`texture_scenes.plane`."""
+    to_world = mi.ScalarTransform4f().look_at([0, -2.5, 0.5], [0, 0, 0], [0, 0, 1])
+    return {"sensor_to_world": to_world, "fov": 60.0, "resolution": size, "spp": spp}
+
+
+@pytest.fixture(scope="module")
+def detailed():
+    """A texture with detail at every level."""
+    rng = np.random.default_rng(3)
+    total = sum(np.kron(rng.random((2**i, 2**i, 3)), np.ones((256 >> i, 256 >> i, 1))) for i in range(2, 9))
+    return np.rint(255 * total / total.max()).astype(np.uint8)
+
+
+def test_one_sample_a_pixel_on_a_plane(mi_rgb, detailed):
+    """Against many: the order of the filters, centred and jittered; and parameters say what the scene's sensor does."""
+    mi = mi_rgb
+    from mi_diffind.plugins.support import footprint
+
+    more = {"bitmap": mi.Bitmap(detailed), "to_uv": mi.ScalarTransform4f().scale([2, 2, 1])}
+    truth = mi.render(texture_scenes.plane(mi, {"type": "bitmap", **more}, 256, "multijitter")).numpy()
+    found = {}
+    for name in ("bitmap", "off", "trilinear", "anisotropic", "stochastic"):
+        texture = {"type": "bitmap", **more} if name == "bitmap" else {"type": "mipmap", "filter": name, **more}
+        loaded = texture_scenes.plane(mi, texture)
+        footprint.attach(loaded)
+        found[name] = mi.render(loaded).numpy()
+        if name in ("trilinear", "anisotropic"):
+            given = mi.render(texture_scenes.plane(mi, {**texture, **SENSOR(mi)})).numpy()
+            np.testing.assert_allclose(given, found[name], atol=2e-3)
+    quality = {name: texture_scenes.psnr(x, truth) for name, x in found.items()}
+    assert quality["off"] == pytest.approx(quality["bitmap"], abs=0.05)
+    assert quality["bitmap"] + 0.5 < quality["stochastic"] < quality["trilinear"] - 1, quality
+    assert quality["bitmap"] + 5 < quality["trilinear"] < quality["anisotropic"] - 3, quality
+
+
+@pytest.mark.parametrize("kind", ["thinlens", "orthographic", "inside", "grazing", "degenerate"])
+def test_sensors_and_places(mi_rgb, detailed, kind):
+    """Better than a bitmap at one sample, wherever a sensor is; a surface without directions of uv is as with one."""
+    mi, t = mi_rgb, mi_rgb.ScalarTransform4f()
+    from mi_diffind.plugins.support import footprint
+
+    sensor, shape = {"fov": 60}, None
+    if kind == "thinlens":
+        sensor = {**sensor, "type": "thinlens", "aperture_radius": 0.05, "focus_distance": 2.5}
+    elif kind == "orthographic":
+        to_world = t.look_at([0, -6, 1], [0, 0, 0], [0, 0, 1]).scale([2, 2, 1])
+        sensor = {"type": "orthographic", "to_world": to_world}
+    elif kind == "grazing":
+        sensor = {**sensor, "to_world": t.look_at([0, -2, 0.01], [0, 0, 0], [0, 0, 1])}
+    images = []
+    for texture, spp in (("bitmap", 256), ("bitmap", 1), ("anisotropic", 1)):
+        form = {"type": "bitmap"} if texture == "bitmap" else {"type": "mipmap", "filter": texture}
+        emitter = {"type": "area", "radiance": {**form, "bitmap": mi.Bitmap(detailed)}}
+        if kind == "inside":
+            sensor = {"fov": 60, "to_world": t.look_at([0.3, 0, 0], [0, 1, 0.2], [0, 0, 1])}
+            emitter["radiance"]["to_uv"] = t.scale([6, 3, 1])
+            shape = {"type": "sphere", "flip_normals": True, "emitter": emitter}
+        elif kind in ("orthographic", "grazing", "degenerate"):
+            shape = {"type": "rectangle", "to_world": t.scale(6), "emitter": emitter}
+            if kind == "degenerate":
+                emitter["radiance"]["to_uv"] = t.scale([0, 0, 1])
+        else:
+            shape = {"type": "rectangle", "to_world": t.scale(6), "emitter": emitter}
+        loaded = texture_scenes.plane(mi, None, spp, "independent", 24, sensor, shape)
+        footprint.attach(loaded)
+        images.append(mi.render(loaded, spp=spp).numpy())
+    assert all(np.isfinite(image).all() for image in images)
+    if kind == "degenerate":
+        np.testing.assert_allclose(images[2], images[1], atol=1e-5)
+    else:
+        noise, found = (texture_scenes.psnr(image, images[0]) for image in images[1:])
+        assert found > noise + 1, (noise, found)
+
+
+# -- in scenes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral_polarized"])
+def test_materials(variant, file):
+    """As with bitmaps where nothing is minified; in the other variant, one alone."""
+    mi = set_variant(variant)
+    bsdfs = []
+    for t in (lambda **m: {"type": "bitmap", "filename": file, **m}, lambda **m: plugin(file, **m)):
+        bsdfs.append([
+            {"type": "principled", "base_color": t(), "roughness": t(raw=True)},
+            {"type": "roughplastic", "diffuse_reflectance": t()},
+            {"type": "bumpmap", "arbitrary": t(raw=True), "bsdf": {"type": "diffuse"}, "scale": 0.01},
+            {"type": "neural_disney", "base_color": t(), "roughness": t(raw=True)},
+        ])  # fmt: skip
+    images = []
+    for found in bsdfs:
+        found = found if mi.variant().endswith("ad_rgb") else found[:1]
+        shapes = {
+            f"wall{i}": {"type": "rectangle", "bsdf": bsdf,
+                         "to_world": mi.ScalarTransform4f().translate([2 * i - 3, 0, 0])}
+            for i, bsdf in enumerate(found)
+        }  # fmt: skip
+        to_world = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+        film = {"type": "hdrfilm", "width": 32, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+        loaded = mi.load_dict({
+            "type": "scene", "integrator": {"type": "path", "max_depth": 2}, "sky": {"type": "constant"},
+            "sensor": {"type": "perspective", "to_world": to_world, "film": film, "fov": 90}, **shapes,
+        })  # fmt: skip
+        images.append(mi.render(loaded, spp=16).numpy())
+    assert images[0].mean() > 0.1 and np.isfinite(images[1]).all()
+    assert images[1].mean() == pytest.approx(images[0].mean(), rel=0.02)
+    assert np.abs(images[1] - images[0]).mean() < 0.08 * images[0].mean()
+
+
+def test_frozen_renders(mi_rgb, file, no_garbage_collection):
+    """With the sensor that there was when a function was frozen."""
+    mi = mi_rgb
+    from mi_diffind.plugins.support import footprint
+
+    loaded = texture_scenes.plane(mi, plugin(file, to_uv=mi.ScalarTransform4f().scale(8)), size=16)
+
+    images = []
+    for spp in (1, 64):
+        frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
+        footprint.attach(loaded, spp=spp)
+        for seed in range(5):
+            images.append(frozen(loaded, mi.UInt32(seed)).numpy())
+            np.testing.assert_allclose(images[-1], mi.render(loaded, spp=1, seed=seed).numpy(), atol=1e-5)
+    assert np.abs(images[0] - images[5]).max() > 0.05
+
+
+def test_textures_of_one_file_are_read_once(mi_rgb, file, rng):
+    """One pyramid, and one read of it, of the same footprint: also with parameters that say the same sensor."""
+    mi = mi_rgb
+    a, b = (mi.load_dict(plugin(file, "anisotropic", **SENSOR(mi))) for _ in range(2))
+    assert a.image is b.image
+    si = texture_scenes.seen(mi, 100)
+    alone = count(lambda: a.eval(si)).gathers
+    assert np.abs(a.eval(si).numpy() - mi.load_dict(plugin(file, "off")).eval(si).numpy()).max() > 0.1
+    assert count(lambda: (a.eval(si), b.eval_1(si))).gathers == alone
+    other = mi.load_dict(plugin(file, "anisotropic", wrap_mode="clamp", **SENSOR(mi)))
+    assert other.image is not a.image
+
+
+def test_sources(mi_rgb, tmp_path, image, rng):
+    """A manifest's maps, an image with alpha, an object, named levels; data are averaged as they are."""
+    mi = mi_rgb
+    from mi_diffind.plugins.support import image_files
+
+    mi.Bitmap(image).write(str(tmp_path / "a.png"))
+    (tmp_path / "wall.json").write_text('{"albedo": "a.png", "roughness": {"file": "a.png", "channels": "g"}}')
+    alpha = np.concatenate([image, image[..., :1]], axis=-1)
+    mi.Bitmap(alpha, mi.Bitmap.PixelFormat.RGBA).write(str(tmp_path / "alpha.png"))
+    image_files.PYRAMIDS["wall"] = pyramid(mi, image)
+    uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE)
+    si = texture_scenes.hits(mi, uv, ddx, ddy)
+    try:
+        same = [
+            {"filename": str(tmp_path / "a.png")}, {"bitmap": mi.Bitmap(image)}, {"pyramid": "wall"},
+            {"filename": str(tmp_path / "wall.json")}, {"filename": str(tmp_path / "alpha.png")},
+        ]  # fmt: skip
+        found = [mi.load_dict({"type": "mipmap", **x}).eval(si).numpy() for x in same]
+    finally:
+        del image_files.PYRAMIDS["wall"]
+    for x in found[1:]:
+        np.testing.assert_allclose(x, found[0], atol=1e-5)
+    level = texture_scenes.isotropic(ddx, ddy, SIZE)
+    u, v, level = (mi.Float(x.astype("f4")) for x in (*uv, level))
+    (truth,) = pyramid(mi, image[..., 1:2], color_space="linear").filtered(u, v, level)
+    rough = {"filename": str(tmp_path / "wall.json"), "channels": "roughness"}
+    np.testing.assert_allclose(mi.load_dict({"type": "mipmap", **rough}).eval_1(si), truth, atol=1e-5)
+    grey = {"bitmap": mi.Bitmap(np.ascontiguousarray(image[..., 1])), "raw": True}
+    np.testing.assert_allclose(mi.load_dict({"type": "mipmap", **grey}).eval_1(si), truth, atol=1e-5)
+
+
+def test_report(mi_rgb, file):
+    mi = mi_rgb
+    found = mi.load_dict(plugin(file, "anisotropic", max_anisotropy=3)).report()
+    assert (found["filter"], found["taps"], found["footprint"]) == ("anisotropic", 3, ["uv partials"])
+    assert found["effects_left_out"]["sensor"].startswith("is not known")
+    assert found["storage"] == "float32" and found["table_bytes"] > 16 * WIDTH * HEIGHT
+    seen = mi.load_dict(plugin(file, **SENSOR(mi)))
+    assert seen.report()["footprint"] == ["uv partials", "parameters"]
+    seen.set_cone(mi.load_dict(plugin(file, **SENSOR(mi, spp=4))).cone)
+    assert seen.report()["footprint"] == ["uv partials", "sensor"]
+    seen.set_cone(None)
+    assert seen.report()["footprint"] == ["uv partials", "parameters"]
+    off = mi.load_dict(plugin(file, "off", **SENSOR(mi))).report()
+    assert off["footprint"] == [] and off["effects_left_out"]["footprint"] == "the filter is off"
+    text = str(mi.load_dict(plugin(file, "stochastic", max_anisotropy=8, **SENSOR(mi))))
+    assert "MipMap[" in text and "filter = stochastic, at most 8 taps, a perspective sensor" in text
+    assert scenes.learned_instances(texture_scenes.plane(mi, plugin(file))) == []
+
+
+def test_words_of_bitmap(mi_rgb, file):
+    mi = mi_rgb
+    for word, name in (("bilinear", "off"), ("trilinear", "trilinear"), ("anisotropic", "anisotropic")):
+        for more in ({}, {"filter": name}):
+            assert mi.load_dict({"type": "mipmap", "filename": file, "filter_type": word, **more}).filter.name == name
+
+
+BAD = {
+    "no source": ({}, 'found none, one of them is needed'),
+    "two sources": ({"filename": "a.png", "pyramid": "b"}, 'found "filename" and "pyramid", one of them is needed'),
+    "missing": ({"filename": "/nowhere/a.png"}, 'parameter "filename": /nowhere/a.png: no such file'),
+    "no such levels": ({"pyramid": "x"}, 'parameter "pyramid": found "x", there are none'),
+    "filter": ({"filter": "nearest"}, 'parameter "filter": found "nearest", allowed are trilinear, off, anisotropic'),
+    "type": ({"filter_type": "nearest"}, 'parameter "filter_type": found "nearest", allowed are bilinear, trilinear'),
+    "both": ({"filter": "off", "filter_type": "trilinear"}, 'found "trilinear" beside the filter "off", which is anot'),
+    "no taps": ({"max_anisotropy": 0}, 'parameter "max_anisotropy": found 0, allowed are whole numbers 1 to 16'),
+    "half a tap": ({"max_anisotropy": 2.5}, 'parameter "max_anisotropy": found 2.5, allowed are whole numbers'),
+    "many taps": ({"max_anisotropy": 17}, 'parameter "max_anisotropy": found 17, allowed are whole numbers 1 to 16'),
+    "sensor": ({"fov": 60.0}, 'parameter "sensor_to_world": not given'),
+    "unknown": ({"filename": "FILE", "filtre": "off"}, "filtre"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", list(BAD))
+def test_bad_parameters(mi_rgb, file, case):
+    wrong, sentence = BAD[case]
+    wrong = {k: file if v == "FILE" else v for k, v in wrong.items()}
+    with pytest.raises(RuntimeError) as e:
+        mi_rgb.load_dict({"type": "mipmap", **wrong})
+    text = compat.one_sentence(e.value)
+    assert sentence in text and "Traceback" not in text, text
+
+
+def test_unsupported_variants_say_so(file):
+    script = f"""
+        import mi_diffind, mitsuba as mi
+        mi.set_variant("scalar_rgb")
+        try:
+            mi.load_dict({plugin(file)!r})
+        except RuntimeError as e:
+            print(e)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and '"mipmap" does not run in the variant "scalar_rgb"' in done.stdout, done.stderr
+
+
+def test_two_variants_in_turn(file, rng):
+    uv, found = rng.random((2, 20)), {}
+    for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
+        mi = set_variant(variant)
+        values = mi.load_dict(plugin(file)).eval(texture_scenes.hits(mi, uv, (0.1, 0), (0, 0.1))).numpy()
+        np.testing.assert_array_equal(found.setdefault(variant, values), values)
+    assert found["llvm_ad_mono"].shape[0] == 1

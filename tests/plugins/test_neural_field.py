@@ -1,0 +1,642 @@
+"""The integrator that shows a radiance field among surfaces: against formulas, ``volpath`` and finite differences."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from radiance_fields import Bumps, Fog, register
+
+from mi_diffind import compat, plugins
+
+#: Density and radiance of the fog.
+DENSITY, HUE = 0.8, np.array([0.2, 0.5, 0.8])
+
+AXIS = [0.36, 0.48, 0.8]
+
+
+@pytest.fixture
+def fields(mi_rgb):
+    return registered(mi_rgb)
+
+
+def registered(mi):
+    types = compat.module_of(mi.Float)
+    found = {"fog": Fog(types, DENSITY, HUE), "bumps": Bumps(types), "black": Fog(types, DENSITY, (0, 0, 0))}
+    register(mi, found)
+    return found
+
+
+def lamp(mi, place, radiance, **more):
+    """A square that shines towards −y, at ``place``."""
+    at = mi.ScalarTransform4f().translate(place).rotate([1, 0, 0], 90).scale(0.7)
+    value = {"type": "rgb", "value": radiance}
+    return {"type": "rectangle", "to_world": at, "emitter": {"type": "area", "radiance": value}, **more}
+
+
+def mirror(mi, bsdf, place=(1.2, 1.2, 0), angle=-25):
+    at = mi.ScalarTransform4f().translate(place).rotate([0, 0, 1], angle).rotate([1, 0, 0], 90).scale(0.6)
+    return {"type": "rectangle", "to_world": at, "bsdf": bsdf}
+
+
+def surfaces(mi):
+    """A lamp in front of the box, within it, and behind it."""
+    return {
+        "front": lamp(mi, [-0.9, -1.6, 0.7], [0.9, 0.1, 0.3]),
+        "within": {"type": "sphere", "radius": 0.5, "emitter": {"type": "area", "radiance": 1.5}},
+        "behind": lamp(mi, [0.8, 2.0, -0.6], [0.1, 0.9, 0.3]),
+    }
+
+
+def scene(mi, field="fog", size=(36, 24), **more):
+    """A field, seen from −y, one sample in the middle of each pixel."""
+    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    integrator = more.pop("integrator", {})
+    if not any(isinstance(v, dict) for v in integrator.values()):
+        integrator = {"jitter": False, **integrator}
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": "test_field", "id": "it", "field": field, **integrator},
+        "sensor": {
+            "type": "perspective",
+            "fov": 45,
+            "to_world": mi.ScalarTransform4f().look_at([0.1, -5, 0.4], [0, 0, 0], [0, 0, 1]),
+            "film": film,
+        },
+        **more,
+    })  # fmt: skip
+
+
+def render(mi, made, spp=1, seed=0, **more):
+    return np.array(mi.render(made, spp=spp, seed=seed, **more))
+
+
+def pixel_rays(mi, made):
+    """The rays through the middles of pixels, row by row."""
+    width, height = (int(n) for n in made.sensors()[0].film().size())
+    y, x = np.divmod(np.arange(width * height), width)
+    place = mi.Point2f(mi.Float(np.float32((x + 0.5) / width)), mi.Float(np.float32((y + 0.5) / height)))
+    ray, _ = made.sensors()[0].sample_ray_differential(0, 0, place, mi.Point2f(0.5))
+    return mi.Ray3f(ray)
+
+
+def inside(ray, far, to_world=None):
+    """Where rays enter the box from −1 to 1, and how far they are in it, up to ``far``; in NumPy."""
+    o, d = np.array(ray.o, np.float64), np.array(ray.d, np.float64)
+    if to_world is not None:
+        inverse = np.linalg.inv(to_world)
+        o, d = inverse[:3, :3] @ o + inverse[:3, 3:], inverse[:3, :3] @ d
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (-1 - o) / d, (1 - o) / d
+    near = np.maximum(np.minimum(a, b).max(0), 0)
+    return near, np.maximum(np.minimum(np.maximum(a, b).min(0), far) - near, 0)
+
+
+def seen(made, ray, throughput=1.0):
+    """What rays see of the fog and the next surface, by the formula: light ``(n, 3)``, alpha, depth, opacity."""
+    si = made.ray_intersect(ray)
+    hit = np.array(si.is_valid())
+    near, length = inside(ray, np.where(hit, np.array(si.t), np.inf))
+    through = np.exp(-DENSITY * length)
+    behind = np.array(si.emitter(made).eval(si)).T * hit[:, None]
+    light = (1 - through)[:, None] * HUE + through[:, None] * behind
+    depth = near * (1 - through) + (1 - through * (1 + DENSITY * length)) / DENSITY
+    depth = depth + np.where(hit, through * np.array(si.t), 0)
+    return throughput * light, np.where(hit, 1, 1 - through), depth, 1 - through
+
+
+def test_surfaces_within_before_and_behind(mi_rgb, fields):
+    """As the formula composites them; alpha and the further channels as well."""
+    made = scene(mi_rgb, integrator={"aovs": "depth, opacity"}, **surfaces(mi_rgb))
+    assert made.integrator().aov_names() == ["depth", "opacity"]
+    image = render(mi_rgb, made).reshape(-1, 6)
+    light, alpha, depth, opacity = seen(made, pixel_rays(mi_rgb, made))
+    assert len(np.unique(np.round(alpha, 2))) > 10 and (alpha == 1).sum() > 100
+    assert np.abs(image[:, :3] - light).max() < 1e-4
+    assert np.abs(image[:, 3] - alpha).max() < 1e-4
+    assert np.abs(image[:, 4] - depth).max() < 2e-3
+    assert np.abs(image[:, 5] - opacity).max() < 1e-4
+
+
+@pytest.mark.parametrize("turn", ["turned", "mirrored"])
+def test_to_world(mi_rgb, fields, turn):
+    """A field that is moved, turned, made larger, or reflected: densities are per length of its own frame."""
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    found = {
+        "turned": at().translate([0.3, 1.0, -0.2]).rotate(AXIS, 40).scale(1.3),
+        "mirrored": at().translate([-0.4, 0.5, 0.1]).rotate([0, 0, 1], 30) @ at().scale([-0.6, 0.6, 0.6]),
+    }[turn]
+    made = scene(mi, "fog", integrator={"to_world": found, "aovs": "depth"})
+    image = render(mi, made).reshape(-1, 5)
+    matrix = np.array(found.matrix, np.float64)
+    size = np.abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3)
+    near, length = inside(pixel_rays(mi, made), np.inf, matrix)
+    k = DENSITY / size
+    through = np.exp(-k * length)
+    assert np.abs(image[:, :3] - (1 - through)[:, None] * HUE).max() < 1e-4
+    assert np.abs(image[:, 3] - (1 - through)).max() < 1e-4
+    assert np.abs(image[:, 4] - near * (1 - through) - (1 - through * (1 + k * length)) / k).max() < 3e-3
+    if turn == "mirrored":  # which cameras cannot be
+        return
+    # What depends on the direction turns, too
+    turned = at().rotate(AXIS, 70)
+    moved, straight = scene(mi, "bumps", integrator={"to_world": turned}), scene(mi, "bumps")
+    params = mi.traverse(moved)
+    camera = np.array(mi.traverse(straight)["sensor.to_world"].matrix)[..., 0]
+    params["sensor.to_world"] = mi.AffineTransform4f(turned @ at(camera))
+    params.update()
+    assert np.abs(render(mi, moved) - render(mi, straight)).max() < 1e-3
+
+
+def test_field_in_a_mirror(mi_rgb, fields):
+    """The mirror's image of the field and of what lies within, by the formula along the reflected rays."""
+    mi = mi_rgb
+    glass = mirror(mi, {"type": "conductor", "specular_reflectance": 0.8})
+    made = scene(mi, glass=glass, **surfaces(mi))
+    ray = pixel_rays(mi, made)
+    light, alpha, _, _ = seen(made, ray)
+    si = made.ray_intersect(ray)
+    met = np.array(si.is_valid()) & np.array(si.shape.bsdf().flags() & int(mi.BSDFFlags.DeltaReflection) != 0)
+    on = si.spawn_ray(si.to_world(mi.reflect(si.wi)))
+    again, _, _, opacity = seen(made, on)
+    first = seen(made, ray)[3][:, None]
+    light = np.where(met[:, None], first * HUE + (1 - first) * 0.8 * again, light)
+    image = render(mi, made).reshape(-1, 4)
+    assert met.sum() > 50 and opacity[met].max() > 0.5
+    assert np.abs(image[:, :3] - light).max() < 1e-4
+    assert np.abs(image[:, 3] - np.where(met, 1, alpha)).max() < 1e-4
+    short = render(mi, scene(mi, integrator={"smooth_depth": 0}, glass=glass, **surfaces(mi))).reshape(-1, 4)
+    differs = np.abs(short - image).max(1) > 1e-3
+    assert differs[met].mean() > 0.5 and not differs[~met].any()
+
+
+def test_mirrors_of_a_group(mi_rgb, fields):
+    mi = mi_rgb
+    group = {"type": "shapegroup", "id": "group", "glass": mirror(mi, {"type": "conductor"})}
+    one = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    expected = render(mi, scene(mi, glass=group["glass"]))
+    assert np.abs(render(mi, scene(mi, group=group, one=one)) - expected).max() < 1e-5
+
+
+def test_shapes_with_holes_are_known(mi_rgb, fields):
+    """No field is seen through them, which a warning says."""
+    of = plugins.declared()["neural_field"].factory.__globals__
+    diffuse = {"type": "diffuse"}
+    things = {
+        "leaf": mirror(mi_rgb, {"type": "mask", "opacity": 0.5, "nested": diffuse}),
+        "pane": mirror(mi_rgb, {"type": "null"}, place=(0, 3, 0)),
+        "wall": mirror(mi_rgb, diffuse, place=(0, 4, 0)),
+    }
+    made = scene(mi_rgb, **things)
+    assert of["with_holes"](made) == ["leaf"] and of["has_smooth"](made)
+    del things["pane"]
+    assert not of["has_smooth"](scene(mi_rgb, **things))
+
+
+@pytest.mark.parametrize("bsdf", ["null", "dielectric"])
+def test_panes_that_do_nothing(mi_rgb, fields, bsdf):
+    more = {"int_ior": 1.0, "ext_ior": 1.0} if bsdf == "dielectric" else {}
+    pane = mirror(mi_rgb, {"type": bsdf, **more}, place=(0, -2, 0), angle=10)
+    found = render(mi_rgb, scene(mi_rgb, pane=pane, **surfaces(mi_rgb)))
+    expected = render(mi_rgb, scene(mi_rgb, **surfaces(mi_rgb)))
+    # Rays go on from beside the surface, 3e-4 along its normal
+    assert np.abs(found[..., :3] - expected[..., :3]).max() < 5e-4
+    changed = np.abs(found[..., 3] - expected[..., 3]) > 1e-3
+    # Glass is something, whatever is behind it
+    assert changed.any() == (bsdf == "dielectric") and (found[..., 3][changed] == 1).all()
+
+
+def test_through_glass_as_volpath(mi_rgb, fields):
+    """A field that only absorbs is Mitsuba's absorbing medium, in front of and behind a ball of glass."""
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    ball = {"type": "sphere", "center": [0.5, -2.2, 0.2], "radius": 0.5, "bsdf": {"type": "dielectric"}}
+    glass = mirror(mi, {"type": "conductor"}, place=(-1.3, 1.3, 0), angle=35)
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.4, 0.7, 1.0]}}
+    things = {"ball": ball, "glass": glass, "sky": sky, "behind": lamp(mi, [0.4, 1.6, 0], [2.0, 1.0, 0.5])}
+    made = scene(mi, "black", integrator={"smooth_depth": 16, "c": {"type": "path", "max_depth": 16}}, **things)
+    medium = {"type": "homogeneous", "albedo": 0.0, "sigma_t": DENSITY}
+    box = {"type": "cube", "to_world": at(), "bsdf": {"type": "null"}, "interior": medium}
+    other = scene(mi, "black", box=box, **things)
+    volpath = mi.load_dict({"type": "volpath", "max_depth": 40, "rr_depth": 100})
+    found = np.stack([render(mi, made, 64, seed)[..., :3] for seed in range(6)])
+    expected = np.stack([render(mi, other, 64, seed + 50, integrator=volpath)[..., :3] for seed in range(6)])
+    a, b = (v.reshape(6, 6, 4, 9, 4, 3).mean((2, 4)) for v in (found, expected))
+    error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / 6)
+    z = (a.mean(0) - b.mean(0)) / np.maximum(error, 2e-3)
+    assert np.abs(z).max() < 6 and abs(a.mean() / b.mean() - 1) < 5e-3
+
+
+def test_hidden_emitters(mi_rgb, fields):
+    """Not seen first, and neither is their alpha; seen in mirrors."""
+    mi = mi_rgb
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.4, 0.7, 1.0]}}
+    glass = mirror(mi, {"type": "conductor", "material": "none"})
+    more = {"glass": glass, "sky": sky, **surfaces(mi)}
+    hidden, shown = (scene(mi, integrator={"hide_emitters": hide}, **more) for hide in (True, False))
+    image, other = (render(mi, made).reshape(-1, 4) for made in (hidden, shown))
+    alone, _, _, opacity = seen(scene(mi), pixel_rays(mi, hidden))
+    si = hidden.ray_intersect(pixel_rays(mi, hidden))
+    met = np.array(si.is_valid()) & np.array(si.shape.bsdf().flags() & int(mi.BSDFFlags.DeltaReflection) != 0)
+    assert np.abs(image[met] - other[met]).max() < 1e-4 and met.sum() > 50
+    # Behind the lamp in front there may be the mirror
+    rest = ~met & (np.abs(image[:, 3] - 1) > 1e-6)
+    assert rest.sum() > 400 and np.abs(image[rest, :3] - alone[rest]).max() < 1e-4
+    assert np.abs(image[rest, 3] - opacity[rest]).max() < 1e-4
+
+
+def beside(mi, place, angle=0.0, **more):
+    """Bumps, half as large, and what is nested in them."""
+    to_world = mi.ScalarTransform4f().translate(place).rotate([0, 0, 1], angle).scale(0.45)
+    return {"type": "test_field", "field": "bumps", "to_world": to_world, **more}
+
+
+def test_several_fields(mi_rgb, fields):
+    """One after the other, whichever is in front, as seen one at a time."""
+    mi = mi_rgb
+    inner = {"type": "path_footprint", "jitter": False}
+    alone = {"aovs": "depth,opacity", "c": inner}
+    front, back = beside(mi, [0.3, -1.7, 0.5], 20), beside(mi, [-0.9, 2.0, -0.6], 50, c=inner)
+    fog = {"type": "test_field", "field": "fog", "c": back}
+    things = surfaces(mi)
+    found = scene(mi, "bumps", integrator={"to_world": front["to_world"], "aovs": "depth,opacity", "c": fog}, **things)
+    image = render(mi, found)
+    front, back = (scene(mi, "bumps", integrator={**alone, "to_world": f["to_world"]}) for f in (front, back))
+    front, back = (render(mi, made) for made in (front, back))
+    middle = render(mi, scene(mi, "fog", integrator=alone, **things))
+    # The last field is seen where no surface is
+    nowhere, before = hits_of(mi, found)
+    back = np.where(nowhere[..., None], back, 0)
+    through = (1 - front[..., 5:]) * (1 - middle[..., 5:])
+    assert (back[..., 5] > 0.05).sum() > 5 and front[..., 5].max() > 0.3 and before.sum() < 400
+    expected = front[..., :3] + (1 - front[..., 5:]) * middle[..., :3] + through * back[..., :3]
+    assert np.abs(image[..., :3] - expected)[~before].max() < 1e-4
+    opacity = 1 - through[..., 0] * (1 - back[..., 5])
+    assert np.abs(image[..., 5] - opacity)[~before].max() < 1e-4
+    depth = front[..., 4] + (1 - front[..., 5]) * middle[..., 4] + through[..., 0] * back[..., 4]
+    assert np.abs(image[..., 4] - depth)[~before].max() < 2e-3
+
+
+def test_derivatives_of_several_fields(mi_rgb, fields):
+    fog = {
+        "type": "test_field",
+        "field": "fog",
+        "to_world": mi_rgb.ScalarTransform4f().translate([0, 2.0, 0]).scale(0.8),
+    }
+    made = scene(mi_rgb, "bumps", size=(16, 12), integrator={"aovs": "depth,opacity", "c": fog})
+    for ending in ("it.tables.density", "surfaces.tables.density"):
+        check(mi_rgb, made, ending)
+
+
+def hits_of(mi, made):
+    """The pixels in which no surface is, and those in which there is one before y = −1, ``(height, width)``."""
+    width, height = (int(n) for n in made.sensors()[0].film().size())
+    si = made.ray_intersect(pixel_rays(mi, made))
+    hit, y = np.array(si.is_valid()), np.array(si.p.y)
+    return ~hit.reshape(height, width), (hit & (y < -1)).reshape(height, width)
+
+
+def test_solids_of_path_sdf(mi_rgb, fields):
+    import sdf_fields
+
+    mi = mi_rgb
+    sdf_fields.register(mi, {"ball": sdf_fields.Ball(compat.module_of(mi.Float))})
+    ball = {"type": "test_solid", "field": "ball", "to_world": mi.ScalarTransform4f().scale(1.5)}
+    integrator = {"aovs": "opacity,depth", "c": {"type": "path_sdf", "jitter": False, "max_depth": 2}}
+    image = render(mi, scene(mi, integrator=integrator, ball=ball))
+    integrator = {**integrator, "c": {"type": "path_footprint", "jitter": False, "max_depth": 2}}
+    expected = render(mi, scene(mi, integrator=integrator, ball={"type": "sphere", "radius": 0.6}))
+    # A pixel or two at the outline may see the one and not the other
+    assert (np.abs(image - expected).max(-1) < 2e-3).mean() > 0.995
+
+
+@pytest.mark.parametrize("inner", ["path", "volpath", "prb_projective"])
+def test_inner_integrators(mi_rgb, fields, inner):
+    things = {**surfaces(mi_rgb), "glass": mirror(mi_rgb, {"type": "conductor"})}
+    expected = render(
+        mi_rgb, scene(mi_rgb, integrator={"c": {"type": "path_footprint", "max_depth": 2}}, **things), 256
+    )
+    found = render(mi_rgb, scene(mi_rgb, integrator={"c": {"type": inner, "max_depth": 2}}, **things), 256)
+    middle = slice(1, -1), slice(1, -1)
+    assert np.abs(found - expected)[middle].mean() < 0.02
+    assert np.abs(found.mean((0, 1)) / expected.mean((0, 1)) - 1).max() < 0.02
+
+
+def test_what_the_inner_integrator_is_asked(mi_rgb, fields):
+    """Nothing behind what is opaque; and a pixel's differentials go with its ray, over mirrors, too."""
+    mi = mi_rgb
+    asked = []
+
+    class Inner(mi.ad.integrators.common.RBIntegrator):
+        def sample(self, mode, scene, sampler, ray, active=True, **kwargs):
+            asked.append([np.array(v) for v in (active, ray.o, ray.d, ray.o_x - ray.o, ray.d_x - ray.d)])
+            return mi.Spectrum(1), mi.Bool(active), [], None
+
+        def sample_rays(self, scene, sensor, sampler):
+            ray, weight, place = super().sample_rays(scene, sensor, sampler)
+            ray.has_differentials = True
+            return ray, weight, place
+
+    mi.register_integrator("test_inner", Inner)
+    dense = Fog(compat.module_of(mi.Float), 20.0)
+    register(mi, {"dense": dense}, "test_dense")
+    made = scene(mi, glass=mirror(mi, {"type": "conductor"}, place=(1.6, 0.5, 0)))
+    integrator = mi.load_dict({"type": "test_dense", "field": "dense", "c": {"type": "test_inner"}})
+    image = render(mi, made, integrator=integrator, seed=1)
+    active, o, d, o_x, d_x = asked[0]
+    active = active.reshape(image.shape[:2])
+    assert 0.3 < active.mean() < 0.9 and not active[12, 12] and active[0, 0]
+    assert (np.abs(image[~active][:, :3] - HUE) < 2e-3).all()
+    turned = np.abs(o - o[:, :1]).max(0) > 1
+    assert 20 < turned.sum() < active.sum() / 2
+    # Of a plane mirror: the neighbour's ray is the neighbouring one, off the middle of the pixel by at most half
+    pixel = turned[:-1] & turned[1:] & (np.arange(1, len(turned)) % image.shape[1] > 0)
+    before, after = np.flatnonzero(pixel), np.flatnonzero(pixel) + 1
+    assert (
+        np.abs(np.linalg.norm(d_x[:, turned], axis=0) / np.linalg.norm(d_x[:, ~turned], axis=0).mean() - 1).max() < 0.2
+    )
+    step = ((d[:, after] - d[:, before]) * d_x[:, before]).sum(0) / (d_x[:, before] ** 2).sum(0)
+    assert abs(step.mean() - 1) < 0.1 and len(step) > 20
+    assert np.linalg.norm(o_x[:, ~turned], axis=0).max() < 1e-3 < np.linalg.norm(o_x[:, turned], axis=0).min()
+
+
+def test_counts(mi_rgb, fields):
+    """Of camera rays, up to the first surface."""
+    found = scene(mi_rgb, **surfaces(mi_rgb))
+    counts = found.integrator().counts(found)
+    ray = pixel_rays(mi_rgb, found)
+    si = found.ray_intersect(ray)
+    _, length = inside(ray, np.where(np.array(si.is_valid()), np.array(si.t), np.inf))
+    steps = np.ceil(length / fields["fog"].step)
+    assert counts["rays"] == len(length) and counts["crossing"] == (length > 0).sum() < len(length)
+    assert counts["steps"] == pytest.approx(steps.sum(), rel=0.01) and counts["looks"] == counts["steps"]
+
+
+def test_within_aov(mi_rgb, fields):
+    made = scene(mi_rgb, integrator={"aovs": "depth,opacity"}, **surfaces(mi_rgb))
+    outer = mi_rgb.load_dict({
+        "type": "aov", "aovs": "dd:depth", "n": {"type": "test_field", "field": "fog", "aovs": "opacity"}
+    })  # fmt: skip
+    image = render(mi_rgb, made, 64, integrator=outer)
+    expected = render(mi_rgb, made, 64)
+    assert image.shape[2] == 4 + 5 + 1 or image.shape[2] >= 6
+    assert np.abs(image[..., :3].mean((0, 1)) - expected[..., :3].mean((0, 1))).max() < 0.01
+
+
+# -- variants ----------------------------------------------------------------------------------------------------------
+
+
+def test_variants(mi_any):
+    """``mono`` shows the luminance, spectra have the colour that was asked for."""
+    mi = mi_any
+    registered(mi)
+    if mi.is_polarized:
+        with pytest.raises(RuntimeError, match="neural_field: does not run in polarised variants"):
+            scene(mi, "bumps")
+        return
+    made = scene(mi, "bumps", size=(12, 8), integrator={"aovs": "opacity"})
+    image = render(mi, made, 512 if mi.is_spectral else 1)
+    mi.set_variant(mi.variant().replace("mono", "rgb").replace("spectral", "rgb"))
+    registered(mi)
+    expected = render(mi, scene(mi, "bumps", size=(12, 8), integrator={"aovs": "opacity"}))
+    assert np.abs(image[..., -1] - expected[..., -1]).max() < 1e-5
+    if image.shape[2] < expected.shape[2]:
+        luminance = expected[..., :3] @ [0.212671, 0.71516, 0.072169]
+        assert np.abs(image[..., 0] - luminance).max() < 1e-4
+    else:
+        assert np.abs(image[..., 3] - expected[..., 3]).max() < 1e-5
+        assert np.abs(image - expected).max() < 0.15 and np.abs((image - expected).mean((0, 1))).max() < 0.01
+
+
+# -- derivatives -------------------------------------------------------------------------------------------------------
+
+
+def lit(mi, field="bumps", **more):
+    """A field before a wall, under a point light, and a mirror that shows both."""
+    at = mi.ScalarTransform4f().translate([-0.7, 0.3, 0]).rotate([1, 0, 0], 80)
+    colour = {"type": "rgb", "value": [0.8, 0.3, 0.2]}
+    return scene(
+        mi,
+        field,
+        size=(16, 12),
+        wall={"type": "rectangle", "to_world": at, "bsdf": {"type": "diffuse", "reflectance": colour}},
+        glass=mirror(mi, {"type": "conductor"}),
+        light={"type": "point", "position": [0, -5, 3], "intensity": 30.0},
+        sky={"type": "constant", "radiance": 0.5},
+        **more,
+    )
+
+
+def check(mi, made, ending, spp=4, step=1e-2, tolerance=0.01):
+    """Forward and backward derivatives with respect to a parameter, along a direction, against differences."""
+    params = mi.traverse(made)
+    key = next(key for key in params.keys() if key.endswith(ending))
+    kind, start = type(params[key]), np.array(params[key], np.float32)
+    rng = np.random.default_rng(3)
+    direction = rng.normal(size=start.shape).astype(np.float32)
+
+    def put(values, gradient=False):
+        params[key] = kind(np.ascontiguousarray(values)) if start.ndim != 1 or dr.is_tensor_v(kind) else kind(*values)
+        if gradient:
+            dr.enable_grad(params[key])
+        params.update()
+
+    def at(amount):
+        put(start + np.float32(amount) * direction)
+        return render(mi, made, spp, 8).astype(np.float64)
+
+    differences = (at(step) - at(-step)) / (2 * step)
+    put(start, True)
+    dr.set_grad(params[key], kind(direction) if dr.is_tensor_v(kind) else kind(*direction))
+    forward = np.array(made.integrator().render_forward(made, params, spp=spp, seed=8))
+    put(start, True)
+    weights = rng.normal(size=forward.shape).astype(np.float32)
+    image = mi.render(made, params, spp=spp, seed=7, seed_grad=8)
+    dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
+    backward = float((np.array(dr.grad(params[key])) * direction).sum())
+    put(start)
+    assert forward.shape == differences.shape and np.abs(differences[..., :3]).max() > 1e-3
+    for c in range(forward.shape[2]):
+        size = np.sqrt((differences[..., c] ** 2).mean())
+        assert np.sqrt(((forward - differences)[..., c] ** 2).mean()) < tolerance * size + 1e-6, (key, c)
+    assert backward == pytest.approx(float((weights * forward).sum()), rel=1e-3, abs=1e-4)
+    return differences
+
+
+def test_derivatives_of_the_field(mi_rgb, fields):
+    """Of light, alpha and further channels, directly, in front of surfaces, and in a mirror."""
+    made = lit(mi_rgb, integrator={"aovs": "depth,opacity", "max_depth": 3, "hide_emitters": True})
+    found = check(mi_rgb, made, "tables.density")
+    assert (np.abs(found).max((0, 1)) > 1e-3).all()
+
+
+def test_derivatives_before_an_integrator_in_cpp(mi_rgb, fields):
+    """It is a constant to them."""
+    made = lit(mi_rgb, integrator={"aovs": "opacity", "c": {"type": "path", "max_depth": 3, "hide_emitters": True}})
+    found = check(mi_rgb, made, "tables.colour")
+    assert np.abs(found[..., 3:]).max() == 0
+
+
+@pytest.mark.parametrize("ending", ["reflectance.value", "specular_reflectance.value", "sky.radiance.value"])
+def test_derivatives_of_surfaces(mi_rgb, fields, ending):
+    """Of the inner integrator, behind the field, and of the mirrors and lights that rays are followed to."""
+    made = lit(mi_rgb, integrator={"max_depth": 3, "hide_emitters": ending.startswith("sky")})
+    if ending == "reflectance.value":
+        ending = "bsdf.reflectance.value"
+    check(mi_rgb, made, ending)
+
+
+def test_derivatives_of_spectra():
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_spectral")
+    registered(mi)
+    made = scene(mi, "bumps", size=(12, 8))
+    # The table of spectra has a kink at each of its entries
+    check(mi, made, "tables.colour", spp=16, tolerance=0.03)
+
+
+# -- as an object of Mitsuba -------------------------------------------------------------------------------------------
+
+
+def test_parameters(mi_rgb, fields):
+    mi = mi_rgb
+    made = scene(mi, "fog")
+    params = mi.traverse(made)
+    assert {"it.tables.density", "it.tables.colour"} <= set(params.keys())
+    params["it.tables.density"] = mi.TensorXf(np.float32([0.0]))
+    params.update()
+    assert np.abs(render(mi, made)).max() == 0
+    params["it.tables.density"] = mi.TensorXf(np.float32([1.0, 2.0]))
+    with pytest.raises(RuntimeError, match=r'"tables.density": has the shape \(2,\), expected \(1,\)'):
+        params.update()
+    assert "NeuralField[" in str(made.integrator()) and "PathFootprint" in str(made.integrator())
+
+
+def test_frozen(mi_rgb, fields, no_garbage_collection):
+    """A recorded render sees other arrays, other seeds."""
+    mi = mi_rgb
+    made = scene(mi, "bumps", glass=mirror(mi, {"type": "conductor"}))
+    params = mi.traverse(made)
+    frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
+    for seed in range(5):
+        params["it.tables.density"] = mi.TensorXf(params["it.tables.density"].numpy() * np.float32(0.7))
+        params.update()
+        found, expected = np.array(frozen(made, dr.opaque(mi.UInt32, seed))), render(mi, made, 1, seed)
+        assert np.abs(found - expected).max() < 1e-5
+    assert frozen.n_recordings < 5
+
+
+@pytest.mark.parametrize(
+    "more, message",
+    [
+        ({"aovs": "depth,colour"}, 'parameter "aovs": found "depth,colour", allowed are depth, opacity'),
+        ({"aovs": "depth,depth"}, "each once"),
+        ({"smooth_depth": 65}, 'parameter "smooth_depth": found 65, allowed'),
+        ({"smooth_depth": 1.5}, 'parameter "smooth_depth": found 1.5, allowed'),
+        ({"max_depth": 3, "c": {"type": "path"}}, 'parameter "max_depth": belongs to the nested integrator'),
+        ({"c": {"type": "path"}, "d": {"type": "path"}}, "found 2 nested integrators"),
+        ({"c": {"type": "ptracer"}}, "does not follow rays from a camera"),
+        ({"c": {"type": "test_field", "field": "fog"}}, "the boxes of two fields overlap"),
+        ({"c": {"type": "test_field", "field": "fog", "aovs": "depth"}}, "has AOVs of its own"),
+        ({"c": {"type": "aov", "aovs": "dd:depth"}}, "has AOVs of its own"),
+        ({"to_world": [1.0, 1.0, 2.0]}, 'parameter "to_world": found'),
+        ({"mistake": 1}, "mistake"),
+    ],
+)
+def test_what_is_refused(mi_rgb, fields, more, message):
+    if "to_world" in more:
+        more = {"to_world": mi_rgb.ScalarTransform4f().scale(more["to_world"])}
+    with pytest.raises(RuntimeError) as raised:
+        mi_rgb.load_dict({"type": "test_field", "field": "fog", **more})
+    assert message in compat.one_sentence(raised.value)
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """A small field: a ball that is red to the left and blue to the right, in half precision."""
+    import drjit.llvm as types
+
+    from mi_diffind.tables import save_table
+    from mi_diffind.tasks.radiance import files, nodes
+
+    side, spacing = 25, 0.1
+    place = np.stack(np.meshgrid(*[spacing * np.arange(side) - 1.2] * 3, indexing="ij"), -1)
+    radius = np.linalg.norm(place, axis=-1)
+    stored = nodes.Nodes(types, (-1.2,) * 3, spacing, (side,) * 3, radius < 1)
+    raw = np.clip(12 * (0.8 - radius), -6, 4)[stored.stored]
+    colour = np.zeros((stored.count, 12))
+    colour[:, 0], colour[:, 4], colour[:, 8] = -place[stored.stored][:, 0], -1, place[stored.stored][:, 0]
+    table = files.grid_table(stored, np.append(-9, raw), np.concatenate([np.zeros((1, 12)), colour]))
+    path = tmp_path_factory.mktemp("field") / "ball.npz"
+    save_table(path, table)
+    return path
+
+
+def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
+    """As the field that it holds; depths and what is nested are known to the commands."""
+    from mi_diffind import scenes
+    from mi_diffind.tasks.radiance import TASK
+
+    mi = mi_rgb
+    text = """<scene version="3.0.0">
+        <integrator type="neural_field" id="it"><string name="filename" value="ball.npz"/>INNER</integrator>
+        <sensor type="perspective"><float name="fov" value="40"/>
+            <transform name="to_world"><lookat origin="0,-4,0" target="0,0,0" up="0,0,1"/></transform>
+            <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
+                <string name="pixel_format" value="rgba"/><rfilter type="box"/></film></sensor>
+    </scene>"""
+    (tmp_path / "ball.npz").write_bytes(file.read_bytes())
+    (tmp_path / "scene.xml").write_text(text.replace("INNER", ""))
+    inner = '<integrator type="prb"><integer name="max_depth" value="3"/></integrator>'
+    (tmp_path / "nested.xml").write_text(text.replace("INNER", inner))
+    inner = """<integrator type="neural_field"><string name="filename" value="ball.npz"/>
+        <transform name="to_world"><translate y="4"/></transform></integrator>"""
+    (tmp_path / "two.xml").write_text(text.replace("INNER", inner))
+    assert scenes.integrator_of(tmp_path / "two.xml") == ("neural_field", -1)
+    assert len(scenes.load(tmp_path / "two.xml", longest_path=3).integrator().fields) == 2
+    assert scenes.integrator_of(tmp_path / "scene.xml") == ("neural_field", -1)
+    assert scenes.integrator_of(tmp_path / "nested.xml") == ("prb", 3)
+    loaded = scenes.load(tmp_path / "scene.xml", longest_path=2)
+    assert loaded.integrator().surfaces.max_depth == 2
+    image = render(mi, loaded, 4)
+    assert image[8, 8, 3] > 0.99 and image[0, 0, 3] == 0
+    assert image[8, 5, 0] > 2 * image[8, 5, 2] > 0 and image[8, 10, 2] > 2 * image[8, 10, 0] > 0
+    assert np.abs(render(mi, scenes.load(tmp_path / "nested.xml"), 4) - image).max() < 1e-5
+    report = plugins.report(loaded.integrator())
+    assert report["table_bytes"] > 0 and report["surfaces"] == "PathFootprint"
+    register(mi, {"file": TASK.open(mi.TensorXf, file).field})
+    same = mi.load_dict({"type": "test_field", "field": "file"})
+    assert np.abs(render(mi, loaded, 4, integrator=same) - image).max() < 1e-6
+
+
+def test_arrays_of_a_file_can_be_optimised(mi_rgb, fields, file):
+    mi = mi_rgb
+    made = scene(mi, size=(16, 12))
+    integrator = mi.load_dict({"type": "neural_field", "filename": str(file), "storage": "float32", "id": "it"})
+    params = mi.traverse(integrator)
+    assert set(params.keys()) == {"tables.density", "tables.colour"}
+    before = render(mi, made, integrator=integrator)
+    dr.enable_grad(params["tables.colour"])
+    image = mi.render(made, params, spp=1, integrator=integrator)
+    dr.backward(dr.sum(image, axis=None))
+    gradient = np.array(dr.grad(params["tables.colour"]))
+    assert (gradient[1:, [0, 4, 8]] >= 0).all() and gradient[1:, [0, 4, 8]].max() > 1e-3
+    params["tables.colour"] = mi.TensorXf(np.array(params["tables.colour"]) + np.float32(np.log(2)) * (gradient != 0))
+    params.update()
+    after = render(mi, made, integrator=integrator)
+    assert after[..., :3].sum() > 1.3 * before[..., :3].sum() and np.abs(after - before)[..., 3].max() < 1e-6
+
+
+def test_a_damaged_file_is_refused(mi_rgb, file, tmp_path):
+    content = file.read_bytes()
+    (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
+    for name, message in (("cut.npz", "cut.npz"), ("missing.npz", "missing.npz")):
+        with pytest.raises(RuntimeError) as raised:
+            mi_rgb.load_dict({"type": "neural_field", "filename": str(tmp_path / name)})
+        assert message in compat.one_sentence(raised.value)
+
+
+def test_a_file_is_needed(mi_rgb):
+    with pytest.raises(RuntimeError, match='parameter "filename": not given'):
+        mi_rgb.load_dict({"type": "neural_field"})

@@ -1,0 +1,342 @@
+"""The analytic Disney model, and the tables that stand in for it, against an independent implementation."""
+
+import dataclasses
+
+import disney_formulas
+import drjit as dr
+import drjit.llvm.ad as ad
+import numpy as np
+import pytest
+
+from mi_diffind import StoredArray, load_model
+from mi_diffind import fit as fit_task
+from mi_diffind.fitting import EXPONENTIAL_RATE, exponential_like
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import Table, TableError, save_table
+from mi_diffind.tasks.disney import TASK
+from mi_diffind.tasks.disney.decoder import Decoder
+from mi_diffind.tasks.disney.effects import Effects, ValueBounds, find_effects
+from mi_diffind.tasks.disney.library import LAYOUTS
+from mi_diffind.tasks.disney.model import ALPHA_MIN, PARAMETERS, Material, exact_factors
+from mi_diffind.tasks.disney.paper import PaperArrays
+from mi_diffind.tasks.disney.training import measure, shade, uniform_hemisphere
+
+N = 100_000
+
+
+def decoder_of(preset, storage=""):
+    """What reads the tables that ship; of the formulas, rearranged, if there is no such preset."""
+    return Decoder() if preset == "formulas" else TASK.open(ad.TensorXf, "", preset, storage).decoder
+
+
+def to_drjit(case):
+    color, m, wi, wo = case
+    material = Material(**{k: ad.Float(m[k].astype(np.float32)) for k in PARAMETERS})
+    return material, *(ad.Array3f(v.T.astype(np.float32)) for v in (color, wi, wo))
+
+
+def shaded(decoder, case, effects=Effects()):  # noqa: B008
+    material, color, wi, wo = to_drjit(case)
+    return shade(decoder, material, color, wi, wo, effects).numpy().T.astype(np.float64)
+
+
+def clipped_psnr(a, b):
+    return -10 * np.log10(np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)) ** 2))
+
+
+@pytest.mark.parametrize("decoder", [None, Decoder()], ids=["formulas", "rearranged"])
+def test_exact_model_is_burley(rng, decoder):
+    case = disney_formulas.random_case(rng, N, low_cosine=1e-3)
+    # In single precision the inputs themselves are rounded: the reference sees the same roundings
+    case = (
+        case[0].astype("f4"),
+        {k: v.astype("f4") for k, v in case[1].items()},
+        *(v.astype("f4") for v in case[2:]),
+    )
+    reference = disney_formulas.brdf(*case) * case[3][:, 2:3]
+    found = shaded(decoder, case)
+    error = np.abs(found - reference) / (np.abs(reference) + 1e-3)
+    assert np.quantile(error, 0.999) < 1e-4
+    assert error.max() < 1e-2  # single precision, next to the peak of a nearly smooth surface
+
+
+@pytest.mark.parametrize("decoder", [None, Decoder()], ids=["formulas", "rearranged"])
+@pytest.mark.parametrize("cosine", [1e-6, 1e-4, 1e-2])
+def test_exact_model_at_grazing_angles(rng, cosine, decoder):
+    color, m, wi, wo = disney_formulas.random_case(rng, 10_000, low_cosine=0.05)
+    z = np.full(len(wi), cosine)
+    wi = np.stack(
+        [*(wi[:, :2] / np.linalg.norm(wi[:, :2], axis=1, keepdims=True) * np.sqrt(1 - z * z)[:, None]).T, z],
+        1,
+    )
+    m["roughness"] = 0.1 + 0.9 * m["roughness"]
+    case = (color.astype("f4"), {k: v.astype("f4") for k, v in m.items()}, wi.astype("f4"), wo.astype("f4"))
+    reference = disney_formulas.brdf(*case) * case[3][:, 2:3]
+    error = np.abs(shaded(decoder, case) - reference) / (np.abs(reference) + 1e-3)
+    assert error.max() < 2e-3
+
+
+def test_exact_model_is_reciprocal(rng):
+    color, m, wi, wo = disney_formulas.random_case(rng, 10_000, low_cosine=0.01)
+    forward = shaded(None, (color, m, wi, wo)) / wo[:, 2:3]
+    backward = shaded(None, (color, m, wo, wi)) / wi[:, 2:3]
+    assert np.allclose(forward, backward, rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("decoder", [None, Decoder()], ids=["formulas", "rearranged"])
+def test_gradients_against_finite_differences(rng, decoder):
+    color, m, wi, wo = disney_formulas.random_case(rng, 2000, low_cosine=0.1)
+    m["roughness"] = 0.25 + 0.7 * m["roughness"]  # away from the floor on alpha, where there is a kink
+    case = (color, {k: 0.05 + 0.9 * v for k, v in m.items()}, wi, wo)
+    material, albedo, wi_, wo_ = to_drjit(case)
+    for name in PARAMETERS:
+        dr.enable_grad(getattr(material, name))
+    value = shade(decoder, material, albedo, wi_, wo_)
+    dr.backward(dr.sum(value.x + value.y + value.z))
+    for name in PARAMETERS:
+        step = 1e-5
+
+        def total(delta, name=name):
+            shifted = {**case[1], name: case[1][name] + delta}
+            return (disney_formulas.brdf(case[0], shifted, wi, wo) * wo[:, 2:3]).sum(axis=1)
+
+        expected = (total(step) - total(-step)) / (2 * step)
+        found = getattr(material, name).grad.numpy()
+        assert np.allclose(found, expected, rtol=5e-3, atol=5e-3 * np.abs(expected).max()), name
+
+
+@pytest.mark.parametrize("preset", list(LAYOUTS))
+def test_shipped_tables_keep_their_promises(preset):
+    table = TASK.load(TASK.file(preset=preset))
+    layout, _ = LAYOUTS[preset]
+    assert preset == layout.PRESET == table.preset and list(TASK.presets) == list(LAYOUTS)
+    assert all(array.shape == layout.SHAPES[name] for name, array in table.arrays.items())
+    assert table.nbytes <= 12_500
+    if preset == "paper":
+        decoder = sum(a.entries.size for n, a in table.arrays.items() if not n.startswith("encoder"))
+        assert decoder == 3104  # the paper's Table 1
+    assert table.settings == dataclasses.asdict(TASK.presets[preset])
+
+
+@pytest.fixture(scope="module")
+def million():
+    """Distribution → 10⁶ random directions and materials with the value of the independent reference, in parts."""
+    rng, found = np.random.default_rng(20231212), {}
+    for distribution in ("training", "uniform"):
+        parts = []
+        for _ in range(4):
+            color, m, wi, wo = disney_formulas.random_case(rng, 250_000)
+            for name in ("metallic", "roughness") if distribution == "training" else ():
+                # Inverse of the exponential-like distribution's CDF
+                m[name] = -np.log(1 - m[name] * (1 - np.exp(-EXPONENTIAL_RATE))) / EXPONENTIAL_RATE
+            wi, wo = (np.where(w[:, 2:3] > 1e-6, w, [0, 0, 1]) for w in (wi, wo))
+            parts.append((to_drjit((color, m, wi, wo)), disney_formulas.brdf(color, m, wi, wo), wo[:, 2:3]))
+        found[distribution] = parts
+    return found
+
+
+#: (BRDF · cosine, BRDF alone) in dB: what is promised, a little less than what is reached.
+PROMISED = {
+    "formulas": {"": (126, 120)},
+    "tables": {"float32": (87, 83), "float16": (82, 79), "uint8": (77, 71)},
+    "paper": dict.fromkeys(("float32", "float16", "uint8"), (38.5, 33)),
+}
+
+
+@pytest.mark.parametrize("distribution", ["training", "uniform"])
+@pytest.mark.parametrize("preset, storage", [(preset, storage) for preset in PROMISED for storage in PROMISED[preset]])
+def test_accuracy_over_a_million_samples(million, preset, storage, distribution):
+    """Over 10⁶ random directions and materials, by the independent reference."""
+    decoder = decoder_of(preset, storage)
+    squared, count = np.zeros(2), 0
+    for (material, color, wi, wo), reference, cosine in million[distribution]:
+        found = shade(decoder, material, color, wi, wo).numpy().T.astype(np.float64)
+        for i, (a, b) in enumerate(((reference * cosine, found), (reference, found / cosine))):
+            squared[i] += np.sum((np.clip(a, 0, 1) - np.clip(b, 0, 1)) ** 2)
+        count += found.size
+    with_cosine, without = -10 * np.log10(squared / count)
+    print(f"{preset} {storage} {distribution}: {with_cosine:.2f} dB (BRDF · cosine), {without:.2f} dB (BRDF)")
+    promised = np.subtract(PROMISED[preset][storage], 4 if (preset, distribution) == ("paper", "uniform") else 0)
+    assert with_cosine >= promised[0]
+    assert without >= promised[1]
+
+
+def test_measure_agrees_with_the_independent_reference(rng):
+    decoder = decoder_of("paper")
+    case = disney_formulas.random_case(rng, N, low_cosine=1e-4)
+    independent = clipped_psnr(disney_formulas.brdf(*case) * case[3][:, 2:3], shaded(decoder, case))
+    # Other samples of a heavy-tailed error: seeds differ by ± 0.5 dB
+    assert abs(measure(decoder, ad, 2**18, "uniform")["psnr_db"] - independent) < 1
+
+
+@pytest.mark.parametrize("preset", ["formulas", "tables", "paper"])
+def test_values_are_finite_and_non_negative_everywhere(rng, preset):
+    """Also with entries at the ends of their allowed ranges, which a user's own tables or an optimiser may have."""
+    cosines = np.concatenate([[0, 1e-38, 1e-20, 1e-8, 1e-4, 0.5, 1], rng.random(50)])
+    z = np.array(np.meshgrid(cosines, cosines)).reshape(2, -1)
+    phi = 2 * np.pi * rng.random(z.shape)
+    wi, wo = (
+        np.stack([np.sqrt(1 - c * c) * np.cos(p), np.sqrt(1 - c * c) * np.sin(p), c])
+        for c, p in zip(z, phi, strict=True)
+    )
+    values = rng.integers(0, 2, (len(PARAMETERS), z.shape[1])).astype(np.float32)
+    material = Material(**{k: ad.Float(v) for k, v in zip(PARAMETERS, values, strict=True)})
+    wi, wo = ad.Array3f(wi.astype("f4")), ad.Array3f(wo.astype("f4"))
+    layout = LAYOUTS[preset][0] if preset in LAYOUTS else None
+    decoders = [decoder_of(preset)]
+    for end in (0, 1) if layout is not None else ():
+        extreme = {n: np.full(s, layout.RANGES[n][end], np.float32) for n, s in layout.SHAPES.items()}
+        table = Table("disney", {n: StoredArray(entries) for n, entries in extreme.items()}, preset)
+        decoders.append(TASK.model(table, ad.TensorXf).decoder)
+    albedo = ad.Array3f(1, 0, 0.5)
+    for decoder in decoders:
+        value = shade(decoder, material, albedo, wi, wo).numpy()
+        assert np.isfinite(value).all() and value.min() >= 0, (value.min(), value.max())
+    factors = exact_factors(material, wi, wo)
+    for field in dataclasses.fields(factors):
+        v = getattr(factors, field.name).numpy()
+        assert np.isfinite(v).all() and v.min() >= -1e-6, (field.name, v.min(), v.max())
+
+
+def test_training_distributions(rng):
+    u = ad.Float(rng.random(N).astype("f4"))
+    x = exponential_like(u).numpy()
+    assert x.min() >= 0 and x.max() <= 1
+    for t in (0.1, 0.5, 0.9):
+        cdf = (1 - np.exp(-EXPONENTIAL_RATE * t)) / (1 - np.exp(-EXPONENTIAL_RATE))
+        assert abs(np.mean(x < t) - cdf) < 0.01
+    w = uniform_hemisphere(ad, ad.Float(rng.random(N).astype("f4")), ad.Float(rng.random(N).astype("f4"))).numpy()
+    assert np.allclose(np.linalg.norm(w, axis=0), 1, atol=1e-5)
+    for t in (0.25, 0.5, 0.75):
+        assert abs(np.mean(w[2] < t) - t) < 0.01
+    assert np.abs(w[:2].mean(axis=1)).max() < 0.01
+
+
+@pytest.mark.parametrize("preset", list(LAYOUTS))
+def test_fit_improves_and_is_repeatable(preset, few_samples):
+    def run(seed):
+        short = {"steps": 60, "batch": 4096, "measure_every": 30, "seed": seed}
+        return fit_task("disney", preset, "llvm", progress=False, **short).table
+
+    layout, decoder = LAYOUTS[preset]
+    start = measure(decoder(layout().alloc(ad.TensorXf)), ad, 2**16)["psnr_db"]
+    first, second, other = run(1), run(1), run(2)
+    assert first.measured["psnr_db"] > start + 1 and first.preset == preset and first.seed == 1
+    assert {"psnr_db", "psnr_brdf_db", "psnr_uniform_db", "psnr_brdf_uniform_db", "mae"} <= set(first.measured)
+    for name in layout.SHAPES:
+        assert np.array_equal(first.arrays[name].entries, second.arrays[name].entries), name
+    assert not np.array_equal(first.arrays["masking"].entries, other.arrays["masking"].entries)
+
+
+def test_measurements_of_both_distributions():
+    """Those of the model are those of the function, at fewer samples than a user waits for."""
+    model = TASK.open(ad.TensorXf, "", "paper")
+    found = model.measure(2**14)
+    assert found["psnr_db"] == measure(model.decoder, ad, 2**14)["psnr_db"]
+    assert found["psnr_uniform_db"] == measure(model.decoder, ad, 2**14, "uniform")["psnr_db"] != found["psnr_db"]
+
+
+def test_tables_out_of_range_are_refused(tmp_path):
+    table = TASK.load(TASK.file(preset="paper"))
+    entries = table.arrays["masking"].entries.copy()
+    entries[3, 4] = -1
+    table.arrays["masking"] = StoredArray(entries)
+    path = tmp_path / "bad.npz"
+    save_table(path, table)
+    with pytest.raises(TableError, match=r'bad\.npz: entries of "masking" lie in .* allowed is'):
+        TASK.load(path)
+
+
+def test_the_layout_of_a_file_is_that_of_its_preset(tmp_path):
+    """A missing array is missed from it; a file of another preset, or of none, is refused."""
+    table = TASK.load(TASK.file())
+    path = tmp_path / "own.npz"
+    save_table(path, table)
+    model = TASK.open(ad.TensorXf, path)
+    assert model.table.preset == "tables" and isinstance(model.layout, LAYOUTS["tables"][0])
+    assert isinstance(load_model(path, ad.TensorXf).decoder, LAYOUTS["tables"][1])
+    with pytest.raises(TableError, match='holds tables of the preset "tables", "paper" was asked for'):
+        TASK.open(ad.TensorXf, path, "paper")
+    save_table(path, dataclasses.replace(table, arrays={n: a for n, a in table.arrays.items() if n != "masking"}))
+    with pytest.raises(TableError, match=r'own\.npz: the array "masking" is missing'):
+        TASK.load(path)
+    save_table(path, dataclasses.replace(table, preset="best"))
+    with pytest.raises(TableError, match=r'own\.npz: holds tables of the preset "best", allowed are tables, paper'):
+        TASK.load(path)
+
+
+def test_copies_of_a_file_are_independent():
+    """They share memory until one is assigned to; a layout's parameters have dotted names."""
+    first, second = (TASK.open(ad.TensorXf, "", "paper") for _ in range(2))
+    assert list(first.layout.keys()) == [f"{name}.data" for name in PaperArrays.SHAPES]
+    before = second.layout.masking.numpy()
+    first.layout.masking.data = first.layout.masking.data * 0
+    np.testing.assert_array_equal(second.layout.masking.numpy(), before)
+    assert array_module("llvm") is first.types
+
+
+def test_masking_floor_matches_the_model():
+    assert PaperArrays.RANGES["masking"][0] < ALPHA_MIN
+
+
+# -- effects in use ----------------------------------------------------------------------------------------------------
+
+
+def constant(value, **more):
+    return ValueBounds(value, value, **more)
+
+
+def test_effects_of_typical_materials():
+    dielectric = dict.fromkeys(PARAMETERS, constant(0)) | {"roughness": constant(0.5), "specular": constant(0.5)}
+    effects, reasons = find_effects({"base_color": ValueBounds(), **dielectric})
+    assert effects.names == ("diffuse", "dielectric") and effects.lobes == ("diffuse", "specular")
+    assert reasons["clearcoat"] == "clearcoat is 0" and reasons["subsurface"] == "flatness is 0"
+    assert reasons["sheen_tint"] == "sheen_tint is 0"
+
+    effects, reasons = find_effects({**dielectric, "metallic": constant(1), "sheen": constant(1)})
+    assert effects.names == ("metal",) and effects.lobes == ("specular",)
+    assert reasons["diffuse"] == reasons["sheen"] == reasons["dielectric"] == "metallic is 1"
+
+    effects, reasons = find_effects({**dielectric, "base_color": constant(0, grey=True), "specular": constant(0)})
+    assert effects.names == () and effects.lobes == ("specular",)
+    assert reasons["diffuse"] == "base_color is black"
+
+    assert find_effects({})[0] == Effects() and not find_effects({})[1]
+
+
+def test_tints_of_a_grey_albedo_are_left_out():
+    effects, reasons = find_effects({"base_color": ValueBounds(0.1, 0.9, grey=True)})
+    assert not effects.spec_tint and not effects.sheen_tint and effects.sheen and effects.dielectric
+    assert reasons["spec_tint"] == "base_color has no hue"
+    assert find_effects({"base_color": ValueBounds(0.1, 0.9, grey=True, optimised=True)})[0].spec_tint
+
+
+@pytest.mark.parametrize("name", ["sheen", "clearcoat", "anisotropic", "flatness", "metallic", "specular"])
+def test_optimised_parameters_keep_their_effect(name):
+    known = dict.fromkeys(PARAMETERS, constant(0))
+    effect = {"flatness": "subsurface", "metallic": "metal", "specular": "dielectric"}.get(name, name)
+    assert not getattr(find_effects(known)[0], effect)
+    assert getattr(find_effects({**known, name: constant(0, optimised=True)})[0], effect)
+
+
+def test_parts_left_out_change_nothing(rng):
+    """Every combination of zeros and ones: the model restricted to the effects in use, against all of it."""
+    switches = ("metallic", "flatness", "sheen", "clearcoat", "anisotropic", "specular", "spec_tint", "sheen_tint")
+    color, m, wi, wo = disney_formulas.random_case(rng, 200)
+    seen = set()
+    for bits in range(2 ** len(switches)):
+        values = {name: bits >> i & 1 for i, name in enumerate(switches)}
+        case = (
+            color,
+            {**m, **{k: np.full(200, v * (1 if k == "metallic" else 0.5)) for k, v in values.items()}},
+            wi,
+            wo,
+        )
+        known = {k: constant(v * (1 if k == "metallic" else 0.5)) for k, v in values.items()}
+        effects, _ = find_effects(known)
+        if effects in seen:
+            continue
+        seen.add(effects)
+        everything, used = shaded(Decoder(), case), shaded(Decoder(), case, effects)
+        assert np.allclose(used, everything, rtol=2e-6, atol=1e-8), effects
+    assert len(seen) > 50

@@ -1,0 +1,167 @@
+"""Radiance fields as dense grids: the numbers of a grid come back, and what is not installed is said."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from mi_diffind.errors import UsageError
+from mi_diffind.tasks.radiance import decode
+from mi_diffind.tasks.radiance.field import DenseField, GridField, VolumeField
+from mi_diffind.tasks.radiance.nodes import Nodes, cells_of
+
+
+@pytest.fixture
+def t():
+    import drjit.llvm.ad
+
+    return drjit.llvm.ad
+
+
+LOWER, VOXEL, SHAPE = (-1.0, 0.5, 2.0), 0.25, (6, 5, 4)
+
+
+def numbers(rng, count=120):
+    """Raw densities of which a third is nothing, and colours."""
+    raw = np.where(rng.random(count) < 0.33, -15, rng.normal(1, 2, count))
+    colour = rng.normal(0, 0.5, (count, 12))
+    return raw.astype(np.float32), colour.astype(np.float32)
+
+
+def softplus(raw):
+    return np.log1p(np.exp(np.asarray(raw, np.float64)))
+
+
+def test_a_grid_comes_back(t, rng):
+    raw, colour = numbers(rng)
+    field = DenseField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    found = decode.grid(field)
+    assert found["density"].shape == SHAPE and found["colour"].shape == (*SHAPE, 12)
+    assert found["lower"] == pytest.approx(LOWER) and found["voxel"] == pytest.approx(VOXEL)
+    # Looked at from a thousandth of a voxel away, along each axis
+    expected = softplus(raw.reshape(SHAPE)) / VOXEL
+    assert np.abs(found["density"] - np.where(expected * VOXEL > 1e-3, expected, 0)).max() < 0.01 * expected.max()
+    filled = found["density"] > 0
+    assert 0.5 < filled.mean() < 0.8 and np.abs(found["colour"] - colour.reshape(*SHAPE, 12))[filled].max() < 0.02
+    other = found["colour"][~filled].reshape(-1, 12)
+    stored = found["colour"][filled]
+    assert all((stored == row).all(axis=1).any() for row in other)  # of the nearest that is something
+
+
+def test_what_was_decoded_is_the_same_field(t, rng):
+    """At other points, the same densities and radiances, and at twice the resolution, too."""
+    smooth = np.stack(np.meshgrid(*(np.linspace(0, 2, n) for n in SHAPE), indexing="ij"))
+    raw = 2 * np.sin(smooth.sum(axis=0))
+    colour = 0.3 * np.sin(np.multiply.outer(smooth[0] + 2 * smooth[1], np.arange(12)) + np.arange(12))
+    field = DenseField(t, raw, colour, LOWER, VOXEL)
+    places = rng.uniform(np.array(LOWER) + 0.01, np.array(field.upper) - 0.01, (500, 3))
+    ways = rng.normal(size=(500, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+
+    def seen(f):
+        p, d = (t.Array3f(*(t.Float(np.float32(x)) for x in v.T)) for v in (places, ways))
+        sigma, latent = f.look(p, t.Bool(True))
+        return sigma.numpy(), np.array([c.numpy() for c in f.colour(latent, p, d, t.Bool(True))])
+
+    sigma, radiance = seen(field)
+    again = decode.grid(field)
+    assert np.allclose(seen(decode.dense(t, again))[0], sigma, rtol=0.01)
+    assert np.allclose(seen(decode.dense(t, again))[1], radiance, rtol=0.01)
+    finer = decode.grid(field, 11)
+    assert finer["density"].shape == (11, 9, 7) and finer["voxel"] == pytest.approx(VOXEL / 2)
+    assert np.allclose(seen(decode.dense(t, finer))[0], sigma, rtol=0.1)
+    assert np.allclose(seen(decode.dense(t, finer))[1], radiance, rtol=0.02)
+
+
+def test_nodes_at_the_rim_of_what_is_stored_count(t, rng):
+    """Such a node belongs to cells of which some are not looked at."""
+    stored = np.zeros(SHAPE, bool)
+    stored[1:4, 1:4, 1:3] = True
+    nodes = Nodes(t, LOWER, VOXEL, SHAPE, stored)
+    raw, colour = numbers(rng, nodes.entries)
+    raw = np.abs(raw)
+    field = GridField(nodes, t.TensorXf(raw), t.TensorXf(colour))
+    found = decode.grid(field)
+    assert cells_of(stored).sum() == 4 and np.array_equal(found["density"] > 0, stored)
+    assert found["density"][stored] == pytest.approx(softplus(raw[1:]) / VOXEL, rel=0.02)
+    assert found["colour"][stored] == pytest.approx(colour[1:], abs=0.02)
+
+
+def test_mean_colour():
+    """Against an average over many directions."""
+    rng = np.random.default_rng(1)
+    d = rng.normal(size=(200_000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    row = np.float32([0.1, 0.5, -1, 0.7, -2, 0, 0, 0, 0.3, 2, 1, 0])
+    expected = [np.exp(row[4 * c] + d @ row[4 * c + 1 : 4 * c + 4]).mean() for c in range(3)]
+    assert decode.mean_colour(row) == pytest.approx(expected, rel=0.01)
+
+
+def test_an_archive_holds_the_grid(t, rng, tmp_path):
+    raw, colour = numbers(rng)
+    field = DenseField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    ((path, line),) = decode.decode(field, tmp_path / "grid.npz")
+    assert path == tmp_path / "grid.npz" and line.startswith("6 x 5 x 4 nodes (x, y, z), 6")
+    with np.load(path) as content:
+        assert np.array_equal(content["density"], decode.grid(field)["density"])
+        assert np.allclose(decode.dense(t, content).voxel, VOXEL)
+
+
+class Written:
+    """What stands in for OpenVDB's module: keeps what it is given."""
+
+    GridClass = types.SimpleNamespace(FOG_VOLUME="fog volume")
+
+    def __init__(self):
+        class Grid:
+            def copyFromArray(self, array):
+                self.array = array
+
+        self.FloatGrid = self.Vec3SGrid = Grid
+        self.grids = []
+
+    def createLinearTransform(self, matrix):
+        return np.array(matrix)
+
+    def write(self, path, grids):
+        self.grids = grids
+        with open(path, "wb") as file:
+            file.write(b"vdb")
+
+
+def test_vdb_where_openvdb_is_there(t, rng, tmp_path, monkeypatch):
+    raw, colour = numbers(rng)
+    field = DenseField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    for name in decode.MODULES:
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(UsageError, match=r"a VDB file needs the Python module openvdb, which is not installed"):
+        decode.decode(field, tmp_path / "grid.vdb")
+    assert not list(tmp_path.iterdir())
+    written = Written()
+    monkeypatch.setitem(sys.modules, "pyopenvdb", written)
+    decode.decode(field, tmp_path / "grid.vdb")
+    density, color = written.grids
+    found = decode.grid(field)
+    assert (density.name, color.name) == ("density", "color") and np.array_equal(density.array, found["density"])
+    assert np.array([2, 0, 1, 1]) @ density.transform == pytest.approx([LOWER[0] + 0.5, LOWER[1], LOWER[2] + 0.25, 1])
+    assert np.array_equal(color.array.any(axis=-1), found["density"] > 0)
+    assert (tmp_path / "grid.vdb").read_bytes() == b"vdb"
+
+
+def test_what_is_refused(t, tmp_path):
+    field = VolumeField(t, (0, 0, 0), (1, 1, 1), 0.1, {})
+    with pytest.raises(UsageError, match=r'found the extension "\.obj", allowed are \.npz and \.vdb'):
+        decode.decode(field, tmp_path / "grid.obj")
+    for resolution in (1, 513):
+        with pytest.raises(UsageError, match=rf"resolution: found {resolution}, allowed are 2 to 512"):
+            decode.grid(field, resolution)
+    field.voxel = 1e-3
+    with pytest.raises(UsageError, match="resolution: found 1001, allowed are 2 to 512"):
+        decode.grid(field)
+
+
+def test_an_empty_field_is_empty(t):
+    field = DenseField(t, np.full(SHAPE, -20.0), np.zeros((*SHAPE, 12)), LOWER, VOXEL)
+    found = decode.grid(field)
+    assert not found["density"].any() and np.isfinite(found["colour"]).all()

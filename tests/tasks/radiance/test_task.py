@@ -1,0 +1,400 @@
+"""``fit field``, ``inspect`` and ``decode``: presets, sizes, interruptions, damaged files, and how they refuse."""
+
+import dataclasses
+import gc
+import json
+import resource
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+from PIL import Image
+
+from mi_diffind.cli import main
+from mi_diffind.fitting import FitSettings
+from mi_diffind.fitting import fit as train
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import TableError, load_table, save_table
+from mi_diffind.task import fit, tasks
+from mi_diffind.tasks.radiance import compression, files, hull, nodes, palette
+from mi_diffind.tasks.radiance import fit as field_fit
+from mi_diffind.tasks.radiance import grid as grids
+from mi_diffind.tasks.radiance.training import Images, evaluate, scores, shown
+from mi_diffind.tasks.radiance.views import load_views
+
+SIZE, FOV = 40, 0.9
+SHORT = ["--resolution", "24", "--batch", "1024", "--variant", "llvm_ad_rgb"]
+
+
+@pytest.fixture(scope="module")
+def ad():
+    return array_module("llvm")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_grids():
+    patch = pytest.MonkeyPatch()
+    grid = field_fit.PRESETS["grid"]
+    short = type(grid)(grid.layout, FitSettings(**{**vars(grid.settings), "steps": 60, "batch": 1024}))
+    patch.setitem(field_fit.PRESETS, "grid", short)
+    patch.setattr(field_fit, "VALUE_STEPS", 20)
+    yield
+    patch.undo()
+
+
+def look_at(o):
+    """Camera to world, from ``o`` to the origin, as Blender has it."""
+    back = np.asarray(o) / np.linalg.norm(o)
+    right = np.cross([0, 0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = o
+    return pose
+
+
+def picture(pose):
+    """Of a ball of radius 0.5 around (0.2, 0, 0), whose colour follows its normal: straight sRGB with alpha."""
+    focal = SIZE / 2 / np.tan(FOV / 2)
+    x, y = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
+    d = np.stack([(x + 0.5 - SIZE / 2) / focal, -(y + 0.5 - SIZE / 2) / focal, -np.ones_like(x)], axis=-1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
+    o = pose[:3, 3] - [0.2, 0, 0]
+    b = d @ o
+    under = b**2 - o @ o + 0.25
+    normal = (o + (-b - np.sqrt(np.maximum(under, 0)))[..., None] * d) / 0.5
+    linear = np.clip(0.5 + 0.4 * normal, 0, 1)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.rint(255 * np.concatenate([srgb, (under > 0)[..., None]], axis=-1)).astype(np.uint8)
+
+
+def write_views(folder, split, count, turn=0.0, alpha=True):
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    angle = np.pi * (1 + 5**0.5) * k + turn
+    frames = []
+    for i, v in enumerate(np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)):
+        pose, name = look_at(2.0 * v), f"{split}_{i}.png"
+        pixels = picture(pose)
+        Image.fromarray(pixels if alpha else pixels[..., :3]).save(folder / name)
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    content = {"camera_angle_x": FOV, "frames": frames}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A capture, its grid ``grid.npz``, and ``ball.npz``."""
+    path = tmp_path_factory.mktemp("field")
+    write_views(path, "train", 16)
+    write_views(path, "test", 3, turn=0.7)
+    assert main(["fit", "field", str(path), "-o", str(path / "ball.npz"), "--grid", str(path / "grid.npz"),
+                 "--json", str(path / "fit.json"), "--steps", "60", *SHORT]) == 0  # fmt: skip
+    return path
+
+
+def test_fit_meets_views_it_has_not_seen(folder):
+    figures = json.loads((folder / "fit.json").read_text())
+    table = load_table(folder / "ball.npz", "field")
+    assert table.preset == "sparse" and table.settings["capture_path"] == "."
+    # A grey ball in its place, the mean of all pixels, has 13 dB
+    assert table.measured["psnr_foreground_db"] > 17.5 and table.measured["psnr_white_db"] > 23
+    assert figures["memory_bytes"] < figures["dense_bytes"] / 10
+
+
+def test_the_stored_field_is_what_was_measured(folder, ad):
+    model = tasks()["field"].open(ad.TensorXf, folder / "ball.npz")
+    held = Images(ad, load_views(folder, "test"))
+    measured = load_table(folder / "ball.npz").measured
+    assert evaluate(model.field, held)["psnr_white_db"] == pytest.approx(measured["psnr_white_db"], abs=1e-3)
+    assert model.measure()["psnr_white_db"] == pytest.approx(measured["psnr_white_db"], abs=1e-3)
+
+
+def test_packed_and_trainable_fields_agree(folder, ad, rng):
+    task = tasks()["field"]
+    packed, floats = (task.open(ad.TensorXf, folder / "ball.npz", storage=s).field for s in ("", "float32"))
+    assert not packed.arrays and set(floats.arrays) == {"share", "curve", "palette"}
+    p = ad.Array3f(rng.uniform(packed.lower, packed.upper, (32768, 3)).T.astype(np.float32))
+    d = ad.Array3f(*np.float32([0.6, 0.0, -0.8]).tolist())
+    read = []
+    for field in (packed, floats):
+        density, latent = field.look(p)
+        colour = field.colour(latent, p, d, density > 0)
+        read.append(np.array([density, *(dr.select(density > 0, c, 0) for c in colour)]))
+    assert (read[0][0] > 0).sum() > 200
+    np.testing.assert_allclose(read[0], read[1], rtol=2e-3, atol=2e-3 * read[1][0].max() * 1e-2)
+
+
+def test_bytes_are_kept(folder, tmp_path):
+    for nbytes in (24_000, 40_000):
+        out = tmp_path / f"{nbytes}.npz"
+        assert main(["fit", "field", str(folder), "-o", str(out), "--grid", str(folder / "grid.npz"), "--bytes",
+                     str(nbytes), "--steps", "4", "--json", str(tmp_path / "f.json"), *SHORT]) == 0  # fmt: skip
+        assert json.loads((tmp_path / "f.json").read_text())["memory_bytes"] <= nbytes
+
+
+def test_paper_preset(folder, tmp_path, ad):
+    out = tmp_path / "paper.npz"
+    assert main(["fit", "field", str(folder), "-o", str(out), "--preset", "paper", "--grid",
+                 str(folder / "grid.npz"), "--compression", "20", "--steps", "30", *SHORT]) == 0  # fmt: skip
+    table = load_table(out)
+    assert table.settings["layout"] == "pairs" and table.measured["psnr_white_db"] > 18
+    arrays = sum(a.nbytes for n, a in table.arrays.items() if n != "cells")
+    dense = 52 * np.prod(table.settings["shape"])
+    assert 0.7 * dense / 20 < arrays <= dense / 20
+    again = evaluate(tasks()["field"].open(ad.TensorXf, out).field, Images(ad, load_views(folder, "test")))
+    assert again["psnr_white_db"] == pytest.approx(table.measured["psnr_white_db"], abs=0.05)
+
+
+def test_inspect_says_what_rays_leave_out(folder, capsys):
+    assert main(["inspect", str(folder / "ball.npz"), "--json", str(folder / "inspect.json")]) == 0
+    said = capsys.readouterr().out
+    assert "skipped as empty" in said and "read no colour" in said and "on disk" in said
+    found = json.loads((folder / "inspect.json").read_text())
+    found = found.get("figures", found)
+    text = json.dumps(found)
+    assert all(word in text for word in ("memory_bytes", "skipped", "hidden", "colours"))
+
+
+def test_same_command_same_file(folder, tmp_path):
+    args = ["fit", "field", str(folder), "--grid", str(folder / "grid.npz"), "--steps", "5", *SHORT]
+    for name in "ab":
+        assert main([*args, "-o", str(tmp_path / f"{name}.npz")]) == 0
+    a, b = (load_table(tmp_path / f"{name}.npz") for name in "ab")
+    for name, array in a.arrays.items():
+        np.testing.assert_array_equal(array.entries, b.arrays[name].entries)
+
+
+def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
+    """In the second stage of the grid: the first is not made again, and the result is that of an unbroken run."""
+    options = {"source": str(folder), "resolution": 24, "batch": 1024, "steps": 60, "variant": "llvm_ad_rgb"}
+    whole = fit("field", preset="grid", progress=False, **options).table
+    stages, ended = [], []
+
+    def stopping(problem, settings, *args, **kwargs):
+        stages.append(problem.nodes.shape)
+        if len(stages) == 2 and not ended:
+            ended.append(True)
+            raise KeyboardInterrupt
+        return train(problem, settings, *args, **kwargs)
+
+    monkeypatch.setattr(field_fit, "train", stopping)
+    checkpoint = tmp_path / "state"
+    with pytest.raises(KeyboardInterrupt):
+        fit("field", preset="grid", progress=False, checkpoint=checkpoint, **options)
+    stages.clear()
+    again = fit("field", preset="grid", progress=False, checkpoint=checkpoint, resume=True, **options).table
+    assert len(stages) == 2
+    assert again.arrays["density"].shape == whole.arrays["density"].shape
+    np.testing.assert_array_equal(again.arrays["density"].values, whole.arrays["density"].values)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
+    """In the first stage of the grid, or too late for it; resumed, the training goes on with the grid."""
+    stages = []
+
+    def stopping(problem, settings, *args, **kwargs):
+        stages.append(settings.steps)
+        result = train(problem, settings, *args, **kwargs)
+        result.interrupted, result.asked_to_stop = not late, True
+        return result
+
+    checkpoint = tmp_path / "state"
+    options = {"source": str(folder), "resolution": 24, "batch": 512, "steps": 4, "variant": "llvm_ad_rgb"}
+    with monkeypatch.context() as patch:
+        patch.setattr(field_fit, "train", stopping)
+        kept = tmp_path / "grid.npz"
+        found = fit("field", progress=False, checkpoint=checkpoint, grid=str(kept), **options)
+    assert not kept.exists()
+    assert len(stages) == 1 and found.result.interrupted and found.table.settings["layout"] == "sparse"
+    assert not checkpoint.exists()
+    assert not fit("field", progress=False, checkpoint=checkpoint, resume=True, **options).result.interrupted
+    assert checkpoint.exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--preset", "grid", "--bytes", "1M"], "--bytes is of the presets sparse and paper, found grid"),
+        (["--preset", "paper", "--psnr", "30"], "--psnr is of the preset sparse, found paper"),
+        (["--bytes", "100"], "--bytes: 100 bytes are fewer than the smallest field needs"),
+        (["--compression", "1e5"], "--compression: "),
+        (["--bytes", "many"], "many"),
+    ],
+)
+def test_options_that_do_not_go_together(folder, tmp_path, capsys, more, message):
+    with_grid = [] if "grid" in more else ["--grid", str(folder / "grid.npz")]
+    try:
+        code = main(["fit", "field", str(folder), "-o", str(tmp_path / "x.npz"), *with_grid, *more, *SHORT])
+    except SystemExit as e:
+        code = e.code
+    assert code == 2 and message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_grid_of_other_views_is_refused(folder, tmp_path, capsys):
+    write_views(tmp_path, "train", 4)
+    assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--grid", str(folder / "grid.npz"),
+                 *SHORT]) == 2  # fmt: skip
+    assert "was fitted to other views" in capsys.readouterr().err
+    assert main(["fit", "field", str(folder), "-o", str(tmp_path / "x.npz"), "--grid", str(folder / "ball.npz"),
+                 *SHORT]) == 2  # fmt: skip
+    assert 'has the layout "sparse", a grid is needed' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("fault", ["layout", "shape", "cells", "codes", "bits", "nan", "truncated"])
+def test_damaged_files_are_refused(folder, tmp_path, fault):
+    table, path = load_table(folder / "ball.npz"), tmp_path / "damaged.npz"
+    arrays = table.arrays
+    if fault == "layout":
+        table.settings["layout"] = "cube"
+    elif fault == "shape":
+        table.settings["shape"] = [1, 2, 3]
+    elif fault == "cells":
+        arrays["cells"] = files.raw(np.full_like(arrays["cells"].entries, 255))
+    elif fault == "codes":
+        arrays["codes"] = files.raw(np.full_like(arrays["codes"].entries, 255))
+    elif fault == "bits":
+        table.settings["code_bits"] = 11
+    elif fault == "nan":
+        table.settings["spacing"] = -1.0
+    save_table(path, table)
+    if fault == "truncated":
+        path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(TableError, match="damaged"):
+        files.load(path)
+
+
+# -- the parts --------------------------------------------------------------------------------------------------------
+
+
+def test_hull_and_box(folder):
+    views = load_views(folder, "train")
+    lower, upper = hull.box_of(views)
+    assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])
+    assert np.all(upper - lower < 1.8)
+    spacing = 0.05
+    shape = np.ceil((upper - lower) / spacing).astype(int) + 1
+    inside = hull.hull(views, lower, spacing, shape)
+    at = np.stack(np.meshgrid(*[a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)], indexing="ij"))
+    distance = np.linalg.norm(at - np.array([0.2, 0, 0])[:, None, None, None], axis=0)
+    assert inside[distance < 0.5].all() and inside[distance > 0.75].mean() < 0.01
+
+
+def test_index_by_masks_is_the_index(ad, rng):
+    for shape in ((9, 7, 33), (6, 8, 32), (4, 5, 70), (12, 9, 2)):
+        stored = nodes.corners_of(rng.random(tuple(n - 1 for n in shape)) < 0.1)
+        made = [nodes.Nodes(ad, (0, 0, 0), 0.1, shape, stored, packed=packed) for packed in (False, True)]
+        p = ad.Array3f((rng.random((3, 4096)) * (np.array(shape)[:, None] - 1) * 0.1).astype(np.float32))
+        (first, seen), (second, again) = (n.corners(p) for n in made)
+        np.testing.assert_array_equal(seen.numpy(), again.numpy())
+        assert 0.02 < seen.numpy().mean() < 0.9
+        for (_, a), (_, b) in zip(first, second, strict=True):
+            np.testing.assert_array_equal(a.numpy()[seen.numpy()], b.numpy()[seen.numpy()])
+        # Against NumPy: numbers of nodes in lexicographic order
+        numbers = np.zeros(shape, int)
+        numbers[stored] = np.arange(1, stored.sum() + 1)
+        i, j, k = np.minimum((p.numpy() / np.float32(0.1)).astype(int), np.array(shape)[:, None] - 2)
+        assert (numbers[i, j, k] == first[0][1].numpy())[seen.numpy()].mean() > 0.999
+        assert (numbers[i + 1, j + 1, k + 1] == first[7][1].numpy())[seen.numpy()].mean() > 0.999
+
+
+def test_clusters(rng):
+    centres = rng.normal(size=(8, 12))
+    which = rng.integers(0, 8, 4000)
+    points = centres[which] + 0.01 * rng.normal(size=(4000, 12))
+    entries, codes = palette.clusters(points, np.ones(4000), 64, 0)
+    assert np.abs(entries[codes] - points).max() < 0.2
+
+
+def test_scores_of_a_known_error(folder):
+    views = load_views(folder, "test")
+    pictures = [image.copy() for image in views.images]
+    assert scores(pictures, views)["psnr_white_db"] > 100
+    covered = views.images[..., 3] > 0
+    share = covered.mean(axis=(1, 2))
+    for image, where in zip(pictures, covered, strict=True):
+        image[where] = [0, 0, 0, 1]
+    found = scores(pictures, views)
+    black = [np.square(shown(v))[c].mean() for v, c in zip(views.images, covered, strict=True)]
+    assert found["psnr_foreground_db"] == pytest.approx(np.mean(-10 * np.log10(black)), abs=1e-3)
+    assert found["psnr_white_db"] == pytest.approx(np.mean(-10 * np.log10(black * share)), abs=1e-3)
+
+
+def test_divided_grids_are_what_they_were(folder, ad, rng):
+    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    images = Images(ad, load_views(folder, "train"))
+    finer = grids.divided(grid, grids.visible(grid, images), 2, 1)
+    cells = nodes.cells_of(finer.nodes.stored)
+    places = np.argwhere(cells)[rng.choice(cells.sum(), 500)] + 0.5
+    p = ad.Array3f((np.array(finer.nodes.lower) + finer.nodes.spacing * places).T.astype(np.float32))
+    weights = np.array([c[0].numpy() for c in finer.nodes.corners(p)[0]])
+    np.testing.assert_allclose(weights.sum(axis=0), 1, atol=1e-5)
+    before, _ = grid.nodes.corners(p)
+    after, _ = finer.nodes.corners(p)
+    raws = [
+        sum(w.numpy() * g.density[s.numpy()] for w, s in corners)
+        for g, corners in ((grid, before), (finer, after))
+    ]  # fmt: skip
+    both = grid.nodes.corners(p)[1].numpy()
+    assert both.mean() > 0.5
+    np.testing.assert_allclose(raws[0][both], raws[1][both], atol=2e-2)
+
+
+def test_nothing_in_view_is_said(tmp_path, capsys):
+    write_views(tmp_path, "train", 4)
+    for image in tmp_path.glob("*.png"):
+        Image.fromarray(np.zeros((SIZE, SIZE, 4), np.uint8)).save(image)
+    assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), *SHORT]) == 2
+    assert "the views show nothing" in capsys.readouterr().err
+
+
+def test_views_without_alpha(tmp_path, capsys):
+    """They are trained in the whole box, and what cannot be known is said."""
+    write_views(tmp_path, "train", 3, alpha=False)
+    file = tmp_path / "transforms_train.json"
+    content = json.loads(file.read_text()) | {"aabb": [[-0.6, -0.8, -0.8], [1, 0.8, 0.8]]}
+    file.write_text(json.dumps(content))
+    assert main(["fit", "field", str(tmp_path), "-o", str(tmp_path / "x.npz"), "--steps", "5", *SHORT]) == 0
+    assert "no alpha" in capsys.readouterr().err
+
+
+def test_sizes(folder, ad):
+    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    for bits in (8, 10):
+        coding = compression.coded(grid, Images(ad, load_views(folder, "train")), bits, 0)
+        problem = compression.PaletteProblem(coding, load_views(folder, "train"))
+        table = files.palette_table(grid.nodes, problem.stored(), bits)
+        assert files.field_of(table, ad).nbytes == pytest.approx(compression.packed_bytes(grid, bits), rel=0.01)
+
+
+@pytest.mark.slow
+def test_ten_thousand_steps_take_no_more_memory(folder, ad):
+    def resident() -> float:
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+
+    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    problem = grids.GridProblem(grid, load_views(folder, "train"))
+    settings = FitSettings(steps=1000, batch=256, lr=1e-3, measure_every=1000, check_every=100)
+    train(problem, settings, progress=False)
+    before = resident()
+    result = train(problem, dataclasses.replace(settings, steps=10_000), progress=False)
+    assert resident() - before < 30
+    assert result.restarts == 0 and np.isfinite(result.measured["psnr_white_db"])
+
+
+def test_a_view_that_sees_nothing(folder):
+    """An empty view that looks elsewhere takes nothing from the hull."""
+    views = load_views(folder, "train")
+    away = look_at([0, 2.0, 0.1])
+    away[:3, :3] = away[:3, :3] @ np.diag([-1, 1, -1])
+    more = dataclasses.replace(
+        views, images=np.concatenate([views.images, np.zeros_like(views.images[:1])]),
+        poses=np.concatenate([views.poses, away[None]]), focal=np.concatenate([views.focal, views.focal[:1]]),
+        centre=np.concatenate([views.centre, views.centre[:1]]), names=(*views.names, "away.png"),
+    )  # fmt: skip
+    made = [hull.hull(v, (-0.5, -0.7, -0.7), 0.07, (18, 20, 20)) for v in (views, more)]
+    assert made[0].sum() > 500 and (made[0] & ~made[1]).sum() < 0.02 * made[0].sum()

@@ -1,0 +1,297 @@
+"""Reading images with poses: Blender's and nerfstudio's layout, what pixels mean, and what is refused in a sentence."""
+
+import json
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from mi_diffind.tasks.radiance.views import ViewsError, load_views
+
+SIZE = (6, 8)  # height, width
+
+
+def pose(x=0.0, scale=1.0):
+    """A camera at (x, 1, 4) that looks along −z."""
+    matrix = scale * np.eye(4)
+    matrix[3, 3] = 1
+    matrix[:3, 3] = x, 1, 4
+    return matrix.tolist()
+
+
+def write_image(path, seed=0, channels=4, size=SIZE):
+    """Random bytes as PNG; returns them."""
+    values = np.random.default_rng(seed).integers(0, 256, (*size, channels), dtype=np.uint8)
+    Image.fromarray(values[..., 0] if channels == 1 else values).save(path)
+    return values
+
+
+def write_json(path, **content):
+    path.write_text(json.dumps(content))
+
+
+@pytest.fixture
+def blender(tmp_path):
+    """Four views for training, two test views; extensions are left out, as Blender's data has it."""
+    for split, count in (("train", 4), ("test", 2)):
+        (tmp_path / split).mkdir()
+        frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": pose(i)} for i in range(count)]
+        for i in range(count):
+            write_image(tmp_path / split / f"r_{i}.png", i)
+        write_json(tmp_path / f"transforms_{split}.json", camera_angle_x=0.7, frames=frames)
+    return tmp_path
+
+
+def change(folder, name="transforms_train.json", frame=None, **changes):
+    """Change a list of views, or its second frame; ``None`` removes a key."""
+    path = folder / name
+    content = json.loads(path.read_text())
+    target = content if frame is None else content["frames"][frame]
+    target.update(changes)
+    for key in [key for key, value in changes.items() if value is None]:
+        del target[key]
+    path.write_text(json.dumps(content))
+
+
+def linear(byte):
+    """IEC 61966-2-1, of one number."""
+    c = byte / 255
+    return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
+
+
+def test_blender_layout(blender):
+    views = load_views(blender)
+    assert len(views) == 4 and (views.height, views.width) == SIZE and views.images.dtype == np.float32
+    assert views.names == tuple(f"train/r_{i}.png" for i in range(4)) and views.has_alpha and views.box is None
+    assert np.array_equal(views.poses, [pose(i) for i in range(4)]) and np.array_equal(views.origins[:, 0], range(4))
+    assert np.allclose(views.focal, 4 / np.tan(0.35)) and np.array_equal(views.centre[0], [4, 3])
+    assert len(load_views(blender, "test")) == 2
+    with pytest.raises(ViewsError, match=r"transforms_val\.json: no such file$"):
+        load_views(blender, "val")
+    assert load_views(blender).digest == views.digest != load_views(blender, "test").digest
+
+
+def test_pixels_are_linear_and_multiplied_by_alpha(blender):
+    stored = write_image(blender / "train" / "r_0.png", 7)
+    image = load_views(blender).images[0]
+    for y, x in ((0, 0), (2, 5), (5, 7)):
+        *colour, alpha = (int(v) for v in stored[y, x])
+        expected = [linear(c) * alpha / 255 for c in colour]
+        assert image[y, x] == pytest.approx([*expected, alpha / 255], abs=1e-6)
+
+
+def test_exr_is_taken_as_it_is(blender):
+    values = np.random.default_rng(3).random((*SIZE, 4)).astype(np.float32) * [4, 4, 4, 1]
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    (blender / "train" / "r_1.png").unlink()
+    with OpenEXR.File(header, {"RGBA": values.astype(np.float32)}) as file:
+        file.write(str(blender / "train" / "r_1.exr"))
+    views = load_views(blender)
+    assert np.array_equal(views.images[1], values.astype(np.float32)) and views.names[1] == "train/r_1.exr"
+    values[2, 3, 1] = np.nan
+    with OpenEXR.File(header, {"RGBA": values.astype(np.float32)}) as file:
+        file.write(str(blender / "train" / "r_1.exr"))
+    with pytest.raises(ViewsError, match=r"r_1\.exr: has 1 values that are NaN or infinite$"):
+        load_views(blender)
+
+
+def test_images_without_alpha_are_opaque(blender):
+    stored = write_image(blender / "train" / "r_2.png", 5, channels=3)
+    Image.fromarray(stored).save(blender / "train" / "r_3.jpg", quality=95)
+    (blender / "train" / "r_3.png").unlink()
+    grey = write_image(blender / "train" / "r_1.png", 6, channels=1)
+    views = load_views(blender)
+    assert not views.has_alpha and (views.images[1:, ..., 3] == 1).all() and views.images[0, ..., 3].min() < 1
+    assert views.images[2, 3, 4, :3] == pytest.approx([linear(c) for c in stored[3, 4]], abs=1e-6)
+    assert views.images[1, 3, 4, :3] == pytest.approx([linear(grey[3, 4, 0])] * 3, abs=1e-6)
+    assert views.names[3] == "train/r_3.jpg"
+
+
+def test_rays_go_through_the_middles_of_pixels(blender):
+    """Against a projection of points: what lies on a ray lands on its pixel."""
+    turn = np.array(pose())
+    turn[:3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    turn[:3, :3] *= np.sign(np.linalg.det(turn[:3, :3]))
+    change(blender, frame=1, transform_matrix=turn.tolist())
+    change(blender, fl_x=9.0, fl_y=7.0, cx=3.5, cy=2.5, camera_angle_x=None)
+    views = load_views(blender)
+    x, y = np.meshgrid(np.arange(8), np.arange(6))
+    origin, direction = views.rays(np.full(x.shape, 1), x, y)
+    assert np.allclose(np.linalg.norm(direction, axis=-1), 1) and np.allclose(origin, turn[:3, 3])
+    local = np.linalg.inv(turn) @ np.concatenate([origin + 3 * direction, np.ones((6, 8, 1))], -1)[..., None]
+    local = local[..., 0]
+    assert (local[..., 2] < 0).all()  # in front, which is −z
+    assert np.allclose(3.5 + 9 * local[..., 0] / -local[..., 2], x + 0.5)
+    assert np.allclose(2.5 - 7 * local[..., 1] / -local[..., 2], y + 0.5)  # y is up, rows go down
+
+
+def test_pixels_can_be_averaged(blender):
+    whole, half = load_views(blender), load_views(blender, reduce=2)
+    assert half.images.shape == (4, 3, 4, 4)
+    assert half.images[1, 2, 3] == pytest.approx(whole.images[1, 4:6, 6:8].mean(axis=(0, 1)), abs=1e-6)
+    assert np.allclose(half.rays(0, 1, 1)[1], whole.rays(0, 2.5, 2.5)[1])
+    with pytest.raises(ViewsError, match=r"has 8 × 6 pixels, which cannot be taken 4 by 4$"):
+        load_views(blender, reduce=4)
+
+
+def test_without_test_views_every_eighth_is_one(blender):
+    (blender / "transforms_test.json").unlink()
+    assert load_views(blender).names == tuple(f"train/r_{i}.png" for i in (1, 2, 3))
+    assert load_views(blender, "test").names == ("train/r_0.png",)
+
+
+def test_a_box_is_read(blender):
+    change(blender, aabb=[[-1, 0, -1], [1, 2, 1]])
+    assert np.array_equal(load_views(blender).box, [[-1, 0, -1], [1, 2, 1]])
+    for wrong in ([[0, 0, 0], [1, 1, 0]], [0, 1], [[0, 0, 0], [1, "a", 1]], None):
+        if wrong is not None:
+            change(blender, aabb=wrong)
+            with pytest.raises(ViewsError, match=r'train\.json: has the "aabb" .*, expected two corners'):
+                load_views(blender)
+
+
+@pytest.fixture
+def studio(tmp_path):
+    """Ten views as nerfstudio writes them."""
+    (tmp_path / "images").mkdir()
+    frames = []
+    for i in range(10):
+        write_image(tmp_path / "images" / f"frame_{i:05d}.png", i, channels=3)
+        frames.append({"file_path": f"images/frame_{i:05d}.png", "transform_matrix": pose(i), "colmap_im_id": i})
+    write_json(
+        tmp_path / "transforms.json", w=8, h=6, fl_x=10.0, fl_y=11.0, cx=4.5, cy=3.25, k1=0.0, k2=0, p1=0.0, p2=0.0,
+        camera_model="OPENCV", applied_transform=np.eye(4)[:3].tolist(), frames=frames,
+    )  # fmt: skip
+    return tmp_path
+
+
+def test_nerfstudio_layout(studio):
+    train, test = load_views(studio), load_views(studio, "test")
+    assert [name[-6:-4] for name in test.names] == ["00", "08"] and len(train) == 8
+    assert np.array_equal(train.focal, [[10, 11]] * 8) and np.array_equal(train.centre, [[4.5, 3.25]] * 8)
+    assert np.array_equal(train.poses[0], pose(1)) and not train.has_alpha
+    listed = [f"images/frame_{i:05d}.png" for i in range(10)]
+    change(studio, "transforms.json", train_filenames=listed[3:], test_filenames=listed[:2])
+    assert [name[-6:-4] for name in load_views(studio, "test").names] == ["00", "01"]
+    assert len(load_views(studio)) == 7
+    with pytest.raises(ViewsError, match=r'has no list "val_filenames"'):
+        load_views(studio, "val")
+    change(studio, "transforms.json", test_filenames=["images/other.png"])
+    with pytest.raises(ViewsError, match=r"test_filenames\" names 'images/other.png', which is not among the frames$"):
+        load_views(studio, "test")
+
+
+def test_cameras_of_single_frames(studio):
+    change(studio, "transforms.json", frame=3, fl_x=12.0, cx=4.0)
+    views = load_views(studio)
+    assert views.focal[2].tolist() == [12, 11] and views.centre[2].tolist() == [4, 3.25]
+    assert views.focal[1].tolist() == [10, 11]
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, "has the camera model 'OPENCV_FISHEYE', allowed are pinholes"),
+        ({"is_fisheye": True}, "has the camera model 'fisheye', allowed are pinholes"),
+        ({"k1": 0.02}, r'has a distortion \("k1" is 0.02\): undistort the images first'),
+        ({"p2": -1e-3}, r'has a distortion \("p2" is -0.001\)'),
+        ({"fl_x": None}, "has no focal length"),
+        ({"fl_x": 0}, 'has the "fl_x" 0, expected a number > 0'),
+        ({"fl_x": "10"}, "has the \"fl_x\" '10', expected a number"),
+        ({"camera_angle_x": 4.0}, 'has the "camera_angle_x" 4, expected radians'),
+        ({"w": 16}, "has 8 × 6 pixels, .*json says 16 × 6"),
+        ({"frames": []}, 'has no "frames"'),
+        ({"frames": [{"transform_matrix": 1}]}, 'frame 0 has no "file_path"'),
+    ],
+)
+def test_cameras_that_are_refused(studio, changes, message):
+    change(studio, "transforms.json", **changes)
+    with pytest.raises(ViewsError, match=message) as e:
+        load_views(studio)
+    assert "\n" not in str(e.value) and str(studio) in str(e.value)
+
+
+def shear():
+    matrix = np.array(pose())
+    matrix[0, 1] = 0.04
+    matrix[:, 1] /= np.linalg.norm(matrix[:3, 1])
+    return matrix.tolist()
+
+
+def mirror():
+    return (np.array(pose()) * [1, 1, -1, 1]).tolist()
+
+
+@pytest.mark.parametrize(
+    "matrix, message",
+    [
+        (None, 'has no "transform_matrix"'),
+        (pose(np.nan), "with NaN or infinite numbers"),
+        (pose(0, 0.5), r"that scales \(columns of length 0.5, 0.5, 0.5\)"),
+        (shear(), "that shears"),
+        (mirror(), "that mirrors"),
+        (np.eye(3).tolist(), r"of the shape \(3, 3\), expected \(4, 4\)"),
+        ([[1, 2], [3]], "that is no matrix of numbers"),
+        (np.ones((4, 4)).tolist(), "whose last row is not 0, 0, 0, 1"),
+    ],
+)
+def test_poses_that_are_refused(blender, matrix, message):
+    change(blender, frame=2, transform_matrix=matrix)
+    with pytest.raises(ViewsError, match=message) as e:
+        load_views(blender)
+    assert 'transforms_train.json: frame "./train/r_2" has' in str(e.value)
+
+
+def test_a_pose_of_three_rows_is_taken(blender):
+    change(blender, frame=2, transform_matrix=pose(2)[:3])
+    assert np.array_equal(load_views(blender).poses[2], pose(2))
+
+
+def test_images_that_are_refused(blender):
+    path = blender / "train" / "r_1.png"
+    data = path.read_bytes()
+    for broken in (data[: len(data) // 2], b"", b"not an image", data[:40] + b"\0" * 40 + data[80:]):
+        path.write_bytes(broken)
+        with pytest.raises(ViewsError, match=r"r_1\.png: cannot be read as an image"):
+            load_views(blender)
+    write_image(path, size=(6, 6))
+    with pytest.raises(ViewsError, match=r"r_1\.png: has another size than train/r_0\.png \(8 × 6 and 6 × 6 pixels\)"):
+        load_views(blender)
+    Image.fromarray(np.zeros(SIZE, np.uint16)).save(path)
+    with pytest.raises(ViewsError, match=r"r_1\.png: has pixels of the kind I"):
+        load_views(blender)
+    path.unlink()
+    with pytest.raises(ViewsError, match=r"train/r_1: no such image, nor with \.png, .*, transforms_train\.json names"):
+        load_views(blender)
+    (blender / "train" / "r_1.exr").write_bytes(b"no")
+    with pytest.raises(ViewsError, match=r"r_1\.exr: cannot be read as an image"):
+        load_views(blender)
+    with OpenEXR.File({"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage},
+                      {"Z": np.zeros(SIZE, np.float32)}) as file:  # fmt: skip
+        file.write(str(blender / "train" / "r_1.exr"))
+    with pytest.raises(ViewsError, match=r"has the channels Z, expected R, G, B or Y, and A"):
+        load_views(blender)
+
+
+def test_folders_that_are_refused(blender, tmp_path):
+    with pytest.raises(ViewsError, match=r"missing: no such folder$"):
+        load_views(tmp_path / "missing")
+    with pytest.raises(ViewsError, match=r"json: is not a folder$"):
+        load_views(blender / "transforms_train.json")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ViewsError, match=r"holds no views: neither transforms_train\.json nor transforms\.json"):
+        load_views(tmp_path / "empty")
+    change(blender, frame=1, mask_path="mask.png")
+    with pytest.raises(ViewsError, match=r'frame 1 has a "mask_path", masks are not supported'):
+        load_views(blender)
+    content = json.loads((blender / "transforms_train.json").read_text())
+    write_json(blender / "transforms_train.json", **{**content, "frames": content["frames"][:1]})
+    with pytest.raises(ViewsError, match=r"has 1 view for training, at least 2 are needed"):
+        load_views(blender)
+    for broken in ("{", "[1, 2]", "{}"):
+        (blender / "transforms_train.json").write_text(broken)
+        with pytest.raises(ViewsError, match=r"transforms_train\.json: (is not valid JSON|has no \"frames\")"):
+            load_views(blender)
+    with pytest.raises(ValueError, match=r'split: found "all", allowed are train, test, val'):
+        load_views(blender, "all")

@@ -1,0 +1,513 @@
+"""``fit shading``, in sample mode: what a material looks like, references, limited derivatives, training, command."""
+
+import contextlib
+import dataclasses
+import functools
+import json
+import re
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_diffind.cli import main
+from mi_diffind.errors import UsageError
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import load_table, save_table
+from mi_diffind.task import Request
+from mi_diffind.tasks.disney import TASK as DISNEY
+from mi_diffind.tasks.disney.decoder import Decoder
+from mi_diffind.tasks.disney.effects import Effects
+from mi_diffind.tasks.disney.training import uniform_hemisphere
+from mi_diffind.tasks.shading import TASK, material, training
+from mi_diffind.tasks.shading.clip import clipped
+from mi_diffind.tasks.shading.evaluation import Evaluation, reader
+from mi_diffind.tasks.shading.presets import PRESETS
+from mi_diffind.tasks.shading.reference import reference
+from mi_diffind.tasks.texture import TASK as TEXTURE
+from mi_diffind.tasks.texture import training as textures
+from mi_diffind.tasks.texture.presets import PRESETS as TEXTURES
+
+OURS = PRESETS["ours"]
+
+
+@pytest.fixture(scope="module")
+def ad():
+    return array_module("llvm")
+
+
+def bumpy(size=32, metallic=1.0, roughness=0.25, seed=3) -> dict:
+    """The maps of a metal whose normals differ from texel to texel."""
+    rng = np.random.default_rng(seed)
+    xy = 0.5 * rng.uniform(-1, 1, (size, size, 2))
+    normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
+    albedo = np.clip(0.7 + 0.1 * rng.standard_normal((size, size, 3)), 0, 1)
+    rough = np.clip(roughness + 0.05 * rng.standard_normal((size, size, 1)), 0, 1)
+    maps = {"albedo": albedo, "normal": normal, "roughness": rough, "metallic": np.full((size, size, 1), metallic)}
+    return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
+
+
+def pyramid_of(maps, ad):
+    source = from_arrays(maps)
+    return source, Pyramid.of(source, textures.layout_of(source, TEXTURES["ours"]), ad, ("repeat", "repeat"))
+
+
+def directions(ad, rng, n):
+    u = [ad.Float(x) for x in rng.random((4, n), dtype=np.float32)]
+    return uniform_hemisphere(ad, u[0], u[1]), uniform_hemisphere(ad, u[2], u[3])
+
+
+def numpy_of(value) -> np.ndarray:
+    return np.stack([c.numpy() for c in value], axis=-1).astype(np.float64)
+
+
+# -- limited derivatives ----------------------------------------------------------------------------------------------
+
+
+def test_clip_changes_derivatives_only(ad):
+    x = ad.Float([0.5, -2.0, 3.0, 7.0])
+    y = ad.Float([1.0, 2.0, 3.0, 4.0])
+    dr.enable_grad(x, y)
+    value = clipped(x, 0.1)
+    assert np.array_equal(dr.detach(value).numpy(), dr.detach(x).numpy())
+    slopes = ad.Float([0.05, -3.0, 0.1, np.nan])
+    dr.backward(dr.sum(slopes * value + 5 * x * y))
+    # What does not flow through the operation is not touched
+    assert np.allclose(dr.grad(x).numpy(), np.array([0.05, -0.1, 0.1, 0]) + 5 * y.numpy(), atol=1e-6)
+    assert np.allclose(dr.grad(y).numpy(), 5 * dr.detach(x).numpy())
+
+
+def test_clip_of_vectors_and_forward(ad):
+    v = ad.Array3f([1.0, 2.0], [0.0, 0.0], [3.0, -3.0])
+    dr.enable_grad(v)
+    out = clipped(v, 0.25)
+    dr.set_grad(v, ad.Array3f(1.0, -0.1, -9.0))
+    dr.enqueue(dr.ADMode.Forward, v)
+    dr.traverse(dr.ADMode.Forward)
+    assert np.allclose(numpy_of(dr.grad(out))[0], [0.25, -0.1, -0.25])
+    assert clipped(2.5, 0.1) == 2.5 and clipped(dr.detach(v), 0.1) is not None
+
+
+def test_clip_is_for_the_specular_lobe(ad, rng):
+    """With a bound, values stay, the diffuse lobe's derivatives too; those of a highlight are bounded."""
+    wi, wo = directions(ad, rng, 512)
+    effects, results = Effects(**{**dict.fromkeys(("metal", "dielectric", "diffuse"), True),
+                                  **dict.fromkeys(("subsurface", "sheen", "sheen_tint", "spec_tint", "anisotropic",
+                                                   "clearcoat"), False)}), []  # fmt: skip
+    for limit in (None, 1e-3, 1e9):
+        rough = dr.full(ad.Float, 0.1, 512)
+        dr.enable_grad(rough)
+        surface = material.Surface(ad.Array3f(0.5), None, rough, 0.5)
+        value = material.shaded(Decoder(), surface, wi, wo, effects, limit)
+        dr.backward(dr.sum(value.x))
+        results.append((numpy_of(dr.detach(value)), dr.grad(rough).numpy()))
+    (a, free), (b, bounded), (c, loose) = results
+    assert np.allclose(a, b, rtol=1e-5, atol=1e-6) and np.allclose(a, c, rtol=1e-5, atol=1e-6)
+    assert np.allclose(free, loose, rtol=1e-3, atol=1e-3 * np.abs(free).max())
+    # What is left over the bound is the derivative of the diffuse lobe, at most 2 albedo (1 - metallic) · Fresnel
+    assert np.abs(free).max() > 10 and np.abs(bounded).max() < 2
+
+
+# -- what a material looks like ---------------------------------------------------------------------------------------
+
+
+def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
+    """A plugin of Mitsuba's around ours, with textures of one texel a place, evaluated in random directions."""
+    mi, n = mi_rgb, 256
+    ad = array_module("llvm")
+    xy = rng.uniform(-0.65, 0.65, (n, 2))
+    normal = np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], -1)
+    values = {
+        "base_color": rng.random((n, 3)),
+        "roughness": rng.uniform(0.1, 1, (n, 1)),
+        "metallic": rng.random((n, 1)),
+    }
+
+    def texture(v):
+        data = np.ascontiguousarray(v[None], dtype=np.float32)
+        return {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest"}
+
+    bsdf = mi.load_dict({
+        "type": "normalmap", "normalmap": texture(0.5 + 0.5 * normal),
+        "bsdf": {"type": "disney", **{name: texture(v) for name, v in values.items()}},
+    })  # fmt: skip
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.uv = mi.Point2f(mi.Float((np.arange(n) + 0.5) / n), 0.5)
+    si.sh_frame, si.dp_du, si.n = mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Vector3f(1, 0, 0), mi.Normal3f(0, 0, 1)
+    wi, wo = directions(ad, rng, n)
+    si.wi = mi.Vector3f(*wi)
+    expected = np.pi * np.stack([c.numpy() for c in bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(*wo))], -1)
+
+    def columns(v):
+        return [ad.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in v.T]
+
+    surface = material.Surface(
+        ad.Array3f(columns(values["base_color"])), ad.Array3f(columns(normal)), *columns(values["roughness"]),
+        *columns(values["metallic"]),
+    )  # fmt: skip
+    effects, _ = material.effects_of(pyramid_of(bumpy(8), ad)[1].layout)
+    for decoder in (Decoder(), None):
+        got = numpy_of(material.shaded(decoder, surface, wi, wo, dataclasses.replace(effects, diffuse=True,
+                                                                                     dielectric=True)))  # fmt: skip
+        assert np.allclose(got, expected, rtol=2e-3, atol=2e-4)
+    assert (expected.max(axis=-1) == 0).mean() < 0.3 and (expected > 0.5).any()
+    flat = material.shaded(Decoder(), dataclasses.replace(surface, normal=None), wi, wo, effects)
+    assert not np.allclose(numpy_of(flat), expected, rtol=0.1, atol=0.1)
+
+
+def test_effects_follow_the_maps(ad):
+    def effects(**changed):
+        maps = {k: v for k, v in {**bumpy(8), **changed}.items() if v is not None}
+        return material.effects_of(pyramid_of(maps, ad)[1].layout)
+
+    found, reasons = effects()
+    assert not found.diffuse and found.metal and not found.dielectric and reasons["diffuse"] == "metallic is 1"
+    found, reasons = effects(metallic=None)
+    assert found.diffuse and not found.metal and found.lobes == ("diffuse", "specular")
+    assert reasons["metal"] == "metallic is 0"
+    grey = np.repeat(bumpy(8)["roughness"], 3, axis=2)
+    assert effects(albedo=grey, metallic=None)[0] == found
+    extra = pyramid_of({**bumpy(8), "ao": bumpy(8)["roughness"]}, ad)[1].layout
+    assert list(material.left_out(extra)) == ["ao"]
+
+
+def test_extreme_materials_stay_finite(ad, rng):
+    """Roughness 0, black, short and vanishing normals, directions at the horizon: values and derivatives."""
+    n = 4096
+    wi, wo = directions(ad, rng, n)
+    flat = rng.choice([1e-7, 1e-4, 0.5, 1.0], (2, n)).astype(np.float32)
+    wi, wo = (dr.normalize(type(w)(w.x, w.y, w.z * ad.Float(s))) for w, s in zip((wi, wo), flat, strict=True))
+    normal = ad.Array3f(*(ad.Float(x) for x in rng.choice([-1.0, 0.0, 1e-8, 0.7], (3, n)).astype(np.float32)))
+    albedo = ad.Array3f(*(ad.Float(x) for x in rng.choice([0.0, 1e-8, 1.0], (3, n)).astype(np.float32)))
+    rough, metal = (ad.Float(x) for x in rng.choice([0.0, 1e-4, 1.0], (2, n)).astype(np.float32))
+    for decoder in (Decoder(), material.frozen_decoder(ad)):
+        leaves = [type(x)(x) for x in (normal, albedo, rough, metal)]
+        dr.enable_grad(leaves)
+        surface = material.Surface(leaves[1], leaves[0], leaves[2], leaves[3])
+        value = material.shaded(decoder, surface, wi, wo, Effects(), 0.1)
+        assert np.isfinite(numpy_of(dr.detach(value))).all() and (numpy_of(dr.detach(value)) >= 0).all()
+        dr.backward(dr.sum(sum(dr.minimum(c, 10) for c in value)))
+        for leaf in leaves:
+            assert all(np.isfinite(g).all() for g in np.atleast_2d(dr.grad(leaf).numpy()))
+
+
+# -- references -------------------------------------------------------------------------------------------------------
+
+
+def lanes(ad, rng, n, level):
+    u, v = (ad.Float(x) for x in rng.random((2, n), dtype=np.float32))
+    return u, v, dr.full(ad.Float, level, n), *directions(ad, rng, n)
+
+
+def test_references_agree_where_nothing_varies(ad, rng):
+    maps = bumpy(8, metallic=0.0)
+    flat = {name: np.repeat(np.repeat(v[:1, :1], 8, 0), 8, 1) for name, v in maps.items()}
+    flat["roughness"][0, 0] += 1  # one texel differs: something has to be stored
+    _, pyramid = pyramid_of(flat, ad)
+    effects, _ = material.effects_of(pyramid.layout)
+    at = lanes(ad, rng, 64, 0.0)
+    at = (ad.Float(0.6), ad.Float(0.6), *at[2:])
+    at = tuple(x + dr.zeros(ad.Float, 64) if i < 2 else x for i, x in enumerate(at))
+    expected = numpy_of(reader(pyramid, effects)(*at))
+    for kind in ("converged", "prefiltered", "jittered"):
+        got = numpy_of(reference(kind, pyramid, *at, effects, dr.rng(seed=1)))
+        assert np.allclose(got, expected, rtol=1e-4, atol=1e-5)
+    assert expected.max() > 0
+
+
+def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
+    """Against NumPy: bilinear reads, and the formulas shaded texel by texel."""
+    size, n, level = 16, 6, 2.0
+    source, pyramid = pyramid_of(bumpy(size, metallic=0.5), ad)
+    effects, _ = material.effects_of(pyramid.layout)
+    at = lanes(ad, rng, n, level)
+    u, v = at[0].numpy().astype(np.float64), at[1].numpy().astype(np.float64)
+    k = (np.arange(16) + 0.5) / 16 - 0.5
+    x = (u[:, None, None] + k[None, None, :] * 4 / size) * size - 0.5 + np.zeros((n, 16, 16))
+    y = (v[:, None, None] + k[None, :, None] * 4 / size) * size - 0.5 + np.zeros((n, 16, 16))
+    fx, fy = x - np.floor(x), y - np.floor(y)
+    x0, y0 = np.floor(x).astype(int) % size, np.floor(y).astype(int) % size
+
+    def read(values):
+        total = 0
+        for i, a in ((0, 1 - fy), (1, fy)):
+            for j, b in ((0, 1 - fx), (1, fx)):
+                total = total + (a * b)[..., None] * values[(y0 + i) % size, (x0 + j) % size]
+        return total.reshape(n * 256, -1)
+
+    maps = {m.name: m.values.astype(np.float64) for m in source.maps}
+    decode = np.where(maps["albedo"] <= 0.04045, maps["albedo"] / 12.92, ((maps["albedo"] + 0.055) / 1.055) ** 2.4)
+    # The third component follows from the other two, as it is stored
+    xy = 2 * read(maps["normal"])[:, :2] - 1
+    normal = np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], -1)
+
+    def columns(values):
+        return [ad.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in values.T]
+
+    surface = material.Surface(
+        ad.Array3f(columns(read(decode))), ad.Array3f(columns(normal)), *columns(read(maps["roughness"])),
+        *columns(read(maps["metallic"])),
+    )  # fmt: skip
+    index = dr.arange(ad.UInt32, n * 256) // 256
+    wi, wo = (dr.gather(type(w), w, index) for w in at[3:])
+    expected = numpy_of(material.shaded(None, surface, wi, wo, effects)).reshape(n, 256, 3).mean(axis=1)
+    got = numpy_of(reference("converged", pyramid, *at, effects))
+    assert np.allclose(got, expected, rtol=2e-3, atol=1e-3) and expected.max() > 0.05
+
+
+def test_jittered_reference_is_right_on_average(ad, rng):
+    _, pyramid = pyramid_of(bumpy(16, metallic=0.5, roughness=0.5), ad)
+    effects, _ = material.effects_of(pyramid.layout)
+    n, repeats = 16, 512
+    at = lanes(ad, rng, n, 3.0)
+    truth = numpy_of(reference("converged", pyramid, *at, effects, side=64))
+    index = dr.arange(ad.UInt32, n * repeats) % n
+    many = [dr.gather(type(x), x, index) for x in at]
+    got = numpy_of(reference("jittered", pyramid, *many, effects, dr.rng(seed=5))).reshape(repeats, n, 3)
+    error = got.mean(axis=0) - truth
+    deviation = got.std(axis=0) / np.sqrt(repeats) + 1e-3 * truth.max()
+    assert np.abs(error / deviation).max() < 5 and np.sqrt(np.mean((error / deviation) ** 2)) < 1.5
+    # The paper's prefiltered samples are not: parameters are filtered first, for a footprint of 4 levels more so
+    prefiltered = numpy_of(reference("prefiltered", pyramid, *at, effects))
+    assert np.abs((prefiltered - truth) / deviation).max() > 5
+
+
+def test_unknown_references_are_refused(ad, rng):
+    _, pyramid = pyramid_of(bumpy(8), ad)
+    effects, _ = material.effects_of(pyramid.layout)
+    with pytest.raises(ValueError, match='found "blurred", allowed are converged, prefiltered, jittered'):
+        reference("blurred", pyramid, *lanes(ad, rng, 4, 0.0), effects)
+    with pytest.raises(ValueError, match="needs random numbers"):
+        reference("jittered", pyramid, *lanes(ad, rng, 4, 0.0), effects)
+
+
+# -- training ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def start(ad, tmp_path_factory):
+    """A metal trained as a texture: source, pyramid, table, the images that measure, its file, and its size."""
+    from mi_diffind.tasks.texture.fit import size_of
+
+    source, pyramid = pyramid_of(bumpy(), ad)
+    recipe = TEXTURES["ours"]
+    recipe = dataclasses.replace(
+        recipe, settings=dataclasses.replace(recipe.settings, steps=60, batch=4096, measure_every=60)
+    )
+    options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
+    options["skip"] = 2
+    size = size_of(source, pyramid, source.nbytes / 2, recipe, options)
+    request = Request("ours", recipe.settings, ad, progress=False)
+    table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
+    path = tmp_path_factory.mktemp("shading") / "start.npz"
+    save_table(path, table)
+    effects, _ = material.effects_of(pyramid.layout)
+    evaluation = Evaluation(pyramid, effects, levels=4, pairs=24, side=16)
+    return source, pyramid, TEXTURE.load(path), evaluation, path, size
+
+
+def quick(**changed):
+    settings = {"steps": 60, "batch": 4096, "measure_every": 60, "lr": 1e-2}
+    settings |= {k: changed.pop(k) for k in list(changed) if k in ("steps", "batch", "measure_every", "lr", "loss")}
+    return dataclasses.replace(OURS, settings=dataclasses.replace(OURS.settings, **settings), **changed)
+
+
+def trained(start, ad, recipe, measured=True, **request):
+    source, pyramid, table, evaluation, *_ = start
+    evaluation = evaluation if measured else None
+    net = training.start_of(table, pyramid)
+    asked = Request("ours", recipe.settings, ad, progress=False, **request)
+    return training.fit_shading(source, net, recipe, asked, pyramid, evaluation)
+
+
+def test_training_for_shading_gains(start, ad):
+    """More than 1.5 dB on coarse levels over what was trained as a texture; and the BRDF's tables stay as they were."""
+    _, pyramid, table, evaluation, *_ = start
+    effects, _ = material.effects_of(pyramid.layout)
+    decoder = material.frozen_decoder(ad)
+    arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
+    before = {name: array.numpy().copy() for name, array in arrays.items()}
+    from mi_diffind.tasks.texture.compressed import CompressedTexture
+
+    old = evaluation.measure(reader(CompressedTexture.of(table, ad.TensorXf), effects, decoder), flip=False)
+    found, result = trained(start, ad, quick())
+    assert result.restarts == 0
+    new = evaluation.measure(reader(CompressedTexture.of(found, ad.TensorXf), effects, decoder), flip=False)
+    assert new["C"]["coarse_db"] > old["C"]["coarse_db"] + 1.5
+    assert found.measured["shaded_converged_db"] == pytest.approx(new["C"]["mean_db"], abs=1e-3)
+    assert found.task == "texture" and found.settings["shading"]["share"] == 0.9
+    arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
+    for name, values in before.items():
+        assert np.array_equal(arrays[name].numpy(), values)
+
+
+def test_a_training_that_loses_keeps_its_start(start, ad):
+    """At a rate that destroys everything, what comes out is what went in."""
+    table = start[2]
+    found, _ = trained(start, ad, quick(steps=2, measure_every=2, lr=0.3))
+    assert found.settings["kept_start"]
+    for name, array in table.arrays.items():
+        assert np.array_equal(found.arrays[name].entries, array.entries)
+
+
+def test_share_zero_is_the_texture_alone(start, ad):
+    """λ = 0 trains as task 4 does, entry by entry."""
+    source, pyramid, table, *_ = start
+    recipe = quick(share=0.0, steps=5)
+    found, _ = trained(start, ad, recipe, measured=False)  # else the start might be kept
+    problem = textures.TextureProblem(training.start_of(table, pyramid), pyramid, TEXTURES["ours"], source.digest)
+    from mi_diffind.fitting import fit
+
+    fit(problem, recipe.settings, progress=False)
+    # Settings say "mse" in both, and the samples are those of the same seed
+    for name, array in textures.stored_form(problem.net).arrays.items():
+        assert np.array_equal(found.arrays[name].entries, array.codes()), name
+
+
+def test_training_can_be_resumed(start, ad, tmp_path):
+    whole, _ = trained(start, ad, quick(steps=8, measure_every=4))
+
+    class Stop(Exception):
+        pass
+
+    checkpoint, problem_measure, calls = tmp_path / "state", training.ShadingProblem.measure, []
+
+    def measure(self, net):
+        calls.append(1)
+        if len(calls) == 3:  # the start, and the first two measurements
+            raise Stop
+        return problem_measure(self, net)
+
+    training.ShadingProblem.measure = measure
+    try:
+        with pytest.raises(Stop):
+            trained(start, ad, quick(steps=8, measure_every=4), checkpoint=checkpoint)
+    finally:
+        training.ShadingProblem.measure = problem_measure
+    again, result = trained(start, ad, quick(steps=8, measure_every=4), checkpoint=checkpoint, resume=True)
+    assert result.steps == 8
+    for name, array in whole.arrays.items():
+        assert np.array_equal(array.entries, again.arrays[name].entries)
+
+
+def test_gradient_of_the_loss_is_that_of_finite_differences(start, ad):
+    """Of the cascaded array's entries, without rounding and without bounds."""
+    source, pyramid, table, *_ = start
+    recipe = quick(share=1.0, clip=None, reference="converged")
+    problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, recipe, source.digest)
+    problem.settings = recipe.settings
+    problem.recipe = dataclasses.replace(problem.recipe, rounded=False)
+    net = problem.net
+    original = dr.detach(net.cascaded.data)
+    values = original.numpy()
+    # Inside of the interval: what lies at its ends is folded back
+    values = np.clip(values, 0.05, 0.95)
+
+    def loss(entries, gradient=False):
+        data = ad.TensorXf(entries)
+        if gradient:
+            dr.enable_grad(data)
+        net.cascaded.data = data
+        total = dr.sum(sum(dr.sum(x) for x in problem.loss(net, dr.rng(seed=dr.opaque(ad.UInt64, 7)), 2048)))
+        if not gradient:
+            return float(total[0])
+        dr.backward(total)
+        return dr.grad(data).numpy()
+
+    derivative = loss(values, True)
+    largest = np.argsort(-np.abs(derivative).ravel())[:12]
+    for i in largest:
+        step = np.zeros(values.size, np.float32)
+        step[i] = 4e-3
+        step = step.reshape(values.shape)
+        finite = (loss(values + step) - loss(values - step)) / 8e-3
+        assert derivative.ravel()[i] == pytest.approx(finite, rel=0.05, abs=0.02 * float(np.abs(derivative).max()))
+    net.cascaded.data = original
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def manifest(tmp_path):
+    import mitsuba as mi
+
+    names = {}
+    for name, values in bumpy().items():
+        file = f"{name}.png"
+        mi.Bitmap(np.ascontiguousarray(values if values.shape[2] == 3 else values[..., 0])).write(str(tmp_path / file))
+        names[name] = file
+    path = tmp_path / "metal.json"
+    path.write_text(json.dumps({"maps": names}))
+    return path
+
+
+def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tmp_path, monkeypatch):
+    from mi_diffind.tasks.shading import fit as shading_fit
+
+    mi = mi_rgb
+    short = dataclasses.replace(TEXTURES["ours"].settings, steps=6, batch=4096, measure_every=6)
+    monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], settings=short))
+    monkeypatch.setattr(shading_fit, "Evaluation", functools.partial(Evaluation, levels=4, pairs=24, side=16))
+    # The same arrays as those of other tests, lest everything is compiled anew
+    monkeypatch.setattr(shading_fit.texture_fit, "size_of", lambda *a: start[5])
+    out, record = tmp_path / "metal.npz", tmp_path / "record.json"
+    command = ["fit", "shading", str(manifest), "-o", str(out), "--steps", "6", "--batch", "4096", "--border", "repeat",
+               "--json", str(record), "--checkpoint", str(tmp_path / "state")]  # fmt: skip
+    assert main(command) == 0
+    said = json.loads(record.read_text())
+    assert said["task"] == "shading" and said["settings"]["shading"]["share"] == OURS.share
+    assert said["effects_left_out"]["diffuse"] == "metallic is 1" and said["measured"]["shaded_converged_db"] > 10
+    assert np.array(mi.Bitmap(str(tmp_path / "metal_preview.png"))).shape == (2 * 192, 3 * 192, 3)
+    texture = mi.load_dict({"type": "neural_texture", "filename": str(out), "channels": "roughness"})
+    si = dr.zeros(mi.SurfaceInteraction3f, 4)
+    assert np.isfinite(texture.eval_1(si).numpy()).all()
+    first = out.read_bytes()
+    assert main([*command, "--resume"]) == 0 and out.read_bytes() == first
+    assert load_table(out).task == "texture"
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        (["--lambda", "1.5"], "argument --lambda: found '1.5', allowed are numbers from 0 to 1"),
+        (["--clip", "-1"], "argument --clip: found '-1', expected a positive number or none"),
+        (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size"),
+        (["--spp", "4"], "unrecognized arguments: --spp 4"),
+    ],
+)
+def test_bad_arguments_are_one_sentence(manifest, tmp_path, capsys, changed, message):
+    with pytest.raises(SystemExit) if "argument " in message or "arguments" in message else contextlib.nullcontext():
+        assert main(["fit", "shading", str(manifest), "-o", str(tmp_path / "x.npz"), *changed]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_scenes_and_materials_have_tasks_of_their_own(tmp_path, capsys):
+    output = ["-o", str(tmp_path / "x.npz")]
+    assert main(["fit", "shading", "room.xml", *output]) == 2
+    assert "found the scene room.xml; fit scene trains a texture inside a scene" in capsys.readouterr().err
+    assert main(["fit", "scene", "material.json", *output]) == 2
+    assert "found material.json, a scene file (.xml) is needed" in capsys.readouterr().err
+
+
+def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
+    only = {"height": bumpy(8)["roughness"]}
+    with pytest.raises(UsageError, match="found no map that shading reads, these are albedo, normal"):
+        material.effects_of(pyramid_of(only, ad)[1].layout)
+    wide = {"albedo": np.zeros((4, 4, 2), np.uint8)}
+    with pytest.raises(UsageError, match='map "albedo": found 2 channels, allowed for albedo are 1 or 3'):
+        material.effects_of(pyramid_of(wide, ad)[1].layout)
+    from mi_diffind.tasks.shading.fit import started
+
+    with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
+        started(
+            start[4], from_arrays(bumpy(seed=9)), Request("ours", OURS.settings, ad, options={"source": "other.json"})
+        )
+
+
+def test_published_recipe_is_a_preset():
+    paper = PRESETS["paper"]
+    assert (paper.share, paper.clip, paper.reference, paper.bounded) == (0.25, 0.1, "prefiltered", False)
+    assert re.search("supplemental 1.5", TASK.section)

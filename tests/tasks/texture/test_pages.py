@@ -1,0 +1,166 @@
+"""``fit texture`` with arrays of pages: an independent reading, files, which textures get them, what they gain."""
+
+import dataclasses
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.task import Request
+from mi_diffind.tasks.texture import TASK, arrays, memory_budget, training
+from mi_diffind.tasks.texture.compressed import CompressedTexture
+from mi_diffind.tasks.texture.presets import PRESETS
+
+TYPES = array_module("llvm")
+
+
+def sparse(side=64):
+    """Noise in a corner, one colour elsewhere."""
+    values = np.full((side, side, 3), 0.4, np.float32)
+    quarter = side // 4
+    values[:quarter, :quarter] = np.random.default_rng(0).random((quarter, quarter, 3))
+    return from_arrays({"albedo": np.rint(255 * values).astype(np.uint8)})
+
+
+def recipe(steps=4):
+    own = PRESETS["ours"]
+    settings = dataclasses.replace(own.settings, steps=steps, batch=2048, measure_every=steps)
+    return dataclasses.replace(own, settings=settings)
+
+
+def trained(source, size, steps=4):
+    own = recipe(steps)
+    pyramid = Pyramid.of(source, training.layout_of(source, own), TYPES, ("repeat", "clamp"))
+    table, _ = training.fit_texture(source, size, own, Request("ours", own.settings, TYPES, progress=False), pyramid)
+    return table
+
+
+def paged(source, nbytes=3000):
+    return memory_budget.paged(source.height, source.width, 3, nbytes, 4)
+
+
+@pytest.fixture(scope="module")
+def table():
+    source = sparse()
+    return trained(source, paged(source))
+
+
+def bilinear(entries, x, y):
+    """A grid whose outer entries are at 0 and 1, at (x, y) along columns and rows."""
+    rows, columns = entries.shape[:2]
+    i, j = min(int(y * (rows - 1)), max(rows - 2, 0)), min(int(x * (columns - 1)), max(columns - 2, 0))
+    a, b = y * (rows - 1) - i, x * (columns - 1) - j
+    i2, j2 = min(i + 1, rows - 1), min(j + 1, columns - 1)
+    above = (1 - b) * entries[i, j] + b * entries[i, j2]
+    return (1 - a) * above + a * ((1 - b) * entries[i2, j] + b * entries[i2, j2])
+
+
+def page_read(table, name, side, u, v):
+    """What an array of pages, 16 texels wide from the first texel's centre on, says at (u, v); u clamps, v wraps."""
+    sizes = table.arrays[f"{name}_pages"].entries.astype(int) + 1
+    starts = np.cumsum(sizes.prod(axis=2).ravel()) - sizes.prod(axis=2).ravel()
+    pages, values = len(sizes), table.arrays[name].values
+    y, x = (v % 1) * pages - 0.5 * pages / side, u * pages - 0.5 * pages / side
+    y, x = y + pages if y < 0 else y, min(max(x, 0), pages)
+    i, j = min(int(y), pages - 1), min(int(x), pages - 1)
+    rows, columns = sizes[i, j]
+    start = starts[i * pages + j]
+    return bilinear(values[start : start + rows * columns].reshape(rows, columns, -1), x - j, y - i)
+
+
+def test_reading_against_numpy(table):
+    """Level 0 reads its pages alone; between levels 1 and 2 the pointers of both arrays are mixed."""
+    texture = CompressedTexture.of(table, TYPES.TensorXf)
+    cascaded = texture.arrays["cascaded"]
+    rng = np.random.default_rng(1)
+    for level in (0.0, 1.0, 1.25, 2.0):
+        u, v = rng.random((2, 40)).astype(np.float32)
+        fine = np.stack([page_read(table, "level0", 64, *p) for p in zip(u, v, strict=True)])
+        coarse = np.stack([page_read(table, "level2", 16, *p) for p in zip(u, v, strict=True)])
+        share = min(max(level - 1, 0), 1)
+        pointer = (1 - share) * fine + share * coarse
+        expected = cascaded([TYPES.Float(level / 4), *(TYPES.Float(p) for p in pointer.T)])
+        got = texture.filtered(TYPES.Float(u), TYPES.Float(v), TYPES.Float(level))
+        for a, b in zip(got, expected, strict=True):
+            np.testing.assert_allclose(a.numpy(), b.numpy(), atol=2e-3)
+        if level == 0:
+            stored = texture.stored(TYPES.Float(u), TYPES.Float(v))
+            np.testing.assert_allclose([s.numpy() for s in stored], [g.numpy() for g in got], atol=1e-5)
+
+
+def test_levels_are_continuous_and_any_is_allowed(table):
+    texture = CompressedTexture.of(table, TYPES.TensorXf, "float32")
+    u, v = np.random.default_rng(2).random((2, 64)).astype(np.float32)
+
+    def read(level):
+        return np.stack([c.numpy() for c in texture.filtered(TYPES.Float(u), TYPES.Float(v), TYPES.Float(level))])
+
+    for level in (1, 2, 3, 4, 5):
+        np.testing.assert_allclose(read(level - 1e-4), read(level + 1e-4), atol=2e-3)
+    np.testing.assert_array_equal(read(np.nan), read(0))
+    np.testing.assert_array_equal(read(np.inf), read(6))
+    np.testing.assert_array_equal(read(-3), read(0))
+
+
+def test_gradients_reach_every_array(table):
+    texture = CompressedTexture.of(table, TYPES.TensorXf, "float32")
+    u, v = (TYPES.Float(x.astype(np.float32)) for x in np.random.default_rng(3).random((2, 4096)))
+    data = [array.data for array in texture.arrays.values()]
+    dr.enable_grad(*data, u, v)
+    dr.backward(sum(texture.filtered(u, v, TYPES.Float(np.linspace(0, 6, 4096)))))
+    for value in (*(d.array for d in map(dr.grad, data)), dr.grad(u), dr.grad(v)):
+        found = value.numpy()
+        assert np.isfinite(found).all() and np.abs(found).max() > 0
+
+
+def test_files_come_back(table, tmp_path):
+    save_table(tmp_path / "t.npz", table)
+    found = TASK.load(tmp_path / "t.npz")
+    assert found.nbytes == table.nbytes <= 3000
+    assert set(found.arrays) == {"level0", "level0_pages", "level2", "level2_pages", "coarse", "cascaded"}
+    for name, array in table.arrays.items():
+        np.testing.assert_array_equal(found.arrays[name].entries, array.entries)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda t: t.arrays.pop("level0_pages"), "holds the arrays"),
+        (lambda t: t.arrays.update(level0_pages=t.arrays["level2_pages"]), "has the shape"),
+        (lambda t: t.arrays.update(level0=StoredArray(t.arrays["level0"].entries[:-1], ("clamp",),
+                                                      t.arrays["level0"].scale, t.arrays["level0"].offset, 5)),
+         "expected"),
+    ],
+)  # fmt: skip
+def test_damaged_files_are_refused(table, tmp_path, change, message):
+    save_table(tmp_path / "t.npz", table)
+    found = load_table(tmp_path / "t.npz")
+    change(found)
+    save_table(tmp_path / "t.npz", found)
+    with pytest.raises(TableError, match=message):
+        TASK.load(tmp_path / "t.npz")
+
+
+def test_which_textures_get_pages():
+    """Those whose detail is in few places; not those that are noise all over, nor those too small for pages."""
+    source = sparse()
+    noise = np.random.default_rng(4).integers(0, 256, (64, 64, 3), np.uint8)
+    for maps, more in ((source, True), (from_arrays({"albedo": noise}), False)):
+        pyramid = Pyramid.of(maps, training.layout_of(maps, recipe()), TYPES, ("repeat", "clamp"))
+        gain = arrays.gain_of_pages(pyramid.values, paged(maps), pyramid.border)
+        assert (gain >= training.GAIN_DB) == more, gain
+    assert memory_budget.paged(8, 8, 3, 100) is None and memory_budget.paged(1024, 1024, 3, 20000) is None
+    assert memory_budget.paged(512, 512, 3, 65536).nbytes <= 65536
+
+
+def test_pages_gain_what_they_are_for():
+    """At equal bytes and steps, on a texture of which a sixteenth has detail; every level, not the first alone."""
+    source = sparse()
+    with_pages = trained(source, paged(source, 5000), 60).measured
+    without = trained(source, memory_budget.choose(64, 64, 3, 5000), 60).measured
+    assert with_pages["psnr_db"] > without["psnr_db"] + 3
+    assert with_pages["psnr_worst_db"] > without["psnr_worst_db"]

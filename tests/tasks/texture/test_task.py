@@ -1,0 +1,602 @@
+"""``fit texture``: equations, sizes, arrays that are read at levels of detail, training, files."""
+
+import itertools
+import json
+import math
+import re
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_diffind.cli import main
+from mi_diffind.errors import UsageError
+from mi_diffind.maps.layout import Layout
+from mi_diffind.maps.pyramid import Pyramid, level_sizes
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.task import Request, fit
+from mi_diffind.tasks.texture import TASK, memory_budget, sampling, training
+from mi_diffind.tasks.texture.compressed import CompressedTexture
+from mi_diffind.tasks.texture.memory_budget import Fine, Size, choose, paper_bytes, paper_size, parse_structure
+from mi_diffind.tasks.texture.presets import PRESETS
+
+OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
+
+
+@pytest.fixture(scope="module")
+def ad():
+    return array_module("llvm")
+
+
+def waves(height=16, width=16, channels=3, periods=1):
+    y, x = np.mgrid[0:height, 0:width]
+    y, x = 2 * np.pi * periods * (y + 0.5) / height, 2 * np.pi * periods * (x + 0.5) / width
+    found = [np.sin(x), np.cos(y), np.sin(x + y), np.cos(x - 2 * y)]
+    return np.stack([0.5 + 0.4 * found[i % 4] for i in range(channels)], axis=-1).astype(np.float32)
+
+
+def material(height=32, width=24, seed=0):
+    """A small one, of four stored channels: grey with noise, normals, roughness that follows the grey."""
+    rng = np.random.default_rng(seed)
+    albedo = np.clip(waves(height, width, 1, 2) + 0.08 * rng.standard_normal((height, width, 1)), 0, 1)
+    xy = 0.5 * (waves(height, width, 2, 3) - 0.5)
+    normal = 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(axis=-1, keepdims=True))], axis=-1)
+    maps = {"albedo": albedo, "normal": normal, "roughness": 1 - albedo}
+    return {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
+
+
+def quick(recipe=OURS, **settings):
+    import dataclasses
+
+    given = {"steps": 4, "batch": 2048, "measure_every": 4, **settings}
+    return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **given))
+
+
+def trained(source, size, recipe, **request):
+    types = array_module("llvm")
+    # Of one size and one border, mostly: what differs has to be compiled anew
+    border = request.pop("border", ("repeat", "clamp"))
+    pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, border)
+    request = Request("ours" if recipe.layered else "paper", recipe.settings, types, progress=False, **request)
+    return training.fit_texture(source, size, recipe, request, pyramid)
+
+
+def sized(source, layout=None, fine="0:1:2,1:2:4", skip=2, dims=3, cascaded=5):
+    layout = layout or Layout.of(source, filtered=True)
+    arrays = parse_structure(fine) if fine else ()
+    return Size(source.height, source.width, layout.stored, arrays, skip, dims, cascaded, skip + 1)
+
+
+def texture_of(source, steps=2, fine="0:1:2,1:2:4", skip=2, storage="", **request):
+    table, _ = trained(source, sized(source, fine=fine, skip=skip), quick(steps=steps), **request)
+    return CompressedTexture.of(table, array_module("llvm").TensorXf, storage), table
+
+
+def numpy_of(channels) -> np.ndarray:
+    return np.stack([np.asarray(c.numpy(), np.float64) for c in channels], axis=-1)
+
+
+def read(texture, u, v, level) -> np.ndarray:
+    Float = texture.types.Float
+    u, v, level = np.broadcast_arrays(*(np.float32(x) for x in (u, v, level)))
+    return numpy_of(texture.filtered(Float(u), Float(v), Float(level)))
+
+
+# -- equations --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("base, n", [(1024, 10), (2048, 11), (4096, 12)])
+def test_powers_of_uniform_numbers(rng, base, n):
+    """Equations 3 to 6: half of the samples below a texel's side, and the whole distribution."""
+    t = sampling.threshold(base)
+    assert t == 1 / base and sampling.exponent(t) == pytest.approx(n)
+    assert sampling.power_fraction(t, n) == pytest.approx(0.5)
+    x = np.sort(sampling.footprints(rng.random(200_000), "power", base))
+    for fraction in (0.1, 0.25, 0.5, 0.9):
+        drawn = x[int(fraction * len(x))]
+        assert sampling.power_fraction(drawn, n) == pytest.approx(fraction, abs=0.01)
+    assert sampling.exponent(t, 0.25) == pytest.approx(n / 2) and x.max() < 1
+
+
+def test_exponential_samples(rng):
+    """Equations 7 to 9."""
+    t = 1 / 1024
+    rate = sampling.exponential_rate(t)
+    assert rate == pytest.approx(1024 * math.log(2)) and sampling.exponential_fraction(t, rate) == pytest.approx(0.5)
+    x = sampling.footprints(1 - rng.random(200_000), "exponential", 1024)
+    for below in (0.5 * t, t, 3 * t):
+        assert np.mean(x < below) == pytest.approx(sampling.exponential_fraction(below, rate), abs=0.01)
+    assert np.isfinite(x).all() and sampling.exponential(0.0, rate) <= 1
+
+
+def test_equations_of_drjit_are_those_of_numpy(ad, rng):
+    u = rng.random(100, dtype=np.float32)
+    for kind in sampling.FOOTPRINTS:
+        np.testing.assert_allclose(
+            sampling.footprints(ad.Float(u), kind, 512).numpy(), sampling.footprints(u, kind, 512), rtol=2e-4, atol=1e-7
+        )
+    for axis in sampling.AXES:
+        x = np.float32([1e-9, 0.001, 0.3, 1])
+        found = sampling.level_of(ad.Float(x), axis, 10).numpy()
+        np.testing.assert_allclose(found, sampling.level_of(x, axis, 10), atol=1e-4)
+        levels = np.float32([0, 0.5, 3, 9])
+        back = sampling.footprint_of(ad.Float(levels), axis, 10)
+        np.testing.assert_allclose(sampling.level_of(back, axis, 10).numpy(), levels, atol=1e-4)
+        assert back.numpy()[-1] == pytest.approx(1) and found[0] < 1e-6
+    with pytest.raises(ValueError, match='footprint samples: found "uniform", allowed are'):
+        sampling.footprints(u, "uniform", 512)
+    with pytest.raises(ValueError, match="p: found 1, allowed are numbers between 0 and 1"):
+        sampling.exponent(0.1, 1)
+
+
+def test_which_levels_the_footprints_are_on():
+    """The supplement rejects the exponential distribution since coarse levels get too few samples."""
+    power, exponential = (sampling.footprint_histogram(kind, 11) for kind in sampling.FOOTPRINTS)
+    assert power.sum() == pytest.approx(1) and exponential.sum() == pytest.approx(1)
+    # Level of u^10 is 10 + 10 log2 u: below ½ with probability 2^-0.95, each further level has 2^(0.1 · level) more
+    expected = np.diff([0, *2 ** ((np.arange(10) + 0.5 - 10) / 10), 1])
+    np.testing.assert_allclose(power, expected, atol=0.005)
+    assert power[0] > 0.5 and power[5:].sum() > 0.2 and exponential[5:].sum() < 1e-3
+
+
+# -- sizes ------------------------------------------------------------------------------------------------------------
+
+
+def test_bytes_are_equation_2():
+    assert paper_bytes(640**2, 8, 8, 3) == 3 * 640**2 + 32 + 3 * 8**3 * 8
+    assert [memory_budget.lods_of(n, n) for n in (1, 8, 256, 1024, 2048, 4096)] == [2, 3, 8, 8, 12, 12]
+    for x, rgb, rest in ((3, 80, 128), (6, 64, 96), (12, 64, 96), (24, 48, 72)):
+        assert memory_budget.ratio(x, 3) == rgb and memory_budget.ratio(x, 7) == rest
+
+
+@pytest.mark.parametrize("height, width", [(4096, 4096), (1024, 1024), (300, 1000), (64, 64)])
+@pytest.mark.parametrize("compression", [3, 12, 24])
+def test_the_papers_sizes_are_near_what_is_asked_for(height, width, compression):
+    for channels in (3, 8):
+        source = height * width * channels
+        size = paper_size(source / compression, source, channels, height, width)
+        assert size.rows <= height and size.columns <= width
+        assert size.nbytes == pytest.approx(source / compression, rel=0.06) or size.cascaded == 4
+
+
+@pytest.mark.parametrize("height, width", [(1024, 1024), (384, 384), (300, 1000), (64, 64), (17, 5), (1, 9), (1, 1)])
+def test_our_sizes_fit(height, width):
+    for channels, smooth in ((1, False), (3, False), (8, False), (8, True)):
+        before = math.inf
+        for compression in (1, 3, 6, 12, 24, 100):
+            nbytes = height * width * channels / compression
+            size = choose(height, width, channels, nbytes, smooth=smooth)
+            assert size.nbytes <= before, "less asked for, more found"
+            before = size.nbytes
+            if size.nbytes > nbytes:
+                assert size.dims == 1 and size.cascaded == 2  # among the smallest that there are
+            elif height * width > 4096 and compression <= 24:
+                assert size.nbytes >= 0.8 * nbytes or compression < 6
+            sizes = level_sizes(height, width)
+            fine = sum(math.ceil(math.prod(sizes[f.level]) * f.channels * f.bits / 8) for f in size.fine)
+            coarse = sum(r * c for r, c in sizes[size.skip :]) * size.dims
+            assert size.nbytes == fine + coarse + (size.skip + 1) * size.cascaded**size.dims * channels
+
+
+def test_structures():
+    assert parse_structure("0:1:2,2:3:8") == (Fine(0, 1, 2), Fine(2, 3, 8))
+    for wrong in ("", "0:1", "1:1:1,0:1:1", "0:5:1", "0:1:9", "a", "0:1:2,"):
+        with pytest.raises(ValueError, match=r"structure|allowed are levels|have to grow"):
+            parse_structure(wrong)
+    with pytest.raises(ValueError, match="do not lie below level 1"):
+        Size(8, 8, 3, (Fine(1, 1, 1),), 1, 3, 4, 2)
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made():
+    """A material, its texture as bytes and as floats, and the table."""
+    source = from_arrays(material())
+    texture, table = texture_of(source, steps=8)
+    return source, texture, CompressedTexture.of(table, array_module("llvm").TensorXf, "float32"), table
+
+
+def reference(texture, u, v, level):
+    """The same in NumPy, one place at a time, from the entries: pointers summed, then one read."""
+    net, form = texture.net, texture.net.form
+
+    def bilinear(values, u, v):
+        places = []
+        for x, n, border in ((v, values.shape[0], texture.border[0]), (u, values.shape[1], texture.border[1])):
+            p = (x % 1 if border == "repeat" else x) * n - 0.5
+            i = math.floor(p)
+            ends = [i % n, (i + 1) % n] if border == "repeat" else [min(max(j, 0), n - 1) for j in (i, i + 1)]
+            places.append([(ends[0], 1 - (p - i)), (ends[1], p - i)])
+        return sum(a * b * values[i, j] for i, a in places[0] for j, b in places[1])
+
+    coarse, levels, start = net.coarse.numpy().astype(np.float64), {}, 0
+    for i, (rows, columns) in enumerate(form.sizes[form.skip :], form.skip):
+        levels[i] = coarse[start : start + rows * columns].reshape(rows, columns, -1)
+        start += rows * columns
+    assert start == len(coarse)
+    at = max(level, form.skip)
+    below, above = math.floor(at), min(math.floor(at) + 1, len(form.sizes) - 1)
+    pointer = (1 - at % 1) * bilinear(levels[below], u, v) + at % 1 * bilinear(levels[above], u, v)
+    layers = list(zip(form.layers, net.fine, strict=True))
+    if form.base:
+        layer, array = layers.pop()
+        share = min(max(layer.until + 1 - level, 0), 1)
+        pointer = (1 - share) * pointer + share * bilinear(array.numpy().astype(np.float64), u, v)
+    for layer, array in layers:
+        share = min(max(layer.until + 1 - level, 0), 1)
+        found = (bilinear(array.numpy().astype(np.float64), u, v) - layer.zero) * layer.scale
+        pointer[: layer.channels] += share * found
+    place = [min(level / form.skip, 1), *np.clip(pointer, 0, 1)]
+    cascaded, total = net.cascaded.numpy().astype(np.float64), 0
+    for corner in np.ndindex(*[2] * 4):
+        weight, index = 1, []
+        for x, n, up in zip(place, cascaded.shape, corner, strict=False):
+            lower = min(int(x * (n - 1)), n - 2)
+            weight *= (x * (n - 1) - lower) if up else 1 - (x * (n - 1) - lower)
+            index.append(lower + up)
+        total = total + weight * cascaded[tuple(index)]
+    return total
+
+
+def test_reading_against_numpy(made, rng):
+    """Where the coarsest fine array holds differences, and where it holds pointers."""
+    based, _ = texture_of(made[0], steps=1, fine="0:1:2,1:3:6")
+    assert based.net.form.base and not made[1].net.form.base
+    for texture in (*made[1:3], based):
+        u, v = rng.random((2, 60))
+        level = np.concatenate([np.arange(texture.levels), rng.uniform(0, texture.levels - 1, 60 - texture.levels)])
+        expected = [reference(texture, *place) for place in zip(u, v, level, strict=True)]
+        np.testing.assert_allclose(read(texture, u, v, level), expected, atol=3e-3)
+
+
+def test_level_0_is_what_stored_says(made, rng):
+    u, v = 3 * rng.random((2, 500), dtype=np.float32) - 1
+    for texture in made[1:3]:
+        Float = texture.types.Float
+        stored = numpy_of(texture.stored(Float(u), Float(v)))
+        np.testing.assert_allclose(read(texture, u, v, 0), stored, atol=1e-4)
+    np.testing.assert_allclose(read(made[1], u, v, 1.3), read(made[2], u, v, 1.3), atol=2e-3)  # bytes and floats
+
+
+def test_levels_are_continuous(made, rng):
+    """No jump at whole levels, where fine arrays end or where the coarse ones begin."""
+    _, texture, *_ = made
+    u, v = rng.random((2, 300), dtype=np.float32)
+    for level in range(texture.levels):
+        a, b = (read(texture, u, v, level + e) for e in (-2e-4, 2e-4))
+        assert np.abs(a - b).max() < 4e-3
+    fine = [read(texture, u, v, level) for level in np.linspace(0, texture.levels - 1, 400)]
+    steps = [np.abs(b - a).max() for a, b in itertools.pairwise(fine)]
+    assert max(steps) < 0.06 and max(steps) > 1e-3
+
+
+def test_any_level_is_clamped(made, rng):
+    _, texture, single, _ = made
+    odd = np.float32([0, 1, -0.0, np.nan, np.inf, -np.inf, 1e30, -1e30, -1e-30])
+    u, v, level = (x.ravel() for x in np.meshgrid(odd, odd, odd))
+    for t in (texture, single):
+        found = read(t, u, v, level)
+        assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
+        u2, v2 = rng.random((2, 50), dtype=np.float32)
+        for wrong in (np.nan, -5, -np.inf):
+            np.testing.assert_array_equal(read(t, u2, v2, wrong), read(t, u2, v2, 0))
+        for wrong in (99, np.inf):
+            np.testing.assert_array_equal(read(t, u2, v2, wrong), read(t, u2, v2, t.levels - 1))
+
+
+def test_borders(made, rng):
+    """The material repeats along v and not along u."""
+    _, texture, *_ = made
+    t = rng.random(50, dtype=np.float32)
+    for level in (0, 0.6, 1, 2.5):
+        np.testing.assert_allclose(read(texture, t, t + 1, level), read(texture, t, t, level), atol=1e-3)
+        before, after = read(texture, t, 1 - 1e-6, level), read(texture, t, 1e-6, level)
+        np.testing.assert_allclose(before, after, atol=2e-3)
+        np.testing.assert_allclose(read(texture, 5, t, level), read(texture, 1, t, level), atol=1e-6)
+
+
+def test_gradients_are_finite(made, rng):
+    _, _, texture, _ = made
+    types = texture.types
+    u, v = (types.Float(x) for x in rng.random((2, 400), dtype=np.float32))
+    level = types.Float(rng.uniform(0, texture.levels - 1, 400).astype(np.float32))
+    level[0], u[1] = 0, 0
+    dr.enable_grad(u, v, level, [a.data for a in texture.arrays.values()])
+    dr.backward(sum(texture.filtered(u, v, level), types.Float(0)))
+    for x in (u, v, level, *(a.data.array for a in texture.arrays.values())):
+        g = dr.grad(x).numpy()
+        assert np.isfinite(g).all() and np.abs(g).max() > 0
+    # Along u: against finite differences at places where it is smooth
+    eps = 1e-3
+    with dr.suspend_grad():
+        high, low = (sum(texture.filtered(u + e, v, level), types.Float(0)).numpy() for e in (eps, -eps))
+    slope = (high - low) / (2 * eps)
+    assert np.median(np.abs(slope - dr.grad(u).numpy())) < 0.1 * np.median(np.abs(slope))
+    dr.disable_grad([a.data for a in texture.arrays.values()])
+
+
+def test_masked_lanes_read_nothing(made):
+    _, texture, single, _ = made
+    for t in (texture, single):
+        types = t.types
+        places = [types.Float([0.2, 0.7]), types.Float([0.1, 0.9]), types.Float([0.5, 2])]
+        all_of_them = numpy_of(t.filtered(*places))
+        some = numpy_of(t.filtered(*places, active=types.Bool([True, False])))
+        np.testing.assert_array_equal(some[0], all_of_them[0])
+        assert np.isfinite(some).all()
+
+
+# -- what comes out ---------------------------------------------------------------------------------------------------
+
+
+def psnr(a, b):
+    return -10 * np.log10(np.mean((np.asarray(a, np.float64) - b) ** 2))
+
+
+def test_reported_qualities(made):
+    """Each level at its texel centres against the pyramid, maps at level 0, means."""
+    source, texture, _, table = made
+    pyramid, measured = Pyramid.of(source, texture.layout), table.measured
+    assert next(iter(measured)) == "psnr_db" and measured["psnr_db"] == measured["psnr_l0_db"]
+    levels = [measured[f"psnr_l{i}_db"] for i in range(texture.levels)]
+    assert measured["psnr_worst_db"] == min(levels) and f"psnr_l{texture.levels}_db" not in measured
+    for i, (rows, columns) in enumerate(level_sizes(source.height, source.width)):
+        v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+        got = read(texture, u.ravel(), v.ravel(), i)
+        maps = [texture.layout.decode(n, list(got.T)) for n in texture.layout.names]
+        true = [
+            texture.layout.decode(n, list(pyramid.values[i].reshape(-1, got.shape[-1]).T)) for n in texture.layout.names
+        ]
+        errors = np.concatenate([np.stack(a) - np.stack(b) for a, b in zip(maps, true, strict=True)])
+        # (A third component of a normal that was left out is measured against the source's own at level 0)
+        assert levels[i] == pytest.approx(-10 * np.log10(np.mean(errors**2)), abs=0.1 if i == 0 else 0.02)
+    decoded = texture.decode()
+    means = []
+    for m in source.maps:
+        assert measured[f"psnr_{m.name}_db"] == pytest.approx(psnr(decoded[m.name], m.values), abs=0.01)
+        means += list(np.abs(decoded[m.name].mean(axis=(0, 1)) - m.values.mean(axis=(0, 1))))
+    assert measured["mean_error"] == pytest.approx(max(means), abs=1e-5)
+
+
+def test_training_improves_every_level():
+    source = from_arrays(material())
+    before, after = (
+        trained(source, sized(source), quick(steps=steps, lr=lr))[0].measured for steps, lr in ((1, 1e-9), (60, 3e-2))
+    )
+    for i in range(5):
+        assert after[f"psnr_l{i}_db"] > before[f"psnr_l{i}_db"] + 1, (i, before, after)
+    assert after["mean_error"] < 0.02
+
+
+def test_better_than_the_paper():
+    """At no more bytes and samples: level 0 by 5 dB, the worst by 10."""
+    source = from_arrays(material(64, 48))
+    nbytes = source.nbytes / 4
+    paper = paper_size(nbytes, source.nbytes, training.layout_of(source, PAPER).stored, 64, 48)
+    theirs = trained(source, paper, quick(PAPER, steps=120))[0]
+    ours = trained(source, choose(64, 48, training.layout_of(source, OURS).stored, nbytes), quick(steps=120))[0]
+    assert theirs.nbytes == pytest.approx(nbytes, rel=0.1) and ours.nbytes <= nbytes
+    assert ours.measured["psnr_db"] > theirs.measured["psnr_db"] + 5
+    assert ours.measured["psnr_worst_db"] > theirs.measured["psnr_worst_db"] + 10
+
+
+@pytest.mark.parametrize("axis", ["side", "level"])
+def test_the_papers_arrays(axis, tmp_path, ad, rng):
+    import dataclasses
+
+    source = from_arrays(material(64, 48))
+    size = paper_size(source.nbytes / 4, source.nbytes, 5, 64, 48)
+    samples = "exponential" if axis == "level" else "power"
+    recipe = dataclasses.replace(quick(PAPER, steps=3), axis=axis, samples=samples)
+    table, _ = trained(source, size, recipe)
+    assert table.arrays["primary0"].shape[-1] == 3 and table.arrays["primary1"].shape == (4 * size.lods, 1)
+    assert table.arrays["cascaded"].shape == (size.lods, *[size.cascaded] * 3, 5) and table.nbytes == size.nbytes
+    save_table(tmp_path / "t.npz", table)
+    u, v = (ad.Float(x) for x in rng.random((2, 100), dtype=np.float32))
+    for storage in ("", "float32"):
+        texture = CompressedTexture.of(TASK.load(tmp_path / "t.npz"), ad.TensorXf, storage)
+        stored = numpy_of(texture.stored(u, v))
+        np.testing.assert_allclose(stored, numpy_of(texture.filtered(u, v, ad.Float(0))), atol=1e-4)
+        assert np.abs(stored - numpy_of(texture.filtered(u, v, ad.Float(4)))).max() > 0
+        assert np.isfinite(read(texture, 0.3, 0.4, np.float32([np.nan, np.inf, -np.inf, 77]))).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 9, 1), (13, 1, 1), (7, 5, 2), (2, 2, 1)])
+def test_odd_sizes(shape, ad, rng):
+    source = from_arrays({"data": rng.integers(0, 256, shape, dtype=np.uint8)})
+    layout = training.layout_of(source, OURS)
+    for size in (
+        choose(*shape[:2], layout.stored, source.nbytes / 2),
+        choose(*shape[:2], layout.stored, 4 * source.nbytes),
+    ):
+        table, _ = trained(source, size, quick(steps=2, batch=64))
+        texture = CompressedTexture.of(table, ad.TensorXf)
+        for level, expected in enumerate(level_sizes(*shape[:2])):
+            decoded = texture.decode(level=level)["data"]
+            assert decoded.shape == (*expected, shape[2]) and np.isfinite(decoded).all()
+        assert np.isfinite(list(table.measured.values())).all()
+
+
+def test_one_colour_needs_no_arrays(tmp_path, ad):
+    source = from_arrays({"albedo": np.full((6, 5, 3), (9, 80, 200), np.uint8)})
+    table, result = trained(source, None, OURS)
+    save_table(tmp_path / "t.npz", table)
+    texture = CompressedTexture.of(TASK.load(tmp_path / "t.npz"), ad.TensorXf)
+    assert table.nbytes == 0 and result.steps == 0 and texture.levels == 3 and texture.arrays == {}
+    assert texture.filtered(ad.Float(0), ad.Float(0), ad.Float(0)) == []
+    np.testing.assert_allclose(texture.decode(level=1)["albedo"][0, 0] * 255, [9, 80, 200], rtol=1e-6)
+    assert table.measured["psnr_worst_db"] == 120 and table.measured["mean_error"] == 0
+
+
+def test_high_dynamic_range(ad):
+    values = (10 ** (4 * waves(8, 8, 1) - 1)).astype(np.float32)
+    table, _ = trained(
+        from_arrays({"image": values}), sized(from_arrays({"image": values})), quick(steps=30, batch=256)
+    )
+    decoded = CompressedTexture.of(table, ad.TensorXf).decode(level=3)["image"]
+    np.testing.assert_allclose(decoded[0, 0], values.mean(axis=(0, 1)), rtol=0.1)
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def file_bytes(table, path):
+    save_table(path, table)
+    return path.read_bytes()
+
+
+def test_the_same_seed_gives_the_same_file(tmp_path):
+    source = from_arrays(material())
+    made = [trained(source, sized(source), quick(steps=5, seed=seed))[0] for seed in (3, 3, 4)]
+    first, again, other = (file_bytes(table, tmp_path / "t.npz") for table in made)
+    assert first == again != other and made[0].seed == 3
+
+
+def test_a_resumed_training_is_the_same(tmp_path, monkeypatch):
+    """Stopped after its first measurement and gone on with, to the last byte."""
+    from mi_diffind import fitting
+
+    source, checkpoint = from_arrays(material()), tmp_path / "c.npz"
+    recipe = quick(steps=8)
+    whole = file_bytes(trained(source, sized(source), recipe)[0], tmp_path / "a.npz")
+    step = fitting._Trainer.take_step
+
+    def stopped(self, *arguments):
+        if self.step == 6:
+            raise InterruptedError
+        return step(self, *arguments)
+
+    monkeypatch.setattr(fitting._Trainer, "take_step", stopped)
+    with pytest.raises(InterruptedError):
+        trained(source, sized(source), recipe, checkpoint=checkpoint)
+    monkeypatch.setattr(fitting._Trainer, "take_step", step)
+    table, result = trained(source, sized(source), recipe, checkpoint=checkpoint, resume=True)
+    assert result.steps == 8 and file_bytes(table, tmp_path / "b.npz") == whole
+    with pytest.raises(fitting.FittingError, match=r"other settings|other table sizes"):
+        trained(source, sized(source, fine="0:1:3,1:2:4"), recipe, checkpoint=checkpoint, resume=True)
+
+
+def test_files_come_back(made, tmp_path, ad, rng):
+    _, texture, _, table = made
+    save_table(tmp_path / "t.npz", table)
+    loaded = TASK.load(tmp_path / "t.npz")
+    assert [a.bits for a in loaded.arrays.values()] == [2, 4, 8, 8]
+    assert list(loaded.arrays) == ["level0", "level1", "coarse", "cascaded"] == list(texture.arrays)
+    model = TASK.model(loaded, ad.TensorXf)
+    u, v = rng.random((2, 99), dtype=np.float32)
+    np.testing.assert_array_equal(read(model.image, u, v, 0.4), read(texture, u, v, 0.4))
+    figures, lines = model.describe()
+    assert figures["levels"] == 6 and "6 levels of detail" in lines[-1] and model.image.border == ("repeat", "clamp")
+
+
+def damaged(table, change):
+    import copy
+
+    table = copy.deepcopy(table)
+    change(table)
+    return table
+
+
+def without_array(table):
+    del table.arrays["level1"]
+
+
+def other_shape(table):
+    a = table.arrays["coarse"]
+    table.arrays["coarse"] = StoredArray(a.entries[:-1], a.border, a.scale, a.offset, a.bits)
+
+
+def other_bits(table):
+    a = table.arrays["level0"]
+    table.arrays["level0"] = StoredArray(a.entries, a.border, (1 / 7,), a.offset, 3)
+
+
+def other_border(table):
+    table.settings["arrays"]["border"] = ["clamp", "clamp"]
+
+
+def no_pointer(table):
+    a = table.arrays["cascaded"]
+    table.arrays["cascaded"] = StoredArray(a.entries, a.border, tuple(2 * s for s in a.scale), a.offset, a.bits)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (without_array, "holds the arrays cascaded, coarse, level0, expected cascaded, coarse, level0, level1"),
+        (other_shape, r'array "coarse" has the shape \(\d+, 3\), expected \d+ x 3'),
+        (other_bits, 'array "level0" has 3 bits an entry, which its settings deny'),
+        (other_border, r'array "level0" has the borders \(\'repeat\', \'clamp\'\), expected'),
+        (no_pointer, 'array "cascaded" has entries outside of'),
+        (lambda t: t.settings["arrays"].update(skip=99), "describe no texture .the level that is skipped to"),
+        (lambda t: t.settings["arrays"].update(kind="x"), "describe no texture .arrays of the kind 'x'"),
+        (lambda t: t.settings["arrays"]["layers"][0].update(level=1), "describe no texture .the fine arrays"),
+        (lambda t: t.settings["arrays"]["layers"][0].update(scale=[-1]), "describe no texture .the scales"),
+        (lambda t: t.settings.pop("arrays"), "describe no texture .'arrays'"),
+        (lambda t: t.settings.update(layout=3), "describe no texture"),
+    ],
+)
+def test_damaged_files_are_refused(made, tmp_path, change, message):
+    path = tmp_path / "t.npz"
+    save_table(path, damaged(made[3], change))
+    with pytest.raises(TableError, match=message) as e:
+        TASK.load(path)
+    assert str(path) in str(e.value) and "\n" not in str(e.value)
+
+
+# -- the command line -------------------------------------------------------------------------------------------------
+
+
+def write(path, array):
+    import mitsuba as mi
+
+    mi.Bitmap(np.ascontiguousarray(array)).write(str(path))
+
+
+def test_fit_inspect_decode(tmp_path, monkeypatch, capsys):
+    import mitsuba as mi
+
+    monkeypatch.chdir(tmp_path)
+    for name, values in material().items():
+        write(f"{name}.png", values if values.shape[2] > 1 else values[..., 0])
+    (tmp_path / "m.json").write_text(json.dumps({name: f"{name}.png" for name in ("albedo", "normal", "roughness")}))
+    short = ["--steps", "3", "--batch", "2048", "--border", "clamp", "--variant", "llvm_ad_rgb"]
+    assert main(["fit", "texture", "m.json", "-o", "m.npz", "--compression", "4x", *short]) == 0
+    table = load_table("m.npz")
+    assert table.task == "texture" and table.preset == "ours" and table.settings["source_path"] == "m.json"
+    assert table.nbytes <= 32 * 24 * 5 / 4
+    capsys.readouterr()
+    assert main(["inspect", "m.npz", "--measure", "--variant", "llvm_ad_rgb"]) == 0
+    shown = capsys.readouterr().out
+    assert "6 levels of detail" in shown and "psnr_worst_db" in shown
+    assert main(["decode", "m.npz", "-o", "d.png", "--map", "albedo", "--level", "2", "--variant", "llvm_ad_rgb"]) == 0
+    assert np.array(mi.Bitmap("d.png")).shape == (8, 6)
+    capsys.readouterr()
+    assert main(["decode", "m.npz", "-o", "d.png", "--level", "6", "--variant", "llvm_ad_rgb"]) == 2
+    assert "--level: found 6, the file has levels 0 to 5" in capsys.readouterr().err
+
+
+def test_options_that_do_not_go_together(tmp_path):
+    source = str(tmp_path / "no.png")
+    for given, message in (
+        ({}, "source: not given"),
+        ({"preset": "paper", "skip": 2}, "--skip is for our arrays"),
+        ({"preset": "paper", "structure": "0:1:1"}, "--structure is for our arrays"),
+        ({"axis": "area"}, "--axis is for the preset paper"),
+        ({"preset": "paper", "footprint_samples": "levels"}, "draws footprints, power or exponential"),
+    ):
+        with pytest.raises(UsageError, match=re.escape(message)):
+            fit("texture", **({"source": source} if given else {}), **given)
+    write(source, material(8, 8)["albedo"])
+    for given, message in (
+        ({"skip": 4}, "--skip: found 4, the texture has levels 0 to 3"),
+        ({"structure": "0:1:2,2:1:4", "skip": 2}, "--skip: found 2, the structure has a fine array on level 2"),
+        ({"structure": "5:1:2"}, "--skip: found 6, the texture has levels 0 to 3"),
+        ({"structure": "0:4:2"}, "--structure: fine arrays have at most as many channels"),
+    ):
+        with pytest.raises(UsageError, match=re.escape(message)):
+            fit("texture", source=source, variant="llvm_ad_rgb", progress=False, **given)

@@ -1,0 +1,564 @@
+"""Training inside a scene: views, references, arrays as parameters, gradients, and what comes out."""
+
+import argparse
+import dataclasses
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from shading_scenes import fitted, material, scene_file
+
+from mi_diffind import scenes
+from mi_diffind.arguments import add_arguments
+from mi_diffind.compat import use_threads
+from mi_diffind.errors import UsageError
+from mi_diffind.files import OutputError
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.maps.source import load_source
+from mi_diffind.plugins.support import footprint
+from mi_diffind.runtime import array_module
+from mi_diffind.scene_training import arguments
+from mi_diffind.scene_training import references as references_module
+from mi_diffind.scene_training.arguments import SCENE_ARGUMENTS, views_of
+from mi_diffind.scene_training.fit import fit_scene, recipe_of, size_of, texture_problem
+from mi_diffind.scene_training.problem import SceneProblem, exposure_of
+from mi_diffind.scene_training.recipe import SceneRecipe, View, Views
+from mi_diffind.scene_training.references import References, colours
+from mi_diffind.scene_training.rig import Rig
+from mi_diffind.scene_training.texture import TrainedScene, texture_file
+from mi_diffind.settings import FitSettings
+from mi_diffind.tables import load_table, save_table
+from mi_diffind.task import Request
+from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
+from mi_diffind.tasks.texture.memory_budget import PaperSize, Size, parse_structure
+from mi_diffind.tasks.texture.presets import PRESETS
+from mi_diffind.tasks.texture.training import layout_of, problem_of, rounded, stored_form
+
+NAMES = ("albedo", "roughness")
+ORBIT = Views(
+    3, 1, azimuth=(-60, 60), elevation=(30, 60), light_azimuth=(-90, 90), light_elevation=(40, 80), up=(0, 0, 1)
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_core():
+    """Sums that repeat, and kernels that do not wait for each other."""
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    before = dr.thread_count()
+    use_threads(1)
+    yield
+    use_threads(before)
+
+
+@pytest.fixture(scope="module")
+def folder(one_core, tmp_path_factory):
+    """A material, its table, and a scene of both."""
+    found = tmp_path_factory.mktemp("scene")
+    scene_file(fitted(material(found, names=NAMES)), NAMES)
+    return found
+
+
+@pytest.fixture(scope="module")
+def path(folder):
+    return folder / "material_directional.xml"
+
+
+@pytest.fixture(scope="module")
+def trained(folder, path):
+    """The scene with its arrays as parameters, and the problem of the texture."""
+    file, _ = texture_file(path)
+    table = load(file)
+    problem = texture_problem(table, load_source(folder / "material.json"))
+    scene = TrainedScene(path, file, ORBIT, 1, table)
+    return scene, problem
+
+
+# -- views ------------------------------------------------------------------------------------------------------------
+
+
+def test_views_lie_in_their_ranges_and_repeat():
+    views = dataclasses.replace(ORBIT, count=200, distance=(2, 3))
+    drawn = views.trained()
+    for name in ("azimuth", "elevation", "distance", "light_azimuth", "light_elevation"):
+        low, high = getattr(views, name)
+        found = np.array([getattr(view, name) for view in drawn])
+        assert low <= found.min() < low + 0.03 * (high - low) and high - 0.03 * (high - low) < found.max() <= high
+        # Low discrepancy: the mean of 200 independent numbers is off by 0.02, in one case of three by more
+        assert abs(found.mean() - (low + high) / 2) < 8e-3 * (high - low)
+    assert all(view.origin is None for view in drawn)
+    assert dataclasses.replace(views, count=5).trained() == drawn[:5] == views.trained()[:5]
+    assert not set(drawn) & set(dataclasses.replace(views, held_out=200).measured())
+    assert not set(drawn) & set(dataclasses.replace(views, seed=1).trained())
+
+
+def test_views_without_ranges_and_in_a_box():
+    assert Views().trained() == Views().measured() == [View()]
+    boxed = Views(50, origins=((-1, 2, 3), (1, 2, 5))).trained()
+    origins = np.array([view.origin for view in boxed])
+    assert (origins >= [-1, 2, 3]).all() and (origins <= [1, 2, 5]).all() and np.ptp(origins, axis=0)[2] > 1.8
+    assert boxed[0].azimuth is None
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"count": 0}, "count of the views: found 0"), ({"elevation": (10, 95)}, r"elevation: found 10 to 95"),
+        ({"azimuth": (5, -5)}, "azimuth: found 5 to -5"), ({"distance": (0, 1)}, "distance: found 0 to 1"),
+        ({"origins": ((0, 0, 0), (1, 1, 1)), "azimuth": (0, 1)}, "origins"), ({"up": (0, 0, 0)}, "up: found 0"),
+    ],
+)  # fmt: skip
+def test_bad_views(change, match):
+    with pytest.raises(UsageError, match=match):
+        Views(**change)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"share": 1.5}, "share: found 1.5"), ({"spp": 0}, "spp: found 0"), ({"bound": -1.0}, "bound: found -1"),
+        ({"start": "there"}, 'start: found "there"'), ({"exposure": float("nan")}, "exposure: found nan"),
+    ],
+)  # fmt: skip
+def test_bad_recipes(change, match):
+    with pytest.raises(UsageError, match=match):
+        SceneRecipe(**change)
+
+
+def parsed(*words):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser, SCENE_ARGUMENTS)
+    return vars(parser.parse_args(words))
+
+
+def test_arguments():
+    assert views_of(parsed()) == Views() and arguments.recipe_of(parsed(), FitSettings()).bound == 1
+    found = parsed(
+        "--views", "3", "--azimuth=-30:30", "--elevation", "40", "--target=-1,0,2.5", "--light-elevation", "10:80",
+        "--bound", "none", "--spp", "4", "--begin", "untrained",
+    )  # fmt: skip
+    expected = Views(3, azimuth=(-30, 30), elevation=(40, 40), target=(-1, 0, 2.5), light_elevation=(10, 80), seed=7)
+    assert views_of(found, 7) == expected
+    recipe = arguments.recipe_of({**found, "share": 0.5}, FitSettings(steps=9))
+    assert recipe == SceneRecipe(0.5, 4, None, start="untrained", settings=FitSettings(steps=9))
+    assert views_of(parsed("--origins", "0,0,0:1,1,1")).origins == ((0, 0, 0), (1, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        (("--azimuth", "1:2:3"), "'1:2:3', expected LOW:HIGH"), (("--up", "0,1"), "'0,1', expected X,Y,Z"),
+        (("--origins", "0,1,2"), "'0,1,2', expected two corners"), (("--bound", "0"), "'0', expected a positive"),
+        (("--distance", "nan"), "expected LOW:HIGH"), (("--bound", "much"), "'much', expected a positive"),
+    ],
+)  # fmt: skip
+def test_bad_arguments(words, match, capsys):
+    with pytest.raises(SystemExit):
+        parsed(*words)
+    assert match in capsys.readouterr().err
+
+
+LIGHTS = {
+    "sun": {"type": "directional", "direction": [0.3, 0.5, -1]},
+    "lamp": {"type": "point", "position": [1, 0, 1]},
+    "sky": {"type": "envmap", "bitmap": None},
+    "shape": {"type": "rectangle", "emitter": {"type": "area"}},
+}
+
+
+def lit(*names, sensor=None):
+    lights = {name: dict(LIGHTS[name]) for name in names}
+    if "sky" in lights:
+        lights["sky"]["bitmap"] = mi.Bitmap(np.ones((4, 8, 3), np.float32))
+    look = mi.ScalarTransform4f().look_at([0, -2, 2], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    return mi.load_dict({
+        "type": "scene", **lights, "sensor": sensor or {"type": "perspective", "to_world": look, "film": film},
+    })  # fmt: skip
+
+
+def matrix(node):
+    return np.array(mi.traverse(node)["to_world"].matrix, np.float64).reshape(4, 4)
+
+
+def emitters(scene):
+    found = {"Directional": "sun", "Point": "lamp", "Environment": "sky", "Area": "shape"}
+    return {found[next(k for k in found if e.class_name().startswith(k))]: e for e in scene.emitters()}
+
+
+def test_camera_and_lights_are_where_a_view_has_them():
+    """Against ``look_at`` and rotations of Mitsuba's own."""
+    scene = lit("sun", "lamp", "sky", "shape")
+    target = (0.5, 0, 0)
+    ranges = {"azimuth": (0, 1), "elevation": (0, 1), "distance": (1, 2), "light_azimuth": (0, 1)}
+    rig = Rig(scene, Views(target=target, up=(0, 0, 1), light_elevation=(0, 1), **ranges))
+    before = {name: matrix(e) for name, e in emitters(scene).items() if name in ("sun", "sky")}
+    angle = np.arctan2(-2, -0.5) + np.radians(30)
+    origin = target + 3 * np.array([np.cos(0.7) * np.cos(angle), np.cos(0.7) * np.sin(angle), np.sin(0.7)])
+    for _ in range(2):  # from where the scene has them, not from where they were last
+        rig.place(View(30, np.degrees(0.7), 3, None, 50, 20))
+        sensor, lights = scene.sensors()[0], emitters(scene)
+        assert np.array(sensor.world_transform().translation()).ravel() == pytest.approx(origin, abs=1e-5)
+        # It looked past the target before: the angle between both stays
+        t = mi.ScalarTransform4f()
+        old, new = (np.array(t.look_at(list(o), list(target), [0, 0, 1]).matrix) for o in ([0, -2, 2], origin))
+        look = np.array(t.look_at([0, -2, 2], [0, 0, 0], [0, 0, 1]).matrix)
+        np.testing.assert_allclose(matrix(sensor), new @ np.linalg.inv(old) @ look, atol=1e-5)
+        sun = -matrix(lights["sun"])[:3, 2]
+        turned = np.arctan2(-0.5, -0.3) + np.radians(50)
+        np.testing.assert_allclose(np.arcsin(sun[2]), np.radians(20), atol=1e-5)
+        np.testing.assert_allclose(np.exp(1j * np.arctan2(sun[1], sun[0])), np.exp(1j * turned), atol=1e-5)
+        np.testing.assert_allclose(np.linalg.det(matrix(lights["sun"])[:3, :3]), 1, atol=1e-5)
+        lamp = np.array(mi.traverse(lights["lamp"])["position"]).ravel() - target
+        np.testing.assert_allclose(np.linalg.norm(lamp), np.sqrt(1.25), rtol=1e-5)
+        np.testing.assert_allclose(lamp[2] / np.linalg.norm(lamp), np.sin(np.radians(20)), atol=1e-5)
+        rotation = np.array(t.rotate([0, 0, 1], 50).matrix)[:3, :3]
+        np.testing.assert_allclose(matrix(lights["sky"])[:3, :3], rotation @ before["sky"][:3, :3], atol=1e-5)
+    rig.place(View())
+    np.testing.assert_allclose(matrix(scene.sensors()[0]), look, atol=1e-5)
+    np.testing.assert_allclose(matrix(emitters(scene)["sun"])[:3, 2], before["sun"][:3, 2], atol=1e-5)
+
+
+def test_a_camera_in_a_box_looks_at_the_target():
+    scene = lit("sun")
+    Rig(scene, Views(origins=((0, 0, 0), (1, 1, 1)), target=(0, 0, 0))).place(View(origin=(3, 4, 5)))
+    expected = mi.ScalarTransform4f().look_at([3, 4, 5], [0, 0, 0], [0, 1, 0]).matrix
+    look = matrix(scene.sensors()[0])
+    np.testing.assert_allclose(look[:3, 2:], np.array(expected)[:3, 2:], atol=1e-5)
+
+
+def test_rigs_that_cannot_be():
+    turn = Views(light_azimuth=(0, 90))
+    with pytest.raises(scenes.SceneError, match=r"light_azimuth: no light of the scene can be moved so \(AreaLight\)"):
+        Rig(lit("shape"), turn)
+    with pytest.raises(scenes.SceneError, match="light_elevation: no light"):
+        Rig(lit("sky"), dataclasses.replace(turn, light_elevation=(0, 9)))
+    Rig(lit("sky"), turn)
+    with pytest.raises(scenes.SceneError, match="target: not given, and the middle"):
+        Rig(lit("sky"), Views(azimuth=(0, 9)))
+
+
+# -- references -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """Passes of four samples, and the number of those that were rendered."""
+    monkeypatch.setattr(references_module, "PASS", 4 * 24 * 24)
+    render, seeds = scenes.render_pass, []
+
+    def counted(scene, spp, seed):
+        seeds.append(seed)
+        if len(seeds) == counted.stop:
+            raise KeyboardInterrupt
+        return render(scene, spp, seed)
+
+    counted.stop, counted.seeds = 0, seeds
+    monkeypatch.setattr(scenes, "render_pass", counted)
+    return counted
+
+
+def test_references_are_rendered_once(path, tmp_path, passes):
+    def references(spp=10, **more):
+        return References(path, ORBIT, spp, tmp_path / "kept", progress=False, **more)
+
+    views = ORBIT.trained()[:2]
+    first = references()
+    images = first.images(views)
+    assert first.rendered == 6 and first.found == 0 and len(set(passes.seeds)) == 6
+    assert min(passes.seeds) >= references_module.SEEDS
+    files = sorted((tmp_path / "kept").iterdir())
+    assert [file.suffix for file in files] == [".npz"] * 2
+    again = references()
+    np.testing.assert_array_equal(images, again.images(views))
+    assert again.rendered == 0 and again.found == 2
+    # Other samples, a scene that is written otherwise: other images; not for what is trained
+    unchanged = references(without=(path.with_name("material.npz"),))
+    assert not {references(11).path(v) for v in views} & set(files)
+    assert not {references(inputs=("x",)).path(v) for v in views} & set(files)
+    for file, kept in ((path, False), (path.with_name("material.npz"), True)):
+        before = file.read_bytes()
+        file.write_bytes(before + b"<!-- changed -->")
+        own = {"without": (path.with_name("material.npz"),)}
+        assert ({references(**own).path(v) for v in views} == {unchanged.path(v) for v in views}) == kept
+        file.write_bytes(before)
+    # A damaged file is rendered anew
+    files[0].write_bytes(files[0].read_bytes()[:100])
+    np.testing.assert_array_equal(images, references().images(views))
+
+
+def test_references_go_on_after_an_interruption(path, tmp_path, passes):
+    view, uninterrupted = ORBIT.trained()[0], References(path, ORBIT, 10, progress=False)
+    expected = uninterrupted.images([view])[0]
+    seeds = list(passes.seeds)
+    kept = References(path, ORBIT, 10, tmp_path, progress=False)
+    passes.stop = len(seeds) + 2
+    with pytest.raises(KeyboardInterrupt):
+        kept.images([view])
+    assert [file.name for file in tmp_path.iterdir()] == [kept.path(view).name]  # nothing half-written beside it
+    passes.stop = 0
+    again = References(path, ORBIT, 10, tmp_path, progress=False)
+    np.testing.assert_array_equal(again.images([view])[0], expected)
+    assert again.found == 1 and again.rendered == 2
+    assert passes.seeds[-4:] == [seeds[0], seeds[1], seeds[1], seeds[2]]
+
+
+def test_references_are_the_exact_scene(path, passes):
+    """Against the scene rendered as it is written, in the view that it has."""
+    image = References(path, Views(), 64, progress=False).images([View()])[0]
+    expected = mi.render(scenes.load(path, exact=True), spp=64, seed=9).numpy()
+    assert np.abs(image - expected).mean() < 0.05 * expected.mean() and not np.array_equal(image, expected)
+
+
+def test_only_colours_count(path):
+    """Of a film with transparency, too."""
+    with_alpha = path.with_name("alpha.xml")
+    with_alpha.write_text(path.read_text().replace('value="rgb"', 'value="rgba"'))
+    image, expected = (References(p, Views(), 16, progress=False).images([View()])[0] for p in (with_alpha, path))
+    assert image.shape == (24, 24, 3)
+    assert np.abs(image - expected).mean() < 0.1 * expected.mean()
+    assert colours(mi.TensorXf(np.zeros((2, 2, 4)))).shape == (2, 2, 3)
+    assert colours(np.zeros((2, 2, 2))).shape == (2, 2, 1)
+
+
+def test_a_folder_for_references_that_cannot_be(path, tmp_path):
+    with pytest.raises(OutputError, match="does not exist"):
+        References(path, Views(), 4, tmp_path / "nowhere" / "kept")
+
+
+# -- training, while no other scene is there ---------------------------------------------------------------------------
+
+
+def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
+    """
+    From arrays that say something else, towards the references, as far as few steps go; what comes out is an ordinary
+    file, and a run that was interrupted ends where one that was not does.
+    """
+    for name in ("material.json", "albedo.png", "roughness.png"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    table = load_table(folder / "material.npz")
+    entries = table.arrays["cascaded"]
+    table.arrays["cascaded"] = dataclasses.replace(entries, entries=255 - entries.entries)
+    save_table(tmp_path / "material.npz", table)
+    scene = scene_file(tmp_path / "material.npz", NAMES)
+    recipe = SceneRecipe(share=1.0, reference_spp=16)
+    changed = {"steps": 6, "measure_every": 3, "batch": 2048, "lr": 0.1, "schedule": "constant"}
+    recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
+
+    def fitted_scene(**more):
+        request = Request("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
+        return fit_scene(scene, ORBIT, recipe, request, references=tmp_path / "kept", preview=tmp_path / "preview.png")
+
+    found, result = fitted_scene()
+    history = [h["psnr_db"] for h in result.history]
+    assert result.steps == 6 and result.restarts == 0 and history[1] > history[0] + 1
+    preview = np.array(mi.Bitmap(str(tmp_path / "preview.png")))
+    assert preview.shape == (24, 72, 3) and np.ptp(preview[:, :48]) > 50
+
+    # Only the entries of the texture have changed, in the form that they had
+    save_table(tmp_path / "trained.npz", found)
+    assert found.settings["source_path"] == "material.json" and found.task == "texture"
+    assert found.measured["psnr_scene_db"] == pytest.approx(result.measured["psnr_db"], rel=1e-4)
+    assert recipe_of(load(tmp_path / "trained.npz")) == PRESETS["ours"]
+    assert {k: (a.shape, a.bits) for k, a in found.arrays.items()} == {
+        k: (a.shape, a.bits) for k, a in table.arrays.items()
+    }
+    # The scene that names it looks as was measured
+    (tmp_path / "after.xml").write_text(scene.read_text().replace("material.npz", "trained.npz"))
+    plain, view = scenes.load(tmp_path / "after.xml"), ORBIT.measured()[0]
+    own = {"without": (tmp_path / "material.npz",), "inputs": (found.settings["source"],)}
+    references = References(scene, ORBIT, 16, tmp_path / "kept", progress=False, **own)
+    (truth,) = references.images([view])
+    assert references.found == 1
+    Rig(plain, ORBIT).place(view)
+    footprint.attach(plain)
+    images = [np.clip(found.settings["exposure"] * mi.render(plain, spp=1, seed=i).numpy(), 0, 1) for i in range(16)]
+    error = np.mean((np.mean(images, axis=0) - np.clip(found.settings["exposure"] * truth, 0, 1)) ** 2)
+    assert -10 * np.log10(error) == pytest.approx(result.measured["psnr_db"], abs=0.3)
+
+    measure, measured = SceneProblem.measure, []
+
+    def stopped(self, net):
+        measured.append(net)
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        return measure(self, net)
+
+    monkeypatch.setattr(SceneProblem, "measure", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        fitted_scene(checkpoint=tmp_path / "c.npz")
+    again, resumed = fitted_scene(checkpoint=tmp_path / "c.npz", resume=True)
+    assert [h["psnr_db"] for h in resumed.history] == history
+    for name, array in again.arrays.items():
+        np.testing.assert_array_equal(array.entries, found.arrays[name].entries)
+
+
+# -- the scene with its arrays as parameters --------------------------------------------------------------------------
+
+
+def opaque(seed):
+    return dr.opaque(mi.UInt32, seed)
+
+
+def test_the_scene_reads_what_it_is_given(path, trained):
+    """Against the scene as it is written, which reads bytes; also from another view, with its footprints."""
+    scene, problem = trained
+    scene.hold(rounded(problem.net))
+    plain = scenes.load(path)
+    rig = Rig(plain, ORBIT)
+    for view in (View(), ORBIT.trained()[1]):
+        scene.place(view)
+        rig.place(view)
+        footprint.attach(plain)
+        image, expected = scene.render(opaque(3), opaque(4)).numpy(), mi.render(plain, spp=1, seed=3).numpy()
+        np.testing.assert_allclose(image, expected, atol=2e-3 * expected.max())
+    # One name for each array sets it for all maps
+    assert set(scene.keys) == {"level0", "coarse", "cascaded"} and len(scene.parameters) == 3
+    everything = mi.traverse(scene.scene)
+    named = [key for key in everything.keys() if key.endswith("tables.coarse")]
+    assert len(named) == len(NAMES)
+    scene.hold(problem.net.changed(lambda array, bits: array.unfolded(lambda entries: 0.5 * entries)))
+    values = [everything[key].numpy() for key in named]
+    np.testing.assert_array_equal(values[0], values[1])
+    assert values[0].max() <= 0.5
+
+
+def test_no_other_scene_reads_the_same_arrays(path, trained):
+    scene, problem = trained
+    other = scenes.load(path, change=lambda state: [
+        props.__setitem__("storage", "float32") for props in scenes.compat.properties_of(state)
+        if props.plugin_name() == "neural_texture"
+    ])  # fmt: skip
+    key = next(key for key in mi.traverse(other).keys() if key.endswith("tables.coarse"))
+    before = mi.traverse(other)[key].numpy()
+    scene.hold(problem.net.changed(lambda array, bits: array.unfolded(lambda entries: 0.5 * entries)))
+    np.testing.assert_array_equal(mi.traverse(other)[key].numpy(), before)
+
+
+def inside(net):
+    """The arrays as training sees them, away from the ends of [0, 1]."""
+    net = rounded(net)
+    for array in net.arrays.values():
+        array.data = mi.TensorXf(0.02 + 0.96 * array.data)
+    return net
+
+
+def rendered(scene, net, weights, *seeds):
+    """An image, and the gradients of a weighted sum of its pixels with respect to all arrays."""
+    for array in net.arrays.values():
+        dr.enable_grad(array.data)
+    scene.hold(net)
+    image = scene.render(*map(opaque, seeds))
+    dr.backward(dr.sum(image * weights, axis=None))
+    return image.numpy(), {name: dr.grad(array.data).numpy() for name, array in net.arrays.items()}
+
+
+@pytest.fixture(scope="module")
+def weights(one_core):
+    return mi.TensorXf(np.random.default_rng(0).random((24, 24, 3), dtype=np.float32))
+
+
+def test_values_and_derivatives_have_their_own_samples(trained, weights):
+    scene, problem = trained
+    scene.place(View())
+    (bsdf,) = (made for made in scenes.instances(scene.scene) if hasattr(made, "decoder"))
+    tables = {name: array.codes() for name, array in bsdf._arrays().items()}
+    (a, da), (b, db), (c, dc) = (
+        rendered(scene, inside(problem.net), weights, *seeds) for seeds in ((1, 2), (1, 3), (5, 2))
+    )
+    np.testing.assert_array_equal(a, b)
+    assert np.abs(a - c).max() > 1e-3
+    for name, gradient in da.items():
+        np.testing.assert_array_equal(gradient, dc[name])
+        assert np.abs(gradient - db[name]).max() > 1e-3 * np.abs(gradient).max()
+    # The tables of the BRDF are bytes, which no derivative reaches
+    for name, array in bsdf._arrays().items():
+        np.testing.assert_array_equal(array.codes(), tables[name])
+    assert not [key for key in mi.traverse(bsdf).keys() if key.startswith("tables.")]
+
+
+def test_gradients_against_differences(trained, weights):
+    """
+    Of a weighted sum of all pixels with respect to entries of each array, seven of those with the largest gradients and
+    three others, by central differences at equal samples. The sun's direction is no random number, so nothing is
+    sampled that would depend on the entries. More of them, with normals: ``benchmarks/bench_shading_scene.py``.
+    """
+    scene, problem = trained
+    scene.place(View())
+    rng, net = np.random.default_rng(1), inside(problem.net)
+    _, gradients = rendered(scene, net, weights, 4, 3)
+    for name, gradient in gradients.items():
+        assert np.isfinite(gradient).all()
+        array, used = net.arrays[name], np.argsort(-np.abs(gradient), axis=None)
+        before, values = array.data, array.data.numpy()
+        for index in [*rng.choice(used[:70], 7, replace=False), *rng.choice(used[70:], 3, replace=False)]:
+            found = []
+            for step in (4e-3, -4e-3):
+                changed = values.copy()
+                changed.flat[index] += step
+                array.data = mi.TensorXf(changed)
+                with dr.suspend_grad():
+                    scene.hold(net)
+                    image = scene.render(opaque(3), opaque(4)) * weights
+                found.append(float(dr.sum(image, axis=None).array[0]))
+            expected, largest = (found[0] - found[1]) / 8e-3, float(np.abs(gradient).max())
+            assert gradient.flat[index] == pytest.approx(expected, rel=0.05, abs=5e-3 * largest)
+        array.data = before
+
+
+def test_which_texture(path, folder):
+    assert texture_file(path) == (folder / "material.npz", "")
+    assert texture_file(path, folder / "material.npz")[0] == folder / "material.npz"
+    with pytest.raises(UsageError, match=r"no neural_texture reads .*other\.npz, the files are material\.npz"):
+        texture_file(path, folder / "other.npz")
+    plain = folder / "plain.xml"
+    plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
+    with pytest.raises(UsageError, match="names 0 files of neural_texture"):
+        texture_file(plain)
+
+
+# -- its parts --------------------------------------------------------------------------------------------------------
+
+
+def test_errors_of_pixels():
+    problem = object.__new__(SceneProblem)
+    error = mi.Float([-3, -0.5, 0, 0.25, 2])
+    for loss, bound, expected, slope in (
+        ("mse", None, [9, 0.25, 0, 0.0625, 4], [-6, -1, 0, 0.5, 4]),
+        ("mse", 1.0, [5, 0.25, 0, 0.0625, 3], [-2, -1, 0, 0.5, 2]),
+        ("mae", 1.0, [3, 0.5, 0, 0.25, 2], [-1, -1, 0, 1, 1]),
+    ):
+        problem.recipe = SceneRecipe(bound=bound)
+        problem.settings = dataclasses.replace(problem.recipe.settings, loss=loss)
+        x = mi.Float(error)
+        dr.enable_grad(x)
+        found = problem.errors(x)
+        dr.backward(found)
+        np.testing.assert_allclose(found.numpy(), expected)
+        nonzero = np.array(error) != 0
+        np.testing.assert_allclose(dr.grad(x).numpy()[nonzero], np.array(slope)[nonzero])
+
+
+def test_exposure():
+    image = np.linspace(0, 2, 100, dtype=np.float32).reshape(10, 10, 1) * np.float32([1, 0.5, 0.2])
+    assert exposure_of([image]) == pytest.approx(1 / 1.9, rel=0.02)
+    assert exposure_of([np.zeros((2, 2, 3))]) == 1
+
+
+@pytest.mark.parametrize("preset", ["ours", "paper"])
+def test_arrays_of_the_same_size(folder, preset, tmp_path):
+    """A file says all that is needed to begin anew."""
+    source, recipe = load_source(folder / "material.json"), PRESETS[preset]
+    layout = layout_of(source, recipe)
+    wanted = PaperSize(16, 24, 4, 5, layout.stored)
+    if preset == "ours":
+        wanted = Size(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
+    pyramid = Pyramid.of(source, layout, array_module("llvm"))
+    net = problem_of(source, wanted, recipe, pyramid).net
+    own = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
+    table = to_table(CompressedTexture(layout, stored_form(net)), {**own, "loss": "mae"})  # a render's
+    save_table(tmp_path / "x.npz", table)
+    table = load(tmp_path / "x.npz")
+    assert size_of(table) == wanted
+    assert recipe_of(table) == recipe

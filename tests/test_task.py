@@ -1,0 +1,369 @@
+"""Tasks: found, never listed; light to declare; and one sentence for whatever they are asked in vain."""
+
+import ast
+import dataclasses
+import importlib.util
+import json
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mi_diffind
+from mi_diffind import DifferentiableArray, DiffindError, StoredArray, TableError, load_model, save_table
+from mi_diffind import task as task_module
+from mi_diffind.arguments import Argument
+from mi_diffind.errors import UsageError, reason
+from mi_diffind.fitting import FitSettings, Problem
+from mi_diffind.lookup import STORAGES
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import Table
+from mi_diffind.task import Model, Task, fit, task_of, tasks
+
+ROOT = Path(__file__).resolve().parents[1]
+BUILT_IN = ("disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture")
+
+
+# -- what is found ----------------------------------------------------------------------------------------------------
+
+LINE = """
+from mi_diffind.settings import FitSettings
+from mi_diffind.task import Task
+
+class Line(Task):
+    name, title = "line", "a straight line"
+    presets = {"default": FitSettings(steps=3, batch=16)}
+
+TASK = Line()
+"""
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """A function that makes a distribution: files of modules, and entry points of the group of tasks."""
+    made = []
+
+    def make(entry_points: dict, **modules) -> None:
+        folder = tmp_path / f"site{len(made)}"
+        information = folder / f"theirs{len(made)}-1.0.dist-info"
+        information.mkdir(parents=True)
+        made.append(folder)
+        (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: theirs{len(made)}\nVersion: 1.0\n")
+        lines = [f"{name} = {value}" for name, value in entry_points.items()]
+        (information / "entry_points.txt").write_text("\n".join(["[mi_diffind.tasks]", *lines]) + "\n")
+        for name, text in modules.items():
+            (folder / f"{name}.py").write_text(text)
+        monkeypatch.syspath_prepend(folder)
+        forget()
+
+    def forget():
+        tasks.cache_clear()
+
+    yield make
+    monkeypatch.undo()
+    forget()
+    for name in [n for n, m in sys.modules.items() if str(tmp_path) in str(getattr(m, "__file__", ""))]:
+        del sys.modules[name]
+
+
+def test_what_ships_is_found():
+    """Each folder of the package is one, and nothing else; nowhere is there a list of them."""
+    folders = {p.parent.name for p in Path(task_module.__file__).parent.glob("tasks/*/__init__.py")}
+    names = {"field" if folder == "radiance" else folder for folder in folders} | {"scene"}
+    assert names == set(BUILT_IN) and tuple(tasks())[: len(BUILT_IN)] == BUILT_IN
+    assert {name: task.name for name, task in tasks().items()} == {name: name for name in tasks()}
+    assert all(isinstance(task, Task) for task in tasks().values())
+
+
+def test_tasks_of_others_are_found(install):
+    install({"line": "their_line"}, their_line=LINE)
+    assert tuple(tasks()) == (*BUILT_IN, "line") and tasks()["line"].title == "a straight line"
+    assert sys.modules["their_line"].TASK is tasks()["line"]
+    with pytest.raises(UsageError, match='line: found the preset "best", allowed are default'):
+        fit("line", "best")
+
+
+def test_an_object_in_a_module_is_as_good(install):
+    """As other packages write their entry points."""
+    install({"line": "their_line:TASK"}, their_line=LINE)
+    assert tasks()["line"].title == "a straight line"
+
+
+BROKEN = {
+    "no such module": ({"x": "no_module_of_theirs"}, {}, "ModuleNotFoundError: No module named"),
+    "an exception": ({"x": "their_x"}, {"their_x": "1 / 0"}, "ZeroDivisionError: division by zero"),
+    "no task": ({"x": "their_x"}, {"their_x": "TASKS = []"}, "AttributeError: .*'TASK'"),
+    "no Task": ({"x": "their_x"}, {"their_x": "TASK = 5"}, "TypeError: its TASK is a int, a Task is needed"),
+    "another name": ({"x": "their_x"}, {"their_x": LINE}, 'ValueError: its TASK is called "line"'),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_broken_tasks_of_others_are_left_out(install, fault):
+    """With a warning that says whose; all others work."""
+    entry_points, modules, why = BROKEN[fault]
+    install({**entry_points, "line": "their_line"}, their_line=LINE, **modules)
+    with pytest.warns(RuntimeWarning, match=rf'^"x" \({entry_points["x"]}\) is left out: {why}') as caught:
+        assert tuple(tasks()) == (*BUILT_IN, "line")
+    assert len(caught) == 1 and "\n" not in str(caught[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert tuple(tasks()) == (*BUILT_IN, "line")  # said once
+
+
+def test_a_name_that_is_taken(install):
+    """Whoever comes first keeps it: this package, and of others the first in the order of the path."""
+    install({"ggx": "their_ggx"}, their_ggx=LINE)
+    with pytest.warns(RuntimeWarning, match=r'^"ggx" \(their_ggx\) is left out: mi_diffind\.tasks has mi_diffind'):
+        assert tuple(tasks()) == BUILT_IN and tasks()["ggx"].title == "the GGX distribution of normals"
+    install({"line": "their_line"}, their_line=LINE)
+    install({"line": "another_line"}, another_line=LINE)
+    with pytest.warns(RuntimeWarning) as caught:
+        assert tuple(tasks()) == (*BUILT_IN, "line")
+    assert sum("is left out: mi_diffind.tasks has" in str(w.message) for w in caught) == 2
+
+
+def test_the_same_entry_point_twice_is_no_conflict(install):
+    """As of a package that is on the path twice, installed and as a checkout."""
+    for _ in range(2):
+        install({"line": "their_line"}, their_line=LINE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert tuple(tasks()) == (*BUILT_IN, "line")
+
+
+LIGHT = """
+import json, sys
+import mi_diffind.task as task
+found = {name: [t.title, list(t.presets), [a.flags for a in t.arguments]] for name, t in task.tasks().items()}
+print(json.dumps(sorted(sys.modules)))
+"""
+
+
+def test_declarations_are_light():
+    """The command line asks all of them whenever it builds its parsers: no Dr.Jit, no Mitsuba, nothing that trains."""
+    done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    modules = set(json.loads(done.stdout))
+    assert not {"drjit", "mitsuba", "matplotlib", "tqdm", "scipy"} & modules
+    assert not [m for m in modules if m.startswith("mi_diffind.") and m.endswith((".training", ".model", ".fitting"))]
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_what_a_task_declares(name):
+    """Enough for the help and the documentation; a file that ships for each preset that says so."""
+    task = tasks()[name]
+    assert (task.title and task.title[0].islower()) or task.title.split()[0].isupper()
+    assert task.section and sys.modules[type(task).__module__].__doc__.strip()
+    assert task.presets and all(isinstance(s, FitSettings) for s in task.presets.values())
+    assert set(task.storages) <= set(STORAGES) == set(task_module.STORAGES)
+    assert set(task.shipped) <= set(task.presets)
+    for preset in task.shipped:
+        table = task.load(task.file(preset=preset))
+        assert (table.task, table.preset) == (name, preset) and task_of(table) is task
+        assert {k: table.settings[k] for k in ("steps", "lr", "batch")} == {
+            k: getattr(task.presets[preset], k) for k in ("steps", "lr", "batch")
+        }
+    names = [a.name for a in task.arguments]
+    assert len(set(names)) == len(names) and not set(names) & {f.name for f in dataclasses.fields(FitSettings)}
+    assert all(a.options.get("help") for a in (*task.arguments, *task.decode_arguments))
+
+
+def test_the_documentation_is_as_declared():
+    """The page of all tasks is made from the declarations."""
+    spec = importlib.util.spec_from_file_location("make_tables", ROOT / "docs" / "make_tables.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8") == module.page_of_tasks()
+
+
+# -- a small one ------------------------------------------------------------------------------------------------------
+
+
+class LineProblem(Problem):
+    def __init__(self, types):
+        self.types, self.net = types, DifferentiableArray(3, 1, value=0.0).alloc(types.TensorXf)
+
+    def batch(self, rng, size):
+        x = rng.random(self.types.Float, size)
+        return [x], {"y": [x]}
+
+    def predict(self, net, inputs):
+        return {"y": net(inputs)}
+
+    def measure(self, net):
+        return {"score": -float(np.abs(net.numpy()[:, 0] - [0, 0.5, 1]).max())}
+
+
+class LineModel(Model):
+    def measure(self):
+        return {"score": -float(np.abs(self.arrays["line"].numpy()[:, 0] - [0, 0.5, 1]).max())}
+
+
+class LineTask(Task):
+    name, title = "line", "a straight line"
+    presets = {  # noqa: RUF012
+        "default": FitSettings(steps=60, batch=256, lr=0.05, measure_every=20),
+        "short": FitSettings(steps=5, batch=16),
+    }
+    arguments = (
+        Argument("--slope", type=float, default=1.0),
+        Argument("--steep", action="store_true"),
+    )
+
+    def check(self, request):
+        if request.options["slope"] != 1:
+            raise UsageError(f"slope: found {request.options['slope']:g}, allowed is 1")
+
+    def problem(self, request):
+        self.request = request
+        return LineProblem(request.types)
+
+    def table(self, problem, request):
+        return Table(self.name, {"line": StoredArray.of(problem.net)}, settings={"own": 1})
+
+    def model_class(self):
+        return LineModel
+
+
+@pytest.fixture
+def line(monkeypatch):
+    task = LineTask()
+    monkeypatch.setattr(task_module, "tasks", lambda: {"line": task})
+    return task
+
+
+def run(*arguments, **options):
+    return fit("line", *arguments, variant="llvm", progress=False, **options)
+
+
+def test_fit(line, tmp_path):
+    """What a task leaves to the base class: the training, the settings, the storage form, what is measured of it."""
+    fitted = run(seed=4, lr=0.1, storage="uint8", output=tmp_path / "line.npz")
+    table, request = fitted.table, line.request
+    assert (table.task, table.preset, table.seed, table.storage) == ("line", "default", 4, "uint8")
+    expected = dataclasses.asdict(dataclasses.replace(LineTask.presets["default"], seed=4, lr=0.1))
+    assert table.settings == {**expected, "own": 1} and fitted.result.steps == 60
+    assert request.options == {"slope": 1.0, "steep": False} and request.output == tmp_path / "line.npz"
+    # Measured in the storage form that is written, in five digits
+    score = -float(np.abs(table.arrays["line"].values[:, 0] - [0, 0.5, 1]).max())
+    assert table.measured == {"score": float(f"{score:.5g}")} and score > -0.1
+    assert run("short").table.settings["steps"] == 5 and run(steep=True) and line.request.options["steep"]
+    assert run().table.storage == "float32"
+
+
+def test_models_of_any_task(line, tmp_path):
+    """Read by the file alone, and by the task, which reads a file once."""
+    dtype, path = array_module("llvm").TensorXf, tmp_path / "line.npz"
+    save_table(path, run("short").table)
+    model = load_model(path, dtype)
+    assert type(model) is LineModel and model.table.path == path and model.types is array_module("llvm")
+    assert model.storage == "float32" and model.nbytes == 12 <= model.memory_nbytes
+    assert load_model(path, dtype, "float16").storage == "float16"
+    opened = line.open(dtype, path, storage="uint8")
+    assert opened.storage == "uint8" and opened.table.storage == "float32"
+    with pytest.raises(ValueError, match='parameter "filename": not given, and no tables ship for this task'):
+        line.open(dtype)
+    with pytest.raises(TableError, match='holds tables of the preset "short", "default" was asked for'):
+        line.open(dtype, path, "default")
+    save_table(path, Table("cloth", {}))
+    with pytest.raises(TableError, match=r'line\.npz: holds tables for the task "cloth", installed are line'):
+        load_model(path, dtype)
+
+
+def test_tables_that_ship_with_others(line, tmp_path):
+    """Anywhere: the path is that of their package."""
+    path = tmp_path / "line.npz"
+    save_table(path, run("short").table)
+    line.shipped = {"short": str(path)}
+    assert line.file() == line.file(preset="short") == path
+    assert line.open(array_module("llvm").TensorXf).table.preset == "short"
+    with pytest.raises(ValueError, match='parameter "preset": found "default", allowed are short'):
+        line.file(preset="default")
+
+
+@pytest.mark.parametrize("method", ["measure", "decode"])
+def test_what_a_model_leaves_out_is_refused(method, tmp_path):
+    table = Table("line", {"a": StoredArray(np.zeros((2, 1), np.float32))}, path=tmp_path / "line.npz")
+    model = Task().model(table, array_module("llvm").TensorXf)
+    assert type(model) is Model and model.describe() == ({}, []) and model.forms == ("",)
+    with pytest.raises(TableError) as caught:
+        model.measure() if method == "measure" else model.decode(tmp_path / "x.csv")
+    what = {"measure": "cannot be measured", "decode": "stand for nothing that could be decoded"}[method]
+    assert str(caught.value) == f'{tmp_path / "line.npz"}: holds tables for the task "line", which {what}'
+
+
+REFUSED = {
+    "task": (("nothing",), {}, 'found the task "nothing", installed are line'),
+    "preset": (("line", "best"), {}, 'line: found the preset "best", allowed are default, short'),
+    "storage": (("line",), {"storage": "int4"}, 'line: found the storage "int4", allowed are float32, float16, uint8'),
+    "argument": (("line",), {"stepz": 3}, 'line: found the argument "stepz", allowed are batch, check_every, '),
+    "own argument": (("line",), {"slope": 2.0}, "slope: found 2, allowed is 1"),
+    "resume": (("line",), {"resume": True, "seconds": 3}, "--resume needs the --steps of the run"),
+    "setting": (("line",), {"lr": -1.0}, "lr: found -1.0, a positive number is needed"),
+    "variant": (("line",), {"variant": "scalar_rgb"}, 'the variant "scalar_rgb" is not vectorised'),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_fit_refuses(line, what):
+    """In one sentence, before anything is made."""
+    arguments, options, sentence = REFUSED[what]
+    with pytest.raises(DiffindError) as caught:
+        fit(*arguments, **{"variant": "llvm", "progress": False, **options})
+    assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
+    assert not hasattr(line, "request")
+
+
+def test_a_task_without_storage_forms(line):
+    line.storages = ()
+    with pytest.raises(UsageError, match='line: found the storage "uint8", allowed are none'):
+        run(storage="uint8")
+    assert run("short").table.storage == "float32" and line.request.storage == ""
+
+
+# -- errors -----------------------------------------------------------------------------------------------------------
+
+
+def exceptions():
+    """Class → the names of its bases, of all exceptions that the library defines."""
+    classes = {}
+    for path in [*(ROOT / "mi_diffind").rglob("*.py"), *(ROOT / "plugins").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                bases = [ast.unparse(base).split(".")[-1] for base in node.bases]
+                if any(base.endswith(("Error", "Exception")) for base in bases):
+                    classes[node.name] = bases
+    return classes
+
+
+def test_all_errors_have_one_base_class():
+    """What the command line catches: each error of the library is, in the end, a ``DiffindError``."""
+    classes = exceptions()
+    assert {"TableError", "OutputError", "FittingError", "SourceError", "SceneError", "UsageError"} <= set(classes)
+
+    def derives(name):
+        return name == "DiffindError" or any(derives(base) for base in classes.get(name, []))
+
+    signals = {"Stopped"}  # no error, but how a loop is left
+    assert [name for name in classes if not derives(name) and name not in signals] == []
+
+
+def test_reasons_are_one_line():
+    assert reason(ValueError("a\n  b\tc")) == "a b c"
+    assert reason(KeyError()) == "KeyError" and reason(ValueError("x " * 300)).endswith("…")
+    assert len(reason(ValueError("x " * 300))) <= 100
+    long = "/tmp/" + "a" * 200
+    assert reason(ValueError(f"{long}: no space left"), **{"b.npz": long}) == "b.npz: no space left"
+
+
+def test_what_can_be_asked_of_the_package():
+    """Its face, without a task or a variant: each name is there, and imported when it is asked for."""
+    for name in mi_diffind.__all__:
+        assert getattr(mi_diffind, name) is not None and name in dir(mi_diffind)
+    assert mi_diffind.fit is fit and mi_diffind.DiffindError is DiffindError
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        mi_diffind.nothing  # noqa: B018

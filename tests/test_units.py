@@ -1,0 +1,213 @@
+"""Sizes of task 3: equation 1, the paper's search, exact fits, and what a user may ask for."""
+
+import itertools
+import math
+
+import pytest
+
+from mi_diffind import units
+from mi_diffind.tasks.image import memory_budget
+from mi_diffind.tasks.image.memory_budget import Size, explain, fit_bytes, image_bytes, paper_search, search
+from mi_diffind.units import parse_size
+
+IMAGES = [(1, 1), (1, 4096), (4096, 1), (7, 5), (64, 64), (100, 100), (333, 1000), (1024, 1024), (4096, 4096)]
+
+
+@pytest.mark.parametrize("side, cascaded, channels", [(8, 4, 1), (960, 12, 3), (2048, 16, 7), (1, 1, 16)])
+def test_bytes_are_equation_1(side, cascaded, channels):
+    assert image_bytes(side**2, cascaded, channels) == 4 * side**2 + channels * cascaded**4
+
+
+def test_bytes_of_other_dimensions_and_bits():
+    assert image_bytes(100, 8, 3, dims=3) == 3 * 100 + 3 * 8**3
+    assert image_bytes(100, 8, 3, dims=2, bits=16) == 2 * 2 * 100 + 3 * 8**2
+    assert image_bytes(3, 4, 1, dims=3, bits=5) == 6 + 64  # 45 bits
+
+
+def test_ratio_is_table_2_at_4k():
+    assert [memory_budget.ratio(e, 4096) for e in (3, 6, 12, 24)] == [128, 128, 80, 72]
+    assert memory_budget.ratio(math.sqrt(12 * 24), 4096) == pytest.approx(76)  # half-way in log2
+    assert memory_budget.ratio(1, 4096) == memory_budget.ratio(0.1, 8192) == 128
+    assert memory_budget.ratio(1000, 4096) == 72
+
+
+def test_ratio_falls_with_resolution_within_the_useful_range():
+    assert (
+        memory_budget.ratio(3, 1024)
+        == memory_budget.ratio(3, 2048)
+        == memory_budget.ratio(3, 1)
+        == pytest.approx(128 * 64 / 80)
+    )
+    assert memory_budget.ratio(3, 2048 * math.sqrt(2)) == pytest.approx(128 * 0.9)
+    assert memory_budget.ratio(12, 1024) == memory_budget.ratio(12, 2048) == pytest.approx(64)  # the safe default
+    values = [memory_budget.ratio(e, n) for e in (0.01, 1, 5, 12, 100, 1e6) for n in (1, 500, 3000, 1e5)]
+    assert min(values) >= 40 and max(values) <= 128
+
+
+@pytest.mark.parametrize("bad", [0, -1, math.nan, math.inf])
+def test_ratio_refuses(bad):
+    with pytest.raises(ValueError, match=r"compression: found .*, allowed"):
+        memory_budget.ratio(bad, 1024)
+    with pytest.raises(ValueError, match=r"resolution: found .*, allowed"):
+        memory_budget.ratio(12, bad)
+
+
+@pytest.mark.parametrize(
+    "side, channels, compression, ratio",
+    [(4096, 3, 3, 128), (4096, 3, 6, 128), (4096, 3, 12, 80), (4096, 3, 24, 72), (4096, 8, 12, 96), (2048, 3, 12, 64),
+     (1024, 3, 12, 64), (1024, 1, 2.5, 40)],
+)  # fmt: skip
+def test_search_is_the_papers(side, channels, compression, ratio):
+    uncompressed = side**2 * channels
+    candidates = []
+    for cascaded in range(4, 257, 4):
+        primary = min(round(ratio * cascaded / 8) * 8, side)
+        candidates.append((cascaded, primary, 4 * primary**2 + channels * cascaded**4))
+    cascaded, primary, nbytes = min(candidates, key=lambda c: abs(compression - uncompressed / c[2]))
+    size = paper_search(uncompressed, compression, channels, side, side, ratio)
+    assert size == Size(primary, primary, cascaded, channels)
+    assert size.nbytes == nbytes
+    found = search(uncompressed, compression, channels, side, side, ratio=ratio)
+    assert found.cascaded == cascaded and found.compression(uncompressed) == pytest.approx(compression, rel=0.05)
+    assert found == size or abs(size.compression(uncompressed) / compression - 1) > 0.04
+
+
+def test_search_at_4k():
+    size = paper_search(4096**2 * 3, 12, 3, 4096, 4096, 80)
+    assert (size.rows, size.columns, size.cascaded, size.ratio) == (960, 960, 12, 80)
+    assert size.compression(4096**2 * 3) == pytest.approx(13.43, abs=0.01)  # the nearest in such steps
+    size = search(4096**2 * 3, 12, 3, 4096, 4096)
+    assert (size.rows, size.cascaded) == (1016, 12) and size.ratio == pytest.approx(80, rel=0.06)
+    assert size.compression(4096**2 * 3) == pytest.approx(12, rel=0.005)
+
+
+def test_side_of_the_cascaded_array():
+    assert memory_budget.cascaded_side(2**20, 4, 4, 1) == 16 and memory_budget.cascaded_side(2**20, 4, 4, 0.05) == 8
+    assert memory_budget.cascaded_side(1, 16) == 4 and memory_budget.cascaded_side(1e12, 1) == 16
+    assert memory_budget.cascaded_side(1e12, 1, 2) == 64
+    with_share = memory_budget.cascaded_side(10**6, 5, 4, 0.1)
+    assert 5 * with_share**4 <= 10**5 < 5 * (with_share + 4) ** 4
+
+
+def test_search_keeps_the_proportions():
+    square = paper_search(2048**2 * 3, 6, 3, 2048, 2048, 64)
+    wide = paper_search(2048**2 * 3, 6, 3, 1024, 4096, 64)
+    tall = paper_search(2048**2 * 3, 6, 3, 4096, 1024, 64)
+    assert (wide.rows, wide.columns) == (tall.columns, tall.rows)
+    assert wide.columns / wide.rows == pytest.approx(4, rel=0.01)
+    assert wide.nbytes == pytest.approx(square.nbytes, rel=0.01)
+
+
+@pytest.mark.parametrize("dims", [2, 3, 4])
+@pytest.mark.parametrize("height, width", IMAGES)
+@pytest.mark.parametrize("compression", [0.5, 3, 12, 1e4])
+def test_search_stays_within_the_image(height, width, compression, dims):
+    size = search(height * width * 3, compression, 3, height, width, dims)
+    assert 1 <= size.rows <= height and 1 <= size.columns <= width
+    assert size.cascaded >= 4 and size.cascaded % 4 == 0 and size.dims == dims
+
+
+def test_search_shrinks_the_primary_of_a_small_image():
+    size = search(256**2 * 3, 12, 3, 256, 256)
+    assert size.cascaded == 4 and size.compression(256**2 * 3) == pytest.approx(12, rel=0.05)
+    assert search(1, 12, 1, 1, 1) == Size(1, 1, 4, 1)
+
+
+@pytest.mark.parametrize("dims, bits", [(4, 8), (3, 8), (2, 8), (4, 5), (4, 16)])
+@pytest.mark.parametrize("height, width", IMAGES)
+def test_fit_is_near_and_never_above(height, width, dims, bits):
+    for budget, cascaded in itertools.product((100, 5_000, 262_144, 10_000_000), (4, 8, 12)):
+        size = fit_bytes(budget, 3, height, width, cascaded, dims, bits)
+        assert 1 <= size.rows <= height and 1 <= size.columns <= width and size.cascaded == cascaded
+        least = image_bytes(1, cascaded, 3, dims, bits)
+        assert size.nbytes <= max(budget, least)
+        assert size.full == ((size.rows, size.columns) == (height, width))
+        if least <= budget and not size.full:
+            per_texel = dims * bits / 8
+            line = per_texel * (2 * min(size.rows, size.columns) + 1) + 1  # another one is too much
+            assert budget - size.nbytes <= line
+            if size.rows * size.columns > 10_000 and min(size.rows, size.columns) > 50:
+                assert size.rows / size.columns == pytest.approx(height / width, rel=0.05)
+
+
+def test_fit_of_exactly_the_image():
+    size = fit_bytes(image_bytes(35, 4, 3), 3, 7, 5, 4)
+    assert (size.rows, size.columns, size.full) == (7, 5, True)
+    assert fit_bytes(image_bytes(35, 4, 3) - 1, 3, 7, 5, 4).rows * 5 < 35
+
+
+@pytest.mark.parametrize("text, value", [("12x", 12), ("12", 12), (" 7.5X ", 7.5), ("1e2×", 100), (".5x", 0.5), (3, 3)])
+def test_compressions(text, value):
+    assert units.parse_compression(text) == value
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [("262144", 262144), ("256k", 262144), ("256K", 262144), ("1.5M", 1572864), ("1 MiB", 1048576), ("2kB", 2048),
+     ("1G", 2**30), (1000, 1000)],
+)  # fmt: skip
+def test_bytes(text, value):
+    assert units.parse_bytes(text) == value
+
+
+@pytest.mark.parametrize("text, value", [("2", 2), ("0.5", 0.5), (1.25, 1.25)])
+def test_bits_per_texel(text, value):
+    assert units.parse_bpp(text) == value
+
+
+@pytest.mark.parametrize("parse", [units.parse_compression, units.parse_bytes, units.parse_bpp])
+@pytest.mark.parametrize(
+    "text", ["0", "-1", "nan", "inf", "1e999", "", "x", "twelve", "1_000", "1,5", "12 x 3", "٣", "0x10", math.nan, None]
+)
+def test_nonsense_is_one_sentence(parse, text):
+    with pytest.raises(ValueError, match=r"is not .*, allowed are finite numbers > 0") as e:
+        parse(text)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize("text", ["0.5", "1e18G"])
+def test_bytes_out_of_range(text):
+    with pytest.raises(ValueError, match="allowed are 1 to 2"):
+        units.parse_bytes(text)
+
+
+def test_a_size_is_asked_for_in_one_way():
+    assert parse_size(3 * 1024**2, 1024**2, compression="12x") == 262144
+    assert parse_size(3 * 1024**2, 1024**2, nbytes="256k") == 262144
+    assert parse_size(3 * 1024**2, 1024**2, bpp="2") == 262144
+    assert parse_size(3, 1, compression=1000) == 1
+    with pytest.raises(ValueError, match="found nothing, give exactly one"):
+        parse_size(3, 1)
+    with pytest.raises(ValueError, match="found compression, bpp, give exactly one"):
+        parse_size(3, 1, compression=12, bpp=2)
+    with pytest.raises(ValueError, match="out of range"):
+        parse_size(3, 1, compression="1e-320")
+
+
+def test_explanations():
+    near = fit_bytes(100_000, 3, 1024, 1024, 8)
+    assert explain(near, 3 * 1024**2, 100_000) == (near.compression(3 * 1024**2), None)
+
+    least = search(35 * 3, 12, 3, 7, 5)
+    achieved, sentence = explain(least, 35 * 3, 9)
+    assert achieved == 105 / least.nbytes and "smallest table with a cascaded side of 4 has 772 bytes" in sentence
+
+    full = fit_bytes(10**6, 3, 64, 64, 4)
+    assert "as large as the image" in explain(full, 64**2 * 3, 10**6)[1]
+
+    coarse = paper_search(4096**2 * 3, 12, 3, 4096, 4096, 80)
+    assert "whole sides of the primary" in explain(coarse, 4096**2 * 3, 4096**2 * 3 / 12)[1]
+
+    wide = paper_search(256**2 * 3, 12, 3, 256, 256, 64)
+    assert "a resolution ratio of 64" in explain(wide, 256**2 * 3, 256**2 / 4)[1]
+
+
+def test_sizes_refuse_nonsense():
+    with pytest.raises(ValueError, match="rows: found 0"):
+        Size(0, 1, 4, 3)
+    with pytest.raises(ValueError, match="height: found 0"):
+        search(1, 12, 3, 0, 1)
+    with pytest.raises(ValueError, match="compression: found nan"):
+        search(1, math.nan, 3, 1, 1)
+    with pytest.raises(ValueError, match="budget: found inf"):
+        fit_bytes(math.inf, 3, 1, 1, 4)
