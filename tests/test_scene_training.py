@@ -29,7 +29,7 @@ from mi_diffind.scene_training.rig import Rig
 from mi_diffind.scene_training.texture import TrainedScene, texture_file
 from mi_diffind.settings import FitSettings
 from mi_diffind.tables import load_table, save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
 from mi_diffind.tasks.texture.memory_budget import PaperSize, Size, parse_structure
 from mi_diffind.tasks.texture.presets import PRESETS
@@ -347,7 +347,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
 
     def fitted_scene(**more):
-        request = Request("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
+        request = FitRequest("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
         return fit_scene(scene, ORBIT, recipe, request, references=tmp_path / "kept", preview=tmp_path / "preview.png")
 
     found, result = fitted_scene()

@@ -21,7 +21,7 @@ from ..maps.layout import Layout
 from ..maps.pyramid import Pyramid
 from ..maps.source import Source, load_source
 from ..tables import PAGES, Table, TableError
-from ..task import Request
+from ..task import FitRequest
 from ..tasks.texture.compressed import CompressedTexture, form_of, load, to_table
 from ..tasks.texture.memory_budget import Fine, PaperSize, Size
 from ..tasks.texture.nets import PaperForm
@@ -37,7 +37,7 @@ def fit_scene(
     path: str | os.PathLike,
     views: Views,
     recipe: SceneRecipe,
-    request: Request,
+    request: FitRequest,
     file: str | os.PathLike | None = None,
     references: str | os.PathLike | None = None,
     preview: str | os.PathLike | None = None,
@@ -89,7 +89,7 @@ def fit_scene(
     return found, result
 
 
-def _relative(path: str | os.PathLike, request: Request) -> str:
+def _relative(path: str | os.PathLike, request: FitRequest) -> str:
     return os.path.relpath(Path(path).resolve(), (request.output or Path("x")).resolve().parent)
 
 

@@ -177,13 +177,13 @@ class Setting:
         """Errors of shaded images, for the details of a record."""
         return {"material": self.name, **self.evaluation.measure(read)}
 
-    def training(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.Request:
+    def training(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.FitRequest:
         """A request for a training of a ``length``, by ``settings`` as they are changed for it."""
         settings, seconds = dataclasses.replace(settings, seed=seed, deterministic=False), length
         if self.request.unit == "steps":
             every = max(1, int(length) // 10)
             settings, seconds = dataclasses.replace(settings, steps=int(length), measure_every=every), None
-        return task.Request("ours", settings, self.types, seconds=seconds, progress=progress, options=self.options)
+        return task.FitRequest("ours", settings, self.types, seconds=seconds, progress=progress, options=self.options)
 
     @cached_property
     def options(self) -> dict:

@@ -19,7 +19,7 @@ from ...indirection import unfolded
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from ..disney.training import random_directions
 from ..texture import training as textures
 from ..texture.compressed import CompressedTexture, to_table
@@ -124,7 +124,7 @@ def fit_shading(
     source: Source,
     start,
     recipe: Recipe,
-    request: Request,
+    request: FitRequest,
     pyramid: Pyramid,
     evaluation: Evaluation | None = None,
     preview: Path | None = None,
