@@ -28,14 +28,14 @@ from ..tasks.texture.nets import PaperForm
 from ..tasks.texture.presets import PRESETS, Recipe
 from ..tasks.texture.training import TextureProblem, problem_of, stored_form
 from .problem import SceneProblem
-from .recipe import SceneRecipe, Views
-from .references import References
+from .recipe import SceneRecipe, ViewDistribution
+from .references import ReferenceRenders
 from .texture import TrainedScene, texture_file
 
 
 def fit_scene(
     path: str | os.PathLike,
-    views: Views,
+    views: ViewDistribution,
     recipe: SceneRecipe,
     request: FitRequest,
     file: str | os.PathLike | None = None,
@@ -62,7 +62,7 @@ def fit_scene(
     if recipe.start == "untrained":
         texture = problem_of(source, size_of(table), texture.recipe, texture.pyramid)
         table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
-    rendered = References(
+    rendered = ReferenceRenders(
         path, views, recipe.reference_spp, references, defines, recipe.against,
         without=(file,), inputs=(source.digest,), progress=request.progress,
     )  # fmt: skip

@@ -29,8 +29,8 @@ from mi_diffind.indirection import unfolded
 from mi_diffind.maps.source import load_source
 from mi_diffind.scene_training.fit import fit_scene, texture_problem
 from mi_diffind.scene_training.problem import SceneProblem
-from mi_diffind.scene_training.recipe import SceneRecipe, View, Views
-from mi_diffind.scene_training.references import References
+from mi_diffind.scene_training.recipe import SceneRecipe, View, ViewDistribution
+from mi_diffind.scene_training.references import ReferenceRenders
 from mi_diffind.scene_training.texture import TrainedScene
 from mi_diffind.tables import save_table
 from mi_diffind.task import FitRequest
@@ -42,7 +42,7 @@ from shading_scenes import fitted, material, scene_file
 
 NAMES = ("albedo", "normal", "roughness", "metallic")
 FILM = 24
-ORBIT = Views(
+ORBIT = ViewDistribution(
     8, 4, azimuth=(-60, 60), elevation=(25, 65), light_azimuth=(-90, 90), light_elevation=(35, 80), up=(0, 0, 1)
 )
 
@@ -62,7 +62,7 @@ def opened(folder: Path, light: str, names=NAMES, preset="ours", fine="0:2:4", d
     table = load(file)
     problem = texture_problem(table, load_source(folder / "material.json"))
     path = scene_file(file, names, light, FILM, depth)
-    views = ORBIT if light == "directional" else Views()
+    views = ORBIT if light == "directional" else ViewDistribution()
     return TrainedScene(path, file, views, 1, table), problem, path
 
 
@@ -310,7 +310,7 @@ def steps(folder: Path, count=2000) -> dict:
     views = dataclasses.replace(ORBIT, count=4, held_out=1)
     del scene
     gc.collect()
-    rendered = References(path, views, 64, progress=False)
+    rendered = ReferenceRenders(path, views, 64, progress=False)
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
     scene = TrainedScene(path, path.parent / "material.npz", views, 1, load(path.parent / "material.npz"))

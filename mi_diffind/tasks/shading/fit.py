@@ -18,11 +18,11 @@ from ..texture import fit as texture_fit
 from ..texture import training as textures
 from ..texture.presets import PRESETS as TEXTURES
 from . import material, training
-from .evaluation import Evaluation
-from .presets import PRESETS, Recipe
+from .evaluation import ShadedEvaluation
+from .presets import PRESETS, ShadingRecipe
 
 
-def recipe_of(preset: str, settings, options) -> Recipe:
+def recipe_of(preset: str, settings, options) -> ShadingRecipe:
     """The recipe of a preset with what the options change."""
     own = PRESETS[preset]
     given = {"share": options["share"], "reference": options["reference"]}
@@ -71,7 +71,7 @@ def fit(request: FitRequest) -> Fitted:
         own = dataclasses.replace(request, seconds=seconds if result is None or seconds is None else seconds / 2)
         if own.resume and not os.path.exists(own.checkpoint or ""):
             own.resume = False  # it was the training as a texture that was interrupted
-        evaluation = Evaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
+        evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
         preview = preview_of(request)
         try:
             net = training.start_of(start, pyramid)
@@ -113,7 +113,7 @@ def started(path, source, request: FitRequest) -> Table:
     return table
 
 
-def pretrained(source, pyramid: Pyramid, recipe: Recipe, request: FitRequest) -> tuple:
+def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequest) -> tuple:
     """A training as a texture alone, with a checkpoint of its own: its table, and its record."""
     own = TEXTURES[recipe.texture]
     settings = dataclasses.replace(own.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic)
