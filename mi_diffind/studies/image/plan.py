@@ -149,7 +149,7 @@ class _Training(_Made):
     seconds: float = 0.0
     file: str = ""
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         self.file = str(folder / f"{file_name(self.name)}.npz") if folder else ""
         return record if record and Path(self.file).is_file() else None
 

@@ -260,7 +260,7 @@ class _Truth(Job):
     def _file(self, folder: Path) -> Path:
         return folder / f"{file_name(self.name)}.npz"
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         if not record or folder is None or not self._file(folder).is_file():
             return None
         with np.load(self._file(folder), allow_pickle=False) as found:
@@ -302,7 +302,7 @@ class _Table(_Made):
     file: str = ""
     samples: str | None = None
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         self.file = str(self.table.path) if self.table else str(folder / f"{file_name(self.name)}.npz")
         return record if record and Path(self.file).is_file() else None
 
@@ -341,7 +341,7 @@ class _Blocks(_Made):
     def _file(self, folder: Path) -> Path:
         return folder / f"{file_name(self.name)}.npz"
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         if not record or folder is None or not self._file(folder).is_file():
             return None
         with np.load(self._file(folder), allow_pickle=False) as found:
