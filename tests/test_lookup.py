@@ -496,22 +496,6 @@ def test_masked_lanes_of_few_bits_are_zero(ad, bits):
     np.testing.assert_array_equal(read(array, ad, x, active=ad.Bool(mask)), np.where(mask[:, None], everything, 0))
 
 
-@pytest.mark.parametrize("bits", range(1, 9))
-@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 31, 64, 1001])
-def test_bits_survive_packing(bits, count):
-    """Bit ``i`` of code ``k`` is bit ``k · bits + i`` of the bytes, the lowest first."""
-    codes = np.random.default_rng(count).integers(0, 2**bits, count).astype(np.uint8)
-    packed = lookup.pack_bits(codes, bits)
-    assert packed.dtype == np.uint8 and packed.shape == (-(-count * bits // 8),)
-    number = sum(int(code) << (k * bits) for k, code in enumerate(codes))
-    assert packed.tobytes() == number.to_bytes(len(packed), "little")
-    unpacked = lookup.unpack_bits(packed, count, bits)
-    assert unpacked.dtype == np.uint8
-    np.testing.assert_array_equal(unpacked, codes)
-    wider = codes | np.uint8(0xFF << bits & 0xFF)  # what lies above is left out
-    np.testing.assert_array_equal(lookup.pack_bits(wider, bits), packed)
-
-
 @pytest.mark.parametrize("bits", range(1, 8))
 def test_few_bits_take_that_memory(ad, bits):
     rng = np.random.default_rng(bits)

@@ -20,6 +20,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
+from ...bits import as_words, pack_bits
 from ...files import replacing
 from ...lookup import clamp
 from ...tasks.sdf import codes
@@ -198,7 +199,7 @@ class Bricks(_Cells):
             raise ValueError(f"found {kept.sum():,} groups of bricks, fewer than {_INSIDE:,} are allowed")
         roots = np.where(inside[:, 0], _INSIDE, _OUTSIDE)
         roots[kept] = np.arange(kept.sum())
-        words = [_words(v[kept]) for v in (flat, inside)]
+        words = [as_words(pack_bits(v[kept], 1)) for v in (flat, inside)]
         count = np.array([int(w).bit_count() for w in words[0]], np.uint32)
         ranks = np.cumsum(count, dtype=np.uint32) - count
         roots = np.pad(roots, (0, len(roots) % 2)).astype("<u2").view("<u4")
@@ -206,8 +207,7 @@ class Bricks(_Cells):
         nodes = nodes[order[flat]].ravel()
         self.count, self.index_bytes = int(present.sum()), 4 * (len(roots) + 3 * len(ranks))
         if bits < 8:
-            nodes = np.unpackbits(nodes[:, None], axis=1, bitorder="little", count=bits)
-            nodes = np.append(np.packbits(nodes.ravel(), bitorder="little"), np.uint8(0))
+            nodes = np.append(pack_bits(nodes, bits), np.uint8(0))
         self.nodes = types.UInt8(np.ascontiguousarray(nodes))
         self.nbytes, self.slope = nodes.size + self.index_bytes, slope
 
@@ -315,12 +315,6 @@ def _grouped(values: np.ndarray) -> np.ndarray:
     """``(X, Y, Z)`` → groups and places in them, ``(X / 4, Y / 4, Z / 4, 4, 4, 4)``."""
     x, y, z = (n // _GROUP for n in values.shape)
     return values.reshape(x, _GROUP, y, _GROUP, z, _GROUP).transpose(0, 2, 4, 1, 3, 5)
-
-
-def _words(flags: np.ndarray) -> np.ndarray:
-    """Flags as words of 32 bits, the first flag in the lowest bit."""
-    packed = np.packbits(flags.ravel(), bitorder="little")
-    return np.pad(packed, (0, -len(packed) % 4)).view("<u4").astype(np.uint32)
 
 
 def bricks(
