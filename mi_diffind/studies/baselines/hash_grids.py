@@ -50,7 +50,7 @@ def network(nbytes: int) -> Network:
     return Network(3, WIDTH, LAYERS, grid)
 
 
-class HashField(DistanceField):
+class HashDistanceField(DistanceField):
     """The field of a trained ``net``, whose outputs are distances divided by :data:`BAND`. It knows no slope."""
 
     def __init__(self, types, net: Network, mesh: Mesh):
@@ -94,7 +94,7 @@ class HashProblem(Problem):
 
     def __init__(self, net: Network, types, mesh: Mesh, pool: tuple, held: tuple, seed: int = 1):
         self.net, self.types = net.alloc(types.TensorXf, 3, dr.rng(seed=seed)), types
-        self.field = HashField(types, self.net, mesh)
+        self.field = HashDistanceField(types, self.net, mesh)
         self.pool, self.held = self._arrays(*pool), self._arrays(*held)
         self.count = len(pool[1])
         self.identity = {"mesh": mesh.digest, "count": self.count, "seed": seed}
