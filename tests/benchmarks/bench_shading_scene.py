@@ -33,7 +33,7 @@ from mi_diffind.scene_training.recipe import SceneRecipe, View, ViewDistribution
 from mi_diffind.scene_training.references import ReferenceRenders
 from mi_diffind.scene_training.texture import TrainedScene
 from mi_diffind.tables import save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture.compressed import load
 from mi_diffind.tasks.texture.training import rounded
 
@@ -245,7 +245,7 @@ def convergence(folder: Path, steps=240) -> dict:
             recipe.settings, steps=steps, lr=1e-2, measure_every=steps // 24, batch=2**14, check_every=10
         )
         recipe = dataclasses.replace(recipe, settings=settings)
-        request = Request("ours", settings, None, progress=False)
+        request = FitRequest("ours", settings, None, progress=False)
         begin = time.perf_counter()
         _, result = fit_scene(path, ORBIT, recipe, request, references=folder / "kept", preview=folder / "p.png")
         histories[start] = [(h["step"], h["psnr_db"], h["texture_psnr_db"]) for h in result.history]
@@ -285,7 +285,7 @@ def losses(folder: Path, count=120) -> dict:
             else:
                 settings = dataclasses.replace(settings, loss=loss)
             recipe = dataclasses.replace(recipe, settings=settings)
-            request = Request("ours", settings, None, progress=False)
+            request = FitRequest("ours", settings, None, progress=False)
             _, result = fit_scene(path, views, recipe, request, references=folder / "kept")
             found[light, loss, bound] = say(
                 what="losses", light=light, loss=loss, bound=bound, restarts=result.restarts,

@@ -13,7 +13,7 @@ Task 2: the Disney BRDF (Burley 2012), exact and as tables.
 from __future__ import annotations
 
 from ...settings import FitSettings
-from ...task import Request, Task
+from ...task import FitRequest, Task
 
 
 class Disney(Task):
@@ -21,6 +21,7 @@ class Disney(Task):
 
     name = "disney"
     title = "the Disney BRDF"
+    files = "library"
     section = "supplemental 1.2"
     #: Tables of one coordinate start close to their optimum: a large rate would only shake them (75 instead of 90 dB).
     presets = {  # noqa: RUF012
@@ -29,25 +30,15 @@ class Disney(Task):
     }
     shipped = {"tables": "disney_tables.npz", "paper": "disney_paper.npz"}  # noqa: RUF012
 
-    def problem(self, request: Request):
+    def problem(self, request: FitRequest):
         from .library import LAYOUTS
         from .training import DisneyProblem
 
         layout, decoder = LAYOUTS[request.preset]
         return DisneyProblem(layout().alloc(request.types.TensorXf), decoder, request.types)
 
-    def table(self, problem, request: Request):
+    def table(self, problem, request: FitRequest):
         return problem.net.to_table()
-
-    def load(self, path):
-        from .library import load
-
-        return load(path)
-
-    def model_class(self):
-        from .library import DisneyModel
-
-        return DisneyModel
 
 
 TASK = Disney()

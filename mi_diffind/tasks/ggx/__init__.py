@@ -6,7 +6,7 @@ import argparse
 
 from ...errors import UsageError
 from ...settings import FitSettings
-from ...task import Argument, Request, Task
+from ...task import Argument, FitRequest, Task
 
 
 def _side(text: str) -> int:
@@ -38,7 +38,7 @@ class GGX(Task):
         for name, side in (("primary", 16), ("cascaded", 8))
     )  # fmt: skip
 
-    def problem(self, request: Request):
+    def problem(self, request: FitRequest):
         from .model import indirection
         from .training import GGXProblem
 
@@ -48,7 +48,7 @@ class GGX(Task):
             raise UsageError(str(e)) from None
         return GGXProblem(net.alloc(request.types.TensorXf), request.types, request.preset)
 
-    def table(self, problem, request: Request):
+    def table(self, problem, request: FitRequest):
         from dataclasses import asdict
 
         from ...tables import StoredArray, Table
@@ -56,16 +56,6 @@ class GGX(Task):
         net = problem.net
         arrays = {"primary": StoredArray.of(net.primary[0]), "cascaded": StoredArray.of(net.cascaded)}
         return Table(self.name, arrays, settings=asdict(problem.encoding))
-
-    def load(self, path):
-        from .files import load
-
-        return load(path)
-
-    def model_class(self):
-        from .files import GGXModel
-
-        return GGXModel
 
     def allocate(self, table, dtype, storage=""):
         arrays = super().allocate(table, dtype, storage)

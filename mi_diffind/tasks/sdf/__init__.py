@@ -16,7 +16,7 @@ import dataclasses
 from ... import units
 from ...arguments import Argument, between, checked, positive
 from ...errors import UsageError
-from ...task import Request, Task
+from ...task import FitRequest, Task
 from .presets import PRESETS
 
 #: Bits of a pointer that go into words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
@@ -58,7 +58,7 @@ class Sdf(Task):
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 4), **given)
 
-    def check(self, request: Request) -> None:
+    def check(self, request: FitRequest) -> None:
         from .fit import asked_bytes
 
         options = request.options
@@ -69,21 +69,6 @@ class Sdf(Task):
             raise UsageError(f"--constant is of the preset paper, found {request.preset}")
         if options["ratio"] is not None and PRESETS[request.preset].layout != "pair":
             raise UsageError(f"--ratio is of the presets dense and paper, found {request.preset}")
-
-    def fit(self, request: Request):
-        from .fit import fit
-
-        return fit(request)
-
-    def load(self, path):
-        from .files import load
-
-        return load(path)
-
-    def model_class(self):
-        from .model import SdfModel
-
-        return SdfModel
 
     def allocate(self, table, dtype, storage=""):
         return super().allocate(table, dtype, storage) if table.settings["layout"] == "pair" else {}

@@ -19,7 +19,7 @@ from ...indirection import unfolded
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from ..disney.training import random_directions
 from ..texture import training as textures
 from ..texture.compressed import CompressedTexture, to_table
@@ -126,7 +126,7 @@ def fit_shading(
     source: Source,
     start,
     recipe: ShadingRecipe,
-    request: Request,
+    request: FitRequest,
     pyramid: Pyramid,
     evaluation: ShadedEvaluation | None = None,
     preview: Path | None = None,
@@ -144,7 +144,7 @@ def fit_shading(
     problem.preview = preview
     result = request.train(problem, "shading")
     kept = any(before[name] > result.measured[name] for name in list(before)[:1])
-    identity = {k: v for k, v in problem.identity.items() if k not in ("form", "border")}
+    identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
     settings = {**request.recorded(), **identity}
     if request.seconds is not None:
         settings["steps"] = result.steps

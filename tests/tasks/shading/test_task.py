@@ -16,7 +16,7 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import load_table, save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import Effects
@@ -299,7 +299,7 @@ def start(ad, tmp_path_factory):
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
     options["skip"] = 2
     size = size_of(source, pyramid, source.nbytes / 2, recipe, options)
-    request = Request("ours", recipe.settings, ad, progress=False)
+    request = FitRequest("ours", recipe.settings, ad, progress=False)
     table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
     path = tmp_path_factory.mktemp("shading") / "start.npz"
     save_table(path, table)
@@ -318,7 +318,7 @@ def trained(start, ad, recipe, measured=True, **request):
     source, pyramid, table, evaluation, *_ = start
     evaluation = evaluation if measured else None
     net = training.start_of(table, pyramid)
-    asked = Request("ours", recipe.settings, ad, progress=False, **request)
+    asked = FitRequest("ours", recipe.settings, ad, progress=False, **request)
     return training.fit_shading(source, net, recipe, asked, pyramid, evaluation)
 
 
@@ -505,7 +505,9 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
 
     with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
         started(
-            start[4], from_arrays(bumpy(seed=9)), Request("ours", OURS.settings, ad, options={"source": "other.json"})
+            start[4],
+            from_arrays(bumpy(seed=9)),
+            FitRequest("ours", OURS.settings, ad, options={"source": "other.json"}),
         )
 
 
