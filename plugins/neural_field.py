@@ -14,7 +14,7 @@ from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
 from .support import properties
-from .support import solids as sdf
+from .support import distance_shapes as sdf
 from .support.differentials import Differentials
 from .support.field_grids import to_grid
 from .support.fields import Light, PlacedField
@@ -483,7 +483,7 @@ def integrator() -> type:
             Rays up to where the inner integrator takes over: the primal phase if there is no ``mode``. One piece is
             enough where nothing is smooth.
             """
-            solids = sdf.solids_of(scene) if hasattr(self.surfaces, "sample_solids") else []
+            solids = sdf.distance_shapes_in(scene) if hasattr(self.surfaces, "sample_shapes") else []
             if self.smooth_depth == 0 or not has_smooth(scene):
                 return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False, False)
 
@@ -580,9 +580,9 @@ def integrator() -> type:
             far = dr.minimum(pi.t, ray.maxt)
             if not solids:
                 return pi, far, mi.Bool(False)
-            met = sdf.meet(solids, ray.o, ray.d, far, active)
-            pi.t = dr.select(met.which > 0, dr.inf, pi.t)
-            return pi, met.t, met.which > 0
+            hit = sdf.intersect(solids, ray.o, ray.d, far, active)
+            pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
+            return pi, hit.t, hit.number > 0
 
         def _see(self, mode, path, placed, ray, far, crossed, first, before):
             """
