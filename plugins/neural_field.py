@@ -13,8 +13,8 @@ from mi_diffind.tasks.radiance.march import OPAQUE
 from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
-from .support import properties
 from .support import distance_shapes as sdf
+from .support import properties
 from .support.differentials import Differentials
 from .support.field_grids import to_grid
 from .support.fields import Light, PlacedField

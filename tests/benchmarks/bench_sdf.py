@@ -26,7 +26,7 @@ import numpy as np
 import mi_diffind  # noqa: F401
 from mi_diffind.files import write_json
 from mi_diffind.measure.clock import machine, timed
-from mi_diffind.tasks.sdf import TASK, decode, tracing
+from mi_diffind.tasks.sdf import TASK, grids, tracing
 from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SIDE = 512
@@ -69,9 +69,9 @@ def scene_of_mesh(mesh):
 
 def scene_of_grid(field, resolution: int):
     """A scene of Mitsuba's ``sdfgrid`` with so many cells along the longest side."""
-    from mi_diffind.plugins.support.solids import cube_of
+    from mi_diffind.plugins.support.distance_shapes import cube_of
 
-    values, lower, upper = decode.grid(field, resolution)
+    values, lower, upper = grids.grid(field, resolution)
     values, upper = cube_of(values, lower, upper)
     box = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
     grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
@@ -115,7 +115,7 @@ def measured(file: Path, resolution: int, rounds: int) -> dict:
             print(json.dumps(rows[-1]), flush=True)
     return {
         "name": Path(model.table.settings["mesh_path"]).stem, "triangles": len(mesh.faces), "bytes": model.nbytes,
-        "index_bytes": tracing.index_of(model.field), "rows": rows,
+        "index_bytes": tracing.index_bytes(model.field), "rows": rows,
     }  # fmt: skip
 
 

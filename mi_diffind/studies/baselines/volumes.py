@@ -23,11 +23,11 @@ import numpy as np
 from ...files import replacing
 from ...lookup import clamp
 from ...tasks.sdf import codes
-from ...tasks.sdf.cells import CORNERS, surface_cells
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 from ...tasks.sdf.nodes import SparseNodes, middles
+from ...tasks.sdf.sampling import CORNERS, surface_cells
 from ...tasks.sdf.structure import Structure
 
 #: Components of a direction below this count as zero.
@@ -285,7 +285,7 @@ class Bricks(_Cells):
         nearest = dr.select(dr.isfinite(nearest), nearest, 0)
         return dr.maximum(nearest, 0) + 1e-3 * self.spacing
 
-    def look(self, p, d, active=True):
+    def safe_step(self, p, d, active=True):
         active = self.inside(p) & active
         cell = self._cell(p)
         index = [i for i, _ in cell]

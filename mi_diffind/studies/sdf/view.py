@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...tasks.sdf import decode, tracing
+from ...tasks.sdf import grids, tracing
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 
@@ -66,9 +66,9 @@ class Stage:
 
     def grid_scene(self, field: DistanceField, resolution: int, lit: bool = False):
         """Mitsuba's ``sdfgrid`` of a field, decoded with ``resolution`` cells along the longest side."""
-        from ...plugins.support.solids import cube_of
+        from ...plugins.support.distance_shapes import cube_of
 
-        values, lower, upper = decode.grid(field, resolution)
+        values, lower, upper = grids.grid(field, resolution)
         values, upper = cube_of(values, lower, upper)
         to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
@@ -78,10 +78,10 @@ class Stage:
 
     def field_scene(self, field: DistanceField, lit: bool = False):
         """The field, traced by ``path_sdf``."""
-        from ...plugins.support.solids import Placement, Solid
+        from ...plugins.support.distance_shapes import DistanceShape, Placement
 
         placement = Placement.of(mi.ScalarTransform4f(), 1.0, (0.0, 0.0, 0.0))
-        return self._scene(Solid(_material(), field, placement, True), "path_sdf", lit)
+        return self._scene(DistanceShape(_material(), field, placement, True), "path_sdf", lit)
 
     def _scene(self, shape, integrator: str, lit: bool):
         found = {"type": "scene", "shape": shape}

@@ -16,7 +16,7 @@ from ...errors import UsageError
 from ...fitting import Problem
 from ...settings import FittingError
 from ...tables import Table
-from ...task import Fitted, FitRequest
+from ...task import FitRequest, Fitted
 from . import codes, encoding
 from .distances import Distances
 from .evaluation import HELD_OUT, HeldOut, SurfaceEvaluation, lost_pieces
