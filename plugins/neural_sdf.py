@@ -87,9 +87,10 @@ def sentence(report: dict) -> str:
     """Return the report of a grid as a sentence."""
     about = "" if report["arrays_error_measured"] else "about "
     return (
-        f"decoded to a grid of {report['resolution']} cells along the longest side, {report['memory_bytes'] / 1e6:,.0f} "
-        f"MB in Mitsuba, {report['seconds']:.1f} s; on average, its surface is {report['error']:.2g} of that side off "
-        f"the arrays', which is {about}{report['arrays_error']:.2g} off the mesh's"
+        f"decoded to a grid of {report['resolution']} cells along the longest side, "
+        f"{report['memory_bytes'] / 1e6:,.0f} MB in Mitsuba, {report['seconds']:.1f} s; on average, its surface is "
+        f"{report['error']:.2g} of that side off the arrays', which is {about}{report['arrays_error']:.2g} off the "
+        f"mesh's"
     )
 
 
@@ -155,8 +156,8 @@ class NeuralSDF(DistanceShape):
     exact counterpart is the mesh that the file was made from.
 
     **With** ``arrays``, nothing is decoded. In Mitsuba 3.9, the only shapes that can be written in Python are meshes.
-    This shape is therefore a mesh without area, and only :monosp:`path_sdf` sees it. For other integrators, the commands
-    of ``mi-diffind`` and ``mi_diffind.load_file`` decode it to a grid, unless ``trace`` is given or ``storage`` is
+    This shape is therefore a mesh without area, and only :monosp:`path_sdf` sees it. For other integrators, commands of
+    ``mi-diffind`` and ``mi_diffind.load_file`` decode it to a grid, unless ``trace`` is given or ``storage`` is
     ``float32``: then commands refuse the scene, and ``mi_diffind.load_file`` warns. ``mi.load_file`` and
     ``mi.load_dict`` do not decode: other integrators render the scene without the shape. Several shapes of one file
     share its arrays. Texture coordinates are 0; emitters, media and :monosp:`shapegroup` are not supported.

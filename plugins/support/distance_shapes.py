@@ -166,7 +166,7 @@ class DistanceShape(mi.Mesh):
 
 
 def distance_shapes_in(scene: mi.Scene) -> list[DistanceShape]:
-    """Return the distance shapes of a scene. Raises ``RuntimeError`` if one is in a shape group: it cannot be traced."""
+    """Return the distance shapes of a scene. Raises ``RuntimeError`` if one is in a shape group."""
     shapes = [shape for shape in scene.shapes() if isinstance(shape, DistanceShape)]
     hidden = [s for s in mi.traverse(scene).hierarchy if isinstance(s, DistanceShape) and s not in shapes]
     if hidden:
@@ -211,7 +211,7 @@ def crop_grid(values: np.ndarray, lower, spacing: float) -> tuple[np.ndarray, np
 
 
 def finest(sides, nbytes: int) -> int:
-    """Return the most cells along the longest side of a box with these ``sides`` that fit into ``nbytes`` in Mitsuba."""
+    """Return the most cells along the longest of a box's ``sides`` (X, Y, Z) whose grid fits into ``nbytes``."""
     x, y, z = np.asarray(sides, np.float64) / max(sides)
     return int((nbytes / (CELL_BYTES * y * max(x, z) ** 2)) ** (1 / 3))
 

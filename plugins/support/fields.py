@@ -14,7 +14,7 @@ from mi_diffind.tasks.radiance import counting
 from mi_diffind.tasks.radiance import march as marching
 
 from . import upsampling
-from .solids import Placement
+from .distance_shapes import Placement
 
 #: Luminance of linear sRGB, as Mitsuba has it.
 LUMINANCE = (0.212671, 0.715160, 0.072169)

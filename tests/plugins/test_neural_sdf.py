@@ -80,10 +80,10 @@ def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     o[within] = np.stack([0.38 * np.cos(angle), 0.38 * np.sin(angle), 0.05 * np.sin(9 * angle)], 1)[within]
     p, v = mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32))
     hit = tracing.intersect(field, p, v, dr.inf)
-    t, found = np.array(hit.t), np.array(hit.found)
+    t, found = np.array(hit.t), np.array(hit.hit)
     near, far, active = tracing.enter(field, p, v, mi.Float(dr.inf))
     start = dr.clip(dr.fma(v, near, p), mi.Vector3f(*field.lower), mi.Vector3f(*field.upper))
-    other, slow, _ = tracing.spheres(field, start, v, far - near, near == 0, active)
+    other, slow, _ = tracing.sphere_trace(field, start, v, far - near, near == 0, active)
     slow = np.where(other, np.array(near + slow), np.inf)
     assert (np.array(hit.leaving) == within).all() and found[within].all()
     assert np.isclose(t, slow, rtol=0, atol=2e-4).mean() > 0.995
@@ -317,15 +317,15 @@ def test_grids_are_cut_to_what_is_inside(mi_rgb, upright_files):
 
 def test_grids_of_sparse_fields(mi_rgb, upright_files):
     """Where no node is stored, one value of a block stands for all: as if each had been asked for."""
-    from mi_diffind.tasks.sdf import TASK, decode
+    from mi_diffind.tasks.sdf import TASK, grids
 
     field = TASK.open(mi_rgb.TensorXf, upright_files[None]).field
     for resolution in (70, 150):
-        values, lower, upper = decode.grid(field, resolution)
+        values, lower, upper = grids.grid(field, resolution)
         shape = values.shape[::-1]
-        expected = decode.node_values(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape).transpose(2, 1, 0)
+        expected = grids.node_values(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape).transpose(2, 1, 0)
         assert np.abs(values - expected).max() < 1e-6
-        crossed = decode.crossed_blocks(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape)
+        crossed = grids.crossed_blocks(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape)
         assert crossed.any() and (resolution < 100 or crossed.mean() < 0.9)
 
 
@@ -371,10 +371,10 @@ def test_images_of_grids_are_those_of_arrays(mi_rgb, folder):
 
 
 def test_grids_without_anything_inside(mi_rgb):
-    from mi_diffind.plugins.support import solids
+    from mi_diffind.plugins.support import distance_shapes
 
     with pytest.raises(RuntimeError, match="nothing is inside at 6 cells"):
-        solids.fitted(np.ones((5, 6, 7)), np.zeros(3), 0.1)
+        distance_shapes.crop_grid(np.ones((5, 6, 7)), np.zeros(3), 0.1)
 
 
 # -- what cannot be ----------------------------------------------------------------------------------------------------

@@ -12,7 +12,8 @@ little. Each kind is as fine as the bytes allow; to find that out is part of the
 
 Or else, what the *parts* of ours are worth, each left out or changed in turn: :mod:`.parts`.
 
-Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.SurfaceEvaluation`; lengths are in units of the longest side.
+Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.SurfaceEvaluation`; lengths are relative to the longest
+side.
 Times: reads at random points within 0.01 of the surface; primary rays, beside Embree on the mesh itself and Mitsuba's
 ``sdfgrid``; a whole render.
 """

@@ -263,7 +263,7 @@ class Marcher:
         return first, last, (t < first) == (slope > 0)
 
     def corners(self, number, cell, active=True):
-        """Return distance and gradient, in spacings, of the eight nodes of a crossed cell, in the order of ``CORNERS``."""
+        """Return distance and gradient, in spacings, of a crossed cell's eight nodes, in the order of ``CORNERS``."""
         field, Words = self.field, dr.uint32_array_t(self.field.types.Array4f)
         owners = [w for n in (0, 1) for w in dr.gather(Words, self.beside, number * 2 + n, active)]
         # The block in which each corner lies, axis by axis

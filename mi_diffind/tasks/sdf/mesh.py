@@ -247,7 +247,7 @@ def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return ordered[first], renamed[faces]
 
 
-def directeddirected_edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def directed_edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a key of each triangle's three edges that both directions share, ``(3 F,)``, and the direction, ±1."""
     ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     return ends.min(axis=1) * count + ends.max(axis=1), np.where(ends[:, 0] < ends[:, 1], 1, -1)

@@ -42,7 +42,7 @@ def sample_surface(mesh: Mesh, count: int, seed) -> tuple[np.ndarray, np.ndarray
 
 
 def sample_near(mesh: Mesh, count: int, width: float, seed) -> np.ndarray:
-    """Return ``count`` surface points displaced by a normal distribution of standard deviation ``width``: (count, 3)."""
+    """Return ``count`` surface points, (count, 3), displaced by a normal distribution of deviation ``width``."""
     rng = np.random.default_rng(seed)
     points, _ = sample_surface(mesh, count, rng)
     return points + rng.normal(scale=width, size=points.shape)

@@ -49,9 +49,10 @@ class Hit:
 
 def enter(field, o, d, maxt, active=True):
     """
-    Return the distances at which rays enter (0 if they start inside) and leave the field's box: ``(near, far, active)``.
+    Return the distances at which rays enter and leave the field's box: ``(near, far, active)``.
 
-    Components of ``d`` may be zero. A ray is not active if it misses the box, or if anything is NaN.
+    A ray that starts in the box enters at 0. Components of ``d`` may be zero. A ray is not active if it misses the
+    box, or if anything is NaN.
     """
     Float = field.types.Float
     near, far = Float(0), Float(maxt)

@@ -8,7 +8,8 @@ import drjit as dr
 import numpy as np
 import pytest
 import trimesh
-from solids import box, sphere, together, write
+from sdf_fields import TrilinearField
+from solid_meshes import box, sphere, together, write
 
 from mi_diffind.cli import main
 from mi_diffind.indirection import DifferentiableArray, Indirection, ramp
@@ -17,10 +18,9 @@ from mi_diffind.settings import FitSettings
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.task import fit, tasks
 from mi_diffind.tasks.sdf import fit as sdf_fit
-from mi_diffind.tasks.sdf import paper, training
+from mi_diffind.tasks.sdf import paper
 from mi_diffind.tasks.sdf.distances import Distances
-from mi_diffind.tasks.sdf.evaluation import Evaluation
-from mi_diffind.tasks.sdf.field import DenseField
+from mi_diffind.tasks.sdf.evaluation import SurfaceEvaluation
 from mi_diffind.tasks.sdf.mesh import load_mesh
 from mi_diffind.tasks.sdf.model import SdfModel
 
@@ -37,9 +37,7 @@ def ad():
 def few_points():
     """Short trainings need no large sets to measure with."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(sdf_fit, "MEASURED", 2**14)
-    patch.setattr(sdf_fit, "SAMPLES", 2**16)
-    patch.setattr(training, "HELD_OUT", 2**12)
+    patch.setattr(sdf_fit.fit, "__defaults__", (2**14, 2**16, 2**12))
     patch.setattr(SdfModel.measure, "__defaults__", (None, 2**14))
     yield
     patch.undo()
@@ -60,7 +58,7 @@ def folder(tmp_path_factory):
 def evaluation(folder):
     mesh = load_mesh(folder / "solids.ply")
     with Distances(mesh) as distances:
-        yield Evaluation(mesh, distances, 2**16)
+        yield SurfaceEvaluation(mesh, distances, 2**16)
 
 
 def opened(path, ad, storage=""):
@@ -88,7 +86,7 @@ def test_size_and_accuracy(folder, evaluation, ad):
     grid = np.round(np.clip(grid / (2 * h), -1, 1) * 127) / 127 * (2 * h)
     assert grid.size <= 1.1 * BYTES
     dense = evaluation.measure(
-        DenseField(ad.TensorXf(grid.astype(np.float32)), mesh.lower - 0.02, [a[-1] for a in axes], 2 * h)
+        TrilinearField(ad.TensorXf(grid.astype(np.float32)), mesh.lower - 0.02, [a[-1] for a in axes], 2 * h)
     )
     assert 1 - found["iou_near"] < 0.5 * (1 - dense["iou_near"])
     assert found["normal_deg"] < 0.7 * dense["normal_deg"]
@@ -192,21 +190,18 @@ def test_decode_and_inspect(folder, tmp_path, capsys):
 
 
 def test_resumed_equals_uninterrupted(folder, tmp_path, monkeypatch):
-    """
-    Ctrl-C after codes were given to half of the nodes; what the problem decided is in the checkpoint. And the same
-    command gives the same file.
-    """
+    """Ctrl-C in the middle of a training; and the same command gives the same file."""
     whole = folder / "solids.npz"
     command = ["fit", "sdf", str(folder / "solids.ply"), "--bytes", str(BYTES), *SHORT]
-    own, calls = training.NodeProblem.loss, []
+    original, calls = sdf_fit.NodeProblem.loss, []
 
     def loss(self, *arguments):
         calls.append(1)
         if len(calls) == 50:
             os.kill(os.getpid(), signal.SIGINT)
-        return own(self, *arguments)
+        return original(self, *arguments)
 
-    monkeypatch.setattr(training.NodeProblem, "loss", loss)
+    monkeypatch.setattr(sdf_fit.NodeProblem, "loss", loss)
     checkpoint = str(tmp_path / "c.npz")
     part = folder / "part.npz"
     assert main([*command, "-o", str(part), "--checkpoint", checkpoint]) == 130
@@ -222,11 +217,11 @@ def test_resumed_equals_uninterrupted(folder, tmp_path, monkeypatch):
     ("arguments", "says"),
     [
         (["none.ply"], "none.ply: there is no such file"),
-        (["solids.ply", "--bytes", "200"], "--bytes: 200 are fewer than the"),
+        (["solids.ply", "--bytes", "200"], "--bytes: found 200, the coarsest grid of this mesh needs"),
         (["solids.ply", "--bytes", "lots"], "is not a number of bytes"),
-        (["solids.ply", "--ratio", "2"], "--ratio is of the presets dense and paper"),
-        (["solids.ply", "--constant"], "--constant is of the preset paper"),
-        (["solids.ply", "--preset", "paper", "--bytes", "20"], "--bytes: 20 are fewer than the smallest arrays"),
+        (["solids.ply", "--ratio", "2"], "--ratio: found the preset sparse, allowed are dense and paper"),
+        (["solids.ply", "--constant"], "--constant: found the preset sparse, allowed is paper"),
+        (["solids.ply", "--preset", "paper", "--bytes", "20"], "--bytes: found 20, the smallest arrays need"),
         (["solids.ply", "--bits", "7"], "invalid choice"),
     ],
 )
@@ -250,8 +245,8 @@ def damaged(table, name, change):
 @pytest.mark.parametrize(
     ("name", "change", "says"),
     [
-        ("blocks", lambda a: a[0].__setitem__(slice(0, 8), 255), "its masks say"),
-        ("region_masks", lambda a: a[0].__setitem__(slice(0, 8), 255), "blocks have nodes, masks are there for"),
+        ("blocks", lambda a: a[0].__setitem__(slice(0, 8), 255), "its masks have"),
+        ("region_masks", lambda a: a[0].__setitem__(slice(0, 8), 255), "blocks have nodes, found masks for"),
         ("regions", lambda a: a.__setitem__(a == 255, 0), "is damaged"),
         ("pointers", lambda a: a.__setitem__(slice(None), 255), "a pointer names entry 1023"),
         ("entries", lambda a: a.__setitem__((0, 0), np.nan), "NaN"),

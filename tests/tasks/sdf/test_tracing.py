@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from sdf_fields import Ball, Slab, Steps, sparse_table, torus
+from sdf_fields import Ball, Slab, Steps, TrilinearField, sparse_table, torus
 
-from mi_diffind.tasks.sdf import codes, files, index, marching, tracing
-from mi_diffind.tasks.sdf.field import DenseField
+from mi_diffind.tasks.sdf import codes, marching, model, tracing
+from mi_diffind.tasks.sdf.nodes import MIDDLE
 
 COUNT = 4096
 
@@ -27,7 +27,7 @@ def trace(field, o, d, maxt=np.inf):
     o, d = (types.Array3f(np.array(v, np.float32).T) for v in np.broadcast_arrays(o, d))
     hit = tracing.intersect(field, o, d, types.Float(maxt))
     t, found = tracing.trace(field, o, d, types.Float(maxt))
-    assert (np.array(found) == np.array(hit.found)).all()
+    assert (np.array(found) == np.array(hit.hit)).all()
     assert (np.array(tracing.occluded(field, o, d, types.Float(maxt))) == np.array(found)).all()
     return np.array(t), np.array(found), np.array(hit.p).T, np.array(hit.leaving)
 
@@ -147,7 +147,7 @@ def test_grids_against_a_slow_march(types, rng):
     x = np.linspace(-0.5, 0.5, n)
     grid = np.stack(np.meshgrid(x, x, x, indexing="ij"), -1)
     values = np.linalg.norm(grid, axis=-1) - 0.33 + rng.uniform(-0.02, 0.02, (n, n, n))
-    field = DenseField(types.TensorXf(values.astype(np.float32)), (-0.5,) * 3, (0.5,) * 3, 0.2)
+    field = TrilinearField(types.TensorXf(values.astype(np.float32)), (-0.5,) * 3, (0.5,) * 3, 0.2)
     count = 1024
     d = unit(rng.normal(size=(count, 3)))
     o = 0.4 * rng.random((count, 1)) * unit(rng.normal(size=(count, 3))) - d
@@ -172,21 +172,22 @@ def shell(p):
 def coded(types, request):
     """The sparse field of a torus, well coded or badly, and of a thin wall."""
     shape, bits = request.param
-    return files.field_of(sparse_table(shape, bits=bits), {}, types)
+    return model.field_of(sparse_table(shape, bits=bits), {}, types)
 
 
 def test_signs_beyond_slabs(coded, rng):
     """Above a block's slab everything is outside, below it inside; and slabs are thin where blocks are well coded."""
-    structure, marcher = coded.structure, marching.of(coded)
+    structure, marcher = coded.structure, marching.marcher_of(coded)
     words = np.array(marcher.slabs)[1::2]
-    full = index.cells_of(structure)[0].any(axis=1)
-    low, high = (v * (2 * index.SLAB / index.STEPS) - index.SLAB for v in (words & 0xFFFF, words >> 16))
-    normals, middles, _ = codes.frames_numpy(coded.frames())
+    full = marching.GridCells(structure).crossed.any(axis=1)
+    low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
+    axes, middles, _ = codes.frames(coded.frames())
+    normals = np.stack(axes, axis=1)
     block = rng.choice(np.flatnonzero(full), 50 * COUNT)
     place = rng.uniform(0, 4, (len(block), 3))
     p = np.array(structure.lower) + structure.spacing * (structure.block_positions()[block] + place)
     inside = np.array(coded.value(coded.types.Array3f(p.T.astype(np.float32)))) < 0
-    height = middles[block] + np.sum(normals[block] * (place - index.MIDDLE), axis=1)
+    height = middles[block] + np.sum(normals[block] * (place - MIDDLE), axis=1)
     above, below = height > high[block], height < low[block]
     assert not inside[above].any() and inside[below].all()
     assert above.mean() > 0.1 and below.any()
@@ -194,16 +195,18 @@ def test_signs_beyond_slabs(coded, rng):
 
 def test_slabs_keep_the_signs_of_other_cells(coded, rng):
     """Cells that are not crossed have the sign that they are said to have, whatever the block's plane says."""
-    crossed, inside, _, _, node = index.cells_of(coded.structure)
+    cells = marching.GridCells(coded.structure)
+    crossed, inside = cells.crossed, cells.inside
     cell = np.argmax(~crossed, axis=1)
     block = np.flatnonzero(crossed.any(axis=1) & ~crossed.all(axis=1))
     cell = cell[block]
     inside[block, cell] = rng.random(len(block)) < 0.5
-    words = index.slabs_of(crossed, inside, node, coded.decoded(), coded.frames())[block]
-    low, high = (v * (2 * index.SLAB / index.STEPS) - index.SLAB for v in (words & 0xFFFF, words >> 16))
-    normals, middles, _ = (v[block] for v in codes.frames_numpy(coded.frames()))
+    words = marching.slab_words(cells, coded.decoded(), coded.frames())[block]
+    low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
+    axes, middles, _ = codes.frames(coded.frames())
+    normals, middles = np.stack(axes, axis=1)[block], middles[block]
     place = np.stack([cell // 16, cell // 4 % 4, cell % 4], axis=1) + rng.random((len(block), 3))
-    height = middles + np.sum(normals * (place - index.MIDDLE), axis=1)
+    height = middles + np.sum(normals * (place - MIDDLE), axis=1)
     within = inside[block, cell]
     assert (height <= high)[within].all() and (height >= low)[~within].all()
     assert 10 < within.sum() < len(block) - 10
@@ -215,7 +218,7 @@ def test_slabs_change_no_hit(types, coded, rng):
     o = rng.uniform(-0.45, 0.45, (3 * COUNT, 3))
     o[:COUNT] -= 2 * d[:COUNT]
     t, found, _, leaving = trace(coded, o, d)
-    marching.of(coded).slabs = None
+    marching.marcher_of(coded).slabs = None
     slow, met, _, left = trace(coded, o, d)
     assert 0.3 < found.mean() < 0.95 and 0.05 < leaving.mean() < 0.5
     # Looked at in other places, a ray that grazes may be seen to touch, or start, elsewhere
@@ -226,19 +229,20 @@ def test_slabs_change_no_hit(types, coded, rng):
 
 def test_rays_along_the_plane_of_a_block(coded, rng):
     """They enter its slab, if ever, at a distance of which there is a cell."""
-    types, marcher, structure = coded.types, marching.of(coded), coded.structure
-    normals, middles, _ = codes.frames_numpy(coded.frames())
-    block = rng.choice(np.flatnonzero(index.cells_of(structure)[0].any(axis=1)), COUNT)
+    types, marcher, structure = coded.types, marching.marcher_of(coded), coded.structure
+    axes, middles, _ = codes.frames(coded.frames())
+    normals = np.stack(axes, axis=1)
+    block = rng.choice(np.flatnonzero(marching.GridCells(structure).crossed.any(axis=1)), COUNT)
     aside = unit(np.cross(normals[block], rng.normal(size=(COUNT, 3))))
-    middle = structure.block_positions()[block] + index.MIDDLE
+    middle = structure.block_positions()[block] + MIDDLE
     height = rng.uniform(-4, 4, COUNT) - middles[block]
     o = types.Array3f((middle + height[:, None] * normals[block]).T.astype(np.float32))
-    course = marching.Course(coded, o, types.Array3f(aside.T.astype(np.float32)))
+    ray = marching.GridRay(coded, o, types.Array3f(aside.T.astype(np.float32)))
     number, t = types.UInt32(block.astype(np.uint32)), types.Float(0)
     cell = [types.Int32(v) for v in (structure.block_positions()[block].T + 1).astype(np.int32)]
-    first, last, below = marcher.slab(course, t, number, cell, True)
+    first, last, below = marcher.slab(ray, t, number, cell, True)
     assert np.abs(np.array(first)).max() < 2**31 and np.abs(np.array(last)).max() < 2**31
-    low = (np.array(marcher.slabs)[1::2] & 0xFFFF)[block] * (2 * index.SLAB / index.STEPS) - index.SLAB
+    low = (np.array(marcher.slabs)[1::2] & 0xFFFF)[block] * (2 * marching.SLAB / marching.STEPS) - marching.SLAB
     off = (np.array(first) > 0) | (np.array(last) < 0)
     above = middles[block] + height
     clear = off & (np.abs(above - low) > 1e-3)
