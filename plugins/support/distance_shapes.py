@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
 from mi_diffind.tasks.sdf import tracing
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
@@ -168,7 +169,7 @@ class DistanceShape(mi.Mesh):
 def distance_shapes_in(scene: mi.Scene) -> list[DistanceShape]:
     """Return the distance shapes of a scene. Raises ``RuntimeError`` if one is in a shape group."""
     shapes = [shape for shape in scene.shapes() if isinstance(shape, DistanceShape)]
-    hidden = [s for s in mi.traverse(scene).hierarchy if isinstance(s, DistanceShape) and s not in shapes]
+    hidden = [s for s in compat.objects_of(scene) if isinstance(s, DistanceShape) and s not in shapes]
     if hidden:
         raise RuntimeError(
             f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file '
@@ -178,14 +179,6 @@ def distance_shapes_in(scene: mi.Scene) -> list[DistanceShape]:
 
 
 # -- Mitsuba's grids ---------------------------------------------------------------------------------------------------
-
-
-def cube_of(values: np.ndarray, lower, upper) -> tuple[np.ndarray, np.ndarray]:
-    """Pad a grid of ``values`` (Z, Y, X) in a box with these corners to a cube; return it and its upper corner."""
-    side = max(values.shape)
-    spacing = (upper[0] - lower[0]) / (values.shape[2] - 1)
-    values = np.pad(values, [(0, side - n) for n in values.shape], constant_values=float(values.max()))
-    return values, np.asarray(lower, np.float64) + spacing * (side - 1)
 
 
 def crop_grid(values: np.ndarray, lower, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -15,9 +15,8 @@ import dataclasses
 
 from ... import units
 from ...arguments import Argument, between, checked, positive
-from ...errors import UsageError
 from ...settings import FitSettings
-from ...task import FitRequest, Task
+from ...task import Task
 
 #: Bits of a pointer that divide words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
 BITS = (4, 5, 6, 8, 10, 16)
@@ -45,6 +44,7 @@ class Sdf(Task):
         "paper": PAIR_SETTINGS,
     }
     storages = ()
+    files = "model"
     arguments = (
         Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
         Argument(
@@ -75,33 +75,6 @@ class Sdf(Task):
         defaults = self.presets[preset]
         steps = given.get("steps", defaults.steps)
         return dataclasses.replace(defaults, measure_every=max(1, steps // 4), **given)
-
-    def check(self, request: FitRequest) -> None:
-        from .fit import requested_bytes
-
-        options = request.options
-        if options["source"] is None:
-            raise UsageError("source: not given, a mesh is needed")
-        requested_bytes(options)
-        if options["constant"] and request.preset != "paper":
-            raise UsageError(f"--constant: found the preset {request.preset}, allowed is paper")
-        if options["ratio"] is not None and request.preset == "sparse":
-            raise UsageError(f"--ratio: found the preset {request.preset}, allowed are dense and paper")
-
-    def fit(self, request: FitRequest):
-        from .fit import fit
-
-        return fit(request)
-
-    def load(self, path):
-        from .model import load
-
-        return load(path)
-
-    def model_class(self):
-        from .model import SdfModel
-
-        return SdfModel
 
     def allocate(self, table, dtype, storage=""):
         return super().allocate(table, dtype, storage) if table.settings["layout"] == "pair" else {}

@@ -134,6 +134,18 @@ class NodeProblem(Problem):
 # -- the task ---------------------------------------------------------------------------------------------------------
 
 
+def check(request: FitRequest) -> None:
+    """Raise :class:`UsageError` for options that exclude each other."""
+    options, preset = request.options, request.preset
+    if options["source"] is None:
+        raise UsageError("source: not given, a mesh is needed")
+    requested_bytes(options)
+    if options["constant"] and preset != "paper":
+        raise UsageError(f"--constant: found the preset {preset}, allowed is paper")
+    if options["ratio"] is not None and preset == "sparse":
+        raise UsageError(f"--ratio: found the preset {preset}, allowed are dense and paper")
+
+
 def requested_bytes(options) -> int:
     """Return the size from the command's options. Raises :class:`UsageError`."""
     try:

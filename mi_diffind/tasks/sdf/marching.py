@@ -18,9 +18,10 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
+from ...bits import mask_flags, mask_words
 from . import codes
 from .nodes import CORNERS, MIDDLE, bernstein
-from .structure import ACTIVE, BLOCK, mask_bits, mask_words, place_of
+from .structure import ACTIVE, BLOCK, place_of
 
 #: Places along the ray at which the field is evaluated in a cell, and steps by false position from there.
 SAMPLES, ROOTS = 3, 3
@@ -65,13 +66,13 @@ class GridCells:
         # Signs of blocks without nodes; beyond the grid outside
         regions = structure.regions.shape
         signs = np.repeat((structure.regions & 1).astype(bool)[..., None], 64, axis=-1)
-        signs[structure.regions == ACTIVE] = mask_bits(structure.region_signs)
+        signs[structure.regions == ACTIVE] = mask_flags(structure.region_signs)
         signs = signs.reshape(*regions, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
         self.empty_signs = signs.reshape([4 * n for n in regions])
         empty = np.pad(self.empty_signs, [(0, 1)] * 3)
 
         stored_nodes = np.concatenate(
-            [mask_bits(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)]
+            [mask_flags(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)]
         )
         groups = (structure.block_signs[:, None] >> np.arange(8) & 1).astype(bool).reshape(-1, 2, 2, 2)
         node_signs = groups.repeat(2, 1).repeat(2, 2).repeat(2, 3)

@@ -249,3 +249,6 @@ class SdfModel(Model):
             np.savez_compressed(stream, distance=values * np.float32(self.scale), lower=lower, upper=upper)
         shape = " x ".join(map(str, values.shape))
         return output, f"{shape} distances (z, y, x) in units of the mesh"
+
+
+MODEL = SdfModel

@@ -17,6 +17,7 @@ from ...fitting import Problem
 from ...indirection import DifferentiableArray, Indirection, ramp, rounded, stored_form
 from ...tables import StoredArray, Table
 from ...task import FitRequest
+from ...units import largest_fitting
 from .distances import Distances
 from .evaluation import HELD_OUT, HeldOut
 from .field import DistanceField
@@ -98,10 +99,12 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
         cascaded = np.maximum(2, np.round(n / ratio * extent / extent.max()).astype(int))
         return primary, cascaded
 
+    def fits(n: float) -> bool:
+        primary, cascaded = sides(n)
+        return 3 * primary.prod() + cascaded.prod() <= nbytes
+
     n = max(4, int((nbytes / (3 + ratio**-3) / np.prod(extent / extent.max())) ** (1 / 3)) + 4)
-    while n > 4 and 3 * sides(n)[0].prod() + sides(n)[1].prod() > nbytes:
-        n -= 1
-    primary, cascaded = sides(n)
+    primary, cascaded = sides(largest_fitting(fits, 4, n + 1))
     return tuple(primary.tolist()), tuple(cascaded.tolist())
 
 

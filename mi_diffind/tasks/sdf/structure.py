@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...bits import mask_flags, mask_words
 from ...errors import DiffindError
 
 #: Nodes along a side of a block and of a region.
@@ -82,7 +83,7 @@ class Structure:
     @property
     def nodes(self) -> int:
         """Number of stored nodes."""
-        return int(mask_bits(self.block_masks).sum())
+        return int(mask_flags(self.block_masks).sum())
 
     @property
     def blocks(self) -> int:
@@ -97,12 +98,12 @@ class Structure:
     def block_positions(self) -> np.ndarray:
         """Return the first node of each block, ``(B, 3)``."""
         regions = np.argwhere(self.regions == ACTIVE)
-        region, bit = np.nonzero(mask_bits(self.region_masks))
+        region, bit = np.nonzero(mask_flags(self.region_masks))
         return regions[region] * REGION + place_of(bit) * BLOCK
 
     def node_positions(self) -> tuple[np.ndarray, np.ndarray]:
         """Return every stored node's position in the grid, ``(n, 3)``, and its block, ``(n,)``."""
-        block, bit = np.nonzero(mask_bits(self.block_masks))
+        block, bit = np.nonzero(mask_flags(self.block_masks))
         return self.block_positions()[block] + place_of(bit), block
 
     def check(self) -> None:
@@ -110,7 +111,7 @@ class Structure:
         active = int((self.regions == ACTIVE).sum())
         if len(self.region_masks) != active or len(self.region_signs) != active:
             raise StructureError(f"{active} regions have nodes, found masks for {len(self.region_masks)}")
-        blocks = int(mask_bits(self.region_masks).sum())
+        blocks = int(mask_flags(self.region_masks).sum())
         if self.blocks != blocks or len(self.block_signs) != blocks:
             raise StructureError(f"{blocks} blocks have nodes, found masks for {self.blocks}")
         if self.nodes > MOST_NODES or max(self.shape) > MOST_SIDE:
@@ -193,18 +194,7 @@ _GROUPS = np.array([
 ])  # fmt: skip
 
 
-def mask_words(bits: np.ndarray) -> np.ndarray:
-    """Pack bits (n, 64) into words (n, 2) of 32 bits, the lowest first."""
-    return np.packbits(bits, axis=1, bitorder="little").view("<u4")
-
-
-def mask_bits(words: np.ndarray) -> np.ndarray:
-    """Unpack words (n, 2) of 32 bits into bits (n, 64), bool."""
-    raw = np.ascontiguousarray(words, "<u4").view(np.uint8)
-    return np.unpackbits(raw, axis=1, bitorder="little").astype(bool)
-
-
 def _before(words: np.ndarray) -> np.ndarray:
     """Return the number of bits set in all masks before each one, ``(n,)`` uint32."""
-    counts = mask_bits(words).sum(axis=1)
+    counts = mask_flags(words).sum(axis=1)
     return (np.cumsum(counts) - counts).astype(np.uint32)
