@@ -46,10 +46,10 @@ class Union(DistanceField):
         self.fields = fields
 
     def value(self, p, active=True):
-        found = [f.value(p, active) for f in self.fields]
-        for other in found[1:]:
-            found[0] = dr.minimum(found[0], other)
-        return found[0]
+        measured = [f.value(p, active) for f in self.fields]
+        for other in measured[1:]:
+            measured[0] = dr.minimum(measured[0], other)
+        return measured[0]
 
     def gradient(self, p, active=True):
         return self.value(p, active), T.Array3f(p)
@@ -103,31 +103,31 @@ def test_points_are_seeded(ball):
 
 
 def test_a_perfect_field(held_out):
-    found = held_out.measure(Ball(0.5, band=0.05))
+    measured = held_out.measure(Ball(0.5, band=0.05))
     normals = ["normal_deg", "normal_p95_deg", "normal_smooth_deg"]
-    assert list(found) == ["iou", "iou_near", "mae_near", "mae_surface", *normals]
-    assert found["iou"] > 0.998 and found["iou_near"] > 0.98 and found["mae_near"] < 2e-4
-    assert found["normal_deg"] < 1.5  # facets of 1.9 degrees
-    assert all(isinstance(v, float) for v in found.values())
+    assert list(measured) == ["iou", "iou_near", "mae_near", "mae_surface", *normals]
+    assert measured["iou"] > 0.998 and measured["iou_near"] > 0.98 and measured["mae_near"] < 2e-4
+    assert measured["normal_deg"] < 1.5  # facets of 1.9 degrees
+    assert all(isinstance(v, float) for v in measured.values())
 
 
 def test_errors_are_told(held_out):
     """A ball too small by 0.003, whose gradient is turned by 10° about z, and whose values end at 0.005."""
-    found = held_out.measure(Ball(0.497, band=0.05, tilt=math.radians(10)))
-    assert found["iou"] == pytest.approx((0.497 / 0.5) ** 3, abs=1e-3)
+    measured = held_out.measure(Ball(0.497, band=0.05, tilt=math.radians(10)))
+    assert measured["iou"] == pytest.approx((0.497 / 0.5) ** 3, abs=1e-3)
     inside = (0.5**3 - 0.49**3) / (0.51**3 - 0.49**3)
     near = (0.497**3 - 0.49**3) / (0.51**3 - 0.49**3)
-    assert found["iou_near"] == pytest.approx(near / inside, abs=0.01)
+    assert measured["iou_near"] == pytest.approx(near / inside, abs=0.01)
     # Truncated to ± 0.01: the last 0.003 on the outer side cannot be told by as much
     r = np.linspace(0.49, 0.51, 2001)
     error = np.abs(np.clip(r - 0.497, -0.01, 0.01) - (r - 0.5))
-    assert found["mae_near"] == pytest.approx(np.average(error, weights=r**2), rel=0.05)
-    assert found["mae_surface"] == pytest.approx(0.003, rel=0.1)
+    assert measured["mae_near"] == pytest.approx(np.average(error, weights=r**2), rel=0.05)
+    assert measured["mae_surface"] == pytest.approx(0.003, rel=0.1)
     z = np.linspace(-1, 1, 2001)
     turned = np.degrees(2 * np.arcsin(np.sqrt(1 - z**2) * math.sin(math.radians(5))))
-    assert found["normal_deg"] == pytest.approx(turned.mean(), rel=0.05)
-    assert found["normal_p95_deg"] == pytest.approx(10, rel=0.1)
-    assert found["normal_smooth_deg"] < 1.5
+    assert measured["normal_deg"] == pytest.approx(turned.mean(), rel=0.05)
+    assert measured["normal_p95_deg"] == pytest.approx(10, rel=0.1)
+    assert measured["normal_smooth_deg"] < 1.5
     # A band that ends before the one that is measured counts as an error
     short = held_out.measure(Ball(0.5, band=0.005))["mae_near"]
     assert short == pytest.approx(np.average(np.maximum(np.abs(r - 0.5) - 0.005, 0), weights=r**2), rel=0.05)
@@ -157,9 +157,9 @@ def test_iou_of_thin_solids():
             return self.value(p), T.Array3f(p.x, p.y, 0 * p.z)
 
     with Distances(mesh) as d:
-        found = SurfaceEvaluation(mesh, d, count=2**14).measure(Rod(0.1))
-    assert found["iou"] == pytest.approx((0.011 / 0.012) ** 2, abs=0.03)
-    assert found["iou_near"] == pytest.approx(found["iou"])
+        measured = SurfaceEvaluation(mesh, d, count=2**14).measure(Rod(0.1))
+    assert measured["iou"] == pytest.approx((0.011 / 0.012) ** 2, abs=0.03)
+    assert measured["iou_near"] == pytest.approx(measured["iou"])
 
 
 def test_fields_that_say_nothing(held_out):
@@ -173,17 +173,19 @@ def test_fields_that_say_nothing(held_out):
         def normal(self, p, active=True):
             return T.Array3f(math.nan) * p.x
 
-    found = held_out.measure(Nothing(0.5))
-    assert found["iou"] == found["iou_near"] == 0 and found["normal_deg"] == found["normal_smooth_deg"] == 90
-    assert math.isfinite(found["mae_near"])
+    measured = held_out.measure(Nothing(0.5))
+    assert (
+        measured["iou"] == measured["iou_near"] == 0 and measured["normal_deg"] == measured["normal_smooth_deg"] == 90
+    )
+    assert math.isfinite(measured["mae_near"])
 
 
 def test_buried_surfaces_do_not_count():
     """Normals are measured where the solid ends, not where a piece lies in another one."""
     mesh = make_mesh(*solids.together(solids.sphere(32), solids.box((1, 1, 1))))
     with Distances(mesh) as d:
-        found = SurfaceEvaluation(mesh, d, count=2**12).measure(Ball(0.5))
-    assert found["normal_deg"] < 5 and found["iou"] > 0.99
+        measured = SurfaceEvaluation(mesh, d, count=2**12).measure(Ball(0.5))
+    assert measured["normal_deg"] < 5 and measured["iou"] > 0.99
 
 
 # -- decoding ---------------------------------------------------------------------------------------------------------
@@ -283,11 +285,15 @@ def test_how_fine_a_grid_has_to_be():
     for n, error, rel in zip((50, 100, 200), errors, (0.15, 0.05, 0.03), strict=True):
         assert error == pytest.approx(expected * (1.1 / n) ** 2 / 0.3, rel=rel)
     for error in (1e-3, 1e-4, 2e-5):
-        chosen, found = grids.resolution_for(field, error)
-        assert found <= error and grids.trilinear_error(field, points, chosen) == pytest.approx(found, rel=0.05)
+        chosen, measured = grids.resolution_for(field, error)
+        assert measured <= error and grids.trilinear_error(field, points, chosen) == pytest.approx(measured, rel=0.05)
         assert grids.trilinear_error(field, points, int(chosen / 1.04)) > 0.98 * error
-    chosen, found = grids.resolution_for(field, 2e-5, finest=60)
-    assert chosen == 60 and found == pytest.approx(grids.trilinear_error(field, points, 60), rel=0.05) and found > 2e-5
+    chosen, measured = grids.resolution_for(field, 2e-5, finest=60)
+    assert (
+        chosen == 60
+        and measured == pytest.approx(grids.trilinear_error(field, points, 60), rel=0.05)
+        and measured > 2e-5
+    )
     assert grids.resolution_for(field, 0, finest=60)[0] == 60
     assert grids.resolution_for(Ball(-0.1), 1e-3) == (8, 0)  # no surface
 
@@ -316,19 +322,19 @@ def test_chamfer(ball, held_out):
     mesh, _ = ball
     for radius in (0.49, 0.5):
         decoded = extraction.extract(Ball(radius), 150, mesh.scale, mesh.centre)
-        found = held_out.chamfer(decoded, 2**14)
-        assert found["chamfer"] == pytest.approx(0.5 - radius, abs=2e-4) and found["components"] == 1
-        assert found["components_mesh"] == 1
+        measured = held_out.chamfer(decoded, 2**14)
+        assert measured["chamfer"] == pytest.approx(0.5 - radius, abs=2e-4) and measured["components"] == 1
+        assert measured["components_mesh"] == 1
     import trimesh
 
     half = trimesh.Trimesh(
         *solids.without(solids.sphere(96), solids.sphere(96)[0][solids.sphere(96)[1]][:, :, 2].max(1) > 1e-6)
     )
-    found = held_out.chamfer(half, 2**14)["chamfer"]
+    measured = held_out.chamfer(half, 2**14)["chamfer"]
     # From the missing half's points to the equator
     z = np.linspace(0, 1, 2001)
     away = 0.5 * 2 * np.sin(np.arcsin(z) / 2)
-    assert found == pytest.approx((away.mean() / 2) / 2, rel=0.03)
+    assert measured == pytest.approx((away.mean() / 2) / 2, rel=0.03)
     nothing = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int))
     assert held_out.chamfer(nothing) == {"chamfer": math.inf, "components": 0, "components_mesh": 1}
 

@@ -138,8 +138,8 @@ def shoot(types, distances, field, count, seed):
         t, hit = trace(field, vectors(types, o), vectors(types, towards / length[:, None]), types.Float(math.inf))
         t, hit = t.numpy().astype(np.float64), hit.numpy()
         missed += int(np.sum(~hit | (t > length)))
-        found = hit[:, None] & np.isfinite(t)[:, None]
-        place = np.where(found, o + (towards / length[:, None]) * np.where(hit, t, 0)[:, None], target)
+        is_hit = hit[:, None] & np.isfinite(t)[:, None]
+        place = np.where(is_hit, o + (towards / length[:, None]) * np.where(hit, t, 0)[:, None], target)
         some = rng.choice(np.flatnonzero(hit & (start != 2)), min(20_000, int(hit.sum() // 2)), replace=False)
         astray += int(np.sum(distances.unsigned(place[some]) > 1.5 * h))
     return missed, astray

@@ -60,11 +60,11 @@ def test_formats(tmp_path, name):
 def test_scene_is_placed(tmp_path):
     """A scene's meshes are taken together where transforms put them, mirrored ones are turned."""
     scene = trimesh.Scene()
-    thing = trimesh.Trimesh(*solids.box(), process=False)
-    scene.add_geometry(thing, transform=np.diag([1.0, 1, 2, 1]))
+    cube = trimesh.Trimesh(*solids.box(), process=False)
+    scene.add_geometry(cube, transform=np.diag([1.0, 1, 2, 1]))
     mirror = np.diag([-1.0, 1, 1, 1])
     mirror[0, 3] = 3
-    scene.add_geometry(thing, transform=mirror)
+    scene.add_geometry(cube, transform=mirror)
     scene.export(tmp_path / "scene.glb")
     mesh = load_mesh(tmp_path / "scene.glb")
     assert mesh.components == 2 and mesh.watertight and mesh.warnings == []
@@ -92,7 +92,7 @@ def test_digest_knows_content():
 
 
 @pytest.mark.parametrize(
-    "content, found",
+    "content, result",
     [
         (b"", "cannot be read as a mesh"),
         (b"OFF\n3 1 0\n0 0 0\n1 0", "cannot be read as a mesh"),
@@ -100,11 +100,11 @@ def test_digest_knows_content():
         (b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", ""),
     ],
 )
-def test_unreadable_files(tmp_path, content, found):
+def test_unreadable_files(tmp_path, content, result):
     (tmp_path / "a.off").write_bytes(content)
     with pytest.raises(MeshError) as error:
         load_mesh(tmp_path / "a.off")
-    assert found in sentence(error) and str(tmp_path / "a.off") in str(error.value)
+    assert result in sentence(error) and str(tmp_path / "a.off") in str(error.value)
 
 
 def test_files_that_are_none(tmp_path):
@@ -137,7 +137,7 @@ NOTHING = np.zeros((0, 3), int)
 
 
 @pytest.mark.parametrize(
-    "vertices, faces, found",
+    "vertices, faces, result",
     [
         (np.zeros((0, 3)), NOTHING, "has no triangles"),
         (np.eye(3), NOTHING, "has no triangles"),
@@ -154,11 +154,11 @@ NOTHING = np.zeros((0, 3), int)
         ([[-1e308, 0, 0], [1e308, 0, 0], [0, 1e308, 1e308]], [[0, 1, 2]], "has the extent inf"),
     ],
 )
-def test_meshes_that_are_none(vertices, faces, found):
+def test_meshes_that_are_none(vertices, faces, result):
     """Refused when they are read, or at the latest when distances are asked for; always in one sentence."""
     with pytest.raises((MeshError, DistancesError)) as error, Distances(make_mesh(vertices, faces, "a.ply")) as d:
         d.signed(np.zeros((1, 3)))
-    assert found in sentence(error) and str(error.value).startswith("a.ply: ")
+    assert result in sentence(error) and str(error.value).startswith("a.ply: ")
 
 
 def test_degenerate_triangles_are_left_out():
@@ -235,14 +235,14 @@ def test_distances_of_a_box():
     points = np.concatenate([sample_box([-0.7] * 3, [0.7] * 3, 3000, 0), sample_near(mesh, 3000, 0.01, 1)])
     with Distances(mesh) as d:
         truth = solids.box_distance(points, size)
-        found = d.signed(points)
-        assert found.dtype == np.float32 and np.abs(found - truth).max() < 1e-6
+        result = d.signed(points)
+        assert result.dtype == np.float32 and np.abs(result - truth).max() < 1e-6
         assert np.array_equal(d.inside(points), truth < 0)
         assert np.abs(d.signed(points, 0.05) - truth.clip(-0.05, 0.05)).max() < 1e-6
         value, gradient = d.signed_normals(points)
         step = 1e-5
         ahead = solids.box_distance(points + step * gradient, size)
-    assert np.array_equal(value, found) and np.allclose(np.linalg.norm(gradient, axis=1), 1, atol=1e-5)
+    assert np.array_equal(value, result) and np.allclose(np.linalg.norm(gradient, axis=1), 1, atol=1e-5)
     assert np.quantile(np.abs((ahead - truth) / step - 1), 0.99) < 1e-3  # but for those with several nearest points
 
 
@@ -337,13 +337,13 @@ def test_overlapping_boxes_are_their_union(shift):
     mesh = make_mesh(*solids.together(solids.box(), solids.box(centre=shift)))
     points = sample_box([-0.6] * 3, [0.6] * 3, 4000, 1)
     with Distances(mesh) as d:
-        found, surface = d.signed(points), d.surface
-        said = [w for w in d.warnings if "pieces overlap" in w]
+        result, surface = d.signed(points), d.surface
+        warnings = [w for w in d.warnings if "pieces overlap" in w]
     file = mesh.to_file_frame(points)
     a, b = solids.box_distance(file, (1, 1, 1)), solids.box_distance(file, (1, 1, 1), shift)
-    assert np.array_equal(found < 0, np.minimum(a, b) < 0) and said
-    outside = found > 0
-    assert np.abs(found - np.minimum(a, b) / mesh.scale)[outside].max() < 0.01
+    assert np.array_equal(result < 0, np.minimum(a, b) < 0) and warnings
+    outside = result > 0
+    assert np.abs(result - np.minimum(a, b) / mesh.scale)[outside].max() < 0.01
     # The exact distance to the union's surface: to all points of either box in front of which neither is
     cloud, normals = sample_surface(make_mesh(*solids.box()), 40000, 2)
     cloud, ahead = (np.concatenate([c, c + np.array(shift)]) for c in (cloud, cloud + 1e-6 * normals))
@@ -351,7 +351,7 @@ def test_overlapping_boxes_are_their_union(shift):
     from scipy.spatial import KDTree
 
     truth, _ = KDTree(cloud[seen]).query(file)
-    error = np.abs(np.abs(found) - truth / mesh.scale)
+    error = np.abs(np.abs(result) - truth / mesh.scale)
     assert np.quantile(error, 0.99) < 0.01 and error.max() < 0.02
     assert surface.area < mesh.area
 
@@ -553,14 +553,14 @@ def test_ctrl_c_ends_a_question():
 
 def test_the_child_outlives_a_thread():
     """Asked first by a thread that ends: the process is not that thread's."""
-    found = []
+    result = []
     with Distances(make_mesh(*solids.box())) as d:
-        thread = threading.Thread(target=lambda: found.append(d.signed(np.zeros((1, 3)))))
+        thread = threading.Thread(target=lambda: result.append(d.signed(np.zeros((1, 3)))))
         thread.start()
         thread.join()
         child = d._child
         time.sleep(0.2)
-        assert d.signed(np.zeros((1, 3))) == found[0] and d._child is child
+        assert d.signed(np.zeros((1, 3))) == result[0] and d._child is child
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")

@@ -56,10 +56,10 @@ def test_every_node_of_the_grid_has_its_sign(ad, solid):
     places = np.array(s.lower) + s.spacing * grid
     inside = distances.inside(places)
     # A hair within the cell whose lowest corner the node is, so that rounding does not choose another
-    found = decoded(ad, sampled).value(points(ad, places + 1e-4 * s.spacing)).numpy()
+    result = decoded(ad, sampled).value(points(ad, places + 1e-4 * s.spacing)).numpy()
     sure = np.abs(distances.unsigned(places)) > 1e-3 * s.spacing
     assert 0.02 < inside.mean() < 0.5
-    assert np.array_equal((found < 0)[sure], inside[sure])
+    assert np.array_equal((result < 0)[sure], inside[sure])
 
 
 def test_positions_follow_from_masks(solid):
@@ -135,8 +135,8 @@ def test_pointers_in_words(ad, bits, rng):
     words = codes.pointer_words(values, bits)
     assert np.array_equal(codes.pointers_of(words, bits, 1001), values)
     index = ad.UInt32(rng.permutation(1001).astype(np.uint32))
-    found = codes.pointer_at(ad.UInt32(words), index, bits, ad.Bool(True))
-    assert np.array_equal(found.numpy(), values[index.numpy()])
+    result = codes.pointer_at(ad.UInt32(words), index, bits, ad.Bool(True))
+    assert np.array_equal(result.numpy(), values[index.numpy()])
 
 
 # -- what cells say ----------------------------------------------------------------------------------------------------
@@ -177,8 +177,8 @@ def test_gradients_are_those_of_the_values(ad, solid):
     h = 0.02 * s.spacing
     for axis in range(3):
         step = [h if i == axis else 0 for i in range(3)]
-        found = (field.value(p + ad.Array3f(*step)) - field.value(p - ad.Array3f(*step))) / (2 * h)
-        assert np.abs(found.numpy() - slope[axis].numpy()).max() < 5e-3
+        result = (field.value(p + ad.Array3f(*step)) - field.value(p - ad.Array3f(*step))) / (2 * h)
+        assert np.abs(result.numpy() - slope[axis].numpy()).max() < 5e-3
 
     start = field.nodes
     weights = ad.Float(rng.normal(size=400).astype(np.float32))
@@ -190,13 +190,13 @@ def test_gradients_are_those_of_the_values(ad, solid):
     touched = np.argwhere(np.abs(grad) > 1e-3)
     assert len(touched) > 500
     for node, channel in touched[rng.integers(len(touched), size=8)]:
-        found = []
+        result = []
         for sign in (1, -1):
             moved = values.copy()
             moved[node, channel] += sign * 0.01
             field.nodes = ad.TensorXf(moved)
-            found.append(dr.sum(weights * field.value(p))[0] / s.spacing)
-        assert (found[0] - found[1]) / 0.02 == pytest.approx(grad[node, channel], rel=2e-2, abs=2e-3)
+            result.append(dr.sum(weights * field.value(p))[0] / s.spacing)
+        assert (result[0] - result[1]) / 0.02 == pytest.approx(grad[node, channel], rel=2e-2, abs=2e-3)
 
 
 def test_coded_nodes_are_the_decoded_ones(ad, solid):
