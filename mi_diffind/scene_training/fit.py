@@ -21,23 +21,23 @@ from ..maps.layout import Layout
 from ..maps.pyramid import Pyramid
 from ..maps.source import Source, load_source
 from ..tables import PAGES, Table, TableError
-from ..task import Request
+from ..task import FitRequest
 from ..tasks.texture.compressed import CompressedTexture, form_of, load, to_table
 from ..tasks.texture.memory_budget import Fine, PaperSize, Size
 from ..tasks.texture.nets import PaperForm
 from ..tasks.texture.presets import PRESETS, Recipe
 from ..tasks.texture.training import TextureProblem, problem_of, stored_form
 from .problem import SceneProblem
-from .recipe import SceneRecipe, Views
-from .references import References
+from .recipe import SceneRecipe, ViewDistribution
+from .references import ReferenceRenders
 from .texture import TrainedScene, texture_file
 
 
 def fit_scene(
     path: str | os.PathLike,
-    views: Views,
+    views: ViewDistribution,
     recipe: SceneRecipe,
-    request: Request,
+    request: FitRequest,
     file: str | os.PathLike | None = None,
     references: str | os.PathLike | None = None,
     preview: str | os.PathLike | None = None,
@@ -62,7 +62,7 @@ def fit_scene(
     if recipe.start == "untrained":
         texture = problem_of(source, size_of(table), texture.recipe, texture.pyramid)
         table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
-    rendered = References(
+    rendered = ReferenceRenders(
         path, views, recipe.reference_spp, references, defines, recipe.against,
         without=(file,), inputs=(source.digest,), progress=request.progress,
     )  # fmt: skip
@@ -89,7 +89,7 @@ def fit_scene(
     return found, result
 
 
-def _relative(path: str | os.PathLike, request: Request) -> str:
+def _relative(path: str | os.PathLike, request: FitRequest) -> str:
     return os.path.relpath(Path(path).resolve(), (request.output or Path("x")).resolve().parent)
 
 

@@ -387,7 +387,7 @@ def test_fields_and_meshes_are_in_one_place(folder):
 def test_trained_in_other_ways():
     """No pointer before the end; nothing trained; and the usual way."""
     settings, coded, moved = fitting.FitSettings(steps=10, batch=2**10, lr=1e-2, measure_every=10), {}, {}
-    for way in (task.Request, parts.AtOnce, parts.Untrained):
+    for way in (task.FitRequest, parts.AtOnce, parts.Untrained):
         coding = encoding.Coding(encoding.sample(Ball(), 1 / 12), 10)
         field = nodes.SparseNodes(T, coding.sampled.structure, 1.0)
         problem = training.NodeProblem(field, Ball.mesh, coding, SimpleNamespace(measure=lambda field: {"x": 0.0}))
@@ -395,7 +395,7 @@ def test_trained_in_other_ways():
         coded[way] = coding.done.mean()
         moved[way] = np.abs(problem.net.values.numpy()[:, 0] - coding.sampled.distances).max() > 1e-3
     assert list(moved.values()) == [True, True, False]
-    assert 0.7 < coded[task.Request] < 0.9 and coded[parts.AtOnce] == coded[parts.Untrained] == 0
+    assert 0.7 < coded[task.FitRequest] < 0.9 and coded[parts.AtOnce] == coded[parts.Untrained] == 0
 
 
 def test_parts_are_jobs(tmp_path):

@@ -156,7 +156,7 @@ class _Training(_Made):
     def run(self, folder: Path | None, progress: bool) -> dict | None:
         source, own = self.source, replaced(self.recipe, deterministic=False)
         types = array_module(mi.variant())
-        asked = task.Request(self.preset, own.settings, types, seconds=self.seconds, progress=progress)
+        asked = task.FitRequest(self.preset, own.settings, types, seconds=self.seconds, progress=progress)
         size = search.default_size(source, source.nbytes / self.compression, own)
         table, result = training.fit_image(source, size, own, asked, title=self.name)
         if result.interrupted:

@@ -36,7 +36,7 @@ def settings_of(setting) -> FitSettings:
 # -- ours, trained in other ways --------------------------------------------------------------------------------------
 
 
-class AtOnce(task.Request):
+class AtOnce(task.FitRequest):
     """No node has a code until the end of the training."""
 
     def train(self, problem, title: str | None = None) -> FitResult:
@@ -44,7 +44,7 @@ class AtOnce(task.Request):
         return super().train(problem, title)
 
 
-class Untrained(task.Request):
+class Untrained(task.FitRequest):
     """The nodes stay what they begin with."""
 
     def train(self, problem, title: str | None = None) -> FitResult:

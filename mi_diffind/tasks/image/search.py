@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from ...fitting import FitResult
 from ...maps.source import Source
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from . import memory_budget
 from .memory_budget import Coarse, Size
 from .presets import PAGED, STRUCTURES, Recipe, replaced
@@ -78,7 +78,7 @@ def _steps(recipe: Recipe, share: float) -> Recipe:
 
 
 def ratio_search(
-    source: Source, nbytes: float, recipe: Recipe, request: Request, free: bool = True, border=None
+    source: Source, nbytes: float, recipe: Recipe, request: FitRequest, free: bool = True, border=None
 ) -> Found:
     """
     The best of several sizes of ``nbytes``, each trained for :data:`SHORT` of the steps: the side of the cascaded
@@ -154,7 +154,7 @@ def psnr_search(
     source: Source,
     goal: float,
     recipe: Recipe,
-    request: Request,
+    request: FitRequest,
     border=None,
     most: int = 8,
     log: Callable[[str], None] = print,

@@ -23,7 +23,7 @@ from ...maps.layout import Layout
 from ...maps.source import Source
 from ...pages import most_entries, page_counts
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from . import arrays, memory_budget
 from .compressed import CompressedImage, to_table
 from .memory_budget import Size
@@ -209,7 +209,7 @@ def fit_image(
     source: Source,
     size: Size | None,
     recipe: Recipe,
-    request: Request,
+    request: FitRequest,
     border: tuple[str, str] | None = None,
     title: str | None = None,
 ) -> tuple[Table, FitResult]:

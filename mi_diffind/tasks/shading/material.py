@@ -37,7 +37,7 @@ READ = {"albedo": (1, 3), "normal": (3,), "roughness": (1,), "metallic": (1,)}
 
 
 @dataclass
-class Surface:
+class SurfaceParameters:
     """
     The material at a place: ``albedo``, a linear colour; ``normal``, of any length, in the frame of the surface;
     ``roughness`` and ``metallic``. What no map has is a number, and the normal ``None``.
@@ -102,7 +102,7 @@ def _linear(v):
     return dr.select(v <= 0.04045, v / 12.92, root**2.4)
 
 
-def surface_of(maps: FilteredMaps, stored: list) -> Surface:
+def surface_of(maps: FilteredMaps, stored: list) -> SurfaceParameters:
     """The material at places of which ``stored`` are the stored channels."""
     found = maps_of(maps.layout)
     read = maps.maps(stored, [m.name for m in found.values()])
@@ -121,14 +121,14 @@ def surface_of(maps: FilteredMaps, stored: list) -> Surface:
         signed = found["normal"].low < 0
         normal = vector(normal) if signed else 2 * vector(normal) - 1
     one = {kind: channels[kind][0] if kind in channels else DEFAULTS[kind] for kind in ("roughness", "metallic")}
-    return Surface(vector(albedo), normal, **one)
+    return SurfaceParameters(vector(albedo), normal, **one)
 
 
 #: The colour of a material without an albedo, as the plugin ``disney`` has it.
 DEFAULT_ALBEDO = 0.5
 
 
-def shaded(decoder: Decoder | None, surface: Surface, wi, wo, effects: Effects, limit: float | None = None):
+def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects: Effects, limit: float | None = None):
     """
     π · BRDF · cosine, a colour, from ``decoder`` (``None``: straight from the formulas). ``limit``: bound of the
     derivatives that flow back through the specular lobe, which has no other (:mod:`.clip`).

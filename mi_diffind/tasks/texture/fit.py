@@ -12,7 +12,7 @@ from ...maps.arguments import asked_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from ...tables import MAX_BYTES
-from ...task import Fitted, Request
+from ...task import FitRequest, Fitted
 from . import arrays, memory_budget, training
 from .presets import PRESETS, Recipe
 
@@ -27,7 +27,7 @@ def recipe_of(preset: str, settings, options) -> Recipe:
     return dataclasses.replace(recipe, **{k: v for k, v in given.items() if v is not None})
 
 
-def check(request: Request) -> None:
+def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     if options["source"] is None:
@@ -48,7 +48,7 @@ def check(request: Request) -> None:
         options["skip"] = fine[-1].level + 1
 
 
-def fit(request: Request) -> Fitted:
+def fit(request: FitRequest) -> Fitted:
     """
     Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
     :class:`~mi_diffind.fitting.FittingError`.

@@ -22,7 +22,7 @@ from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from . import arrays
 from .compressed import CompressedTexture, to_table
 from .memory_budget import PaperSize, Size
@@ -178,7 +178,7 @@ def problem_of(source: Source, size: Size | PaperSize, recipe: Recipe, pyramid: 
 
 
 def fit_texture(
-    source: Source, size: Size | PaperSize | None, recipe: Recipe, request: Request, pyramid: Pyramid
+    source: Source, size: Size | PaperSize | None, recipe: Recipe, request: FitRequest, pyramid: Pyramid
 ) -> tuple[Table, FitResult]:
     """
     Train the arrays of ``source`` and return them as they are stored, with their errors

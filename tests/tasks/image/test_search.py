@@ -10,7 +10,7 @@ import pytest
 from mi_diffind.fitting import FitResult
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import memory_budget, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.image.memory_budget import Size
@@ -37,12 +37,12 @@ def short(recipe=OURS, steps=8, **settings):
 
 
 #: What a training is asked for, where none takes place.
-ASKED = Request("ours", OURS.settings, None)
+ASKED = FitRequest("ours", OURS.settings, None)
 
 
 def asked():
     """What it is asked for where one does."""
-    return Request("ours", OURS.settings, array_module("llvm"), progress=False)
+    return FitRequest("ours", OURS.settings, array_module("llvm"), progress=False)
 
 
 def nbytes_of(size, channels):

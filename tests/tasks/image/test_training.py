@@ -15,7 +15,7 @@ from mi_diffind.maps import components
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import TASK, arrays, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
 from mi_diffind.tasks.image.memory_budget import Coarse, Size
@@ -50,7 +50,7 @@ def short(recipe=OURS, steps=3, batch=256, **settings):
 def trained(source, size, recipe, types=None, border=None, **request):
     """:func:`.training.fit_image`, in silence."""
     types = types or array_module("llvm")
-    request = Request("ours", recipe.settings, types, progress=False, **request)
+    request = FitRequest("ours", recipe.settings, types, progress=False, **request)
     return training.fit_image(source, size, recipe, request, border)
 
 

@@ -16,7 +16,7 @@ from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
-from mi_diffind.task import Request, fit
+from mi_diffind.task import FitRequest, fit
 from mi_diffind.tasks.texture import TASK, memory_budget, sampling, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 from mi_diffind.tasks.texture.memory_budget import Fine, Size, choose, paper_bytes, paper_size, parse_structure
@@ -59,7 +59,7 @@ def trained(source, size, recipe, **request):
     # Of one size and one border, mostly: what differs has to be compiled anew
     border = request.pop("border", ("repeat", "clamp"))
     pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, border)
-    request = Request("ours" if recipe.layered else "paper", recipe.settings, types, progress=False, **request)
+    request = FitRequest("ours" if recipe.layered else "paper", recipe.settings, types, progress=False, **request)
     return training.fit_texture(source, size, recipe, request, pyramid)
 
 
