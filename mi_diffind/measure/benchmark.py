@@ -154,7 +154,7 @@ class _Steps:
         if self.store.folder is not None and plan.jobs:
             folder = models_folder(self.store.folder, plan.study, plan.jobs_fingerprint)
         for i, job in enumerate(plan.jobs):
-            record = job.known(folder, done.get(job.name))
+            record = job.cached_record(folder, done.get(job.name))
             if record is None:
                 if self.progress:
                     print(f"{i + 1} of {len(plan.jobs)}: {job.name}", file=sys.stderr)

@@ -76,7 +76,7 @@ def test_kept_models_are_read_and_not_trained(tmp_path):
     assert os.listdir(tmp_path) == ["a_ramp.npz"]  # no checkpoint stays
     log = []
     again = training(log)
-    assert again.known(tmp_path) == record and log == []
+    assert again.cached_record(tmp_path) == record and log == []
     assert np.array_equal(again.net.numpy(), first.net.numpy())
 
 
@@ -84,11 +84,11 @@ def test_models_of_other_settings_are_trained_again(tmp_path):
     training([]).run(tmp_path, progress=False)
     for options in ({"longest": 320}, {"target": 0.5}):
         other = training([], **options)
-        assert other.known(tmp_path) is None
+        assert other.cached_record(tmp_path) is None
         other.run(tmp_path, progress=False)
     assert np.allclose(other.net.numpy(), 0.5, atol=0.05)
     (tmp_path / "a_ramp.npz").write_bytes(b"damaged")
-    assert training([]).known(tmp_path) is None
+    assert training([]).cached_record(tmp_path) is None
 
 
 def test_interrupted_training_goes_on(tmp_path):
