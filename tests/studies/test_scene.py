@@ -232,7 +232,8 @@ def test_values_that_are_not_finite_are_counted(scene, monkeypatch):
 
 
 def test_one_sample_count(scene, tmp_path):
-    result = study.measure(scene, SceneStudySettings.choose(quick=True, spp=1), tmp_path, progress=False, defines={"spp": 2})
+    settings = SceneStudySettings.choose(quick=True, spp=1)
+    result = study.measure(scene, settings, tmp_path, progress=False, defines={"spp": 2})
     assert result["counts"] == [1] and len(result["points"]) == 2 and result["defines"] == {"spp": "2"}
 
 

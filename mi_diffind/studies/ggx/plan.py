@@ -3,8 +3,8 @@ Plan of the GGX study: indirection, single tables, networks and the formula, tra
 
 Every representation is measured with two parametrisations of its *inputs*: the plain one, (cos θ_h, α) as in the
 paper, and the logarithmic one of ``neural_ggx`` (:class:`~mi_diffind.tasks.ggx.model.Encoding`). All learn the same
-output, the bounded root of D, from the same samples with the same error measure; candidates marked *raw* learn D itself,
-as the paper's recipe does. All are trained until they converge (:mod:`~mi_diffind.measure.training`). The rough
+output, the bounded root of D, from the same samples with the same error measure; candidates marked *raw* learn D
+itself, as the paper's recipe does. All are trained until they converge (:mod:`~mi_diffind.measure.training`). The rough
 conductor that is built from the distribution is timed beside Mitsuba's.
 """
 
