@@ -68,7 +68,7 @@ def _verdict(result: dict) -> list[str]:
         timings = measured["queries"]["eval"]
         reads = {name: t["operations"]["gathers"] for name, t in timings.items()}
         # Excludes tables that are read only once because the material is constant
-        learned = [name for name, a in accuracy.items() if a is not None and reads[name] > reads["disney"]]
+        learned = [name for name, n in reads.items() if accuracy[name] is not None and n > reads["disney"]]
         if not learned or timings["disney"]["time"] <= 0:
             continue
         best = min(learned, key=lambda name: timings[name]["time"])

@@ -83,9 +83,10 @@ def summary(result: dict) -> list[str]:
     lines += grid(cells)
     reference, bias, crossover = result["reference"], result["bias"], result["crossover"]
     lines += ["", f"reference   {reference['spp']} spp, its own noise {percent(reference['noise_rmse'])} (subtracted)"]
-    size = f"below {percent(bias['rmse_below'])}"
     if bias["measured"]:
         size = f"{percent(bias['rmse'])} ± {percent(bias['rmse_standard_error'], 2)}"
+    else:
+        size = f"below {percent(bias['rmse_below'])}"
     lines.append(f"bias        {size}, {picture.decibel(bias)}")
     if "spp" in crossover and practical(crossover):
         between = f"{rounded(crossover['spp_low'])} to {rounded(crossover['spp_high'])}"
