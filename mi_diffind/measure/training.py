@@ -25,7 +25,7 @@ from .study import Job
 GAIN = 0.5
 
 
-class Training(Job):
+class ConvergenceTraining(Job):
     """
     A representation that is trained to convergence.
 

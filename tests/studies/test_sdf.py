@@ -314,8 +314,8 @@ def folder(tmp_path_factory):
     vertices[:, 2] = np.minimum(vertices[:, 2], 0.64 + 0.2 * vertices[:, 2])
     solids.write(folder / "dent.ply", (vertices, faces))
     with pytest.MonkeyPatch.context() as patch:
-        small = benchmark.Settings(2**10, 2, 1, 2**10, True)
-        patch.setattr(benchmark.Settings, "choose", classmethod(lambda cls, variant, quick=False: small))
+        small = benchmark.BenchmarkSettings(2**10, 2, 1, 2**10, True)
+        patch.setattr(benchmark.BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: small))
         assert main([*command(folder), "--json", str(folder / "r.json")]) == 0
     return folder
 

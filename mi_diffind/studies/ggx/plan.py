@@ -28,7 +28,7 @@ from ...measure.bsdf import QUERIES, bsdf_queries, directions, noise_texture
 from ...measure.operations import FLOPS, Operations, count_query
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...measure.training import Training
+from ...measure.training import ConvergenceTraining
 from ...tasks.ggx import TASK
 from ...tasks.ggx.model import INPUTS, Encoding, LearnedGGX, ggx, indirection
 from ...tasks.ggx.training import GGXProblem, draw, measure
@@ -131,7 +131,7 @@ class GGXCandidates:
     def __init__(self, types, quick: bool, quick_steps: int):
         self.types, self.quick, self.quick_steps = types, quick, quick_steps
         self.candidates: list[Candidate] = []
-        self.trainings: list[Training] = []
+        self.trainings: list[ConvergenceTraining] = []
         self.ratios: list[tuple[str, str]] = []
         #: Name of a candidate → function that returns its reader; and the inputs that it is read at.
         self.readers: dict[str, Callable[[], Callable]] = {}
@@ -145,7 +145,7 @@ class GGXCandidates:
         """Return the name of the indirection of the paper's sizes."""
         return self.name(f"{PRIMARY}→{CASCADED}", inputs)
 
-    def train(self, label: str, net: Callable, settings_key: str, encoding: Encoding) -> Training:
+    def train(self, label: str, net: Callable, settings_key: str, encoding: Encoding) -> ConvergenceTraining:
         """Register a training by the settings :data:`SETTINGS` ``[settings_key]``."""
         options = dict(SETTINGS[settings_key])
         longest = options.pop("longest")
@@ -158,7 +158,7 @@ class GGXCandidates:
             return GGXProblem(net().alloc(self.types.TensorXf, 2, dr.rng(seed=1)), self.types, samples, encoding)
 
         name = self.name(label, encoding.inputs)
-        self.trainings.append(Training(name, problem, settings, longest, 4 if self.quick else 20))
+        self.trainings.append(ConvergenceTraining(name, problem, settings, longest, 4 if self.quick else 20))
         return self.trainings[-1]
 
     def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
@@ -235,7 +235,7 @@ class GGXCandidates:
             self.add(f"{label} tensor", representation, "tensors", size, training, lambda net: net, encoding,
                      operations)  # fmt: skip
 
-    def _network_operations(self, training: Training, encoding: Encoding) -> Callable[[str], Operations]:
+    def _network_operations(self, training: ConvergenceTraining, encoding: Encoding) -> Callable[[str], Operations]:
         """Return a counter of the operations in a kernel and of the matrix products, which a kernel does not show."""
 
         def counted(query: str) -> Operations:

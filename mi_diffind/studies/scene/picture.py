@@ -31,7 +31,7 @@ def draw(result: dict, caption: str):
     line unless it is beyond :data:`REACH`.
     """
     title = f"{Path(result['scene']).stem}: noise and bias at a given render time"
-    figure = plot.sheet(title, caption, 7.6, 4.9)
+    figure = plot.figure(title, caption, 7.6, 4.9)
     axes = figure.add_subplot()
     axes.set_xlabel("seconds of a render (kernels)", fontsize=9)
     axes.set_ylabel("relative RMS error", fontsize=9)
@@ -39,8 +39,8 @@ def draw(result: dict, caption: str):
     _limits(axes, result, curves)
     labels = _draw(axes, result, curves)
     _legend(axes, curves)
-    plot.fix(figure)
-    plot.place(axes, labels, [(p["seconds"], p["rmse"]) for curve in curves.values() for p in curve])
+    plot.fix_layout(figure)
+    plot.place_labels(axes, labels, [(p["seconds"], p["rmse"]) for curve in curves.values() for p in curve])
     return figure
 
 

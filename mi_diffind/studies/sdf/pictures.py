@@ -50,7 +50,7 @@ def shapes(setting, view: views.Stage, result: dict):
     shown = [kinds[k] for k in SHOWN if k in kinds]
     columns = max(3, len(shown) + 1)
     caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
-    found = plot.sheet(f"{result['title']}, {size_text(first)} above", caption, 2.6 * columns, 6.4)
+    found = plot.figure(f"{result['title']}, {size_text(first)} above", caption, 2.6 * columns, 6.4)
     grid = found.add_gridspec(2, 6 * columns, height_ratios=[1, 1.25])
     truth, hit = _mesh_normals(view)
     rows, cols = np.flatnonzero(hit.any(axis=1)), np.flatnonzero(hit.any(axis=0))
@@ -76,9 +76,9 @@ def shapes(setting, view: views.Stage, result: dict):
     axes = found.add_subplot(grid[1, 2 * third :])
     labels = _against_time(axes, result)
     found.get_layout_engine().set(hspace=0.16)
-    plot.fix(found)
+    plot.fix_layout(found)
     _legend(found, axes.get_position().y1)
-    plot.place(axes, labels, [label.at for label in labels])
+    plot.place_labels(axes, labels, [label.at for label in labels])
     return found
 
 

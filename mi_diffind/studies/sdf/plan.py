@@ -33,7 +33,7 @@ import numpy as np
 from ...fitting import FitSettings
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...measure.training import Training
+from ...measure.training import ConvergenceTraining
 from ...runtime import array_module
 from ...tasks.sdf import decode
 from ...tasks.sdf.distances import Distances
@@ -352,7 +352,7 @@ class Hashed(DistanceContender):
     """A hash grid with a network, trained to convergence."""
 
     @functools.cached_property
-    def training(self) -> Training:
+    def training(self) -> ConvergenceTraining:
         setting, (steps, longest) = self.context, self.context.request.hash_steps
 
         def problem():
@@ -360,7 +360,7 @@ class Hashed(DistanceContender):
             return hash_grids.HashProblem(net, setting.types, setting.mesh, *setting.pools)
 
         settings = FitSettings(**{**asdict(HASH_SETTINGS), "steps": steps})
-        return Training(f"{self.name} training", problem, settings, longest, 8)
+        return ConvergenceTraining(f"{self.name} training", problem, settings, longest, 8)
 
     def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         super().cached_record(folder, record)
