@@ -52,7 +52,7 @@ class MovingView:
         """
         shown = np.unique(np.linspace(0, self.frames - 1, SHOWN_FRAMES).round().astype(int))
         rows, columns = len(strips) + 1, len(shown) + 1
-        figure = plot.sheet(title, caption, 2.0 * columns, 1.6 * rows)
+        figure = plot.figure(title, caption, 2.0 * columns, 1.6 * rows)
         cells = figure.add_gridspec(rows, columns)
         shape = (self.frames, POINTS, POINTS, truth.shape[-1])
         line = int(np.argmax(self.aligned(truth).reshape(shape)[-1].var(axis=1).sum(axis=-1)))  # with the most detail

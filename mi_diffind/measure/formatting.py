@@ -76,3 +76,8 @@ def state(result: dict) -> str:
     """What a caption has to say about a run that is not whole: ``quick`` settings, ``interrupted``."""
     quick = " A smoke run (--quick): times are not to be quoted." if result["settings"]["quick"] else ""
     return quick + (" Interrupted: less was measured than asked for." if result["interrupted"] else "")
+
+
+def figure_caption(result: dict) -> str:
+    """Return the caption of a figure: the notes of a result, its machine, and its :func:`state`."""
+    return f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"

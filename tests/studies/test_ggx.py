@@ -2,17 +2,15 @@
 
 import copy
 import csv
-import json
 import os
 
 import drjit as dr
 import numpy as np
 import pytest
+from study_runs import quick_result
 from variants import BACKENDS, VARIANTS
 
 from mi_diffind.fitting import FitSettings, fit
-from mi_diffind.measure import benchmark
-from mi_diffind.measure import report as reports
 from mi_diffind.runtime import array_module
 from mi_diffind.studies.baselines.networks import Network
 from mi_diffind.studies.ggx import conclusions
@@ -90,11 +88,8 @@ def quick(tmp_path_factory):
 
     mi.set_variant(VARIANTS[0])
     folder = tmp_path_factory.mktemp("ggx") / "out"
-    plan = plans.plan(quick=True, quick_steps=10)
-    settings = benchmark.Settings.choose(mi.variant(), quick=True)
-    result = benchmark.measure(plan, settings, folder, progress=False)
-    reports.write(result, folder, plan)
-    return folder, json.loads((folder / "tradeoff_ggx.json").read_text(encoding="utf-8"))
+    result, _ = quick_result(plans.plan(quick=True, quick_steps=10), folder)
+    return folder, result
 
 
 def test_quick_run_writes_what_it_promises(quick):

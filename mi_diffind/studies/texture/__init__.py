@@ -41,10 +41,10 @@ class TextureStudy(Study):
                             help="seconds of each training (default: 60; --quick: 2)")  # fmt: skip
         add_astc_option(parser)
         parser.add_argument("--footprints", action="store_true",
-                            help="also train with each distribution of footprints, and draw errors by level")  # fmt: skip
+                            help="also train with each distribution of footprints and draw both")  # fmt: skip
         parser.add_argument("--frames", type=positive, metavar="N", help="frames of the zoom (default: 60; --quick: 6)")
         parser.add_argument("--width", type=positive, metavar="N",
-                            help="width of the stills, the height is two thirds (default: 480; --quick: 96)")  # fmt: skip
+                            help="width of the stills; the height is 2/3 (default: 480; --quick: 96)")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check the options and load the source and tables; raise as :func:`.load_source` does."""

@@ -52,7 +52,8 @@ def crops(context, readers: dict, result: dict):
 def zoom(context, readers: dict, result: dict):
     """Draw frames of the zoom, by each of the readers and of the truth."""
     strips = {
-        name.replace(", anisotropic", ",\nanisotropic"): context.zoom.render(reader()) for name, reader in readers.items()
+        name.replace(", anisotropic", ",\nanisotropic"): context.zoom.render(reader())
+        for name, reader in readers.items()
     }
     title = f"{result['title']}: a zoom of {context.zoom.frames} frames"
     return context.zoom.figure(title, figure_caption(result), strips, context.truths["zoom"].model)
@@ -99,7 +100,9 @@ def _finish(axes, x_label: str, y_label: str) -> None:
 def _busiest(image: np.ndarray, side: int) -> tuple[int, int]:
     """Return row and column of the square with the largest variance, of those without NaN."""
     step = max(1, side // 8)
-    places = [(t, l) for t in range(0, image.shape[0] - side + 1, step) for l in range(0, image.shape[1] - side + 1, step)]
+    places = [
+        (t, l) for t in range(0, image.shape[0] - side + 1, step) for l in range(0, image.shape[1] - side + 1, step)
+    ]
     parts = (image[top : top + side, left : left + side] for top, left in places)
     variances = [np.nan_to_num(part.var(axis=(0, 1)).sum(), nan=-1) for part in parts]
     return places[int(np.argmax(variances))] if places else (0, 0)

@@ -376,7 +376,9 @@ class TextureCandidates:
         errors = lambda samples: self.context.errors(once())  # noqa: E731
         self.candidates.append(Candidate(name, method, errors=errors, **fields))
 
-    def add_filtered(self, name: str, method: str, reader: Callable, reads: Sequence, in_picture=True, **fields) -> None:
+    def add_filtered(
+        self, name: str, method: str, reader: Callable, reads: Sequence, in_picture=True, **fields
+    ) -> None:
         """Register a candidate for each of ``reads``, pairs of a filter and whether samples are centred."""
         for filter_name, centred in reads:
             self.add(

@@ -27,8 +27,8 @@ class TextureScene:
 
     The uv of ``shape`` (without its material) covers ``extent`` units of length along u and v. The camera at ``origin``
     looks at ``target``, ``fov`` degrees wide; light comes from ``towards_light``. ``texels`` is the area of a pixel in
-    texels at the ``anchor``, (x, y) in the image from (0, 0), the upper left, to (1, 1). Errors are those of pixels with
-    at least one texel, or if ``magnified``, with less than one.
+    texels at the ``anchor``, (x, y) in the image from (0, 0), the upper left, to (1, 1). Errors are those of pixels
+    with at least one texel, or if ``magnified``, with less than one.
     """
 
     name: str

@@ -16,7 +16,7 @@ NEARER = 2.0
 
 @dataclass(frozen=True)
 class TextureZoom(MovingView):
-    """A zoom into a ``scene``: ``frames`` of a ``film`` (width, height), with a ``texture`` of (width, height) texels."""
+    """A zoom into a scene: ``frames`` of a ``film`` (width, height), with a ``texture`` of (width, height) texels."""
 
     scene: TextureScene
     film: tuple[int, int]
