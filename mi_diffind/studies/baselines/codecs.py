@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...errors import DiffindError
+from ...units import largest_fitting
 
 #: Block size of ASTC in 2D, width × height, finest first → bits per texel.
 ASTC_BLOCKS = {
@@ -373,17 +374,9 @@ def _encode(image: np.ndarray, normal: bool, block: str, reduce: int, quality) -
 
 
 def _highest_quality(encode: Callable[[int], Encoded], qualities: range, nbytes: int) -> Encoded:
-    """Encode at the highest quality that fits into ``nbytes``, else the lowest, by bisection."""
-    low, high = qualities[0], qualities[-1] + 1
-    best = encode(low)
-    while high - low > 1:
-        middle = (low + high) // 2
-        coded = encode(middle)
-        if coded.nbytes <= nbytes:
-            low, best = middle, coded
-        else:
-            high = middle
-    return best
+    """Encode at the highest quality that takes at most ``nbytes``, else at the lowest."""
+    coded = functools.cache(encode)
+    return coded(largest_fitting(lambda quality: coded(quality).nbytes <= nbytes, qualities[0], qualities[-1] + 1))
 
 
 def _files(codec: str, image: np.ndarray, quality: int, **options) -> Encoded:

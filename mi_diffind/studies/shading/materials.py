@@ -101,10 +101,10 @@ MATERIALS: dict[str, Callable[[int], dict[str, np.ndarray]]] = {
 
 def generated_source(name: str, side: int = SIDE) -> Source:
     """Return one of :data:`MATERIALS` as a source of 8-bit maps: albedo sRGB-encoded, normals as (n + 1)/2."""
-    from ...metrics import srgb
+    from ...srgb import for_display
 
     maps = {}
     for key, values in MATERIALS[name](side).items():
-        values = srgb(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values
+        values = for_display(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values
         maps[key] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
     return from_arrays(maps)

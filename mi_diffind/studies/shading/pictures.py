@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ... import metrics
+from ... import srgb
 from ...maps.compressed import decibel
 from ...measure import plot
 from ...measure.curves import finish
@@ -108,7 +108,7 @@ def crops(contexts: dict, result: dict):
                 text += f"\n{decibel(float(np.mean((image[pair] - truths[pair]) ** 2))):.1f} dB"
             axes = figure.add_subplot(len(rows), len(images) + 1, row * (len(images) + 1) + column + 1)
             label = "" if column else f"{material.name}, level {level}"
-            plot.image_panel(axes, metrics.srgb(image[pair, :side, :side]), text, label)
+            plot.image_panel(axes, srgb.for_display(image[pair, :side, :side]), text, label)
     return figure
 
 

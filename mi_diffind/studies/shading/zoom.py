@@ -13,7 +13,7 @@ from functools import cached_property
 import drjit as dr
 import numpy as np
 
-from ... import metrics
+from ... import srgb
 from ...maps.pyramid import Pyramid
 from ...measure.flicker import POINTS, MovingView
 from ...tasks.disney.effects import Effects
@@ -67,7 +67,7 @@ class ShadedZoom(MovingView):
                 value = read(*self.lanes(frame))
                 dr.eval(value)
                 image = np.stack([c.numpy() for c in value], axis=-1)
-            images.append(metrics.srgb(image.reshape(self.side, self.side, 3)).astype(np.float32))
+            images.append(srgb.for_display(image.reshape(self.side, self.side, 3)).astype(np.float32))
         return np.stack(images)
 
     @cached_property
