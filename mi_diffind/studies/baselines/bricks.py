@@ -8,7 +8,7 @@ import math
 import drjit as dr
 import numpy as np
 
-from ...lookup import pack_bits
+from ...bits import mask_words
 from ...tasks.sdf.cells import CORNERS, surface_cells
 from ...tasks.sdf.distances import Distances
 from .byte_grids import NEAREST, ByteCells, dequantised, places, quantised, slope_bound
@@ -57,7 +57,7 @@ class Bricks(ByteCells):
             raise ValueError(f"found {numbered.sum():,} groups of bricks, fewer than {INSIDE:,} are allowed")
         roots = np.where(inside[:, 0], INSIDE, OUTSIDE)
         roots[numbered] = np.arange(numbered.sum())
-        words = [pack_bits(v[numbered], 1).view("<u4").astype(np.uint32) for v in (present, inside)]
+        words = [mask_words(v[numbered]).ravel() for v in (present, inside)]
         count = np.array([int(w).bit_count() for w in words[0]], np.uint32)
         ranks = np.cumsum(count, dtype=np.uint32) - count
         roots = np.pad(roots, (0, len(roots) % 2)).astype("<u2").view("<u4")

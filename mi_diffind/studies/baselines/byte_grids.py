@@ -18,6 +18,7 @@ from ...tasks.sdf.cells import CORNERS, surface_cells
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
+from ...units import largest_fitting
 
 #: Largest distance, in cells, between the surface and a corner of a cell that the surface crosses.
 NEAREST = 1.75
@@ -151,12 +152,11 @@ def dense(types, distances: Distances, spacing: float, train: bool = False) -> B
 
 def dense_spacing(mesh: Mesh, nbytes: int) -> float:
     """Return the spacing of the finest :func:`dense` grid of ``nbytes``."""
-    low, high = 1e-4, 1.0
-    for _ in range(40):
-        spacing = math.sqrt(low * high)
-        fits = np.prod(_dense_cells(mesh, spacing) + 1.0) <= nbytes
-        low, high = (low, spacing) if fits else (spacing, high)
-    return high
+
+    def fits(fineness: float) -> bool:
+        return np.prod(_dense_cells(mesh, math.exp(-fineness)) + 1.0) <= nbytes
+
+    return math.exp(-largest_fitting(fits, 0.0, math.log(1e4), steps=40))
 
 
 def _dense_cells(mesh: Mesh, spacing: float) -> np.ndarray:
