@@ -24,12 +24,12 @@ from ...interrupt import interruptible
 from ...measure.benchmark import Stopped
 from ...measure.bias import LEAST, crossover, describe, error, estimate, root, weights_of
 from ...measure.clock import machine, timed
-from ...measure.statistics import finite, named, spread
+from ...measure.statistics import finite, flat_spread, spread
 from ...measure.store import Store, fingerprint, sources
 from .picture import VERSIONS
 from .report import verdict
 
-#: Name in the store of the exact image whose brightness weights all errors; passes are named by their numbers.
+#: Name in the store of the exact image whose brightness weights all errors; passes are flat_spread by their numbers.
 BRIGHTNESS = "brightness"
 
 #: Samples of the whole image in one launch, far below Mitsuba's limit of 2³².
@@ -280,14 +280,14 @@ def _assemble(store: Store, counts: list[int]) -> dict:
 
 def _point(records: list[dict]) -> dict:
     timed_records = [r for r in records if r["seconds"] is not None]
-    mse = named("mse", (r["mse"] for r in records))
+    mse = flat_spread("mse", (r["mse"] for r in records))
     return {
         **mse,
         "rmse": root(mse["mse"]),
         "psnr_db": float(np.median([r["psnr_db"] for r in records])),
         "images": len(records),
-        **named("seconds", (r["seconds"] for r in timed_records)),
-        **named("seconds_wall", (r["seconds_wall"] for r in timed_records)),
+        **flat_spread("seconds", (r["seconds"] for r in timed_records)),
+        **flat_spread("seconds_wall", (r["seconds_wall"] for r in timed_records)),
         "timed": len(timed_records),
     }
 
