@@ -29,7 +29,7 @@ from ...measure.store import Store, fingerprint, sources
 from .picture import VERSIONS
 from .report import verdict
 
-#: Name in the store of the exact image whose brightness weights all errors; passes are flat_spread by their numbers.
+#: Name in the store of the exact image whose brightness weights all errors; passes are named by their numbers.
 BRIGHTNESS = "brightness"
 
 #: Samples of the whole image in one launch, far below Mitsuba's limit of 2³².
