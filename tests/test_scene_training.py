@@ -31,7 +31,7 @@ from mi_diffind.settings import FitSettings
 from mi_diffind.tables import load_table, save_table
 from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.memory_budget import PaperSize, Size, parse_structure
+from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.presets import PRESETS
 from mi_diffind.tasks.texture.training import layout_of, problem_of, rounded, stored_form
 
@@ -555,9 +555,9 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
     """A file says all that is needed to begin anew."""
     source, recipe = load_source(folder / "material.json"), PRESETS[preset]
     layout = layout_of(source, recipe)
-    wanted = PaperSize(16, 24, 4, 5, layout.stored)
+    wanted = PaperBudget(16, 24, 4, 5, layout.stored)
     if preset == "ours":
-        wanted = Size(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
+        wanted = TextureBudget(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
     pyramid = Pyramid.of(source, layout, array_module("llvm"))
     net = problem_of(source, wanted, recipe, pyramid).net
     own = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}

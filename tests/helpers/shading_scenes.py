@@ -13,7 +13,7 @@ from mi_diffind.runtime import array_module
 from mi_diffind.tables import save_table
 from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture import training
-from mi_diffind.tasks.texture.memory_budget import Size, parse_structure
+from mi_diffind.tasks.texture.memory_budget import TextureBudget, parse_structure
 from mi_diffind.tasks.texture.presets import PRESETS
 
 #: Maps of a material, and the parameters of the BSDF that read them.
@@ -49,7 +49,7 @@ def fitted(manifest: Path, steps=2, fine="0:2:4", skip=2, cascaded=5, batch=2048
     )
     layout = training.layout_of(source, recipe)
     arrays = parse_structure(fine) if fine else ()
-    size = size or Size(source.height, source.width, layout.stored, arrays, skip, 3, cascaded, skip + 1)
+    size = size or TextureBudget(source.height, source.width, layout.stored, arrays, skip, 3, cascaded, skip + 1)
     types = array_module("llvm")
     pyramid = Pyramid.of(source, layout, types, ("repeat", "repeat"))
     request = FitRequest(preset, recipe.settings, types, progress=False)

@@ -105,7 +105,7 @@ class Moments:
 
 def unit_normals(source: Source) -> np.ndarray | None:
     """The source's normals, ``(height, width, 3)``, each of length 1; ``None`` without a normal map."""
-    m = next((m for m in source.maps if m.kind == "normal"), None)
+    m = next((m for m in source.maps if m.role == "normal"), None)
     if m is None:
         return None
     normal = (m.values if m.values.min() < 0 else 2 * m.values - 1).astype(np.float64)
@@ -121,7 +121,7 @@ def slopes(normals: np.ndarray) -> np.ndarray:
 
 def roughness(source: Source) -> np.ndarray:
     """The source's roughness, ``(height, width, 1)``."""
-    m = next((m for m in source.maps if m.kind == "roughness"), None)
+    m = next((m for m in source.maps if m.role == "roughness"), None)
     if m is None:
         return np.full((source.height, source.width, 1), DEFAULTS["roughness"])
     return m.values.astype(np.float64)

@@ -231,7 +231,7 @@ class _Classical(_Made):
     make: Callable[[Path | None], ShadedReader] = lambda folder: None
     channels: int = 0
 
-    def known(self, folder, record):
+    def cached_record(self, folder, record):
         self.record = record
         if record is not None:
             self.setting.readers[self.name] = lambda: self.make(folder)
@@ -254,7 +254,7 @@ class _Trained(_Made):
     def file(self, folder: Path) -> Path:
         return folder / f"{file_name(self.name)}.npz"
 
-    def known(self, folder, record):
+    def cached_record(self, folder, record):
         if record is None or folder is None or not self.file(folder).is_file():
             return None
         self.record, self.table = record, task.tasks()["texture"].load(self.file(folder))
@@ -343,7 +343,7 @@ class _Shifted(_Made):
     def _read(self) -> ShadedReader:
         return self.kernel(lambda folder: self.setting.readers[self.base.name]())(None)
 
-    def known(self, folder, record):
+    def cached_record(self, folder, record):
         self.record = record
         if record is not None:
             self.setting.readers[self.name] = self._read

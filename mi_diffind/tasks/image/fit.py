@@ -14,10 +14,10 @@ from ...settings import FittingError
 from ...tables import MAX_BYTES
 from ...task import FitRequest, Fitted
 from . import memory_budget, search, training
-from .presets import PAGED, PRESETS, STRUCTURES, Recipe, without
+from .presets import PAGED, PRESETS, STRUCTURES, ImageRecipe, without
 
 
-def recipe_of(preset: str, settings, options) -> Recipe:
+def recipe_of(preset: str, settings, options) -> ImageRecipe:
     """The recipe of a preset with what the options change. Raises :class:`UsageError`."""
     recipe = without(PRESETS[preset], options["without"])
     given = {k: options[k] for k in ("structure", "dims") if options[k] is not None}
@@ -73,7 +73,7 @@ def fit(request: FitRequest) -> Fitted:
     return fitted
 
 
-def _train(request: FitRequest, source: Source, recipe: Recipe) -> tuple[Fitted, float | None]:
+def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:
     """What was trained, and the bytes that were asked for."""
     options = request.options
     border = None if options["border"] == "auto" else (options["border"],) * 2
@@ -117,7 +117,7 @@ def _train(request: FitRequest, source: Source, recipe: Recipe) -> tuple[Fitted,
     return Fitted(table, result, [*lines, *([sentence] if sentence else [])], {"tried": tried}), asked
 
 
-def _for_psnr(request: FitRequest, source: Source, recipe: Recipe, border) -> Fitted:
+def _for_psnr(request: FitRequest, source: Source, recipe: ImageRecipe, border) -> Fitted:
     goal = float(request.options["psnr"])
     table, result, tried = search.psnr_search(source, goal, recipe, request, border)
     if table is None:

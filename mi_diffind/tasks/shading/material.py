@@ -53,14 +53,14 @@ def maps_of(layout: Layout) -> dict[str, MapLayout]:
     """The maps that shading reads, by their kind. Raises :class:`UsageError` if it cannot read them."""
     found = {}
     for m in layout.maps:
-        if m.kind not in READ:
+        if m.role not in READ:
             continue
-        if m.kind in found:
-            raise UsageError(f'map "{m.name}": found a second {m.kind} beside "{found[m.kind].name}", one is allowed')
-        if m.channels not in READ[m.kind]:
-            allowed = " or ".join(map(str, READ[m.kind]))
-            raise UsageError(f'map "{m.name}": found {m.channels} channels, allowed for {m.kind} are {allowed}')
-        found[m.kind] = m
+        if m.role in found:
+            raise UsageError(f'map "{m.name}": found a second {m.role} beside "{found[m.role].name}", one is allowed')
+        if m.channels not in READ[m.role]:
+            allowed = " or ".join(map(str, READ[m.role]))
+            raise UsageError(f'map "{m.name}": found {m.channels} channels, allowed for {m.role} are {allowed}')
+        found[m.role] = m
     if not found:
         raise UsageError(f"source: found no map that shading reads, these are {', '.join(READ)}")
     return found
@@ -69,7 +69,7 @@ def maps_of(layout: Layout) -> dict[str, MapLayout]:
 def left_out(layout: Layout) -> dict[str, str]:
     """Map → why it is not shaded."""
     reason = "the BRDF has no such parameter, its loss is that of a texture"
-    return {m.name: reason for m in layout.maps if m.kind not in READ}
+    return {m.name: reason for m in layout.maps if m.role not in READ}
 
 
 def effects_of(layout: Layout) -> tuple[Effects, dict[str, str]]:

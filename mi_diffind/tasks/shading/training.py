@@ -144,7 +144,7 @@ def fit_shading(
     problem.preview = preview
     result = request.train(problem, "shading")
     kept = any(before[name] > result.measured[name] for name in list(before)[:1])
-    identity = {k: v for k, v in problem.identity.items() if k not in ("form", "border")}
+    identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
     settings = {**request.recorded(), **identity}
     if request.seconds is not None:
         settings["steps"] = result.steps

@@ -14,13 +14,13 @@ from ...maps.source import Source, load_source
 from ...tables import MAX_BYTES
 from ...task import FitRequest, Fitted
 from . import arrays, memory_budget, training
-from .presets import PRESETS, Recipe
+from .presets import PRESETS, TextureRecipe
 
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on a texture is smooth.
 SMOOTH_DB = 30.0
 
 
-def recipe_of(preset: str, settings, options) -> Recipe:
+def recipe_of(preset: str, settings, options) -> TextureRecipe:
     """The recipe of a preset with what the options change."""
     recipe = dataclasses.replace(PRESETS[preset], settings=settings or PRESETS[preset].settings)
     given = {"samples": options["footprint_samples"], "axis": options["axis"]}
@@ -80,7 +80,7 @@ def fit(request: FitRequest) -> Fitted:
     return Fitted(table, result, lines, figures)
 
 
-def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, options):
+def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureRecipe, options):
     """The size of the arrays for so many bytes. Raises :class:`UsageError`."""
     layout = pyramid.layout
     if not recipe.layered:
