@@ -347,6 +347,12 @@ def render_pass(scene, spp: int, seed: int) -> np.ndarray:
         return mi.render(scene, spp=spp, seed=seed % 2**32).numpy().astype(np.float64)
 
 
+def colour_channels(image):
+    """Drop alpha and other channels that are no colour from an image ``(height, width, channels)``, array or tensor."""
+    count = 3 if image.shape[2] >= 3 else 1
+    return image if image.shape[2] == count else image[:, :, :count]
+
+
 def progress_bar(title: str, total: int, unit: str = "pass", progress: bool = True, initial: int = 0) -> tqdm:
     """Return a progress bar on stderr; without ``progress`` it stays hidden, as it does outside of a terminal."""
     return tqdm(total=total, initial=initial, desc=title, unit=unit, disable=None if progress else True)
