@@ -269,8 +269,7 @@ def instances(scene) -> list:
     Nested objects (in a ``twosided``, a ``bumpmap``, …) are included.
     """
     # All nodes, not only owners of parameters: tables of bytes are no parameters
-    objects = {id(node): node for node in mi.traverse(scene).hierarchy if plugins.origin(node) is not None}
-    return list(objects.values())
+    return [node for node in compat.objects_of(scene) if plugins.origin(node) is not None]
 
 
 def learned_instances(scene) -> list:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .. import metrics
+from .. import srgb
 from . import plot
 
 #: What draws one cell: a function of a Matplotlib figure and of the axes of the cell.
@@ -18,7 +18,7 @@ def picture(title: str, image: np.ndarray) -> Cell:
     """A linear image, ``(height, width, 3)`` or ``(height, width, 1)``, as displayed."""
 
     def draw(sheet, axes):
-        axes.imshow(metrics.srgb(np.repeat(image, 3, -1) if image.shape[-1] == 1 else image))
+        axes.imshow(srgb.for_display(np.repeat(image, 3, -1) if image.shape[-1] == 1 else image))
         axes.set_title(title)
 
     return draw

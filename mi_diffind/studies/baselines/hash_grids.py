@@ -15,6 +15,7 @@ from ...tasks.sdf import samples
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
+from ...units import largest_fitting
 from .networks import Network
 
 #: Half the range of distances that are learned.
@@ -34,20 +35,22 @@ def network(nbytes: int) -> Network:
     features = 2
     weights = features * LEVELS * WIDTH + (LAYERS - 1) * WIDTH**2 + WIDTH + LAYERS * WIDTH + 1
     resolutions = [math.ceil(COARSEST * scale**level) for level in range(LEVELS)]
-    size = 0
-    for power in np.arange(8, 24, 0.05):
-        most = int(2**power) // 16 * 16
-        entries = sum(min(most, (n + 1) ** 3) for n in resolutions)
-        if 2 * (features * entries + weights) <= nbytes:
-            size = most
-    if not size:
+    sizes = [int(2**power) // 16 * 16 for power in np.arange(8, 24, 0.05)]
+
+    def fits(index: int) -> bool:
+        entries = sum(min(sizes[index], (n + 1) ** 3) for n in resolutions)
+        return 2 * (features * entries + weights) <= nbytes
+
+    largest = largest_fitting(fits, -1, len(sizes))
+    if largest < 0:
         raise ValueError(f"{nbytes:,} bytes are too few for a hash grid of {LEVELS} levels")
-    grid = {"n_levels": LEVELS, "n_features_per_level": features, "hashmap_size": size, "base_resolution": COARSEST,
-            "per_level_scale": scale, "align_corners": True, "init_scale": 1e-4}  # fmt: skip
+    grid = {"n_levels": LEVELS, "n_features_per_level": features, "hashmap_size": sizes[largest],
+            "base_resolution": COARSEST, "per_level_scale": scale,
+            "align_corners": True, "init_scale": 1e-4}  # fmt: skip
     return Network(3, WIDTH, LAYERS, grid)
 
 
-class HashField(DistanceField):
+class HashDistanceField(DistanceField):
     """The field of a trained ``net``, whose outputs are distances divided by :data:`BAND`. It knows no slope."""
 
     def __init__(self, types, net: Network, mesh: Mesh):
@@ -91,7 +94,7 @@ class HashProblem(Problem):
 
     def __init__(self, net: Network, types, mesh: Mesh, pool: tuple, held: tuple, seed: int = 1):
         self.net, self.types = net.alloc(types.TensorXf, 3, dr.rng(seed=seed)), types
-        self.field = HashField(types, self.net, mesh)
+        self.field = HashDistanceField(types, self.net, mesh)
         self.pool, self.held = self._arrays(*pool), self._arrays(*held)
         self.count = len(pool[1])
         self.identity = {"mesh": mesh.digest, "count": self.count, "seed": seed}

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from ...bits import pack_bits
 from ...tasks.radiance.field import GridField
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
@@ -212,8 +213,7 @@ def nodes_of(types, state: dict) -> Nodes:
 
 def bits_of(numbers: np.ndarray, count: int) -> bytes:
     """Numbers below ``count`` in as many bits as they need."""
-    width = max(1, int(count - 1).bit_length())
-    return np.packbits((numbers[:, None] >> np.arange(width)) & 1, bitorder="little").tobytes()
+    return pack_bits(numbers, max(1, int(count - 1).bit_length())).tobytes()
 
 
 def density_steps(levels: int = 256) -> Steps:
