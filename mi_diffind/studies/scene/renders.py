@@ -108,12 +108,12 @@ def measure(
     ``None``. Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no learned plugin, and
     :class:`~mi_diffind.files.OutputError` if the folder cannot be written.
     """
-    defines = {k: str(v) for k, v in (defines or {}).items()}
-    learned = scenes.learned_plugins(scene_path, defines)
+    parsed = scenes.ParsedScene(scene_path, defines)
+    learned = parsed.learned_plugins()
     if not learned:
         names = ", ".join(plugins.with_counterpart())
         raise scenes.SceneError(f"{scene_path}: names no learned plugin ({names}), so there is nothing to compare")
-    loaded = {name: scenes.load(scene_path, exact=name == "exact", defines=defines) for name in VERSIONS}
+    loaded = {name: parsed.load(exact=name == "exact") for name in VERSIONS}
     sensor = loaded["learned"].sensors()[0]
     width, height = (int(v) for v in sensor.film().crop_size())
     counts = settings.counts(sensor.sampler().sample_count())
@@ -123,13 +123,13 @@ def measure(
         "width": width,
         "height": height,
         "seed": seed,
-        "defines": defines,
+        "defines": parsed.defines,
         "learned_plugins": len(learned),
         "settings": asdict(settings),
         "counts": counts,
         "machine": machine(mi.variant()),
     }
-    files = {file for file, _ in scenes.tables_of(scene_path, learned)} | set(scenes.files_of(scene_path, defines))
+    files = {file for file, _ in parsed.tables(learned)} | set(parsed.files())
     key = {**facts, "scene": Path(scene_path).name, "sources": fingerprint([*sources(), *files])}
     store = Store(folder, "scene", key, ("passes", "rounds"), progress)
     samples = len(VERSIONS) * (settings.passes * counts[-1] + settings.rounds * sum(counts[:-1])) + counts[-1]
