@@ -214,7 +214,7 @@ def reports(scene) -> list[dict]:
     :func:`learned_plugins`; what it reports, ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
     ``evaluated_once``, ``storage``, ``table_bytes`` and more; and for a BSDF the ``operations`` of ``eval``, ``pdf``
     and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance
-    field, how many steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.counting.Counts`).
+    field, how many steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.march.RayCounts`).
     """
     found = []
     for made in learned_instances(scene):

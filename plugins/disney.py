@@ -272,8 +272,7 @@ class Disney(mi.BSDF):
         cb.put("base_color", self.base_color, _DIFFERENTIABLE)
         for name, texture in self.scalars.items():
             cb.put(name, texture, _DISCONTINUOUS if name == "roughness" else _DIFFERENTIABLE)
-        if self.reflectance is not None:
-            cb.put(self.reflectance_name, self.reflectance, _DISCONTINUOUS)
+        cb.put(self.reflectance_name, self.reflectance, _DISCONTINUOUS)
         for lobe, name in self.RATES.items():
             cb.put(name, self.rates[lobe], mi.ParamFlags.NonDifferentiable)
 
@@ -520,19 +519,12 @@ def luminance(albedo, si: mi.SurfaceInteraction3f):
 
 def to_principled(props: mi.Properties) -> None:
     """Turn properties into those of ``principled``, which takes the same ones, but no textures for two of them."""
-    refuse_latents(props, "principled")
     for name in ("specular", "eta"):
         if name in props and not properties.is_number(props, name):
             raise RuntimeError(f'parameter "{name}": is a texture, and "principled" takes a number only')
     if "subsurface" in props:
         props["flatness"] = props["subsurface"]
         del props["subsurface"]
-
-
-def refuse_latents(props: mi.Properties, name: str) -> None:
-    """A material whose parameters are encoded has no counterpart."""
-    if "latents" in props:
-        raise RuntimeError(f'"{props.id()}" has its parameters encoded (latents); "{name}" needs the originals')
 
 
 #: For this form of the model and any other: Mitsuba's own model of the same parameters.

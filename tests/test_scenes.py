@@ -113,7 +113,6 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
         ("neural_ggx", "", "principled", 'names no plugin that "principled" can stand for (disney, neural_disney)'),
         ("disney", "", "plastic", '"plastic": no plugin has this counterpart; there are principled'),
         ("disney", '<texture name="specular" type="checkerboard"/>', "principled", '"specular": is a texture, and'),
-        ("neural_disney", '<string name="latents" value="roughness"/>', "principled", '"m" has its parameters encoded'),
     ],
 )
 def test_what_cannot_be_compared(mi_rgb, tmp_path, plugin, parameters, against, sentence):

@@ -29,7 +29,7 @@ FLOORS = (
     ("maps",),
     ("tasks",),
     ("plugins",),
-    ("scenes", "capture", "orbit", "compare", "regress", "depth", "encode", "measure"),
+    ("scenes", "capture", "orbit", "compare", "regress", "depth", "measure"),
     ("scene_training",),
     ("studies",),
     ("commands",),

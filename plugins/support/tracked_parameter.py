@@ -89,20 +89,6 @@ class TrackedParameter:
         return ValueBounds() if self.changed() else self._found
 
 
-class TrackedChannel(TrackedParameter):
-    """A channel of a texture, about whose values nothing is known."""
-
-    def __init__(self, texture):
-        super().__init__(texture)
-        self.constant = False
-
-    def changed(self) -> bool:
-        return False
-
-    def look(self) -> None:
-        pass
-
-
 def bounds(texture, colour: bool = False) -> ValueBounds:
     """
     Bounds of what ``texture`` (or a number) gives: of its ``eval`` if ``colour``, else of its ``eval_1``. Constants and

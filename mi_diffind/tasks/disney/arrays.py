@@ -70,26 +70,12 @@ class Arrays(nn.Module):
             return values
         return [clamp(v, *self.RANGES[name]) for v in values]
 
-    def encode(self, material, active=True):
-        """
-        The latent coordinates of (roughness, anisotropic), or ``material.latent`` if it has them already. Depends on
-        the material only.
-        """
-        latent = getattr(material, "latent", None)
-        if latent is not None:
-            return latent
+    def encode(self, material, active=True) -> tuple:
+        """Return the encoder's coordinates, each in [0, 1], of a material's roughness and anisotropy."""
         return (
-            self.encode_roughness(material.roughness, active),
-            self.encode_anisotropic(material.anisotropic, active),
+            sum(self.encoder_roughness([warp_roughness(material.roughness)], active)),
+            sum(self.encoder_anisotropic([material.anisotropic], active)),
         )
-
-    def encode_roughness(self, roughness, active=True):
-        """The coordinate of a roughness, in [0, 1]."""
-        return sum(self.encoder_roughness([warp_roughness(roughness)], active))
-
-    def encode_anisotropic(self, anisotropic, active=True):
-        """The coordinate of an anisotropy, in [0, 1]."""
-        return sum(self.encoder_anisotropic([anisotropic], active))
 
     # -- training ---------------------------------------------------------------------------------------------------
 

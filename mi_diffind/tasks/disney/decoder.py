@@ -64,20 +64,6 @@ class Decoder:
         """The coefficients of one group."""
         return getattr(self, f"_{group}")(p, e)
 
-    # -- the encoded roughness and anisotropy, as a texture may hold them ----------------------------------------------
-
-    def encode_roughness(self, roughness, active=True):
-        """The coordinate of a roughness, in [0, 1]: warped, so that bytes are finer where it is low."""
-        return warp_roughness(roughness)
-
-    def encode_anisotropic(self, anisotropic, active=True):
-        """The coordinate of an anisotropy, in [0, 1]."""
-        return anisotropic
-
-    def decode(self, latent, active=True) -> tuple:
-        """The roughness and anisotropy of a pair of coordinates."""
-        return model.clamp(unwarp_roughness(latent[0]), 0.0, 1.0), latent[1]
-
     # -- the material -----------------------------------------------------------------------------------------------
 
     def _ggx(self, p, e: Effects) -> dict:
@@ -266,12 +252,6 @@ def unwarp_roughness(u):
 
 
 _WARP = 0.01
-
-
-def alpha_to_roughness(ax, ay) -> tuple:
-    """The roughness and anisotropy in [0, 1] whose α these are, the inverse of :func:`.model.roughness_to_alpha`."""
-    roughness = dr.sqrt(dr.sqrt(ax * ay))
-    return model.clamp(roughness, 0.0, 1.0), model.clamp((1 - ay / ax) / 0.9, 0.0, 1.0)
 
 
 def _mix_tint(p, amount):

@@ -152,15 +152,6 @@ class FactoredDecoder(decoder.Decoder):
     def __init__(self, arrays: FactoredArrays, read=FACTORS):
         self.arrays, self.read = arrays, tuple(read)
 
-    def encode_roughness(self, roughness, active=True):
-        return self.arrays.encode_roughness(roughness, active)
-
-    def encode_anisotropic(self, anisotropic, active=True):
-        return self.arrays.encode_anisotropic(anisotropic, active)
-
-    def decode(self, latent, active=True):
-        return decoder.alpha_to_roughness(*self._alpha(latent, True, active))
-
     def _alpha(self, latent, anisotropic: bool, active=True) -> list:
         """α_x and α_y of the encoded roughness and anisotropy, or one number for an isotropic material."""
         mean = clamp(sum(self.arrays.alpha([latent[0]], active)), *LOG_ALPHA)

@@ -199,16 +199,6 @@ class PaperDecoder(decoder.Decoder):
     def __init__(self, arrays: PaperArrays):
         self.arrays = arrays
 
-    def encode_roughness(self, roughness, active=True):
-        return self.arrays.encode_roughness(roughness, active)
-
-    def encode_anisotropic(self, anisotropic, active=True):
-        return self.arrays.encode_anisotropic(anisotropic, active)
-
-    def decode(self, latent, active=True):
-        qx, qy, qz = self.arrays.ggx_coefficients(latent, active)
-        return decoder.alpha_to_roughness(dr.sqrt(qz / qx), dr.sqrt(qz / qy))
-
     def required(self, e):
         return ("encoded", "encoded_coat") if e.clearcoat else ("encoded",)
 

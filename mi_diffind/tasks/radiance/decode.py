@@ -43,7 +43,8 @@ def grid(field: VolumeField, resolution: int | None = None) -> dict[str, np.ndar
 
     ``density`` ``(X, Y, Z)`` is per unit of length. ``colour`` ``(X, Y, Z, 12)`` holds numbers a and b for each of red,
     green and blue: the radiance in direction d is exp(a + b·d) (:func:`.volume_field.colour_of`). ``lower`` is
-    ``(3,)``, ``voxel`` ``()``. The grid has ``resolution`` nodes along the longest side; by default, the voxels of the field.
+    ``(3,)``, ``voxel`` ``()``. The grid has ``resolution`` nodes along the longest side; by
+    default, its voxels are those of the field.
 
     If the radiance of a field is not such an exponential, the mean of the logarithms of opposite directions is kept
     along the axes. Empty nodes get the colour of the nearest node that is not empty. A sparse field ends at the faces

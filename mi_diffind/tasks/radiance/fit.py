@@ -16,7 +16,7 @@ from ...fitting import FitResult, FittingError
 from ...fitting import fit as train
 from ...interrupt import interruptible
 from ...tables import StoredArray, Table, save_table
-from ...task import Fitted, Request
+from ...task import FitRequest, Fitted
 from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
@@ -34,7 +34,7 @@ VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 300, 2**15, 1e-2
 DENSITY_SHARE = 0.35
 
 
-def check(request: Request) -> None:
+def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     if options["source"] is None:
@@ -52,7 +52,7 @@ def check(request: Request) -> None:
                 raise UsageError(f"--{name}: {e}") from None
 
 
-def fit(request: Request) -> Fitted:
+def fit(request: FitRequest) -> Fitted:
     """
     Fit a field to the views in a folder.
 
@@ -66,7 +66,7 @@ def fit(request: Request) -> Fitted:
 class FieldFit:
     """One run of ``fit field``: the request, the session of its capture, and the steps from views to a table."""
 
-    request: Request
+    request: FitRequest
     session: FieldSession
 
     def run(self) -> Fitted:

@@ -137,10 +137,8 @@ class NodeField(NodeVolume):
         self.palette_index = palette_index
 
     def density_at(self, p, active=True):
-        density = self.arrays["density"].array
-        return self.interpolated_density(
-            lambda number, seen: dr.gather(self.types.Float, density, number, seen), p, active
-        )
+        Float, density = self.types.Float, self.arrays["density"].array
+        return self.interpolated_density(lambda number, seen: dr.gather(Float, density, number, seen), p, active)
 
     def radiance_at(self, point_data, p, d, active=True):
         return colour_of(self.coefficients(point_data, active), d)
