@@ -172,7 +172,7 @@ def has_smooth(scene: mi.Scene) -> bool:
     """Return whether the scene has a smooth surface that rays are followed across; an instance counts as one."""
     for shape in scene.shapes():
         bsdf = shape.bsdf()
-        if shape.class_name() == "Instance":
+        if compat.is_instance(shape):
             return True
         if bsdf is not None and is_smooth(bsdf) and not shape.is_medium_transition():
             return True

@@ -1,8 +1,8 @@
 """
-File encoding of the numbers of a sparse grid: codes of up to 8 bits, predicted from their neighbours, then zlib.
+Compression of sparse grids in files: numbers of up to 8 bits, predicted from neighbours, then zlib.
 
-Each channel takes the prediction with the fewest bytes: none, the previous neighbour along z, or the mean of the stored
-previous neighbours along x, y and z. Masks of nodes are bits after zlib.
+Each channel has the prediction that leaves the fewest bytes: none, the previous neighbour along z, or the mean of the
+previous neighbours along x, y and z that are stored. Masks of nodes are bits after zlib.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ PREDICTIONS = ("none", "before", "mean")
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelSteps:
+class QuantisationSteps:
     """
-    Uniform quantisation of the channels of an array ``(n, C)``: number = ``low`` + ``step`` · code.
+    Uniform quantisation of the channels of an array ``(n, C)``.
 
-    A code lies between 0 and ``levels`` − 1, with at most 256 levels; ``low`` and ``step`` are float32 ``(C,)``.
+    Value = ``low`` + ``step`` · code, with codes from 0 to ``levels`` − 1; ``low`` and ``step`` are float32 ``(C,)``,
+    ``levels`` are at most 256.
     """
 
     low: np.ndarray
@@ -34,11 +35,11 @@ class ChannelSteps:
     @staticmethod
     def over(
         values: np.ndarray, levels: int = 256, weights: np.ndarray | None = None, tail: float = 0.0
-    ) -> ChannelSteps:
+    ) -> QuantisationSteps:
         """
         Return ``levels`` steps over the range of ``values`` (n, C).
 
-        The share ``tail`` of the ``weights`` (n,) at either end is left out of the range.
+        The range is without the share ``tail`` of the ``weights`` (n,) at either end.
         """
         values = np.asarray(values, np.float64)
         weights = np.ones(len(values)) if weights is None else np.asarray(weights, np.float64)
@@ -49,23 +50,27 @@ class ChannelSteps:
             ends = np.searchsorted(share, (tail, 1 - tail)).clip(0, len(v) - 1)
             low[c], high[c] = v[order[ends]]
         step = np.maximum(high - low, 1e-6) / (levels - 1)
-        return ChannelSteps(low.astype(np.float32), step.astype(np.float32), np.full(len(low), levels))
+        return QuantisationSteps(low.astype(np.float32), step.astype(np.float32), np.full(len(low), levels))
 
     @staticmethod
-    def of_width(values: np.ndarray, width: np.ndarray, most: int = 256) -> ChannelSteps:
-        """Return steps of a ``width`` (C,), or wider if the range of ``values`` needs more than ``most`` levels."""
+    def of_width(values: np.ndarray, width: np.ndarray, most: int = 256) -> QuantisationSteps:
+        """Return steps of a given ``width`` (C,), wider where ``values`` would need more than ``most`` steps."""
         low, high = (np.asarray(f(values, axis=0), np.float64) for f in (np.min, np.max))
         step = np.maximum(width, np.maximum(high - low, 1e-6) / (most - 1))
         levels = np.ceil((high - low) / step).astype(int) + 1
-        return ChannelSteps(low.astype(np.float32), step.astype(np.float32), np.minimum(levels, most))
+        return QuantisationSteps(low.astype(np.float32), step.astype(np.float32), np.minimum(levels, most))
 
     def codes(self, values: np.ndarray) -> np.ndarray:
-        """Return the codes of ``values`` ``(n, C)``, uint8."""
-        codes = np.rint((np.asarray(values, np.float64) - self.low) / self.step.astype(np.float64))
-        return np.clip(codes, 0, self.levels - 1).astype(np.uint8)
+        """Return the codes of ``values``, uint8 ``(n, C)``."""
+        nearest = np.rint((np.asarray(values, np.float64) - self.low) / self.step.astype(np.float64))
+        return np.clip(nearest, 0, self.levels - 1).astype(np.uint8)
+
+    def values(self, codes: np.ndarray) -> np.ndarray:
+        """Return the values of ``codes``, float32 ``(n, C)``."""
+        return (self.low + self.step * codes.astype(np.float32)).astype(np.float32)
 
     def rounded(self, types, tensor):
-        """Return a tensor ``(n, C)`` rounded as it is stored, with straight-through gradients."""
+        """Return a tensor ``(n, C)`` rounded to its steps, with the gradients of the tensor (straight through)."""
         import drjit as dr
 
         low, inverse, step = [
@@ -78,28 +83,28 @@ class ChannelSteps:
 
 
 def deflated(data: bytes) -> bytes:
-    """Return ``data`` after zlib, by the strategy with the fewest bytes."""
-    results = []
+    """Return ``data`` after zlib with the best of :data:`STRATEGIES`."""
+    packed = []
     for strategy in STRATEGIES:
         packer = zlib.compressobj(9, zlib.DEFLATED, 15, 9, strategy)
-        results.append(packer.compress(data) + packer.flush())
-    return min(results, key=len)
+        packed.append(packer.compress(data) + packer.flush())
+    return min(packed, key=len)
 
 
 def mask_bytes(stored: np.ndarray) -> bytes:
-    """Return the bytes of a mask of stored nodes, bool ``(X, Y, Z)``."""
+    """Return the mask of stored nodes, bool ``(X, Y, Z)``, as bits after zlib."""
     return deflated(np.packbits(stored).tobytes())
 
 
 class Neighbours:
-    """Numbers of the previous nodes of each stored node along x, y and z, in lexicographic order; −1: not stored."""
+    """Numbers of the previous nodes along x, y and z of each stored node, in lexicographic order; −1: not stored."""
 
     def __init__(self, stored: np.ndarray):
         number = np.full(tuple(n + 1 for n in stored.shape), -1)
         number[1:, 1:, 1:][stored] = np.arange(np.count_nonzero(stored))
         place = np.argwhere(stored)
         self.before = np.stack([number[tuple((place + 1 - np.eye(3, dtype=int)[axis]).T)] for axis in range(3)])
-        # The previous nodes of a node have a lower sum of coordinates
+        # Previous nodes have a lower sum of places
         total = place.sum(axis=1)
         order = np.argsort(total, kind="stable")
         self.waves = np.split(order, np.flatnonzero(np.diff(total[order])) + 1)
@@ -108,23 +113,23 @@ class Neighbours:
         if prediction == "none":
             return np.zeros(len(nodes), np.int64)
         before = self.before[2:, nodes] if prediction == "before" else self.before[:, nodes]
-        known = before >= 0
-        count = known.sum(axis=0)
-        total = np.where(known, codes[before], 0).sum(axis=0)
+        stored = before >= 0
+        count = stored.sum(axis=0)
+        total = np.where(stored, codes[before], 0).sum(axis=0)
         return np.where(count > 0, total // np.maximum(count, 1), 0)
 
     def packed(self, codes: np.ndarray) -> tuple[bytes, str]:
-        """Return the codes of one channel ``(n,)`` as bytes, and the name of the prediction."""
-        codes, results = codes.astype(np.int64), []
+        """Return the codes of one channel ``(n,)`` as bytes, and the prediction."""
+        codes, attempts = codes.astype(np.int64), []
         everything = np.arange(len(codes))
         for prediction in PREDICTIONS:
             rest = (codes - self._predicted(codes, prediction, everything)).astype(np.uint8).tobytes()
-            results.append((len(zlib.compress(rest, 6)), prediction, rest))
-        _, prediction, rest = min(results)
+            attempts.append((len(zlib.compress(rest, 6)), prediction, rest))
+        _, prediction, rest = min(attempts)
         return deflated(rest), prediction
 
     def unpacked(self, data: bytes, prediction: str) -> np.ndarray:
-        """Return the codes of what :meth:`packed` returned, uint8 ``(n,)``."""
+        """Return the codes of :meth:`packed`, uint8 ``(n,)``."""
         rest = np.frombuffer(zlib.decompress(data), np.uint8).astype(np.int64)
         codes = np.zeros_like(rest)
         for wave in self.waves:
@@ -134,9 +139,9 @@ class Neighbours:
 
 def coded_bytes(stored: np.ndarray, channels: np.ndarray, predict: bool = True) -> int:
     """
-    Return the number of bytes after zlib of a mask ``(X, Y, Z)`` and of the codes of its nodes, ``channels`` (n, C).
+    Return the bytes after zlib of a mask ``(X, Y, Z)`` and of the ``channels`` (n, C), uint8, of its nodes.
 
-    Without ``predict``, codes are compressed as they are.
+    Channels are compressed one by one; without ``predict``, the codes are not predicted.
     """
     if not predict:
         return len(mask_bytes(stored)) + sum(len(deflated(np.ascontiguousarray(c).tobytes())) for c in channels.T)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...tasks.radiance.nodes import Nodes
 from ...tasks.radiance.volume_field import NodeField, NodeVolume, colour_of
-from .node_codes import ChannelSteps
+from .node_codes import QuantisationSteps
 
 #: Range of stored raw densities: empty at the lower end, opaque at the upper.
 RAW = (-8.0, 12.0)
@@ -61,7 +61,9 @@ class ByteField(NodeVolume):
     ``nbytes`` are all bytes in memory.
     """
 
-    def __init__(self, nodes: Nodes, density, colour, steps: tuple[ChannelSteps, ChannelSteps], matrix=None, rows=None):
+    def __init__(
+        self, nodes: Nodes, density, colour, steps: tuple[QuantisationSteps, QuantisationSteps], matrix=None, rows=None
+    ):
         types = nodes.types
         if nodes.stored is not None:
             nodes = Nodes(types, nodes.lower, nodes.spacing, nodes.shape, nodes.stored, packed=True)

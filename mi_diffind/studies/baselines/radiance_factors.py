@@ -16,7 +16,7 @@ from drjit import nn
 
 from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, chessboard_distances, corners_of
 from ...tasks.radiance.volume_field import VolumeField, colour_of, density_of
-from .node_codes import ChannelSteps, deflated, mask_bytes
+from .node_codes import QuantisationSteps, deflated, mask_bytes
 from .radiance import transformed
 from .radiance_fits import HEADER, WeightedGrid, nodes_of, nodes_state
 
@@ -186,7 +186,7 @@ class PlanesFit:
         for k in (0, 1):
             low, high = (float(f(self._scaled(self.net, k).numpy())) for f in (np.min, np.max))
             step = (high - low) / 255
-            self.steps.append(ChannelSteps(np.float32([low]), np.float32([step]), np.array([256])))
+            self.steps.append(QuantisationSteps(np.float32([low]), np.float32([step]), np.array([256])))
 
     def field_of(self, net) -> PlanesField:
         """Return the field of the trained parameters, after :meth:`round` rounded as they are stored."""
@@ -210,7 +210,7 @@ class PlanesFit:
         nodes = nodes_of(types, state)
         occupancy = Occupancy(nodes)
         matrix = types.TensorXf(np.ascontiguousarray(state["matrix"], np.float32))
-        steps = [ChannelSteps(state[f"{n}_low"], state[f"{n}_step"], np.array([256])) for n in TABLES]
+        steps = [QuantisationSteps(state[f"{n}_low"], state[f"{n}_step"], np.array([256])) for n in TABLES]
         shape, ranks = map(tuple, (state["sides"].tolist(), state["ranks"].tolist()))
         field = PlanesField(nodes, shape, {"matrix": matrix}, ranks, occupancy, steps)
         field.words = [types.UInt32(np.ascontiguousarray(state[n]).view("<u4").reshape(-1)) for n in TABLES]

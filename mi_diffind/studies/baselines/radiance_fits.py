@@ -13,11 +13,12 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
+from ...bits import pack_bits
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
 from ...tasks.radiance.nodes import Nodes, cells_of, corners_of
 from ...tasks.radiance.volume_field import NodeField
-from .node_codes import ChannelSteps, coded_bytes, deflated
+from .node_codes import QuantisationSteps, coded_bytes, deflated
 from .radiance import RAW, ByteField, CoefficientField
 
 #: Weight of a node that no ray sees, so that its colour is defined, too.
@@ -133,7 +134,9 @@ class NodesFit:
     coefficients, if there is one.
     """
 
-    def __init__(self, nodes: Nodes, density, colour, steps: tuple[ChannelSteps, ChannelSteps], matrix=None, rows=None):
+    def __init__(
+        self, nodes: Nodes, density, colour, steps: tuple[QuantisationSteps, QuantisationSteps], matrix=None, rows=None
+    ):
         self.nodes, self.rows, self.steps = nodes, rows, steps
         types = self.types = nodes.types
         self.first = int(nodes.stored is not None)
@@ -143,7 +146,7 @@ class NodesFit:
         colour = np.pad(colour, ((0 if rows is not None else self.first, 0), (0, spare)))
         ones = {"constant_values": 1}
         padded = [np.pad(steps[1].low, (0, spare)), np.pad(steps[1].step, (0, spare), **ones)]
-        self.rounding = ChannelSteps(*padded, np.pad(steps[1].levels, (0, spare), **ones))
+        self.rounding = QuantisationSteps(*padded, np.pad(steps[1].levels, (0, spare), **ones))
         self.net = {
             "density": types.TensorXf(np.pad(density, (self.first, 0)).astype(np.float32)[:, None] / DENSITY_SCALE),
             "colour": types.TensorXf(colour.astype(np.float32)),
@@ -186,7 +189,7 @@ class NodesFit:
     def field(types, state: dict) -> ByteField:
         """Return the field that reads what :meth:`state` returned."""
         names = ("low", "step", "levels")
-        steps = tuple(ChannelSteps(*(state[f"{array}_{n}"] for n in names)) for array in ("density", "colour"))
+        steps = tuple(QuantisationSteps(*(state[f"{array}_{n}"] for n in names)) for array in ("density", "colour"))
         return ByteField(nodes_of(types, state), state["density"][:, 0], state["colour"], steps, state.get("matrix"),
                          state.get("rows"))  # fmt: skip
 
@@ -219,18 +222,17 @@ def nodes_of(types, state: dict) -> Nodes:
 
 def bits_of(numbers: np.ndarray, count: int) -> bytes:
     """Return numbers below ``count``, packed in as few bits each as they need."""
-    width = max(1, int(count - 1).bit_length())
-    return np.packbits((numbers[:, None] >> np.arange(width)) & 1, bitorder="little").tobytes()
+    return pack_bits(numbers, max(1, int(count - 1).bit_length())).tobytes()
 
 
-def density_steps() -> ChannelSteps:
+def density_steps() -> QuantisationSteps:
     """Return the 256 steps of raw densities over :data:`.radiance.RAW`."""
-    return ChannelSteps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / 255]), np.array([256]))
+    return QuantisationSteps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / 255]), np.array([256]))
 
 
 def plain(grid: WeightedGrid, levels: int = 256) -> NodesFit:
     """Return the fit of thirteen numbers a node, those of colour in ``levels`` uniform steps."""
-    steps = density_steps(), ChannelSteps.over(grid.colour, levels, grid.seen + LEAST, 1e-3)
+    steps = density_steps(), QuantisationSteps.over(grid.colour, levels, grid.seen + LEAST, 1e-3)
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), grid.colour, steps)
 
 
@@ -255,7 +257,7 @@ def components(grid: WeightedGrid, width: float, count: int = 12) -> NodesFit:
     values, vectors = np.linalg.eigh(np.cov(centred.T, aweights=seen))
     vectors = vectors[:, np.argsort(values)[::-1][:count]]
     values = centred @ vectors
-    steps = density_steps(), ChannelSteps.of_width(values, np.full(count, width))
+    steps = density_steps(), QuantisationSteps.of_width(values, np.full(count, width))
     matrix = np.concatenate([vectors.T / scale, mean[None]])
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), values, steps, matrix)
 
@@ -265,7 +267,7 @@ def codebook(grid: WeightedGrid, count: int) -> NodesFit:
     scale = display(grid)
     centres, rows = k_means((grid.colour * scale).astype(np.float32), grid.seen + LEAST, count)
     colour = centres / scale
-    steps = density_steps(), ChannelSteps.over(colour)
+    steps = density_steps(), QuantisationSteps.over(colour)
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), colour, steps, None, rows)
 
 

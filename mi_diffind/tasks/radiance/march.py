@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 
 import drjit as dr
 
+from ...rays import box_interval
 from .volume_field import VolumeField
 
 #: Transmittance at which a ray ends.
@@ -52,15 +53,7 @@ def box(field, o, d, near, far, active):
     """
     types = field.types
     near, far = types.Float(near), types.Float(far)
-    active = types.Bool(active)
-    for x, v, a, b in zip(o, d, *field.box, strict=True):
-        # Along a face of the box, 0 · inf would be NaN
-        moves = v != 0
-        inverse = dr.rcp(dr.select(moves, v, 1))
-        first, second = (a - x) * inverse, (b - x) * inverse
-        near = dr.select(moves, dr.maximum(near, dr.minimum(first, second)), near)
-        far = dr.select(moves, dr.minimum(far, dr.maximum(first, second)), far)
-        active &= moves | ((x >= a) & (x <= b))
+    near, far, active = box_interval(o, d, *field.box, near, far, types.Bool(active))
     # Comparisons with NaN are false
     active &= (near < far) & dr.isfinite(near) & dr.isfinite(far)
     return types.Array3f(dr.fma(d, near, o)), near, far - near, active

@@ -12,6 +12,8 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
+from ...bits import mask_words
+
 #: Cells along a side of a cell of the coarser grid of distances.
 COARSE = 2
 
@@ -209,17 +211,12 @@ def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     counts.reshape(x * y, count)[:, -1] += bits.reshape(x * y, count, 32)[:, -1, -1]
     first = 1 + np.cumsum(counts) - counts
     filled = bits.any(axis=1)
-    columns = np.stack([words_of(bits[filled]), first[filled].astype(np.uint32)], axis=1)
+    columns = np.stack([mask_words(bits[filled])[:, 0], first[filled].astype(np.uint32)], axis=1)
     masks = np.pad(filled, (0, -len(filled) % 32)).reshape(-1, 32)
     before = np.cumsum(masks.sum(axis=1)) - masks.sum(axis=1)
-    return np.stack([words_of(masks), before.astype(np.uint32)], axis=1), columns
+    return np.stack([mask_words(masks)[:, 0], before.astype(np.uint32)], axis=1), columns
 
 
 def columns_of(nodes: int) -> int:
     """Return the number of columns along a line of ``nodes`` nodes."""
     return -(-(nodes - 1) // COLUMN)
-
-
-def words_of(bits: np.ndarray) -> np.ndarray:
-    """Return bits ``(n, 32)`` as 32-bit words ``(n,)``, the lowest bit first."""
-    return np.packbits(bits, axis=1, bitorder="little").view("<u4")[:, 0]

@@ -14,19 +14,14 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from ... import srgb
 from ...fitting import Problem
-from ...metrics import srgb
 from .march import differentiable, march
 from .views import CapturedViews, ViewsError, load_views
 from .volume_field import VolumeField
 
 #: Pixels along a side of a patch.
 PATCH = 4
-
-
-def encoded(x):
-    """Return linear Dr.Jit values in [0, 1] as sRGB."""
-    return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
 class ViewImages:
@@ -154,9 +149,9 @@ class ImagesProblem(Problem):
         seen = differentiable(self.field_of(net), o, d, 0, dr.inf, True, offset)
         total = types.Float(0)
         for c in range(3):
-            reference = encoded(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1))
+            reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1))
             # The prediction is not clamped at white: its slope leads back into the range
-            total += dr.square(encoded(seen.colour[c] + seen.transmittance * grey) - reference)
+            total += dr.square(srgb.from_linear(seen.colour[c] + seen.transmittance * grey) - reference)
         return total * (1 / (3 * count))
 
     def measure(self, net):
@@ -165,7 +160,7 @@ class ImagesProblem(Problem):
 
 def displayed(image: np.ndarray) -> np.ndarray:
     """Return an image ``(…, 4)`` in front of white as sRGB ``(…, 3)`` in [0, 1]."""
-    return srgb(image[..., :3] + (1 - image[..., 3:]))
+    return srgb.for_display(image[..., :3] + (1 - image[..., 3:]))
 
 
 def scores(pictures: list[np.ndarray], views: CapturedViews) -> dict[str, float]:

@@ -12,6 +12,7 @@ import copy
 import drjit as dr
 import numpy as np
 
+from ...bits import as_words, pack_bits
 from .nodes import Nodes
 
 #: Optical depth of a voxel below which its density counts as zero.
@@ -239,6 +240,4 @@ class PackedPaletteField(NodeVolume):
 def node_words(levels: np.ndarray, density_bits: int, index: np.ndarray, index_bits: int) -> np.ndarray:
     """Return 32-bit words that hold the level and the index of each node without gaps, and one more word."""
     joined = levels.astype(np.uint32) | (index.astype(np.uint32) << density_bits)
-    bits = np.unpackbits(joined[:, None].view(np.uint8), axis=1, bitorder="little")[:, : density_bits + index_bits]
-    packed = np.packbits(bits, bitorder="little")
-    return np.pad(packed, (0, -len(packed) % 4 + 4)).view("<u4")
+    return as_words(pack_bits(joined, density_bits + index_bits), spare=1)
