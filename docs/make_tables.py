@@ -209,7 +209,7 @@ def shading_shares(study: str) -> str:
     """Return the paper's figure 2 as a table: quality by λ, with the spread over seeds."""
     rows = []
     for name, material in shading_curves(study).items():
-        for way in material.ways:
+        for way in material.remedies:
             for letter in "CP":
                 cells = []
                 for share in material.shares(way):
@@ -217,9 +217,8 @@ def shading_shares(study: str) -> str:
                     spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
                     cells.append(f"{mean(values):.2f}{spread}")
                 rows.append([name, way, letter, *cells])
-    shares = max(
-        (material.shares(way) for material in shading_curves(study).values() for way in material.ways), key=len
-    )
+    curves = shading_curves(study).values()
+    shares = max((material.shares(way) for material in curves for way in material.remedies), key=len)
     return table(["material", "", "", *(f"λ {share:g}" for share in shares)], rows)
 
 
