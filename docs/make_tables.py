@@ -223,10 +223,10 @@ def shading_shares(study: str) -> str:
 
 def sdf_errors(study: str) -> str:
     """Distance fields in equal bytes: IoU, IoU near the surface, normals."""
-    from mi_diffind.studies.equal_memory import by_size
+    from mi_diffind.studies.equal_memory import candidates_by_budget
     from mi_diffind.studies.sdf.conclusions import size_text
 
-    sizes = by_size(measured(study))
+    sizes = candidates_by_budget(measured(study))
     rows: dict[str, dict[int, str]] = {}
     for size, made in sizes.items():
         for c in made.values():
@@ -281,12 +281,12 @@ def sdf_rays() -> str:
 
 def field_errors(study: str) -> str:
     """Radiance fields, by how many times smaller than a dense grid: PSNR before white, and of the foreground."""
-    from mi_diffind.studies.equal_memory import by_size
+    from mi_diffind.studies.equal_memory import candidates_by_budget
     from mi_diffind.studies.radiance.conclusions import ratio_text, references
 
     result = measured(study)
     rows = []
-    for found in (references(result), *by_size(result).values()):
+    for found in (references(result), *candidates_by_budget(result).values()):
         for c in found.values():
             e, d = c["errors"], c["details"]
             rows.append([

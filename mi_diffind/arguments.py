@@ -17,7 +17,7 @@ class Argument:
 
     @property
     def name(self) -> str:
-        """Its name in Python, and in :attr:`Request.options`."""
+        """Its name in Python, and in :attr:`FitRequest.options`."""
         return self.options.get("dest", self.flags[0].lstrip("-").replace("-", "_"))
 
     @property

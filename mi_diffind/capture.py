@@ -56,7 +56,7 @@ class CaptureError(DiffindError, RuntimeError):
 
 
 @dataclass(frozen=True)
-class Settings:
+class CaptureSettings:
     """
     How a scene is captured: ``views`` for training and ``test`` views, square images of ``resolution`` pixels and a
     field of view ``fov`` (degrees), ``spp`` samples a pixel.
@@ -115,7 +115,7 @@ class Settings:
 # -- places -----------------------------------------------------------------------------------------------------------
 
 
-def directions(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+def directions(settings: CaptureSettings) -> tuple[np.ndarray, np.ndarray]:
     """
     From the centre to the cameras, unit vectors ``(views, 3)`` and ``(test, 3)``; z is up.
 
@@ -199,7 +199,7 @@ class Captured:
 def capture(
     scene: str | os.PathLike,
     folder: str | os.PathLike,
-    settings: Settings = Settings(),
+    settings: CaptureSettings = CaptureSettings(),
     defines: dict[str, str] | None = None,
     progress: bool = True,
 ) -> Captured:
@@ -223,7 +223,7 @@ def capture(
     radius = settings.radius or _reach(loaded, settings.objects, centre) / math.sin(math.radians(settings.fov) / 2)
     if not radius > 0:
         raise CaptureError(f"{scene}: what is captured has no extent, --radius has to be given")
-    camera = _Camera(loaded, settings)
+    camera = CaptureCamera(loaded, settings)
     write_json(folder / RECORD, record)
     splits, left = _plan(settings, centre, radius), []
     for split, views in splits.items():
@@ -288,7 +288,7 @@ def _reach(scene, objects: tuple[str, ...], centre: np.ndarray) -> float:
     return found
 
 
-def _plan(settings: Settings, centre: np.ndarray, radius: float) -> dict[str, list[np.ndarray]]:
+def _plan(settings: CaptureSettings, centre: np.ndarray, radius: float) -> dict[str, list[np.ndarray]]:
     """Split → poses."""
     frame = frame_of(settings.up)
     places = (d @ frame.T * radius + centre for d in directions(settings))
@@ -310,10 +310,10 @@ def _load(path, defines: dict[str, str] | None):
     return scenes.load(path, defines=defines, change=hide, merge=False)
 
 
-class _Camera:
+class CaptureCamera:
     """A camera of its own for a loaded scene."""
 
-    def __init__(self, scene, settings: Settings):
+    def __init__(self, scene, settings: CaptureSettings):
         self.scene, self.settings = scene, settings
         side = settings.resolution
         mono = mi.is_monochromatic
@@ -399,7 +399,7 @@ def _only(inner, shapes: list):
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def _record(scene, settings: Settings, defines: dict[str, str] | None) -> dict:
+def _record(scene, settings: CaptureSettings, defines: dict[str, str] | None) -> dict:
     """How a folder is made: the settings, and what else its images depend on."""
     digest = hashlib.sha256()
     for file in scenes.files_of(scene, defines):
@@ -447,11 +447,11 @@ def _changed(before: dict, now: dict) -> list[str]:
     return found
 
 
-def _name(split: str, i: int, settings: Settings) -> str:
+def _name(split: str, i: int, settings: CaptureSettings) -> str:
     return f"{split}/r_{i:03d}.{settings.format}"
 
 
-def _write_lists(folder: Path, settings: Settings, splits: dict, box: np.ndarray) -> list[str]:
+def _write_lists(folder: Path, settings: CaptureSettings, splits: dict, box: np.ndarray) -> list[str]:
     """Write ``transforms_*.json`` of the images that are there; returns their names."""
     margin = MARGIN * (box[1] - box[0]).max()
     head = {

@@ -48,10 +48,12 @@ def core_library() -> str:
 
 class JitCore:
     """
-    C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures:
-    ``jit_shutdown(int)``, ``jit_init(uint32_t)``, ``jit_launch_stats(size_t *, size_t *, size_t *)`` and
-    ``jit_registry_id_bound(const char *, const char *)``. Raises ``OSError`` or ``AttributeError`` where one is
-    missing.
+    C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures.
+
+    These are ``jit_shutdown(int)``, ``jit_init(uint32_t)``, ``jit_launch_stats(size_t *, size_t *, size_t *)``,
+    ``jit_registry_id_bound(const char *, const char *)`` and
+    ``jit_llvm_set_target(const char *, const char *, uint32_t)``. Raises ``OSError`` or ``AttributeError`` where one
+    is missing.
     """
 
     #: ``JitBackend`` as ``jit_init`` takes it: a mask.
@@ -65,6 +67,8 @@ class JitCore:
         self._shutdown, self._init = core["_Z12jit_shutdowni"], core["_Z8jit_initj"]
         self._launch_stats, self._id_bound = core["_Z16jit_launch_statsPmS_S_"], core["_Z21jit_registry_id_boundPKcS0_"]
         self._id_bound.argtypes, self._id_bound.restype = [ctypes.c_char_p] * 2, ctypes.c_uint32
+        self._set_target = core["_Z19jit_llvm_set_targetPKcS0_j"]
+        self._set_target.argtypes, self._set_target.restype = [ctypes.c_char_p] * 2 + [ctypes.c_uint32], None
 
     def launches(self) -> int:
         """Kernels that have been launched since the start."""
@@ -83,6 +87,26 @@ class JitCore:
     def init(self, backend: int) -> None:
         """Start a backend: :attr:`LLVM` or :attr:`CUDA`."""
         self._init(backend)
+
+    def set_target(self, cpu: str, features: str, lanes: int) -> None:
+        """Generate LLVM code for this processor and these features, in vectors of so many single-precision lanes."""
+        self._set_target(cpu.encode(), features.encode(), lanes)
+
+
+def limit_code_generation(target: str) -> None:
+    """
+    Generate LLVM code for the processor ``target``, written as name, features and lanes: ``haswell:+avx2,+fma:8``.
+
+    Names and features are LLVM's; this processor must have all of the features. Lanes of single precision, a power of
+    two. Call it before the first kernel and the first scene. Dr.Jit has no Python function for this. Raises
+    ``ValueError`` for another form and ``RuntimeError`` where Dr.Jit has no LLVM.
+    """
+    match = re.fullmatch(r"([\w.-]+):([\w.,+-]+):(\d+)", target)
+    if match is None:
+        raise ValueError(f'found the target "{target}", expected name:features:lanes like "haswell:+avx2,+fma:8"')
+    if llvm_version()[0] < 0:
+        raise RuntimeError(f'the target "{target}" cannot be set: Dr.Jit has not started its LLVM backend')
+    JitCore().set_target(match[1], match[2], int(match[3]))
 
 
 # -- Dr.Jit: kernels ---------------------------------------------------------------------------------------------------

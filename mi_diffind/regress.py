@@ -138,7 +138,7 @@ def _alpha(pixels: int) -> float:
 
 
 @dataclass
-class Moments:
+class PassMoments:
     """
     Passes of a render that were added up so far: the ``mean`` of all ``samples`` of a pixel, ``(height, width,
     channels)``, float64; ``squares``, the sum over the ``passes`` of their samples times their squared deviation from
@@ -170,7 +170,7 @@ def render_with_variance(
     passes: int = REFERENCE_PASSES,
     on_pass: Callable[[], object] | None = None,
     stop: threading.Event | None = None,
-    moments: Moments | None = None,
+    moments: PassMoments | None = None,
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """
     Render ``passes`` (at least 2) independent images of ``spp / passes`` samples a pixel, rounded up to a power of two:
@@ -189,7 +189,7 @@ def render_with_variance(
     """
     if passes < 2:
         raise ValueError(f"passes: found {passes}, at least 2 are needed")
-    moments = Moments() if moments is None else moments
+    moments = PassMoments() if moments is None else moments
     n = _samples_of_a_pass(spp, passes)
     for _ in range(_missing(moments, spp, passes)):
         moments.add(_colour(scenes.render_pass(scene, n, (seed << 16) + _REFERENCE_SEEDS + moments.passes)), n)
@@ -204,7 +204,7 @@ def _samples_of_a_pass(spp: int, passes: int) -> int:
     return 1 << (-(-spp // passes) - 1).bit_length()
 
 
-def _missing(moments: Moments, spp: int, passes: int) -> int:
+def _missing(moments: PassMoments, spp: int, passes: int) -> int:
     """Passes that are still to be rendered."""
     n = _samples_of_a_pass(spp, passes)
     return max(0, passes - moments.samples // n)
@@ -431,20 +431,20 @@ def _fingerprint(path, defines: dict[str, str]) -> str:
     return digest.hexdigest()
 
 
-def _write_partial(path: Path, moments: Moments, key: dict) -> None:
+def _write_partial(path: Path, moments: PassMoments, key: dict) -> None:
     about = json.dumps({**key, "samples": moments.samples, "passes": moments.passes}).encode()
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         np.savez(stream, mean=moments.mean, squares=moments.squares, about=np.frombuffer(about, np.uint8))
 
 
-def _read_partial(path: Path, key: dict) -> Moments:
+def _read_partial(path: Path, key: dict) -> PassMoments:
     """What was kept of the same render; nothing if there is none, or it is damaged."""
     with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as data:
         about = json.loads(data["about"].tobytes())
-        moments = Moments(data["mean"], data["squares"], about.pop("samples"), about.pop("passes"))
+        moments = PassMoments(data["mean"], data["squares"], about.pop("samples"), about.pop("passes"))
         if about == key and np.isfinite(moments.mean + moments.squares).all():
             return moments
-    return Moments()
+    return PassMoments()
 
 
 def regress(

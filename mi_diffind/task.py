@@ -37,7 +37,7 @@ DATA = Path(__file__).resolve().parent / "data"
 
 
 @dataclass
-class Request:
+class FitRequest:
     """
     What a training is asked for: the ``preset`` and its ``settings`` as they were changed, the module of Dr.Jit
     ``types`` to train with, the ``storage`` form of the result ("": the task's own), and the task's own arguments
@@ -174,18 +174,18 @@ class Task:
         """The settings of a preset with what was ``given`` in place of its own; ``options`` are the task's own."""
         return dataclasses.replace(self.presets[preset], **given)
 
-    def check(self, request: Request) -> None:
+    def check(self, request: FitRequest) -> None:
         """Raise :class:`~mi_diffind.errors.UsageError` for options that do not go together, before any work."""
 
-    def problem(self, request: Request) -> Problem:
+    def problem(self, request: FitRequest) -> Problem:
         """What is to be trained, arrays allocated."""
         raise NotImplementedError
 
-    def table(self, problem: Problem, request: Request) -> Table:
+    def table(self, problem: Problem, request: FitRequest) -> Table:
         """The arrays of a problem, as a file holds them: in single precision, or as the task stores them."""
         raise NotImplementedError
 
-    def fit(self, request: Request) -> Fitted:
+    def fit(self, request: FitRequest) -> Fitted:
         """One training, and what is measured of its result in its storage form."""
         problem = self.problem(request)
         result = request.train(problem)
@@ -323,7 +323,7 @@ def fit(
             raise UsageError(f'{name}: found the argument "{key}", allowed are {allowed}')
     options |= {k: v for k, v in given.items() if k in options}
     settings = task.settings(preset, {k: v for k, v in given.items() if k in fields}, options)
-    request = Request(preset, settings, None, storage or next(iter(task.storages), ""), options, seconds)
+    request = FitRequest(preset, settings, None, storage or next(iter(task.storages), ""), options, seconds)
     request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
     request.output = None if output is None else Path(output)
     if resume and seconds is not None:

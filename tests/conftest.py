@@ -1,10 +1,17 @@
 """Fixtures shared by all tests: Mitsuba variants and seeded generators."""
 
 import gc
+import os
 
 import numpy as np
 import pytest
 from variants import BACKENDS, VARIANTS, set_variant
+
+from mi_diffind import compat
+
+#: Run all tests with code for another processor, such as ``haswell:+avx2,+fma:8`` (most laptops).
+if TARGET := os.environ.get("MI_DIFFIND_LLVM_TARGET"):
+    compat.limit_code_generation(TARGET)
 
 
 def pytest_collection_modifyitems(items):

@@ -142,7 +142,7 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
     from mi_diffind import capture
     from mi_diffind.tasks.radiance.views import load_views
 
-    stop, render = threading.Event(), capture._Camera.render
+    stop, render = threading.Event(), capture.CaptureCamera.render
 
     def third(self, *arguments):
         third.calls += 1
@@ -153,7 +153,7 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
     third.calls = 0
     with monkeypatch.context() as patch:
         patch.setattr(capture, "interruptible", lambda: contextlib.nullcontext(stop))
-        patch.setattr(capture._Camera, "render", third)
+        patch.setattr(capture.CaptureCamera, "render", third)
         assert run(scene, tmp_path / "views") == 130
     assert "3 of 6 views, 3 rendered now" in capsys.readouterr().out
     assert len(load_views(tmp_path / "views")) == 3  # what there is can be used
@@ -309,9 +309,9 @@ def angles(a, b):
 
 
 def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
-    from mi_diffind.capture import Settings, directions
+    from mi_diffind.capture import CaptureSettings, directions
 
-    train, test = directions(Settings(seed=1))
+    train, test = directions(CaptureSettings(seed=1))
     assert train.shape == (60, 3) and test.shape == (20, 3)
     assert np.allclose(np.linalg.norm(train, axis=1), 1)
     apart = angles(train, train) + 360 * np.eye(60)
@@ -319,23 +319,23 @@ def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
     assert apart.min() > 0.7 * even and np.abs(train.mean(axis=0)).max() < 0.02
     assert angles(test, train).min() > 0.2 * even
     assert angles(test, train).min(axis=1).max() < 0.9 * even
-    other = directions(Settings(seed=2))[0]
+    other = directions(CaptureSettings(seed=2))[0]
     assert np.abs(other - train).max() > 0.1 and np.allclose(other[:, 2], train[:, 2])
-    upper = np.degrees(np.arcsin(directions(Settings(elevation=(10.0, 50.0)))[0][:, 2]))
+    upper = np.degrees(np.arcsin(directions(CaptureSettings(elevation=(10.0, 50.0)))[0][:, 2]))
     assert upper.min() > 10 and upper.max() < 50 and upper.min() < 12 and upper.max() > 48
 
 
 def test_an_orbit_closes_and_swings(mi_rgb):
-    from mi_diffind.capture import Settings, directions
+    from mi_diffind.capture import CaptureSettings, directions
 
-    train, test = directions(Settings(path="orbit", views=12, test=6, elevation=(0.0, 60.0)))
+    train, test = directions(CaptureSettings(path="orbit", views=12, test=6, elevation=(0.0, 60.0)))
     azimuth = np.degrees(np.arctan2(train[:, 1], train[:, 0])) % 360
     assert np.allclose(azimuth, np.arange(12) * 30)
     elevation = np.degrees(np.arcsin(train[:, 2]))
     assert elevation[0] == pytest.approx(0) and elevation[6] == pytest.approx(60) and elevation[3] == pytest.approx(30)
     between = np.degrees(np.arctan2(test[:, 1], test[:, 0])) % 360
     assert np.allclose(between % 30, 15) and len(np.unique(between.round())) == 6
-    assert np.allclose(directions(Settings(path="orbit"))[0][:, 2], np.sin(np.radians(20)))
+    assert np.allclose(directions(CaptureSettings(path="orbit"))[0][:, 2], np.sin(np.radians(20)))
 
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 2), (1, 1, -1)])

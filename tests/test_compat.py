@@ -1,6 +1,7 @@
 """Each hook into what Mitsuba and Dr.Jit do not promise: a failure says which one broke."""
 
 import contextlib
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,9 @@ import pytest
 from mi_diffind import compat, runtime
 
 SCENE = Path(__file__).resolve().parent / "lamp.xml"
+
+#: A processor whose features this one has, with vectors of another width.
+TARGET = {"x86_64": "nehalem:+sse4.2:4", "AMD64": "nehalem:+sse4.2:4"}.get(platform.machine(), "generic:+neon:8")
 
 
 @contextlib.contextmanager
@@ -58,7 +62,7 @@ def test_functions_of_the_library(mi_rgb):
     """Starting LLVM again itself is tested in processes of their own (``test_runtime.py``)."""
     with hook("the place of Dr.Jit's library"):
         assert Path(compat.core_library()).is_file(), compat.core_library()
-    with hook("mangled names of jit_shutdown, jit_init, jit_launch_stats or jit_registry_id_bound"):
+    with hook("mangled names of the functions of JitCore"):
         core = compat.JitCore()
     with hook("jit_launch_stats: kernels are not counted"):
         before = core.launches()
@@ -68,6 +72,21 @@ def test_functions_of_the_library(mi_rgb):
         bsdf = mi_rgb.load_dict({"type": "diffuse"})
         assert bsdf is not None and core.holds_objects(mi_rgb.variant())
         assert not core.holds_objects("llvm_ad_rgb_double")
+
+
+def test_limited_code_generation():
+    """The width of vectors and the processor of kernels, and the result; in a process of its own."""
+    code = (
+        "import sys, mi_diffind, drjit as dr; from mi_diffind import compat; from drjit.llvm.ad import Float\n"
+        "compat.limit_code_generation(sys.argv[1]); dr.set_flag(dr.JitFlag.KernelHistory, True)\n"
+        "y = dr.square(dr.opaque(Float, 3, 1000)) + 1; dr.eval(y); dr.sync_thread()\n"
+        "print(y[999], *compat.llvm_target(compat.kernel_code(dr.kernel_history([dr.KernelType.JIT])[0])))"
+    )
+    with hook("mangled name of jit_llvm_set_target"):
+        done = subprocess.run([sys.executable, "-c", code, TARGET], capture_output=True, text=True, check=True)
+        assert done.stdout.split() == ["10.0", *TARGET.split(":")[::2]]
+    with pytest.raises(ValueError, match='found the target "haswell", expected name:features:lanes like "haswell:'):
+        compat.limit_code_generation("haswell")
 
 
 def test_kernels(mi_rgb, history):

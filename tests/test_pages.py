@@ -13,7 +13,7 @@ from mi_diffind.maps.source import from_arrays
 from mi_diffind.pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import PAGES, TableError, gathers_of, load_table, save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import TASK, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
 
@@ -281,7 +281,7 @@ def short(structure, steps=30, **changes):
 def trained(ad, recipe, nbytes=1500):
     source = from_arrays({"albedo": np.rint(255 * half_empty()).astype(np.uint8)})
     size = search.default_size(source, nbytes, recipe)
-    asked = Request("ours", recipe.settings, ad, progress=False)
+    asked = FitRequest("ours", recipe.settings, ad, progress=False)
     return training.fit_image(source, size, recipe, asked)[0]
 
 

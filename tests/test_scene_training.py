@@ -23,20 +23,20 @@ from mi_diffind.scene_training import references as references_module
 from mi_diffind.scene_training.arguments import SCENE_ARGUMENTS, views_of
 from mi_diffind.scene_training.fit import fit_scene, recipe_of, size_of, texture_problem
 from mi_diffind.scene_training.problem import SceneProblem, exposure_of
-from mi_diffind.scene_training.recipe import SceneRecipe, View, Views
-from mi_diffind.scene_training.references import References, colours
+from mi_diffind.scene_training.recipe import SceneRecipe, View, ViewDistribution
+from mi_diffind.scene_training.references import ReferenceRenders, colours
 from mi_diffind.scene_training.rig import Rig
 from mi_diffind.scene_training.texture import TrainedScene, texture_file
 from mi_diffind.settings import FitSettings
 from mi_diffind.tables import load_table, save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
-from mi_diffind.tasks.texture.memory_budget import PaperSize, Size, parse_structure
+from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
 from mi_diffind.tasks.texture.presets import PRESETS
 from mi_diffind.tasks.texture.training import layout_of, problem_of, rounded, stored_form
 
 NAMES = ("albedo", "roughness")
-ORBIT = Views(
+ORBIT = ViewDistribution(
     3, 1, azimuth=(-60, 60), elevation=(30, 60), light_azimuth=(-90, 90), light_elevation=(40, 80), up=(0, 0, 1)
 )
 
@@ -94,8 +94,8 @@ def test_views_lie_in_their_ranges_and_repeat():
 
 
 def test_views_without_ranges_and_in_a_box():
-    assert Views().trained() == Views().measured() == [View()]
-    boxed = Views(50, origins=((-1, 2, 3), (1, 2, 5))).trained()
+    assert ViewDistribution().trained() == ViewDistribution().measured() == [View()]
+    boxed = ViewDistribution(50, origins=((-1, 2, 3), (1, 2, 5))).trained()
     origins = np.array([view.origin for view in boxed])
     assert (origins >= [-1, 2, 3]).all() and (origins <= [1, 2, 5]).all() and np.ptp(origins, axis=0)[2] > 1.8
     assert boxed[0].azimuth is None
@@ -111,7 +111,7 @@ def test_views_without_ranges_and_in_a_box():
 )  # fmt: skip
 def test_bad_views(change, match):
     with pytest.raises(UsageError, match=match):
-        Views(**change)
+        ViewDistribution(**change)
 
 
 @pytest.mark.parametrize(
@@ -133,12 +133,14 @@ def parsed(*words):
 
 
 def test_arguments():
-    assert views_of(parsed()) == Views() and arguments.recipe_of(parsed(), FitSettings()).bound == 1
+    assert views_of(parsed()) == ViewDistribution() and arguments.recipe_of(parsed(), FitSettings()).bound == 1
     found = parsed(
         "--views", "3", "--azimuth=-30:30", "--elevation", "40", "--target=-1,0,2.5", "--light-elevation", "10:80",
         "--bound", "none", "--spp", "4", "--begin", "untrained",
     )  # fmt: skip
-    expected = Views(3, azimuth=(-30, 30), elevation=(40, 40), target=(-1, 0, 2.5), light_elevation=(10, 80), seed=7)
+    expected = ViewDistribution(
+        3, azimuth=(-30, 30), elevation=(40, 40), target=(-1, 0, 2.5), light_elevation=(10, 80), seed=7
+    )
     assert views_of(found, 7) == expected
     recipe = arguments.recipe_of({**found, "share": 0.5}, FitSettings(steps=9))
     assert recipe == SceneRecipe(0.5, 4, None, start="untrained", settings=FitSettings(steps=9))
@@ -192,7 +194,7 @@ def test_camera_and_lights_are_where_a_view_has_them():
     scene = lit("sun", "lamp", "sky", "shape")
     target = (0.5, 0, 0)
     ranges = {"azimuth": (0, 1), "elevation": (0, 1), "distance": (1, 2), "light_azimuth": (0, 1)}
-    rig = Rig(scene, Views(target=target, up=(0, 0, 1), light_elevation=(0, 1), **ranges))
+    rig = Rig(scene, ViewDistribution(target=target, up=(0, 0, 1), light_elevation=(0, 1), **ranges))
     before = {name: matrix(e) for name, e in emitters(scene).items() if name in ("sun", "sky")}
     angle = np.arctan2(-2, -0.5) + np.radians(30)
     origin = target + 3 * np.array([np.cos(0.7) * np.cos(angle), np.cos(0.7) * np.sin(angle), np.sin(0.7)])
@@ -222,21 +224,21 @@ def test_camera_and_lights_are_where_a_view_has_them():
 
 def test_a_camera_in_a_box_looks_at_the_target():
     scene = lit("sun")
-    Rig(scene, Views(origins=((0, 0, 0), (1, 1, 1)), target=(0, 0, 0))).place(View(origin=(3, 4, 5)))
+    Rig(scene, ViewDistribution(origins=((0, 0, 0), (1, 1, 1)), target=(0, 0, 0))).place(View(origin=(3, 4, 5)))
     expected = mi.ScalarTransform4f().look_at([3, 4, 5], [0, 0, 0], [0, 1, 0]).matrix
     look = matrix(scene.sensors()[0])
     np.testing.assert_allclose(look[:3, 2:], np.array(expected)[:3, 2:], atol=1e-5)
 
 
 def test_rigs_that_cannot_be():
-    turn = Views(light_azimuth=(0, 90))
+    turn = ViewDistribution(light_azimuth=(0, 90))
     with pytest.raises(scenes.SceneError, match=r"light_azimuth: no light of the scene can be moved so \(AreaLight\)"):
         Rig(lit("shape"), turn)
     with pytest.raises(scenes.SceneError, match="light_elevation: no light"):
         Rig(lit("sky"), dataclasses.replace(turn, light_elevation=(0, 9)))
     Rig(lit("sky"), turn)
     with pytest.raises(scenes.SceneError, match="target: not given, and the middle"):
-        Rig(lit("sky"), Views(azimuth=(0, 9)))
+        Rig(lit("sky"), ViewDistribution(azimuth=(0, 9)))
 
 
 # -- references -------------------------------------------------------------------------------------------------------
@@ -261,7 +263,7 @@ def passes(monkeypatch):
 
 def test_references_are_rendered_once(path, tmp_path, passes):
     def references(spp=10, **more):
-        return References(path, ORBIT, spp, tmp_path / "kept", progress=False, **more)
+        return ReferenceRenders(path, ORBIT, spp, tmp_path / "kept", progress=False, **more)
 
     views = ORBIT.trained()[:2]
     first = references()
@@ -289,16 +291,16 @@ def test_references_are_rendered_once(path, tmp_path, passes):
 
 
 def test_references_go_on_after_an_interruption(path, tmp_path, passes):
-    view, uninterrupted = ORBIT.trained()[0], References(path, ORBIT, 10, progress=False)
+    view, uninterrupted = ORBIT.trained()[0], ReferenceRenders(path, ORBIT, 10, progress=False)
     expected = uninterrupted.images([view])[0]
     seeds = list(passes.seeds)
-    kept = References(path, ORBIT, 10, tmp_path, progress=False)
+    kept = ReferenceRenders(path, ORBIT, 10, tmp_path, progress=False)
     passes.stop = len(seeds) + 2
     with pytest.raises(KeyboardInterrupt):
         kept.images([view])
     assert [file.name for file in tmp_path.iterdir()] == [kept.path(view).name]  # nothing half-written beside it
     passes.stop = 0
-    again = References(path, ORBIT, 10, tmp_path, progress=False)
+    again = ReferenceRenders(path, ORBIT, 10, tmp_path, progress=False)
     np.testing.assert_array_equal(again.images([view])[0], expected)
     assert again.found == 1 and again.rendered == 2
     assert passes.seeds[-4:] == [seeds[0], seeds[1], seeds[1], seeds[2]]
@@ -306,7 +308,7 @@ def test_references_go_on_after_an_interruption(path, tmp_path, passes):
 
 def test_references_are_the_exact_scene(path, passes):
     """Against the scene rendered as it is written, in the view that it has."""
-    image = References(path, Views(), 64, progress=False).images([View()])[0]
+    image = ReferenceRenders(path, ViewDistribution(), 64, progress=False).images([View()])[0]
     expected = mi.render(scenes.load(path, exact=True), spp=64, seed=9).numpy()
     assert np.abs(image - expected).mean() < 0.05 * expected.mean() and not np.array_equal(image, expected)
 
@@ -315,7 +317,9 @@ def test_only_colours_count(path):
     """Of a film with transparency, too."""
     with_alpha = path.with_name("alpha.xml")
     with_alpha.write_text(path.read_text().replace('value="rgb"', 'value="rgba"'))
-    image, expected = (References(p, Views(), 16, progress=False).images([View()])[0] for p in (with_alpha, path))
+    image, expected = (
+        ReferenceRenders(p, ViewDistribution(), 16, progress=False).images([View()])[0] for p in (with_alpha, path)
+    )
     assert image.shape == (24, 24, 3)
     assert np.abs(image - expected).mean() < 0.1 * expected.mean()
     assert colours(mi.TensorXf(np.zeros((2, 2, 4)))).shape == (2, 2, 3)
@@ -324,7 +328,7 @@ def test_only_colours_count(path):
 
 def test_a_folder_for_references_that_cannot_be(path, tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
-        References(path, Views(), 4, tmp_path / "nowhere" / "kept")
+        ReferenceRenders(path, ViewDistribution(), 4, tmp_path / "nowhere" / "kept")
 
 
 # -- training, while no other scene is there ---------------------------------------------------------------------------
@@ -347,7 +351,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
 
     def fitted_scene(**more):
-        request = Request("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
+        request = FitRequest("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
         return fit_scene(scene, ORBIT, recipe, request, references=tmp_path / "kept", preview=tmp_path / "preview.png")
 
     found, result = fitted_scene()
@@ -368,7 +372,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     (tmp_path / "after.xml").write_text(scene.read_text().replace("material.npz", "trained.npz"))
     plain, view = scenes.load(tmp_path / "after.xml"), ORBIT.measured()[0]
     own = {"without": (tmp_path / "material.npz",), "inputs": (found.settings["source"],)}
-    references = References(scene, ORBIT, 16, tmp_path / "kept", progress=False, **own)
+    references = ReferenceRenders(scene, ORBIT, 16, tmp_path / "kept", progress=False, **own)
     (truth,) = references.images([view])
     assert references.found == 1
     Rig(plain, ORBIT).place(view)
@@ -551,9 +555,9 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
     """A file says all that is needed to begin anew."""
     source, recipe = load_source(folder / "material.json"), PRESETS[preset]
     layout = layout_of(source, recipe)
-    wanted = PaperSize(16, 24, 4, 5, layout.stored)
+    wanted = PaperBudget(16, 24, 4, 5, layout.stored)
     if preset == "ours":
-        wanted = Size(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
+        wanted = TextureBudget(32, 32, layout.stored, parse_structure("0:2:4,1:3:6"), 2, 3, 6, 3)
     pyramid = Pyramid.of(source, layout, array_module("llvm"))
     net = problem_of(source, wanted, recipe, pyramid).net
     own = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}

@@ -7,7 +7,7 @@ import pytest
 
 from mi_diffind import units
 from mi_diffind.tasks.image import memory_budget
-from mi_diffind.tasks.image.memory_budget import Size, explain, fit_bytes, image_bytes, paper_search, search
+from mi_diffind.tasks.image.memory_budget import ImageBudget, explain, fit_bytes, image_bytes, paper_search, search
 from mi_diffind.units import parse_size
 
 IMAGES = [(1, 1), (1, 4096), (4096, 1), (7, 5), (64, 64), (100, 100), (333, 1000), (1024, 1024), (4096, 4096)]
@@ -65,7 +65,7 @@ def test_search_is_the_papers(side, channels, compression, ratio):
         candidates.append((cascaded, primary, 4 * primary**2 + channels * cascaded**4))
     cascaded, primary, nbytes = min(candidates, key=lambda c: abs(compression - uncompressed / c[2]))
     size = paper_search(uncompressed, compression, channels, side, side, ratio)
-    assert size == Size(primary, primary, cascaded, channels)
+    assert size == ImageBudget(primary, primary, cascaded, channels)
     assert size.nbytes == nbytes
     found = search(uncompressed, compression, channels, side, side, ratio=ratio)
     assert found.cascaded == cascaded and found.compression(uncompressed) == pytest.approx(compression, rel=0.05)
@@ -110,7 +110,7 @@ def test_search_stays_within_the_image(height, width, compression, dims):
 def test_search_shrinks_the_primary_of_a_small_image():
     size = search(256**2 * 3, 12, 3, 256, 256)
     assert size.cascaded == 4 and size.compression(256**2 * 3) == pytest.approx(12, rel=0.05)
-    assert search(1, 12, 1, 1, 1) == Size(1, 1, 4, 1)
+    assert search(1, 12, 1, 1, 1) == ImageBudget(1, 1, 4, 1)
 
 
 @pytest.mark.parametrize("dims, bits", [(4, 8), (3, 8), (2, 8), (4, 5), (4, 16)])
@@ -204,7 +204,7 @@ def test_explanations():
 
 def test_sizes_refuse_nonsense():
     with pytest.raises(ValueError, match="rows: found 0"):
-        Size(0, 1, 4, 3)
+        ImageBudget(0, 1, 4, 3)
     with pytest.raises(ValueError, match="height: found 0"):
         search(1, 12, 3, 0, 1)
     with pytest.raises(ValueError, match="compression: found nan"):

@@ -59,7 +59,7 @@ def run(arguments) -> dict:
     }
     tuples = {name: getattr(arguments, name) for name in ("centre", "elevation", "up", "objects")}
     given |= {name: value if value is None else tuple(value) for name, value in tuples.items()}
-    settings = capture.Settings(**given)
+    settings = capture.CaptureSettings(**given)
     try:
         settings.check()
     except ValueError as e:

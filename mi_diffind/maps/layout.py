@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from .source import KINDS, Map, Source
+from .source import ROLES, Map, Source
 
 #: dB. A normal map is stored as two channels if the third follows from them at least as precisely.
 NORMAL_FLOOR_DB = 45.0
@@ -40,7 +40,7 @@ class MapLayout:
     """
 
     name: str
-    kind: str
+    role: str
     color_space: str
     depth: int
     where: tuple
@@ -52,6 +52,11 @@ class MapLayout:
     def channels(self) -> int:
         """Channels of the map."""
         return len(self.where)
+
+    def to_json(self) -> dict:
+        """Return the entry of a table file's settings."""
+        where = [list(w) if isinstance(w, tuple) else w for w in self.where]
+        return {("kind" if k == "role" else k): v for k, v in {**asdict(self), "where": where}.items()}
 
     def encode(self, values):
         """The numbers in [0, 1] that stand for ``values``; outside of the range of the map, the nearest."""
@@ -95,9 +100,11 @@ class Layout:
         for m in source.maps:
             shell = _range(m)
             where = []
-            vectors = filtered and m.kind == "normal" and m.channels == 3
+            vectors = filtered and m.role == "normal" and m.channels == 3
             keep = vectors and not all(m.values[..., c].min() == m.values[..., c].max() for c in range(3))
-            kind = (m.color_space, shell.knee, shell.low, shell.high, m.name if vectors else "") if filtered else ()
+            averaging = (
+                (m.color_space, shell.knee, shell.low, shell.high, m.name if vectors else "") if filtered else ()
+            )
             for c in range(m.values.shape[-1]):
                 values = shell.encode(m.values[..., c])
                 low = float(values.min())
@@ -107,16 +114,18 @@ class Layout:
                 if c == 2 and _drops_z(m, where, two_channel_normals):
                     where.append(FROM_NORMAL)
                     continue
-                same = [i for i, v in enumerate(stored) if once and averaged[i] == kind and np.array_equal(v, values)]
+                same = [
+                    i for i, v in enumerate(stored) if once and averaged[i] == averaging and np.array_equal(v, values)
+                ]
                 if not same:
                     same = [len(stored)]
                     stored.append(values)
-                    averaged.append(kind)
-                    initial.append(_initial(m.kind, c))
+                    averaged.append(averaging)
+                    initial.append(_initial(m.role, c))
                     groups.append(m.name)
                 where.append(same[0])
             maps.append(
-                MapLayout(m.name, m.kind, m.color_space, m.depth, tuple(where), shell.low, shell.high, shell.knee)
+                MapLayout(m.name, m.role, m.color_space, m.depth, tuple(where), shell.low, shell.high, shell.knee)
             )
         return Layout(source.width, source.height, tuple(maps), tuple(initial), tuple(groups))
 
@@ -179,9 +188,7 @@ class Layout:
         return {
             "width": self.width,
             "height": self.height,
-            "maps": [
-                {**asdict(m), "where": [list(w) if isinstance(w, tuple) else w for w in m.where]} for m in self.maps
-            ],
+            "maps": [m.to_json() for m in self.maps],
             "initial": list(self.initial),
             "groups": list(self.groups),
         }
@@ -197,17 +204,17 @@ class Layout:
             if not isinstance(entry["name"], str) or not entry["name"].isidentifier():
                 raise ValueError(f"a map is called {entry['name']!r:.40}")
             where = tuple(_where(w, len(found["groups"])) for w in entry["where"])
-            kind, color_space = str(entry["kind"]), str(entry["color_space"])
+            role, color_space = str(entry["kind"]), str(entry["color_space"])
             low, high, knee = (float(entry[k]) for k in ("low", "high", "knee"))
             depth = int(entry["depth"])
-            if not where or kind not in KINDS or color_space not in ("srgb", "linear") or depth not in (1, 2, 4):
+            if not where or role not in ROLES or color_space not in ("srgb", "linear") or depth not in (1, 2, 4):
                 raise ValueError(f'the map "{entry["name"]}" is of no kind that is known')
             if FROM_NORMAL in where and (where.index(FROM_NORMAL) != 2 or where.count(FROM_NORMAL) != 1):
                 raise ValueError(f'the map "{entry["name"]}" has its third component in another place')
             finite = max(-low, high, knee) <= LARGEST
             if not (finite and low < high and knee >= 0) or (knee > 0 and not 0 < high <= 1e6 * knee):
                 raise ValueError(f'the map "{entry["name"]}" has no range of values')
-            maps.append(MapLayout(str(entry["name"]), kind, color_space, depth, where, low, high, knee))
+            maps.append(MapLayout(str(entry["name"]), role, color_space, depth, where, low, high, knee))
         width, height = int(found["width"]), int(found["height"])
         initial, groups = tuple(map(float, found["initial"])), tuple(map(str, found["groups"]))
         if min(width, height) < 1 or width * height >= 2**32 or not maps or len(initial) != len(groups):
@@ -237,12 +244,12 @@ def _range(m: Map) -> MapLayout:
         knee, high = max(middle, 1e-3 * largest), largest
     elif smallest < 0 or (m.depth > 1 and m.color_space == "linear" and 0 < largest - smallest < NARROW):
         low, high = smallest, max(largest, smallest + 1e-6 * max(1.0, abs(smallest)))
-    return MapLayout(m.name, m.kind, m.color_space, m.depth, (), low, high, knee)
+    return MapLayout(m.name, m.role, m.color_space, m.depth, (), low, high, knee)
 
 
 def _drops_z(m: Map, where: list, wanted: bool | None) -> bool:
     """Is the third channel of this map left out? ``where``: what was said of the first two."""
-    if m.kind != "normal" or m.values.shape[-1] != 3 or wanted is False:
+    if m.role != "normal" or m.values.shape[-1] != 3 or wanted is False:
         return False
     if not all(isinstance(w, int) for w in where) or m.values.min() < 0 or m.values.max() > 1:
         return False
@@ -253,8 +260,8 @@ def _drops_z(m: Map, where: list, wanted: bool | None) -> bool:
     return float(np.mean((z - m.values[..., 2]) ** 2)) <= 10 ** (-NORMAL_FLOOR_DB / 10)
 
 
-def _initial(kind: str, channel: int) -> float:
+def _initial(role: str, channel: int) -> float:
     """Initial value of the cascaded array (supplement 1.3): grey, white, light blue, grey; others 0."""
-    if kind == "normal":
+    if role == "normal":
         return 1.0 if channel == 2 else 0.5
-    return {"albedo": 0.5, "ao": 1.0, "roughness": 0.5}.get(kind, 0.0)
+    return {"albedo": 0.5, "ao": 1.0, "roughness": 0.5}.get(role, 0.0)

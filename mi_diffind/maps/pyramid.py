@@ -93,7 +93,7 @@ class Pyramid(FilteredMaps):
             channels = [(c, w) for c, w in enumerate(own.where) if isinstance(w, int) and _owner(layout, w) is own]
             if not channels:
                 continue
-            vectors = m.kind == "normal" and m.channels == 3
+            vectors = m.role == "normal" and m.channels == 3
             signed = m.values.min() < 0
             if vectors:
                 level = m.values if signed else 2 * m.values - 1

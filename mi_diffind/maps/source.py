@@ -30,7 +30,7 @@ from ..errors import DiffindError, reason
 MAX_CHANNELS = 16
 
 COLOR_SPACES = ("srgb", "linear")
-KINDS = ("albedo", "normal", "roughness", "ao", "metallic", "other")
+ROLES = ("albedo", "normal", "roughness", "ao", "metallic", "other")
 NONFINITE = ("error", "clean")
 
 _SYNONYMS = {
@@ -55,13 +55,13 @@ class Map:
     16-bit numbers over 65535, others as they are).
 
     ``color_space`` is ``"srgb"`` if they carry the sRGB transfer function, ``"linear"`` if they are data as they are;
-    ``kind`` is one of :data:`KINDS`; ``depth`` the bytes of a channel in the source (1, 2 or 4).
+    ``role`` is one of :data:`ROLES`; ``depth`` the bytes of a channel in the source (1, 2 or 4).
     """
 
     name: str
     values: np.ndarray
     color_space: str
-    kind: str
+    role: str
     depth: int
     file: str = ""
 
@@ -105,7 +105,7 @@ def load_source(path: str | os.PathLike, name: str | None = None, nonfinite: str
     Read an image or a manifest (``.json``).
 
     An image is one map, called ``name`` (default: ``"image"``); its alpha channel is another one, ``"alpha"``. It is
-    sRGB if it is grey or RGB of 8 or 16 bits (and ``name`` is not that of another kind of map), else linear. A map of
+    sRGB if it is grey or RGB of 8 or 16 bits (and ``name`` is not that of a map of another role), else linear. A map of
     a manifest is sRGB by default if it is an albedo of 8 or 16 bits and 1 or 3 channels; its alpha channel is left out
     if it is 1 everywhere, otherwise ``channels`` has to say what is meant. A roughness, AO or metallic map whose three
     channels are equal keeps one.
@@ -123,14 +123,14 @@ def load_source(path: str | os.PathLike, name: str | None = None, nonfinite: str
     name = "image" if name is None else name
     _check_name(path, name)
     image = _read(path)
-    kind = kind_of(name)
-    if kind == "other" and name != "alpha" and image.named:
-        kind = "albedo"
-    maps = [_Raw(name, image.values[:, :, : image.colors], kind, str(path))]
+    role = role_of(name)
+    if role == "other" and name != "alpha" and image.named:
+        role = "albedo"
+    maps = [_RawMap(name, image.values[:, :, : image.colors], role, str(path))]
     if image.has_alpha:
         if name == "alpha":
             raise SourceError(f'{path}: has an alpha channel, so the name "alpha" is taken')
-        maps.append(_Raw("alpha", image.values[:, :, image.colors :], "other", str(path)))
+        maps.append(_RawMap("alpha", image.values[:, :, image.colors :], "other", str(path)))
     return _assemble(maps, path, nonfinite)
 
 
@@ -161,22 +161,22 @@ def from_arrays(
                 f"{where}: has the shape {values.shape}, expected (height, width, channels), none of them 0"
             )
         values = values.reshape(*values.shape[:2], -1)
-        kind = kind_of(name)
+        role = role_of(name)
         if name == "image" and values.shape[2] in (1, 3):
-            kind = "albedo"
+            role = "albedo"
         color_space = color_spaces.pop(name, None)
         if color_space is not None and color_space not in COLOR_SPACES:
             raise SourceError(f'{where}: has the color space "{color_space}", allowed are {COLOR_SPACES}')
-        maps.append(_Raw(name, _one_of_equal(values, kind), kind, "", color_space))
+        maps.append(_RawMap(name, _one_of_equal(values, role), role, "", color_space))
     if color_spaces:
         raise SourceError(f'arrays: a color space is given for "{next(iter(color_spaces))}", which is not among them')
     return _assemble(maps, "arrays", nonfinite)
 
 
-def kind_of(name: str) -> str:
-    """The one of :data:`KINDS` that the name of a map stands for, such as ``"albedo"`` for ``"base_color"``."""
+def role_of(name: str) -> str:
+    """The one of :data:`ROLES` that the name of a map stands for, such as ``"albedo"`` for ``"base_color"``."""
     plain = name.lower().replace("_", "").removesuffix("texture").removesuffix("map")
-    return next((kind for kind, names in _SYNONYMS.items() if plain in names), "other")
+    return next((role for role, names in _SYNONYMS.items() if plain in names), "other")
 
 
 # -- manifests --------------------------------------------------------------------------------------------------------
@@ -221,12 +221,12 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
         file = path.parent / file
         if file not in images:
             images[file] = _read(file)
-        kind = kind_of(name)
+        role = role_of(name)
         if "channels" in entry:
             values = images[file].select(entry["channels"], f'{path}: map "{name}"')
         else:
-            values = _one_of_equal(images[file].opaque(f'{path}: map "{name}"'), kind)
-        maps.append(_Raw(name, values, kind, str(file), color_space))
+            values = _one_of_equal(images[file].opaque(f'{path}: map "{name}"'), role)
+        maps.append(_RawMap(name, values, role, str(file), color_space))
     return _assemble(maps, path, nonfinite)
 
 
@@ -244,7 +244,7 @@ def _unique(pairs: list) -> dict:
 
 
 @dataclass(frozen=True, eq=False)
-class _Image:
+class _ImageFile:
     """A file's content in its own type, ``(height, width, channels)``: ``colors`` channels, then perhaps alpha."""
 
     values: np.ndarray
@@ -283,7 +283,7 @@ class _Image:
         return colors
 
 
-def _read(path: Path) -> _Image:
+def _read(path: Path) -> _ImageFile:
     """An image file. Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it or it is cut short."""
     import mitsuba as mi
 
@@ -308,7 +308,7 @@ def _read(path: Path) -> _Image:
     formats = mi.Bitmap.PixelFormat
     has_alpha = pixels in (formats.YA, formats.RGBA)
     named = has_alpha or pixels in (formats.Y, formats.RGB)
-    return _Image(values, values.shape[2] - has_alpha, has_alpha, named)
+    return _ImageFile(values, values.shape[2] - has_alpha, has_alpha, named)
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -362,26 +362,26 @@ def _jpeg_ends(data: bytes) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Raw:
+class _RawMap:
     """A map before its values are converted; without a color space it gets the default."""
 
     name: str
     values: np.ndarray
-    kind: str
+    role: str
     file: str
     color_space: str | None = None
 
 
-def _one_of_equal(values: np.ndarray, kind: str) -> np.ndarray:
-    """One of three equal channels, if one is what a map of this kind has."""
-    if kind not in ("roughness", "ao", "metallic") or values.shape[2] != 3:
+def _one_of_equal(values: np.ndarray, role: str) -> np.ndarray:
+    """One of three equal channels, if one is what a map of this role has."""
+    if role not in ("roughness", "ao", "metallic") or values.shape[2] != 3:
         return values
     nan = values.dtype.kind == "f"
     equal = all(np.array_equal(values[:, :, 0], values[:, :, i], equal_nan=nan) for i in (1, 2))
     return values[:, :, :1] if equal else values
 
 
-def _assemble(raw: list[_Raw], where, nonfinite: str) -> Source:
+def _assemble(raw: list[_RawMap], where, nonfinite: str) -> Source:
     """The source with these maps, if they go together."""
     if not raw:
         raise SourceError(f"{where}: has no maps")
@@ -400,21 +400,21 @@ def _assemble(raw: list[_Raw], where, nonfinite: str) -> Source:
     maps, cleaned = [], 0
     digest = hashlib.sha256()
     for m in raw:
-        kind_of_number = m.values.dtype.name
+        number_type = m.values.dtype.name
         color_space = m.color_space
         if color_space is None:
-            srgb = m.kind == "albedo" and kind_of_number in _ENCODED and m.values.shape[2] in (1, 3)
+            srgb = m.role == "albedo" and number_type in _ENCODED and m.values.shape[2] in (1, 3)
             color_space = "srgb" if srgb else "linear"
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, which is told below
             values = m.values.astype("<f4", order="C")
-        if kind_of_number in _ENCODED:
+        if number_type in _ENCODED:
             values /= np.iinfo(m.values.dtype).max
         else:
             cleaned += _check_finite(values, f'{m.file or where}: map "{m.name}"', nonfinite)
         values.flags.writeable = False
-        depth = _DEPTHS[kind_of_number]
-        maps.append(Map(m.name, values, color_space, m.kind, depth, m.file))
-        layout = [m.name, color_space, m.kind, depth, *values.shape]
+        depth = _DEPTHS[number_type]
+        maps.append(Map(m.name, values, color_space, m.role, depth, m.file))
+        layout = [m.name, color_space, m.role, depth, *values.shape]
         digest.update(json.dumps(layout).encode() + b"\n")
         digest.update(values)
     height, width = first.values.shape[:2]

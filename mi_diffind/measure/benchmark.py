@@ -40,7 +40,7 @@ SECTIONS = ("jobs", "errors", "operations", "queries", "passes")
 
 
 @dataclass(frozen=True)
-class Settings:
+class BenchmarkSettings:
     """
     How much is measured: ``lanes`` of a kernel, ``rounds`` of the queries, ``passes`` of whole jobs, ``samples`` for
     the errors.
@@ -53,7 +53,7 @@ class Settings:
     quick: bool = False
 
     @classmethod
-    def choose(cls, variant: str, quick: bool = False) -> Settings:
+    def choose(cls, variant: str, quick: bool = False) -> BenchmarkSettings:
         """For this machine: enough lanes that each core, or the GPU, gets several blocks of them."""
         blocks = 2 ** math.ceil(math.log2(max(dr.thread_count(), 2)))
         lanes = 2**22 if variant.startswith("cuda") else blocks * 2**16
@@ -64,7 +64,9 @@ class Stopped(Exception):
     """The first Ctrl-C has been seen."""
 
 
-def measure(plan: Plan, settings: Settings, folder: str | os.PathLike | None = None, progress: bool = True) -> dict:
+def measure(
+    plan: Plan, settings: BenchmarkSettings, folder: str | os.PathLike | None = None, progress: bool = True
+) -> dict:
     """
     Measure everything that ``plan`` asks for, or what is missing of it, if ``folder`` holds an interrupted run. What
     is measured stays there until :func:`.report.write` has written the result.
@@ -89,7 +91,7 @@ def measure(plan: Plan, settings: Settings, folder: str | os.PathLike | None = N
     store = Store(folder, plan.study, key, SECTIONS, progress)
     interrupted, cases = False, [plan.resolved(case) for case in plan.cases]
     with interruptible() as stop:
-        steps = _Steps(plan, settings, store, stop, progress)
+        steps = BenchmarkSteps(plan, settings, store, stop, progress)
         try:
             steps.jobs()
             with steps.bar(cases):
@@ -119,10 +121,10 @@ def measure(plan: Plan, settings: Settings, folder: str | os.PathLike | None = N
     return result
 
 
-class _Steps:
+class BenchmarkSteps:
     """The steps of a run; each does what is missing, and raises :class:`Stopped` where it may be left off."""
 
-    def __init__(self, plan: Plan, settings: Settings, store: Store, stop: threading.Event, progress: bool):
+    def __init__(self, plan: Plan, settings: BenchmarkSettings, store: Store, stop: threading.Event, progress: bool):
         self.plan, self.settings, self.store, self.stop, self.progress = plan, settings, store, stop, progress
 
     def bar(self, cases: list[Case]) -> tqdm:
@@ -154,7 +156,7 @@ class _Steps:
         if self.store.folder is not None and plan.jobs:
             folder = models_folder(self.store.folder, plan.study, plan.jobs_fingerprint)
         for i, job in enumerate(plan.jobs):
-            record = job.known(folder, done.get(job.name))
+            record = job.cached_record(folder, done.get(job.name))
             if record is None:
                 if self.progress:
                     print(f"{i + 1} of {len(plan.jobs)}: {job.name}", file=sys.stderr)
@@ -234,7 +236,7 @@ class _Steps:
 # -- the result -------------------------------------------------------------------------------------------------------
 
 
-def _assemble(plan: Plan, cases: list[Case], settings: Settings, data: dict) -> dict:
+def _assemble(plan: Plan, cases: list[Case], settings: BenchmarkSettings, data: dict) -> dict:
     candidates, records = {}, data["jobs"]
     for c in plan.candidates:
         record = records.get(c.job, {})

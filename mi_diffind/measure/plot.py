@@ -82,10 +82,10 @@ class Label:
 # -- sheets -----------------------------------------------------------------------------------------------------------
 
 
-def sheet(title: str, caption: str, width: float, height: float, above: float = 0.3, dpi: int = 200):
+def figure(title: str, caption: str, width: float, height: float, above: float = 0.3, dpi: int = 200):
     """
     A Matplotlib figure of ``width`` × ``height`` inches for axes, ``above`` which is the title and below which is the
-    caption; its layout is constrained until :func:`fix`.
+    caption; its layout is constrained until :func:`fix_layout`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -101,7 +101,7 @@ def sheet(title: str, caption: str, width: float, height: float, above: float = 
     return found
 
 
-def fix(sheet) -> None:
+def fix_layout(sheet) -> None:
     """Fix the layout, in which labels are placed."""
     sheet.draw_without_rendering()
     sheet.set_layout_engine("none")
@@ -132,7 +132,7 @@ def plain(value: float) -> str:
 # -- accuracy against time --------------------------------------------------------------------------------------------
 
 
-def draw(title: str, panels: Sequence[Panel], y_label: str, caption: str):
+def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str):
     """
     A Matplotlib figure with up to two panels a row, and with time or bytes on a logarithmic axis (accuracies in dB are
     logarithms already). If there are several representations, a legend names them.
@@ -144,7 +144,7 @@ def draw(title: str, panels: Sequence[Panel], y_label: str, caption: str):
     styles: dict[str, tuple[str, str]] = {}
     for point in (x for panel in panels for x in panel.points):
         styles.setdefault(point.representation, STYLES[len(styles) % len(STYLES)])
-    found = sheet(title, caption, 6.4 * columns, 4.6 * rows, 0.55 if len(styles) > 1 else 0.3)
+    found = figure(title, caption, 6.4 * columns, 4.6 * rows, 0.55 if len(styles) > 1 else 0.3)
     if len(styles) > 1:
         shown = [
             Line2D([], [], color=colour, marker=marker, linestyle="none", markersize=6.5, label=name)
@@ -160,7 +160,7 @@ def draw(title: str, panels: Sequence[Panel], y_label: str, caption: str):
         axes.set_title(panel.title, fontsize=10)
         axes.set_xlabel(panel.x_label, fontsize=9)
         axes.set_ylabel(y_label, fontsize=9)
-    fix(found)
+    fix_layout(found)
     for axes, panel in zip(found.axes, panels, strict=True):
         _label(axes, panel, styles)
     return found
@@ -217,23 +217,25 @@ def _label(axes, panel: Panel, styles: dict) -> None:
         weight = "bold" if p.on_front else "normal"
         labels.append(Label(p.name, (p.time, p.accuracy), styles[p.representation][0], weight))
     spans = [((max(p.q1, 1e-6), p.accuracy), (p.q3, p.accuracy)) for p in panel.points]
-    place(axes, labels, [(p.time, p.accuracy) for p in panel.points], spans)
+    place_labels(axes, labels, [(p.time, p.accuracy) for p in panel.points], spans)
 
 
 # -- labels -----------------------------------------------------------------------------------------------------------
 
 
-def place(
+def place_labels(
     axes,
     labels: Iterable[Label],
     points: Sequence[tuple[float, float]],
     spans: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
 ) -> None:
     """
-    Write each label near its anchor, in this order, where it covers neither another text, nor one of ``points`` or
-    ``spans`` (pairs of ends; data coordinates), and if possible no line; a thin line leads to one that is away. The
-    layout must be fixed (:func:`fix`). Packages that do this move labels by forces for as long as there is time: the
-    picture would depend on the speed of the machine.
+    Write each label near its anchor where it covers no other text, in the given order.
+
+    Labels also avoid ``points`` and ``spans`` (pairs of ends), both in data coordinates, and if possible the lines of
+    ``axes``. A thin line leads from an anchor to a label that is away. The layout must be fixed (:func:`fix_layout`).
+    Each label takes the best of a fixed set of places: packages that move labels by forces stop after a time, so their
+    pictures would depend on the speed of the machine.
     """
     renderer, scale = axes.figure.canvas.get_renderer(), axes.figure.dpi / 72
     inside = axes.get_window_extent(renderer).extents[None]
@@ -301,15 +303,17 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 # -- courses of trainings ---------------------------------------------------------------------------------------------
 
 
-def draw_courses(title: str, records: dict[str, dict], caption: str):
+def draw_training_curves(title: str, records: dict[str, dict], caption: str):
     """
-    The courses of trainings (records of :class:`.training.Training`): PSNR over steps, one panel each, every run a
-    line, from the shortest (light) to the longest (dark); what has not converged is marked.
+    Draw PSNR over steps of trainings (records of :class:`.training.ConvergenceTraining`).
+
+    Each training has a panel, each of its runs a line, from the shortest (light) to the longest (dark). A training
+    that has not converged is marked in red.
     """
     columns = min(5, len(records))
     rows = -(-len(records) // columns)
     about = "PSNR in dB over training steps; each line is a run of its own, twice as long as that before."
-    found = sheet(title, f"{about} {caption}", 2.6 * columns, 1.9 * rows, 0.4, 160)
+    found = figure(title, f"{about} {caption}", 2.6 * columns, 1.9 * rows, 0.4, 160)
     for k, (name, record) in enumerate(records.items()):
         axes = found.add_subplot(rows, columns, k + 1)
         runs = record["runs"]

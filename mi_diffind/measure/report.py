@@ -79,10 +79,10 @@ def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> 
     courses = {name: record for name, record in result["jobs"].items() if "runs" in record}
     found = panels(result)
     if found:
-        pictures["png"] = lambda: plot.draw(result["title"], found, result["accuracy_label"], caption(result))
+        pictures["png"] = lambda: plot.draw_panels(result["title"], found, result["accuracy_label"], caption(result))
     if courses:
         title = f"{result['title']}: training"
-        pictures["training"] = lambda: plot.draw_courses(title, courses, machine_line(result))
+        pictures["training"] = lambda: plot.draw_training_curves(title, courses, machine_line(result))
     if plan is not None and not result["interrupted"]:
         pictures |= {kind: (lambda draw=draw: draw(result)) for kind, draw in plan.pictures.items()}
     names = dict.fromkeys(name for row in table for name in row if name not in COLUMNS)

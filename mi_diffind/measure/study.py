@@ -92,7 +92,7 @@ class Job:
 
     name: str
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         """The record if all is done: it is in the store (``record``), or what it made is in ``folder``."""
         return record
 

@@ -25,13 +25,13 @@ from .study import Job
 GAIN = 0.5
 
 
-class Training(Job):
+class ConvergenceTraining(Job):
     """
     A representation that is trained to convergence.
 
     ``problem()`` makes the problem anew, with untrained parameters; ``settings`` are those of the first, shortest run,
     ``longest`` the steps of the longest that is tried; each is measured ``measurements`` times. After :meth:`run` or
-    :meth:`known`, ``net`` is the trained module of the best run.
+    :meth:`cached_record`, ``net`` is the trained module of the best run.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Training(Job):
         self.measurements = measurements
         self.net = None
 
-    def known(self, folder: Path | None, record: dict | None = None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None = None) -> dict | None:
         """The record that :meth:`run` left in ``folder``, if there is one of the same settings."""
         if folder is None or not self._file(folder).is_file():
             return None

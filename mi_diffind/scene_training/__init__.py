@@ -16,7 +16,7 @@ import dataclasses
 
 from ..arguments import Argument, fraction
 from ..errors import UsageError
-from ..task import Fitted, Request, Task
+from ..task import FitRequest, Fitted, Task
 from .arguments import SCENE_ARGUMENTS, recipe_of, views_of
 from .recipe import SceneRecipe
 
@@ -43,12 +43,12 @@ class SceneTraining(Task):
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
 
-    def check(self, request: Request) -> None:
+    def check(self, request: FitRequest) -> None:
         source = request.options["source"]
         if not str(source).lower().endswith(".xml"):
             raise UsageError(f"source: found {source}, a scene file (.xml) is needed; fit shading trains maps")
 
-    def fit(self, request: Request) -> Fitted:
+    def fit(self, request: FitRequest) -> Fitted:
         """Train a texture of a scene, in the active variant, or in the one of ``request.types`` if none is set."""
         import mitsuba as mi
 

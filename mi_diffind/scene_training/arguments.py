@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 
 from ..arguments import Argument, define, positive, positive_or_none
-from .recipe import STARTS, SceneRecipe, Views
+from .recipe import STARTS, SceneRecipe, ViewDistribution
 
 
 def _numbers(text: str, count: int, separator: str, form: str) -> tuple[float, ...]:
@@ -87,11 +87,14 @@ FILES = (
 SCENE_ARGUMENTS = (*VIEWS, *RECIPE, *FILES)
 
 
-def views_of(options: Mapping, seed: int = 0) -> Views:
+def views_of(options: Mapping, seed: int = 0) -> ViewDistribution:
     """The views that options ask for. Raises :class:`~mi_diffind.errors.UsageError`."""
-    names = {"views": "count", **{f.name: f.name for f in dataclasses.fields(Views) if f.name not in ("count", "seed")}}
+    names = {
+        "views": "count",
+        **{f.name: f.name for f in dataclasses.fields(ViewDistribution) if f.name not in ("count", "seed")},
+    }
     given = {names[k]: options[k] for k in names if options.get(k) is not None}
-    return Views(**given, seed=seed)
+    return ViewDistribution(**given, seed=seed)
 
 
 def recipe_of(options: Mapping, settings) -> SceneRecipe:

@@ -21,23 +21,23 @@ from ..maps.layout import Layout
 from ..maps.pyramid import Pyramid
 from ..maps.source import Source, load_source
 from ..tables import PAGES, Table, TableError
-from ..task import Request
-from ..tasks.texture.compressed import CompressedTexture, form_of, load, to_table
-from ..tasks.texture.memory_budget import Fine, PaperSize, Size
-from ..tasks.texture.nets import PaperForm
-from ..tasks.texture.presets import PRESETS, Recipe
+from ..task import FitRequest
+from ..tasks.texture.compressed import CompressedTexture, load, structure_of, to_table
+from ..tasks.texture.memory_budget import FineArray, PaperBudget, TextureBudget
+from ..tasks.texture.nets import PaperStructure
+from ..tasks.texture.presets import PRESETS, TextureRecipe
 from ..tasks.texture.training import TextureProblem, problem_of, stored_form
 from .problem import SceneProblem
-from .recipe import SceneRecipe, Views
-from .references import References
+from .recipe import SceneRecipe, ViewDistribution
+from .references import ReferenceRenders
 from .texture import TrainedScene, texture_file
 
 
 def fit_scene(
     path: str | os.PathLike,
-    views: Views,
+    views: ViewDistribution,
     recipe: SceneRecipe,
-    request: Request,
+    request: FitRequest,
     file: str | os.PathLike | None = None,
     references: str | os.PathLike | None = None,
     preview: str | os.PathLike | None = None,
@@ -62,7 +62,7 @@ def fit_scene(
     if recipe.start == "untrained":
         texture = problem_of(source, size_of(table), texture.recipe, texture.pyramid)
         table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
-    rendered = References(
+    rendered = ReferenceRenders(
         path, views, recipe.reference_spp, references, defines, recipe.against,
         without=(file,), inputs=(source.digest,), progress=request.progress,
     )  # fmt: skip
@@ -76,7 +76,7 @@ def fit_scene(
     )  # fmt: skip
     problem.identity |= {"views": dataclasses.asdict(views)}
     result = request.train(problem)
-    settings = {**request.recorded(), **{k: v for k, v in problem.identity.items() if k not in ("form", "border")}}
+    settings = {**request.recorded(), **{k: v for k, v in problem.identity.items() if k not in ("structure", "border")}}
     settings["scene_path"] = _relative(path, request)
     if request.seconds is not None:
         settings["steps"] = result.steps
@@ -89,7 +89,7 @@ def fit_scene(
     return found, result
 
 
-def _relative(path: str | os.PathLike, request: Request) -> str:
+def _relative(path: str | os.PathLike, request: FitRequest) -> str:
     return os.path.relpath(Path(path).resolve(), (request.output or Path("x")).resolve().parent)
 
 
@@ -114,28 +114,28 @@ def texture_problem(table: Table, source: Source) -> TextureProblem:
     return TextureProblem(texture.net, pyramid, recipe_of(table), source.digest)
 
 
-def recipe_of(table: Table) -> Recipe:
+def recipe_of(table: Table) -> TextureRecipe:
     """How the arrays of a file are trained as a texture."""
     own = PRESETS["ours" if table.settings.get("layered", True) else "paper"]
-    names = [f.name for f in dataclasses.fields(Recipe) if f.name != "settings"]
+    names = [f.name for f in dataclasses.fields(TextureRecipe) if f.name != "settings"]
     return dataclasses.replace(own, **{n: table.settings[n] for n in names if n in table.settings})
 
 
-def size_of(table: Table) -> Size | PaperSize:
+def size_of(table: Table) -> TextureBudget | PaperBudget:
     """The size of the arrays of a texture."""
     layout = Layout.from_json(table.settings["layout"])
-    form, _ = form_of(table.settings, layout)
+    structure, _ = structure_of(table.settings, layout)
     shapes = {name: array.shape for name, array in table.arrays.items()}
-    if isinstance(form, PaperForm):
+    if isinstance(structure, PaperStructure):
         rows, columns, _ = shapes["primary0"]
-        return PaperSize(rows, columns, shapes["cascaded"][0], shapes["cascaded"][1], layout.stored)
-    paged = [layer for layer in form.layers if layer.paged]
-    fine = tuple(Fine(x.level, x.channels, x.bits) for x in form.layers if not x.paged)
+        return PaperBudget(rows, columns, shapes["cascaded"][0], shapes["cascaded"][1], layout.stored)
+    paged = [layer for layer in structure.layers if layer.paged]
+    fine = tuple(FineArray(x.level, x.channels, x.bits) for x in structure.layers if not x.paged)
     dims, axes = shapes["coarse"][-1], len(shapes["cascaded"]) - 1
     names = [f"level{x.level}" for x in paged]
     nbytes = sum(table.arrays[name].nbytes + table.arrays[name + PAGES].nbytes for name in names)
-    return Size(
-        layout.height, layout.width, layout.stored, fine, form.skip, dims, shapes["cascaded"][-2],
-        form.skip + 1 if axes > dims else 1, form.bits, tuple(x.level for x in paged), nbytes,
+    return TextureBudget(
+        layout.height, layout.width, layout.stored, fine, structure.skip, dims, shapes["cascaded"][-2],
+        structure.skip + 1 if axes > dims else 1, structure.bits, tuple(x.level for x in paged), nbytes,
         paged[0].bits if paged else 5,
     )  # fmt: skip

@@ -64,7 +64,7 @@ class SceneRecipe:
 class View:
     """
     One view and its light: angles in degrees, ``origin`` and ``distance`` in units of the scene; ``None``: as in the
-    scene (:class:`Views`).
+    scene (:class:`ViewDistribution`).
     """
 
     azimuth: float | None = None
@@ -76,7 +76,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Views:
+class ViewDistribution:
     """
     Ranges, ``(low, high)``, that views and lights are drawn from; ``None`` leaves what it is of as it is in the scene.
 

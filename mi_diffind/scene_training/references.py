@@ -19,7 +19,7 @@ from ..files import replacing, writable_folder
 from ..measure.store import fingerprint
 from ..plugins.support import footprint
 from ..tasks import disney
-from .recipe import View, Views
+from .recipe import View, ViewDistribution
 from .rig import Rig
 
 #: Samples of the whole image in one pass; what is interrupted loses a pass at most.
@@ -37,7 +37,7 @@ def colours(image):
 
 
 @dataclass
-class References:
+class ReferenceRenders:
     """
     Images of the views of a scene file with exact plugins, or those that ``against`` names, at ``spp`` samples a pixel.
     ``folder``, which is made if its parent exists, keeps a file for each (``None``: nothing is kept), under a name that
@@ -49,7 +49,7 @@ class References:
     """
 
     scene: str | os.PathLike
-    views: Views
+    views: ViewDistribution
     spp: int
     folder: str | os.PathLike | None = None
     defines: dict[str, str] | None = None

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..scenes import SceneError
-from .recipe import View, Views
+from .recipe import View, ViewDistribution
 
 #: Of two directions, the sine of the angle below which they count as parallel.
 PARALLEL = 1e-4
@@ -18,7 +18,7 @@ class Rig:
     Raises :class:`~mi_diffind.scenes.SceneError` where there is nothing to move, or to look at.
     """
 
-    def __init__(self, scene: mi.Scene, views: Views):
+    def __init__(self, scene: mi.Scene, views: ViewDistribution):
         self.scene, self.views = scene, views
         if not scene.sensors():
             raise SceneError("the scene has no sensor that views could be of")

@@ -13,7 +13,7 @@ from .. import compat, plugins, scenes
 from ..errors import UsageError
 from ..plugins.support import footprint
 from ..tables import Table, save_table
-from .recipe import View, Views
+from .recipe import View, ViewDistribution
 from .references import colours
 from .rig import Rig
 
@@ -54,7 +54,7 @@ class TrainedScene:
     values: a lobe's sampling does, but the density divides it out. Footprints are those of ``spp`` samples a pixel.
     """
 
-    def __init__(self, path, file: Path, views: Views, spp: int, table: Table, defines=None):
+    def __init__(self, path, file: Path, views: ViewDistribution, spp: int, table: Table, defines=None):
         folder = Path(path).resolve().parent
         with tempfile.TemporaryDirectory() as temporary:
             # A name of its own, so that no other scene reads the same arrays

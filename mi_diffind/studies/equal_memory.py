@@ -1,7 +1,7 @@
 """
 Equal-memory comparison: each method is trained once per memory budget (:class:`Contender`) and cached.
 
-The models are files in a folder, so an interrupted study continues with the models that it has.
+Trained models are files in a folder, so an interrupted study continues with the models that are there.
 """
 
 from __future__ import annotations
@@ -17,102 +17,114 @@ from typing import Any, ClassVar
 from .. import task
 from ..measure.study import Candidate, Job
 
-# -- which ------------------------------------------------------------------------------------------------------------
+# -- selection --------------------------------------------------------------------------------------------------------
 
 
-def add_without(parser: argparse.ArgumentParser) -> None:
-    """The option by which kinds are left out."""
+def add_without_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--without``, which leaves methods out."""
     parser.add_argument(
-        "--without", action="append", default=[], metavar="KIND",
-        help="leave out a kind, as it is named in the table without its size; may be repeated",
+        "--without", action="append", default=[], metavar="METHOD",
+        help="leave out a method, named as in the table without its budget; may be repeated",
     )  # fmt: skip
 
 
-def check_without(without: Iterable[str], kinds: Iterable[str]) -> None:
-    """Raise ``ValueError`` for what is no kind."""
-    unknown = [name for name in without if name not in kinds]
+def check_without(without: Iterable[str], methods: Iterable[str]) -> None:
+    """Raise ``ValueError`` if ``without`` names something else than one of the ``methods``."""
+    unknown = [name for name in without if name not in methods]
     if unknown:
-        raise ValueError(f'--without: found "{unknown[0]}", allowed are {", ".join(kinds)}')
+        raise ValueError(f'--without: found "{unknown[0]}", allowed are {", ".join(methods)}')
 
 
-def chosen(kinds: Iterable[str], sizes: Sequence, once: Iterable[str], without: Iterable[str]) -> list[tuple]:
-    """``(kind, size)`` of all that is made: of ``once`` in the first size only."""
-    kinds = [kind for kind in kinds if kind not in without]
-    return [(kind, size) for size in sizes for kind in kinds if size == sizes[0] or kind not in once]
+def combinations(
+    methods: Iterable[str], budgets: Sequence, first_only: Iterable[str], without: Iterable[str]
+) -> list[tuple]:
+    """Return the pairs ``(method, budget)`` to train; those in ``first_only`` are trained at the first budget only."""
+    methods = [method for method in methods if method not in without]
+    return [(m, budget) for budget in budgets for m in methods if budget == budgets[0] or m not in first_only]
 
 
-# -- how --------------------------------------------------------------------------------------------------------------
+# -- contenders -------------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class Contender(Job):
     """
-    A ``kind`` in a ``size``: after :meth:`known` or :meth:`run`, ``field`` is what it became. ``setting`` is what all
-    of a study share; it has the module ``types``.
+    A ``method`` at one memory ``budget``: the job that trains or encodes it, and the candidate that is measured.
 
-    A study derives from it, says how sizes are written (:meth:`text`) and has the ``labels`` of kinds and the
-    ``families``, for pictures. What makes a kind derives from that: its :meth:`run` sets ``field`` and writes ``file``,
-    if there is one, which :meth:`load` reads.
+    ``budget`` is in the study's unit (bytes, or a compression ratio), ``context`` is what all contenders of the study
+    share. After :meth:`cached_record` or :meth:`run`, :attr:`model` is the trained or encoded representation.
+
+    A study derives one class, with the ``labels`` and ``families`` of its methods and :meth:`budget_text`; each way to
+    train derives from that class, with :meth:`run`, which sets ``model`` and writes ``file`` (``None``: no folder for
+    models), and :meth:`load`, which reads the file.
     """
 
-    kind: str
-    size: float
-    setting: Any
+    method: str
+    budget: float
+    context: Any
     name: str = ""
     file: Path | None = None
 
+    #: Method → its name in tables, and the group that it belongs to in pictures.
     labels: ClassVar[Mapping[str, str]] = {}
     families: ClassVar[Mapping[str, str]] = {}
+    #: False: there is no file, the record alone is kept.
+    has_file: ClassVar[bool] = True
 
     def __post_init__(self):
-        self.name = self.name or f"{self.labels[self.kind]} {self.text(self.size)}"
+        self.name = self.name or f"{self.labels[self.method]} {self.budget_text(self.budget)}"
 
     @staticmethod
-    def text(size) -> str:
-        """A size, in names."""
+    def budget_text(budget) -> str:
+        """Return the budget as names of contenders show it, as in "1 MiB"."""
         raise NotImplementedError
 
-    def candidate(self, **more) -> Candidate:
-        """The candidate that is made."""
+    def candidate(self, **fields) -> Candidate:
+        """Return the candidate to measure; ``fields`` are further ones of :class:`Candidate`."""
         return Candidate(
-            self.name, self.families[self.kind], self.text(self.size), job=self.name, label=self.labels[self.kind],
-            details={"kind": self.kind, "asked": self.size}, **more,
+            self.name, self.families[self.method], self.budget_text(self.budget), job=self.name,
+            label=self.labels[self.method], details={"kind": self.method, "asked": self.budget}, **fields,
         )  # fmt: skip
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         from ..measure.store import file_name
 
         self.file = folder / f"{file_name(self.name)}.npz" if folder else None
-        self.__dict__.pop("field", None)
-        return record if record and self.file is not None and self.file.is_file() else None
+        self.__dict__.pop("model", None)
+        is_cached = self.file is not None and self.file.is_file()
+        return record if record and (is_cached or not self.has_file) else None
 
     @functools.cached_property
-    def field(self):
-        """What it became, from the file of the models' folder if it was not just made."""
+    def model(self):
+        """The trained or encoded representation, read from ``file`` unless :meth:`run` has just set it."""
         return self.load(self.file)
 
     def load(self, path: Path):
-        """What a file holds."""
+        """Return the representation that a file of the models folder holds."""
         raise NotImplementedError
 
 
 class PresetContender(Contender):
-    """What a task makes by one of its presets. Of a kind, :meth:`arguments` are those of ``fit``."""
+    """
+    A contender that a task trains by one of its presets, as ``mi-diffind fit`` does.
 
-    #: The task, by its name.
+    The context has ``types``, the module of Dr.Jit types.
+    """
+
+    #: Name of the task.
     task_name: ClassVar[str]
 
     @property
     def preset(self) -> str:
-        """The preset ("": the default)."""
+        """The task's preset; "" is its default."""
         raise NotImplementedError
 
     def arguments(self) -> dict:
-        """Settings, and the task's own arguments."""
+        """Return the training settings and the task's own arguments, those of :func:`mi_diffind.task.fit`."""
         raise NotImplementedError
 
     def fit(self, progress: bool) -> task.Fitted:
-        """The training."""
+        """Train the preset."""
         import mitsuba as mi
 
         return task.fit(
@@ -124,47 +136,52 @@ class PresetContender(Contender):
         from ..tables import save_table
 
         if not self.file:
-            raise ValueError("presets are measured from files: give a folder")
+            raise ValueError("presets are measured from their files: give a folder for them")
         start = time.perf_counter()
         fitted = self.fit(progress)
         if fitted.result.interrupted:
             return None
         save_table(self.file, fitted.table)
-        model = self.model(self.file)
-        self.field = model.field
-        return self.fitted(model, fitted, time.perf_counter() - start)
+        task_model = self.open(self.file)
+        self.model = self.representation(task_model)
+        return self.fit_record(task_model, fitted, time.perf_counter() - start)
 
-    def fitted(self, model: task.Model, fitted: task.Fitted, seconds: float) -> dict:
-        """The record of a training, which took so many ``seconds`` with everything."""
+    def fit_record(self, task_model: task.Model, fitted: task.Fitted, seconds: float) -> dict:
+        """Return the record of a training that took ``seconds``, preparation and storage included."""
         raise NotImplementedError
 
-    def model(self, path: Path) -> task.Model:
-        """What a table file stands for."""
-        return task.tasks()[self.task_name].open(self.setting.types.TensorXf, str(path))
+    def open(self, path: Path) -> task.Model:
+        """Return the task's model of a table file."""
+        return task.tasks()[self.task_name].open(self.context.types.TensorXf, str(path))
+
+    def representation(self, task_model: task.Model):
+        """Return the part of the task's model that the study measures: ``field``, unless a study overrides it."""
+        return task_model.field
 
     def load(self, path: Path):
-        return self.model(path).field
+        return self.representation(self.open(path))
 
 
-# -- what was found ---------------------------------------------------------------------------------------------------
+# -- results ----------------------------------------------------------------------------------------------------------
 
 
-def by_size(result: dict) -> dict[Any, dict[str, dict]]:
-    """Size that was asked for → name → candidate, of a result."""
-    found: dict[Any, dict[str, dict]] = {}
-    for name, c in result["candidates"].items():
-        if c["details"].get("asked") and c["errors"]:
-            found.setdefault(c["details"]["asked"], {})[name] = c
-    return dict(sorted(found.items()))
+def candidates_by_budget(result: dict) -> dict[Any, dict[str, dict]]:
+    """Return a map from each budget, ascending, to the measured contenders of a result: name → candidate."""
+    groups: dict[Any, dict[str, dict]] = {}
+    for name, candidate in result["candidates"].items():
+        budget = candidate["details"].get("asked")
+        if budget and candidate["errors"]:
+            groups.setdefault(budget, {})[name] = candidate
+    return dict(sorted(groups.items()))
 
 
-def ours_of(result: dict) -> str:
-    """The name of the candidate of the kind "ours" in the first size, "" if there is none."""
-    first = by_size(result).get(result["details"]["first"], {})
+def name_of_ours(result: dict) -> str:
+    """Return the name of the contender of the method "ours" at the first budget, "" if there is none."""
+    first = candidates_by_budget(result).get(result["details"]["first"], {})
     return next((name for name, c in first.items() if c["details"]["kind"] == "ours"), "")
 
 
-def times_that_of(pairs: Mapping[str, dict], ours: str) -> list[str]:
-    """``"1.20 times that of …"``, of the ratios of a result in which ``ours`` comes first."""
-    found = [(pair.removeprefix(f"{ours} / "), r["median"]) for pair, r in pairs.items() if pair.startswith(ours)]
-    return [f"{value:.2f} times that of {name}" for name, value in found if value == value]
+def ratio_phrases(ratios: Mapping[str, dict], ours: str) -> list[str]:
+    """Return ``"1.20 times that of …"`` for each finite ratio ``"ours / other"`` of a result."""
+    medians = {pair.removeprefix(f"{ours} / "): r["median"] for pair, r in ratios.items() if pair.startswith(ours)}
+    return [f"{median:.2f} times that of {name}" for name, median in medians.items() if median == median]

@@ -27,7 +27,7 @@ from .tables import exposed
 STORAGES = ("uint8", "float32")
 
 #: Kinds of maps that hold data, not colours.
-DATA_KINDS = ("normal", "roughness", "ao", "metallic")
+DATA_ROLES = ("normal", "roughness", "ao", "metallic")
 
 #: Pyramids that a texture may name: name → :class:`~mi_diffind.maps.pyramid.Pyramid`. (No property can hold one.)
 PYRAMIDS: dict[str, Pyramid] = {}
@@ -169,7 +169,7 @@ def map_of(layout: Layout, channels: str) -> MapLayout:
     if channels:
         found = layout[channels]
     else:
-        candidates = layout.maps if len(layout.maps) == 1 else [m for m in layout.maps if m.kind == "albedo"]
+        candidates = layout.maps if len(layout.maps) == 1 else [m for m in layout.maps if m.role == "albedo"]
         if len(candidates) != 1:
             names = ", ".join(layout.names)
             raise RuntimeError(f'parameter "channels": not given, and the file holds several maps: {names}')
@@ -183,7 +183,7 @@ def map_of(layout: Layout, channels: str) -> MapLayout:
 
 def is_data(layout: MapLayout) -> bool:
     """Does a map hold data that are never converted, so that ``raw`` is its default?"""
-    return layout.kind in DATA_KINDS and layout.color_space == "linear"
+    return layout.role in DATA_ROLES and layout.color_space == "linear"
 
 
 # -- the exact counterpart ---------------------------------------------------------------------------------------------

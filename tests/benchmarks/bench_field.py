@@ -16,7 +16,7 @@ import numpy as np
 
 from mi_diffind.files import write_json
 from mi_diffind.runtime import array_module
-from mi_diffind.task import Request, tasks
+from mi_diffind.task import FitRequest, tasks
 from mi_diffind.tasks.radiance import compression, files, fit
 from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance.presets import NODE_BYTES, PRESETS
@@ -64,7 +64,7 @@ def main() -> None:
         preset = "paper" if paper else "sparse"
         settings = dataclasses.replace(PRESETS[preset].settings, steps=max(1, steps), measure_every=max(1, steps))
         options = {a.name: a.default for a in tasks()["field"].arguments}
-        request = Request(preset, settings, types, options=options, progress=False)
+        request = FitRequest(preset, settings, types, options=options, progress=False)
         compression.CURVE = change.get("curve", curve)
         compression.importance = weigh if change.get("weighted", True) else even
         if paper:

@@ -22,7 +22,7 @@ from mi_diffind.fitting import FitSettings, _Trainer
 from mi_diffind.maps import source
 from mi_diffind.runtime import array_module
 from mi_diffind.tasks.image import training
-from mi_diffind.tasks.image.memory_budget import Size
+from mi_diffind.tasks.image.memory_budget import ImageBudget
 from mi_diffind.tasks.image.presets import PRESETS, replaced
 
 PRIMARY, CASCADED, SAMPLES, SIDE = 496, 12, 2**20, 1024
@@ -31,7 +31,7 @@ PRIMARY, CASCADED, SAMPLES, SIDE = 496, 12, 2**20, 1024
 def drjit_step(image: np.ndarray):
     """A function that makes a step by the paper's recipe, and waits for it."""
     recipe = replaced(PRESETS["paper"], batch=SAMPLES, deterministic=False)
-    size = Size(PRIMARY, PRIMARY, CASCADED, 3)
+    size = ImageBudget(PRIMARY, PRIMARY, CASCADED, 3)
     problem = training.problem_of(source.from_arrays({"albedo": image}), size, recipe, array_module("llvm"))
     trainer = _Trainer(problem, FitSettings(batch=SAMPLES, lr=1e-3, schedule="constant", loss="mae"))
 

@@ -29,11 +29,11 @@ from mi_diffind.indirection import unfolded
 from mi_diffind.maps.source import load_source
 from mi_diffind.scene_training.fit import fit_scene, texture_problem
 from mi_diffind.scene_training.problem import SceneProblem
-from mi_diffind.scene_training.recipe import SceneRecipe, View, Views
-from mi_diffind.scene_training.references import References
+from mi_diffind.scene_training.recipe import SceneRecipe, View, ViewDistribution
+from mi_diffind.scene_training.references import ReferenceRenders
 from mi_diffind.scene_training.texture import TrainedScene
 from mi_diffind.tables import save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture.compressed import load
 from mi_diffind.tasks.texture.training import rounded
 
@@ -42,7 +42,7 @@ from shading_scenes import fitted, material, scene_file
 
 NAMES = ("albedo", "normal", "roughness", "metallic")
 FILM = 24
-ORBIT = Views(
+ORBIT = ViewDistribution(
     8, 4, azimuth=(-60, 60), elevation=(25, 65), light_azimuth=(-90, 90), light_elevation=(35, 80), up=(0, 0, 1)
 )
 
@@ -62,7 +62,7 @@ def opened(folder: Path, light: str, names=NAMES, preset="ours", fine="0:2:4", d
     table = load(file)
     problem = texture_problem(table, load_source(folder / "material.json"))
     path = scene_file(file, names, light, FILM, depth)
-    views = ORBIT if light == "directional" else Views()
+    views = ORBIT if light == "directional" else ViewDistribution()
     return TrainedScene(path, file, views, 1, table), problem, path
 
 
@@ -245,7 +245,7 @@ def convergence(folder: Path, steps=240) -> dict:
             recipe.settings, steps=steps, lr=1e-2, measure_every=steps // 24, batch=2**14, check_every=10
         )
         recipe = dataclasses.replace(recipe, settings=settings)
-        request = Request("ours", settings, None, progress=False)
+        request = FitRequest("ours", settings, None, progress=False)
         begin = time.perf_counter()
         _, result = fit_scene(path, ORBIT, recipe, request, references=folder / "kept", preview=folder / "p.png")
         histories[start] = [(h["step"], h["psnr_db"], h["texture_psnr_db"]) for h in result.history]
@@ -285,7 +285,7 @@ def losses(folder: Path, count=120) -> dict:
             else:
                 settings = dataclasses.replace(settings, loss=loss)
             recipe = dataclasses.replace(recipe, settings=settings)
-            request = Request("ours", settings, None, progress=False)
+            request = FitRequest("ours", settings, None, progress=False)
             _, result = fit_scene(path, views, recipe, request, references=folder / "kept")
             found[light, loss, bound] = say(
                 what="losses", light=light, loss=loss, bound=bound, restarts=result.restarts,
@@ -310,7 +310,7 @@ def steps(folder: Path, count=2000) -> dict:
     views = dataclasses.replace(ORBIT, count=4, held_out=1)
     del scene
     gc.collect()
-    rendered = References(path, views, 64, progress=False)
+    rendered = ReferenceRenders(path, views, 64, progress=False)
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
     scene = TrainedScene(path, path.parent / "material.npz", views, 1, load(path.parent / "material.npz"))

@@ -11,9 +11,9 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture import training
-from mi_diffind.tasks.texture.memory_budget import Size, parse_structure
+from mi_diffind.tasks.texture.memory_budget import TextureBudget, parse_structure
 from mi_diffind.tasks.texture.presets import PRESETS
 
 #: Maps of a material, and the parameters of the BSDF that read them.
@@ -49,10 +49,10 @@ def fitted(manifest: Path, steps=2, fine="0:2:4", skip=2, cascaded=5, batch=2048
     )
     layout = training.layout_of(source, recipe)
     arrays = parse_structure(fine) if fine else ()
-    size = size or Size(source.height, source.width, layout.stored, arrays, skip, 3, cascaded, skip + 1)
+    size = size or TextureBudget(source.height, source.width, layout.stored, arrays, skip, 3, cascaded, skip + 1)
     types = array_module("llvm")
     pyramid = Pyramid.of(source, layout, types, ("repeat", "repeat"))
-    request = Request(preset, recipe.settings, types, progress=False)
+    request = FitRequest(preset, recipe.settings, types, progress=False)
     table, _ = training.fit_texture(source, size, recipe, request, pyramid)
     table.settings["source_path"] = manifest.name
     output = manifest.with_suffix(".npz")

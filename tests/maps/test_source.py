@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from mi_diffind.maps.source import SourceError, from_arrays, kind_of, load_source
+from mi_diffind.maps.source import SourceError, from_arrays, load_source, role_of
 
 
 def pattern(height, width, channels, dtype=np.uint8, seed=0):
@@ -32,7 +32,7 @@ def manifest(folder, content):
 
 
 def described(source):
-    return [(m.name, m.kind, m.color_space, m.depth, m.channels) for m in source.maps]
+    return [(m.name, m.role, m.color_space, m.depth, m.channels) for m in source.maps]
 
 
 def sentence(error):
@@ -76,7 +76,7 @@ def test_exr_is_exact(tmp_path, channels, dtype, depth):
     assert {m.color_space for m in source.maps} == {"linear"} and {m.depth for m in source.maps} == {depth}
     names = [m.name for m in source.maps]
     assert names == (["image", "alpha"] if channels in (2, 4) else ["image"])
-    assert source.maps[0].kind == ("albedo" if channels < 5 else "other")
+    assert source.maps[0].role == ("albedo" if channels < 5 else "other")
 
 
 def test_exr_with_named_channels_is_one_map(tmp_path):
@@ -163,7 +163,7 @@ def test_bmp_with_a_palette(tmp_path):
 )  # fmt: skip
 def test_name_of_an_image(tmp_path, name, expected):
     m = load_source(write(tmp_path / "a.png", pattern(5, 7, 3)), name).maps[0]
-    assert (m.name, m.kind, m.color_space) == (name, *expected)
+    assert (m.name, m.role, m.color_space) == (name, *expected)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_name_of_an_image(tmp_path, name, expected):
      ("roughness", "roughness"), ("alpha", "other"), ("height", "other"), ("map", "other")],
 )  # fmt: skip
 def test_kinds(name, kind):
-    assert kind_of(name) == kind
+    assert role_of(name) == kind
 
 
 def test_no_variant_is_set_or_changed(tmp_path, mi_rgb):

@@ -12,7 +12,7 @@ from variants import BACKENDS
 
 from mi_diffind.fitting import FitSettings, Problem
 from mi_diffind.indirection import DifferentiableArray
-from mi_diffind.measure.training import GAIN, Training
+from mi_diffind.measure.training import GAIN, ConvergenceTraining
 from mi_diffind.runtime import array_module
 
 SETTINGS = FitSettings(steps=10, batch=64, lr=1e-2, schedule="constant", seed=3, deterministic=False)
@@ -43,7 +43,7 @@ class Ramp(Problem):
 
 def training(log, **options):
     longest = options.pop("longest", 640)
-    return Training("a ramp", lambda: Ramp(log, **options), SETTINGS, longest)
+    return ConvergenceTraining("a ramp", lambda: Ramp(log, **options), SETTINGS, longest)
 
 
 def test_doubles_until_it_gains_nothing():
@@ -66,7 +66,7 @@ def test_says_so_if_it_has_not_converged():
     record = training([], longest=40).run(progress=False)
     assert [run["steps"] for run in record["runs"]] == [10, 20, 40]
     assert not record["converged"] and record["gain_db"] > GAIN
-    only = Training("a ramp", lambda: Ramp([]), SETTINGS, 10).run(progress=False)
+    only = ConvergenceTraining("a ramp", lambda: Ramp([]), SETTINGS, 10).run(progress=False)
     assert only["gain_db"] is None and not only["converged"]
 
 
@@ -76,7 +76,7 @@ def test_kept_models_are_read_and_not_trained(tmp_path):
     assert os.listdir(tmp_path) == ["a_ramp.npz"]  # no checkpoint stays
     log = []
     again = training(log)
-    assert again.known(tmp_path) == record and log == []
+    assert again.cached_record(tmp_path) == record and log == []
     assert np.array_equal(again.net.numpy(), first.net.numpy())
 
 
@@ -84,11 +84,11 @@ def test_models_of_other_settings_are_trained_again(tmp_path):
     training([]).run(tmp_path, progress=False)
     for options in ({"longest": 320}, {"target": 0.5}):
         other = training([], **options)
-        assert other.known(tmp_path) is None
+        assert other.cached_record(tmp_path) is None
         other.run(tmp_path, progress=False)
     assert np.allclose(other.net.numpy(), 0.5, atol=0.05)
     (tmp_path / "a_ramp.npz").write_bytes(b"damaged")
-    assert training([]).known(tmp_path) is None
+    assert training([]).cached_record(tmp_path) is None
 
 
 def test_interrupted_training_goes_on(tmp_path):

@@ -28,7 +28,7 @@ from mi_diffind.maps.source import from_arrays, load_source
 from mi_diffind.measure.operations import bsdf_operations, count
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, Table, load_table, save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.ggx import TASK as GGX
 from mi_diffind.tasks.image import TASK, memory_budget, training
 from mi_diffind.tasks.image.compressed import CompressedImage
@@ -90,7 +90,7 @@ def single(kind, color_space="linear", channels=3):
 def trained(source, size, batch):
     """The table of a short training."""
     recipe = replaced(PRESETS["ours"], steps=60, batch=batch, measure_every=60)
-    request = Request("ours", recipe.settings, array_module("llvm"), progress=False)
+    request = FitRequest("ours", recipe.settings, array_module("llvm"), progress=False)
     return training.fit_image(source, size, recipe, request)[0]
 
 

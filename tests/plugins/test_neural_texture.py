@@ -41,10 +41,12 @@ def make(path, source, preset="ours", border="repeat", **settings):
     pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, (border, border))
     stored = pyramid.layout.stored
     if preset == "paper":
-        size = memory_budget.PaperSize(9, 12, 4, 4, stored)
+        size = memory_budget.PaperBudget(9, 12, 4, 4, stored)
     else:
         dims = min(3, stored)
-        size = memory_budget.Size(source.height, source.width, stored, (memory_budget.Fine(0, dims, 8),), 1, dims, 12)
+        size = memory_budget.TextureBudget(
+            source.height, source.width, stored, (memory_budget.FineArray(0, dims, 8),), 1, dims, 12
+        )
     net, rng = training.problem_of(source, size, recipe, pyramid).net, np.random.default_rng(7)
     if preset == "paper":
         for array in net.arrays.values():

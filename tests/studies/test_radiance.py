@@ -249,8 +249,8 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("field")
     captures.write(folder / "balls")
     with pytest.MonkeyPatch.context() as patch:
-        small = benchmark.Settings(2**10, 2, 1, 2**10, True)
-        patch.setattr(benchmark.Settings, "choose", classmethod(lambda cls, variant, quick=False: small))
+        small = benchmark.BenchmarkSettings(2**10, 2, 1, 2**10, True)
+        patch.setattr(benchmark.BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: small))
         assert main([*command(folder), "--json", str(folder / "r.json")]) == 0
     return folder
 
@@ -295,11 +295,11 @@ def test_what_was_made_is_known(folder):
     models = folder / "out" / "tradeoff_field_models"
     for job in plan.jobs:
         record = result["jobs"][job.name]
-        assert job.known(models, None) is None and job.known(None, record) is None
-        assert job.known(models, record) == record
+        assert job.cached_record(models, None) is None and job.cached_record(None, record) is None
+        assert job.cached_record(models, record) == record
     for name in ("sparse grid, 8 bits 60×", "grid, trained on"):
         job = next(job for job in plan.jobs if job.name == name)
-        found = job.setting.errors(job.field)
+        found = job.context.errors(job.model)
         assert found == pytest.approx(result["candidates"][name]["errors"], abs=0.01)
 
 

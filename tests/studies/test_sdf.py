@@ -314,8 +314,8 @@ def folder(tmp_path_factory):
     vertices[:, 2] = np.minimum(vertices[:, 2], 0.64 + 0.2 * vertices[:, 2])
     solids.write(folder / "dent.ply", (vertices, faces))
     with pytest.MonkeyPatch.context() as patch:
-        small = benchmark.Settings(2**10, 2, 1, 2**10, True)
-        patch.setattr(benchmark.Settings, "choose", classmethod(lambda cls, variant, quick=False: small))
+        small = benchmark.BenchmarkSettings(2**10, 2, 1, 2**10, True)
+        patch.setattr(benchmark.BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: small))
         assert main([*command(folder), "--json", str(folder / "r.json")]) == 0
     return folder
 
@@ -357,9 +357,9 @@ def test_what_was_made_is_known(folder):
     models = folder / "out" / "tradeoff_sdf_models"
     for job in plan.jobs:
         record = result["jobs"][job.name]
-        assert job.known(models, None) is None and job.known(None, record) is None
-        assert job.known(models, record) == record
-        assert (job.field.spacing, job.field.slope) == (record["details"]["spacing"], record["details"]["slope"])
+        assert job.cached_record(models, None) is None and job.cached_record(None, record) is None
+        assert job.cached_record(models, record) == record
+        assert (job.model.spacing, job.model.slope) == (record["details"]["spacing"], record["details"]["slope"])
 
 
 def test_fields_and_meshes_are_in_one_place(folder):
@@ -374,10 +374,10 @@ def test_fields_and_meshes_are_in_one_place(folder):
     bricks = volumes.load(next((folder / "out" / "tradeoff_sdf_models").glob("4*bricks*.npz")), T)
     o, d = view.rays(mi)
     scenes = view.mesh_scene(), view.grid_scene(bricks, 48)  # what is not evaluated yet needs them
-    expected = view.met(scenes[0], o, d).numpy()
+    expected = views.met(scenes[0], o, d).numpy()
     hit = np.isfinite(expected)
     assert 0.2 < hit.mean() < 0.8
-    for t in (view.traced(bricks, o, d), view.met(scenes[1], o, d)):
+    for t in (views.traced(bricks, o, d), views.met(scenes[1], o, d)):
         t = t.numpy()
         assert np.mean(np.isfinite(t) != hit) < 0.03
         both = np.isfinite(t) & hit
@@ -387,7 +387,7 @@ def test_fields_and_meshes_are_in_one_place(folder):
 def test_trained_in_other_ways():
     """No pointer before the end; nothing trained; and the usual way."""
     settings, coded, moved = fitting.FitSettings(steps=10, batch=2**10, lr=1e-2, measure_every=10), {}, {}
-    for way in (task.Request, parts.AtOnce, parts.Untrained):
+    for way in (task.FitRequest, parts.AtOnce, parts.Untrained):
         coding = encoding.Coding(encoding.sample(Ball(), 1 / 12), 10)
         field = nodes.SparseNodes(T, coding.sampled.structure, 1.0)
         problem = training.NodeProblem(field, Ball.mesh, coding, SimpleNamespace(measure=lambda field: {"x": 0.0}))
@@ -395,7 +395,7 @@ def test_trained_in_other_ways():
         coded[way] = coding.done.mean()
         moved[way] = np.abs(problem.net.values.numpy()[:, 0] - coding.sampled.distances).max() > 1e-3
     assert list(moved.values()) == [True, True, False]
-    assert 0.7 < coded[task.Request] < 0.9 and coded[parts.AtOnce] == coded[parts.Untrained] == 0
+    assert 0.7 < coded[task.FitRequest] < 0.9 and coded[parts.AtOnce] == coded[parts.Untrained] == 0
 
 
 def test_parts_are_jobs(tmp_path):
@@ -407,15 +407,15 @@ def test_parts_are_jobs(tmp_path):
     assert (plan.jobs[0].preset, isinstance(plan.jobs[0], parts.Changed)) == ("", True)
     records = []
     for job in plan.jobs[1:]:
-        job.setting.distances, job.setting.errors = Ball(), lambda field: {}
-        assert job.known(tmp_path, None) is None
+        job.context.distances, job.context.errors = Ball(), lambda field: {}
+        assert job.cached_record(tmp_path, None) is None
         records.append(job.run(tmp_path, False))
         assert 0.9 * 24576 < records[-1]["bytes"] <= 24576
-        field = job.field
-        assert job.known(tmp_path, records[-1]) == records[-1] and job.field is not field
-        assert (job.field.nbytes, job.field.slope) == (field.nbytes, field.slope)
+        field = job.model
+        assert job.cached_record(tmp_path, records[-1]) == records[-1] and job.model is not field
+        assert (job.model.nbytes, job.model.slope) == (field.nbytes, field.slope)
     assert [r["details"]["steps"] for r in records] == [10, 0]
-    assert not np.array_equal(*(job.field.state["numbers"] for job in plan.jobs[1:]))
+    assert not np.array_equal(*(job.model.state["numbers"] for job in plan.jobs[1:]))
 
 
 def test_errors_of_an_earlier_run(folder):
@@ -425,12 +425,12 @@ def test_errors_of_an_earlier_run(folder):
     request = plans.Request((24576, 32768), tuple(LEFT_OUT))
     mesh, models = load_mesh(folder / "dent.ply"), folder / "out" / "tradeoff_sdf_models"
     plan = plans.plan(mesh, str(folder / "dent.ply"), request)
-    assert [job.known(models, None) for job in plan.jobs] == [None] * 4
+    assert [job.cached_record(models, None) for job in plan.jobs] == [None] * 4
     before = {job.name: {"name": job.name} for job in plan.jobs}
     plan = plans.plan(mesh, str(folder / "dent.ply"), request, before)
-    assert [job.known(models, None) for job in plan.jobs] == list(before.values())
-    assert [job.known(None, None) for job in plan.jobs] == [None, None, *list(before.values())[2:]]
-    assert plan.jobs[0].known(models, {"own": 1}) == {"own": 1}
+    assert [job.cached_record(models, None) for job in plan.jobs] == list(before.values())
+    assert [job.cached_record(None, None) for job in plan.jobs] == [None, None, *list(before.values())[2:]]
+    assert plan.jobs[0].cached_record(models, {"own": 1}) == {"own": 1}
 
 
 def result_of(**errors):

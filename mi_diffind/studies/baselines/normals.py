@@ -34,8 +34,8 @@ from ...tasks.disney.decoder import Decoder, ggx_coefficients
 from ...tasks.disney.effects import Effects
 from ...tasks.disney.model import ALPHA_MIN, PARAMETERS, Material, sanitize
 from ...tasks.disney.training import Shaded, shade, uniform_hemisphere
-from ...tasks.shading.evaluation import Reader, reader
-from ...tasks.shading.material import DEFAULTS, Surface, frame, maps_of, shaded, shadowing, surface_of
+from ...tasks.shading.evaluation import ShadedReader, reader
+from ...tasks.shading.material import DEFAULTS, SurfaceParameters, frame, maps_of, shaded, shadowing, surface_of
 from ...tasks.shading.reference import reference
 
 #: The least third component that a normal's slope is made of: a slope of 10.
@@ -105,7 +105,7 @@ class Moments:
 
 def unit_normals(source: Source) -> np.ndarray | None:
     """The source's normals, ``(height, width, 3)``, each of length 1; ``None`` without a normal map."""
-    m = next((m for m in source.maps if m.kind == "normal"), None)
+    m = next((m for m in source.maps if m.role == "normal"), None)
     if m is None:
         return None
     normal = (m.values if m.values.min() < 0 else 2 * m.values - 1).astype(np.float64)
@@ -121,7 +121,7 @@ def slopes(normals: np.ndarray) -> np.ndarray:
 
 def roughness(source: Source) -> np.ndarray:
     """The source's roughness, ``(height, width, 1)``."""
-    m = next((m for m in source.maps if m.kind == "roughness"), None)
+    m = next((m for m in source.maps if m.role == "roughness"), None)
     if m is None:
         return np.full((source.height, source.width, 1), DEFAULTS["roughness"])
     return m.values.astype(np.float64)
@@ -175,7 +175,7 @@ def means(base: np.ndarray) -> list[np.ndarray]:
 # -- classical --------------------------------------------------------------------------------------------------------
 
 
-def filtered(pyramid: Pyramid, effects: Effects) -> Reader:
+def filtered(pyramid: Pyramid, effects: Effects) -> ShadedReader:
     """Filtered parameters."""
     return reader(pyramid, effects)
 
@@ -192,7 +192,7 @@ def toksvig_alpha2(alpha2, length):
     return 2 / (scaled + 2)
 
 
-def toksvig(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> Reader:
+def toksvig(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> ShadedReader:
     """
     Roughness from the length of the mean normal (:func:`toksvig_alpha2`), which is read unnormalised. ``smooth``: the
     mean is over what is :func:`interpolated` between texels, as the truth has it.
@@ -222,7 +222,7 @@ def _moments(function: Callable, source: Source, pyramid: Pyramid, smooth: bool)
     return Moments(means(base), pyramid.types, pyramid.border)
 
 
-def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> Reader:
+def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> ShadedReader:
     """
     An anisotropic lobe around the normal of the mean slope. The covariance of slopes is that in the surface's tangent
     plane; about a tilted normal n slopes are, to first order, n_z times what the tangents of its frame see of them. To
@@ -280,7 +280,7 @@ def specular(material: Material, albedo, ax, ay, wi, wo, effects: Effects):
     return type(wi)(decoder.value(c, replace(effects, sheen=False), ("specular",), p, wi, wo))
 
 
-def _parameters(surface: Surface, Float) -> tuple:
+def _parameters(surface: SurfaceParameters, Float) -> tuple:
     given = {"roughness": surface.roughness, "metallic": surface.metallic}
     material = Material(**{name: Float(given.get(name, DEFAULTS[name])) for name in PARAMETERS})
     return sanitize(material), dr.maximum(surface.albedo, 0)
@@ -298,7 +298,7 @@ def _in_frame(axes, wi, wo, value: Callable):
 # -- roughness that was fitted ----------------------------------------------------------------------------------------
 
 
-def roughness_reader(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray]) -> Reader:
+def roughness_reader(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray]) -> ShadedReader:
     """Filtered parameters, but for roughness, of which all levels are given, ``(height, width)`` each."""
     moments = Moments([level[..., None] for level in levels], pyramid.types, pyramid.border)
 
@@ -309,7 +309,7 @@ def roughness_reader(pyramid: Pyramid, effects: Effects, levels: Sequence[np.nda
     return read
 
 
-def baked(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray] | None = None) -> Reader:
+def baked(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray] | None = None) -> ShadedReader:
     """Filtered parameters with roughness as :func:`bake` has it, made now unless its ``levels`` are given."""
     return roughness_reader(pyramid, effects, bake(pyramid, effects) if levels is None else levels)
 
@@ -446,7 +446,7 @@ def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
 # -- the kernel -------------------------------------------------------------------------------------------------------
 
 
-def biased(read: Reader, biases: Sequence[float]) -> Reader:
+def biased(read: ShadedReader, biases: Sequence[float]) -> ShadedReader:
     """
     What ``read`` shows of another level of detail: ``biases`` (:func:`choose_biases`), one for each whole level, are
     added, and interpolated between them.
@@ -463,7 +463,7 @@ def biased(read: Reader, biases: Sequence[float]) -> Reader:
     return at
 
 
-def choose_biases(read: Reader, pyramid: Pyramid, effects: Effects, places: int = PLACES) -> list[float]:
+def choose_biases(read: ShadedReader, pyramid: Pyramid, effects: Effects, places: int = PLACES) -> list[float]:
     """
     Of each level, the one of :data:`BIASES` with which ``read`` errs least against the converged truth, at random
     ``places``, views and lights. Few of these see a highlight, so that the same ones are used for all levels.

@@ -28,7 +28,7 @@ from ...measure.bsdf import QUERIES, bsdf_queries, directions, noise_texture
 from ...measure.operations import FLOPS, Operations, count_query
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...measure.training import Training
+from ...measure.training import ConvergenceTraining
 from ...tasks.ggx import TASK
 from ...tasks.ggx.model import INPUTS, Encoding, LearnedGGX, ggx, indirection
 from ...tasks.ggx.training import GGXProblem, draw, measure
@@ -126,7 +126,7 @@ class _Made:
     def __init__(self, types, quick: bool):
         self.types, self.quick = types, quick
         self.candidates: list[Candidate] = []
-        self.trainings: list[Training] = []
+        self.trainings: list[ConvergenceTraining] = []
         self.ratios: list[tuple[str, str]] = []
         self.readers: dict[str, Callable[[], Callable]] = {}
         self.inputs: dict[str, str] = {}
@@ -135,7 +135,7 @@ class _Made:
     def name(label: str, inputs: str) -> str:
         return label if inputs == "plain" else f"{label}, log"
 
-    def train(self, label: str, net: Callable, how: str, encoding: Encoding) -> Training:
+    def train(self, label: str, net: Callable, how: str, encoding: Encoding) -> ConvergenceTraining:
         """Register a training; ``how`` is a key of :data:`SETTINGS`."""
         options = dict(SETTINGS[how])
         longest = options.pop("longest")
@@ -148,7 +148,7 @@ class _Made:
             return GGXProblem(net().alloc(self.types.TensorXf, 2, dr.rng(seed=1)), self.types, samples, encoding)
 
         name = self.name(label, encoding.inputs)
-        self.trainings.append(Training(name, problem, settings, longest, 4 if self.quick else 20))
+        self.trainings.append(ConvergenceTraining(name, problem, settings, longest, 4 if self.quick else 20))
         return self.trainings[-1]
 
     def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
@@ -241,7 +241,7 @@ def _add_networks(made: _Made, inputs: str) -> None:
             made.add(shown, representation, setting, size, training, form, encoding, operations)
 
 
-def _network_operations(made: _Made, training: Training, encoding: Encoding) -> Callable[[str], Operations]:
+def _network_operations(made: _Made, training: ConvergenceTraining, encoding: Encoding) -> Callable[[str], Operations]:
     """What a kernel of cooperative vectors shows, and the products by weights that it does not."""
 
     def counted(query: str) -> Operations:

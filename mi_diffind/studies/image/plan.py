@@ -33,7 +33,7 @@ from ...runtime import array_module
 from ...tables import save_table
 from ...tasks.image import search, training
 from ...tasks.image.compressed import CompressedImage
-from ...tasks.image.presets import IMPROVEMENTS, PRESETS, Recipe, replaced, without
+from ...tasks.image.presets import IMPROVEMENTS, PRESETS, ImageRecipe, replaced, without
 from ..baselines import codecs
 from .conclusions import conclusions, table
 
@@ -144,19 +144,19 @@ class _Made(Job):
 class _Training(_Made):
     """A training of so many seconds on all cores; its file stays in the folder of models."""
 
-    recipe: Recipe | None = None
+    recipe: ImageRecipe | None = None
     preset: str = ""
     seconds: float = 0.0
     file: str = ""
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         self.file = str(folder / f"{file_name(self.name)}.npz") if folder else ""
         return record if record and Path(self.file).is_file() else None
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
         source, own = self.source, replaced(self.recipe, deterministic=False)
         types = array_module(mi.variant())
-        asked = task.Request(self.preset, own.settings, types, seconds=self.seconds, progress=progress)
+        asked = task.FitRequest(self.preset, own.settings, types, seconds=self.seconds, progress=progress)
         size = search.default_size(source, source.nbytes / self.compression, own)
         table, result = training.fit_image(source, size, own, asked, title=self.name)
         if result.interrupted:
@@ -214,7 +214,7 @@ def _trainings(source: Source, request: Request) -> list[_Training]:
 def _codecs(source: Source, request: Request) -> list[_Codec]:
     """What of the codecs is installed; all maps together take at most the bytes that are asked for."""
     values = {m.name: _shown(m.values) for m in source.maps}
-    normals = [m.name for m in source.maps if m.kind == "normal"]
+    normals = [m.name for m in source.maps if m.role == "normal"]
     found, cache, jobs = codecs.available(), {}, []
     if any(v.shape[-1] > 4 for v in values.values()):
         return []
@@ -265,7 +265,7 @@ def errors_of(source: Source, maps: dict[str, np.ndarray]) -> dict:
         found[f"psnr_{m.name}_db"] = -10 * math.log10(max(errors[-1], 1e-12))
         found[f"flip_{m.name}"] = metrics.flip_shown(_picture(reference), _picture(image))
         found[f"ssim_{m.name}"] = metrics.ssim(reference, image)
-        if m.kind == "normal" and m.channels == 3:
+        if m.role == "normal" and m.channels == 3:
             found[f"angle_{m.name}_deg"] = metrics.angle(reference, image)
 
     def mean(measure: str) -> float | None:

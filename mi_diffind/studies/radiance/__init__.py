@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 
 from ...measure.study import Plan, Study
-from ..equal_memory import add_without, check_without
+from ..equal_memory import add_without_option, check_without
 
 #: What is asked for unless something else is: how many times smaller than a dense grid of float32. At the first one all
 #: kinds are made, and reads and renders are timed.
@@ -34,7 +34,7 @@ class FieldStudy(Study):
             help="how many times smaller than a dense grid of float32; may be repeated (default: "
             f"{', '.join(f'{r:g}' for r in RATIOS)}; --quick: 75); all kinds are made and timed at the first one",
         )  # fmt: skip
-        add_without(parser)
+        add_without_option(parser)
         parser.add_argument(
             "--resolution", type=int, default=0, metavar="N",
             help="nodes of the grid that all begin with, of a cube of the same volume (default: 128; --quick: 24)",

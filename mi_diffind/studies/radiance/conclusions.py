@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ...measure.benchmark import PASS
 from ...measure.formatting import duration, enumeration, grid
-from ..equal_memory import by_size, ours_of, times_that_of
+from ..equal_memory import candidates_by_budget, name_of_ours, ratio_phrases
 
 #: The two figures that are always given together.
 FOREGROUND, WHITE = "psnr_foreground_db", "psnr_white_db"
@@ -27,7 +27,7 @@ def references(result: dict) -> dict[str, dict]:
 def table(result: dict) -> list[str]:
     """All candidates: bytes in memory and on disk, seconds, steps and errors."""
     cells = [["", "MB in memory", "MB on disk", "times smaller", "nodes", "seconds", "steps", "white", "foreground"]]
-    made = [references(result), *by_size(result).values()]
+    made = [references(result), *candidates_by_budget(result).values()]
     for name, c in ((n, c) for found in made for n, c in found.items()):
         e, d = c["errors"], c["details"]
         cells.append([
@@ -49,7 +49,7 @@ def conclusions(result: dict) -> list[str]:
     """Ours against the grid, the sparse grid and the best of the others at each size; times against those."""
     lines = []
     longer = next((c["errors"] for name, c in references(result).items() if c["details"]["kind"] == "longer"), None)
-    for ratio, made in by_size(result).items():
+    for ratio, made in candidates_by_budget(result).items():
         kinds = {c["details"]["kind"]: (name, c) for name, c in made.items()}
         if "ours" not in kinds or len(kinds) < 2:
             continue
@@ -81,7 +81,7 @@ def _kind(name: str, ratio: float) -> str:
 def _times(result: dict) -> list[str]:
     """Sentences about reads and renders, of the first size."""
     lines, reads = [], result["cases"].get("reads", {})
-    ours = ours_of(result)
+    ours = name_of_ours(result)
     side = result["details"]["request"]["film"]
     timings = reads.get("queries", {}).get("both", {})
     if ours in timings:
@@ -91,7 +91,7 @@ def _times(result: dict) -> list[str]:
         lines.append(f"A sample of {ours}, density and colour, takes {timings[ours]['time']:.3g} ns{text}.")
     passes = reads.get("passes", {}).get(PASS, {})
     if ours in passes:
-        texts = times_that_of(reads["ratios"].get(PASS, {}), ours)
+        texts = ratio_phrases(reads["ratios"].get(PASS, {}), ours)
         text = f": {enumeration(texts)}" if texts else ""
         lines.append(f"A picture of {side}² with {ours} takes {duration(passes[ours]['time'] / 1e3)}{text}.")
     return lines

@@ -10,7 +10,7 @@ from ...measure import plot
 from ...measure.curves import against_time, curves, finish
 from ...measure.formatting import machine_line, state
 from ...tasks.radiance.training import rendered, shown
-from ..equal_memory import by_size
+from ..equal_memory import candidates_by_budget
 from .conclusions import FOREGROUND, WHITE, ratio_text, references
 
 #: The difference of sRGB values that is as dark as it gets.
@@ -35,7 +35,7 @@ def views(setting, result: dict):
     errors of all sizes against bytes, and of the first against the time of a picture.
     """
     first = result["details"]["first"]
-    shown_jobs = [job for job in setting.jobs.values() if job.size == first and job.kind in STYLES]
+    shown_jobs = [job for job in setting.jobs.values() if job.budget == first and job.method in STYLES]
     columns = max(4, len(shown_jobs) + 1)
     caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
     truth = setting.held.images[0]
@@ -44,7 +44,7 @@ def views(setting, result: dict):
     crop = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)) if len(rows) else (slice(None),) * 2
     wanted = shown(truth)
     tall = 1.6 * wanted[crop].shape[0] / wanted[crop].shape[1]
-    found = plot.sheet(f"{result['title']}, {ratio_text(first)} above", caption, 1.6 * columns, 2 * tall + 4.6)
+    found = plot.figure(f"{result['title']}, {ratio_text(first)} above", caption, 1.6 * columns, 2 * tall + 4.6)
     grid = found.add_gridspec(3, 2 * columns, height_ratios=[tall, tall, 3.8])
     for k, job in enumerate([None, *shown_jobs]):
         axes = found.add_subplot(grid[0, 2 * k : 2 * k + 2])
@@ -53,10 +53,10 @@ def views(setting, result: dict):
             axes.imshow(wanted[crop], interpolation="nearest")
             axes.set_title("test view", fontsize=8)
             continue
-        picture = shown(rendered(job.field, setting.tests, 0))
+        picture = shown(rendered(job.model, setting.tests, 0))
         axes.imshow(picture[crop], interpolation="nearest")
         c = result["candidates"][job.name]
-        bold = {"fontweight": "bold"} if job.kind == "ours" else {}
+        bold = {"fontweight": "bold"} if job.method == "ours" else {}
         axes.set_title(
             f"{c['label']}\n{c['errors'][WHITE]:.2f} / {c['errors'][FOREGROUND]:.2f} dB", fontsize=7.5, **bold
         )
@@ -73,14 +73,14 @@ def views(setting, result: dict):
     _curves(found.add_subplot(grid[2, :columns]), result)
     axes = found.add_subplot(grid[2, columns:])
     labels = _against_time(axes, result)
-    plot.fix(found)
-    plot.place(axes, labels, [label.at for label in labels])
+    plot.fix_layout(found)
+    plot.place_labels(axes, labels, [label.at for label in labels])
     return found
 
 
 def _curves(axes, result: dict) -> None:
     """PSNR of the foreground against bytes, a line for each kind; the grids as lines across."""
-    made = [c for found in by_size(result).values() for c in found.values()]
+    made = [c for found in candidates_by_budget(result).values() for c in found.values()]
     curves(axes, made, STYLES, lambda c: (c["bytes"] / 1e6, c["errors"][FOREGROUND]), 5)
     for name, c in references(result).items():
         axes.axhline(c["errors"][FOREGROUND], color="0.55", linestyle=(0, (1, 1.5)))

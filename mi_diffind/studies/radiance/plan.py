@@ -132,7 +132,7 @@ class Setting:
     source: str
     request: Request
     types: object
-    jobs: dict[str, Made] = field(default_factory=dict)
+    jobs: dict[str, RadianceContender] = field(default_factory=dict)
 
     @functools.cached_property
     def images(self) -> Images:
@@ -195,12 +195,12 @@ def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
     jobs = setting.jobs
     jobs[GRID] = Gridded("grid", 1.0, setting, GRID)
     jobs[LONGER] = Longer("longer", 1.0, setting, LONGER)
-    for kind, ratio in equal_memory.chosen(KINDS, request.ratios, ONCE, request.without):
-        made = Made.of(kind, ratio, setting)
+    for kind, ratio in equal_memory.combinations(KINDS, request.ratios, ONCE, request.without):
+        made = RadianceContender.of(kind, ratio, setting)
         jobs[made.name] = made
     candidates = [job.candidate() for job in jobs.values()]
-    shown = [name for name, job in jobs.items() if job.size == first and job.kind in KINDS]
-    ours = next((n for n in shown if jobs[n].kind == "ours"), "")
+    shown = [name for name, job in jobs.items() if job.budget == first and job.method in KINDS]
+    ours = next((n for n in shown if jobs[n].method == "ours"), "")
     timed = tuple([GRID, *shown])
     cases = [
         Case("reads", lambda lanes: _reads(setting, timed, lanes), lambda: _renders(setting, timed), candidates=timed,
@@ -219,7 +219,7 @@ def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
         queries=("density",),
         accuracy="psnr_foreground_db",
         accuracy_label="PSNR of the foreground in test views, dB",
-        ratios=[(ours, n) for n in shown if jobs[n].kind in AGAINST] if ours else [],
+        ratios=[(ours, n) for n in shown if jobs[n].method in AGAINST] if ours else [],
         details={
             "source": source, "source_digest": views.digest + held.digest, "views": [len(views), len(held)],
             "pixels": [views.width, views.height], "request": asdict(request), "first": first,
@@ -240,45 +240,45 @@ def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
 # -- jobs -------------------------------------------------------------------------------------------------------------
 
 
-class Made(equal_memory.Contender):
+class RadianceContender(equal_memory.Contender):
     """A field of a kind, so many times smaller than a dense grid."""
 
-    labels, families, text = KINDS, FAMILIES, staticmethod(ratio_text)
+    labels, families, budget_text = KINDS, FAMILIES, staticmethod(ratio_text)
 
     @staticmethod
-    def of(kind: str, ratio: float, setting: Setting) -> Made:
+    def of(kind: str, ratio: float, setting: Setting) -> RadianceContender:
         own = {"planes": Planes, "hash": Hashed}.get(kind, Preset if kind in PRESETS else OnNodes)
         return own(kind, ratio, setting)
 
     def record(self, nbytes: int, file_bytes: int, seconds: float, **details) -> dict:
-        details |= {"memory_bytes": nbytes, "file_bytes": file_bytes, "dense_bytes": self.setting.dense_bytes}
-        counted = nbytes if self.kind in IN_MEMORY else file_bytes
-        return {"bytes": counted, "seconds": seconds, "errors": self.setting.errors(self.field), "details": details}
+        details |= {"memory_bytes": nbytes, "file_bytes": file_bytes, "dense_bytes": self.context.dense_bytes}
+        counted = nbytes if self.method in IN_MEMORY else file_bytes
+        return {"bytes": counted, "seconds": seconds, "errors": self.context.errors(self.model), "details": details}
 
     @property
     def asked(self) -> int:
-        return self.setting.asked(self.size)
+        return self.context.asked(self.budget)
 
 
-class Preset(equal_memory.PresetContender, Made):
+class Preset(equal_memory.PresetContender, RadianceContender):
     """By a preset of ``fit field``, from the grid."""
 
     task_name = "field"
 
     @property
     def preset(self) -> str:
-        return PRESETS[self.kind]
+        return PRESETS[self.method]
 
     def arguments(self) -> dict:
-        setting = self.setting
+        setting = self.context
         return {
             "source": setting.source, "grid": str(setting.jobs[GRID].file), "bytes": str(self.asked),
             "steps": setting.request.steps,
         }  # fmt: skip
 
-    def fitted(self, model, fitted, seconds: float) -> dict:
-        details = {"steps": fitted.result.steps, "nodes": model.field.nodes.count}
-        return self.record(model.memory_nbytes, self.file.stat().st_size, seconds, **details)
+    def fit_record(self, task_model, fitted, seconds: float) -> dict:
+        details = {"steps": fitted.result.steps, "nodes": task_model.field.nodes.count}
+        return self.record(task_model.memory_nbytes, self.file.stat().st_size, seconds, **details)
 
 
 class Gridded(Preset):
@@ -287,19 +287,19 @@ class Gridded(Preset):
     preset = "grid"
 
     def candidate(self) -> Candidate:
-        return Candidate(self.name, "reference", job=self.name, is_reference=True, details={"kind": self.kind})
+        return Candidate(self.name, "reference", job=self.name, is_reference=True, details={"kind": self.method})
 
     def arguments(self) -> dict:
-        request = self.setting.request
+        request = self.context.request
         steps = {"steps": request.grid_steps} if request.grid_steps else {}
-        return {"source": self.setting.source, "resolution": request.resolution, **steps}
+        return {"source": self.context.source, "resolution": request.resolution, **steps}
 
 
 class Longer(Gridded):
     """The grid after as many more steps as the others have."""
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        setting = self.setting
+        setting = self.context
         start = time.perf_counter()
         problem = grids.GridProblem(setting.target, setting.views)
         problem.measure = lambda net: {"step": 0.0}
@@ -311,16 +311,16 @@ class Longer(Gridded):
         if self.file:
             with replacing(self.file) as temporary, open(temporary, "wb") as stream:
                 np.savez(stream, density=found.density, colour=found.colour)
-        self.field = found.field()
+        self.model = found.field()
         nbytes = 52 * found.nodes.count
         return self.record(nbytes, nbytes, time.perf_counter() - start, steps=steps)
 
     def load(self, path: Path) -> VolumeField:
         with np.load(path) as data:
-            return grids.Grid(self.setting.target.nodes, data["density"], data["colour"]).field()
+            return grids.Grid(self.context.target.nodes, data["density"], data["colour"]).field()
 
 
-class Fitted(Made):
+class Fitted(RadianceContender):
     """What :mod:`..baselines` make; ``CLASS`` is that of the fits."""
 
     CLASS: type
@@ -330,13 +330,13 @@ class Fitted(Made):
         if self.file:
             with replacing(self.file) as temporary, open(temporary, "wb") as stream:
                 np.savez_compressed(stream, **state)
-        self.field = self.CLASS.field(self.setting.types, state)
+        self.model = self.CLASS.field(self.context.types, state)
         details["deflated_bytes"] = self.CLASS.file_bytes(state, False)
-        return self.record(self.field.nbytes, self.CLASS.file_bytes(state), seconds, **details)
+        return self.record(self.model.nbytes, self.CLASS.file_bytes(state), seconds, **details)
 
     def load(self, path: Path) -> VolumeField:
         with np.load(path) as data:
-            return self.CLASS.field(self.setting.types, {name: data[name] for name in data})
+            return self.CLASS.field(self.context.types, {name: data[name] for name in data})
 
 
 class OnNodes(Fitted):
@@ -346,24 +346,24 @@ class OnNodes(Fitted):
 
     def makers(self) -> list[Callable[[fits.Grid], fits.NodesFit]]:
         """What can be made of a grid, the best first."""
-        if self.kind == "codebook":
+        if self.method == "codebook":
             return [functools.partial(fits.codebook, count=n) for n in COUNTS]
-        if self.kind == "components":
+        if self.method == "components":
             return [functools.partial(fits.components, width=w) for w in WIDTHS]
-        return [functools.partial(fits.plain, levels=64 if self.kind == "sparse6" else 256)]
+        return [functools.partial(fits.plain, levels=64 if self.method == "sparse6" else 256)]
 
     def bytes_of(self, made: fits.NodesFit) -> int:
         # What is everywhere has no need to be predicted, and no place for it
-        return made.file_bytes(made.state()) if self.kind != "dense" else 13 * made.nodes.count
+        return made.file_bytes(made.state()) if self.method != "dense" else 13 * made.nodes.count
 
     @property
     def room(self) -> float:
-        return self.asked * {"dense": 1.0, "components": ROOM_COMPONENTS}.get(self.kind, ROOM)
+        return self.asked * {"dense": 1.0, "components": ROOM_COMPONENTS}.get(self.method, ROOM)
 
     def beginning(self) -> tuple[fits.Grid, Callable, float]:
         """The grid to begin with, what is made of it in the end, and how much coarser it is."""
-        whole, asked, makers = self.setting.grid, self.room, self.makers()
-        if self.kind == "dense":
+        whole, asked, makers = self.context.grid, self.room, self.makers()
+        if self.method == "dense":
             shape = np.array(whole.nodes.shape)
             scale = (13 * shape.prod() / asked) ** (1 / 3)
             while 13 * np.prod(np.ceil((shape - 1) / scale - 1e-6) + 1) > asked:
@@ -383,7 +383,7 @@ class OnNodes(Fitted):
         return whole.resampled(high), make, high
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        start, setting = time.perf_counter(), self.setting
+        start, setting = time.perf_counter(), self.context
         grid, make, scale = self.beginning()
         steps = rest = setting.request.steps
         if scale > 1:
@@ -391,7 +391,7 @@ class OnNodes(Fitted):
             if setting.train(first, "coarser", steps - rest, progress, f"{self.name}, at first").interrupted:
                 return None
             made = make(first.grid(grid.seen))
-            for least in LADDER if self.kind != "dense" else ():
+            for least in LADDER if self.method != "dense" else ():
                 made = make(setting.seen(first.field_of(first.net), least))
                 if self.bytes_of(made) <= self.room:
                     break
@@ -399,7 +399,7 @@ class OnNodes(Fitted):
             made = make(grid)
         if setting.train(made, "coarser, stored" if scale > 1 else "", rest, progress, self.name).interrupted:
             return None
-        colours = len(made.state()["colour"]) if self.kind == "codebook" else 0
+        colours = len(made.state()["colour"]) if self.method == "codebook" else 0
         return self.finish(
             made, time.perf_counter() - start, steps=steps, coarser=scale, nodes=made.nodes.count, entries=colours
         )
@@ -411,7 +411,7 @@ class Planes(Fitted):
     CLASS = factors.PlanesFit
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        start, setting = time.perf_counter(), self.setting
+        start, setting = time.perf_counter(), self.context
         grid = setting.grid
         longest = max(b - a for a, b in zip(grid.nodes.lower, grid.nodes.upper, strict=True))
         low, high = longest / 2000, longest / 4
@@ -423,7 +423,7 @@ class Planes(Fitted):
         steps = 0
         for share, title in ((0.7, f"{self.name}, at first"), (0.3, self.name)):
             seconds = share * setting.request.seconds
-            result = setting.train(made, self.kind, 10**6, progress, title, seconds)
+            result = setting.train(made, self.method, 10**6, progress, title, seconds)
             if result.interrupted:
                 return None
             steps += result.steps
@@ -438,12 +438,12 @@ class Hashed(Fitted):
     CLASS = factors.HashFit
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        start, setting = time.perf_counter(), self.setting
+        start, setting = time.perf_counter(), self.context
         finest = float(max(setting.grid.nodes.shape))
         powers = np.arange(8, 24, 0.1)
         fitting = [2**p for p in powers if 2 * factors.parameters(int(2**p) // 16 * 16, finest) <= 0.97 * self.asked]
         made = factors.HashFit(setting.grid, int(max(fitting, default=256)) // 16 * 16, finest)
-        result = setting.train(made, self.kind, 10**6, progress, self.name, setting.request.seconds)
+        result = setting.train(made, self.method, 10**6, progress, self.name, setting.request.seconds)
         if result.interrupted:
             return None
         return self.finish(made, time.perf_counter() - start, steps=result.steps)
@@ -467,7 +467,7 @@ def _reads(setting: Setting, names, lanes: int) -> dict:
     density = {FLOOR: lambda: [*p, *d]}
     both = {FLOOR: lambda: [*p, *d]}
     for name in names:
-        own = setting.jobs[name].field
+        own = setting.jobs[name].model
         density[name] = lambda f=own: [f.look(p)[0]]
         both[name] = lambda f=own: _both(f, p, d)
     return {"density": density, "both": both}
@@ -496,4 +496,4 @@ def _renders(setting: Setting, names) -> dict:
         seen = march(own, o, d, 0, dr.inf)
         return [*seen.colour, seen.transmittance]
 
-    return {name: lambda k, f=setting.jobs[name].field: render(f) for name in names}
+    return {name: lambda k, f=setting.jobs[name].model: render(f) for name in names}

@@ -28,7 +28,7 @@ def draw(result: dict, caption: str):
     line that it is below; the crossover as a vertical line, if it is not too far away.
     """
     title = f"{Path(result['scene']).stem}: noise and bias at a given render time"
-    sheet = plot.sheet(title, caption, 7.6, 4.9)
+    sheet = plot.figure(title, caption, 7.6, 4.9)
     axes = sheet.add_subplot()
     axes.set_xlabel("seconds of a render (kernels)", fontsize=9)
     axes.set_ylabel("relative RMS error", fontsize=9)
@@ -36,8 +36,8 @@ def draw(result: dict, caption: str):
     _limits(axes, result, curves)
     labels = _draw(axes, result, curves)
     _legend(axes, curves)
-    plot.fix(sheet)
-    plot.place(axes, labels, [(p["seconds"], p["rmse"]) for curve in curves.values() for p in curve])
+    plot.fix_layout(sheet)
+    plot.place_labels(axes, labels, [(p["seconds"], p["rmse"]) for curve in curves.values() for p in curve])
     return sheet
 
 

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 
 from ...measure.study import Plan, Study
-from ..equal_memory import add_without, check_without
+from ..equal_memory import add_without_option, check_without
 
 #: Sizes unless asked otherwise, and the one at which everything is made and timed, if it is among them.
 SIZES, FIRST = ("256k", "512k", "1M", "2M", "4M"), "1M"
@@ -33,7 +33,7 @@ class SdfStudy(Study):
             help=f"in memory; may be repeated (default: {', '.join(SIZES)}; --quick: 64k); of the first that is named "
             "(default: 1M) all kinds are made, and reads, rays and renders are timed",
         )  # fmt: skip
-        add_without(parser)
+        add_without_option(parser)
         parser.add_argument(
             "--ablation", action="store_true",
             help=f"in place of other kinds, what the parts of ours are worth (default: of {FIRST} alone)",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ...measure.benchmark import PASS
 from ...measure.formatting import enumeration, grid
-from ..equal_memory import by_size, ours_of, times_that_of
+from ..equal_memory import candidates_by_budget, name_of_ours, ratio_phrases
 
 #: What verdicts are about: its name, the error, how it is written, whether more is better.
 MEASURES = (
@@ -28,7 +28,7 @@ def size_text(nbytes: int) -> str:
 def table(result: dict) -> list[str]:
     """All candidates: bytes, seconds and errors."""
     cells = [["", "bytes", "file", "seconds", *(label for label, *_ in MEASURES), "smooth", "pieces"]]
-    for made in by_size(result).values():
+    for made in candidates_by_budget(result).values():
         for name, c in made.items():
             e, d = c["errors"], c["details"]
             pieces = f"{e['components']} of {e['components_mesh']}" if "components" in e else "-"
@@ -48,7 +48,7 @@ def _written(errors: dict, key: str, form: str) -> str:
 def conclusions(result: dict) -> list[str]:
     """Ours against the best of the others at each size; times against the mesh's and the best of the others."""
     lines = []
-    for size, made in by_size(result).items():
+    for size, made in candidates_by_budget(result).items():
         kinds = {c["details"]["kind"]: (name, c["errors"]) for name, c in made.items()}
         if "ours" not in kinds or len(kinds) < 2:
             continue
@@ -76,11 +76,11 @@ def _kind(name: str, size: int) -> str:
 def _times(result: dict) -> list[str]:
     """Sentences about rays, reads and renders."""
     lines = []
-    ours = ours_of(result)
+    ours = name_of_ours(result)
     rays = result["cases"].get("rays", {})
     for query, what in (("ray", "A primary ray"), (PASS, "A render")):
         pairs = rays.get("ratios", {}).get(query, {})
-        texts = times_that_of(pairs, ours)
+        texts = ratio_phrases(pairs, ours)
         if ours and texts:
             timings = rays["queries"][query] if query in rays["queries"] else rays["passes"][query]
             unit = "ns" if query == "ray" else "ms"

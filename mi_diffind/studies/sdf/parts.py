@@ -18,7 +18,7 @@ from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.nodes import SparseNodes
 from ..baselines import volumes
 from ..baselines.direct_nodes import DirectCoding, DirectNodes
-from .plan import Fitted, Made
+from .plan import DistanceContender, Fitted
 
 #: Our preset.
 SPARSE = "sparse"
@@ -36,7 +36,7 @@ def settings_of(setting) -> FitSettings:
 # -- ours, trained in other ways --------------------------------------------------------------------------------------
 
 
-class AtOnce(task.Request):
+class AtOnce(task.FitRequest):
     """No node has a code until the end of the training."""
 
     def train(self, problem, title: str | None = None) -> FitResult:
@@ -44,7 +44,7 @@ class AtOnce(task.Request):
         return super().train(problem, title)
 
 
-class Untrained(task.Request):
+class Untrained(task.FitRequest):
     """The nodes stay what they begin with."""
 
     def train(self, problem, title: str | None = None) -> FitResult:
@@ -57,8 +57,8 @@ class Changed(Fitted):
     def fit(self, progress: bool) -> task.Fitted:
         own, given = task.tasks()["sdf"], self.arguments()
         options = {a.name: given.get(a.name, a.default) for a in own.arguments}
-        request = REQUESTS[self.kind](
-            SPARSE, settings_of(self.setting), self.setting.types, options=options, progress=progress, output=self.file
+        request = REQUESTS[self.method](
+            SPARSE, settings_of(self.context), self.context.types, options=options, progress=progress, output=self.file
         )
         return own.fit(request)
 
@@ -68,19 +68,19 @@ REQUESTS = {"at-once": AtOnce, "untrained": Untrained}
 # -- nodes that hold it all -------------------------------------------------------------------------------------------
 
 
-class Direct(Made):
+class Direct(DistanceContender):
     """A distance and a normal a node."""
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        setting = self.setting
+        setting = self.context
         types, distances = setting.types, setting.distances
         start = time.perf_counter()
-        coding = volumes.fitted(lambda h: DirectCoding(sample(distances, h)), self.size)
+        coding = volumes.fitted(lambda h: DirectCoding(sample(distances, h)), self.budget)
         structure = coding.sampled.structure
         held_out = training.HeldOut(distances, types, structure.spacing)
         problem = training.NodeProblem(SparseNodes(types, structure, 1.0), distances.surface, coding, held_out)
         result = NOTHING
-        if self.kind == "direct":
+        if self.method == "direct":
             result = fit(problem, settings_of(setting), progress=progress, title=self.name)
             if result.interrupted:
                 return None
@@ -92,7 +92,7 @@ class Direct(Made):
         return self.record(found, found.nbytes, seconds, volumes.file_bytes(found), steps=result.steps)
 
     def load(self, path: Path) -> DirectNodes:
-        return volumes.load(path, self.setting.types, DirectNodes)
+        return volumes.load(path, self.context.types, DirectNodes)
 
 
 #: Kind → what makes it.

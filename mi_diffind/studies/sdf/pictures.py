@@ -10,7 +10,7 @@ import numpy as np
 from ...measure import plot
 from ...measure.curves import against_time, curves, finish
 from ...measure.formatting import machine_line, state
-from ..equal_memory import by_size
+from ..equal_memory import candidates_by_budget
 from . import view as views
 from .conclusions import size_text
 
@@ -46,11 +46,11 @@ def shapes(setting, view: views.Stage, result: dict):
     errors of all sizes against bytes, and of the first against the time of a ray.
     """
     first = result["details"]["first"]
-    kinds = {job.kind: job for job in setting.jobs.values() if job.size == first}
+    kinds = {job.method: job for job in setting.jobs.values() if job.budget == first}
     shown = [kinds[k] for k in SHOWN if k in kinds]
     columns = max(3, len(shown) + 1)
     caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
-    found = plot.sheet(f"{result['title']}, {size_text(first)} above", caption, 2.6 * columns, 6.4)
+    found = plot.figure(f"{result['title']}, {size_text(first)} above", caption, 2.6 * columns, 6.4)
     grid = found.add_gridspec(2, 6 * columns, height_ratios=[1, 1.25])
     truth, hit = _mesh_normals(view)
     rows, cols = np.flatnonzero(hit.any(axis=1)), np.flatnonzero(hit.any(axis=0))
@@ -61,7 +61,7 @@ def shapes(setting, view: views.Stage, result: dict):
             axes.imshow(_shaded(truth, hit)[crop])
             axes.set_title("mesh", fontsize=9)
         else:
-            angles = _angles(setting.types, view, job.field, truth, hit)
+            angles = _angles(setting.types, view, job.model, truth, hit)
             drawn = axes.imshow(angles[crop], vmin=0, vmax=WORST, cmap="inferno_r")
             error = result["candidates"][job.name]["errors"]["normal_deg"]
             axes.set_title(f"{job.name.removesuffix(' ' + size_text(first))}\n{error:.2f}°", fontsize=8)
@@ -76,9 +76,9 @@ def shapes(setting, view: views.Stage, result: dict):
     axes = found.add_subplot(grid[1, 2 * third :])
     labels = _against_time(axes, result)
     found.get_layout_engine().set(hspace=0.16)
-    plot.fix(found)
+    plot.fix_layout(found)
     _legend(found, axes.get_position().y1)
-    plot.place(axes, labels, [label.at for label in labels])
+    plot.place_labels(axes, labels, [label.at for label in labels])
     return found
 
 
@@ -97,7 +97,7 @@ def _angles(types, view: views.Stage, field, truth: np.ndarray, hit: np.ndarray)
     """Angles in degrees between normals; NaN where neither is met, 90 where one of the two is."""
     o, d = view.rays(types)
     with dr.suspend_grad():
-        t = view.traced(field, o, d)
+        t = views.traced(field, o, d)
         found = dr.isfinite(t)
         g = np.array(field.gradient(types.Array3f(dr.fma(d, dr.select(found, t, 0), o)))[1]).T.astype(np.float64)
     found = found.numpy()
@@ -117,7 +117,7 @@ def _shaded(normals: np.ndarray, hit: np.ndarray) -> np.ndarray:
 
 def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
     """An error against bytes, a line for each kind."""
-    made = [c for found in by_size(result).values() for c in found.values()]
+    made = [c for found in candidates_by_budget(result).values() for c in found.values()]
     curves(axes, made, STYLES, lambda c: (c["bytes"], 1 - c["errors"][key] if missing else c["errors"][key]))
     sizes = sorted({c["details"]["asked"] for c in made})
     axes.set_xscale("log", base=2)

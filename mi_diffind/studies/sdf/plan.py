@@ -33,7 +33,7 @@ import numpy as np
 from ...fitting import FitSettings
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...measure.training import Training
+from ...measure.training import ConvergenceTraining
 from ...runtime import array_module
 from ...tasks.sdf import decode
 from ...tasks.sdf.distances import Distances
@@ -150,7 +150,7 @@ class Setting:
     request: Request
     types: object
     before: dict[str, dict] = field(default_factory=dict)
-    jobs: dict[str, Made] = field(default_factory=dict)
+    jobs: dict[str, DistanceContender] = field(default_factory=dict)
     _sparse: dict[int, tuple[volumes.DistanceNodes, float]] = field(default_factory=dict)
 
     @functools.cached_property
@@ -198,23 +198,25 @@ def plan(mesh: Mesh, name: str, request: Request, before: dict[str, dict] | None
     """
     setting = Setting(mesh, name, request, array_module(mi.variant()), before or {})
     first, jobs = request.sizes[0], setting.jobs
-    for kind, size in equal_memory.chosen(PARTS if request.ablation else KINDS, request.sizes, ONCE, request.without):
-        made = Made.of(kind, size, setting)
+    for kind, size in equal_memory.combinations(
+        PARTS if request.ablation else KINDS, request.sizes, ONCE, request.without
+    ):
+        made = DistanceContender.of(kind, size, setting)
         jobs[made.name] = made
-    shown = [name for name, job in jobs.items() if job.size == first]
-    ours = next((n for n in shown if jobs[n].kind == "ours"), "")
+    shown = [name for name, job in jobs.items() if job.budget == first]
+    ours = next((n for n in shown if jobs[n].method == "ours"), "")
     candidates = [job.candidate() for job in jobs.values()]
     cases = [
         Case("reads", lambda lanes: _reads(setting, shown, lanes), candidates=tuple(shown),
              query_names=("value", "normal")),
     ]  # fmt: skip
-    compared, drawn = [n for n in shown if jobs[n].kind in AGAINST], {}
+    compared, drawn = [n for n in shown if jobs[n].method in AGAINST], {}
     if not request.ablation:
         grid = f"{GRID} {request.grid}³"
         reference = {"is_reference": True, "in_passes": True}
         candidates.append(Candidate(MESH, "mesh", bytes=12 * (len(mesh.vertices) + len(mesh.faces)), **reference))
         candidates.append(Candidate(grid, "sdfgrid", bytes=4 * request.grid**3, **reference))
-        traced = [name for name in shown if jobs[name].kind != "hash"]
+        traced = [name for name in shown if jobs[name].method != "hash"]
         stage_of = functools.cache(lambda: views.Stage(mesh, request.film))
         cases.append(
             Case("rays", lambda lanes: _rays(setting, stage_of(), traced, grid, lanes),
@@ -264,44 +266,44 @@ def _sentence(said: str, mesh: Mesh) -> str:
 # -- jobs -------------------------------------------------------------------------------------------------------------
 
 
-class Made(equal_memory.Contender):
+class DistanceContender(equal_memory.Contender):
     """A field of a kind in at most so many bytes."""
 
-    labels, families, text = LABELS, FAMILIES, staticmethod(size_text)
+    labels, families, budget_text = LABELS, FAMILIES, staticmethod(size_text)
 
     @staticmethod
-    def of(kind: str, nbytes: int, setting: Setting) -> Made:
+    def of(kind: str, nbytes: int, setting: Setting) -> DistanceContender:
         from . import parts
 
         own = Fitted if kind in PRESETS else Hashed if kind == "hash" else Sampled
         return parts.MADE.get(kind, own)(kind, nbytes, setting)
 
     def candidate(self) -> Candidate:
-        return super().candidate(in_passes=self.kind in RENDERED)
+        return super().candidate(in_passes=self.method in RENDERED)
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
-        before = self.setting.before.get(self.name)
-        found = super().known(folder, record or before)
-        return found if self.size == self.setting.request.sizes[0] else found or before
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
+        before = self.context.before.get(self.name)
+        found = super().cached_record(folder, record or before)
+        return found if self.budget == self.context.request.sizes[0] else found or before
 
     def record(self, found: DistanceField, nbytes: int, seconds: float, file_bytes: int, **details) -> dict:
-        self.field = found
-        if nbytes > self.size:
+        self.model = found
+        if nbytes > self.budget:
             raise AssertionError(f"{self.name}: takes {nbytes:,} bytes")
         details |= {"file_bytes": file_bytes, "spacing": found.spacing, "slope": found.slope}
         details |= {"bits": found.bits} if isinstance(found, volumes.DistanceNodes) else {}
-        return {"bytes": nbytes, "seconds": seconds, "errors": self.setting.errors(found), "details": details}
+        return {"bytes": nbytes, "seconds": seconds, "errors": self.context.errors(found), "details": details}
 
 
-class Sampled(Made):
+class Sampled(DistanceContender):
     """A grid, bricks or sparse distances."""
 
     def make(self) -> tuple[DistanceField, float]:
         """The field, and how many seconds it took."""
         start, before = time.perf_counter(), 0.0
-        setting, train = self.setting, volumes.Training() if self.kind.endswith("-trained") else None
-        types, distances, mesh, nbytes = setting.types, setting.distances, setting.mesh, self.size
-        name = self.kind.removesuffix("-trained")
+        setting, train = self.context, volumes.Training() if self.method.endswith("-trained") else None
+        types, distances, mesh, nbytes = setting.types, setting.distances, setting.mesh, self.budget
+        name = self.method.removesuffix("-trained")
         if name == "dense":
             found = volumes.dense(types, distances, volumes.dense_size(mesh, nbytes), train)
         elif name == "distances":
@@ -321,53 +323,53 @@ class Sampled(Made):
         return self.record(found, found.nbytes, seconds, volumes.file_bytes(found))
 
     def load(self, path: Path) -> DistanceField:
-        return volumes.load(path, self.setting.types)
+        return volumes.load(path, self.context.types)
 
 
-class Fitted(equal_memory.PresetContender, Made):
+class Fitted(equal_memory.PresetContender, DistanceContender):
     """By a preset of ``fit sdf``."""
 
     task_name = "sdf"
 
     @property
     def preset(self) -> str:
-        return PRESETS[self.kind][0]
+        return PRESETS[self.method][0]
 
     def arguments(self) -> dict:
-        setting = self.setting
+        setting = self.context
         given = {"steps": setting.request.steps} if setting.request.steps else {}
-        return {"source": setting.name, "bytes": str(self.size), **given, **PRESETS[self.kind][1]}
+        return {"source": setting.name, "bytes": str(self.budget), **given, **PRESETS[self.method][1]}
 
-    def fitted(self, model, fitted, seconds: float) -> dict:
+    def fit_record(self, task_model, fitted, seconds: float) -> dict:
         trained = fitted.result.seconds
         return self.record(
-            model.field, model.nbytes, fitted.figures["prepared_seconds"] + trained, self.file.stat().st_size,
+            task_model.field, task_model.nbytes, fitted.figures["prepared_seconds"] + trained, self.file.stat().st_size,
             steps=fitted.result.steps, trained_seconds=trained,
         )  # fmt: skip
 
 
-class Hashed(Made):
+class Hashed(DistanceContender):
     """A hash grid with a network, trained to convergence."""
 
     @functools.cached_property
-    def training(self) -> Training:
-        setting, (steps, longest) = self.setting, self.setting.request.hash_steps
+    def training(self) -> ConvergenceTraining:
+        setting, (steps, longest) = self.context, self.context.request.hash_steps
 
         def problem():
-            net = hash_grids.network(self.size)
+            net = hash_grids.network(self.budget)
             return hash_grids.HashProblem(net, setting.types, setting.mesh, *setting.pools)
 
         settings = FitSettings(**{**asdict(HASH_SETTINGS), "steps": steps})
-        return Training(f"{self.name} training", problem, settings, longest, 8)
+        return ConvergenceTraining(f"{self.name} training", problem, settings, longest, 8)
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
-        super().known(folder, record)
-        record = record or self.setting.before.get(self.name)
-        return record if record and self.training.known(folder, record) else None
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
+        super().cached_record(folder, record)
+        record = record or self.context.before.get(self.name)
+        return record if record and self.training.cached_record(folder, record) else None
 
     def load(self, path: Path) -> DistanceField:
         hash_grids.halved(self.training.net)
-        return hash_grids.HashField(self.setting.types, self.training.net, self.setting.mesh)
+        return hash_grids.HashField(self.context.types, self.training.net, self.context.mesh)
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
         record = self.training.run(folder, progress)
@@ -389,7 +391,7 @@ def _reads(setting: Setting, names: list[str], lanes: int) -> dict:
     dr.make_opaque(p)
     value, normal = {FLOOR: lambda: list(p)}, {FLOOR: lambda: list(p)}
     for name in names:
-        own = setting.jobs[name].field
+        own = setting.jobs[name].model
         value[name] = lambda f=own: [f.value(p)]
         normal[name] = lambda f=own: [f.gradient(p)[1]]
     return {"value": value, "normal": normal}
@@ -400,15 +402,15 @@ def _rays(setting: Setting, view: views.Stage, names: list[str], grid: str, lane
     o, d = view.rays(setting.types, lanes)
     found: dict[str, Callable] = {FLOOR: lambda: [*o, *d]}
     for name in names:
-        found[name] = lambda f=setting.jobs[name].field: [view.traced(f, o, d)]
+        found[name] = lambda f=setting.jobs[name].model: [views.traced(f, o, d)]
     for name, scene in ((MESH, view.mesh_scene()), (grid, view.grid_scene(_grid_field(setting), setting.request.grid))):
-        found[name] = lambda s=scene: [view.met(s, o, d)]
+        found[name] = lambda s=scene: [views.met(s, o, d)]
     return {"ray": found}
 
 
 def _renders(setting: Setting, view: views.Stage, names: list[str], grid: str) -> dict:
     jobs = setting.jobs
-    scenes = {name: view.field_scene(jobs[name].field, True) for name in names if jobs[name].kind in RENDERED}
+    scenes = {name: view.field_scene(jobs[name].model, True) for name in names if jobs[name].method in RENDERED}
     scenes[MESH] = view.mesh_scene(True)
     scenes[grid] = view.grid_scene(_grid_field(setting), setting.request.grid, True)
     spp = setting.request.spp
@@ -417,5 +419,5 @@ def _renders(setting: Setting, view: views.Stage, names: list[str], grid: str) -
 
 def _grid_field(setting: Setting) -> DistanceField:
     """What ``sdfgrid`` is decoded from: ours of the first size, or else another one."""
-    shown = (job for job in setting.jobs.values() if job.kind != "hash" and job.size == setting.request.sizes[0])
-    return min(shown, key=lambda job: job.kind != "ours").field
+    shown = (job for job in setting.jobs.values() if job.method != "hash" and job.budget == setting.request.sizes[0])
+    return min(shown, key=lambda job: job.method != "ours").model

@@ -17,7 +17,7 @@ import numpy as np
 from ... import metrics
 from ...maps.pyramid import Pyramid
 from ...tasks.disney.effects import Effects
-from ...tasks.shading.evaluation import Reader
+from ...tasks.shading.evaluation import ShadedReader
 from ...tasks.shading.reference import reference
 from ..texture.zoom import bilinear, flicker
 
@@ -63,7 +63,7 @@ class Motion:
         dr.eval(found)
         return found
 
-    def render(self, read: Reader) -> np.ndarray:
+    def render(self, read: ShadedReader) -> np.ndarray:
         """The frames as displayed, ``(frames, side, side, 3)``."""
         return np.stack([self._shown(read(*self.lanes(k))) for k in range(self.frames)])
 
@@ -87,7 +87,7 @@ class Motion:
             found.append(bilinear(image, np.stack([x, y], axis=-1) / spacing + self.side / 2))
         return np.stack(found)
 
-    def errors(self, read: Reader) -> dict[str, float]:
+    def errors(self, read: ShadedReader) -> dict[str, float]:
         """``flicker``, and ``flicker_error``, that of the difference to the truth."""
         frames, truth = self.aligned(self.render(read)), self.aligned(self.truth)
         return {"flicker": flicker(frames), "flicker_error": flicker(frames - truth)}

@@ -34,7 +34,7 @@ def of(settings: dict) -> dict[str, Callable[[dict], object]]:
 def figure_2(settings: dict, result: dict):
     """A row for each material: PSNR against C and P for each λ, all ways; bars from the worst to the best seed."""
     found = curves(result)
-    sheet = plot.sheet(result["title"], _caption(result), 12.0, 3.5 * len(found))
+    sheet = plot.figure(result["title"], _caption(result), 12.0, 3.5 * len(found))
     for row, own in enumerate(found.values()):
         for column, letter in enumerate("CP"):
             axes = sheet.add_subplot(len(found), 2, 2 * row + column + 1)
@@ -76,7 +76,7 @@ def _shares(axes, own: Curves, letter: str) -> None:
 def levels(settings: dict, result: dict):
     """Quality by level of detail, of λ = 0, the best λ and classical filters."""
     found = curves(result)
-    sheet = plot.sheet(f"{result['title']}: levels of detail", _caption(result), 12.0, 3.3 * len(found))
+    sheet = plot.figure(f"{result['title']}: levels of detail", _caption(result), 12.0, 3.3 * len(found))
     for row, own in enumerate(found.values()):
         for column, letter in enumerate("CP"):
             axes = sheet.add_subplot(len(found), 2, 2 * row + column + 1)
@@ -99,7 +99,7 @@ def strip(settings: dict, result: dict):
     """Crops of a minified level: filtered parameters, the best classical filter, λ = 0, the best λ, the truth."""
     found = curves(result)
     rows = [(own, settings[own.name]) for own in found.values() if own.best() is not None]
-    sheet = plot.sheet(f"{result['title']}: what is seen", _caption(result), 11.5, 2.45 * len(rows))
+    sheet = plot.figure(f"{result['title']}: what is seen", _caption(result), 11.5, 2.45 * len(rows))
     for row, (own, setting) in enumerate(rows):
         evaluation = setting.evaluation
         level = min(LEVEL, evaluation.levels - 1)
@@ -128,7 +128,7 @@ def zoom(settings: dict, result: dict):
     strips = {text: motion.render(setting.readers[job]()) for text, job in _columns(own)} | {"truth": motion.truth}
     frames = np.unique(np.linspace(0, motion.frames - 1, FRAMES).round().astype(int))
     title = f"{result['title']}: {own.name}, a zoom of {motion.frames} frames"
-    sheet = plot.sheet(title, _caption(result), 11.0, 1.75 * len(strips))
+    sheet = plot.figure(title, _caption(result), 11.0, 1.75 * len(strips))
     grid = sheet.add_gridspec(len(strips), len(frames) + 1)
     truth = motion.aligned(motion.truth).reshape(motion.frames, GRID, GRID, 3)
     line = int(np.argmax(truth[-1].var(axis=1).sum(axis=-1)))  # where there is most to see

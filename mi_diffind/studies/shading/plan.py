@@ -10,7 +10,7 @@ Beside them stand classical filters of normals (:mod:`..baselines.normals`), unc
 texture can hold, compressed as λ = 0 is, with as much time: Toksvig's and baked roughness. The *kernel* control reads
 at other levels of detail, those with which it errs least; λ = 0 is read so, too.
 
-*Errors* are those of :class:`mi_diffind.tasks.shading.evaluation.Evaluation`: PSNR of shaded values and FLIP, under
+*Errors* are those of :class:`.ShadedEvaluation`: PSNR of shaded values and FLIP, under
 views and lights of no training, against C, converged, and P, the paper's reference. *Flicker*: :mod:`.motion`.
 
 A run is in *trouble* if its loss became NaN or exploded, so that it was restarted (``restarts``), or given up
@@ -44,7 +44,7 @@ from ...runtime import array_module
 from ...settings import FitSettings, FittingError
 from ...tables import Table, save_table
 from ...tasks.shading import presets
-from ...tasks.shading.evaluation import Evaluation, Reader, reader
+from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader
 from ...tasks.shading.material import effects_of, frozen_decoder
 from ...tasks.shading.training import fit_shading, start_of
 from ...tasks.texture import presets as texture_presets
@@ -117,12 +117,12 @@ def materials_of(given: Sequence[str], side: int, quick: bool = False) -> dict[s
     return found
 
 
-class _Images(Evaluation):
+class _Images(ShadedEvaluation):
     """Images of a material; those by which trainings choose among their states are made once for all trainings."""
 
-    _others: Evaluation | None = None
+    _others: ShadedEvaluation | None = None
 
-    def another(self) -> Evaluation:
+    def another(self) -> ShadedEvaluation:
         self._others = self._others or super().another()
         return self._others
 
@@ -138,7 +138,7 @@ class Setting:
     source: Source
     request: Request
     #: What was made of it: name of a job → its reader.
-    readers: dict[str, Callable[[], Reader]] = field(default_factory=dict)
+    readers: dict[str, Callable[[], ShadedReader]] = field(default_factory=dict)
 
     @cached_property
     def types(self):
@@ -161,7 +161,7 @@ class Setting:
         return frozen_decoder(self.types)
 
     @cached_property
-    def evaluation(self) -> Evaluation:
+    def evaluation(self) -> ShadedEvaluation:
         levels, pairs, side = (3, 2, 16) if self.request.quick else (6, 16, 64)
         return _Images(self.pyramid, self.effects, levels, pairs, side)
 
@@ -169,21 +169,21 @@ class Setting:
     def motion(self) -> Motion:
         return Motion(self.pyramid, self.effects, self.request.frames, 32 if self.request.quick else 96)
 
-    def reader_of(self, table: Table) -> Reader:
+    def reader_of(self, table: Table) -> ShadedReader:
         """A compressed texture, shaded by the tables of the BRDF that it was trained through."""
         return reader(CompressedTexture.of(table, self.types.TensorXf), self.effects, self.decoder)
 
-    def measured(self, read: Reader) -> dict:
+    def measured(self, read: ShadedReader) -> dict:
         """Errors of shaded images, for the details of a record."""
         return {"material": self.name, **self.evaluation.measure(read)}
 
-    def training(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.Request:
+    def training(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.FitRequest:
         """A request for a training of a ``length``, by ``settings`` as they are changed for it."""
         settings, seconds = dataclasses.replace(settings, seed=seed, deterministic=False), length
         if self.request.unit == "steps":
             every = max(1, int(length) // 10)
             settings, seconds = dataclasses.replace(settings, steps=int(length), measure_every=every), None
-        return task.Request("ours", settings, self.types, seconds=seconds, progress=progress, options=self.options)
+        return task.FitRequest("ours", settings, self.types, seconds=seconds, progress=progress, options=self.options)
 
     @cached_property
     def options(self) -> dict:
@@ -216,7 +216,7 @@ class _Made(Job):
     setting: Setting
     record: dict | None = None
 
-    def kept(self, nbytes: int, start: float, read: Reader, **details) -> dict:
+    def kept(self, nbytes: int, start: float, read: ShadedReader, **details) -> dict:
         """The record of what was made since ``start``."""
         found = {**self.setting.measured(read), **details}
         self.record = {"bytes": nbytes, "seconds": time.perf_counter() - start, "details": found}
@@ -228,10 +228,10 @@ class _Classical(_Made):
     """A classical filter, uncompressed: ``make`` its reader; it needs ``channels`` beyond the maps of a mip map."""
 
     label: str = ""
-    make: Callable[[Path | None], Reader] = lambda folder: None
+    make: Callable[[Path | None], ShadedReader] = lambda folder: None
     channels: int = 0
 
-    def known(self, folder, record):
+    def cached_record(self, folder, record):
         self.record = record
         if record is not None:
             self.setting.readers[self.name] = lambda: self.make(folder)
@@ -254,7 +254,7 @@ class _Trained(_Made):
     def file(self, folder: Path) -> Path:
         return folder / f"{file_name(self.name)}.npz"
 
-    def known(self, folder, record):
+    def cached_record(self, folder, record):
         if record is None or folder is None or not self.file(folder).is_file():
             return None
         self.record, self.table = record, task.tasks()["texture"].load(self.file(folder))
@@ -340,10 +340,10 @@ class _Shifted(_Made):
     base: _Run | None = None
     kernel: Callable = lambda make: make
 
-    def _read(self) -> Reader:
+    def _read(self) -> ShadedReader:
         return self.kernel(lambda folder: self.setting.readers[self.base.name]())(None)
 
-    def known(self, folder, record):
+    def cached_record(self, folder, record):
         self.record = record
         if record is not None:
             self.setting.readers[self.name] = self._read
@@ -425,7 +425,7 @@ def _jobs(setting: Setting) -> list[Job]:
     name, request = setting.name, setting.request
     pyramid, found = (lambda: setting.pyramid), []
 
-    def classical(label: str, make: Callable[[Path | None], Reader], channels: int = 0) -> None:
+    def classical(label: str, make: Callable[[Path | None], ShadedReader], channels: int = 0) -> None:
         found.append(_Classical(f"{name}, {label}", setting, label=label, make=make, channels=channels))
 
     def bake(folder: Path | None) -> list[np.ndarray]:
@@ -440,23 +440,23 @@ def _jobs(setting: Setting) -> list[Job]:
         with np.load(file, allow_pickle=False) as data:
             return [data[f"arr_{i}"] for i in range(len(data.files))]
 
-    def shifted(make: Callable[[Path | None], Reader]) -> Callable[[Path | None], Reader]:
+    def shifted(make: Callable[[Path | None], ShadedReader]) -> Callable[[Path | None], ShadedReader]:
         """The same with the kernel that suits the truth best."""
 
-        def biased(folder: Path | None) -> Reader:
+        def biased(folder: Path | None) -> ShadedReader:
             read = make(folder)
             places = 2**10 if request.quick else normals.PLACES
             return normals.biased(read, normals.choose_biases(read, pyramid(), setting.effects, places))
 
         return biased
 
-    def filtered(folder: Path | None) -> Reader:
+    def filtered(folder: Path | None) -> ShadedReader:
         return normals.filtered(pyramid(), setting.effects)
 
-    def baked(folder: Path | None) -> Reader:
+    def baked(folder: Path | None) -> ShadedReader:
         return normals.baked(pyramid(), setting.effects, bake(folder))
 
-    def lean(folder: Path | None, smooth: bool = False) -> Reader:
+    def lean(folder: Path | None, smooth: bool = False) -> ShadedReader:
         return normals.lean(source, pyramid(), setting.effects, smooth)
 
     def rough(levels: Callable[[Path | None], list[np.ndarray]]) -> Callable[[Path | None], Pyramid]:

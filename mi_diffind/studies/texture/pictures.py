@@ -34,7 +34,7 @@ def crops(setting, readers: dict, result: dict):
     height = setting.request.film[1]
     side = max(8, height * 2 // 5)
     title = f"{result['title']}: parts of the stills"
-    found = plot.sheet(title, _caption(result), 2.3 * len(columns), 2.5 * len(names))
+    found = plot.figure(title, _caption(result), 2.3 * len(columns), 2.5 * len(names))
     for i, (name, stage) in enumerate(setting.stages.items()):
         counted = setting.counted(stage)
         part = np.where(counted[..., None], setting.truths[name], np.nan)
@@ -64,7 +64,7 @@ def zoom(setting, readers: dict, result: dict):
     frames = np.unique(np.linspace(0, motion.frames - 1, FRAMES).round().astype(int))
     rows, columns = len(strips), len(frames) + 1
     title = f"{result['title']}: a zoom of {motion.frames} frames"
-    found = plot.sheet(title, _caption(result), 2.2 * columns, 1.55 * rows)
+    found = plot.figure(title, _caption(result), 2.2 * columns, 1.55 * rows)
     grid = found.add_gridspec(rows, columns)
     truth = motion.aligned(strips["truth"]).reshape(motion.frames, GRID, GRID, 3)
     row = int(np.argmax(truth[0].var(axis=1).sum(axis=-1)))  # where there is most to see
@@ -94,7 +94,7 @@ def levels(setting, readers: dict, result: dict):
     known = {n: r["details"] for n, r in result["jobs"].items() if "levels" in r.get("details", {})}
     compared = setting.request.footprints
     title = f"{result['title']}: levels of detail"
-    found = plot.sheet(title, _caption(result), 6.4 * (1 + compared), 4.6)
+    found = plot.figure(title, _caption(result), 6.4 * (1 + compared), 4.6)
     if compared:
         axes = found.add_subplot(1, 2, 1)
         count = setting.pyramid.levels

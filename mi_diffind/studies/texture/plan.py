@@ -100,8 +100,8 @@ class Request:
 
 def colour_map(source: Source, name: str = "") -> str:
     """The name of a map with three channels of 8 bits: ``name``, or the first albedo. Raises ``ValueError``."""
-    fitting = [m.name for m in source.maps if m.channels == 3 and m.depth == 1 and m.kind != "normal"]
-    fitting.sort(key=lambda n: next(m.kind for m in source.maps if m.name == n) != "albedo")
+    fitting = [m.name for m in source.maps if m.channels == 3 and m.depth == 1 and m.role != "normal"]
+    fitting.sort(key=lambda n: next(m.role for m in source.maps if m.name == n) != "albedo")
     if name and name not in fitting:
         raise ValueError(f'--map: found "{name}", colours of 8 bits have {", ".join(fitting) or "no maps"}')
     if not fitting:
@@ -260,7 +260,7 @@ class _Truth(Job):
     def _file(self, folder: Path) -> Path:
         return folder / f"{file_name(self.name)}.npz"
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         if not record or folder is None or not self._file(folder).is_file():
             return None
         with np.load(self._file(folder), allow_pickle=False) as found:
@@ -302,7 +302,7 @@ class _Table(_Made):
     file: str = ""
     samples: str | None = None
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         self.file = str(self.table.path) if self.table else str(folder / f"{file_name(self.name)}.npz")
         return record if record and Path(self.file).is_file() else None
 
@@ -341,7 +341,7 @@ class _Blocks(_Made):
     def _file(self, folder: Path) -> Path:
         return folder / f"{file_name(self.name)}.npz"
 
-    def known(self, folder: Path | None, record: dict | None) -> dict | None:
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         if not record or folder is None or not self._file(folder).is_file():
             return None
         with np.load(self._file(folder), allow_pickle=False) as found:
@@ -352,7 +352,7 @@ class _Blocks(_Made):
     def run(self, folder: Path | None, progress: bool) -> dict:
         start, request, source = time.perf_counter(), self.setting.request, self.setting.source
         nbytes = task.tasks()["texture"].load(self.like.file).nbytes
-        normals = [m.name for m in source.maps if m.kind == "normal"]
+        normals = [m.name for m in source.maps if m.role == "normal"]
         found, nbytes = codecs.astc_levels(
             self.setting.truth_levels, nbytes, request.astc, normals, request.astc_choice, self.cache
         )

@@ -13,7 +13,7 @@ Task 2: the Disney BRDF (Burley 2012), exact and as tables.
 from __future__ import annotations
 
 from ...settings import FitSettings
-from ...task import Request, Task
+from ...task import FitRequest, Task
 
 
 class Disney(Task):
@@ -29,14 +29,14 @@ class Disney(Task):
     }
     shipped = {"tables": "disney_tables.npz", "paper": "disney_paper.npz"}  # noqa: RUF012
 
-    def problem(self, request: Request):
+    def problem(self, request: FitRequest):
         from .library import LAYOUTS
         from .training import DisneyProblem
 
         layout, decoder = LAYOUTS[request.preset]
         return DisneyProblem(layout().alloc(request.types.TensorXf), decoder, request.types)
 
-    def table(self, problem, request: Request):
+    def table(self, problem, request: FitRequest):
         return problem.net.to_table()
 
     def load(self, path):

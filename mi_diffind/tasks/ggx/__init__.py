@@ -6,7 +6,7 @@ import argparse
 
 from ...errors import UsageError
 from ...settings import FitSettings
-from ...task import Argument, Request, Task
+from ...task import Argument, FitRequest, Task
 
 
 def _side(text: str) -> int:
@@ -38,7 +38,7 @@ class GGX(Task):
         for name, side in (("primary", 16), ("cascaded", 8))
     )  # fmt: skip
 
-    def problem(self, request: Request):
+    def problem(self, request: FitRequest):
         from .model import indirection
         from .training import GGXProblem
 
@@ -48,7 +48,7 @@ class GGX(Task):
             raise UsageError(str(e)) from None
         return GGXProblem(net.alloc(request.types.TensorXf), request.types, request.preset)
 
-    def table(self, problem, request: Request):
+    def table(self, problem, request: FitRequest):
         from dataclasses import asdict
 
         from ...tables import StoredArray, Table

@@ -18,13 +18,13 @@ from ...indirection import DifferentiableArray, Indirection, ramp
 from ...maps import components
 from ...maps.layout import Layout
 from ...pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
-from .memory_budget import Size
+from .memory_budget import ImageBudget
 
 #: Room between the components' range and the ends of [0, 1], and the share of texels beyond the range at either end.
 MARGIN, OUTSIDE = 0.02, 1e-3
 
 
-def from_ramp(layout: Layout, size: Size, border: tuple[str, str]) -> Indirection:
+def from_ramp(layout: Layout, size: ImageBudget, border: tuple[str, str]) -> Indirection:
     """The supplement's initial values; not allocated."""
     primaries = [
         DifferentiableArray((rows, columns), dims, "ramp", fold=True, border=border)
@@ -39,7 +39,7 @@ def joined(primaries: Sequence[DifferentiableArray], cascaded: DifferentiableArr
     return Indirection(primaries, cascaded, [(0, 1)] * len(primaries))
 
 
-def from_components(values: np.ndarray, size: Size, border: tuple[str, str]) -> Indirection:
+def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> Indirection:
     """
     Initial values from the principal components of ``values``, ``(height, width, k)`` in [0, 1]; not allocated. Of two
     primaries, the first takes the components of the differences of neighbours, which need its resolution most, the
@@ -93,7 +93,7 @@ def from_components(values: np.ndarray, size: Size, border: tuple[str, str]) -> 
     return joined(primaries, DifferentiableArray(shape, k, back.astype(np.float32), fold=True))
 
 
-def gain_of_pages(values: np.ndarray, size: Size, border: tuple[str, str]) -> tuple[float, float]:
+def gain_of_pages(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> tuple[float, float]:
     """:func:`~mi_diffind.pages.page_gain` of the components of an image at a size of one primary."""
     k = values.shape[-1]
     mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
@@ -105,7 +105,7 @@ def gain_of_pages(values: np.ndarray, size: Size, border: tuple[str, str]) -> tu
     return gain, psnr + 10 * math.log10(k)
 
 
-def page_budget(size: Size, shape: Sequence[int]) -> float:
+def page_budget(size: ImageBudget, shape: Sequence[int]) -> float:
     """Entries of all pages of the first primary together, for an image of ``shape``: less what the index takes."""
     rows, columns, dims, bits = size.primaries[0]
     index = PagedArray(np.ones((*page_counts(shape[:2]), 2), int)).index_nbytes

@@ -12,12 +12,12 @@ from ...maps.source import Source, load_source
 from ...pages import most_entries
 from ...settings import FittingError
 from ...tables import MAX_BYTES
-from ...task import Fitted, Request
+from ...task import FitRequest, Fitted
 from . import memory_budget, search, training
-from .presets import PAGED, PRESETS, STRUCTURES, Recipe, without
+from .presets import PAGED, PRESETS, STRUCTURES, ImageRecipe, without
 
 
-def recipe_of(preset: str, settings, options) -> Recipe:
+def recipe_of(preset: str, settings, options) -> ImageRecipe:
     """The recipe of a preset with what the options change. Raises :class:`UsageError`."""
     recipe = without(PRESETS[preset], options["without"])
     given = {k: options[k] for k in ("structure", "dims") if options[k] is not None}
@@ -29,7 +29,7 @@ def recipe_of(preset: str, settings, options) -> Recipe:
     return recipe
 
 
-def check(request: Request) -> None:
+def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     several = options["ratio_search"] or options["psnr"]
@@ -48,7 +48,7 @@ def check(request: Request) -> None:
     recipe_of(request.preset, request.settings, options)
 
 
-def fit(request: Request) -> Fitted:
+def fit(request: FitRequest) -> Fitted:
     """
     Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
     :class:`~mi_diffind.fitting.FittingError`.
@@ -73,7 +73,7 @@ def fit(request: Request) -> Fitted:
     return fitted
 
 
-def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, float | None]:
+def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:
     """What was trained, and the bytes that were asked for."""
     options = request.options
     border = None if options["border"] == "auto" else (options["border"],) * 2
@@ -117,7 +117,7 @@ def _train(request: Request, source: Source, recipe: Recipe) -> tuple[Fitted, fl
     return Fitted(table, result, [*lines, *([sentence] if sentence else [])], {"tried": tried}), asked
 
 
-def _for_psnr(request: Request, source: Source, recipe: Recipe, border) -> Fitted:
+def _for_psnr(request: FitRequest, source: Source, recipe: ImageRecipe, border) -> Fitted:
     goal = float(request.options["psnr"])
     table, result, tried = search.psnr_search(source, goal, recipe, request, border)
     if table is None:

@@ -64,7 +64,7 @@ _default_ratio = ratio  # where "ratio" is the argument that replaces it
 
 
 @dataclass(frozen=True)
-class Coarse:
+class CoarsePrimary:
     """
     A second primary array, of lower resolution: how many ``dims`` of the pointer it holds, their ``bits``, and its
     sides in units of those of the first, ``scale``.
@@ -80,7 +80,7 @@ class Coarse:
 
 
 @dataclass(frozen=True)
-class Size:
+class ImageBudget:
     """
     Resolutions of a pair of arrays: the primary's ``rows`` and ``columns``, the side of the ``cascaded`` array, its
     ``channels``, the ``dims`` of the pointer and the ``bits`` of each of its coordinates. With ``coarse``, so many of
@@ -99,7 +99,7 @@ class Size:
     dims: int = 4
     bits: int = 8
     full: bool = field(default=False, compare=False)
-    coarse: Coarse | None = None
+    coarse: CoarsePrimary | None = None
     paged: bool = False
 
     def __post_init__(self):
@@ -146,7 +146,7 @@ def paper_search(
     ratio: float,
     dims: int = 4,
     bits: int = 8,
-) -> Size:
+) -> ImageBudget:
     """
     The paper's linear search: of all sides ``N_c`` = 4, 8, 12, … of the cascaded array, the one that minimises
     ``|compression − uncompressed_bytes / bytes|``, with ``N_p = ratio · N_c`` rounded to a multiple of 8.
@@ -165,7 +165,7 @@ def paper_search(
     while True:
         cascaded += CASCADED_STEP
         side = PRIMARY_STEP * max(1, round(ratio * cascaded / PRIMARY_STEP))
-        size = Size(*_spread(side, height, width), cascaded, channels, dims, bits)
+        size = ImageBudget(*_spread(side, height, width), cascaded, channels, dims, bits)
         achieved = size.compression(uncompressed_bytes)
         if abs(compression - achieved) < distance:
             best, distance = size, abs(compression - achieved)
@@ -183,7 +183,7 @@ def search(
     dims: int = 4,
     bits: int = 8,
     ratio: float | None = None,
-) -> Size:
+) -> ImageBudget:
     """
     The resolutions for a compression ratio: :func:`paper_search` with ``ratio``, by default that of :func:`ratio`.
 
@@ -222,8 +222,8 @@ def fit_bytes(
     cascaded: int,
     dims: int = 4,
     bits: int = 8,
-    coarse: Coarse | None = None,
-) -> Size:
+    coarse: CoarsePrimary | None = None,
+) -> ImageBudget:
     """
     The largest primary that fits into ``budget`` bytes beside a cascaded array of side ``cascaded``, in the proportions
     of the image (a square one exactly, others to 2% or one texel) and no larger than it. At least 1×1: only then can
@@ -238,7 +238,7 @@ def fit_bytes(
     entries = min(max(entries, 1), height * width)
     if height == width:
         side = math.isqrt(entries)
-        return Size(side, side, cascaded, channels, dims, bits, full=side == height)
+        return ImageBudget(side, side, cascaded, channels, dims, bits, full=side == height)
     short, long = sorted((height, width))
     wanted = short * math.sqrt(entries / (height * width))
     margin = max(1.0, 0.02 * wanted)
@@ -250,18 +250,18 @@ def fit_bytes(
             best = max(best, (rank, one, other)) if best else (rank, one, other)
     _, one, other = best
     rows, columns = (one, other) if height <= width else (other, one)
-    return Size(rows, columns, cascaded, channels, dims, bits, full=(rows, columns) == (height, width))
+    return ImageBudget(rows, columns, cascaded, channels, dims, bits, full=(rows, columns) == (height, width))
 
 
-def _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse: Coarse) -> Size:
+def _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse: CoarsePrimary) -> ImageBudget:
     """:func:`fit_bytes` of two primaries: the sides in proportion, then the longer one alone, both by bisection."""
     short, long = sorted((height, width))
 
-    def sized(one: int, other: int) -> Size:
+    def sized(one: int, other: int) -> ImageBudget:
         rows, columns = (one, other) if height <= width else (other, one)
-        return Size(rows, columns, cascaded, channels, dims, bits, (rows, columns) == (height, width), coarse)
+        return ImageBudget(rows, columns, cascaded, channels, dims, bits, (rows, columns) == (height, width), coarse)
 
-    def largest(at) -> Size:
+    def largest(at) -> ImageBudget:
         low, high = 1, long
         while low < high:
             middle = (low + high + 1) // 2
@@ -301,7 +301,7 @@ def _check_image(uncompressed_bytes: int, channels: int, height: int, width: int
 # -- what was asked for ------------------------------------------------------------------------------------------------
 
 
-def explain(size: Size, uncompressed_bytes: int, asked_bytes: float) -> tuple[float, str | None]:
+def explain(size: ImageBudget, uncompressed_bytes: int, asked_bytes: float) -> tuple[float, str | None]:
     """The compression ratio that ``size`` reaches and, unless its bytes are within 5% of ``asked_bytes``, why not."""
     achieved = size.compression(uncompressed_bytes)
     if abs(size.nbytes / asked_bytes - 1) <= TOLERANCE:

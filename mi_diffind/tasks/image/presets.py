@@ -6,18 +6,18 @@ import dataclasses
 from dataclasses import dataclass
 
 from ...settings import FitSettings
-from .memory_budget import Coarse
+from .memory_budget import CoarsePrimary
 
 #: How the primary is stored: bits of an entry, and a second primary or none. The fewer bits, the more entries fit.
 #: The resolution of pages follows the image.
-STRUCTURES: dict[str, tuple[int, Coarse | None]] = {
+STRUCTURES: dict[str, tuple[int, CoarsePrimary | None]] = {
     **{f"{bits} bits": (bits, None) for bits in (8, 7, 6, 5, 4, 3)},
-    "4 + 8 bits": (4, Coarse(2, 8, 0.5)),
-    "3 + 6 bits": (3, Coarse(2, 6, 0.4)),
-    "2 + 6 bits": (2, Coarse(2, 6, 0.35)),
+    "4 + 8 bits": (4, CoarsePrimary(2, 8, 0.5)),
+    "3 + 6 bits": (3, CoarsePrimary(2, 6, 0.4)),
+    "2 + 6 bits": (2, CoarsePrimary(2, 6, 0.35)),
     "pages of 5 bits": (5, None),
     "pages of 6 bits": (6, None),
-    "pages of 2 + 6 bits": (2, Coarse(2, 6, 0.35)),
+    "pages of 2 + 6 bits": (2, CoarsePrimary(2, 6, 0.35)),
 }
 
 #: Structures whose first primary consists of pages (:class:`mi_diffind.pages.PagedArray`).
@@ -25,7 +25,7 @@ PAGED = ("pages of 5 bits", "pages of 6 bits", "pages of 2 + 6 bits")
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ImageRecipe:
     """
     How an image is stored and trained.
 
@@ -54,8 +54,8 @@ _PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, sche
 
 #: The first is the default.
 PRESETS = {
-    "ours": Recipe(settings=_OURS),
-    "paper": Recipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
+    "ours": ImageRecipe(settings=_OURS),
+    "paper": ImageRecipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
 }
 
 #: What of ours can be switched off: to what the supplement does.
@@ -72,7 +72,7 @@ IMPROVEMENTS = {
 }
 
 
-def without(recipe: Recipe, names) -> Recipe:
+def without(recipe: ImageRecipe, names) -> ImageRecipe:
     """``recipe`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown one."""
     paper = PRESETS["paper"]
     for name in names:
@@ -90,6 +90,6 @@ def without(recipe: Recipe, names) -> Recipe:
     return recipe
 
 
-def replaced(recipe: Recipe, **settings) -> Recipe:
+def replaced(recipe: ImageRecipe, **settings) -> ImageRecipe:
     """``recipe`` with other settings of the training."""
     return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **settings))

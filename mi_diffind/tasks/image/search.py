@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from ...fitting import FitResult
 from ...maps.source import Source
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from . import memory_budget
-from .memory_budget import Coarse, Size
-from .presets import PAGED, STRUCTURES, Recipe, replaced
+from .memory_budget import CoarsePrimary, ImageBudget
+from .presets import PAGED, STRUCTURES, ImageRecipe, replaced
 from .training import dims_of, fit_image, layout_of, structure_of
 
 #: A candidate of a search is trained for this share of the steps.
@@ -33,20 +33,20 @@ NEAR = 1.06
 
 
 @dataclass
-class Found:
+class RatioSearch:
     """
     What a search has tried (one dictionary a training: sizes, ``bytes``, ``psnr_db``) and chosen; ``best`` is the table
     of the best short training and its record, for a search that was interrupted.
     """
 
-    size: Size
-    recipe: Recipe
+    size: ImageBudget
+    recipe: ImageRecipe
     tried: list[dict]
     best: tuple[Table, FitResult] | None = None
     interrupted: bool = False
 
 
-def default_size(source: Source, nbytes: float, recipe: Recipe) -> Size:
+def default_size(source: Source, nbytes: float, recipe: ImageRecipe) -> ImageBudget:
     """
     The size of a recipe for so many bytes: the supplement's search, or with ``components`` a cascaded array of
     :func:`.memory_budget.cascaded_side` and whatever primary fits beside it.
@@ -60,7 +60,7 @@ def default_size(source: Source, nbytes: float, recipe: Recipe) -> Size:
     return memory_budget.search(source.nbytes, compression, stored, source.height, source.width, recipe.dims, bits)
 
 
-def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
+def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> ImageBudget:
     """
     The size for so many bytes, with a cascaded array of a given side. A single primary of pages may have fewer
     channels than the recipe says (:func:`.dims_of`).
@@ -72,14 +72,14 @@ def sized(source: Source, nbytes: float, recipe: Recipe, cascaded: int) -> Size:
     return dataclasses.replace(size, paged=paged)
 
 
-def _steps(recipe: Recipe, share: float) -> Recipe:
+def _steps(recipe: ImageRecipe, share: float) -> ImageRecipe:
     steps = max(20, round(recipe.settings.steps * share))
     return replaced(recipe, steps=steps, measure_every=steps)
 
 
 def ratio_search(
-    source: Source, nbytes: float, recipe: Recipe, request: Request, free: bool = True, border=None
-) -> Found:
+    source: Source, nbytes: float, recipe: ImageRecipe, request: FitRequest, free: bool = True, border=None
+) -> RatioSearch:
     """
     The best of several sizes of ``nbytes``, each trained for :data:`SHORT` of the steps: the side of the cascaded
     array, and so the ratio ρ; with ``free`` then the structure of the primary and dimensions (with sides of their
@@ -87,7 +87,7 @@ def ratio_search(
     """
     tried, tables = [], []
 
-    def attempt(recipe: Recipe, side: int) -> bool:
+    def attempt(recipe: ImageRecipe, side: int) -> bool:
         """Train a candidate; was that interrupted?"""
         size = sized(source, nbytes, recipe, side)
         structure, recipe = structure_of(source, recipe, nbytes), dataclasses.replace(recipe, dims=size.dims)
@@ -114,11 +114,11 @@ def ratio_search(
         if interrupted:
             break
     if not tried:
-        return Found(start, recipe, tried)
+        return RatioSearch(start, recipe, tried)
     tables[0][1].interrupted = interrupted
     chosen = best()
     recipe = dataclasses.replace(recipe, structure=chosen["structure"], dims=chosen["dims"])
-    return Found(sized(source, nbytes, recipe, chosen["cascaded"]), recipe, tried, tables[0], interrupted)
+    return RatioSearch(sized(source, nbytes, recipe, chosen["cascaded"]), recipe, tried, tables[0], interrupted)
 
 
 def _merit(tried: dict) -> float:
@@ -126,17 +126,17 @@ def _merit(tried: dict) -> float:
     return 0.5 * (tried["psnr_db"] + tried["psnr_between_db"])
 
 
-def _title(size: Size, structure: str) -> str:
+def _title(size: ImageBudget, structure: str) -> str:
     return f"try {size.columns}×{size.rows}×{size.dims} of {structure} → {size.cascaded}"
 
 
-def _stages(recipe: Recipe, structure: str, side: int, free: bool, best: Callable) -> Iterator[list]:
+def _stages(recipe: ImageRecipe, structure: str, side: int, free: bool, best: Callable) -> Iterator[list]:
     """Lists of (recipe, side) to try, each made when the results of those before are there."""
     yield [(recipe, s) for s in sorted(SIDES[recipe.dims], key=lambda s: abs(math.log(s / side)))]
     if not free or best() is None:  # not even the smallest cascaded array fits
         return
     found = best()
-    several = recipe.dims > Coarse().dims
+    several = recipe.dims > CoarsePrimary().dims
     tried = [s for s, (_, coarse) in STRUCTURES.items() if s in TRIED and s != structure and (several or not coarse)]
     yield [(dataclasses.replace(recipe, structure=s), found["cascaded"]) for s in tried]
     found = best()
@@ -153,8 +153,8 @@ def _stages(recipe: Recipe, structure: str, side: int, free: bool, best: Callabl
 def psnr_search(
     source: Source,
     goal: float,
-    recipe: Recipe,
-    request: Request,
+    recipe: ImageRecipe,
+    request: FitRequest,
     border=None,
     most: int = 8,
     log: Callable[[str], None] = print,

@@ -23,11 +23,11 @@ from ...maps.layout import Layout
 from ...maps.source import Source
 from ...pages import most_entries, page_counts
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from . import arrays, memory_budget
 from .compressed import CompressedImage, to_table
-from .memory_budget import Size
-from .presets import PAGED, STRUCTURES, Recipe
+from .memory_budget import ImageBudget
+from .presets import PAGED, STRUCTURES, ImageRecipe
 
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on an image is smooth enough for one primary.
 SMOOTH_DB = 28.0
@@ -42,7 +42,7 @@ ENTRIES = 3
 _structures: dict[tuple, str] = {}  # what was found for a source, by its digest: looking takes a second
 
 
-def structure_of(source: Source, recipe: Recipe, nbytes: float | None = None) -> str:
+def structure_of(source: Source, recipe: ImageRecipe, nbytes: float | None = None) -> str:
     """The structure of a recipe; for ``"auto"`` what suits the image in so many bytes (default: at 12x)."""
     if recipe.structure != "auto":
         return recipe.structure
@@ -53,7 +53,7 @@ def structure_of(source: Source, recipe: Recipe, nbytes: float | None = None) ->
     return _structures[key]
 
 
-def dims_of(recipe: Recipe, structure: str, stored: int) -> int:
+def dims_of(recipe: ImageRecipe, structure: str, stored: int) -> int:
     """
     Dimensions of the cascaded array. Those of a single primary of pages are no more than there are channels ``stored``,
     but 2: more entries are of more use to it, and read better between texels.
@@ -62,7 +62,7 @@ def dims_of(recipe: Recipe, structure: str, stored: int) -> int:
     return min(recipe.dims, max(stored, 2)) if single else recipe.dims
 
 
-def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
+def _suitable(values: np.ndarray, recipe: ImageRecipe, nbytes: float) -> str:
     """The structure that suits an image, ``(height, width, k)``, in so many bytes."""
     height, width, k = values.shape
     smooth = recipe.dims < 3 or components.smoothness(values) >= SMOOTH_DB
@@ -80,7 +80,7 @@ def _suitable(values: np.ndarray, recipe: Recipe, nbytes: float) -> str:
     return "6 bits" if smooth else "2 + 6 bits"
 
 
-def layout_of(source: Source, recipe: Recipe) -> Layout:
+def layout_of(source: Source, recipe: ImageRecipe) -> Layout:
     """What of ``source`` is stored by a recipe."""
     return Layout.of(source, recipe.once, None if recipe.normals else False)
 
@@ -92,7 +92,9 @@ class ImageProblem(Problem):
     that of the image along v and u.
     """
 
-    def __init__(self, net, bits, layout: Layout, values: np.ndarray, border, recipe: Recipe, types, digest: str = ""):
+    def __init__(
+        self, net, bits, layout: Layout, values: np.ndarray, border, recipe: ImageRecipe, types, digest: str = ""
+    ):
         self.net, self.bits, self.layout, self.types = net, tuple(bits), layout, types
         self.recipe, self.border = recipe, border
         self.height, self.width, self.channels = values.shape
@@ -189,7 +191,7 @@ class ImageProblem(Problem):
 
 
 def problem_of(
-    source: Source, size: Size, recipe: Recipe, types, layout: Layout | None = None, border=None
+    source: Source, size: ImageBudget, recipe: ImageRecipe, types, layout: Layout | None = None, border=None
 ) -> ImageProblem:
     """
     The problem of training ``source`` at a size by a recipe, its arrays at their initial values. Raises ``ValueError``
@@ -207,9 +209,9 @@ def problem_of(
 
 def fit_image(
     source: Source,
-    size: Size | None,
-    recipe: Recipe,
-    request: Request,
+    size: ImageBudget | None,
+    recipe: ImageRecipe,
+    request: FitRequest,
     border: tuple[str, str] | None = None,
     title: str | None = None,
 ) -> tuple[Table, FitResult]:
@@ -238,7 +240,7 @@ def fit_image(
     return table, result
 
 
-def _name_of(size: Size) -> str:
+def _name_of(size: ImageBudget) -> str:
     """The structure of a size, "" if it is none of those that are known."""
     known = (name for name, s in STRUCTURES.items() if s == (size.bits, size.coarse) and size.paged == (name in PAGED))
     return next(known, "")

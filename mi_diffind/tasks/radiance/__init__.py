@@ -14,7 +14,7 @@ import dataclasses
 
 from ... import units
 from ...arguments import Argument, checked, decibels, positive
-from ...task import Request, Task
+from ...task import FitRequest, Task
 from .presets import PRESETS
 
 
@@ -57,12 +57,12 @@ class RadianceField(Task):
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 2), **given)
 
-    def check(self, request: Request) -> None:
+    def check(self, request: FitRequest) -> None:
         from .fit import check
 
         check(request)
 
-    def fit(self, request: Request):
+    def fit(self, request: FitRequest):
         from .fit import fit
 
         return fit(request)

@@ -16,7 +16,7 @@ from ...fitting import FitResult, FittingError
 from ...fitting import fit as train
 from ...interrupt import interruptible
 from ...tables import StoredArray, Table, save_table
-from ...task import Fitted, Request
+from ...task import FitRequest, Fitted
 from . import compression, files, paper
 from . import grid as grids
 from .grid import Grid
@@ -34,7 +34,7 @@ VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 300, 2**15, 1e-2
 DENSITY_SHARE = 0.35
 
 
-def check(request: Request) -> None:
+def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     if options["source"] is None:
@@ -63,7 +63,7 @@ def held_views(folder) -> tuple[Views, bool]:
             raise e from None
 
 
-def fit(request: Request) -> Fitted:
+def fit(request: FitRequest) -> Fitted:
     """
     Fit the capture. Raises :class:`UsageError`, :class:`.views.ViewsError`, :class:`~mi_diffind.tables.TableError` and
     :class:`~mi_diffind.fitting.FittingError`.
@@ -111,7 +111,7 @@ def fit(request: Request) -> Fitted:
 # -- the grid ---------------------------------------------------------------------------------------------------------
 
 
-def _grid(request: Request, views: Views, held: Views) -> tuple[Grid, FitResult | None, float]:
+def _grid(request: FitRequest, views: Views, held: Views) -> tuple[Grid, FitResult | None, float]:
     """The grid: that of ``--grid`` if the file exists, else a trained one, which is written there."""
     path, start = request.options["grid"], time.perf_counter()
     if path and Path(path).exists() and request.preset != "grid":
@@ -138,7 +138,7 @@ def grid_of(table: Table, types) -> Grid:
     return Grid(nodes, table.arrays["density"].values[:, 0], table.arrays["colour"].values)
 
 
-def trained_grid(request: Request, views: Views, held: Views) -> tuple[Grid, FitResult]:
+def trained_grid(request: FitRequest, views: Views, held: Views) -> tuple[Grid, FitResult]:
     """
     A grid from nothing, in stages. With a checkpoint, each stage has one beside it, and what the stages before have
     found is kept in ``CHECKPOINT.grid.npz``.
@@ -216,7 +216,7 @@ def wanted_bytes(options, grid: Grid) -> int | None:
     return None
 
 
-def _train(request: Request, problem: ImagesProblem, stopped: bool) -> FitResult:
+def _train(request: FitRequest, problem: ImagesProblem, stopped: bool) -> FitResult:
     """
     The training; if that of the grid was ``stopped``, none, so that what there is is kept, and one that is resumed goes
     on with the grid.
@@ -231,7 +231,7 @@ def _train(request: Request, problem: ImagesProblem, stopped: bool) -> FitResult
     return request.train(problem, title="through the images")
 
 
-def _sparse(request: Request, grid: Grid, views: Views, held: Views, stopped: bool):
+def _sparse(request: FitRequest, grid: Grid, views: Views, held: Views, stopped: bool):
     images = Images(request.types, views)
     if request.options["psnr"] is not None:
         return _reaching(request, grid, images, views, held, stopped)
@@ -243,14 +243,14 @@ def _sparse(request: Request, grid: Grid, views: Views, held: Views, stopped: bo
     return _coded(request, smaller, bits, images, views, held, stopped)
 
 
-def _coded(request: Request, grid: Grid, bits: int, images: Images, views: Views, held: Views, stopped: bool):
+def _coded(request: FitRequest, grid: Grid, bits: int, images: Images, views: Views, held: Views, stopped: bool):
     problem = compression.PaletteProblem(compression.coded(grid, images, bits, request.settings.seed), views, held)
     result = _train(request, problem, stopped)
     table = files.palette_table(grid.nodes, problem.stored(), bits)
     return table, result, files.field_of(table, request.types)
 
 
-def _reaching(request: Request, grid: Grid, images: Images, views: Views, held: Views, stopped: bool):
+def _reaching(request: FitRequest, grid: Grid, images: Images, views: Views, held: Views, stopped: bool):
     """The first size of the ladder that reaches the PSNR that is asked for, or the last one."""
     wanted, found = float(request.options["psnr"]), None
     cells = grids.visible(grid, images)
@@ -270,7 +270,7 @@ def _reaching(request: Request, grid: Grid, images: Images, views: Views, held: 
     return found
 
 
-def _pairs(request: Request, grid: Grid, views: Views, held: Views, stopped: bool):
+def _pairs(request: FitRequest, grid: Grid, views: Views, held: Views, stopped: bool):
     seen = grids.divided(grid, grids.visible(grid, Images(request.types, views)), 1, 0)
     nbytes = wanted_bytes(request.options, grid) or dense_bytes(grid.nodes.shape) / COMPRESSION
     problem = pairs_problem(seen, nbytes, views, held, request, 0 if stopped else VALUE_STEPS)
@@ -286,7 +286,7 @@ def _pairs(request: Request, grid: Grid, views: Views, held: Views, stopped: boo
 
 
 def pairs_problem(
-    grid: Grid, nbytes: float, views: Views, held: Views, request: Request, steps: int
+    grid: Grid, nbytes: float, views: Views, held: Views, request: FitRequest, steps: int
 ) -> paper.PairsProblem:
     """The supplement's arrays of so many bytes, fitted to the grid's numbers in so many steps."""
     types = request.types

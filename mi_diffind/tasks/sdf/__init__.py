@@ -16,7 +16,7 @@ import dataclasses
 from ... import units
 from ...arguments import Argument, between, checked, positive
 from ...errors import UsageError
-from ...task import Request, Task
+from ...task import FitRequest, Task
 from .presets import PRESETS
 
 #: Bits of a pointer that go into words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
@@ -58,7 +58,7 @@ class Sdf(Task):
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 4), **given)
 
-    def check(self, request: Request) -> None:
+    def check(self, request: FitRequest) -> None:
         from .fit import asked_bytes
 
         options = request.options
@@ -70,7 +70,7 @@ class Sdf(Task):
         if options["ratio"] is not None and PRESETS[request.preset].layout != "pair":
             raise UsageError(f"--ratio is of the presets dense and paper, found {request.preset}")
 
-    def fit(self, request: Request):
+    def fit(self, request: FitRequest):
         from .fit import fit
 
         return fit(request)

@@ -15,7 +15,7 @@ from ...fitting import FitResult
 from ...indirection import stored_form
 from ...settings import FittingError
 from ...tables import StoredArray, Table
-from ...task import Fitted, Request
+from ...task import FitRequest, Fitted
 from . import codes, encoding, files, nodes, paper, samples, training
 from .distances import Distances
 from .evaluation import Evaluation, lost_pieces
@@ -50,7 +50,7 @@ def asked_bytes(options) -> int:
         raise UsageError(f"--bytes: {e}") from None
 
 
-def fit(request: Request) -> Fitted:
+def fit(request: FitRequest) -> Fitted:
     """
     Fit the mesh. Raises :class:`UsageError`, :class:`.mesh.MeshError`, :class:`.distances.DistancesError` and
     :class:`~mi_diffind.fitting.FittingError`.
@@ -135,7 +135,7 @@ def entries_for(sampled: encoding.Sampled, bits: int) -> int:
     return max(1, min(2**bits, sampled.structure.nodes))
 
 
-def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Request):
+def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: FitRequest):
     bits = request.options["bits"]
     sampled = sampled_for(distances, nbytes, bits)
     structure = sampled.structure
@@ -172,7 +172,7 @@ def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: R
 # -- the supplement's --------------------------------------------------------------------------------------------------
 
 
-def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: Request):
+def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: FitRequest):
     options = request.options
     ratio = options["ratio"] or ratio_for(nbytes)
     extent = mesh.upper - mesh.lower

@@ -18,7 +18,7 @@ import dataclasses
 
 from ...arguments import Argument, fraction, positive_or_none
 from ...maps.arguments import SIZES, SOURCES
-from ...task import Request, Task
+from ...task import FitRequest, Task
 from .presets import PRESETS, REFERENCES
 
 
@@ -65,12 +65,12 @@ class Shading(Task):
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
 
-    def check(self, request: Request) -> None:
+    def check(self, request: FitRequest) -> None:
         from .fit import check
 
         check(request)
 
-    def fit(self, request: Request):
+    def fit(self, request: FitRequest):
         from .fit import fit
 
         return fit(request)

@@ -19,7 +19,7 @@ from .material import shaded, surface_of
 from .reference import KINDS, reference
 
 #: ``(u, v, level, wi, wo) → Array3f`` of shaded values.
-Reader = Callable[[Any, Any, Any, Any, Any], Any]
+ShadedReader = Callable[[Any, Any, Any, Any, Any], Any]
 
 #: What images are compared with: letter → kind of reference.
 TRUTHS = {"C": "converged", "P": "prefiltered"}
@@ -32,7 +32,7 @@ PER_TEXEL, LARGEST = 4, 64
 SEED = 20231212
 
 
-def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None) -> Reader:
+def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None) -> ShadedReader:
     """Filtered parameters, shaded: by ``decoder``, or by the analytic model."""
     decoder = decoder or Decoder()
 
@@ -42,7 +42,7 @@ def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None)
     return read
 
 
-class Evaluation:
+class ShadedEvaluation:
     """
     Images of a material, at most ``side`` texels wide and high, of ``levels`` levels of detail, level 0 the first, for
     ``pairs`` of a view and a light. Each shows another part of the material, and its pixels are those of a level, but
@@ -70,9 +70,9 @@ class Evaluation:
         self.origins = np.floor(rng.random(shifts.shape) * (spare[:, None] + 1)).clip(0, spare[:, None]) + shifts
         self.truths = {letter: [self._truth(TRUTHS[letter], i) for i in range(self.levels)] for letter in truths}
 
-    def another(self) -> Evaluation:
+    def another(self) -> ShadedEvaluation:
         """Images of the same form and number under other views and lights, with the converged truth alone."""
-        return Evaluation(self.pyramid, self.effects, *self.form, "C", stream=1)
+        return ShadedEvaluation(self.pyramid, self.effects, *self.form, "C", stream=1)
 
     def _lanes(self, level: int, pairs=None) -> tuple:
         """``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""
@@ -96,13 +96,13 @@ class Evaluation:
         side = int(np.clip(PER_TEXEL << level, KINDS[kind], LARGEST)) if kind == "converged" else KINDS[kind]
         return _image(reference(kind, self.pyramid, *lanes, self.effects, side=side), shape)
 
-    def images(self, read: Reader, level: int, pairs=None) -> np.ndarray:
+    def images(self, read: ShadedReader, level: int, pairs=None) -> np.ndarray:
         """What a reader shows at a level, ``(pairs, rows, columns, 3)``, linear; all pairs unless some are named."""
         lanes, shape = self._lanes(level, pairs)
         with dr.suspend_grad():
             return _image(read(*lanes), shape)
 
-    def measure(self, read: Reader, flip: bool = True) -> dict[str, dict]:
+    def measure(self, read: ShadedReader, flip: bool = True) -> dict[str, dict]:
         """
         For each truth ``psnr_db``, of values clipped to [0, 1], at each level; ``mean_db``, their mean; ``coarse_db``,
         their mean from level 2 on; ``flip``, the mean FLIP of the images as displayed, at each level of 16 pixels or

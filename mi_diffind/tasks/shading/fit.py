@@ -12,17 +12,17 @@ from ...maps.arguments import asked_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ...tables import MAX_BYTES, Table
-from ...task import Fitted, Request
+from ...task import FitRequest, Fitted
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
 from ..texture import training as textures
 from ..texture.presets import PRESETS as TEXTURES
 from . import material, training
-from .evaluation import Evaluation
-from .presets import PRESETS, Recipe
+from .evaluation import ShadedEvaluation
+from .presets import PRESETS, ShadingRecipe
 
 
-def recipe_of(preset: str, settings, options) -> Recipe:
+def recipe_of(preset: str, settings, options) -> ShadingRecipe:
     """The recipe of a preset with what the options change."""
     own = PRESETS[preset]
     given = {"share": options["share"], "reference": options["reference"]}
@@ -36,7 +36,7 @@ def recipe_of(preset: str, settings, options) -> Recipe:
 PAIRS, SIDE = 32, 48
 
 
-def check(request: Request) -> None:
+def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     if options["source"] is None:
@@ -47,7 +47,7 @@ def check(request: Request) -> None:
         raise UsageError("--start: the arrays have their size, leave out --compression, --bytes and --bpp")
 
 
-def fit(request: Request) -> Fitted:
+def fit(request: FitRequest) -> Fitted:
     """
     Train as a texture, unless arrays are given that were, then for shading, and measure. With a time, half of it goes
     to each. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
@@ -71,7 +71,7 @@ def fit(request: Request) -> Fitted:
         own = dataclasses.replace(request, seconds=seconds if result is None or seconds is None else seconds / 2)
         if own.resume and not os.path.exists(own.checkpoint or ""):
             own.resume = False  # it was the training as a texture that was interrupted
-        evaluation = Evaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
+        evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
         preview = preview_of(request)
         try:
             net = training.start_of(start, pyramid)
@@ -98,14 +98,14 @@ def fit(request: Request) -> Fitted:
     return Fitted(table, result, lines, figures)
 
 
-def preview_of(request: Request) -> Path | None:
+def preview_of(request: FitRequest) -> Path | None:
     """The picture that is written on the way: beside the output, unless it was named."""
     if request.options["preview"] is not None:
         return Path(request.options["preview"])
     return None if request.output is None else request.output.with_name(f"{request.output.stem}_preview.png")
 
 
-def started(path, source, request: Request) -> Table:
+def started(path, source, request: FitRequest) -> Table:
     """A texture's file to start from. Raises :class:`UsageError` if it is of another source."""
     table = TEXTURE.load(path)
     if table.settings.get("source", source.digest) != source.digest:
@@ -113,7 +113,7 @@ def started(path, source, request: Request) -> Table:
     return table
 
 
-def pretrained(source, pyramid: Pyramid, recipe: Recipe, request: Request) -> tuple:
+def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequest) -> tuple:
     """A training as a texture alone, with a checkpoint of its own: its table, and its record."""
     own = TEXTURES[recipe.texture]
     settings = dataclasses.replace(own.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic)

@@ -37,7 +37,7 @@ READ = {"albedo": (1, 3), "normal": (3,), "roughness": (1,), "metallic": (1,)}
 
 
 @dataclass
-class Surface:
+class SurfaceParameters:
     """
     The material at a place: ``albedo``, a linear colour; ``normal``, of any length, in the frame of the surface;
     ``roughness`` and ``metallic``. What no map has is a number, and the normal ``None``.
@@ -53,14 +53,14 @@ def maps_of(layout: Layout) -> dict[str, MapLayout]:
     """The maps that shading reads, by their kind. Raises :class:`UsageError` if it cannot read them."""
     found = {}
     for m in layout.maps:
-        if m.kind not in READ:
+        if m.role not in READ:
             continue
-        if m.kind in found:
-            raise UsageError(f'map "{m.name}": found a second {m.kind} beside "{found[m.kind].name}", one is allowed')
-        if m.channels not in READ[m.kind]:
-            allowed = " or ".join(map(str, READ[m.kind]))
-            raise UsageError(f'map "{m.name}": found {m.channels} channels, allowed for {m.kind} are {allowed}')
-        found[m.kind] = m
+        if m.role in found:
+            raise UsageError(f'map "{m.name}": found a second {m.role} beside "{found[m.role].name}", one is allowed')
+        if m.channels not in READ[m.role]:
+            allowed = " or ".join(map(str, READ[m.role]))
+            raise UsageError(f'map "{m.name}": found {m.channels} channels, allowed for {m.role} are {allowed}')
+        found[m.role] = m
     if not found:
         raise UsageError(f"source: found no map that shading reads, these are {', '.join(READ)}")
     return found
@@ -69,7 +69,7 @@ def maps_of(layout: Layout) -> dict[str, MapLayout]:
 def left_out(layout: Layout) -> dict[str, str]:
     """Map → why it is not shaded."""
     reason = "the BRDF has no such parameter, its loss is that of a texture"
-    return {m.name: reason for m in layout.maps if m.kind not in READ}
+    return {m.name: reason for m in layout.maps if m.role not in READ}
 
 
 def effects_of(layout: Layout) -> tuple[Effects, dict[str, str]]:
@@ -102,7 +102,7 @@ def _linear(v):
     return dr.select(v <= 0.04045, v / 12.92, root**2.4)
 
 
-def surface_of(maps: FilteredMaps, stored: list) -> Surface:
+def surface_of(maps: FilteredMaps, stored: list) -> SurfaceParameters:
     """The material at places of which ``stored`` are the stored channels."""
     found = maps_of(maps.layout)
     read = maps.maps(stored, [m.name for m in found.values()])
@@ -121,14 +121,14 @@ def surface_of(maps: FilteredMaps, stored: list) -> Surface:
         signed = found["normal"].low < 0
         normal = vector(normal) if signed else 2 * vector(normal) - 1
     one = {kind: channels[kind][0] if kind in channels else DEFAULTS[kind] for kind in ("roughness", "metallic")}
-    return Surface(vector(albedo), normal, **one)
+    return SurfaceParameters(vector(albedo), normal, **one)
 
 
 #: The colour of a material without an albedo, as the plugin ``disney`` has it.
 DEFAULT_ALBEDO = 0.5
 
 
-def shaded(decoder: Decoder | None, surface: Surface, wi, wo, effects: Effects, limit: float | None = None):
+def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects: Effects, limit: float | None = None):
     """
     π · BRDF · cosine, a colour, from ``decoder`` (``None``: straight from the formulas). ``limit``: bound of the
     derivatives that flow back through the specular lobe, which has no other (:mod:`.clip`).

@@ -12,7 +12,7 @@ REFERENCES = ("jittered", "prefiltered", "converged")
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ShadingRecipe:
     """
     How a texture is trained for its shading, from arrays that were trained as a texture before.
 
@@ -38,8 +38,8 @@ _OURS = FitSettings(steps=STEPS, batch=2**16, lr=2e-3, schedule="cosine", loss="
 
 #: The first is the default. The paper's λ is 0.1 or 0.25, by its scene.
 PRESETS = {
-    "ours": Recipe(settings=_OURS),
-    "paper": Recipe(
+    "ours": ShadingRecipe(settings=_OURS),
+    "paper": ShadingRecipe(
         share=0.25, clip=0.1, reference="prefiltered", bounded=False, texture="paper",
         settings=dataclasses.replace(_OURS, lr=1e-3, schedule="constant", loss="mae"),
     ),

@@ -8,7 +8,7 @@ import numpy as np
 
 from ... import metrics
 from ...files import replacing
-from .evaluation import Evaluation, Reader
+from .evaluation import ShadedEvaluation, ShadedReader
 
 #: Levels that are shown, and how often a difference is amplified.
 LEVELS, AMPLIFIED = (0, 2, 4), 4
@@ -20,7 +20,7 @@ BRIGHTNESS = 0.3
 PANEL = 192
 
 
-def write_preview(path: Path, evaluation: Evaluation, read: Reader) -> None:
+def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) -> None:
     """
     Write a picture of one view and light, under which the material is neither dark nor glaring: for each of
     :data:`LEVELS` a row, and in it the truth, what a reader shows, and their difference, amplified, as displayed.

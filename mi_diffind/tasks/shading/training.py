@@ -19,15 +19,15 @@ from ...indirection import unfolded
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from ..disney.training import random_directions
 from ..texture import training as textures
 from ..texture.compressed import CompressedTexture, to_table
 from ..texture.presets import PRESETS as TEXTURES
 from .evaluation import TRUTHS as LETTERS
-from .evaluation import Evaluation, reader
+from .evaluation import ShadedEvaluation, reader
 from .material import effects_of, frozen_decoder, shaded, surface_of
-from .presets import Recipe
+from .presets import ShadingRecipe
 from .preview import write_preview
 from .reference import reference
 
@@ -44,7 +44,9 @@ class ShadingProblem(textures.TextureProblem):
     #: dB of shaded images.
     tolerance = 0.02
 
-    def __init__(self, net, pyramid: Pyramid, recipe: Recipe, digest: str = "", evaluation: Evaluation | None = None):
+    def __init__(
+        self, net, pyramid: Pyramid, recipe: ShadingRecipe, digest: str = "", evaluation: ShadedEvaluation | None = None
+    ):
         super().__init__(net, pyramid, TEXTURES[recipe.texture], digest)
         self.shading, self.evaluation = recipe, evaluation
         self.preview: Path | None = None
@@ -123,10 +125,10 @@ def start_of(table: Table, pyramid: Pyramid):
 def fit_shading(
     source: Source,
     start,
-    recipe: Recipe,
-    request: Request,
+    recipe: ShadingRecipe,
+    request: FitRequest,
     pyramid: Pyramid,
-    evaluation: Evaluation | None = None,
+    evaluation: ShadedEvaluation | None = None,
     preview: Path | None = None,
 ) -> tuple[Table, FitResult]:
     """
@@ -142,7 +144,7 @@ def fit_shading(
     problem.preview = preview
     result = request.train(problem, "shading")
     kept = any(before[name] > result.measured[name] for name in list(before)[:1])
-    identity = {k: v for k, v in problem.identity.items() if k not in ("form", "border")}
+    identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
     settings = {**request.recorded(), **identity}
     if request.seconds is not None:
         settings["steps"] = result.steps

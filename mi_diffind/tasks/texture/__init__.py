@@ -16,7 +16,7 @@ import dataclasses
 
 from ...arguments import Argument, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
-from ...task import Request, Task
+from ...task import FitRequest, Task
 from .presets import PRESETS
 
 
@@ -79,12 +79,12 @@ class Texture(Task):
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
 
-    def check(self, request: Request) -> None:
+    def check(self, request: FitRequest) -> None:
         from .fit import check
 
         check(request)
 
-    def fit(self, request: Request):
+    def fit(self, request: FitRequest):
         from .fit import fit
 
         return fit(request)

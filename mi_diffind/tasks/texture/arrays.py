@@ -15,8 +15,8 @@ from ...maps import components
 from ...maps.compressed import taps
 from ...maps.layout import Layout
 from ...pages import PagedArray, page_entries, page_gain, page_positions, page_shift, page_sizes_of
-from .memory_budget import PaperSize, Size
-from .nets import Layer, LayeredForm, LayeredNet, PaperForm, PaperNet
+from .memory_budget import PaperBudget, TextureBudget
+from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
 #: Of the differences of two levels, by bits of an entry (8: and more): the share that lies within its range.
 WITHIN = {1: 0.7, 2: 0.97, 3: 0.99, 4: 0.998, 5: 0.998, 6: 0.998, 7: 0.998, 8: 0.998}
@@ -25,17 +25,17 @@ WITHIN = {1: 0.7, 2: 0.97, 3: 0.99, 4: 0.998, 5: 0.998, 6: 0.998, 7: 0.998, 8: 0
 SMALLEST = 0.02
 
 
-def from_ramps(layout: Layout, size: PaperSize, border: tuple[str, str], levels: int, axis: str) -> PaperNet:
+def from_ramps(layout: Layout, size: PaperBudget, border: tuple[str, str], levels: int, axis: str) -> PaperNet:
     """The supplement's initial values; not allocated."""
     primary0 = DifferentiableArray((size.rows, size.columns), 3, "ramp", fold=True, border=border)
     primary1 = DifferentiableArray((4 * size.lods,), 1, "ramp", fold=True)
     shape = (size.lods, *[size.cascaded] * 3)
     cascaded = DifferentiableArray(shape, layout.stored, "constant", layout.initial, fold=True)
-    return PaperNet(primary0, primary1, cascaded, PaperForm(levels, axis))
+    return PaperNet(primary0, primary1, cascaded, PaperStructure(levels, axis))
 
 
 @dataclass(frozen=True)
-class Components:
+class PrincipalComponents:
     """
     The principal components of a texture, as pointers of its texels: ``mean`` (``(k,)``) and ``directions`` (``(dims,
     k)``) of the channels, those with the most differences between neighbours first, and ``low`` and ``high``, the range
@@ -51,7 +51,7 @@ class Components:
     MARGIN, OUTSIDE = 0.02, 1e-3
 
     @staticmethod
-    def of(values: np.ndarray, dims: int) -> Components:
+    def of(values: np.ndarray, dims: int) -> PrincipalComponents:
         """Of level 0, ``(height, width, k)``: ``dims`` of them, if there are so many."""
         k = values.shape[-1]
         mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
@@ -61,8 +61,8 @@ class Components:
         detail = directions @ components.differences(values) @ directions.T
         directions = components.strongest(detail, len(directions)) @ directions
         found = (values.reshape(-1, k) - mean) @ directions.T
-        low, high = np.quantile(found, [Components.OUTSIDE, 1 - Components.OUTSIDE], axis=0)
-        return Components(mean, directions, low, np.maximum(high, low + 1e-3))
+        low, high = np.quantile(found, [PrincipalComponents.OUTSIDE, 1 - PrincipalComponents.OUTSIDE], axis=0)
+        return PrincipalComponents(mean, directions, low, np.maximum(high, low + 1e-3))
 
     @property
     def dims(self) -> int:
@@ -96,13 +96,13 @@ def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str])
     return values.astype(np.float32)
 
 
-def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str, str]) -> LayeredNet:
+def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> LayeredNet:
     """
     Initial values from the levels ``values`` of a texture, each ``(height, width, k)`` in [0, 1]; not allocated. From
     the coarsest fine array on each holds the difference between the components of its level and what the coarser ones
     say of them.
     """
-    found = Components.of(values[0], size.dims)
+    found = PrincipalComponents.of(values[0], size.dims)
     # A texture has no more components than channels: further coordinates start as ramps along u or v
     pointers = [
         np.concatenate([found.pointers(level), _ramps(*level.shape[:2], size.dims - found.dims)], axis=-1)
@@ -119,13 +119,13 @@ def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str,
         until = (size.fine[i + 1].level if i + 1 < len(size.fine) else size.skip) - 1
         if size.base and i + 1 == len(size.fine):
             reached = np.clip(pointers[level], 1e-3, 1 - 1e-3)
-            layers.insert(0, Layer(level, until, wanted.bits, (1.0,) * wanted.channels))
+            layers.insert(0, FineLayer(level, until, wanted.bits, (1.0,) * wanted.channels))
             fine.insert(0, DifferentiableArray((rows, columns), size.dims, reached, fold=True, border=border))
             continue
         rest = (pointers[level] - reached)[..., : wanted.channels]
         within = np.quantile(np.abs(rest).reshape(-1, wanted.channels), WITHIN[wanted.bits], axis=0)
         scale = np.maximum(2 * within, SMALLEST)
-        layer = Layer(level, until, wanted.bits, tuple(float(f"{s:.6g}") for s in scale))
+        layer = FineLayer(level, until, wanted.bits, tuple(float(f"{s:.6g}") for s in scale))
         entries = np.clip(rest / np.array(layer.scale) + layer.zero, 0, 1).astype(np.float32)
         layers.insert(0, layer)
         fine.insert(0, DifferentiableArray((rows, columns), wanted.channels, entries, fold=True, border=border))
@@ -138,11 +138,11 @@ def from_components(values: Sequence[np.ndarray], size: Size, border: tuple[str,
     back = back.reshape(*back.shape[:-1], *[1] * (size.dims - found.dims), back.shape[-1])
     cascaded = np.broadcast_to(back, (*shape, size.channels)).astype(np.float32)
     cascaded = DifferentiableArray(shape, size.channels, cascaded, fold=True)
-    form = LayeredForm(size.height, size.width, tuple(layers), size.skip, size.bits, size.base)
-    return LayeredNet(fine, coarse, cascaded, form, border)
+    structure = LayeredStructure(size.height, size.width, tuple(layers), size.skip, size.bits, size.base)
+    return LayeredNet(fine, coarse, cascaded, structure, border)
 
 
-def _pages(pointers: list, found: Components, size: Size, border) -> tuple[list, list]:
+def _pages(pointers: list, found: PrincipalComponents, size: TextureBudget, border) -> tuple[list, list]:
     """The layers of pages, and their arrays."""
     if not size.pages:
         return [], []
@@ -157,14 +157,14 @@ def _pages(pointers: list, found: Components, size: Size, border) -> tuple[list,
         entries = np.clip(page_entries(values[..., :used].astype(np.float32), border, sizes), 0, 1)
         further = page_positions(sizes, shift)[:, [j % 2 for j in range(size.dims - used)]]
         entries = np.concatenate([entries, further], axis=-1).astype(np.float32)
-        layers.append(Layer(level, end - 1, size.page_bits, (1.0,) * size.dims, True))
+        layers.append(FineLayer(level, end - 1, size.page_bits, (1.0,) * size.dims, True))
         fine.append(PagedArray(sizes, size.dims, entries, shift, fold=True, border=border))
     return layers, fine
 
 
-def gain_of_pages(values: Sequence[np.ndarray], size: Size, border: tuple[str, str]) -> float:
+def gain_of_pages(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> float:
     """What pages gain over one grid of as many bytes at level 0, in dB: :func:`~mi_diffind.pages.page_gain`."""
-    found = Components.of(values[0], size.dims)
+    found = PrincipalComponents.of(values[0], size.dims)
     flat = values[0].reshape(-1, values[0].shape[-1]) - found.mean
     exact = flat @ found.directions.T
     rest = float(np.mean(flat**2, axis=0).sum() - np.mean(exact**2, axis=0).sum())

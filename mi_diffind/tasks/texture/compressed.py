@@ -18,7 +18,7 @@ from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
 from ...pages import page_counts, page_shift
 from ...tables import PAGES, Table, TableError, allocate_pages, load_table, page_sides, stored_arrays
-from .nets import Layer, LayeredForm, LayeredNet, PaperForm, PaperNet, coarse_texels, types_of
+from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure, coarse_texels, types_of
 from .sampling import AXES
 
 
@@ -118,7 +118,7 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     The arrays of a checked table for the tensor type ``dtype``: as bytes, if it has them as bytes, which can be read
     only; with the ``storage`` ``"float32"``, as floats that pass through the fold, which can be optimised.
     """
-    form = "uint8" if storage != "float32" and table.storage == "uint8" else "float32"
+    entry_type = "uint8" if storage != "float32" and table.storage == "uint8" else "float32"
     found = {}
     for name, array in table.arrays.items():
         pages = table.arrays.get(name + PAGES)
@@ -126,9 +126,9 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
             layout = Layout.from_json(table.settings["layout"])
             sizes = level_sizes(layout.height, layout.width)
             shift = page_shift(sizes[int(name.removeprefix("level"))])
-            found[name] = allocate_pages(array, pages, dtype, shift, form, fold=True)
+            found[name] = allocate_pages(array, pages, dtype, shift, entry_type, fold=True)
         elif not name.endswith(PAGES):
-            found[name] = array.allocate(dtype, form, fold=True)
+            found[name] = array.allocate(dtype, entry_type, fold=True)
     return found
 
 
@@ -137,11 +137,11 @@ def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> Compresse
     layout = Layout.from_json(table.settings["layout"])
     if not arrays:
         return CompressedTexture(layout, None)
-    form, border = form_of(table.settings, layout)
-    if isinstance(form, PaperForm):
-        return CompressedTexture(layout, PaperNet(*(arrays[name] for name in PAPER), form))
-    fine = [arrays[f"level{layer.level}"] for layer in form.layers]
-    return CompressedTexture(layout, LayeredNet(fine, arrays["coarse"], arrays["cascaded"], form, border))
+    structure, border = structure_of(table.settings, layout)
+    if isinstance(structure, PaperStructure):
+        return CompressedTexture(layout, PaperNet(*(arrays[name] for name in PAPER), structure))
+    fine = [arrays[f"level{layer.level}"] for layer in structure.layers]
+    return CompressedTexture(layout, LayeredNet(fine, arrays["coarse"], arrays["cascaded"], structure, border))
 
 
 #: Names of the paper's arrays.
@@ -155,22 +155,22 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
         stored |= stored_arrays(name, array)
     settings = {**settings, "layout": texture.layout.to_json()}
     if texture.net is not None:
-        form = texture.net.form
-        if isinstance(form, PaperForm):
-            settings["arrays"] = {"kind": "paper", "axis": form.axis}
+        structure = texture.net.structure
+        if isinstance(structure, PaperStructure):
+            settings["arrays"] = {"kind": "paper", "axis": structure.axis}
         else:
             layers = [
                 {"level": x.level, "until": x.until, "bits": x.bits, "scale": list(x.scale), "paged": x.paged}
-                for x in form.layers
+                for x in structure.layers
             ]
             settings["arrays"] = {
-                "kind": "layers", "skip": form.skip, "bits": form.bits, "base": form.base,
+                "kind": "layers", "skip": structure.skip, "bits": structure.bits, "base": structure.base,
                 "border": list(texture.border), "layers": layers,
             }  # fmt: skip
     return Table("texture", stored, settings=settings)
 
 
-def form_of(settings: dict, layout: Layout):
+def structure_of(settings: dict, layout: Layout):
     """
     What the settings of a file say about its arrays, and the border along v and u. Raises ``KeyError``, ``TypeError``
     or ``ValueError`` for anything else.
@@ -179,7 +179,7 @@ def form_of(settings: dict, layout: Layout):
     if found["kind"] == "paper":
         if found["axis"] not in AXES:
             raise ValueError(f"footprints measure {found['axis']!r}")
-        return PaperForm(levels, found["axis"]), None
+        return PaperStructure(levels, found["axis"]), None
     if found["kind"] != "layers":
         raise ValueError(f"arrays of the kind {found['kind']!r:.40}")
     skip, bits, border = int(found["skip"]), int(found["bits"]), tuple(found["border"])
@@ -188,7 +188,7 @@ def form_of(settings: dict, layout: Layout):
     layers, last = [], -1
     for entry in found["layers"]:
         scale, paged = tuple(map(float, entry["scale"])), bool(entry["paged"])
-        layer = Layer(int(entry["level"]), int(entry["until"]), int(entry["bits"]), scale, paged)
+        layer = FineLayer(int(entry["level"]), int(entry["until"]), int(entry["bits"]), scale, paged)
         if not last < layer.level <= layer.until < skip or not 1 <= layer.bits <= 8:
             raise ValueError("the fine arrays are of no levels that there are")
         if not layer.scale or not all(math.isfinite(s) and 0 < s <= 4 for s in layer.scale):
@@ -198,45 +198,55 @@ def form_of(settings: dict, layout: Layout):
     base = bool(found["base"])
     if base and not layers:
         raise ValueError("there is no fine array that could hold pointers")
-    return LayeredForm(layout.height, layout.width, tuple(layers), skip, bits, base), border
+    return LayeredStructure(layout.height, layout.width, tuple(layers), skip, bits, base), border
 
 
 def load(path: str | os.PathLike) -> Table:
     """Read and check a table file of this task. Raises :class:`~mi_diffind.tables.TableError`."""
     table = load_table(path, "texture")
-    form = border = None
+    structure = border = None
     try:
         layout = Layout.from_json(table.settings["layout"])
         if layout.stored:
-            form, border = form_of(table.settings, layout)
+            structure, border = structure_of(table.settings, layout)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
         raise TableError(f"{path}: its settings describe no texture ({e})") from None
-    pages = [] if not isinstance(form, LayeredForm) else [f"level{x.level}{PAGES}" for x in form.layers if x.paged]
+    pages = (
+        []
+        if not isinstance(structure, LayeredStructure)
+        else [f"level{x.level}{PAGES}" for x in structure.layers if x.paged]
+    )
     shapes = {name: array.shape for name, array in table.arrays.items() if name not in pages}
-    fine = [] if form is None or isinstance(form, PaperForm) else [f"level{layer.level}" for layer in form.layers]
-    expected = [] if form is None else PAPER if isinstance(form, PaperForm) else [*fine, "coarse", "cascaded"]
+    fine = (
+        []
+        if structure is None or isinstance(structure, PaperStructure)
+        else [f"level{layer.level}" for layer in structure.layers]
+    )
+    expected = (
+        [] if structure is None else PAPER if isinstance(structure, PaperStructure) else [*fine, "coarse", "cascaded"]
+    )
     if set(table.arrays) != {*expected, *pages}:
         found, wanted = (", ".join(sorted(names)) or "none" for names in (table.arrays, {*expected, *pages}))
         raise TableError(f"{path}: holds the arrays {found}, expected {wanted}")
-    if form is None:
+    if structure is None:
         return table
-    if isinstance(form, PaperForm):
+    if isinstance(structure, PaperStructure):
         wanted = {"primary0": (None, None, 3), "primary1": (None, 1), "cascaded": (None,) * 4 + (layout.stored,)}
     else:
         dims = shapes["coarse"][-1]
         axes = len(shapes["cascaded"]) - 1
         wanted = {
             **{
-                n: (_entries(table, n, form.sizes[x.level], border), x.channels)
+                n: (_entries(table, n, structure.sizes[x.level], border), x.channels)
                 if x.paged
-                else (*form.sizes[x.level], x.channels)
-                for n, x in zip(fine, form.layers, strict=True)
+                else (*structure.sizes[x.level], x.channels)
+                for n, x in zip(fine, structure.layers, strict=True)
             },
-            "coarse": (coarse_texels(form), dims),
-            "cascaded": (form.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,),
+            "coarse": (coarse_texels(structure), dims),
+            "cascaded": (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,),
         }
-        for x in form.layers:
-            if x.channels != dims and form.is_pointer(x):
+        for x in structure.layers:
+            if x.channels != dims and structure.is_pointer(x):
                 raise TableError(f"{path}: has a fine array that holds pointers of {x.channels} of {dims} coordinates")
             if x.channels > dims:
                 raise TableError(f"{path}: has a fine array with more channels than the {dims} of its pointers")
@@ -250,7 +260,7 @@ def load(path: str | os.PathLike) -> Table:
             raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
         if name in fine and name + PAGES not in pages and array.border != border:
             raise TableError(f'{path}: array "{name}" has the borders {array.border}, expected {border}')
-        if name in fine and array.storage == "uint8" and array.bits != form.layers[fine.index(name)].bits:
+        if name in fine and array.storage == "uint8" and array.bits != structure.layers[fine.index(name)].bits:
             raise TableError(f'{path}: array "{name}" has {array.bits} bits an entry, which its settings deny')
     return table
 

@@ -12,22 +12,22 @@ from ...maps.arguments import asked_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from ...tables import MAX_BYTES
-from ...task import Fitted, Request
+from ...task import FitRequest, Fitted
 from . import arrays, memory_budget, training
-from .presets import PRESETS, Recipe
+from .presets import PRESETS, TextureRecipe
 
 #: dB of :func:`~mi_diffind.maps.components.smoothness` from which on a texture is smooth.
 SMOOTH_DB = 30.0
 
 
-def recipe_of(preset: str, settings, options) -> Recipe:
+def recipe_of(preset: str, settings, options) -> TextureRecipe:
     """The recipe of a preset with what the options change."""
     recipe = dataclasses.replace(PRESETS[preset], settings=settings or PRESETS[preset].settings)
     given = {"samples": options["footprint_samples"], "axis": options["axis"]}
     return dataclasses.replace(recipe, **{k: v for k, v in given.items() if v is not None})
 
 
-def check(request: Request) -> None:
+def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that do not go together."""
     options = request.options
     if options["source"] is None:
@@ -48,7 +48,7 @@ def check(request: Request) -> None:
         options["skip"] = fine[-1].level + 1
 
 
-def fit(request: Request) -> Fitted:
+def fit(request: FitRequest) -> Fitted:
     """
     Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
     :class:`~mi_diffind.fitting.FittingError`.
@@ -80,7 +80,7 @@ def fit(request: Request) -> Fitted:
     return Fitted(table, result, lines, figures)
 
 
-def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: Recipe, options):
+def size_of(source: Source, pyramid: Pyramid, nbytes: float, recipe: TextureRecipe, options):
     """The size of the arrays for so many bytes. Raises :class:`UsageError`."""
     layout = pyramid.layout
     if not recipe.layered:

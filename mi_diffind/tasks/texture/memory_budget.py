@@ -56,7 +56,7 @@ def ratio(compression: float, channels: int) -> float:
 
 
 @dataclass(frozen=True)
-class PaperSize:
+class PaperBudget:
     """Resolutions of the paper's arrays: ``rows`` × ``columns`` of primary 0, and the sides of the cascaded array."""
 
     rows: int
@@ -70,7 +70,7 @@ class PaperSize:
         return paper_bytes(self.rows * self.columns, self.lods, self.cascaded, self.channels)
 
 
-def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, width: int) -> PaperSize:
+def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, width: int) -> PaperBudget:
     """
     The paper's linear search: of all sides ``N_c`` = 4, 8, … the one whose bytes are nearest to what is wanted, as a
     ratio to ``source_bytes``, with ``N_p0 = ρ N_c`` in multiples of 8 and no larger than the image. If that is more
@@ -82,7 +82,7 @@ def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, wid
     while True:
         cascaded += CASCADED_STEP
         side = PRIMARY_STEP * max(1, round(rho * cascaded / PRIMARY_STEP))
-        size = PaperSize(*_spread(side**2, height, width), lods, cascaded, channels)
+        size = PaperBudget(*_spread(side**2, height, width), lods, cascaded, channels)
         if abs(source_bytes / size.nbytes - wanted) < distance:
             best, distance = size, abs(source_bytes / size.nbytes - wanted)
         if size.nbytes >= nbytes:  # more only lead away
@@ -93,7 +93,7 @@ def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, wid
     while cascaded > CASCADED_STEP and channels * cascaded**3 * lods > nbytes / 2:
         cascaded -= CASCADED_STEP
     entries = (nbytes - paper_bytes(0, lods, cascaded, channels)) / 3
-    return PaperSize(*_spread(max(1, entries), height, width), lods, cascaded, channels)
+    return PaperBudget(*_spread(max(1, entries), height, width), lods, cascaded, channels)
 
 
 def _spread(entries: float, height: int, width: int) -> tuple[int, int]:
@@ -109,7 +109,7 @@ def _spread(entries: float, height: int, width: int) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class Fine:
+class FineArray:
     """A fine array: the ``level`` whose grid it is on, and how many ``channels`` of how many ``bits``."""
 
     level: int
@@ -122,7 +122,7 @@ class Fine:
 
 
 @dataclass(frozen=True)
-class Size:
+class TextureBudget:
     """
     Resolutions of our arrays: the ``fine`` ones, the finest first; the level ``skip`` from which on all levels have
     pointers of their own, with ``dims`` coordinates of ``bits``; and the side of the ``cascaded`` array, of
@@ -133,7 +133,7 @@ class Size:
     height: int
     width: int
     channels: int
-    fine: tuple[Fine, ...]
+    fine: tuple[FineArray, ...]
     skip: int
     dims: int
     cascaded: int
@@ -175,14 +175,14 @@ class Size:
         return int((self.page_bytes - index) * 8 / (self.page_bits * self.dims))
 
 
-def parse_structure(text: str) -> tuple[Fine, ...]:
+def parse_structure(text: str) -> tuple[FineArray, ...]:
     """
     Fine arrays from ``LEVEL:CHANNELS:BITS`` of each, separated by commas, such as ``0:1:2,1:2:4``. Raises
     ``ValueError``.
     """
     if not re.fullmatch(r"\d+:\d+:\d+(,\d+:\d+:\d+)*", text, re.ASCII):
         raise ValueError(f'{text!r} is no structure, expected LEVEL:CHANNELS:BITS,… such as "0:1:2,1:2:4", or "auto"')
-    fine = tuple(Fine(*map(int, part.split(":"))) for part in text.split(","))
+    fine = tuple(FineArray(*map(int, part.split(":"))) for part in text.split(","))
     if [f.level for f in fine] != sorted({f.level for f in fine}):
         raise ValueError(f"{text!r}: levels have to grow, one array each")
     return fine
@@ -231,10 +231,10 @@ def choose(
     channels: int,
     nbytes: float,
     skip: int | None = None,
-    fine: tuple[Fine, ...] | None = None,
+    fine: tuple[FineArray, ...] | None = None,
     cascaded: int | None = None,
     smooth: bool = False,
-) -> Size:
+) -> TextureBudget:
     """
     Our size for a texture of so many stored channels and so many bytes, some of it given unless ``None``: the structure
     of :data:`LADDER` (for a ``smooth`` texture of :data:`SMOOTH_LADDER`) with the most bytes that fit, on coarser
@@ -262,7 +262,7 @@ PAGES, PAGES_SKIP, FEWEST = (0, 2), 4, 3
 PAGES_CASCADED, PAGES_SIDE = 0.06, 12
 
 
-def paged(height: int, width: int, channels: int, nbytes: float, cascaded: int | None = None) -> Size | None:
+def paged(height: int, width: int, channels: int, nbytes: float, cascaded: int | None = None) -> TextureBudget | None:
     """
     A size whose fine arrays consist of pages, for so many bytes; ``None`` if the texture is too small, or the bytes are
     too few or too many for that.
@@ -274,13 +274,13 @@ def paged(height: int, width: int, channels: int, nbytes: float, cascaded: int |
     side = int((PAGES_CASCADED * nbytes / (channels * knots)) ** (1 / dims) + 1e-9)
     side = cascaded or min(max(4, side), PAGES_SIDE)
     bits = 6 if channels > dims else 5
-    size = Size(height, width, channels, (), PAGES_SKIP, dims, side, knots, 8, PAGES, 0, bits)
+    size = TextureBudget(height, width, channels, (), PAGES_SKIP, dims, side, knots, 8, PAGES, 0, bits)
     size = replace(size, page_bytes=max(0, int(nbytes) - size.nbytes))
     fewest = FEWEST * sum(math.prod(page_counts(sizes[level])) for level in PAGES)
     return size if fewest <= size.page_entries <= most_entries(2) else None
 
 
-def _structures(height: int, width: int, dims: int, skip: int | None, fine: tuple[Fine, ...] | None, ladder):
+def _structures(height: int, width: int, dims: int, skip: int | None, fine: tuple[FineArray, ...] | None, ladder):
     """
     What is tried, the first choice first: groups of structures, each the fine arrays and the level from which on the
     others are. The ladder on the levels themselves, then on coarser ones.
@@ -293,23 +293,23 @@ def _structures(height: int, width: int, dims: int, skip: int | None, fine: tupl
         group = []
         for text, start in ladder:
             start = min(start + shift, last)
-            arrays = [Fine(f.level + shift, min(f.channels, dims), f.bits) for f in parse_structure(text)]
+            arrays = [FineArray(f.level + shift, min(f.channels, dims), f.bits) for f in parse_structure(text)]
             if skip in (None, start):
                 group.append((tuple(f for f in arrays if f.level < start), start))
         yield group
     yield [((), last if skip is None else skip)]
 
 
-def _without(size: Size, channels: int) -> int:
+def _without(size: TextureBudget, channels: int) -> int:
     """Bytes of all but the cascaded array."""
     return size.nbytes - channels * size.knots * size.cascaded**size.dims
 
 
-def _sized(nbytes, height, width, channels, fine, skip, dims, cascaded) -> Size:
+def _sized(nbytes, height, width, channels, fine, skip, dims, cascaded) -> TextureBudget:
     """With the largest cascaded array that is left room for, and no small one, unless its side is given."""
 
-    def sized(side: int) -> Size:
-        return Size(height, width, channels, fine, skip, dims, side, skip + 1)
+    def sized(side: int) -> TextureBudget:
+        return TextureBudget(height, width, channels, fine, skip, dims, side, skip + 1)
 
     if cascaded is not None:
         return sized(cascaded)

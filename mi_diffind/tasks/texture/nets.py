@@ -22,7 +22,7 @@ from .sampling import footprint_of
 
 
 @dataclass(frozen=True)
-class PaperForm:
+class PaperStructure:
     """What the paper's arrays do not say themselves: the ``levels`` of the texture, and what footprints measure."""
 
     levels: int
@@ -39,11 +39,11 @@ class PaperNet(nn.Module):
         "primary0": DifferentiableArray,
         "primary1": DifferentiableArray,
         "cascaded": DifferentiableArray,
-        "form": object,
+        "structure": object,
     }
 
-    def __init__(self, primary0=None, primary1=None, cascaded=None, form: PaperForm | None = None):
-        self.primary0, self.primary1, self.cascaded, self.form = primary0, primary1, cascaded, form
+    def __init__(self, primary0=None, primary1=None, cascaded=None, structure: PaperStructure | None = None):
+        self.primary0, self.primary1, self.cascaded, self.structure = primary0, primary1, cascaded, structure
 
     @property
     def arrays(self) -> dict[str, DifferentiableArray]:
@@ -57,7 +57,7 @@ class PaperNet(nn.Module):
 
     def changed(self, change) -> PaperNet:
         """A copy with ``change(array, bits)`` in place of each array."""
-        return PaperNet(*(change(a, 8) for a in self.arrays.values()), self.form)
+        return PaperNet(*(change(a, 8) for a in self.arrays.values()), self.structure)
 
     def at_footprint(self, u, v, x, active=True) -> list:
         """The channels at (u, v) for a footprint in [0, 1]."""
@@ -66,11 +66,11 @@ class PaperNet(nn.Module):
 
     def filtered(self, u, v, level, active=True) -> list:
         """The channels at (u, v) and a level of detail within those that there are."""
-        return self.at_footprint(u, v, footprint_of(level, self.form.axis, self.form.levels), active)
+        return self.at_footprint(u, v, footprint_of(level, self.structure.axis, self.structure.levels), active)
 
     def stored(self, u, v, active=True) -> list:
         """The same at level 0. The footprint's array is not read: it says one number, known when bytes are stored."""
-        array, x = self.primary1, float(footprint_of(0.0, self.form.axis, self.form.levels))
+        array, x = self.primary1, float(footprint_of(0.0, self.structure.axis, self.structure.levels))
         if array.storage == "uint8":
             entries, at = array.numpy()[:, 0], x * (array.resolution[0] - 1)
             lower = min(int(at), len(entries) - 2)
@@ -81,13 +81,13 @@ class PaperNet(nn.Module):
 
 
 @dataclass(frozen=True)
-class Layer:
+class FineLayer:
     """
     A fine array of ours: it has the size of the level of detail ``level``, and what is read of it, less
     :attr:`zero`, times the ``scale`` of each channel, is added to the pointer from the levels below ``until``, and less
     and less from there to ``until + 1``. ``bits`` are those of an entry. One that is ``paged`` consists of pages, whose
-    resolution follows the content, and holds pointers themselves. (Of these, see also :class:`LayeredForm`, ``scale``
-    is 1 and there is no zero.)
+    resolution follows the content, and holds pointers themselves. (Of these, see also :class:`LayeredStructure`,
+    ``scale`` is 1 and there is no zero.)
     """
 
     level: int
@@ -107,7 +107,7 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class LayeredForm:
+class LayeredStructure:
     """
     What our arrays do not say themselves: the size of the texture, the fine ``layers``, the finest first, the level of
     detail ``skip`` from which on each has its own pointers, and the ``bits`` of these. ``base``: the coarsest of the
@@ -116,7 +116,7 @@ class LayeredForm:
 
     height: int
     width: int
-    layers: tuple[Layer, ...]
+    layers: tuple[FineLayer, ...]
     skip: int
     bits: int = 8
     base: bool = False
@@ -126,17 +126,17 @@ class LayeredForm:
         """Rows and columns of all levels."""
         return level_sizes(self.height, self.width)
 
-    def is_pointer(self, layer: Layer) -> bool:
+    def is_pointer(self, layer: FineLayer) -> bool:
         """Does a layer hold pointers, not differences?"""
         return layer.paged or (self.base and layer == self.layers[-1])
 
 
 class LayeredNet(nn.Module):
     """
-    Our arrays. ``coarse`` holds pointers for all texels of the levels from ``form.skip`` on, one level after the other,
+    Our arrays. ``coarse`` holds pointers for all texels of the levels from ``structure.skip`` on, level by level,
     read trilinearly; ``fine`` what the pointers of finer levels differ by, each array on the grid of its level, in few
     bits and not of all channels, or, where it consists of pages, pointers; ``cascaded`` is read at what that makes. Its
-    first axis is the level of detail, one entry a level up to ``form.skip``, if it has one dimension more than
+    first axis is the level of detail, one entry a level up to ``structure.skip``, if it has one dimension more than
     ``coarse`` has channels.
     """
 
@@ -144,18 +144,20 @@ class LayeredNet(nn.Module):
         "fine": tuple,
         "coarse": DifferentiableArray,
         "cascaded": DifferentiableArray,
-        "form": object,
+        "structure": object,
         "along": tuple,
     }
 
-    def __init__(self, fine=(), coarse=None, cascaded=None, form: LayeredForm | None = None, border=("clamp", "clamp")):
-        self.fine, self.coarse, self.cascaded, self.form = tuple(fine), coarse, cascaded, form
+    def __init__(
+        self, fine=(), coarse=None, cascaded=None, structure: LayeredStructure | None = None, border=("clamp", "clamp")
+    ):
+        self.fine, self.coarse, self.cascaded, self.structure = tuple(fine), coarse, cascaded, structure
         self.along = tuple(border)
 
     @property
     def arrays(self) -> dict[str, DifferentiableArray]:
         """The arrays by name, in the order of a file."""
-        fine = {f"level{x.level}": a for x, a in zip(self.form.layers, self.fine, strict=True)}
+        fine = {f"level{x.level}": a for x, a in zip(self.structure.layers, self.fine, strict=True)}
         return {**fine, "coarse": self.coarse, "cascaded": self.cascaded}
 
     @property
@@ -165,31 +167,31 @@ class LayeredNet(nn.Module):
 
     def changed(self, change) -> LayeredNet:
         """A copy with ``change(array, bits)`` in place of each array."""
-        form = self.form
-        fine = [change(a, x.bits) for a, x in zip(self.fine, form.layers, strict=True)]
-        return LayeredNet(fine, change(self.coarse, form.bits), change(self.cascaded, 8), form, self.along)
+        structure = self.structure
+        fine = [change(a, x.bits) for a, x in zip(self.fine, structure.layers, strict=True)]
+        return LayeredNet(fine, change(self.coarse, structure.bits), change(self.cascaded, 8), structure, self.along)
 
     def filtered(self, u, v, level, active=True) -> list:
         """The channels at (u, v) and a level of detail within those that there are."""
-        form, Float = self.form, type(u)
+        structure, Float = self.structure, type(u)
         UInt32 = dr.uint32_array_t(Float)
-        above = dr.maximum(level - form.skip, 0)
+        above = dr.maximum(level - structure.skip, 0)
         lower = dr.floor(above)
         weight = above - dr.detach(lower)
-        index = UInt32(lower) + form.skip
+        index = UInt32(lower) + structure.skip
         pointer = self._coarse(u, v, index, active)
-        upper = self._coarse(u, v, dr.minimum(index + 1, len(form.sizes) - 1), active)
+        upper = self._coarse(u, v, dr.minimum(index + 1, len(structure.sizes) - 1), active)
         pointer = [dr.fma(weight, b - a, a) for a, b in zip(pointer, upper, strict=True)]
-        for x, array in reversed([*zip(form.layers, self.fine, strict=True)]):
+        for x, array in reversed([*zip(structure.layers, self.fine, strict=True)]):
             share = 1 - lookup.clamp(level - x.until, 0.0, 1.0)
             self._add(pointer, x, array, u, v, share, active)
         return self._answer(pointer, level, active)
 
     def stored(self, u, v, active=True) -> list:
         """The same at level 0."""
-        layers = [*zip(self.form.layers, self.fine, strict=True)]
+        layers = [*zip(self.structure.layers, self.fine, strict=True)]
         # What is finer than the finest array that holds pointers, and this one
-        last = next((i for i, (x, _) in enumerate(layers) if self.form.is_pointer(x)), None)
+        last = next((i for i, (x, _) in enumerate(layers) if self.structure.is_pointer(x)), None)
         if last is None:
             pointer = self._coarse(u, v, None, active)
         else:
@@ -202,13 +204,13 @@ class LayeredNet(nn.Module):
 
     def _answer(self, pointer: list, level, active) -> list:
         if self.cascaded.dims > len(pointer):
-            pointer = [lookup.clamp(level * (1 / max(1, self.form.skip)), 0.0, 1.0), *pointer]
+            pointer = [lookup.clamp(level * (1 / max(1, self.structure.skip)), 0.0, 1.0), *pointer]
         return self.cascaded(pointer, active)
 
-    def _add(self, pointer: list, layer: Layer, array: DifferentiableArray, u, v, share, active) -> None:
+    def _add(self, pointer: list, layer: FineLayer, array: DifferentiableArray, u, v, share, active) -> None:
         """Add what a layer says to a pointer, times ``share`` (``None``: 1); pointers take its place."""
         found = array(self._place(array, u, v), active)
-        if self.form.is_pointer(layer):
+        if self.structure.is_pointer(layer):
             for k, value in enumerate(found):
                 pointer[k] = value if share is None else dr.fma(share, value - pointer[k], pointer[k])
             return
@@ -227,16 +229,16 @@ class LayeredNet(nn.Module):
 
     def _coarse(self, u, v, level, active) -> list:
         """The pointer that ``coarse`` has at (u, v) of a level, a whole number for each place; ``None``: the finest."""
-        form, UInt32 = self.form, dr.uint32_array_t(type(u))
-        sizes = form.sizes[form.skip :]
+        structure, UInt32 = self.structure, dr.uint32_array_t(type(u))
+        sizes = structure.sizes[structure.skip :]
         if level is None or len(sizes) == 1:
             (rows, columns), offset = (UInt32(n) for n in sizes[0]), UInt32(0)
         else:
-            rows, columns = (dr.maximum(UInt32(n) >> level, 1) for n in (form.height, form.width))
+            rows, columns = (dr.maximum(UInt32(n) >> level, 1) for n in (structure.height, structure.width))
             offset, start = UInt32(0), 0
             for i, size in enumerate(sizes[:-1]):
                 start += math.prod(size)
-                offset = dr.select(level > form.skip + i, start, offset)
+                offset = dr.select(level > structure.skip + i, start, offset)
         total = None
         for row, a in around(v, rows, self.along[0]):
             for column, b in around(u, columns, self.along[1]):
@@ -249,9 +251,9 @@ class LayeredNet(nn.Module):
         return total
 
 
-def coarse_texels(form: LayeredForm) -> int:
-    """Texels of all levels from ``form.skip`` on."""
-    return sum(math.prod(size) for size in form.sizes[form.skip :])
+def coarse_texels(structure: LayeredStructure) -> int:
+    """Texels of all levels from ``structure.skip`` on."""
+    return sum(math.prod(size) for size in structure.sizes[structure.skip :])
 
 
 def types_of(net) -> object:

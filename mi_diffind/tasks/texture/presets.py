@@ -9,7 +9,7 @@ from ...settings import FitSettings
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TextureRecipe:
     """
     How a texture is stored and trained.
 
@@ -40,6 +40,6 @@ _PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, sche
 
 #: The first is the default.
 PRESETS = {
-    "ours": Recipe(settings=_OURS),
-    "paper": Recipe(False, False, False, 1.0, False, "power", "side", _PAPER),
+    "ours": TextureRecipe(settings=_OURS),
+    "paper": TextureRecipe(False, False, False, 1.0, False, "power", "side", _PAPER),
 }

@@ -22,19 +22,19 @@ from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
 from ...tables import Table
-from ...task import Request
+from ...task import FitRequest
 from . import arrays
 from .compressed import CompressedTexture, to_table
-from .memory_budget import PaperSize, Size
+from .memory_budget import PaperBudget, TextureBudget
 from .nets import PaperNet
-from .presets import Recipe
+from .presets import TextureRecipe
 from .sampling import footprints, level_of
 
 #: dB that pages have to gain, before training, over one grid of as many bytes. (0.7 on bricks, where they lose 0.4.)
 GAIN_DB = 1.0
 
 
-def layout_of(source: Source, recipe: Recipe) -> Layout:
+def layout_of(source: Source, recipe: TextureRecipe) -> Layout:
     """What of ``source`` is stored by a recipe."""
     return Layout.of(source, recipe.once, None if recipe.normals else False, filtered=True)
 
@@ -53,7 +53,7 @@ class TextureProblem(Problem):
 
     tolerance = 0.02
 
-    def __init__(self, net, pyramid: Pyramid, recipe: Recipe, digest: str = ""):
+    def __init__(self, net, pyramid: Pyramid, recipe: TextureRecipe, digest: str = ""):
         self.net, self.pyramid, self.recipe, self.types = net, pyramid, recipe, pyramid.types
         layout = pyramid.layout
         self.groups = {}
@@ -62,10 +62,10 @@ class TextureProblem(Problem):
         self.weights = {name: len(found) / layout.stored for name, found in self.groups.items()}
         self.sizes = [level.shape[:2] for level in pyramid.values]
         self.starts = np.cumsum([0] + [rows * columns for rows, columns in self.sizes])
-        form = dataclasses.asdict(net.form)
+        structure = dataclasses.asdict(net.structure)
         self.identity = {
             "source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"},
-            "form": form, "border": list(net.border),
+            "structure": structure, "border": list(net.border),
         }  # fmt: skip
         self.jittered = False
         self._stretches = {}  # size of a batch → of each sample: level, first texel and number of texels, …
@@ -167,9 +167,11 @@ class TextureProblem(Problem):
         return {"psnr_db": decibels[0], "psnr_worst_db": min(decibels)}
 
 
-def problem_of(source: Source, size: Size | PaperSize, recipe: Recipe, pyramid: Pyramid) -> TextureProblem:
+def problem_of(
+    source: Source, size: TextureBudget | PaperBudget, recipe: TextureRecipe, pyramid: Pyramid
+) -> TextureProblem:
     """The problem of training ``source`` at a size by a recipe, its arrays at their initial values."""
-    if isinstance(size, PaperSize):
+    if isinstance(size, PaperBudget):
         net = arrays.from_ramps(pyramid.layout, size, pyramid.border, pyramid.levels, recipe.axis)
     else:
         net = arrays.from_components(pyramid.values, size, pyramid.border)
@@ -178,7 +180,11 @@ def problem_of(source: Source, size: Size | PaperSize, recipe: Recipe, pyramid: 
 
 
 def fit_texture(
-    source: Source, size: Size | PaperSize | None, recipe: Recipe, request: Request, pyramid: Pyramid
+    source: Source,
+    size: TextureBudget | PaperBudget | None,
+    recipe: TextureRecipe,
+    request: FitRequest,
+    pyramid: Pyramid,
 ) -> tuple[Table, FitResult]:
     """
     Train the arrays of ``source`` and return them as they are stored, with their errors
@@ -193,7 +199,7 @@ def fit_texture(
     else:
         problem = problem_of(source, size, recipe, pyramid)
         result = request.train(problem)
-        identity = {k: v for k, v in problem.identity.items() if k not in ("form", "border")}
+        identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
         settings = {**request.recorded(), **identity}
         if request.seconds is not None:
             settings["steps"] = result.steps

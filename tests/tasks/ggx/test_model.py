@@ -16,7 +16,7 @@ from mi_diffind.errors import UsageError
 from mi_diffind.fitting import EXPONENTIAL_RATE, fit
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import TableError, save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.ggx import TASK
 from mi_diffind.tasks.ggx.files import encoding_of
 from mi_diffind.tasks.ggx.model import ALPHA_FLOOR, ALPHA_MIN, ENCODINGS, PEAKS, Encoding, LearnedGGX, ggx, indirection
@@ -525,7 +525,7 @@ def test_fit_of_other_sizes(tmp_path, storage):
 def test_what_a_checkpoint_has_to_agree_in():
     """Samples and encoding, besides the settings; entries of two forms are stored as they are."""
     ad = array_module("llvm")
-    request = Request("paper", TASK.presets["paper"], ad, options={"primary": 5, "cascaded": 4})
+    request = FitRequest("paper", TASK.presets["paper"], ad, options={"primary": 5, "cascaded": 4})
     problem = TASK.problem(request)
     assert problem.identity == {"samples": "paper", "inputs": "plain", "output": "raw"}
     problem.net = problem.net.to("uint8", "float16")

@@ -10,10 +10,10 @@ import pytest
 from mi_diffind.fitting import FitResult
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import memory_budget, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.image.memory_budget import Size
+from mi_diffind.tasks.image.memory_budget import ImageBudget
 from mi_diffind.tasks.image.presets import PRESETS
 
 OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
@@ -37,12 +37,12 @@ def short(recipe=OURS, steps=8, **settings):
 
 
 #: What a training is asked for, where none takes place.
-ASKED = Request("ours", OURS.settings, None)
+ASKED = FitRequest("ours", OURS.settings, None)
 
 
 def asked():
     """What it is asked for where one does."""
-    return Request("ours", OURS.settings, array_module("llvm"), progress=False)
+    return FitRequest("ours", OURS.settings, array_module("llvm"), progress=False)
 
 
 def nbytes_of(size, channels):
@@ -313,4 +313,4 @@ def test_sides_to_try_can_be_read():
     for dims, sides in search.SIDES.items():
         assert max(sides) <= memory_budget.CASCADED_LIMITS[dims - 1] and list(sides) == sorted(sides)
         assert all(side % memory_budget.CASCADED_STEP == 0 for side in sides)
-        assert Size(1, 1, max(sides), 16, dims).nbytes < 2**21
+        assert ImageBudget(1, 1, max(sides), 16, dims).nbytes < 2**21

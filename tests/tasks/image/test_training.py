@@ -15,10 +15,10 @@ from mi_diffind.maps import components
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.image import TASK, arrays, presets, search, training
 from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.image.memory_budget import Coarse, Size
+from mi_diffind.tasks.image.memory_budget import CoarsePrimary, ImageBudget
 from mi_diffind.tasks.image.presets import IMPROVEMENTS, PAGED, PRESETS, STRUCTURES, replaced, without
 
 OURS = PRESETS["ours"]
@@ -41,7 +41,7 @@ def waves(height=24, width=24, channels=3, periods=1):
 
 def short(recipe=OURS, steps=3, batch=256, **settings):
     """A recipe for images of a few texels; keywords that are no settings are the recipe's own."""
-    own = {f.name for f in dataclasses.fields(presets.Recipe)} - {"settings"}
+    own = {f.name for f in dataclasses.fields(presets.ImageRecipe)} - {"settings"}
     recipe = dataclasses.replace(recipe, **{k: settings.pop(k) for k in own & set(settings)})
     settings = {"measure_every": steps, **settings}
     return replaced(recipe, steps=steps, batch=batch, **settings)
@@ -50,7 +50,7 @@ def short(recipe=OURS, steps=3, batch=256, **settings):
 def trained(source, size, recipe, types=None, border=None, **request):
     """:func:`.training.fit_image`, in silence."""
     types = types or array_module("llvm")
-    request = Request("ours", recipe.settings, types, progress=False, **request)
+    request = FitRequest("ours", recipe.settings, types, progress=False, **request)
     return training.fit_image(source, size, recipe, request, border)
 
 
@@ -58,7 +58,7 @@ def problem(ad, values, recipe=OURS, border=None, size=None):
     values = np.asarray(values, np.float32)
     source = from_arrays({"other": values})
     layout = Layout.of(source, once=False)
-    size = size or Size(6, 6, 4, layout.stored, recipe.dims, 6)
+    size = size or ImageBudget(6, 6, 4, layout.stored, recipe.dims, 6)
     return training.problem_of(source, size, recipe, ad, layout, border)
 
 
@@ -125,7 +125,7 @@ def test_downscaling_is_a_tent(rows, columns, border):
 @pytest.mark.parametrize("border", ["repeat", "clamp"])
 def test_components_reproduce_a_smooth_image(ad, channels, border):
     values = waves(32, 40, channels)
-    size = Size(24, 30, 5, channels, 4, 6)
+    size = ImageBudget(24, 30, 5, channels, 4, 6)
     net = arrays.from_components(values, size, (border,) * 2).alloc(ad.TensorXf)
     assert net.primary[0].border == (border,) * 2
     assert net.nbytes == 4 * (24 * 30 * 4 + 5**4 * channels)
@@ -140,12 +140,12 @@ def test_components_of_more_channels_than_dimensions(ad):
     rng = np.random.default_rng(0)
     two = waves(32, 32, 2) - 0.5
     mixed = (0.5 + 0.5 * two @ rng.uniform(-0.9, 0.9, (2, 7))).astype(np.float32)
-    size = Size(24, 24, 9, 7, 2, 6)
+    size = ImageBudget(24, 24, 9, 7, 2, 6)
     found = arrays.from_components(mixed, size, ("repeat",) * 2).alloc(ad.TensorXf)
     assert psnr(numpy_of(found(texel_centres(ad, 32, 32))).reshape(mixed.shape), mixed) > 30
     seven = rng.random((32, 32, 7)).astype(np.float32)
     seven[..., 3:5] = 0.5 + 0.1 * (seven[..., 3:5] - 0.5)
-    found = arrays.from_components(seven, Size(32, 32, 9, 7, 2, 6), ("repeat",) * 2).alloc(ad.TensorXf)
+    found = arrays.from_components(seven, ImageBudget(32, 32, 9, 7, 2, 6), ("repeat",) * 2).alloc(ad.TensorXf)
     colors = found.cascaded.numpy()[1:-1, 1:-1]  # a plane in the seven: the largest is hardly clipped
     flat = colors.reshape(-1, 7) - colors.mean(axis=(0, 1))
     assert np.linalg.svd(flat, compute_uv=False)[2] < 0.3 * np.linalg.svd(flat, compute_uv=False)[1]
@@ -153,7 +153,9 @@ def test_components_of_more_channels_than_dimensions(ad):
 
 
 def test_components_leave_other_dimensions_a_ramp(ad):
-    net = arrays.from_components(waves(16, 16, 1), Size(5, 9, 4, 1, 3, 8), ("clamp", "repeat")).alloc(ad.TensorXf)
+    net = arrays.from_components(waves(16, 16, 1), ImageBudget(5, 9, 4, 1, 3, 8), ("clamp", "repeat")).alloc(
+        ad.TensorXf
+    )
     entries = net.primary[0].numpy()
     np.testing.assert_allclose(entries[..., 1], np.repeat(np.linspace(0, 1, 5)[:, None], 9, 1), atol=1e-6)
     np.testing.assert_allclose(entries[..., 2], np.repeat(np.arange(9)[None] / 9, 5, 0), atol=1e-6)
@@ -165,7 +167,7 @@ def test_components_leave_other_dimensions_a_ramp(ad):
 def test_components_in_two_arrays(ad, channels):
     """The first of two primaries is the finer one; together they reproduce what one does."""
     values = waves(32, 40, channels)
-    size = Size(24, 30, 5, channels, 4, 4, coarse=Coarse(2, 8, 0.5))
+    size = ImageBudget(24, 30, 5, channels, 4, 4, coarse=CoarsePrimary(2, 8, 0.5))
     net = arrays.from_components(values, size, ("repeat", "clamp")).alloc(ad.TensorXf)
     assert [p.resolution for p in net.primary] == [(24, 30), (12, 15)]
     assert [p.channels for p in net.primary] == [2, 2] and {p.border for p in net.primary} == {("repeat", "clamp")}
@@ -182,8 +184,8 @@ def test_components_that_do_not_vary(ad, name):
         "one colour": np.full((8, 8, 3), 0.3, np.float32),
     }[name]
     height, width, channels = values.shape
-    for coarse in (None, Coarse(2, 8, 0.5), Coarse(1, 8, 0.9)):
-        size = Size(min(height, 20), 20, 5, channels, 4, 4, coarse=coarse)
+    for coarse in (None, CoarsePrimary(2, 8, 0.5), CoarsePrimary(1, 8, 0.9)):
+        size = ImageBudget(min(height, 20), 20, 5, channels, 4, 4, coarse=coarse)
         net = arrays.from_components(values, size, ("repeat",) * 2).alloc(ad.TensorXf)
         found = numpy_of(net(texel_centres(ad, height, width))).reshape(values.shape)
         assert psnr(found, values) > 30, coarse
@@ -210,14 +212,14 @@ def test_detail():
 def test_the_ramp_is_the_supplements(ad):
     maps = {"albedo": waves(), "ao": waves(channels=1), "normal": waves(channels=3) * 0.7, "roughness": waves()[..., 1]}
     layout = Layout.of(from_arrays(maps), once=False, two_channel_normals=False)
-    size = Size(8, 6, 4, 8, 4, 8)
+    size = ImageBudget(8, 6, 4, 8, 4, 8)
     net = arrays.from_ramp(layout, size, ("clamp", "repeat")).alloc(ad.TensorXf)
     v, u = np.meshgrid(np.arange(8) / 7, np.arange(6) / 6, indexing="ij")
     np.testing.assert_allclose(net.primary[0].numpy(), np.stack([v, u, v, u], axis=-1), atol=1e-6)
     expected = [0.5, 0.5, 0.5, 1, 0.5, 0.5, 1, 0.5]
     np.testing.assert_allclose(net.cascaded.numpy(), np.broadcast_to(expected, (4,) * 4 + (8,)), atol=1e-6)
     assert net.primary[0].border == ("clamp", "repeat") and net.cascaded.border == ("clamp",) * 4
-    two = dataclasses.replace(size, coarse=Coarse(1, 6, 0.5))
+    two = dataclasses.replace(size, coarse=CoarsePrimary(1, 6, 0.5))
     two = arrays.from_ramp(layout, two, ("clamp", "repeat")).alloc(ad.TensorXf)
     np.testing.assert_allclose(two.primary[0].numpy(), np.stack([v, u, v], axis=-1), atol=1e-6)
     np.testing.assert_allclose(two.primary[1].numpy()[..., 0], np.repeat(np.arange(4)[:, None] / 3, 3, 1), atol=1e-6)
@@ -329,7 +331,7 @@ def test_shares_of_the_steps(ad, share, rounded):
 def test_maps_have_the_weight_of_their_channels(ad):
     maps = {"albedo": waves(8, 8), "ao": waves(8, 8, 1) * 0.9, "roughness": waves(8, 8, 1) * 0.8}
     source = from_arrays(maps)
-    found = training.problem_of(source, Size(4, 4, 4, 5, 4, 6), OURS, ad)
+    found = training.problem_of(source, ImageBudget(4, 4, 4, 5, 4, 6), OURS, ad)
     assert found.weights == pytest.approx({"albedo": 0.6, "ao": 0.2, "roughness": 0.2})
     _, targets = found.batch(dr.rng(seed=ad.UInt64(0)), 64)
     assert {name: len(channels) for name, channels in targets.items()} == {"albedo": 3, "ao": 1, "roughness": 1}
@@ -438,7 +440,7 @@ def test_rounding_is_no_divergence(ad):
     """The loss of a smooth image rises a hundredfold where rounding starts; its training goes on."""
     source = from_arrays({"image": waves()})
     recipe = short(steps=60, dims=3, rounded=0.5, jitter=0.5, lr=1e-2, check_every=10, measure_every=10, loss="mse")
-    _, result = trained(source, Size(24, 24, 4, 3, 3, 1), recipe, ad)
+    _, result = trained(source, ImageBudget(24, 24, 4, 3, 3, 1), recipe, ad)
     losses = [h["loss"] for h in result.history]
     assert losses[3] > 10 * losses[1] + 1e-6, losses  # what it would have been taken for
     assert result.restarts == 0 and result.steps == 60
@@ -448,7 +450,7 @@ def test_training_with_rounding_makes_up_for_it(ad):
     source, found = from_arrays({"image": waves()}), {}
     for rounded in (0, 0.5):
         recipe = short(steps=100, batch=576, dims=3, rounded=rounded, lr=1e-2, loss="mse", schedule="cosine")
-        made = training.problem_of(source, Size(24, 24, 4, 3, 3, 2), recipe, ad)
+        made = training.problem_of(source, ImageBudget(24, 24, 4, 3, 3, 2), recipe, ad)
         fit(made, recipe.settings, progress=False)
         found[rounded] = made.measure(made.net)["psnr_db"]
         x = texel_centres(ad, 24, 24)
@@ -460,7 +462,7 @@ def test_training_with_rounding_makes_up_for_it(ad):
 def test_eight_bits_cost_little(ad):
     source = from_arrays({"image": waves(channels=3)})
     recipe = short(steps=60, batch=576, dims=3, rounded=0.5, lr=1e-2, loss="mse", schedule="cosine")
-    made = training.problem_of(source, Size(16, 16, 4, 3, 3, 8), recipe, ad)
+    made = training.problem_of(source, ImageBudget(16, 16, 4, 3, 3, 8), recipe, ad)
     fit(made, recipe.settings, progress=False)
     x, values = texel_centres(ad, 24, 24), source.maps[0].values
     full = psnr(numpy_of(made.net(x)).reshape(values.shape), values)
@@ -477,7 +479,7 @@ def file_bytes(table, path):
 
 
 def test_the_same_seed_gives_the_same_file(tmp_path):
-    source, size = from_arrays({"image": waves(9, 11)}), Size(6, 7, 4, 3, 3, 5)
+    source, size = from_arrays({"image": waves(9, 11)}), ImageBudget(6, 7, 4, 3, 3, 5)
     recipe = short(steps=6, dims=3, batch=40)
     made = [trained(source, size, replaced(recipe, seed=seed))[0] for seed in (3, 3, 4)]
     first, again, other = (file_bytes(table, tmp_path / "t.npz") for table in made)
@@ -496,7 +498,7 @@ def test_reported_qualities_are_those_of_the_decoded_image(ad):
     }
     source = from_arrays(maps)
     recipe = short(steps=4, dims=3)
-    table, _ = trained(source, Size(8, 8, 4, 7, 3, 6), recipe)
+    table, _ = trained(source, ImageBudget(8, 8, 4, 7, 3, 6), recipe)
     image = CompressedImage.of(table, ad.TensorXf)
     decoded = image.decode()
     errors, found = [], table.measured
@@ -518,7 +520,7 @@ def test_the_quality_between_texels(ad):
     source = from_arrays({"image": values})
     for border, mode in (("repeat", "grid-wrap"), ("clamp", "nearest")):
         recipe = short(steps=4, dims=3)
-        size = Size(8, 8, 4, 3, 3, 6)
+        size = ImageBudget(8, 8, 4, 3, 3, 6)
         table, _ = trained(source, size, recipe, border=(border,) * 2)
         u, v = np.random.default_rng(1).random((2, 50_000), dtype=np.float32)
         read = CompressedImage.of(table, ad.TensorXf).read(ad.Float(u), ad.Float(v))["image"]
@@ -554,7 +556,7 @@ def test_decoding_reads_texel_centres(ad, monkeypatch):
 
     source = from_arrays({"albedo": waves(9, 11), "height": waves(9, 11, 1) * 0.9})
     recipe = short(steps=2, dims=3)
-    table, _ = trained(source, Size(6, 6, 4, 4, 3, 6), recipe)
+    table, _ = trained(source, ImageBudget(6, 6, 4, 4, 3, 6), recipe)
     image = CompressedImage.of(table, ad.TensorXf)
     whole = image.decode()
     v, u = texel_centres(ad, 9, 11)
@@ -572,7 +574,7 @@ def test_decoding_reads_texel_centres(ad, monkeypatch):
 
 def test_training_improves(ad):
     source = from_arrays({"image": np.rint(255 * waves(24, 24, periods=3)).astype(np.uint8)})
-    size = Size(16, 16, 4, 3, 3, 6)
+    size = ImageBudget(16, 16, 4, 3, 3, 6)
     for recipe in (OURS, PRESETS["paper"]):
         recipe = short(recipe, steps=60, batch=576, dims=3, lr=1e-2)
         made = training.problem_of(source, size, recipe, ad)
@@ -618,7 +620,7 @@ def test_without_everything_it_is_the_paper():
 def test_the_papers_recipe(ad):
     source = from_arrays({"image": np.rint(255 * waves(9, 11)).astype(np.uint8)})
     recipe = short(PRESETS["paper"])
-    table, _ = trained(source, Size(8, 8, 4, 3), recipe)
+    table, _ = trained(source, ImageBudget(8, 8, 4, 3), recipe)
     assert table.arrays["primary"].shape == (8, 8, 4) and table.arrays["cascaded"].shape == (4,) * 4 + (3,)
     assert {a.bits for a in table.arrays.values()} == {8} and table.nbytes == 4 * 64 + 3 * 256
     assert table.measured["psnr_db"] > 5
@@ -629,7 +631,7 @@ def test_high_dynamic_range(ad):
     values = (10 ** (5 * waves() - 1)).astype(np.float32)
     source = from_arrays({"image": values})
     recipe = short(steps=60, batch=576, dims=3, lr=1e-2)
-    table, _ = trained(source, Size(24, 24, 6, 3, 3, 6), recipe)
+    table, _ = trained(source, ImageBudget(24, 24, 6, 3, 3, 6), recipe)
     found = CompressedImage.of(table, ad.TensorXf).decode()["image"]
     assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= values.max() * 1.0001
     assert table.measured["psnr_db"] > 35
@@ -649,7 +651,7 @@ def test_one_colour_needs_no_arrays(ad):
 def test_no_seam(ad):
     """What repeats reads the same at both ends, exactly there and beyond, in each storage form."""
     source = from_arrays({"image": np.rint(255 * waves(16, 12)).astype(np.uint8)})
-    table, _ = trained(source, Size(8, 7, 4, 3, 3, 5), short(dims=3))
+    table, _ = trained(source, ImageBudget(8, 7, 4, 3, 3, 5), short(dims=3))
     assert table.arrays["primary"].border == ("repeat", "repeat")
     t = np.linspace(0, 1, 50, dtype=np.float32)
     for storage in ("uint8", "float32"):
@@ -683,7 +685,9 @@ def test_training_for_a_time(ad, monkeypatch):
 
     monkeypatch.setattr(fitting.time, "perf_counter", tick)
     monkeypatch.setattr(fitting._Trainer, "learning_rate", watched)
-    table, result = trained(from_arrays({"image": waves(8, 8)}), Size(4, 4, 4, 3, 4, 6), short(lr=3e-2), seconds=1)
+    table, result = trained(
+        from_arrays({"image": waves(8, 8)}), ImageBudget(4, 4, 4, 3, 4, 6), short(lr=3e-2), seconds=1
+    )
     assert result.steps == len(rates) == table.settings["steps"] and 30 <= len(rates) <= 40
     assert table.settings["seconds"] == 1 and not result.interrupted
     assert 8 <= len(result.history) <= 11
@@ -726,7 +730,7 @@ def test_strange_values(name, recipe):
     source = from_arrays({"image": values})
     recipe = short(PRESETS[recipe], steps=2, dims=2, batch=72)
     stored = training.layout_of(source, recipe).stored
-    size = Size(8, 8, 4, stored, 2, 4) if stored else None
+    size = ImageBudget(8, 8, 4, stored, 2, 4) if stored else None
     table, result = trained(source, size, recipe)
     assert np.isfinite(list(table.measured.values())).all() and result.restarts == 0
     decoded = CompressedImage.of(table, array_module("llvm").TensorXf).decode()["image"]

@@ -16,14 +16,14 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import load_table, save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
 from mi_diffind.tasks.shading import TASK, material, training
 from mi_diffind.tasks.shading.clip import clipped
-from mi_diffind.tasks.shading.evaluation import Evaluation, reader
+from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader
 from mi_diffind.tasks.shading.presets import PRESETS
 from mi_diffind.tasks.shading.reference import reference
 from mi_diffind.tasks.texture import TASK as TEXTURE
@@ -99,7 +99,7 @@ def test_clip_is_for_the_specular_lobe(ad, rng):
     for limit in (None, 1e-3, 1e9):
         rough = dr.full(ad.Float, 0.1, 512)
         dr.enable_grad(rough)
-        surface = material.Surface(ad.Array3f(0.5), None, rough, 0.5)
+        surface = material.SurfaceParameters(ad.Array3f(0.5), None, rough, 0.5)
         value = material.shaded(Decoder(), surface, wi, wo, effects, limit)
         dr.backward(dr.sum(value.x))
         results.append((numpy_of(dr.detach(value)), dr.grad(rough).numpy()))
@@ -143,7 +143,7 @@ def test_shaded_is_mitsubas_normalmap(mi_rgb, rng):
     def columns(v):
         return [ad.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in v.T]
 
-    surface = material.Surface(
+    surface = material.SurfaceParameters(
         ad.Array3f(columns(values["base_color"])), ad.Array3f(columns(normal)), *columns(values["roughness"]),
         *columns(values["metallic"]),
     )  # fmt: skip
@@ -185,7 +185,7 @@ def test_extreme_materials_stay_finite(ad, rng):
     for decoder in (Decoder(), material.frozen_decoder(ad)):
         leaves = [type(x)(x) for x in (normal, albedo, rough, metal)]
         dr.enable_grad(leaves)
-        surface = material.Surface(leaves[1], leaves[0], leaves[2], leaves[3])
+        surface = material.SurfaceParameters(leaves[1], leaves[0], leaves[2], leaves[3])
         value = material.shaded(decoder, surface, wi, wo, Effects(), 0.1)
         assert np.isfinite(numpy_of(dr.detach(value))).all() and (numpy_of(dr.detach(value)) >= 0).all()
         dr.backward(dr.sum(sum(dr.minimum(c, 10) for c in value)))
@@ -246,7 +246,7 @@ def test_converged_reference_is_the_mean_of_shaded_texels(ad, rng):
     def columns(values):
         return [ad.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in values.T]
 
-    surface = material.Surface(
+    surface = material.SurfaceParameters(
         ad.Array3f(columns(read(decode))), ad.Array3f(columns(normal)), *columns(read(maps["roughness"])),
         *columns(read(maps["metallic"])),
     )  # fmt: skip
@@ -299,12 +299,12 @@ def start(ad, tmp_path_factory):
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | {"structure": "0:1:2,1:2:4"}
     options["skip"] = 2
     size = size_of(source, pyramid, source.nbytes / 2, recipe, options)
-    request = Request("ours", recipe.settings, ad, progress=False)
+    request = FitRequest("ours", recipe.settings, ad, progress=False)
     table, _ = textures.fit_texture(source, size, recipe, request, pyramid)
     path = tmp_path_factory.mktemp("shading") / "start.npz"
     save_table(path, table)
     effects, _ = material.effects_of(pyramid.layout)
-    evaluation = Evaluation(pyramid, effects, levels=4, pairs=24, side=16)
+    evaluation = ShadedEvaluation(pyramid, effects, levels=4, pairs=24, side=16)
     return source, pyramid, TEXTURE.load(path), evaluation, path, size
 
 
@@ -318,7 +318,7 @@ def trained(start, ad, recipe, measured=True, **request):
     source, pyramid, table, evaluation, *_ = start
     evaluation = evaluation if measured else None
     net = training.start_of(table, pyramid)
-    asked = Request("ours", recipe.settings, ad, progress=False, **request)
+    asked = FitRequest("ours", recipe.settings, ad, progress=False, **request)
     return training.fit_shading(source, net, recipe, asked, pyramid, evaluation)
 
 
@@ -450,7 +450,9 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     mi = mi_rgb
     short = dataclasses.replace(TEXTURES["ours"].settings, steps=6, batch=4096, measure_every=6)
     monkeypatch.setitem(TEXTURES, "ours", dataclasses.replace(TEXTURES["ours"], settings=short))
-    monkeypatch.setattr(shading_fit, "Evaluation", functools.partial(Evaluation, levels=4, pairs=24, side=16))
+    monkeypatch.setattr(
+        shading_fit, "ShadedEvaluation", functools.partial(ShadedEvaluation, levels=4, pairs=24, side=16)
+    )
     # The same arrays as those of other tests, lest everything is compiled anew
     monkeypatch.setattr(shading_fit.texture_fit, "size_of", lambda *a: start[5])
     out, record = tmp_path / "metal.npz", tmp_path / "record.json"
@@ -503,7 +505,9 @@ def test_sources_that_cannot_be_shaded_are_refused(ad, start, tmp_path):
 
     with pytest.raises(UsageError, match=r"was made from another source than other\.json"):
         started(
-            start[4], from_arrays(bumpy(seed=9)), Request("ours", OURS.settings, ad, options={"source": "other.json"})
+            start[4],
+            from_arrays(bumpy(seed=9)),
+            FitRequest("ours", OURS.settings, ad, options={"source": "other.json"}),
         )
 
 

@@ -10,7 +10,7 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
-from mi_diffind.task import Request
+from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture import TASK, arrays, memory_budget, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture
 from mi_diffind.tasks.texture.presets import PRESETS
@@ -35,7 +35,7 @@ def recipe(steps=4):
 def trained(source, size, steps=4):
     own = recipe(steps)
     pyramid = Pyramid.of(source, training.layout_of(source, own), TYPES, ("repeat", "clamp"))
-    table, _ = training.fit_texture(source, size, own, Request("ours", own.settings, TYPES, progress=False), pyramid)
+    table, _ = training.fit_texture(source, size, own, FitRequest("ours", own.settings, TYPES, progress=False), pyramid)
     return table
 
 

@@ -16,10 +16,17 @@ from mi_diffind.maps.pyramid import Pyramid, level_sizes
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
-from mi_diffind.task import Request, fit
+from mi_diffind.task import FitRequest, fit
 from mi_diffind.tasks.texture import TASK, memory_budget, sampling, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture
-from mi_diffind.tasks.texture.memory_budget import Fine, Size, choose, paper_bytes, paper_size, parse_structure
+from mi_diffind.tasks.texture.memory_budget import (
+    FineArray,
+    TextureBudget,
+    choose,
+    paper_bytes,
+    paper_size,
+    parse_structure,
+)
 from mi_diffind.tasks.texture.presets import PRESETS
 
 OURS, PAPER = PRESETS["ours"], PRESETS["paper"]
@@ -59,14 +66,14 @@ def trained(source, size, recipe, **request):
     # Of one size and one border, mostly: what differs has to be compiled anew
     border = request.pop("border", ("repeat", "clamp"))
     pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, border)
-    request = Request("ours" if recipe.layered else "paper", recipe.settings, types, progress=False, **request)
+    request = FitRequest("ours" if recipe.layered else "paper", recipe.settings, types, progress=False, **request)
     return training.fit_texture(source, size, recipe, request, pyramid)
 
 
 def sized(source, layout=None, fine="0:1:2,1:2:4", skip=2, dims=3, cascaded=5):
     layout = layout or Layout.of(source, filtered=True)
     arrays = parse_structure(fine) if fine else ()
-    return Size(source.height, source.width, layout.stored, arrays, skip, dims, cascaded, skip + 1)
+    return TextureBudget(source.height, source.width, layout.stored, arrays, skip, dims, cascaded, skip + 1)
 
 
 def texture_of(source, steps=2, fine="0:1:2,1:2:4", skip=2, storage="", **request):
@@ -181,12 +188,12 @@ def test_our_sizes_fit(height, width):
 
 
 def test_structures():
-    assert parse_structure("0:1:2,2:3:8") == (Fine(0, 1, 2), Fine(2, 3, 8))
+    assert parse_structure("0:1:2,2:3:8") == (FineArray(0, 1, 2), FineArray(2, 3, 8))
     for wrong in ("", "0:1", "1:1:1,0:1:1", "0:5:1", "0:1:9", "a", "0:1:2,"):
         with pytest.raises(ValueError, match=r"structure|allowed are levels|have to grow"):
             parse_structure(wrong)
     with pytest.raises(ValueError, match="do not lie below level 1"):
-        Size(8, 8, 3, (Fine(1, 1, 1),), 1, 3, 4, 2)
+        TextureBudget(8, 8, 3, (FineArray(1, 1, 1),), 1, 3, 4, 2)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -202,7 +209,7 @@ def made():
 
 def reference(texture, u, v, level):
     """The same in NumPy, one place at a time, from the entries: pointers summed, then one read."""
-    net, form = texture.net, texture.net.form
+    net, structure = texture.net, texture.net.structure
 
     def bilinear(values, u, v):
         places = []
@@ -214,15 +221,15 @@ def reference(texture, u, v, level):
         return sum(a * b * values[i, j] for i, a in places[0] for j, b in places[1])
 
     coarse, levels, start = net.coarse.numpy().astype(np.float64), {}, 0
-    for i, (rows, columns) in enumerate(form.sizes[form.skip :], form.skip):
+    for i, (rows, columns) in enumerate(structure.sizes[structure.skip :], structure.skip):
         levels[i] = coarse[start : start + rows * columns].reshape(rows, columns, -1)
         start += rows * columns
     assert start == len(coarse)
-    at = max(level, form.skip)
-    below, above = math.floor(at), min(math.floor(at) + 1, len(form.sizes) - 1)
+    at = max(level, structure.skip)
+    below, above = math.floor(at), min(math.floor(at) + 1, len(structure.sizes) - 1)
     pointer = (1 - at % 1) * bilinear(levels[below], u, v) + at % 1 * bilinear(levels[above], u, v)
-    layers = list(zip(form.layers, net.fine, strict=True))
-    if form.base:
+    layers = list(zip(structure.layers, net.fine, strict=True))
+    if structure.base:
         layer, array = layers.pop()
         share = min(max(layer.until + 1 - level, 0), 1)
         pointer = (1 - share) * pointer + share * bilinear(array.numpy().astype(np.float64), u, v)
@@ -230,7 +237,7 @@ def reference(texture, u, v, level):
         share = min(max(layer.until + 1 - level, 0), 1)
         found = (bilinear(array.numpy().astype(np.float64), u, v) - layer.zero) * layer.scale
         pointer[: layer.channels] += share * found
-    place = [min(level / form.skip, 1), *np.clip(pointer, 0, 1)]
+    place = [min(level / structure.skip, 1), *np.clip(pointer, 0, 1)]
     cascaded, total = net.cascaded.numpy().astype(np.float64), 0
     for corner in np.ndindex(*[2] * 4):
         weight, index = 1, []
@@ -245,7 +252,7 @@ def reference(texture, u, v, level):
 def test_reading_against_numpy(made, rng):
     """Where the coarsest fine array holds differences, and where it holds pointers."""
     based, _ = texture_of(made[0], steps=1, fine="0:1:2,1:3:6")
-    assert based.net.form.base and not made[1].net.form.base
+    assert based.net.structure.base and not made[1].net.structure.base
     for texture in (*made[1:3], based):
         u, v = rng.random((2, 60))
         level = np.concatenate([np.arange(texture.levels), rng.uniform(0, texture.levels - 1, 60 - texture.levels)])

@@ -8,7 +8,7 @@ from pathlib import Path
 from mi_diffind.arguments import Argument, positive
 from mi_diffind.errors import UsageError
 from mi_diffind.settings import FitSettings
-from mi_diffind.task import Request, Task
+from mi_diffind.task import FitRequest, Task
 
 _FIT = FitSettings(steps=600, batch=4096, lr=3e-2, loss="mse", seed=1)
 
@@ -27,18 +27,18 @@ class Profile(Task):
         Argument("--samples", type=positive, metavar="N", help="number of angles from 0° to 90° (default: 181)"),
     )
 
-    def check(self, request: Request) -> None:
+    def check(self, request: FitRequest) -> None:
         if request.options["source"] is None:
             raise UsageError("source: not given, a file of angles and intensities is needed")
 
-    def problem(self, request: Request):
+    def problem(self, request: FitRequest):
         from . import measurement
         from .training import ProfileProblem, arrays
 
         truth = measurement.read(request.options["source"])
         return ProfileProblem(arrays(*SIZES[request.preset]).alloc(request.types.TensorXf), truth, request.types)
 
-    def table(self, problem, request: Request):
+    def table(self, problem, request: FitRequest):
         from mi_diffind.tables import StoredArray, Table
 
         folder = (request.output or Path("x")).resolve().parent
