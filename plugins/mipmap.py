@@ -1,3 +1,5 @@
+"""Uncompressed image with levels of detail."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import drjit as dr
@@ -40,7 +42,7 @@ class MipMap(FilteredTexture):
 
      * - raw
        - |bool|
-       - Leave values as they are: levels are averaged without conversion from sRGB, and there is no spectral upsampling.
+       - Leave values as they are: levels are averaged without conversion from sRGB, without spectral upsampling.
          (Default: false for colours; true for a manifest's maps of data)
        - --
 

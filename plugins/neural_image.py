@@ -1,3 +1,5 @@
+"""Compressed image or material."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import functools

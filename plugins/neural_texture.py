@@ -1,3 +1,5 @@
+"""Compressed texture or material with levels of detail."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import functools

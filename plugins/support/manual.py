@@ -80,8 +80,8 @@ PARTS = {
         the result of ``anisotropic``, with the noise of one sample; every read on a path makes the same choice, and so
         do all samples through one point of a pixel.""",
     "gradient": """\
-        With ``off``, the gradient that :monosp:`bumpmap` reads is that of :monosp:`bitmap`. With any other filter, it is
-        the difference over the width of one texel of the trilinear level, also for ``anisotropic``.""",
+        With ``off``, the gradient that :monosp:`bumpmap` reads is that of :monosp:`bitmap`. Any other filter takes the
+        difference over the width of one texel of the trilinear level.""",
 }
 
 
