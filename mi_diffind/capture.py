@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from . import __version__, compat, metrics, scenes
+from . import __version__, compat, scenes, srgb
 from .errors import DiffindError, reason
 from .files import replacing, writable_folder, write_json
 from .interrupt import interruptible
@@ -368,7 +368,7 @@ def _only(inner, shapes: list):
             )
     if not isinstance(inner, mi.SamplingIntegrator):
         raise CaptureError(f"objects: the integrator {inner.class_name()} follows no rays from a camera, as path does")
-    replays = isinstance(inner, mi.ad.integrators.common.ADIntegrator)
+    replays = compat.samples_in_python(inner)
 
     class Only(mi.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -477,7 +477,7 @@ def _write(path: Path, image: np.ndarray) -> None:
             from PIL import Image
 
             colours = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
-            shown = np.concatenate([metrics.srgb(colours), image[..., 3:]], axis=-1)
+            shown = np.concatenate([srgb.for_display(colours), image[..., 3:]], axis=-1)
             Image.fromarray(np.round(255 * shown).astype(np.uint8)).save(temporary)
         else:
             import OpenEXR

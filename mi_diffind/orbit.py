@@ -10,7 +10,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from . import metrics, scenes
+from . import scenes, srgb
 from .files import replacing
 from .plugins.support import footprint
 
@@ -130,7 +130,7 @@ def displayed(image: np.ndarray) -> np.ndarray:
     colours, alpha = (image[..., :-1], image[..., -1:]) if has_alpha else (image, np.ones_like(image[..., :1]))
     if colours.shape[2] == 1:
         colours = colours.repeat(3, axis=2)
-    shown = metrics.srgb(colours[..., :3] / np.maximum(alpha, 1e-6))
+    shown = srgb.for_display(colours[..., :3] / np.maximum(alpha, 1e-6))
     if has_alpha:
         shown = np.concatenate([shown, np.clip(alpha, 0, 1)], axis=-1)
     return np.round(255 * shown).astype(np.uint8)

@@ -198,8 +198,7 @@ def instances(scene) -> list:
     of Mitsuba, each once.
     """
     # Not only nodes that own a parameter: tables of bytes are none
-    found = {id(node): node for node in mi.traverse(scene).hierarchy if plugins.origin(node) is not None}
-    return list(found.values())
+    return [node for node in compat.objects_of(scene) if plugins.origin(node) is not None]
 
 
 def learned_instances(scene) -> list:

@@ -211,3 +211,17 @@ def test_sizes_refuse_nonsense():
         search(1, math.nan, 3, 1, 1)
     with pytest.raises(ValueError, match="budget: found inf"):
         fit_bytes(math.inf, 3, 1, 1, 4)
+
+
+@pytest.mark.parametrize("threshold", [-3, 0, 1, 7, 99, 100, 250])
+def test_largest_fitting(threshold):
+    asked = []
+
+    def fits(n):
+        asked.append(n)
+        return n <= threshold
+
+    assert units.largest_fitting(fits, 0, 100) == min(max(threshold, 0), 99)
+    assert len(asked) <= 7 and all(0 < n < 100 for n in asked)
+    assert units.largest_fitting(fits, 5, 6) == 5
+    assert units.largest_fitting(lambda x: x * x <= 2, 0.0, 2.0, steps=40) == pytest.approx(2**0.5)

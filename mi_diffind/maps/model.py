@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import metrics
+from .. import srgb
 from ..errors import UsageError
 from ..files import replacing
 from ..tables import TableError
@@ -98,6 +98,6 @@ def _write(path: Path, values: np.ndarray, color_space: str) -> None:
             mi.Bitmap(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).write(str(temporary))
             return
         if color_space == "srgb":
-            values = metrics.linear(values)
+            values = srgb.to_linear(values)
         form = np.float16 if np.abs(values).max() < 65520 else np.float32  # what rounds to a finite number
         mi.Bitmap(np.ascontiguousarray(values, dtype=form)).write(str(temporary))

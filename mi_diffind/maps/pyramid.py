@@ -21,7 +21,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from .. import lookup, metrics
+from .. import lookup, srgb
 from ..indirection import aligned
 from . import components
 from .compressed import FilteredMaps
@@ -99,7 +99,7 @@ class Pyramid(FilteredMaps):
                 level = m.values if signed else 2 * m.values - 1
                 level = np.concatenate([level, np.linalg.norm(level, axis=-1, keepdims=True)], axis=-1)
             else:
-                level = metrics.linear(m.values) if m.color_space == "srgb" else m.values
+                level = srgb.to_linear(m.values) if m.color_space == "srgb" else m.values
                 level = level.astype(np.float32)
             for found in values[1:]:
                 level = halved(level)
@@ -109,7 +109,7 @@ class Pyramid(FilteredMaps):
                     mean = mean * level[..., 3:]
                     mean = mean if signed else 0.5 + 0.5 * mean
                 else:
-                    mean = srgb(level) if m.color_space == "srgb" else level
+                    mean = srgb.from_linear(level) if m.color_space == "srgb" else level
                 for c, where in channels:
                     found[..., where] = own.encode(mean[..., c])
         border = border or components.borders(values[0])
@@ -226,7 +226,7 @@ class Pyramid(FilteredMaps):
                 found.append(None)
                 continue
             if owner.color_space == "srgb":
-                value = _srgb(value)
+                value = srgb.from_linear(value)
             if owner.knee > 0:
                 scale = 1 / np.log2(1 + owner.high / owner.knee)
                 value = dr.log2(1 + dr.maximum(value, 0) / owner.knee) * float(scale)
@@ -234,18 +234,6 @@ class Pyramid(FilteredMaps):
                 value = (value - owner.low) / (owner.high - owner.low)
             found.append(value)
         return found
-
-
-def srgb(values: np.ndarray) -> np.ndarray:
-    """Linear values with the sRGB transfer function, beyond [0, 1], too: the inverse of ``metrics.linear``."""
-    root = np.power(np.maximum(values, 0.0031308), 1 / 2.4)
-    return np.where(values <= 0.0031308, 12.92 * values, 1.055 * root - 0.055)
-
-
-def _srgb(value):
-    """The same of Dr.Jit's arrays."""
-    root = dr.power(dr.maximum(value, 0.0031308), 1 / 2.4)
-    return dr.select(value <= 0.0031308, 12.92 * value, dr.fma(1.055, root, -0.055))
 
 
 def _owner(layout: Layout, channel: int) -> MapLayout:
@@ -256,7 +244,7 @@ def _owner(layout: Layout, channel: int) -> MapLayout:
 def _interpolated(stored: np.ndarray, owner: MapLayout) -> np.ndarray:
     """What hardware would interpolate in place of a stored channel."""
     if owner.color_space == "srgb":
-        return metrics.linear(owner.decode(stored))
+        return srgb.to_linear(owner.decode(stored))
     return owner.decode(stored) if owner.knee > 0 else stored
 
 

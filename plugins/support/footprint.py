@@ -20,6 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
+
 #: Limit of the components of a footprint in uv: larger than any texture, and its fourth power is finite.
 LARGEST = 2.0**20
 
@@ -344,7 +346,7 @@ def _major(p, q, r) -> tuple:
 
 def textures(scene: mi.Scene) -> list:
     """Return the textures of a loaded scene that have a method ``set_cone(cone)``, each once."""
-    return list({id(node): node for node in mi.traverse(scene).hierarchy if hasattr(node, "set_cone")}.values())
+    return [node for node in compat.objects_of(scene) if hasattr(node, "set_cone")]
 
 
 def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None) -> int:

@@ -500,7 +500,7 @@ BAD = {
     "no such levels": ({"pyramid": "x"}, 'parameter "pyramid": found "x", allowed are the keys of PYRAMIDS: none'),
     "filter": ({"filter": "nearest"}, 'parameter "filter": found "nearest", allowed are trilinear, off, anisotropic'),
     "type": ({"filter_type": "nearest"}, 'parameter "filter_type": found "nearest", allowed are bilinear, trilinear'),
-    "both": ({"filter": "off", "filter_type": "trilinear"}, 'found "trilinear" beside the filter "off", which is anot'),
+    "both": ({"filter": "off", "filter_type": "trilinear"}, 'found "trilinear", which contradicts the filter "off"'),
     "no taps": ({"max_anisotropy": 0}, 'parameter "max_anisotropy": found 0, allowed are whole numbers 1 to 16'),
     "half a tap": ({"max_anisotropy": 2.5}, 'parameter "max_anisotropy": found 2.5, allowed are whole numbers'),
     "many taps": ({"max_anisotropy": 17}, 'parameter "max_anisotropy": found 17, allowed are whole numbers 1 to 16'),

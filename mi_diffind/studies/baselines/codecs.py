@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...errors import DiffindError
+from ...units import largest_fitting
 
 #: The 2D block sizes of ASTC, width × height, from the finest on, and their bits per texel.
 ASTC_BLOCKS = {
@@ -356,17 +357,9 @@ def _front(pairs: Iterable[tuple[_Way, _Way]], nbytes: int) -> list[_Way]:
 
 
 def _fitting(encode: Callable[[int], Encoded], qualities: range, nbytes: int) -> Encoded:
-    """The highest quality that fits into ``nbytes``, else the lowest, by bisection."""
-    low, high = qualities[0], qualities[-1] + 1
-    best = encode(low)
-    while high - low > 1:
-        middle = (low + high) // 2
-        coded = encode(middle)
-        if coded.nbytes <= nbytes:
-            low, best = middle, coded
-        else:
-            high = middle
-    return best
+    """Encode at the highest quality that takes at most ``nbytes``, else at the lowest."""
+    coded = functools.cache(encode)
+    return coded(largest_fitting(lambda quality: coded(quality).nbytes <= nbytes, qualities[0], qualities[-1] + 1))
 
 
 def _files(kind: str, image: np.ndarray, quality: int, **options) -> Encoded:

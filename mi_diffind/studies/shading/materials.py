@@ -97,10 +97,10 @@ MADE: dict[str, Callable[[int], dict[str, np.ndarray]]] = {"hammered": hammered,
 
 def made(name: str, side: int = SIDE) -> Source:
     """One of :data:`MADE` as a source of 8-bit maps: albedo sRGB-encoded, normals as (n + 1)/2."""
-    from ...metrics import srgb
+    from ...srgb import for_display
 
     found = {}
     for key, values in MADE[name](side).items():
-        values = srgb(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values
+        values = for_display(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values
         found[key] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
     return from_arrays(found)

@@ -14,7 +14,7 @@ from functools import cached_property
 import drjit as dr
 import numpy as np
 
-from ... import metrics
+from ... import srgb
 from ...maps.pyramid import Pyramid
 from ...tasks.disney.effects import Effects
 from ...tasks.shading.evaluation import ShadedReader
@@ -76,7 +76,7 @@ class Motion:
         dr.eval(value)
         with dr.suspend_grad():
             image = np.stack([c.numpy() for c in value], axis=-1)
-        return metrics.srgb(image.reshape(self.side, self.side, 3)).astype(np.float32)
+        return srgb.for_display(image.reshape(self.side, self.side, 3)).astype(np.float32)
 
     def aligned(self, frames: np.ndarray) -> np.ndarray:
         """What points of the plane look like that all frames show, ``(frames, n, 3)``."""

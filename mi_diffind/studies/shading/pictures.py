@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ... import metrics
+from ... import srgb
 from ...measure import plot
 from ...measure.formatting import machine_line, state
 from ..texture.zoom import flicker
@@ -110,7 +110,7 @@ def strip(settings: dict, result: dict):
         for column, (text, image) in enumerate({**images, "truth": truths}.items()):
             axes = sheet.add_subplot(len(rows), len(images) + 1, row * (len(images) + 1) + column + 1)
             side = min(CROP, *image.shape[1:3])
-            axes.imshow(metrics.srgb(image[pair, :side, :side]), interpolation="nearest")
+            axes.imshow(srgb.for_display(image[pair, :side, :side]), interpolation="nearest")
             mse = float(np.mean((image[pair] - truths[pair]) ** 2))
             axes.set_title(text if text == "truth" else f"{text}\n{-10 * np.log10(max(mse, 1e-12)):.1f} dB", fontsize=8)
             axes.set_xticks([])

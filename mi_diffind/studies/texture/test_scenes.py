@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import metrics
+from ... import srgb
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def to_uv(repeats: tuple[float, float]):
 def shown(image) -> np.ndarray:
     """A linear image as displayed, float32."""
     with dr.suspend_grad():
-        return metrics.srgb(np.array(image, np.float32)[..., :3]).astype(np.float32)
+        return srgb.for_display(np.array(image, np.float32)[..., :3]).astype(np.float32)
 
 
 def errors(truth: np.ndarray, image: np.ndarray, counted: np.ndarray) -> dict[str, float]:

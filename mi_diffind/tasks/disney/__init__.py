@@ -21,6 +21,7 @@ class DisneyTask(Task):
 
     name = "disney"
     title = "the Disney BRDF"
+    files = "library"
     section = "supplemental 1.2"
     #: Tables of one coordinate start close to their optimum: ten times the rate costs 15 dB (75 in place of 90 dB).
     presets = {  # noqa: RUF012
@@ -38,16 +39,6 @@ class DisneyTask(Task):
 
     def table(self, problem, request: FitRequest):
         return problem.net.to_table()
-
-    def load(self, path):
-        from .library import load
-
-        return load(path)
-
-    def model_class(self):
-        from .library import DisneyModel
-
-        return DisneyModel
 
 
 TASK = DisneyTask()

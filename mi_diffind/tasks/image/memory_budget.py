@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ...units import largest_fitting
+
 #: Best resolution ratio for compression ratios of RGB textures at 4K (the supplement's table 2).
 RATIOS = {3: 128, 6: 128, 12: 80, 24: 72}
 
@@ -262,11 +264,7 @@ def _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse: Coar
         return ImageBudget(rows, columns, cascaded, channels, dims, bits, (rows, columns) == (height, width), coarse)
 
     def largest(at) -> ImageBudget:
-        low, high = 1, long
-        while low < high:
-            middle = (low + high + 1) // 2
-            low, high = (middle, high) if at(middle).nbytes <= budget else (low, middle - 1)
-        return at(low)
+        return at(largest_fitting(lambda n: at(n).nbytes <= budget, 1, long + 1))
 
     best = largest(lambda n: sized(min(max(1, round(n * short / long)), short), n))
     if short < long:

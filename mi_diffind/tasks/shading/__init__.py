@@ -18,7 +18,7 @@ import dataclasses
 
 from ...arguments import Argument, fraction, positive_or_none
 from ...maps.arguments import SIZES, SOURCES
-from ...task import FitRequest, Task
+from ...task import Task
 from .presets import PRESETS, REFERENCES
 
 
@@ -64,16 +64,6 @@ class Shading(Task):
         own = PRESETS[preset].settings
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
-
-    def check(self, request: FitRequest) -> None:
-        from .fit import check
-
-        check(request)
-
-    def fit(self, request: FitRequest):
-        from .fit import fit
-
-        return fit(request)
 
 
 TASK = Shading()
