@@ -5,7 +5,7 @@ Task 2: the Disney BRDF (Burley 2012), exact and as tables.
 - :mod:`.effects`: the parts of the model that a material uses;
 - :mod:`.decoder`: the model in two steps, per material and per direction, with methods that tables can replace;
 - :mod:`.arrays`, :mod:`.factored`, :mod:`.paper`: the tables, their base class and both layouts;
-- :mod:`.library`: table files;
+- :mod:`.files`: table files;
 - :mod:`.sampling`: importance sampling and its density;
 - :mod:`.training`: training distributions and errors.
 """
@@ -21,7 +21,6 @@ class DisneyTask(Task):
 
     name = "disney"
     title = "the Disney BRDF"
-    files = "library"
     section = "supplemental 1.2"
     #: Tables of one coordinate start close to their optimum: ten times the rate costs 15 dB (75 in place of 90 dB).
     presets = {  # noqa: RUF012
@@ -31,7 +30,7 @@ class DisneyTask(Task):
     shipped = {"tables": "disney_tables.npz", "paper": "disney_paper.npz"}  # noqa: RUF012
 
     def problem(self, request: FitRequest):
-        from .library import LAYOUTS
+        from .files import LAYOUTS
         from .training import DisneyProblem
 
         layout, decoder = LAYOUTS[request.preset]

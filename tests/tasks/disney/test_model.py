@@ -17,7 +17,7 @@ from mi_diffind.tables import Table, TableError, save_table
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import Effects, ValueBounds, find_effects
-from mi_diffind.tasks.disney.library import LAYOUTS
+from mi_diffind.tasks.disney.files import LAYOUTS
 from mi_diffind.tasks.disney.model import ALPHA_MIN, PARAMETERS, Material, exact_factors
 from mi_diffind.tasks.disney.paper import PaperArrays
 from mi_diffind.tasks.disney.training import measure, shade, uniform_hemisphere
