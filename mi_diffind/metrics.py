@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 
-def srgb(image: np.ndarray) -> np.ndarray:
-    """Linear values, clipped to [0, 1], with the sRGB transfer function (IEC 61966-2-1) for display."""
-    c = np.clip(np.nan_to_num(image), 0, 1)
+def srgb(image: np.ndarray, clip: bool = True) -> np.ndarray:
+    """Return linear values, by default clipped to [0, 1], with the sRGB transfer function (IEC 61966-2-1)."""
+    c = np.clip(np.nan_to_num(image), 0, 1) if clip else image
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 0.0031308), 1 / 2.4) - 0.055)
 
 

@@ -63,3 +63,15 @@ def _positive(match: re.Match | None, text, what: str, example: str) -> float:
     if not (value > 0 and math.isfinite(value)):
         raise ValueError(f"{text!r} is not {what}, allowed are finite numbers > 0 such as {example}")
     return value
+
+
+def largest_fitting(nbytes_of, budget: float, low: int, high: int) -> int:
+    """
+    Return the largest whole number ``n`` in ``low`` … ``high`` with ``nbytes_of(n) <= budget``, by bisection.
+
+    ``nbytes_of`` must not decrease. If not even ``low`` fits, the result is ``low``.
+    """
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if nbytes_of(middle) <= budget else (low, middle - 1)
+    return low

@@ -31,7 +31,7 @@ def pyramid_of(maps: dict[str, list[np.ndarray]], like: Pyramid) -> Pyramid:
                 if isinstance(where, int):
                     found[..., where] = m.encode(maps[m.name][i][..., c])
         levels.append(found)
-    return Pyramid.from_levels(layout, levels, like.types, like.border)
+    return Pyramid(layout, levels, like.types, like.border)
 
 
 def errors(truth: dict[str, list[np.ndarray]], found: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:
