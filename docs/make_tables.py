@@ -228,7 +228,7 @@ def shading_shares(study: str) -> str:
     """The paper's figure 2: quality by λ, with the spread over seeds."""
     rows = []
     for name, own in shading_curves(study).items():
-        for way in own.ways:
+        for way in own.remedies:
             for letter in "CP":
                 cells = []
                 for share in own.shares(way):
@@ -236,7 +236,7 @@ def shading_shares(study: str) -> str:
                     spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
                     cells.append(f"{mean(values):.2f}{spread}")
                 rows.append([name, way, letter, *cells])
-    shares = max((own.shares(way) for own in shading_curves(study).values() for way in own.ways), key=len)
+    shares = max((own.shares(way) for own in shading_curves(study).values() for way in own.remedies), key=len)
     return table(["material", "", "", *(f"λ {share:g}" for share in shares)], rows)
 
 

@@ -344,6 +344,13 @@ def replays_paths(integrator) -> bool:
     return any(kind.__name__ == "RBIntegrator" for kind in type(integrator).__mro__)
 
 
+def samples_in_python(integrator) -> bool:
+    """Is it one of Mitsuba's integrators in Python (``prb``, …), whose ``sample`` takes a mode?"""
+    import mitsuba as mi
+
+    return isinstance(integrator, mi.ad.integrators.common.ADIntegrator)
+
+
 def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
     """
     Put samples into an image block, with further channels ``aovs``: what Mitsuba's integrators in Python do in a
@@ -358,6 +365,36 @@ def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
 # -- Mitsuba: scenes ---------------------------------------------------------------------------------------------------
 
 
+def objects_of(scene) -> list:
+    """
+    Return all objects of a loaded scene, each once, wherever they hide (in a ``twosided``, a ``bumpmap``, …).
+
+    They are the keys of ``hierarchy`` of ``mi.traverse``, which is not in the manual and lists some twice.
+    """
+    import mitsuba as mi
+
+    return list({id(node): node for node in mi.traverse(scene).hierarchy}.values())
+
+
+def is_instance(shape) -> bool:
+    """Is it an ``instance`` of a ``shapegroup``? By the name of its class, which is not promised."""
+    return shape.class_name() == "Instance"
+
+
+def is_shared(holder: list) -> bool:
+    """
+    Does anything but the list ``holder`` refer to its first item, an object of Mitsuba's own?
+
+    Their classes allow no weak references, but references from C++ count in Python, too. How many ``sys.getrefcount``
+    adds by itself differs between versions of Python: a new object that nothing else refers to says it.
+    """
+    return _references(holder) > _references([object()])
+
+
+def _references(holder: list) -> int:
+    return sys.getrefcount(holder[0])
+
+
 def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -> tuple:
     """
     The configuration and the state of a parsed scene file (``mi.parser``, which is new in 3.8 and still moves), with
@@ -367,6 +404,13 @@ def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -
 
     config = mi.parser.ParserConfig(mi.variant())
     return config, mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in (defines or {}).items()})
+
+
+def copy_parsed(state) -> tuple:
+    """Return a configuration and a copy of a parsed scene's state, since :func:`instantiate` changes the state."""
+    import mitsuba as mi
+
+    return mi.parser.ParserConfig(mi.variant()), mi.parser.ParserState(state)
 
 
 def instantiate(config, state):

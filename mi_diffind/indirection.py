@@ -18,6 +18,7 @@ import numpy as np
 from drjit import nn
 
 from . import lookup
+from .bits import as_words, pack_bits, unpack_bits
 from .compat import module_of
 from .runtime import llvm_problem
 
@@ -230,11 +231,7 @@ class DifferentiableArray(nn.Module):
             require_backend(dtype)
             UInt32 = module_of(dtype).UInt32
             result.bits = bits
-            if bits < 8:
-                packed = lookup.pack_bits(codes, bits)
-                packed = np.pad(packed, (0, 4 + -len(packed) % 4)).view(np.uint32)
-            else:
-                packed = lookup.pack(codes, result.border)
+            packed = as_words(pack_bits(codes, bits), spare=1) if bits < 8 else lookup.pack(codes, result.border)
             words = aligned(packed.shape, np.uint32)
             words[...] = packed
             result.data = UInt32(words)
@@ -259,7 +256,7 @@ class DifferentiableArray(nn.Module):
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
         if self.bits < 8:
             count = math.prod(self.resolution) * self.channels
-            return lookup.unpack_bits(self.data.numpy().view(np.uint8), count, self.bits).reshape(
+            return unpack_bits(self.data.numpy().view(np.uint8), count, self.bits).reshape(
                 *self.resolution, self.channels
             )
         return lookup.unpack(self.data.numpy(), self.resolution, self.channels)

@@ -277,9 +277,10 @@ def read_bits(
     bits: int = 4,
 ):
     """
-    Read a table whose channels have ``bits`` bits each, fewer than 8 (:func:`pack_bits`, in words of 32 bits and one
-    word more): it takes no more memory than that. One gather a corner if an entry is a half, a quarter … of a word, two
-    if it may begin in one and end in the next. Otherwise as :func:`read_packed`.
+    Read a table of fewer than 8 ``bits`` a channel (:func:`.bits.pack_bits`, in words of 32 bits and one word more).
+
+    The table takes no more memory than these bits. A corner takes one gather if entries never cross the end of a word,
+    else two. Otherwise like :func:`read_packed`.
     """
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
     fetch = functools.partial(fetch_bits, words, channels, bits, active, type(x[0]))
@@ -289,7 +290,7 @@ def read_bits(
 
 
 def fetch_bits(words, channels: int, bits: int, active, Float, index) -> list:
-    """The numbers that :func:`pack_bits` packed for an entry, as ``Float``."""
+    """The numbers that :func:`.bits.pack_bits` packed for an entry, as ``Float``."""
     UInt32, width = type(words), channels * bits
     Int32, count = dr.int32_array_t(UInt32), channels_words(channels, bits)
     start = index * width
@@ -327,22 +328,6 @@ def entry_packed(
                 codes += [Float(Int32((rotated >> shift) & 0xFF)) for shift in (15, 7)]
     values = [dr.fma(c, scale[k], offset[k]) for k, c in enumerate(codes[:channels])]
     return values if active is True else [dr.select(active, v, 0) for v in values]
-
-
-def pack_bits(codes, bits: int):
-    """The lower ``bits`` bits of each byte of a NumPy array, one after the other, lowest first: flat ``uint8``."""
-    import numpy as np
-
-    found = np.unpackbits(np.asarray(codes, np.uint8).reshape(-1, 1), axis=1, bitorder="little")
-    return np.packbits(found[:, :bits], bitorder="little")
-
-
-def unpack_bits(packed, count: int, bits: int):
-    """The ``count`` bytes that :func:`pack_bits` packed: flat ``uint8``."""
-    import numpy as np
-
-    found = np.unpackbits(packed, count=count * bits, bitorder="little").reshape(count, bits)
-    return np.packbits(np.pad(found, ((0, 0), (0, 8 - bits))), axis=1, bitorder="little").reshape(count)
 
 
 def quantize(values, channels: int):

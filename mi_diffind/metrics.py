@@ -6,17 +6,7 @@ import math
 
 import numpy as np
 
-
-def srgb(image: np.ndarray, clip: bool = True) -> np.ndarray:
-    """Return linear values, by default clipped to [0, 1], with the sRGB transfer function (IEC 61966-2-1)."""
-    c = np.clip(np.nan_to_num(image), 0, 1) if clip else image
-    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 0.0031308), 1 / 2.4) - 0.055)
-
-
-def linear(values: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`srgb`; not clipped, negative values become multiples of themselves."""
-    c = np.maximum(values, 0.04045)
-    return np.where(values <= 0.04045, values / 12.92, (c / 1.055 + 0.055 / 1.055) ** 2.4)
+from .srgb import for_display
 
 
 def psnr(reference: np.ndarray, image: np.ndarray) -> float:
@@ -32,10 +22,11 @@ def mae(reference: np.ndarray, image: np.ndarray) -> float:
 
 def flip(reference: np.ndarray, image: np.ndarray) -> float:
     """
-    Mean LDR-FLIP (Andersson et al. 2020), 0 = equal to the eye, of the images as displayed (:func:`srgb`) at the
-    default viewing distance of 67 pixels per degree.
+    Return the mean LDR-FLIP (Andersson et al. 2020; 0: equal to the eye) of linear images as a screen displays them.
+
+    They are encoded by :func:`.srgb.for_display`; the viewing distance is the default one, 67 pixels per degree.
     """
-    return flip_shown(srgb(reference), srgb(image))
+    return flip_shown(for_display(reference), for_display(image))
 
 
 def flip_shown(reference: np.ndarray, image: np.ndarray) -> float:

@@ -19,6 +19,7 @@ import numpy as np
 from drjit import nn
 
 from . import lookup
+from .bits import as_words, pack_bits, unpack_bits
 from .compat import module_of
 from .indirection import DifferentiableArray, aligned, coordinates_of, fold, padded_tensor, require_backend
 
@@ -162,8 +163,7 @@ class PagedArray(DifferentiableArray):
             codes, *affine = lookup.quantize(values, result.channels)
         result.scale, result.offset = (tuple(map(float, numbers)) for numbers in affine)
         result.bits = bits
-        packed = lookup.pack_bits(codes, bits)
-        packed = np.pad(packed, (0, 4 + -len(packed) % 4)).view(np.uint32)
+        packed = as_words(pack_bits(codes, bits), spare=1)
         words = aligned(packed.shape, np.uint32)
         words[...] = packed
         result.data = module.UInt32(words)
@@ -174,7 +174,7 @@ class PagedArray(DifferentiableArray):
         if self.storage != "uint8":
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
         packed = self.data.numpy().view(np.uint8)
-        return lookup.unpack_bits(packed, self.entries * self.channels, self.bits).reshape(-1, self.channels)
+        return unpack_bits(packed, self.entries * self.channels, self.bits).reshape(-1, self.channels)
 
     def at(self, x):
         raise NotImplementedError("an array of pages cannot be reduced by a dimension")

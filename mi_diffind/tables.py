@@ -2,7 +2,7 @@
 The file that holds one trained thing: a ``.npz`` archive (readable by ``numpy.load``, never pickled).
 
 It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``, or,
-of entries with fewer than 8 bits, their bits one after the other (:func:`.lookup.pack_bits`), and an array ``meta`` of
+of entries with fewer than 8 bits, their bits one after the other (:func:`.bits.pack_bits`), and an array ``meta`` of
 UTF-8 bytes: JSON with the format version, the task and its preset, for each array its shape, borders, storage form, and
 (of bytes) affine map and bits, the training settings, the seed and what was measured. The same content gives the same
 bytes.
@@ -20,10 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
+from .bits import pack_bits, unpack_bits
 from .errors import DiffindError, reason
 from .files import replacing
 from .indirection import DifferentiableArray
-from .lookup import BORDERS, STORAGES, channels_words, gathers, pack_bits, quantize, unpack_bits
+from .lookup import BORDERS, STORAGES, channels_words, gathers, quantize
 from .pages import SIDE_BITS, PagedArray
 
 #: Version of the format that is written. A file with another version is refused.

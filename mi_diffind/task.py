@@ -1,17 +1,30 @@
 """
-What a task is: a ground truth, arrays that are fitted to it, and a table file that holds them.
+Base classes of tasks, the registry of all tasks, and the function ``fit``.
 
-A task declares itself as ``TASK``, a :class:`Task`, in the package ``mi_diffind/tasks/NAME`` or, if it is somebody
-else's, in a module that an entry point of the group ``mi_diffind.tasks`` names. Nothing lists tasks: ``fit``,
-``inspect``, ``decode`` and the documentation ask :func:`tasks`. A declaration is read whenever the command line builds
-its parsers, so it is cheap to import: no Dr.Jit, no Mitsuba; what trains and reads is imported by the methods.
+A task is a ground truth, arrays that are fitted to it, and a table file that holds them. It declares itself as
+``TASK``, a :class:`Task`, in the package ``mi_diffind/tasks/NAME`` or in a module that an entry point of the group
+``mi_diffind.tasks`` names. No list of tasks exists: ``fit``, ``inspect``, ``decode`` and the documentation ask
+:func:`tasks`. The command line imports every declaration, so a declaration imports neither Dr.Jit nor Mitsuba.
+
+Code that needs them lies in other modules of the task's package, where :class:`Task` looks for it by name:
+
+=============  =====================================================================================
+``fit.py``     ``check(request)`` and ``fit(request)``
+``files.py``   ``load(path)``, ``allocate(table, dtype, storage)``, ``MODEL``
+``model.py``   ``MODEL``, the class of the task's :class:`Model`, if ``files.py`` has none
+=============  =====================================================================================
+
+A task that needs more than that overrides the methods of :class:`Task`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
+import importlib.util
 import os
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -149,7 +162,7 @@ class Task:
     A task: the base class. Class attributes say what it is, methods how it is done.
 
     A task has to have a ``name`` (that of its package), a ``title`` (what it is of, for help texts), its ``section`` in
-    the paper, ``presets`` (the first is the default), :meth:`problem`, :meth:`table` and :meth:`model_class`.
+    the paper, ``presets`` (the first is the default), and :meth:`problem` and :meth:`table`, or a ``fit.py``.
     """
 
     #: The word that stands for it on the command line and in table files.
@@ -167,6 +180,8 @@ class Task:
     #: The arguments of ``fit`` and ``decode`` that only this task adds.
     arguments: tuple[Argument, ...] = ()
     decode_arguments: tuple[Argument, ...] = ()
+    #: The module of the task's package that reads its table files.
+    files: str = "files"
 
     # -- training ---------------------------------------------------------------------------------------------------
 
@@ -175,7 +190,13 @@ class Task:
         return dataclasses.replace(self.presets[preset], **given)
 
     def check(self, request: FitRequest) -> None:
-        """Raise :class:`~mi_diffind.errors.UsageError` for options that do not go together, before any work."""
+        """
+        Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
+
+        Calls ``check`` of the task's ``fit.py`` if there is one.
+        """
+        if check := self._implementation("check", "fit"):
+            check(request)
 
     def problem(self, request: FitRequest) -> Problem:
         """What is to be trained, arrays allocated."""
@@ -186,7 +207,13 @@ class Task:
         raise NotImplementedError
 
     def fit(self, request: FitRequest) -> Fitted:
-        """One training, and what is measured of its result in its storage form."""
+        """
+        Train, and measure the result in its storage form.
+
+        Calls ``fit`` of the task's ``fit.py`` if there is one, else trains :meth:`problem` once.
+        """
+        if fit := self._implementation("fit", "fit"):
+            return fit(request)
         problem = self.problem(request)
         result = request.train(problem)
         table = self.table(problem, request)
@@ -202,18 +229,40 @@ class Task:
     # -- files ------------------------------------------------------------------------------------------------------
 
     def load(self, path: str | os.PathLike) -> Table:
-        """Read and check a file of this task. Raises :class:`~mi_diffind.tables.TableError`."""
+        """
+        Read and check a file of this task, by ``load`` of ``files.py`` if there is one.
+
+        Raises :class:`~mi_diffind.tables.TableError`.
+        """
         from .tables import load_table
 
-        return load_table(path, self.name)
+        load = self._implementation("load", self.files)
+        return load(path) if load else load_table(path, self.name)
 
     def model_class(self) -> type[Model]:
-        """What a file of this task becomes."""
-        return Model
+        """Return ``MODEL`` of ``files.py`` or ``model.py``, the class that :meth:`model` makes an instance of."""
+        return self._implementation("MODEL", self.files, "model") or Model
 
     def allocate(self, table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
-        """The arrays of a checked table for the tensor type ``dtype``, in a storage form ("": the file's own)."""
+        """
+        Return the arrays of a checked table for the tensor type ``dtype``, by ``allocate`` of ``files.py`` if any.
+
+        ``storage`` is the storage form ("": the file's own).
+        """
+        if allocate := self._implementation("allocate", self.files):
+            return allocate(table, dtype, storage)
         return {name: array.allocate(dtype, storage) for name, array in table.arrays.items()}
+
+    def _implementation(self, name: str, *modules: str) -> Any:
+        """Return ``name`` of the first of the package's ``modules`` that has it, ``None`` if none has."""
+        for cls in type(self).__mro__[: type(self).__mro__.index(Task)]:
+            package = sys.modules[cls.__module__].__package__
+            for module in modules if package else ():
+                if importlib.util.find_spec(f"{package}.{module}") is not None:
+                    found = getattr(importlib.import_module(f"{package}.{module}"), name, None)
+                    if found is not None:
+                        return found
+        return None
 
     def model(self, table: Table, dtype, storage: str = "") -> Model:
         """What a checked table stands for, allocated. Raises :class:`~mi_diffind.tables.TableError`."""

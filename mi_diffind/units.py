@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 
 _NUMBER = r"(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
 _UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
@@ -65,13 +66,15 @@ def _positive(match: re.Match | None, text, what: str, example: str) -> float:
     return value
 
 
-def largest_fitting(nbytes_of, budget: float, low: int, high: int) -> int:
+def largest_fitting(fits: Callable[[float], bool], low: float, high: float, steps: int | None = None) -> float:
     """
-    Return the largest whole number ``n`` in ``low`` … ``high`` with ``nbytes_of(n) <= budget``, by bisection.
+    Return the largest number from ``low`` to below ``high`` that ``fits``, by bisection; ``low`` if none above it does.
 
-    ``nbytes_of`` must not decrease. If not even ``low`` fits, the result is ``low``.
+    ``fits`` holds up to some number and not beyond, such as "this side takes at most so many bytes". Both ends are
+    whole numbers, and so is the result; with ``steps``, they are real numbers and are halved that often.
     """
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if nbytes_of(middle) <= budget else (low, middle - 1)
+    while high - low > 1 if steps is None else steps > 0:
+        middle = (low + high) // 2 if steps is None else (low + high) / 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+        steps = None if steps is None else steps - 1
     return low

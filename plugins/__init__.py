@@ -238,15 +238,10 @@ def shown_as(made, part) -> None:
 
 
 def _forget_dead() -> None:
-    """
-    Drop the native objects that nobody else holds. Mitsuba's classes allow no weak references; references from C++
-    count in Python, too, so those that remain here are three: the list of it, the name ``made``, the argument.
-    """
+    """Drop the native objects that nothing else refers to."""
     for key, entry in list(_native.items()):
-        made = entry[0]
-        if sys.getrefcount(made) <= 3:
+        if not compat.is_shared(entry):
             del _native[key]
-        del made
 
 
 def origin(made) -> dict | None:

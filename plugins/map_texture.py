@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_diffind import metrics
+from mi_diffind import srgb
 from mi_diffind.lookup import clamp
 
 from .support import properties, tables, textures, upsampling
@@ -114,7 +114,8 @@ class MapTexture(mi.Texture):
         if not self._is_encoded():
             return values
         bounded = self.map.low >= 0 and self.map.high <= 1 and self.map.knee == 0
-        return [textures.linear(v, bounded) for v in values]
+        decode = srgb.to_linear_bounded if bounded else srgb.to_linear
+        return [decode(v) for v in values]
 
     def _is_encoded(self) -> bool:
         """Are values in the file sRGB, and to be converted?"""
@@ -229,7 +230,7 @@ class MapTexture(mi.Texture):
 
         with ThreadPoolExecutor(1) as pool:
             values = pool.submit(decode).result()
-        return metrics.linear(values) if self._is_encoded() else values
+        return srgb.to_linear(values) if self._is_encoded() else values
 
     # -- sampling of positions ----------------------------------------------------------------------------------------
 

@@ -3,9 +3,10 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
+from mi_diffind import srgb
+
 from . import Plugin
 from .filtered_texture import FilteredTexture
-from .support import textures
 from .support.image_files import SharedMaps, open_uncompressed
 
 
@@ -148,7 +149,7 @@ class MipMap(FilteredTexture):
         if not (self._is_encoded() and self.image.is_linear(self.map.name)):
             return self._used(self.image.encoded(stored))
         return [
-            mi.Float(stored[where]) if isinstance(where, int) else textures.linear(mi.Float(where[1]), True)
+            mi.Float(stored[where]) if isinstance(where, int) else srgb.to_linear_bounded(mi.Float(where[1]))
             for where in self.map.where
         ]
 

@@ -171,7 +171,7 @@ def has_smooth(scene: mi.Scene) -> bool:
     """Is there a surface in the scene across which rays are followed? One that is instanced counts in any case."""
     for shape in scene.shapes():
         bsdf = shape.bsdf()
-        if shape.class_name() == "Instance":
+        if compat.is_instance(shape):
             return True
         if bsdf is not None and is_smooth(bsdf) and not shape.is_medium_transition():
             return True

@@ -373,3 +373,37 @@ def test_base_of_integrators(mi_any):
 
     ray, _, _ = base(mi_any.Properties()).sample_rays(scene, scene.sensors()[0], Sampler())
     assert ray.has_differentials and drawn[0] == 2
+
+
+def test_objects_of_scenes(mi_rgb):
+    with hook("hierarchy of mi.traverse"):
+        bsdf = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}
+        group = {"type": "shapegroup", "ball": {"type": "sphere", "bsdf": bsdf}}
+        ref = {"type": "ref", "id": "group"}
+        scene = mi_rgb.load_dict({
+            "type": "scene", "group": group, "one": {"type": "instance", "group": ref},
+            "two": {"type": "instance", "group": ref}, "rectangle": {"type": "rectangle"},
+        })  # fmt: skip
+        objects = compat.objects_of(scene)
+        names = [node.class_name() for node in objects]
+        assert len({id(node) for node in objects}) == len(objects) and names.count("Checkerboard") == 1
+    with hook("class_name of instances"):
+        assert sorted(compat.is_instance(shape) for shape in scene.shapes()) == [False, True, True]
+
+
+def test_references(mi_rgb):
+    with hook("references to Mitsuba's objects, counted in Python and in C++"):
+        holder = [mi_rgb.load_dict({"type": "sphere"})]
+        assert not compat.is_shared(holder)
+        scene = mi_rgb.load_dict({"type": "scene", "ball": holder[0]})
+        assert compat.is_shared(holder) and scene is not None
+        del scene
+        assert not compat.is_shared(holder)
+        name = holder[0]
+        assert compat.is_shared(holder) and name is not None
+
+
+def test_integrators_in_python(mi_rgb):
+    with hook("mi.ad.integrators.common"):
+        assert compat.samples_in_python(mi_rgb.load_dict({"type": "prb"}))
+        assert not compat.samples_in_python(mi_rgb.load_dict({"type": "path"}))

@@ -17,6 +17,9 @@ BACKENDS = ["llvm", "cuda"] if dr.has_backend(dr.JitBackend.CUDA) else ["llvm"]
 CHANNELS = (1, 2, 3, 4, 7, 12)
 RESOLUTION = (5, 4, 6, 3)
 DENORMAL = 1e-45
+
+#: The smallest single-precision number that is no denormal.
+SMALLEST_NORMAL = 2.0**-126
 BELOW_ONE = float(np.nextafter(np.float32(1), np.float32(0)))
 ABOVE_ONE = float(np.nextafter(np.float32(1), np.float32(2)))
 SPECIAL = (
@@ -287,9 +290,9 @@ def test_packed_reads_are_differentiable_in_the_coordinate(ad, dims, channels):
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
 def test_slope_at_the_ends(ad, storage):
-    """That of the first and last cell at exactly 0 and 1, of the cell that is read otherwise, none beyond a clamp."""
+    """The first and the last cell's at exactly 0 and 1, that of the cell that is read inside, none beyond a clamp."""
     table = np.array([[1.0], [3.0], [4.0], [0.0]], np.float32)
-    x = (0.0, -0.0, 1.0, BELOW_ONE, 0.5, -DENORMAL, -0.01, ABOVE_ONE, 1.01, np.inf, -np.inf, np.nan)
+    x = (0.0, -0.0, 1.0, BELOW_ONE, 0.5, -SMALLEST_NORMAL, -0.01, ABOVE_ONE, 1.01, np.inf, -np.inf, np.nan, -DENORMAL)
     clamped = [6, 6, -12, -12, 3, 0, 0, 0, 0, 0, 0, 0]
     around = [8, 8, 8, 4, -16, 4, 4, 8, 8, 0, 0, 0]
     for border, expected in (("clamp", clamped), ("repeat", around)):
@@ -297,10 +300,12 @@ def test_slope_at_the_ends(ad, storage):
         point = ad.Float(np.float32(x))
         dr.enable_grad(point)
         dr.backward(array(point)[0])
-        found = point.grad.numpy()
-        held = array.numpy()[:, 0] - table[:, 0]
-        np.testing.assert_allclose(found, expected, atol=1e-3 + 8 * np.abs(held).max(), err_msg=border)
-        assert (found[np.equal(expected, 0)] == 0).all()
+        *slopes, denormal_slope = point.grad.numpy()
+        tolerance = 1e-3 + 8 * np.abs(array.numpy()[:, 0] - table[:, 0]).max()
+        np.testing.assert_allclose(slopes, expected, atol=tolerance, err_msg=border)
+        assert (np.array(slopes)[np.equal(expected, 0)] == 0).all()
+        # Kernels treat denormals as zero; some instructions do not: -DENORMAL is 0 or the next number below
+        assert min(abs(denormal_slope - slope) for slope in (expected[0], expected[5])) <= tolerance
 
 
 def test_entries_get_the_gradient_of_reads_outside(ad):
@@ -489,22 +494,6 @@ def test_masked_lanes_of_few_bits_are_zero(ad, bits):
     assert (everything[~mask] != 0).any()
     x[~mask] = np.nan
     np.testing.assert_array_equal(read(array, ad, x, active=ad.Bool(mask)), np.where(mask[:, None], everything, 0))
-
-
-@pytest.mark.parametrize("bits", range(1, 9))
-@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 31, 64, 1001])
-def test_bits_survive_packing(bits, count):
-    """Bit ``i`` of code ``k`` is bit ``k · bits + i`` of the bytes, the lowest first."""
-    codes = np.random.default_rng(count).integers(0, 2**bits, count).astype(np.uint8)
-    packed = lookup.pack_bits(codes, bits)
-    assert packed.dtype == np.uint8 and packed.shape == (-(-count * bits // 8),)
-    number = sum(int(code) << (k * bits) for k, code in enumerate(codes))
-    assert packed.tobytes() == number.to_bytes(len(packed), "little")
-    unpacked = lookup.unpack_bits(packed, count, bits)
-    assert unpacked.dtype == np.uint8
-    np.testing.assert_array_equal(unpacked, codes)
-    wider = codes | np.uint8(0xFF << bits & 0xFF)  # what lies above is left out
-    np.testing.assert_array_equal(lookup.pack_bits(wider, bits), packed)
 
 
 @pytest.mark.parametrize("bits", range(1, 8))

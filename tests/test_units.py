@@ -193,11 +193,20 @@ def test_explanations():
     assert "nearest with whole sides and a cascaded side of 4" in explain(wide, 256**2 * 3, 256**2 / 4)
 
 
-def test_largest_that_fits():
-    for budget, largest in ((-1, 3), (9, 3), (16, 4), (24, 4), (25, 5), (99, 9), (10**6, 20)):
-        assert units.largest_fitting(lambda n: n * n, budget, 3, 20) == largest
-
-
 def test_sizes_refuse_nonsense():
     with pytest.raises(ValueError, match="rows: found 0"):
         ImageBudget(0, 1, 4, 3)
+
+
+@pytest.mark.parametrize("threshold", [-3, 0, 1, 7, 99, 100, 250])
+def test_largest_fitting(threshold):
+    tried = []
+
+    def fits(n):
+        tried.append(n)
+        return n <= threshold
+
+    assert units.largest_fitting(fits, 0, 100) == min(max(threshold, 0), 99)
+    assert len(tried) <= 7 and all(0 < n < 100 for n in tried)
+    assert units.largest_fitting(fits, 5, 6) == 5
+    assert units.largest_fitting(lambda x: x * x <= 2, 0.0, 2.0, steps=40) == pytest.approx(2**0.5)

@@ -109,10 +109,10 @@ def _inspect_scene(arguments) -> dict:
     set_variant(arguments.variant)
     from .. import scenes
 
-    defines = dict(arguments.defines)
-    learned = scenes.learned_plugins(arguments.file, defines=defines)
-    tables = scenes.tables_of(arguments.file, learned)
-    reports = scenes.reports(scenes.load(arguments.file, defines=defines))
+    parsed = scenes.ParsedScene(arguments.file, dict(arguments.defines))
+    learned = parsed.learned_plugins()
+    tables = parsed.tables(learned)
+    reports = scenes.reports(parsed.load())
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned plugin(s), {total:,} bytes of tables in {len(tables)} file(s)")
     for found in reports:

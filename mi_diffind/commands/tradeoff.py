@@ -62,5 +62,5 @@ def run(arguments) -> dict:
 def _measure(plan, arguments) -> dict:
     from ..measure import benchmark, report
 
-    result = benchmark.measure(plan, benchmark.Settings.choose(plan.variant, arguments.quick), arguments.out)
+    result = benchmark.measure(plan, benchmark.BenchmarkSettings.choose(plan.variant, arguments.quick), arguments.out)
     return report.publish(result, report.write(result, arguments.out, plan), report.summary(result, plan))

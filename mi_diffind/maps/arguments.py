@@ -36,6 +36,11 @@ SOURCES = (
     ),
 )  # fmt: skip
 
+#: Picture of a training that is written at each measurement.
+PREVIEW = Argument(
+    "--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"
+)
+
 #: Options of decoding maps.
 DECODED = (
     Argument("--map", action="append", metavar="NAME", help="only this map; may be repeated (default: all)"),
@@ -78,3 +83,10 @@ def size_figures(source: Source, table, requested: float | None) -> tuple[dict, 
     }
     wanted = f" ({source.nbytes / requested:.2f}x requested)" if requested else ""
     return figures, (f"{achieved:.2f}x" if achieved else "of one colour") + wanted
+
+
+def preview_path(request) -> Path | None:
+    """Return the file of :data:`PREVIEW`: the given one, or ``…_preview.png`` beside the output (``None`` without)."""
+    if request.options["preview"] is not None:
+        return Path(request.options["preview"])
+    return None if request.output is None else request.output.with_name(f"{request.output.stem}_preview.png")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import metrics
+from .. import srgb
 from ..errors import UsageError
 from ..files import replacing
 from ..indirection import DifferentiableArray
@@ -140,6 +140,6 @@ def _write(path: Path, values: np.ndarray, color_space: str) -> None:
             mi.Bitmap(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).write(str(temporary))
             return
         if color_space == "srgb":
-            values = metrics.linear(values)
+            values = srgb.to_linear(values)
         fits = np.abs(values).max() < 65520  # the limit of rounding to a finite half
         mi.Bitmap(np.ascontiguousarray(values, dtype=np.float16 if fits else np.float32)).write(str(temporary))

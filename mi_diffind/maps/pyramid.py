@@ -19,7 +19,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from .. import lookup, metrics
+from .. import lookup, srgb
 from ..indirection import aligned
 from . import components
 from .compressed import FilteredMaps
@@ -102,7 +102,7 @@ class Pyramid(FilteredMaps):
                 level = m.values if signed else 2 * m.values - 1
                 level = np.concatenate([level, np.linalg.norm(level, axis=-1, keepdims=True)], axis=-1)
             else:
-                level = metrics.linear(m.values) if m.color_space == "srgb" else m.values
+                level = srgb.to_linear(m.values) if m.color_space == "srgb" else m.values
                 level = level.astype(np.float32)
             for stored in values[1:]:
                 level = halved(level)
@@ -112,7 +112,7 @@ class Pyramid(FilteredMaps):
                     mean = mean * level[..., 3:]
                     mean = mean if signed else 0.5 + 0.5 * mean
                 else:
-                    mean = metrics.srgb(level, clip=False) if m.color_space == "srgb" else level
+                    mean = srgb.from_linear(level) if m.color_space == "srgb" else level
                 for c, where in channels:
                     stored[..., where] = entry.encode(mean[..., c])
         border = border or components.borders(values[0])
@@ -206,8 +206,7 @@ class Pyramid(FilteredMaps):
                 stored.append(None)
                 continue
             if owner.color_space == "srgb":
-                root = dr.power(dr.maximum(value, 0.0031308), 1 / 2.4)
-                value = dr.select(value <= 0.0031308, 12.92 * value, dr.fma(1.055, root, -0.055))
+                value = srgb.from_linear(value)
             if owner.knee > 0:
                 scale = 1 / np.log2(1 + owner.high / owner.knee)
                 value = dr.log2(1 + dr.maximum(value, 0) / owner.knee) * float(scale)
@@ -240,7 +239,7 @@ def _owner(layout: Layout, channel: int) -> MapLayout:
 def _interpolated(stored: np.ndarray, owner: MapLayout) -> np.ndarray:
     """Return the values that are interpolated in place of a stored channel."""
     if owner.color_space == "srgb":
-        return metrics.linear(owner.decode(stored))
+        return srgb.to_linear(owner.decode(stored))
     return owner.decode(stored) if owner.knee > 0 else stored
 
 

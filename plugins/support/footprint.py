@@ -19,6 +19,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
+
 #: Components of a footprint are limited to ± this, in uv: beyond any texture, and its fourth power is finite.
 LARGEST = 2.0**20
 
@@ -333,7 +335,7 @@ def _major(p, q, r) -> tuple:
 
 def textures(scene: mi.Scene) -> list:
     """The textures of a loaded scene that ask for a sensor: they have a method ``set_cone(cone)``; each once."""
-    return list({id(node): node for node in mi.traverse(scene).hierarchy if hasattr(node, "set_cone")}.values())
+    return [node for node in compat.objects_of(scene) if hasattr(node, "set_cone")]
 
 
 def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None) -> int:

@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
 from mi_diffind.tasks.sdf import tracing
 
 #: Secondary rays start this far from a surface, in steps of a ray.
@@ -170,7 +171,7 @@ class Solid(mi.Mesh):
 def solids_of(scene: mi.Scene) -> list[Solid]:
     """The solids of a scene. Raises ``RuntimeError`` for those in a shape group, which cannot be traced."""
     found = [shape for shape in scene.shapes() if isinstance(shape, Solid)]
-    hidden = [shape for shape in mi.traverse(scene).hierarchy if isinstance(shape, Solid) and shape not in found]
+    hidden = [shape for shape in compat.objects_of(scene) if isinstance(shape, Solid) and shape not in found]
     if hidden:
         raise RuntimeError(
             f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file '

@@ -17,25 +17,8 @@ from . import upsampling
 
 WRAP_MODES = ("repeat", "mirror", "clamp")
 
-#: ((x + 0.055) / 1.055)^2.4 from 0.04045 to 1 as a polynomial, within 3e-6 and 0.005%.
-SRGB = (
-    *(0.000844892288, 0.0357163657, 0.479150754, 0.90598945, -1.02686536),
-    *(1.28132485, -1.12294745, 0.573176484, -0.126392614),
-)
-
 #: Density of positions that are black, relative to the mean.
 FLOOR = 0.01
-
-
-def linear(v, bounded: bool):
-    """The sRGB transfer function backwards; ``bounded``: of values in [0, 1] only, which is a power less."""
-    if not bounded:
-        power = dr.fma(dr.maximum(v, 0), 1 / 1.055, 0.055 / 1.055) ** 2.4
-    else:
-        power = mi.Float(SRGB[-1])
-        for c in reversed(SRGB[:-1]):
-            power = dr.fma(power, v, c)
-    return dr.select(v < 0.04045, v * (1 / 12.92), power)
 
 
 def luminance(values: list):

@@ -69,10 +69,10 @@ def scene_of_mesh(mesh):
 
 def scene_of_grid(field, resolution: int):
     """A scene of Mitsuba's ``sdfgrid`` with so many cells along the longest side."""
-    from mi_diffind.plugins.support.solids import cube_of
+    from mi_diffind.plugins.support.solids import fitted
 
     values, lower, upper = decode.grid(field, resolution)
-    values, upper = cube_of(values, lower, upper)
+    values, lower, upper = fitted(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
     box = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
     grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
     return mi.load_dict({"type": "scene", "shape": {"type": "sdfgrid", "grid": grid, "to_world": box}})

@@ -13,7 +13,7 @@ from small_study import KERNELS, SETTINGS, Log, small_plan
 from variants import BACKENDS
 
 from mi_diffind.cli import main
-from mi_diffind.measure.benchmark import Settings
+from mi_diffind.measure.benchmark import BenchmarkSettings
 from mi_diffind.measure.study import Study
 from mi_diffind.studies import studies
 
@@ -56,7 +56,7 @@ def small(tmp_path, monkeypatch):
     monkeypatch.setattr(
         metadata, "entry_points", lambda **k: points if k.get("group") == "mi_diffind.studies" else others(**k)
     )
-    monkeypatch.setattr(Settings, "choose", classmethod(lambda cls, variant, quick=False: SETTINGS))
+    monkeypatch.setattr(BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: SETTINGS))
     studies.cache_clear()
     yield log
     monkeypatch.undo()
@@ -89,7 +89,7 @@ def test_command_interrupted_and_gone_on_with(small, tmp_path, capsys):
     log.stop_at = None
     assert main(["tradeoff", "small", "--out", out, *variant]) == 0
     captured = capsys.readouterr()
-    assert "going on from" in captured.err and "Interrupted" not in captured.out
+    assert "continuing from" in captured.err and "Interrupted" not in captured.out
     assert sorted(os.listdir(out)) == [f"tradeoff_small.{kind}" for kind in ("csv", "json", "png")]
 
 

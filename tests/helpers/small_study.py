@@ -6,11 +6,11 @@ import signal
 import drjit as dr
 from variants import BACKENDS
 
-from mi_diffind.measure.benchmark import Settings
+from mi_diffind.measure.benchmark import BenchmarkSettings
 from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan
 from mi_diffind.runtime import array_module
 
-SETTINGS = Settings(lanes=1024, rounds=4, passes=3, samples=100)
+SETTINGS = BenchmarkSettings(lanes=1024, rounds=4, passes=3, samples=100)
 
 
 class Log(list):

@@ -177,7 +177,7 @@ STOPS = {
 
 @pytest.mark.parametrize("where", STOPS)
 def test_interruption_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, monkeypatch, where):
-    monkeypatch.setattr(plot, "draw", lambda *arguments: None)
+    monkeypatch.setattr(plot, "draw_panels", lambda *arguments: None)
     monkeypatch.setattr(plot, "save", lambda sheet, path: Path(path).touch())
     log = Log()
     log.stop_at = STOPS[where]
@@ -254,7 +254,7 @@ def crowd(rng, number):
 
 
 def test_labels_do_not_cover_each_other(rng):
-    sheet = plot.draw("title", [crowd(rng, n) for n in (3, 8, 12)], "dB", "A caption of many words. " * 30)
+    sheet = plot.draw_panels("title", [crowd(rng, n) for n in (3, 8, 12)], "dB", "A caption of many words. " * 30)
     sheet.draw_without_rendering()
     renderer = sheet.canvas.get_renderer()
     for axes, number in zip(sheet.axes, (3, 8, 12), strict=True):
@@ -271,7 +271,7 @@ def test_labels_do_not_cover_each_other(rng):
 def test_a_picture_of_little(tmp_path):
     alone = plot.Point("alone", 1.0, 0.0, 2.0, 50.0, "a", True)
     for panel in (plot.Panel("a", "ns", [alone], []), plot.Panel("b", "ns", [], [plot.Line("exact", 2.0, True)])):
-        plot.save(plot.draw("title", [panel], "dB", "caption"), tmp_path / "plot.png")
+        plot.save(plot.draw_panels("title", [panel], "dB", "caption"), tmp_path / "plot.png")
         assert (tmp_path / "plot.png").stat().st_size > 5000
 
 

@@ -12,7 +12,7 @@ from variants import BACKENDS
 
 from mi_diffind.fitting import FitSettings, Problem
 from mi_diffind.indirection import DifferentiableArray
-from mi_diffind.measure.training import GAIN, Training
+from mi_diffind.measure.training import GAIN, ConvergenceTraining
 from mi_diffind.runtime import array_module
 
 SETTINGS = FitSettings(steps=10, batch=64, lr=1e-2, schedule="constant", seed=3, deterministic=False)
@@ -43,7 +43,7 @@ class Ramp(Problem):
 
 def training(log, **options):
     longest = options.pop("longest", 640)
-    return Training("a ramp", lambda: Ramp(log, **options), SETTINGS, longest)
+    return ConvergenceTraining("a ramp", lambda: Ramp(log, **options), SETTINGS, longest)
 
 
 def test_doubles_until_it_gains_nothing():
@@ -66,7 +66,7 @@ def test_says_so_if_it_has_not_converged():
     record = training([], longest=40).run(progress=False)
     assert [run["steps"] for run in record["runs"]] == [10, 20, 40]
     assert not record["converged"] and record["gain_db"] > GAIN
-    only = Training("a ramp", lambda: Ramp([]), SETTINGS, 10).run(progress=False)
+    only = ConvergenceTraining("a ramp", lambda: Ramp([]), SETTINGS, 10).run(progress=False)
     assert only["gain_db"] is None and not only["converged"]
 
 

@@ -593,10 +593,10 @@ def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
     inner = """<integrator type="neural_field"><string name="filename" value="ball.npz"/>
         <transform name="to_world"><translate y="4"/></transform></integrator>"""
     (tmp_path / "two.xml").write_text(text.replace("INNER", inner))
-    assert scenes.integrator_of(tmp_path / "two.xml") == ("neural_field", -1)
+    assert scenes.ParsedScene(tmp_path / "two.xml").path_integrator() == ("neural_field", -1)
     assert len(scenes.load(tmp_path / "two.xml", longest_path=3).integrator().fields) == 2
-    assert scenes.integrator_of(tmp_path / "scene.xml") == ("neural_field", -1)
-    assert scenes.integrator_of(tmp_path / "nested.xml") == ("prb", 3)
+    assert scenes.ParsedScene(tmp_path / "scene.xml").path_integrator() == ("neural_field", -1)
+    assert scenes.ParsedScene(tmp_path / "nested.xml").path_integrator() == ("prb", 3)
     loaded = scenes.load(tmp_path / "scene.xml", longest_path=2)
     assert loaded.integrator().surfaces.max_depth == 2
     image = render(mi, loaded, 4)

@@ -249,8 +249,8 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("field")
     captures.write(folder / "balls")
     with pytest.MonkeyPatch.context() as patch:
-        small = benchmark.Settings(2**10, 2, 1, 2**10, True)
-        patch.setattr(benchmark.Settings, "choose", classmethod(lambda cls, variant, quick=False: small))
+        small = benchmark.BenchmarkSettings(2**10, 2, 1, 2**10, True)
+        patch.setattr(benchmark.BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: small))
         assert main([*command(folder), "--json", str(folder / "r.json")]) == 0
     return folder
 

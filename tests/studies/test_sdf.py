@@ -1,5 +1,8 @@
-"""``tradeoff sdf``: what distance fields are compared with, against trilinear interpolation by NumPy and exact
-distances by formulas; what the study makes, says and writes."""
+"""
+``tradeoff sdf``: baselines of distance fields against trilinear interpolation by NumPy and distances by formulas.
+
+Also the files and sentences of the study.
+"""
 
 import json
 import math
@@ -14,9 +17,11 @@ import solids
 from mi_diffind import fitting, task
 from mi_diffind.cli import main
 from mi_diffind.measure import benchmark
-from mi_diffind.studies.baselines import direct_nodes, hash_grids, volumes
-from mi_diffind.studies.sdf import conclusions, parts
-from mi_diffind.studies.sdf import plan as plans
+from mi_diffind.studies.baselines import bricks, byte_grids, direct_nodes, hash_grids, volumes
+from mi_diffind.studies.sdf import conclusions, contenders, parts
+from mi_diffind.studies.sdf.contenders import DistanceStudySettings
+from mi_diffind.studies.sdf.plan import plan as plan_of
+from mi_diffind.studies.sdf.view import MeshView, scene_distance, traced_distance
 from mi_diffind.tasks.sdf import encoding, nodes, tracing, training
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
@@ -45,12 +50,11 @@ class Torus:
 
 
 MAKERS = {
-    "dense": lambda h, train=None: volumes.dense(T, Torus(), h, train),
-    "4³": lambda h, train=None: volumes.bricks(T, Torus(), h, 4, True, train),
-    "8³": lambda h, train=None: volumes.bricks(T, Torus(), h, 8, True, train),
-    "4³ shared": lambda h, train=None: volumes.bricks(T, Torus(), h, 4, False, train),
-    "4³ shared, 6 bits": lambda h, train=None: volumes.bricks(T, Torus(), h, 4, False, train, bits=6),
-    "nodes": lambda h, train=None: volumes.distance_nodes(T, Torus(), h, train),
+    "dense": lambda h, train=False: byte_grids.dense(T, Torus(), h, train),
+    "4³": lambda h: bricks.bricks(T, Torus(), h, 4),
+    "8³": lambda h: bricks.bricks(T, Torus(), h, 8),
+    "4³ shared": lambda h: bricks.bricks(T, Torus(), h, 4, False),
+    "nodes": lambda h, train=False: volumes.distance_nodes(T, Torus(), h, train),
 }
 
 
@@ -72,7 +76,7 @@ def interpolated(field, points):
     """The corners' rounded distances and their trilinear interpolation, by NumPy."""
     origin, h = lattice(field)
     band = 1.75 * h
-    half = 2 ** (field.bits - 1)
+    half = 2 ** (getattr(field, "bits", 8) - 1)
     place = (points - origin) / h
     cell = np.floor(place).astype(int)
     corner = origin + (cell[:, None] + CORNERS) * h
@@ -139,22 +143,22 @@ def test_no_sign_changes_within_a_step(fields, name, rng):
 
 
 def test_bytes_count_nodes_and_index(fields):
-    dense, bricks, shared = (fields[n] for n in ("dense", "4³", "4³ shared, 6 bits"))
+    dense, aprons, shared = (fields[n] for n in ("dense", "4³", "4³ shared"))
     assert dense.nbytes == np.prod([n + 1 for n in dense.cells])
-    groups = math.prod(-(-n // 4) for n in bricks.state["present"].shape)
-    kept = dr.width(bricks.ranks) // 2
-    assert bricks.nbytes == 125 * bricks.count + 24 * kept + 4 * -(-groups // 2)
-    assert 0 < shared.nbytes - 48 * shared.count - shared.index_bytes <= 1
+    groups = math.prod(-(-n // 4) for n in aprons.state["present"].shape)
+    kept = dr.width(aprons.ranks) // 2
+    assert aprons.nbytes == 125 * aprons.count + 24 * kept + 4 * -(-groups // 2)
+    assert shared.nbytes == 64 * shared.count + shared.index_bytes
     # No brick more than those with both signs
-    assert bricks.count == sum((b < 128).any() and (b >= 128).any() for b in bricks.state["nodes"])
+    assert aprons.count == sum((b < 128).any() and (b >= 128).any() for b in aprons.state["nodes"])
 
 
 def test_training_is_nearer_to_the_truth(rng):
     points, normals = surface_points(rng, 20000)
     near = points + rng.normal(scale=0.01, size=(len(points), 1)) * normals
     truth = Torus().signed(near) < 0
-    for name in ("dense", "4³ shared", "nodes"):
-        sampled, trained = (MAKERS[name](1 / 20, train) for train in (None, volumes.Training()))
+    for name in ("dense", "nodes"):
+        sampled, trained = (MAKERS[name](1 / 20, train) for train in (False, True))
         wrong = [np.mean((f.value(arrays(near)).numpy() < 0) != truth) for f in (sampled, trained)]
         assert wrong[1] < 0.7 * wrong[0], name
         assert trained.nbytes <= 1.1 * sampled.nbytes
@@ -172,10 +176,10 @@ def test_training_leaves_what_is_exact():
 
     keys, lower = np.arange(1000), np.full(3, -0.45)
     values = Plane().signed(lower + np.stack(np.unravel_index(keys, (10,) * 3), -1) * 0.1)
-    found = volumes.trained(Plane(), lower, 0.1, (10,) * 3, keys, values, volumes.Training())
+    found = byte_grids.least_squares(Plane(), lower, 0.1, (10,) * 3, keys, values)
     assert np.abs(found - values).max() < 1e-6
     off = values + 0.03 * np.sin(np.arange(1000)).astype(np.float32)
-    found = volumes.trained(Plane(), lower, 0.1, (10,) * 3, keys, off, volumes.Training(keep=1e-6))
+    found = byte_grids.least_squares(Plane(), lower, 0.1, (10,) * 3, keys, off, keep=1e-6)
     changed = found != off
     assert 100 < changed.sum() < 900
     assert np.abs(found - values)[changed].max() < 1e-3
@@ -194,17 +198,16 @@ class Ball(Torus):
 @pytest.mark.parametrize("side, apron", [(4, True), (4, False), (1, False)])
 def test_as_fine_as_the_bytes_allow(side, apron):
     def make(h):
-        return volumes.bricks(T, Ball(), h, side, apron) if side > 1 else volumes.distance_nodes(T, Ball(), h)
+        return bricks.bricks(T, Ball(), h, side, apron) if side > 1 else volumes.distance_nodes(T, Ball(), h)
 
-    found = volumes.fitted(make, 60000)
+    found = volumes.fit_bytes(make, 60000)
     assert 0.97 * 60000 <= found.nbytes <= 60000
     with pytest.raises(ValueError, match="too few"):
-        volumes.fitted(make, 10)
+        volumes.fit_bytes(make, 10)
 
 
 def test_dense_size():
-    size = volumes.dense_size(Ball.mesh, 50000)
-    grid = volumes.dense(T, Ball(), size)
+    grid = byte_grids.dense(T, Ball(), byte_grids.dense_spacing(Ball.mesh, 50000))
     assert 0.8 * 50000 < grid.nbytes <= 50000
 
 
@@ -244,7 +247,7 @@ def test_nodes_without_indirection(rng, tmp_path):
     values = coding.values().astype(np.float64)
     assert np.array_equal(values[:, 0] < 0, sampled.distances < 0)
     assert (np.abs(values[:, 0]) >= coding.least - 1e-6).mean() > 0.99
-    step, kept = 2 * volumes.NEAREST / direct_nodes.LEVELS, np.abs(off[:, 0]) < volumes.NEAREST
+    step, kept = 2 * byte_grids.NEAREST / direct_nodes.LEVELS, np.abs(off[:, 0]) < byte_grids.NEAREST
     kept &= ((off[:, 0] < 0) == (sampled.distances < 0)) & (coding.least == encoding.LEAST)
     assert kept.mean() > 0.5 and np.abs(values - off)[kept, 0].max() < 0.51 * step
     field = coding.field(T)
@@ -303,7 +306,7 @@ def test_hash_grid(rng):
 
 # -- the study --------------------------------------------------------------------------------------------------------
 
-LEFT_OUT = [k for k in plans.KINDS if k not in ("bricks4", "ours")]
+LEFT_OUT = [k for k in contenders.METHODS if k not in ("bricks4", "ours")]
 
 
 @pytest.fixture(scope="module")
@@ -314,8 +317,8 @@ def folder(tmp_path_factory):
     vertices[:, 2] = np.minimum(vertices[:, 2], 0.64 + 0.2 * vertices[:, 2])
     solids.write(folder / "dent.ply", (vertices, faces))
     with pytest.MonkeyPatch.context() as patch:
-        small = benchmark.Settings(2**10, 2, 1, 2**10, True)
-        patch.setattr(benchmark.Settings, "choose", classmethod(lambda cls, variant, quick=False: small))
+        small = benchmark.BenchmarkSettings(2**10, 2, 1, 2**10, True)
+        patch.setattr(benchmark.BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: small))
         assert main([*command(folder), "--json", str(folder / "r.json")]) == 0
     return folder
 
@@ -351,8 +354,8 @@ def test_what_was_made_is_known(folder):
 
     assert mi.variant() == "llvm_ad_rgb"
     result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
-    request = plans.Request((24576,), tuple(LEFT_OUT))
-    plan = plans.plan(load_mesh(folder / "dent.ply"), str(folder / "dent.ply"), request)
+    request = DistanceStudySettings((24576,), tuple(LEFT_OUT))
+    plan = plan_of(load_mesh(folder / "dent.ply"), str(folder / "dent.ply"), request)
     assert [job.name for job in plan.jobs] == list(result["jobs"])
     models = folder / "out" / "tradeoff_sdf_models"
     for job in plan.jobs:
@@ -366,18 +369,17 @@ def test_fields_and_meshes_are_in_one_place(folder):
     """The rays of fields, of the mesh and of the decoded grid meet surfaces in the same places."""
     import mitsuba as mi
 
-    from mi_diffind.studies.sdf import view as views
     from mi_diffind.tasks.sdf.mesh import load_mesh
 
     mesh = load_mesh(folder / "dent.ply")
-    view = views.Stage(mesh, (64, 48))
-    bricks = volumes.load(next((folder / "out" / "tradeoff_sdf_models").glob("4*bricks*.npz")), T)
+    view = MeshView(mesh, (64, 48))
+    model = volumes.load(next((folder / "out" / "tradeoff_sdf_models").glob("4*bricks*.npz")), T)
     o, d = view.rays(mi)
-    scenes = view.mesh_scene(), view.grid_scene(bricks, 48)  # what is not evaluated yet needs them
-    expected = views.met(scenes[0], o, d).numpy()
+    scenes = view.mesh_scene(), view.grid_scene(model, 48)  # what is not evaluated yet needs them
+    expected = scene_distance(scenes[0], o, d).numpy()
     hit = np.isfinite(expected)
     assert 0.2 < hit.mean() < 0.8
-    for t in (views.traced(bricks, o, d), views.met(scenes[1], o, d)):
+    for t in (traced_distance(model, o, d), scene_distance(scenes[1], o, d)):
         t = t.numpy()
         assert np.mean(np.isfinite(t) != hit) < 0.03
         both = np.isfinite(t) & hit
@@ -387,7 +389,7 @@ def test_fields_and_meshes_are_in_one_place(folder):
 def test_trained_in_other_ways():
     """No pointer before the end; nothing trained; and the usual way."""
     settings, coded, moved = fitting.FitSettings(steps=10, batch=2**10, lr=1e-2, measure_every=10), {}, {}
-    for way in (task.FitRequest, parts.AtOnce, parts.Untrained):
+    for way in (task.FitRequest, parts.AtOnceRequest, parts.UntrainedRequest):
         coding = encoding.Coding(encoding.sample(Ball(), 1 / 12), 10)
         field = nodes.SparseNodes(T, coding.sampled.structure, 1.0)
         problem = training.NodeProblem(field, Ball.mesh, coding, SimpleNamespace(measure=lambda field: {"x": 0.0}))
@@ -395,16 +397,16 @@ def test_trained_in_other_ways():
         coded[way] = coding.done.mean()
         moved[way] = np.abs(problem.net.values.numpy()[:, 0] - coding.sampled.distances).max() > 1e-3
     assert list(moved.values()) == [True, True, False]
-    assert 0.7 < coded[task.FitRequest] < 0.9 and coded[parts.AtOnce] == coded[parts.Untrained] == 0
+    assert 0.7 < coded[task.FitRequest] < 0.9 and coded[parts.AtOnceRequest] == coded[parts.UntrainedRequest] == 0
 
 
 def test_parts_are_jobs(tmp_path):
     """Which there are; those without indirection are made and known again."""
     made = ("untrained", "direct", "direct-untrained")
-    without = tuple(kind for kind in plans.PARTS if kind not in made)
-    plan = plans.plan(Ball.mesh, "ball.ply", plans.Request((24576,), without, True, 2**10, 10))
+    without = tuple(kind for kind in contenders.PARTS if kind not in made)
+    plan = plan_of(Ball.mesh, "ball.ply", DistanceStudySettings((24576,), without, True, 2**10, 10))
     assert [c.details["kind"] for c in plan.candidates] == list(made) and [c.name for c in plan.cases] == ["reads"]
-    assert (plan.jobs[0].preset, isinstance(plan.jobs[0], parts.Changed)) == ("", True)
+    assert (plan.jobs[0].preset, isinstance(plan.jobs[0], parts.ChangedTraining)) == ("", True)
     records = []
     for job in plan.jobs[1:]:
         job.context.distances, job.context.errors = Ball(), lambda field: {}
@@ -422,12 +424,12 @@ def test_errors_of_an_earlier_run(folder):
     """They stand for what is not timed; what is timed is made unless its file is there."""
     from mi_diffind.tasks.sdf.mesh import load_mesh
 
-    request = plans.Request((24576, 32768), tuple(LEFT_OUT))
+    request = DistanceStudySettings((24576, 32768), tuple(LEFT_OUT))
     mesh, models = load_mesh(folder / "dent.ply"), folder / "out" / "tradeoff_sdf_models"
-    plan = plans.plan(mesh, str(folder / "dent.ply"), request)
+    plan = plan_of(mesh, str(folder / "dent.ply"), request)
     assert [job.cached_record(models, None) for job in plan.jobs] == [None] * 4
     before = {job.name: {"name": job.name} for job in plan.jobs}
-    plan = plans.plan(mesh, str(folder / "dent.ply"), request, before)
+    plan = plan_of(mesh, str(folder / "dent.ply"), request, before)
     assert [job.cached_record(models, None) for job in plan.jobs] == list(before.values())
     assert [job.cached_record(None, None) for job in plan.jobs] == [None, None, *list(before.values())[2:]]
     assert plan.jobs[0].cached_record(models, {"own": 1}) == {"own": 1}
@@ -436,11 +438,11 @@ def test_errors_of_an_earlier_run(folder):
 def result_of(**errors):
     """A result with candidates of 1 MiB: kind → errors."""
     made = {
-        f"{plans.KINDS[kind]} 1 MiB": {
+        f"{contenders.METHODS[kind]} 1 MiB": {
             "errors": {"iou": 0.99, "iou_near": 0.98, "normal_deg": 4.0, "normal_p95_deg": 9.0, "mae_near": 1e-4,
                        "normal_smooth_deg": 4.0, **e},
             "details": {"kind": kind, "asked": 2**20, "file_bytes": 5}, "bytes": 2**20, "training_seconds": 1.0,
-            "label": plans.KINDS[kind], "is_reference": False,
+            "label": contenders.METHODS[kind], "is_reference": False,
         }
         for kind, e in errors.items()
     }  # fmt: skip
@@ -482,7 +484,7 @@ def test_sentences_about_times():
         (["--bytes", "0"], "0"),
         (["--without", "bricks"], '--without: found "bricks", allowed are dense, dense-trained'),
         (["--ablation", "--without", "hash"], '--without: found "hash", allowed are ours, bits6'),
-        (["--errors-of", "none.json"], "--errors-of: none.json is not what --json wrote of this study"),
+        (["--errors-of", "none.json"], "--errors-of: none.json is not a file that --json wrote of this study"),
     ],
 )
 def test_bad_options(tmp_path, options, message, capsys):

@@ -13,9 +13,9 @@ import numpy as np
 from ...tasks.sdf import codes, encoding
 from ...tasks.sdf.nodes import SparseNodes, slope_bound
 from ...tasks.sdf.structure import Structure
-from .volumes import NEAREST
+from .byte_grids import NEAREST
 
-#: Steps of a distance between ± :data:`.volumes.NEAREST`, and of each of the normal's octahedral coordinates: of all
+#: Steps of a distance between ± :data:`.byte_grids.NEAREST`, and of each of the normal's octahedral coordinates: of all
 #: that 16 bits can tell apart, those with the best normals.
 LEVELS, SIDE = 128, 22
 

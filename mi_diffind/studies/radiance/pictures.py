@@ -44,7 +44,7 @@ def views(setting, result: dict):
     crop = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)) if len(rows) else (slice(None),) * 2
     wanted = shown(truth)
     tall = 1.6 * wanted[crop].shape[0] / wanted[crop].shape[1]
-    found = plot.sheet(f"{result['title']}, {ratio_text(first)} above", caption, 1.6 * columns, 2 * tall + 4.6)
+    found = plot.figure(f"{result['title']}, {ratio_text(first)} above", caption, 1.6 * columns, 2 * tall + 4.6)
     grid = found.add_gridspec(3, 2 * columns, height_ratios=[tall, tall, 3.8])
     for k, job in enumerate([None, *shown_jobs]):
         axes = found.add_subplot(grid[0, 2 * k : 2 * k + 2])
@@ -73,8 +73,8 @@ def views(setting, result: dict):
     _curves(found.add_subplot(grid[2, :columns]), result)
     axes = found.add_subplot(grid[2, columns:])
     labels = _against_time(axes, result)
-    plot.fix(found)
-    plot.place(axes, labels, [label.at for label in labels])
+    plot.fix_layout(found)
+    plot.place_labels(axes, labels, [label.at for label in labels])
     return found
 
 

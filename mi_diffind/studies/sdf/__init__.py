@@ -1,7 +1,8 @@
 """
-``tradeoff sdf``: the distance field of a mesh in equal bytes, ours beside dense grids, bricks, sparse distances, the
-supplement's arrays and a hash grid with a network: solids, normals, reads, rays and renders. :mod:`.candidates` says
-more.
+Study of signed distance fields (``tradeoff sdf``): errors and times of ours and of other methods in equal bytes.
+
+The other methods are dense grids, bricks, sparse distances, the supplement's arrays and a hash grid with a network;
+:mod:`.plan` describes the measurements.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from pathlib import Path
 from ...measure.study import Plan, Study
 from ..equal_memory import add_without_option, check_without
 
-#: Sizes unless asked otherwise, and the one at which everything is made and timed, if it is among them.
+#: Default memory budgets, and the one at which all methods are trained and timed.
 SIZES, FIRST = ("256k", "512k", "1M", "2M", "4M"), "1M"
 
 
 class SdfStudy(Study):
-    """A distance field in equal bytes: how near to the mesh, and the time of reads, rays and renders."""
+    """Distance fields in equal bytes: errors against the mesh, and times of reads, rays and renders."""
 
     name = "sdf"
     title = "the distance field of a mesh, in equal bytes, reads, rays and renders"
@@ -26,42 +27,42 @@ class SdfStudy(Study):
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             "source", nargs="?", default="scenes/assets/suzanne.ply", metavar="MESH",
-            help="any that trimesh reads (default: scenes/assets/suzanne.ply)",
+            help="a mesh file that trimesh reads (default: scenes/assets/suzanne.ply)",
         )  # fmt: skip
         parser.add_argument(
             "--bytes", action="append", default=[], metavar="N",
-            help=f"in memory; may be repeated (default: {', '.join(SIZES)}; --quick: 64k); of the first that is named "
-            "(default: 1M) all kinds are made, and reads, rays and renders are timed",
+            help=f"memory budget; may be repeated (default: {', '.join(SIZES)}; --quick: 64k); at the first one "
+            "(default: 1M) all methods are trained, and reads, rays and renders are timed",
         )  # fmt: skip
         add_without_option(parser)
         parser.add_argument(
             "--ablation", action="store_true",
-            help=f"in place of other kinds, what the parts of ours are worth (default: of {FIRST} alone)",
+            help=f"compare ours with parts of it left out, in place of other methods (default: at {FIRST} alone)",
         )  # fmt: skip
         parser.add_argument(
             "--errors-of", metavar="FILE",
-            help="what --json wrote of an earlier run: its errors are taken over but for the size at which reads, rays "
-            "and renders are timed, which are timed anew",
+            help="JSON file (--json) of an earlier run; its errors are taken over, except at the budget that is timed",
         )  # fmt: skip
 
     def check(self, arguments) -> None:
-        """Also reads the mesh; raises :class:`~mi_diffind.tasks.sdf.mesh.MeshError`."""
+        """Check the arguments and read the mesh; raises :class:`~mi_diffind.tasks.sdf.mesh.MeshError`."""
         from ...tasks.sdf.mesh import load_mesh
         from ...units import parse_bytes
-        from .plan import KINDS, PARTS
+        from .contenders import METHODS, PARTS
 
         every = (FIRST,) if arguments.ablation else (FIRST, *(s for s in SIZES if s != FIRST))
         default = ("64k",) if arguments.quick else every
         arguments.sizes = tuple(dict.fromkeys(map(parse_bytes, arguments.bytes or default)))
-        check_without(arguments.without, PARTS if arguments.ablation else KINDS)
+        check_without(arguments.without, PARTS if arguments.ablation else METHODS)
         arguments.loaded = load_mesh(arguments.source)
         arguments.before = earlier(arguments) if arguments.errors_of else {}
 
     def plan(self, arguments) -> Plan:
-        from .plan import Request, plan
+        from .contenders import DistanceStudySettings
+        from .plan import plan
 
         quick = arguments.quick
-        request = Request(
+        settings = DistanceStudySettings(
             sizes=arguments.sizes,
             without=tuple(arguments.without),
             ablation=arguments.ablation,
@@ -73,21 +74,22 @@ class SdfStudy(Study):
             decoded=96 if quick else 768,
             spp=1 if quick else 4,
         )
-        return plan(arguments.loaded, arguments.source, request, arguments.before)
+        return plan(arguments.loaded, arguments.source, settings, arguments.before)
 
 
 def earlier(arguments) -> dict[str, dict]:
-    """The records of the earlier run, name → record. Raises ``ValueError`` with a sentence."""
+    """Return the records of the earlier run by name. Raises ``ValueError`` if its file does not fit the arguments."""
     path, mesh = arguments.errors_of, arguments.loaded
     try:
-        found = json.loads(Path(path).read_text(encoding="utf-8"))
-        digest, quick, records = found["details"]["source_digest"], found["settings"]["quick"], dict(found["jobs"])
+        result = json.loads(Path(path).read_text(encoding="utf-8"))
+        digest, quick, records = result["details"]["source_digest"], result["settings"]["quick"], dict(result["jobs"])
     except (OSError, ValueError, KeyError, TypeError) as e:
-        raise ValueError(f"--errors-of: {path} is not what --json wrote of this study: {e!r}") from None
+        raise ValueError(f"--errors-of: {path} is not a file that --json wrote of this study: {e!r}") from None
     if digest != mesh.digest:
         raise ValueError(f"--errors-of: {path} is of another mesh than {mesh.path}")
     if quick != arguments.quick:
-        raise ValueError(f"--errors-of: {path} is of a run {'with' if quick else 'without'} --quick, found the other")
+        with_quick, expected = ("with", "without") if quick else ("without", "with")
+        raise ValueError(f"--errors-of: {path} is of a run {with_quick} --quick, give one {expected} it")
     return records
 
 

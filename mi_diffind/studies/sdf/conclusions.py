@@ -1,4 +1,4 @@
-"""What the study of distance fields says: a table of all candidates, and verdicts in equal bytes."""
+"""Table of all distance fields of the study, and sentences about the best in equal bytes and about times."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from ...measure.benchmark import PASS
 from ...measure.formatting import enumeration, grid
 from ..equal_memory import candidates_by_budget, name_of_ours, ratio_phrases
 
-#: What verdicts are about: its name, the error, how it is written, whether more is better.
+#: Measures of the sentences: label, error, format, and whether more is better.
 MEASURES = (
     ("IoU", "iou", ".4f", True),
     ("IoU near", "iou_near", ".4f", True),
@@ -16,75 +16,70 @@ MEASURES = (
     ("Chamfer", "chamfer", ".1e", False),
 )
 
-#: Those that decide.
+#: Measures that decide who is ahead.
 DECISIVE = ("iou", "iou_near", "normal_deg")
+AHEAD = "ours is ahead of all others in IoU and in normals"
 
 
 def size_text(nbytes: int) -> str:
-    """``262144`` → ``"256 KiB"``."""
+    """Return a number of bytes as text: ``262144`` → ``"256 KiB"``."""
     return f"{nbytes / 2**20:g} MiB" if nbytes >= 2**20 else f"{nbytes / 2**10:g} KiB"
 
 
 def table(result: dict) -> list[str]:
-    """All candidates: bytes, seconds and errors."""
+    """Return a text table of all candidates: bytes, seconds and errors."""
     cells = [["", "bytes", "file", "seconds", *(label for label, *_ in MEASURES), "smooth", "pieces"]]
-    for made in candidates_by_budget(result).values():
-        for name, c in made.items():
+    for candidates in candidates_by_budget(result).values():
+        for name, c in candidates.items():
             e, d = c["errors"], c["details"]
             pieces = f"{e['components']} of {e['components_mesh']}" if "components" in e else "-"
             cells.append([
                 name, f"{c['bytes']:,}", f"{d['file_bytes']:,}", f"{c['training_seconds']:.1f}",
-                *(_written(e, key, form) for _, key, form, _ in MEASURES), f"{e['normal_smooth_deg']:.2f}", pieces,
+                *(_error_text(e, key, form) for _, key, form, _ in MEASURES), f"{e['normal_smooth_deg']:.2f}", pieces,
             ])  # fmt: skip
     d = result["details"]
     return [f"{d['source']}: {d['triangles']:,} triangles", *result["notes"][1:], "", *grid(cells, "")]
 
 
-def _written(errors: dict, key: str, form: str) -> str:
+def _error_text(errors: dict, key: str, form: str) -> str:
     value = errors.get(key)
     return "-" if value is None else f"{value:{form}}" + ("°" if key.endswith("_deg") else "")
 
 
 def conclusions(result: dict) -> list[str]:
-    """Ours against the best of the others at each size; times against the mesh's and the best of the others."""
+    """Return sentences: ours against the best other method at each budget; times against the mesh and others."""
     lines = []
-    for size, made in candidates_by_budget(result).items():
-        kinds = {c["details"]["kind"]: (name, c["errors"]) for name, c in made.items()}
-        if "ours" not in kinds or len(kinds) < 2:
+    for size, candidates in candidates_by_budget(result).items():
+        methods = {c["details"]["kind"]: (name, c["errors"]) for name, c in candidates.items()}
+        if "ours" not in methods or len(methods) < 2:
             continue
-        own, others = kinds.pop("ours")[1], kinds.values()
-        texts, lost = [], []
+        ours, others = methods.pop("ours")[1], methods.values()
+        texts, behind = [], []
         for label, key, form, more in MEASURES:
-            known = [(e[key], name) for name, e in others if e.get(key) is not None]
-            if own.get(key) is None or not known:
+            values = [(e[key], name) for name, e in others if e.get(key) is not None]
+            if ours.get(key) is None or not values:
                 continue
-            best, name = (max if more else min)(known)
-            better = own[key] > best if more else own[key] < best
-            texts.append(f"{label} {own[key]:{form}} against {best:{form}} ({_kind(name, size)})")
-            lost += [label] if key in DECISIVE and not better else []
-        verdict = (
-            "ours is ahead of all others in IoU and in normals" if not lost else f"not ahead in {enumeration(lost)}"
-        )
+            best, name = (max if more else min)(values)
+            ahead = ours[key] > best if more else ours[key] < best
+            method = name.removesuffix(f" {size_text(size)}")
+            texts.append(f"{label} {ours[key]:{form}} against {best:{form}} ({method})")
+            behind += [label] if key in DECISIVE and not ahead else []
+        verdict = f"not ahead in {enumeration(behind)}" if behind else AHEAD
         lines.append(f"{size_text(size)}: {verdict}. " + "; ".join(texts) + ".")
     return [*lines, *_times(result)]
 
 
-def _kind(name: str, size: int) -> str:
-    return name.removesuffix(f" {size_text(size)}")
-
-
 def _times(result: dict) -> list[str]:
-    """Sentences about rays, reads and renders."""
+    """Return sentences about the times of rays, renders and reads."""
     lines = []
     ours = name_of_ours(result)
     rays = result["cases"].get("rays", {})
-    for query, what in (("ray", "A primary ray"), (PASS, "A render")):
-        pairs = rays.get("ratios", {}).get(query, {})
-        texts = ratio_phrases(pairs, ours)
+    for query, subject in (("ray", "A primary ray"), (PASS, "A render")):
+        texts = ratio_phrases(rays.get("ratios", {}).get(query, {}), ours)
         if ours and texts:
             timings = rays["queries"][query] if query in rays["queries"] else rays["passes"][query]
             unit = "ns" if query == "ray" else "ms"
-            lines.append(f"{what} with {ours} takes {timings[ours]['time']:.3g} {unit}: {enumeration(texts)}.")
+            lines.append(f"{subject} with {ours} takes {timings[ours]['time']:.3g} {unit}: {enumeration(texts)}.")
     reads = result["cases"].get("reads", {}).get("queries", {})
     if ours in reads.get("value", {}):
         value, normal = (reads[q] for q in ("value", "normal"))

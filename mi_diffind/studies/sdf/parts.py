@@ -1,7 +1,8 @@
 """
-What the parts of our layout are worth, in equal bytes: other bits of a pointer; pointers that are all decided on at the
-end; distances and normals as they were sampled, not trained; and all of these in 16 bits of each node, without frames
-and cascaded array (:mod:`..baselines.direct_nodes`).
+Ablation: contenders that leave out or change a part of our layout, in equal bytes.
+
+Distances and normals that stay as they were sampled; all pointers chosen at the end; and all of a node in its 16 bits,
+without frames and cascaded array (:mod:`..baselines.direct_nodes`).
 """
 
 from __future__ import annotations
@@ -18,82 +19,85 @@ from ...tasks.sdf.encoding import sample
 from ...tasks.sdf.nodes import SparseNodes
 from ..baselines import volumes
 from ..baselines.direct_nodes import DirectCoding, DirectNodes
-from .plan import DistanceContender, Fitted
+from .contenders import DistanceContender, DistancePresetContender
 
-#: Our preset.
+#: Name of our preset.
 SPARSE = "sparse"
 
-#: The result of no training.
-NOTHING = FitResult({}, 0, 0, 0.0, False, 0)
+#: Result of a training that is left out.
+NO_TRAINING = FitResult({}, 0, 0, 0.0, False, 0)
 
 
-def settings_of(setting) -> FitSettings:
-    """How ours is trained."""
-    steps = {"steps": setting.request.steps} if setting.request.steps else {}
+def settings_of(context) -> FitSettings:
+    """Return the settings by which ours is trained."""
+    steps = {"steps": context.settings.steps} if context.settings.steps else {}
     return task.tasks()["sdf"].settings(SPARSE, {"deterministic": False, **steps}, {})
 
 
 # -- ours, trained in other ways --------------------------------------------------------------------------------------
 
 
-class AtOnce(task.FitRequest):
-    """No node has a code until the end of the training."""
+class AtOnceRequest(task.FitRequest):
+    """Request of a training in which no node has a code until the end."""
 
     def train(self, problem, title: str | None = None) -> FitResult:
         problem.stage = len(training.COMMITTED)
         return super().train(problem, title)
 
 
-class Untrained(task.FitRequest):
-    """The nodes stay what they begin with."""
+class UntrainedRequest(task.FitRequest):
+    """Request of a fit without training: nodes keep their sampled values."""
 
     def train(self, problem, title: str | None = None) -> FitResult:
-        return NOTHING
+        return NO_TRAINING
 
 
-class Changed(Fitted):
-    """By our preset, trained as a request of another class has it."""
+class ChangedTraining(DistancePresetContender):
+    """Our preset, trained as a request of another class trains."""
 
     def fit(self, progress: bool) -> task.Fitted:
-        own, given = task.tasks()["sdf"], self.arguments()
-        options = {a.name: given.get(a.name, a.default) for a in own.arguments}
+        sdf, arguments = task.tasks()["sdf"], self.arguments()
+        options = {a.name: arguments.get(a.name, a.default) for a in sdf.arguments}
         request = REQUESTS[self.method](
             SPARSE, settings_of(self.context), self.context.types, options=options, progress=progress, output=self.file
         )
-        return own.fit(request)
+        return sdf.fit(request)
 
 
-REQUESTS = {"at-once": AtOnce, "untrained": Untrained}
+REQUESTS = {"at-once": AtOnceRequest, "untrained": UntrainedRequest}
 
-# -- nodes that hold it all -------------------------------------------------------------------------------------------
+# -- nodes without indirection ----------------------------------------------------------------------------------------
 
 
-class Direct(DistanceContender):
-    """A distance and a normal a node."""
+class DirectContender(DistanceContender):
+    """A distance and a normal in the 16 bits of each node."""
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        setting = self.context
-        types, distances = setting.types, setting.distances
+        context = self.context
+        types, distances = context.types, context.distances
         start = time.perf_counter()
-        coding = volumes.fitted(lambda h: DirectCoding(sample(distances, h)), self.budget)
+        coding = volumes.fit_bytes(lambda h: DirectCoding(sample(distances, h)), self.budget)
         structure = coding.sampled.structure
         held_out = training.HeldOut(distances, types, structure.spacing)
         problem = training.NodeProblem(SparseNodes(types, structure, 1.0), distances.surface, coding, held_out)
-        result = NOTHING
+        result = NO_TRAINING
         if self.method == "direct":
-            result = fit(problem, settings_of(setting), progress=progress, title=self.name)
+            result = fit(problem, settings_of(context), progress=progress, title=self.name)
             if result.interrupted:
                 return None
         coding.commit(problem.net.unit(types).numpy().astype(np.float64), 1.0)
-        found = coding.field(types)
+        model = coding.field(types)
         if self.file:
-            volumes.save(self.file, found)
+            volumes.save(self.file, model)
         seconds = time.perf_counter() - start
-        return self.record(found, found.nbytes, seconds, volumes.file_bytes(found), steps=result.steps)
+        return self.record(model, model.nbytes, seconds, volumes.file_bytes(model), steps=result.steps)
 
     def load(self, path: Path) -> DirectNodes:
         return volumes.load(path, self.context.types, DirectNodes)
 
 
-#: Kind → what makes it.
-MADE = {"at-once": Changed, "untrained": Changed, "direct": Direct, "direct-untrained": Direct}
+#: Method → class of its contender.
+CONTENDERS = {
+    "at-once": ChangedTraining, "untrained": ChangedTraining, "direct": DirectContender,
+    "direct-untrained": DirectContender,
+}  # fmt: skip

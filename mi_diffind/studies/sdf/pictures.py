@@ -1,8 +1,6 @@
-"""The picture of the study of distance fields: where normals are off in equal bytes, errors against bytes and time."""
+"""Picture of the study of distance fields: errors of normals on the shape, errors against bytes and against time."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import drjit as dr
 import numpy as np
@@ -11,13 +9,14 @@ from ...measure import plot
 from ...measure.curves import against_time, curves, finish
 from ...measure.formatting import machine_line, state
 from ..equal_memory import candidates_by_budget
-from . import view as views
 from .conclusions import size_text
+from .contenders import DistanceContender, DistanceStudyContext
+from .view import MeshView, traced_distance
 
-#: The error of normals that is as dark as it gets, in degrees.
+#: Error of a normal, in degrees, at the end of the colour map.
 WORST = 15.0
 
-#: Kind → colour, marker and line: trained ones dashed.
+#: Method → colour, marker and line; lines of trained methods are dashed.
 STYLES = {
     "dense": ("#4d4d4d", "s", ":"), "dense-trained": ("#4d4d4d", "s", "--"), "bricks8": ("#c47a00", "D", ":"),
     "bricks4": ("#762a83", "v", ":"), "bricks4-shared": ("#762a83", "^", "--"), "distances": ("#2166ac", "o", ":"),
@@ -25,65 +24,62 @@ STYLES = {
     "paper": ("#1b7837", "X", ":"), "hash": ("#12908e", "*", ":"),
 }  # fmt: skip
 
-#: Kinds that are shown as pictures, if they were made.
+#: Methods whose errors are shown on the shape, if they are part of the study.
 SHOWN = ("dense-trained", "bricks4", "bricks4-shared", "distances", "ours")
 
-#: Errors that are drawn against bytes: the error, its label, whether what is drawn is what is missing to 1.
+#: Errors drawn against bytes: the error, its label, and whether one minus the error is drawn.
 CURVES = (
     ("iou_near", "1 − IoU within 0.01 of the surface", True),
     ("normal_deg", "normals, mean error in degrees", False),
 )
 
 
-def of(setting, stage_of: Callable) -> dict[str, Callable[[dict], object]]:
-    """The pictures of a plan: ``shapes``."""
-    return {"shapes": lambda result: shapes(setting, stage_of(), result)}
-
-
-def shapes(setting, view: views.Stage, result: dict):
+def shapes(context: DistanceStudyContext, jobs: dict[str, DistanceContender], view: MeshView, result: dict):
     """
-    Above, the angles between normals of the mesh and those of fields of the first size, where rays meet them; below,
-    errors of all sizes against bytes, and of the first against the time of a ray.
+    Draw the errors of contenders of the first budget (``jobs``), and of all budgets.
+
+    Above, the angles between normals of the mesh and of the fields, where rays meet them; below, errors of all budgets
+    against bytes, and errors of the first budget against the time of a ray.
     """
     first = result["details"]["first"]
-    kinds = {job.method: job for job in setting.jobs.values() if job.budget == first}
-    shown = [kinds[k] for k in SHOWN if k in kinds]
+    methods = {job.method: job for job in jobs.values()}
+    shown = [methods[m] for m in SHOWN if m in methods]
     columns = max(3, len(shown) + 1)
     caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
-    found = plot.sheet(f"{result['title']}, {size_text(first)} above", caption, 2.6 * columns, 6.4)
-    grid = found.add_gridspec(2, 6 * columns, height_ratios=[1, 1.25])
+    figure = plot.figure(f"{result['title']}, {size_text(first)} above", caption, 2.6 * columns, 6.4)
+    grid = figure.add_gridspec(2, 6 * columns, height_ratios=[1, 1.25])
     truth, hit = _mesh_normals(view)
     rows, cols = np.flatnonzero(hit.any(axis=1)), np.flatnonzero(hit.any(axis=0))
     crop = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)) if len(rows) else (slice(None),) * 2
     for k, job in enumerate([None, *shown]):
-        axes = found.add_subplot(grid[0, 6 * k : 6 * k + 6])
+        axes = figure.add_subplot(grid[0, 6 * k : 6 * k + 6])
         if job is None:
             axes.imshow(_shaded(truth, hit)[crop])
             axes.set_title("mesh", fontsize=9)
         else:
-            angles = _angles(setting.types, view, job.model, truth, hit)
+            angles = _angles(context.types, view, job.model, truth, hit)
             drawn = axes.imshow(angles[crop], vmin=0, vmax=WORST, cmap="inferno_r")
             error = result["candidates"][job.name]["errors"]["normal_deg"]
             axes.set_title(f"{job.name.removesuffix(' ' + size_text(first))}\n{error:.2f}°", fontsize=8)
         axes.set_axis_off()
     if shown:
-        bar = found.colorbar(drawn, ax=found.axes[1:], shrink=0.8, pad=0.01)
+        bar = figure.colorbar(drawn, ax=figure.axes[1:], shrink=0.8, pad=0.01)
         bar.set_label("error of the normal, degrees", fontsize=8)
         bar.ax.tick_params(labelsize=7)
     third = 2 * columns
     for k, (key, label, missing) in enumerate(CURVES):
-        _curves(found.add_subplot(grid[1, third * k : third * (k + 1)]), result, key, label, missing)
-    axes = found.add_subplot(grid[1, 2 * third :])
+        _curves(figure.add_subplot(grid[1, third * k : third * (k + 1)]), result, key, label, missing)
+    axes = figure.add_subplot(grid[1, 2 * third :])
     labels = _against_time(axes, result)
-    found.get_layout_engine().set(hspace=0.16)
-    plot.fix(found)
-    _legend(found, axes.get_position().y1)
-    plot.place(axes, labels, [label.at for label in labels])
-    return found
+    figure.get_layout_engine().set(hspace=0.16)
+    plot.fix_layout(figure)
+    _legend(figure, axes.get_position().y1)
+    plot.place_labels(axes, labels, [label.at for label in labels])
+    return figure
 
 
-def _mesh_normals(view: views.Stage) -> tuple[np.ndarray, np.ndarray]:
-    """The normals of the mesh's triangles at all pixels ``(height, width, 3)``, and where there are any."""
+def _mesh_normals(view: MeshView) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normals of the mesh's triangles at all pixels ``(height, width, 3)``, and the mask of hits."""
     import mitsuba as mi
 
     o, d = view.rays(mi)
@@ -93,33 +89,34 @@ def _mesh_normals(view: views.Stage) -> tuple[np.ndarray, np.ndarray]:
     return np.array(si.n).T.reshape(height, width, 3), hit
 
 
-def _angles(types, view: views.Stage, field, truth: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Angles in degrees between normals; NaN where neither is met, 90 where one of the two is."""
+def _angles(types, view: MeshView, field, truth: np.ndarray, hit: np.ndarray) -> np.ndarray:
+    """Return angles in degrees between normals; NaN where both are missed, 90 where one of them is."""
     o, d = view.rays(types)
     with dr.suspend_grad():
-        t = views.traced(field, o, d)
-        found = dr.isfinite(t)
-        g = np.array(field.gradient(types.Array3f(dr.fma(d, dr.select(found, t, 0), o)))[1]).T.astype(np.float64)
-    found = found.numpy()
+        t = traced_distance(field, o, d)
+        field_hit = dr.isfinite(t)
+        p = types.Array3f(dr.fma(d, dr.select(field_hit, t, 0), o))
+        g = np.array(field.gradient(p)[1]).T.astype(np.float64)
+    field_hit = field_hit.numpy()
     g /= np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-12)
     angles = np.degrees(np.arccos(np.clip(np.sum(g * truth.reshape(-1, 3), axis=1), -1, 1)))
-    angles[found != hit.ravel()] = 90
-    angles[~found & ~hit.ravel()] = np.nan
+    angles[field_hit != hit.ravel()] = 90
+    angles[~field_hit & ~hit.ravel()] = np.nan
     return angles.reshape(hit.shape)
 
 
 def _shaded(normals: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """A picture of the mesh: light from the upper left."""
+    """Return a picture of the mesh, lit from the upper left."""
     light = np.array([-0.4, 0.7, 0.6]) / np.linalg.norm([-0.4, 0.7, 0.6])
     grey = 0.25 + 0.65 * np.clip(normals @ light, 0, 1)
     return np.where(hit[..., None], grey[..., None] * np.array([1.0, 0.96, 0.9]), 1.0)
 
 
 def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
-    """An error against bytes, a line for each kind."""
-    made = [c for found in candidates_by_budget(result).values() for c in found.values()]
-    curves(axes, made, STYLES, lambda c: (c["bytes"], 1 - c["errors"][key] if missing else c["errors"][key]))
-    sizes = sorted({c["details"]["asked"] for c in made})
+    """Draw an error against bytes, a line for each method."""
+    candidates = [c for group in candidates_by_budget(result).values() for c in group.values()]
+    curves(axes, candidates, STYLES, lambda c: (c["bytes"], 1 - c["errors"][key] if missing else c["errors"][key]))
+    sizes = sorted({c["details"]["asked"] for c in candidates})
     axes.set_xscale("log", base=2)
     axes.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
     axes.set_xticks(sizes)
@@ -131,17 +128,17 @@ def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
     finish(axes, label)
 
 
-def _legend(found, above: float) -> None:
-    """The kinds, in two lines above the curves, whose upper end is at ``above``."""
-    handles, labels = found.axes[-3].get_legend_handles_labels()
-    found.legend(
+def _legend(figure, above: float) -> None:
+    """Name the methods, in two lines above the curves, whose upper end is at ``above``."""
+    handles, labels = figure.axes[-3].get_legend_handles_labels()
+    figure.legend(
         handles, labels, loc="lower center", bbox_to_anchor=(0.5, above + 0.01), ncols=-(-len(labels) // 2),
         fontsize=7.5, frameon=False,
     )  # fmt: skip
 
 
 def _against_time(axes, result: dict) -> list[plot.Label]:
-    """The error of normals against the time of a ray; the times of the mesh and of ``sdfgrid`` as lines."""
+    """Draw the error of normals against the time of a ray; the mesh and ``sdfgrid`` are vertical lines."""
     timings = result["cases"].get("rays", {}).get("queries", {}).get("ray", {})
     axis = f"ns a primary ray, {size_text(result['details']['first'])}"
     labels = against_time(axes, result, timings, STYLES, "normal_deg", axis)

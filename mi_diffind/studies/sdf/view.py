@@ -1,4 +1,4 @@
-"""Where distance fields are looked at: a camera in the unit frame, and scenes with a field, a mesh or a grid in it."""
+"""Camera in the unit frame, and scenes of a distance field, a mesh or a grid, alone or lit on a floor."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from ...tasks.sdf import decode, tracing
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 
-#: Where the camera stands, as a direction from the middle, how far away, and its field of view (degrees, longer side).
+#: The camera: its direction from the origin, its distance, and its field of view (degrees, of the longer side).
 DIRECTION, DISTANCE, FOV = (0.45, 0.3, 1.0), 2.6, 32.0
 
-#: What is not met lies there.
+#: Rays end there.
 FAR = 1e3
 
 MATERIAL = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.55, 0.5, 0.45]}}
 
 
-class Stage:
-    """The camera, which sees all of ``mesh``, and the ``film``, width and height."""
+class MeshView:
+    """A camera that sees all of ``mesh``, with a ``film`` of (width, height) pixels."""
 
     def __init__(self, mesh: Mesh, film: tuple[int, int]):
         self.mesh, self.film = mesh, film
@@ -34,8 +34,9 @@ class Stage:
 
     def rays(self, types, count: int | None = None):
         """
-        The rays of all pixels' centres, row by row from the top, or ``count`` such rays of a film of the same shape:
-        origins and directions, evaluated.
+        Return origins and directions of the rays through all pixels' centres, row by row from the top, evaluated.
+
+        With ``count``, so many rays of a film of the same shape.
         """
         width, height = self.film
         if count is not None:
@@ -47,16 +48,17 @@ class Stage:
         y = (0.5 - (index // width + 0.5) / height) * self.film[1] * scale
         d = self.forward + x[:, None] * self.right + y[:, None] * self.up
         d /= np.linalg.norm(d, axis=1, keepdims=True)
-        found = []
-        for v in (np.broadcast_to(self.origin, d.shape), d):
-            found.append(types.Array3f(*(types.Float(np.ascontiguousarray(c, np.float32)) for c in v.T)))
-        dr.make_opaque(found)
-        return found
+        rays = [
+            types.Array3f(*(types.Float(np.ascontiguousarray(c, np.float32)) for c in v.T))
+            for v in (np.broadcast_to(self.origin, d.shape), d)
+        ]
+        dr.make_opaque(rays)
+        return rays
 
     # -- scenes -------------------------------------------------------------------------------------------------------
 
     def mesh_scene(self, lit: bool = False):
-        """The mesh, alone or ``lit`` on a floor."""
+        """Return a scene of the mesh, alone or ``lit`` on a floor."""
         shape = mi.Mesh("mesh", len(self.mesh.vertices), len(self.mesh.faces), props=_material())
         buffers = mi.traverse(shape)
         buffers["vertex_positions"] = np.ascontiguousarray(self.mesh.vertices, np.float32).ravel()
@@ -65,11 +67,11 @@ class Stage:
         return self._scene(shape, "path", lit)
 
     def grid_scene(self, field: DistanceField, resolution: int, lit: bool = False):
-        """Mitsuba's ``sdfgrid`` of a field, decoded with ``resolution`` cells along the longest side."""
-        from ...plugins.support.solids import cube_of
+        """Return a scene of Mitsuba's ``sdfgrid``, decoded with ``resolution`` cells along the longest side."""
+        from ...plugins.support.solids import fitted
 
         values, lower, upper = decode.grid(field, resolution)
-        values, upper = cube_of(values, lower, upper)
+        values, lower, upper = fitted(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
         to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
         shape = mi.load_dict({"type": "sdfgrid", "grid": grid, "to_world": to_world, "normals": "smooth",
@@ -77,21 +79,21 @@ class Stage:
         return self._scene(shape, "path", lit)
 
     def field_scene(self, field: DistanceField, lit: bool = False):
-        """The field, traced by ``path_sdf``."""
+        """Return a scene of the field, traced by ``path_sdf``."""
         from ...plugins.support.solids import Placement, Solid
 
         placement = Placement.of(mi.ScalarTransform4f(), 1.0, (0.0, 0.0, 0.0))
         return self._scene(Solid(_material(), field, placement, True), "path_sdf", lit)
 
     def _scene(self, shape, integrator: str, lit: bool):
-        found = {"type": "scene", "shape": shape}
+        scene = {"type": "scene", "shape": shape}
         if lit:
             low = float(self.mesh.lower[1])
             turn = mi.ScalarTransform4f().translate([0, low, 0]).rotate([1, 0, 0], -90).scale(4.0)
             lamp = mi.ScalarTransform4f().look_at([1.5, 2.5, 1.0], [0, 0, 0], [0, 1, 0]).scale(0.6)
             target, up = (self.origin + self.forward).tolist(), self.up.tolist()
             camera = mi.ScalarTransform4f().look_at(self.origin.tolist(), target, up)
-            found |= {
+            scene |= {
                 "integrator": {"type": integrator, "max_depth": 4},
                 "floor": {"type": "rectangle", "to_world": turn, "bsdf": {"type": "diffuse"}},
                 "sky": {"type": "constant", "radiance": 0.4},
@@ -102,7 +104,7 @@ class Stage:
                            "film": {"type": "hdrfilm", "width": self.film[0], "height": self.film[1],
                                     "rfilter": {"type": "box"}}},
             }  # fmt: skip
-        return mi.load_dict(found)
+        return mi.load_dict(scene)
 
 
 def _material() -> mi.Properties:
@@ -111,11 +113,11 @@ def _material() -> mi.Properties:
     return props
 
 
-def traced(field: DistanceField, o, d):
-    """How far rays go until they meet a field, infinite if they do not."""
+def traced_distance(field: DistanceField, o, d):
+    """Return the length of rays until they meet a field, infinite if they miss it."""
     return tracing.trace(field, o, d, FAR)[0]
 
 
-def met(scene, o, d):
-    """The same in a scene of Mitsuba's, which has to live until the result is evaluated."""
+def scene_distance(scene, o, d):
+    """Return the length of rays until they meet a scene, which has to live until the result is evaluated."""
     return scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), coherent=True).t

@@ -21,6 +21,7 @@ class Disney(Task):
 
     name = "disney"
     title = "the Disney BRDF"
+    files = "library"
     section = "supplemental 1.2"
     #: Tables of one coordinate start close to their optimum: a large rate would only shake them (75 instead of 90 dB).
     presets = {  # noqa: RUF012
@@ -38,16 +39,6 @@ class Disney(Task):
 
     def table(self, problem, request: FitRequest):
         return problem.net.to_table()
-
-    def load(self, path):
-        from .library import load
-
-        return load(path)
-
-    def model_class(self):
-        from .library import DisneyModel
-
-        return DisneyModel
 
 
 TASK = Disney()

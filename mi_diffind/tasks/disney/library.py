@@ -46,3 +46,6 @@ def load(path: str | os.PathLike) -> Table:
     table = load_table(path, task="disney", shapes=layout.SHAPES)
     check_ranges(table, layout.RANGES)
     return table
+
+
+MODEL = DisneyModel

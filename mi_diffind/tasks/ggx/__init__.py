@@ -57,16 +57,6 @@ class GGX(Task):
         arrays = {"primary": StoredArray.of(net.primary[0]), "cascaded": StoredArray.of(net.cascaded)}
         return Table(self.name, arrays, settings=asdict(problem.encoding))
 
-    def load(self, path):
-        from .files import load
-
-        return load(path)
-
-    def model_class(self):
-        from .files import GGXModel
-
-        return GGXModel
-
     def allocate(self, table, dtype, storage=""):
         arrays = super().allocate(table, dtype, storage)
         arrays["primary"].folded = arrays["primary"].storage == "float32"  # an optimiser may leave the range

@@ -40,3 +40,6 @@ def load(path: str | os.PathLike) -> Table:
     bounded = encoding_of(table).output == "root"
     check_ranges(table, {"primary": (0.0, 1.0), **({"cascaded": (-0.5, 1.5)} if bounded else {})})
     return table
+
+
+MODEL = GGXModel

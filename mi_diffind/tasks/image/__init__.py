@@ -14,7 +14,7 @@ import dataclasses
 
 from ...arguments import Argument, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
-from ...task import FitRequest, Task
+from ...task import Task
 from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, without
 
 
@@ -23,6 +23,7 @@ class Image(Task):
 
     name = "image"
     title = "an image or the maps of a material"
+    files = "compressed"
     section = "supplemental 1.3"
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
@@ -53,31 +54,6 @@ class Image(Task):
         defaults = without(PRESETS[preset], options["without"]).settings
         steps = given.get("steps", defaults.steps)
         return dataclasses.replace(defaults, measure_every=max(1, steps // 10), **given)
-
-    def check(self, request: FitRequest) -> None:
-        from .fit import check
-
-        check(request)
-
-    def fit(self, request: FitRequest):
-        from .fit import fit
-
-        return fit(request)
-
-    def load(self, path):
-        from .compressed import load
-
-        return load(path)
-
-    def model_class(self):
-        from .compressed import ImageModel
-
-        return ImageModel
-
-    def allocate(self, table, dtype, storage=""):
-        from .compressed import allocate
-
-        return allocate(table, dtype, storage)
 
 
 TASK = Image()

@@ -105,3 +105,6 @@ class ImageModel(MapsModel):
 
     def build(self):
         self.image = CompressedImage(Layout.from_json(self.table.settings["layout"]), joined_of(self.arrays))
+
+
+MODEL = ImageModel

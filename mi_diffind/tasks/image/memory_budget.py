@@ -231,7 +231,7 @@ def _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse: Coar
         return ImageBudget(rows, columns, cascaded, channels, dims, bits, (rows, columns) == (height, width), coarse)
 
     def largest(candidate) -> ImageBudget:
-        return candidate(largest_fitting(lambda n: candidate(n).nbytes, budget, 1, long))
+        return candidate(largest_fitting(lambda n: candidate(n).nbytes <= budget, 1, long + 1))
 
     best = largest(lambda n: sized(min(max(1, round(n * short / long)), short), n))
     if short < long:

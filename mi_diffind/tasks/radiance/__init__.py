@@ -14,7 +14,7 @@ import dataclasses
 
 from ... import units
 from ...arguments import Argument, checked, decibels, positive
-from ...task import FitRequest, Task
+from ...task import Task
 from .presets import PRESETS
 
 
@@ -56,26 +56,6 @@ class RadianceField(Task):
         own = self.presets[preset]
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 2), **given)
-
-    def check(self, request: FitRequest) -> None:
-        from .fit import check
-
-        check(request)
-
-    def fit(self, request: FitRequest):
-        from .fit import fit
-
-        return fit(request)
-
-    def load(self, path):
-        from .files import load
-
-        return load(path)
-
-    def model_class(self):
-        from .model import FieldModel
-
-        return FieldModel
 
     def allocate(self, table, dtype, storage=""):
         return {}

@@ -11,6 +11,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ...bits import as_words, pack_bits
 from .field import VolumeField, blended, colour_of, density_of
 from .nodes import Nodes
 
@@ -105,8 +106,5 @@ class PackedField(VolumeField):
 
 def node_words(shares: np.ndarray, share_bits: int, codes: np.ndarray, code_bits: int) -> np.ndarray:
     """Words of 32 bits that hold a share and a code for each node, one after the other, and one word more."""
-    width = share_bits + code_bits
     joined = shares.astype(np.uint32) | (codes.astype(np.uint32) << share_bits)
-    bits = np.unpackbits(joined[:, None].view(np.uint8), axis=1, bitorder="little")[:, :width]
-    packed = np.packbits(bits, bitorder="little")
-    return np.pad(packed, (0, -len(packed) % 4 + 4)).view("<u4")
+    return as_words(pack_bits(joined, share_bits + code_bits), spare=1)

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import drjit as dr
 
+from ...rays import box_interval
+
 #: The transmittance at which a ray ends.
 OPAQUE = 1e-4
 
@@ -45,15 +47,7 @@ def box(field, o, d, near, far, active):
     """
     types = field.types
     near, far = types.Float(near), types.Float(far)
-    active = types.Bool(active)
-    for x, v, a, b in zip(o, d, *field.box, strict=True):
-        # Along a face of the box, 0 · inf would be NaN
-        moves = v != 0
-        inverse = dr.rcp(dr.select(moves, v, 1))
-        first, second = (a - x) * inverse, (b - x) * inverse
-        near = dr.select(moves, dr.maximum(near, dr.minimum(first, second)), near)
-        far = dr.select(moves, dr.minimum(far, dr.maximum(first, second)), far)
-        active &= moves | ((x >= a) & (x <= b))
+    near, far, active = box_interval(o, d, *field.box, near, far, types.Bool(active))
     # Comparisons with NaN are false
     active &= (near < far) & dr.isfinite(near) & dr.isfinite(far)
     return types.Array3f(dr.fma(d, near, o)), near, far - near, active

@@ -120,3 +120,6 @@ class FieldModel(Model):
         from .decode import decode
 
         return decode(self.field, output, resolution)
+
+
+MODEL = FieldModel

@@ -12,6 +12,8 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
+from ...bits import mask_words
+
 #: Cells along a side of a cell of the grid of distances.
 COARSE = 2
 
@@ -205,17 +207,12 @@ def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     own.reshape(x * y, count)[:, -1] += bits.reshape(x * y, count, 32)[:, -1, -1]
     first = 1 + np.cumsum(own) - own
     filled = bits.any(axis=1)
-    columns = np.stack([words_of(bits[filled]), first[filled].astype(np.uint32)], axis=1)
+    columns = np.stack([mask_words(bits[filled])[:, 0], first[filled].astype(np.uint32)], axis=1)
     masks = np.pad(filled, (0, -len(filled) % 32)).reshape(-1, 32)
     before = np.cumsum(masks.sum(axis=1)) - masks.sum(axis=1)
-    return np.stack([words_of(masks), before.astype(np.uint32)], axis=1), columns
+    return np.stack([mask_words(masks)[:, 0], before.astype(np.uint32)], axis=1), columns
 
 
 def columns_of(nodes: int) -> int:
     """Columns along a line of so many nodes."""
     return -(-(nodes - 1) // COLUMN)
-
-
-def words_of(bits: np.ndarray) -> np.ndarray:
-    """Bits (n, 32) as words (n,), the lowest first."""
-    return np.packbits(bits, axis=1, bitorder="little").view("<u4")[:, 0]

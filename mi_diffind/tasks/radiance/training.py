@@ -11,6 +11,7 @@ from collections.abc import Callable
 import drjit as dr
 import numpy as np
 
+from ... import srgb
 from ...fitting import Problem
 from .field import VolumeField
 from .march import differentiable, march
@@ -18,11 +19,6 @@ from .views import Views
 
 #: Pixels along a side of a patch.
 PATCH = 4
-
-
-def encoded(x):
-    """Linear values in [0, 1] as sRGB."""
-    return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
 class Images:
@@ -90,10 +86,10 @@ class ImagesProblem(Problem):
         seen = differentiable(self.field_of(net), o, d, 0, dr.inf, True, offset)
         total = types.Float(0)
         for c in range(3):
-            wanted = encoded(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1))
+            wanted = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1))
             found = seen.colour[c] + seen.transmittance * grey
             # Beyond white, all is white; the slope goes on, so that it comes back
-            total += dr.square(encoded(found) - wanted)
+            total += dr.square(srgb.from_linear(found) - wanted)
         return total * (1 / (3 * count))
 
     def measure(self, net):
@@ -118,8 +114,7 @@ def rendered(field: VolumeField, images: Images, view: int):
 
 def shown(image: np.ndarray, grey: float = 1.0) -> np.ndarray:
     """An image before a grey, white by default, as sRGB in [0, 1]."""
-    linear = np.clip(image[..., :3] + (1 - image[..., 3:]) * grey, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+    return srgb.from_linear(np.clip(image[..., :3] + (1 - image[..., 3:]) * grey, 0, 1))
 
 
 def evaluate(field: VolumeField, images: Images) -> dict[str, float]:

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
-from ...metrics import linear
+from ...srgb import to_linear
 
 SPLITS = ("train", "test", "val")
 
@@ -336,7 +336,7 @@ def _read(path: Path) -> tuple[np.ndarray, bool]:
 
 
 #: Byte → linear value.
-_LINEAR = linear(np.arange(256) / 255).astype(np.float32)
+_LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
 
 
 def _read_bytes(path: Path) -> np.ndarray:

@@ -70,21 +70,6 @@ class Sdf(Task):
         if options["ratio"] is not None and PRESETS[request.preset].layout != "pair":
             raise UsageError(f"--ratio is of the presets dense and paper, found {request.preset}")
 
-    def fit(self, request: FitRequest):
-        from .fit import fit
-
-        return fit(request)
-
-    def load(self, path):
-        from .files import load
-
-        return load(path)
-
-    def model_class(self):
-        from .model import SdfModel
-
-        return SdfModel
-
     def allocate(self, table, dtype, storage=""):
         return super().allocate(table, dtype, storage) if table.settings["layout"] == "pair" else {}
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
+from ...bits import mask_flags
 from .codes import frames_numpy
 from .nodes import CORNERS, bernstein
-from .structure import ACTIVE, BLOCK, _bits, _places
+from .structure import ACTIVE, BLOCK, _places
 
 #: A word of a block without crossed cells: this, the sign, and how far the next one that has some is, in blocks.
 EMPTY, INSIDE = 1 << 31, 1 << 30
@@ -39,12 +40,12 @@ def cells_of(structure) -> tuple[np.ndarray, ...]:
     coarse = (structure.regions & 1).astype(bool)
     for x, y, z in np.ndindex(4, 4, 4):
         part = coarse.copy()
-        part[structure.regions == ACTIVE] = _bits(structure.region_signs)[:, x * 16 + y * 4 + z]
+        part[structure.regions == ACTIVE] = mask_flags(structure.region_signs)[:, x * 16 + y * 4 + z]
         empty[x : x + 4 * coarse.shape[0] : 4, y : y + 4 * coarse.shape[1] : 4, z : z + 4 * coarse.shape[2] : 4][
             : coarse.shape[0], : coarse.shape[1], : coarse.shape[2]
         ] = part
 
-    nodes = np.concatenate([_bits(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)])
+    nodes = np.concatenate([mask_flags(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)])
     groups = (structure.block_signs[:, None] >> np.arange(8) & 1).astype(bool).reshape(-1, 2, 2, 2)
     signs = groups.repeat(2, 1).repeat(2, 2).repeat(2, 3)
     inside = np.zeros((len(at), 5, 5, 5), bool)

@@ -16,10 +16,10 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ...bits import mask_words
 from . import codes
 from .index import EMPTY, INSIDE, MIDDLE, SLAB, STEPS, cells_of, slabs_of, words_of
 from .nodes import CORNERS
-from .structure import _words
 
 #: Places along the ray at which a cell is looked at, and steps by false position from there.
 SAMPLES, ROOTS = 3, 3
@@ -47,7 +47,7 @@ class Marcher:
         structure, UInt32 = field.structure, field.types.UInt32
         crossed, inside, beside, empty, node = cells_of(structure)
         regions, blocks = words_of(structure, crossed, inside, empty)
-        words = np.concatenate([_words(crossed), _words(inside)], axis=1)
+        words = np.concatenate([mask_words(crossed), mask_words(inside)], axis=1)
         self.cells, self.beside, self.regions, self.words = (
             UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (words, beside, regions, blocks)
         )

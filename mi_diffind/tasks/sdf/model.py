@@ -127,3 +127,6 @@ class SdfModel(Model):
             )
         shape = " x ".join(map(str, values.shape))
         return output, f"{shape} distances (z, y, x) in units of the mesh"
+
+
+MODEL = SdfModel

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...indirection import DifferentiableArray, Indirection, ramp
+from ...units import largest_fitting
 from .field import DistanceField, edge_steps
 
 #: Of the spacing of the primary array: how far distances are told. At least :data:`LEAST_BAND` of the longest side.
@@ -71,9 +72,12 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
         cascaded = np.maximum(2, np.round(n / ratio * extent / extent.max()).astype(int))
         return primary, cascaded
 
+    def fits(n: float) -> bool:
+        primary, cascaded = sides(n)
+        return 3 * primary.prod() + cascaded.prod() <= nbytes
+
     n = max(4, int((nbytes / (3 + ratio**-3) / np.prod(extent / extent.max())) ** (1 / 3)) + 4)
-    while n > 4 and 3 * sides(n)[0].prod() + sides(n)[1].prod() > nbytes:
-        n -= 1
+    n = largest_fitting(fits, 4, n + 1)
     primary, cascaded = sides(n)
     return tuple(primary.tolist()), tuple(cascaded.tolist())
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...bits import mask_flags, mask_words
 from ...errors import DiffindError
 
 #: Nodes along a side of a block and of a region.
@@ -96,13 +97,13 @@ class Structure:
     def block_positions(self) -> np.ndarray:
         """The first node of each block, ``(B, 3)``."""
         regions = np.argwhere(self.regions == ACTIVE)
-        inner = _bits(self.region_masks)
+        inner = mask_flags(self.region_masks)
         region, bit = np.nonzero(inner)
         return regions[region] * REGION + _places(bit) * BLOCK
 
     def node_positions(self) -> tuple[np.ndarray, np.ndarray]:
         """Every stored node's position in the grid, ``(n, 3)``, and its block, ``(n,)``."""
-        block, bit = np.nonzero(_bits(self.block_masks))
+        block, bit = np.nonzero(mask_flags(self.block_masks))
         return self.block_positions()[block] + _places(bit), block
 
     def check(self) -> None:
@@ -174,9 +175,9 @@ def build(positions: np.ndarray, inside: np.ndarray, shape, lower, spacing: floa
         tuple(map(float, lower)),
         float(spacing),
         regions.reshape(regions_shape),
-        _words(region_bits),
-        _words(region_signs),
-        _words(block_bits),
+        mask_words(region_bits),
+        mask_words(region_signs),
+        mask_words(block_bits),
         np.packbits(group_signs, axis=1, bitorder="little")[:, 0],
     )
 
@@ -198,19 +199,8 @@ _GROUPS = np.array([
 ])  # fmt: skip
 
 
-def _words(bits: np.ndarray) -> np.ndarray:
-    """Bits (n, 64) as words (n, 2), the lowest first."""
-    return np.packbits(bits, axis=1, bitorder="little").view("<u4")
-
-
-def _bits(words: np.ndarray) -> np.ndarray:
-    """The reverse: (n, 64) bool."""
-    raw = np.ascontiguousarray(words, "<u4").view(np.uint8)
-    return np.unpackbits(raw, axis=1, bitorder="little").astype(bool)
-
-
 def _count(words: np.ndarray) -> np.ndarray:
-    return _bits(words).sum(axis=1)
+    return mask_flags(words).sum(axis=1)
 
 
 def _before(words: np.ndarray) -> np.ndarray:

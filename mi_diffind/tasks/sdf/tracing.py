@@ -17,6 +17,7 @@ from typing import Any
 
 import drjit as dr
 
+from ...rays import box_interval
 from . import marching
 
 #: The shortest step, in units of the longest side: a solid that a ray crosses in less may be missed.
@@ -51,15 +52,8 @@ def enter(field, o, d, maxt, active=True):
     and leaves it. Components of ``d`` may be zero. Not active: it misses the box, or something is NaN.
     """
     Float = field.types.Float
-    near, far = Float(0), Float(maxt)
     active = field.types.Bool(active)
-    for x, v, low, high in zip(o, d, field.lower, field.upper, strict=True):
-        parallel = v == 0
-        inverse = dr.rcp(dr.select(parallel, 1, v))
-        a, b = (low - x) * inverse, (high - x) * inverse
-        active &= ~parallel | ((x >= low) & (x <= high))
-        near = dr.select(parallel, near, dr.maximum(near, dr.minimum(a, b)))
-        far = dr.select(parallel, far, dr.minimum(far, dr.maximum(a, b)))
+    near, far, active = box_interval(o, d, field.lower, field.upper, Float(0), Float(maxt), active)
     active &= near <= far  # false for NaN
     return near, far, active
 

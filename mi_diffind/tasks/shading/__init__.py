@@ -17,8 +17,8 @@ from __future__ import annotations
 import dataclasses
 
 from ...arguments import Argument, fraction, positive_or_none
-from ...maps.arguments import SIZES, SOURCES
-from ...task import FitRequest, Task
+from ...maps.arguments import PREVIEW, SIZES, SOURCES
+from ...task import Task
 from .presets import PRESETS, REFERENCES
 
 
@@ -55,25 +55,13 @@ class Shading(Task):
             "prefiltered ones (default of paper), or 256 unfiltered ones (converged)",
         ),
         *SOURCES,
-        Argument(
-            "--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"
-        ),
+        PREVIEW,
     )  # fmt: skip
 
     def settings(self, preset, given, options):
         own = PRESETS[preset].settings
         steps = given.get("steps", own.steps)
         return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
-
-    def check(self, request: FitRequest) -> None:
-        from .fit import check
-
-        check(request)
-
-    def fit(self, request: FitRequest):
-        from .fit import fit
-
-        return fit(request)
 
 
 TASK = Shading()

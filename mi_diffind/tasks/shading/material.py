@@ -17,6 +17,7 @@ from typing import Any
 
 import drjit as dr
 
+from ... import srgb
 from ...bounds import ValueBounds
 from ...compat import module_of
 from ...errors import UsageError
@@ -92,14 +93,7 @@ def linear(values, m: MapLayout):
     """The channels of a map, linear: the sRGB transfer function backwards, where it is encoded so."""
     if m.color_space != "srgb":
         return values
-    return [_linear(v) for v in values]
-
-
-def _linear(v):
-    if isinstance(v, float):
-        return v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4
-    root = dr.maximum((v + 0.055) / 1.055, 0.05)
-    return dr.select(v <= 0.04045, v / 12.92, root**2.4)
+    return [srgb.to_linear(v) for v in values]
 
 
 def surface_of(maps: FilteredMaps, stored: list) -> SurfaceParameters:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import metrics
+from ... import srgb
 from ...files import replacing
 from .evaluation import ShadedEvaluation, ShadedReader
 
@@ -32,7 +32,7 @@ def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) 
     rows, side = [], max(PANEL, *(max(size) for size in evaluation.sizes))
     for level in (i for i in LEVELS if i < evaluation.levels):
         truth, got = truths[level][pair], evaluation.images(read, level, [pair])[0]
-        row = [metrics.srgb(truth), metrics.srgb(got), np.clip(AMPLIFIED * np.abs(truth - got), 0, 1)]
+        row = [srgb.for_display(truth), srgb.for_display(got), np.clip(AMPLIFIED * np.abs(truth - got), 0, 1)]
         rows.append(np.concatenate([_enlarged(image, side) for image in row], axis=1))
     picture = np.rint(255 * np.concatenate(rows)).astype(np.uint8)
     with replacing(path) as temporary:

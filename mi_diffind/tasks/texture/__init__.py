@@ -16,7 +16,7 @@ import dataclasses
 
 from ...arguments import Argument, natural, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
-from ...task import FitRequest, Task
+from ...task import Task
 from .presets import PRESETS
 
 
@@ -37,6 +37,7 @@ class Texture(Task):
 
     name = "texture"
     title = "a texture or the maps of a material at every level of detail"
+    files = "compressed"
     section = "supplemental 1.4"
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
@@ -69,31 +70,6 @@ class Texture(Task):
         defaults = PRESETS[preset].settings
         steps = given.get("steps", defaults.steps)
         return dataclasses.replace(defaults, measure_every=max(1, steps // 10), **given)
-
-    def check(self, request: FitRequest) -> None:
-        from .fit import check
-
-        check(request)
-
-    def fit(self, request: FitRequest):
-        from .fit import fit
-
-        return fit(request)
-
-    def load(self, path):
-        from .compressed import load
-
-        return load(path)
-
-    def model_class(self):
-        from .compressed import TextureModel
-
-        return TextureModel
-
-    def allocate(self, table, dtype, storage=""):
-        from .compressed import allocate
-
-        return allocate(table, dtype, storage)
 
 
 TASK = Texture()

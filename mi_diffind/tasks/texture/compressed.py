@@ -266,3 +266,6 @@ class TextureModel(MapsModel):
             raise UsageError(f"{self.table.path}: --level: found {level}, the file has levels 0 to {image.levels - 1}")
         rows, columns = image.level_size(level)
         return super().decode(output, map, width or columns, height or rows, level=level)
+
+
+MODEL = TextureModel

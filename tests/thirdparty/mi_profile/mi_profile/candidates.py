@@ -12,7 +12,7 @@ from mi_diffind.indirection import DifferentiableArray
 from mi_diffind.lookup import STORAGES
 from mi_diffind.measure.store import fingerprint
 from mi_diffind.measure.study import FLOOR, Candidate, Case, Plan
-from mi_diffind.measure.training import Training
+from mi_diffind.measure.training import ConvergenceTraining
 from mi_diffind.runtime import array_module
 
 from . import measurement
@@ -33,7 +33,7 @@ def plan(source: str, quick: bool) -> Plan:
     def problem(net):
         return lambda: ProfileProblem(net().alloc(types.TensorXf), truth, types)
 
-    jobs = {name: Training(name, problem(net), settings, settings.steps * 8) for name, net in nets.items()}
+    jobs = {name: ConvergenceTraining(name, problem(net), settings, settings.steps * 8) for name, net in nets.items()}
     data = exact(truth, types.TensorXf)
     readers, candidates = {"measurement": lambda: data}, []
     candidates.append(Candidate("measurement", "measurement", "float32", data.nbytes, is_truth=True))

@@ -43,3 +43,6 @@ class ProfileModel(Model):
         found = self.net([self.types.Float(x)])[0].numpy()
         measurement.write(output, 90 * x, np.maximum(found, 0) * self.peak)
         return [(output, f"{len(x)} angles, peak {self.peak:,.1f} cd")]
+
+
+MODEL = ProfileModel

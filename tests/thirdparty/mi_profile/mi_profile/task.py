@@ -61,10 +61,5 @@ class Profile(Task):
             raise TableError(f"{path}: its settings name no peak, found {peak!r}")
         return table
 
-    def model_class(self):
-        from .model import ProfileModel
-
-        return ProfileModel
-
 
 TASK = Profile()

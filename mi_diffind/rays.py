@@ -1,0 +1,23 @@
+"""Intersection of rays with an axis-aligned box (the slab method of Kay and Kajiya 1986)."""
+
+from __future__ import annotations
+
+import drjit as dr
+
+
+def box_interval(o, d, lower, upper, near, far, active) -> tuple:
+    """
+    Cut the parts ``near`` ≤ t ≤ ``far`` of rays ``o + t·d`` down to those in the box: ``(near, far, active)``.
+
+    ``o``, ``d`` are Dr.Jit points and vectors; ``lower``, ``upper`` the corners, three numbers each; ``near``, ``far``
+    and ``active`` Dr.Jit arrays. A component of ``d`` may be zero, also along a face of the box: such a ray is active
+    if it lies between the two planes. The caller drops empty parts (``near`` > ``far``) and NaN by a comparison.
+    """
+    for x, v, low, high in zip(o, d, lower, upper, strict=True):
+        parallel = v == 0  # 0 · inf along a face would be NaN
+        inverse = dr.rcp(dr.select(parallel, 1, v))
+        first, second = (low - x) * inverse, (high - x) * inverse
+        active &= ~parallel | ((x >= low) & (x <= high))
+        near = dr.select(parallel, near, dr.maximum(near, dr.minimum(first, second)))
+        far = dr.select(parallel, far, dr.minimum(far, dr.maximum(first, second)))
+    return near, far, active
