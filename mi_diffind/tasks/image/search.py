@@ -94,7 +94,7 @@ def ratio_search(
         table, result = fit_image(source, size, shortened, request, border, title)
         tried.append({
             "dims": size.dims, "structure": structure, "cascaded": side, "rows": size.rows, "columns": size.columns,
-            "ratio": size.ratio, "bytes": size.nbytes, "psnr_db": table.measured["psnr_db"],
+            "ratio": size.ratio, "bytes": table.nbytes, "psnr_db": table.measured["psnr_db"],
             "psnr_between_db": table.measured["psnr_between_db"],
         })  # fmt: skip
         if best() is tried[-1]:
