@@ -96,7 +96,7 @@ def _inspect_table(arguments) -> dict:
 
 
 def _print_rays(n: dict) -> None:
-    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.radiance.counting.Counts`)."""
+    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.radiance.march.RayCounts`)."""
     total = max(1, n["steps"])
     print(
         f"    rays      {n['crossing']:,} of {n['rays']:,} cross the field, {n['opaque']:,} of them end opaque\n"
@@ -109,10 +109,10 @@ def _inspect_scene(arguments) -> dict:
     set_variant(arguments.variant)
     from .. import scenes
 
-    defines = dict(arguments.defines)
-    learned = scenes.learned_plugins(arguments.file, defines=defines)
-    tables = scenes.tables_of(arguments.file, learned)
-    reports = scenes.reports(scenes.load(arguments.file, defines=defines))
+    parsed = scenes.ParsedScene(arguments.file, dict(arguments.defines))
+    learned = parsed.learned_plugins()
+    tables = parsed.tables(learned)
+    reports = scenes.reports(parsed.load())
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned plugin(s), {total:,} bytes of tables in {len(tables)} file(s)")
     for found in reports:
