@@ -78,8 +78,9 @@ class DirectNodes(SparseNodes):
 
 class DirectCoding(encoding.NodeCoding):
     """
-    In place of frames, a cascaded array and pointers: the ``pointers`` are numbers that say it all. No node changes its
-    side; the surface stays within the cells.
+    Codes of nodes without frames and cascaded array: ``pointers`` hold a distance and a normal each.
+
+    As in the base class, no node changes its side, and the surface stays within the stored cells.
     """
 
     def __init__(self, sampled: encoding.SampledNodes, seed: int = 0):
@@ -109,7 +110,7 @@ class DirectCoding(encoding.NodeCoding):
 
     def _keep_sides(self, wanted: np.ndarray, nodes: np.ndarray) -> None:
         wrong = nodes[self._distances(nodes, self.pointers[nodes, None])[:, 0] < self.least[nodes]]
-        # Up to the next step
+        # Half a step more, so that quantisation does not round the distance down below the least one
         least = self.least[wrong] + NEAREST / LEVELS
         self._write(wrong, self.side[wrong] * least, _normals(self.pointers[wrong]))
 
@@ -118,7 +119,7 @@ class DirectCoding(encoding.NodeCoding):
         return np.concatenate([_distances(self.pointers)[:, None], normals], axis=1).astype(np.float32)
 
     def field(self, types) -> DirectNodes:
-        """What it decided on."""
-        told = self.values().astype(np.float64)
-        slope = slope_bound(told[:, 0], told[:, 1:], self.sampled.corners)
+        """Return the field of the chosen codes."""
+        values = self.values().astype(np.float64)
+        slope = slope_bound(values[:, 0], values[:, 1:], self.sampled.corners)
         return DirectNodes(types, self.sampled.structure, self.pointers.astype(np.uint16), slope)
