@@ -1,8 +1,8 @@
 """
 Write capture_group.xml, capture_thin.xml and capture_glossy.xml, and the meshes ``cage.ply`` and ``leaves.ply``.
 
-``mi-diffind capture`` takes views of these scenes for radiance fields: objects in the light of a probe, with nothing
-below or behind them. The meshes are those of capture_thin.xml. See README.md.
+``mi-diffind capture`` renders views of these scenes for radiance fields: objects in the light of a probe, with nothing
+below or behind them. See README.md.
 """
 
 from pathlib import Path
@@ -20,27 +20,27 @@ CAMERA = {"origin": (2.6, 2.6, 5.6), "target": (0, 0.85, 0), "up": (0, 1, 0)}
 
 
 def place(x: float, y: float, z: float) -> dict:
-    """Return the parameters of a translation."""
+    """Where something is moved to."""
     return {"x": x, "y": y, "z": z}
 
 
 def turn(axis: str, angle: float) -> dict:
-    """Return the parameters of a rotation around an axis, in degrees."""
+    """Return a rotation around an axis, in degrees."""
     return {axis: 1, "angle": angle}
 
 
 def mesh(file: str, material, id: str = "", **steps):
-    """Return a mesh of the assets; ``steps`` are those of its transform."""
+    """Return a mesh of the assets."""
     return plugin("shape", "ply", transform(**steps), material, id=id or file, filename=f"assets/{file}.ply")
 
 
 def bitmap(name: str, file: str):
-    """Return a texture of the assets."""
+    """Return a texture."""
     return plugin("texture", "bitmap", name=name, filename=f"assets/{file}")
 
 
 def principled(*children, **parameters):
-    """Return a ``principled`` material."""
+    """Return a material."""
     return plugin("bsdf", "principled", *children, **parameters)
 
 
@@ -48,7 +48,7 @@ def principled(*children, **parameters):
 
 
 def tube(points: np.ndarray, radius: float, sides: int = 6) -> tuple:
-    """Return positions, normals and triangles of an open tube around a line through ``points`` ``(n, 3)``."""
+    """Positions, normals and triangles of a tube around a line through ``points`` ``(n, 3)``, open at its ends."""
     along = np.gradient(points, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     side = np.eye(3)[np.argmin(np.abs(along).max(axis=0))]
@@ -62,14 +62,14 @@ def tube(points: np.ndarray, radius: float, sides: int = 6) -> tuple:
 
 
 def joined(parts: list[tuple]) -> tuple:
-    """Return several meshes as one."""
+    """Several meshes as one."""
     starts = np.cumsum([0, *(len(p) for p, _, _ in parts)])
     positions, normals = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     return positions, normals, np.concatenate([f + s for (_, _, f), s in zip(parts, starts, strict=False)])
 
 
 def cage(name: str, radius: float = 0.95, wire: float = 0.014) -> None:
-    """Write a globe of wires on y = 0: meridians, circles of latitude, and a ring on top."""
+    """Return a globe of wires, on y = 0: meridians and circles of latitude, and a ring on top."""
     t = np.linspace(0, 2 * np.pi, 65)
     lines = []
     for k in range(8):
@@ -87,7 +87,7 @@ def cage(name: str, radius: float = 0.95, wire: float = 0.014) -> None:
 
 
 def leaf(base, direction, length: float, width: float, droop: float) -> tuple:
-    """Return positions, normals and triangles of a thin leaf that bends down along the horizontal ``direction``."""
+    """Positions, normals and triangles of a thin leaf, ``direction`` in the plane, that bends down towards its tip."""
     s = np.linspace(0, 1, 9)[:, None]
     direction = np.array(direction) / np.linalg.norm(direction)
     spine = np.array(base) + length * (s * direction + [0, 1, 0] * (0.5 * s - droop * s**2))
@@ -103,7 +103,7 @@ def leaf(base, direction, length: float, width: float, droop: float) -> tuple:
 
 
 def leaves(name: str, count: int = 26) -> None:
-    """Write a plant: leaves in spirals around three stems, smaller towards the top."""
+    """Return a plant: leaves around three stems, in the spiral of a sunflower, smaller towards the top."""
     parts, rng = [], np.random.default_rng(15)
     for stem in range(3):
         lean = 2.1 * stem + 0.4
@@ -133,7 +133,7 @@ def scene(name: str, what: str, light: str, lighting, content: list) -> None:
 
 
 def main() -> None:
-    """Write the meshes and the scenes."""
+    """Write the files."""
     clay = principled(base_color=(0.62, 0.31, 0.2), roughness=0.55, specular=0.4)
     porcelain = principled(bitmap("base_color", "vase_color.png"), roughness=0.35, specular=0.5)
     blue = principled(base_color=(0.07, 0.2, 0.5), roughness=0.4, specular=0.5)
