@@ -42,7 +42,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser(argv: list[str]) -> argparse.ArgumentParser:
-    """The parser of all verbs, or of the one that is asked for: those of tasks need not be looked for then."""
+    """
+    Build the parser of the verb in ``argv``; the other verbs are only named, so that no task is imported for them.
+    """
     parser = argparse.ArgumentParser(
         prog="mi-diffind", description="Learned lookup tables for Mitsuba 3: differentiable indirection."
     )

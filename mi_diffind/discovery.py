@@ -1,8 +1,9 @@
 """
-What can be added to this package without editing it: tasks, plugins and studies are found, never listed.
+Discovery of tasks, plugins and studies, which are never listed.
 
-What ships is found by its place, a module of a package (``mi_diffind.tasks``, ``mi_diffind.plugins``,
-``mi_diffind.studies``); what others add by an entry point of the group of that name, in their ``pyproject.toml``::
+A part that ships is found by its place, a module of a package (``mi_diffind.tasks``, ``mi_diffind.plugins``,
+``mi_diffind.studies``); a part of another package by an entry point of the group of that name, in its
+``pyproject.toml``::
 
     [project.entry-points."mi_diffind.tasks"]
     profile = "their_package.profile"
@@ -19,10 +20,10 @@ from collections.abc import Iterable
 
 def modules(package: str, ignored: tuple[str, ...] = ()) -> dict[str, str]:
     """
-    Name → full name of the module, in alphabetical order, those of ``package`` first: its own modules and packages but
-    for the ``ignored`` ones and those whose name begins with an underscore, and what entry points of the group
-    ``package`` name. Nothing is imported but the package itself. A name that is taken already is left out with a
-    warning.
+    Return name → full name of the modules of ``package`` and of the entry points of the group ``package``.
+
+    The package's own modules come first, in alphabetical order, without the ``ignored`` ones and those that begin with
+    an underscore. Nothing is imported but the package itself. A name that exists already is left out with a warning.
     """
     path = importlib.import_module(package).__path__
     names = sorted(m.name for m in pkgutil.iter_modules(path))
@@ -44,9 +45,10 @@ def load(
     kind: type = object,
 ) -> dict:
     """
-    Name → what each of :func:`modules` (or ``only`` those of some names) calls ``attribute``, an instance of ``kind``
-    of that ``name``. A module of somebody else's that cannot be imported, or lacks it, is left out with a warning; one
-    of ours that lacks it is no such thing.
+    Import :func:`modules` (or ``only`` some of them) and return name → the ``attribute`` that each declares.
+
+    A declaration is an instance of ``expected`` with that ``name``. A module of another package that cannot be imported
+    or lacks the attribute is left out with a warning; one of this package that lacks it declares nothing.
     """
     found, others, known = {}, {}, modules(package, ignored)
     for name in known if only is None else only:

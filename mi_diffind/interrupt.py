@@ -1,4 +1,4 @@
-"""Ctrl-C that lets a long job finish its step and keep what it has."""
+"""Ctrl-C that lets a long job finish its step and keep its result so far."""
 
 from __future__ import annotations
 

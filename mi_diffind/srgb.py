@@ -23,7 +23,7 @@ def from_linear(values):
     import drjit as dr
 
     root = dr.power(dr.maximum(values, 0.0031308), 1 / 2.4)
-    return dr.select(values <= 0.0031308, 12.92 * values, dr.fma(1.055, root, -0.055))
+    return dr.select(values <= 0.0031308, 12.92 * values, 1.055 * root - 0.055)
 
 
 def to_linear(values):

@@ -1,4 +1,4 @@
-"""``mi-diffind capture``: a scene from all sides, as images with poses that radiance fields are made from."""
+"""``mi-diffind capture``: views of a scene from all sides with their poses, the input of a radiance field."""
 
 from __future__ import annotations
 
@@ -45,8 +45,10 @@ def add(commands) -> None:
 
 def run(arguments) -> dict:
     """
-    Render what is missing of the views. Returns what is printed; after Ctrl-C, of the views that there are. Raises
-    :class:`UsageError`, and as :mod:`mi_diffind.capture` does.
+    Render the views that are missing and return what is printed.
+
+    After Ctrl-C, the result lists the views that exist. Raises :class:`UsageError`, and as :mod:`mi_diffind.capture`
+    does.
     """
     require_scene(arguments.scene)
     writable_folder(Path(arguments.output).parent)

@@ -1,4 +1,4 @@
-"""``mi-diffind decode``: what a table file stands for, in an ordinary format again."""
+"""``mi-diffind decode``: the content of a table file in an ordinary format."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ def add(commands) -> None:
 
 def run(arguments) -> dict:
     """
-    Write the files; returns their names as ``files``. Raises :class:`UsageError`,
-    :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.files.OutputError`.
+    Write the files and return their names as ``files``.
+
+    Raises :class:`UsageError`, :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.files.OutputError`.
     """
     output = writable_file(arguments.output)
     from ..runtime import array_module

@@ -60,8 +60,10 @@ def _default(task: Task, name: str) -> str:
 
 def run(arguments) -> dict:
     """
-    Train and write the table file. Returns its size, accuracy and how the training went; after Ctrl-C, of the best so
-    far. Raises :class:`~mi_diffind.errors.DiffindError`.
+    Train, write the table file, and return its size, its accuracy and the history of the training.
+
+    After Ctrl-C, these are of the best state so far. Raises :class:`UsageError`,
+    :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.
     """
     output = Path(arguments.output)
     if output.suffix.lower() != ".npz":

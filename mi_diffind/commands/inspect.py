@@ -1,4 +1,4 @@
-"""``mi-diffind inspect``: what is in a table file, or which learned plugins a scene uses."""
+"""``mi-diffind inspect``: the content of a table file, or the learned plugins of a scene."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ def add(commands) -> None:
 
 def run(arguments) -> dict:
     """
-    Print what the file holds and return it. Raises :class:`UsageError`, and
-    :class:`~mi_diffind.tables.TableError` or :class:`~mi_diffind.scenes.SceneError` for a file that cannot be read.
+    Print what the file holds and return it.
+
+    Raises :class:`UsageError`, and :class:`~mi_diffind.tables.TableError` or :class:`~mi_diffind.scenes.SceneError` for
+    a file that cannot be read.
     """
     if Path(arguments.file).suffix.lower() == ".xml":
         if arguments.measure:
@@ -96,7 +98,7 @@ def _inspect_table(arguments) -> dict:
 
 
 def _print_rays(n: dict) -> None:
-    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.radiance.counting.Counts`)."""
+    """Print what camera rays read of a radiance field (:class:`mi_diffind.tasks.radiance.counting.Counts`)."""
     total = max(1, n["steps"])
     print(
         f"    rays      {n['crossing']:,} of {n['rays']:,} cross the field, {n['opaque']:,} of them end opaque\n"

@@ -1,4 +1,4 @@
-"""``mi-diffind render``: a scene that names learned plugins, as an image."""
+"""``mi-diffind render``: an image or an orbit of a scene that names learned plugins."""
 
 from __future__ import annotations
 
@@ -52,8 +52,10 @@ def add(commands) -> None:
 
 def run(arguments) -> dict:
     """
-    Render the scene and write the image. Returns what is printed, which learned plugins the scene names and how long it
-    took; after Ctrl-C of the passes that are done. Raises :class:`UsageError`, and as :mod:`mi_diffind.scenes` does.
+    Render the scene and write the image.
+
+    Returns what is printed, the learned plugins of the scene and the times; after Ctrl-C, of the passes that are done.
+    Raises :class:`UsageError`, and as :mod:`mi_diffind.scenes` does.
     """
     from tqdm import tqdm
 
@@ -111,7 +113,7 @@ def run(arguments) -> dict:
 
 
 def _orbit(arguments, output: Path, scene, spp: int) -> dict:
-    """Render and write the frames of an orbit; after Ctrl-C, of those that are done."""
+    """Render and write the frames of an orbit; after Ctrl-C, those that are done."""
     import mitsuba as mi
     from tqdm import tqdm
 
@@ -142,7 +144,7 @@ def _orbit(arguments, output: Path, scene, spp: int) -> dict:
 
 
 def _choose_depth(arguments, defines: dict[str, str]) -> dict:
-    """The depth to render to, and why; what was not measured is None."""
+    """Choose the depth to render to and say why; what was not measured is None."""
     from .. import depth, scenes
 
     if arguments.depth == "auto":

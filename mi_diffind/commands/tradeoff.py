@@ -1,4 +1,4 @@
-"""``mi-diffind tradeoff``: time against accuracy, of all forms of a task or of a scene."""
+"""``mi-diffind tradeoff``: time against accuracy of all forms of a task, or of a scene."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ def add(commands) -> None:
 
 def run(arguments) -> dict:
     """
-    Measure and write table and plot. Returns the result with its ``files``; after Ctrl-C, what there is up to then.
-    Raises :class:`UsageError`, :class:`~mi_diffind.files.OutputError`, and what the study's own input may raise
+    Measure, write table and plot, and return the result with its ``files``; after Ctrl-C, the part that is done.
+
+    Raises :class:`UsageError`, :class:`~mi_diffind.files.OutputError`, and what the study's own input raises
     (:class:`~mi_diffind.maps.source.SourceError`, :class:`~mi_diffind.scenes.SceneError`).
     """
     study = studies()[arguments.study]
