@@ -105,8 +105,9 @@ def define(text: str) -> tuple[str, str]:
 
 def checked(parse):
     """
-    Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown; it returns the
-    text.
+    Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown.
+
+    The type returns the text itself.
     """
 
     def parsed(text: str):

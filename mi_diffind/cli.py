@@ -42,18 +42,16 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser(argv: list[str]) -> argparse.ArgumentParser:
-    """
-    Build the parser of the verb in ``argv``; the other verbs are only named, so that no task is imported for them.
-    """
+    """Build the parser of the verb in ``argv``; other verbs are only named, without imports of tasks."""
     parser = argparse.ArgumentParser(
         prog="mi-diffind", description="Learned lookup tables for Mitsuba 3: differentiable indirection."
     )
     parser.add_argument("--version", action="version", version=f"mi-diffind {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    asked = next((word for word in argv if not word.startswith("-")), None)
+    chosen = next((word for word in argv if not word.startswith("-")), None)
     for name in VERBS:
         module = importlib.import_module(f"{__package__}.commands.{name}")
-        if name == asked:
+        if name == chosen:
             module.add(commands)
         else:
             commands.add_parser(name, help=module.HELP)

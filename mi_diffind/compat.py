@@ -148,9 +148,7 @@ def llvm_target(code: str) -> tuple[str, int] | None:
 
 
 def kernel_seconds(history: list[dict]) -> float:
-    """
-    Return the time in seconds of the kernels of a ``dr.kernel_history()``, whose keys and unit, ms, are not promised.
-    """
+    """Return the seconds that the kernels of a ``dr.kernel_history()`` took; its unit, ms, is not promised."""
     return sum(entry["execution_time"] for entry in history) / 1e3
 
 
@@ -293,9 +291,7 @@ def is_uniform_spectrum(texture) -> bool:
 
 
 def is_bitmap(texture) -> bool:
-    """
-    Return whether a texture is a ``bitmap`` of any storage (``BitmapTextureImpl<…>``). Its parameter is then ``data``.
-    """
+    """Return whether a texture is a ``bitmap`` of any storage. Its parameter is then ``data``."""
     return texture_class(texture).startswith("BitmapTextureImpl")
 
 
@@ -322,11 +318,11 @@ def srgb_coefficients() -> tuple:
 
 def normal_edges(pi, si, ray, active) -> tuple:
     """
-    Return two vectors in space, ``mi.Vector3f``, along which the shading normal changes by ``si.dn_du`` and
-    ``si.dn_dv``.
+    Return two vectors in space along which the shading normal changes by ``si.dn_du`` and ``si.dn_dv``.
 
-    ``si`` is of ``pi.compute_surface_interaction(ray)`` with ``RayFlags.dNSdUV``. The vectors are ``dp_du`` and
-    ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in barycentric coordinates.
+    They are ``mi.Vector3f``; ``si`` is of ``pi.compute_surface_interaction(ray)`` with ``RayFlags.dNSdUV``. The vectors
+    are ``dp_du`` and ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in
+    barycentric coordinates.
     """
     import drjit as dr
     import mitsuba as mi
@@ -366,12 +362,12 @@ def written_in_python(integrator) -> bool:
 
 
 def replays_paths(integrator) -> bool:
-    """Return whether an integrator derives from the class of :func:`replay_integrator`, by the name of that class."""
-    return any(kind.__name__ == "RBIntegrator" for kind in type(integrator).__mro__)
+    """Return whether an integrator derives from :func:`replay_integrator`'s class, by the name of that class."""
+    return any(base.__name__ == "RBIntegrator" for base in type(integrator).__mro__)
 
 
 def samples_in_python(integrator) -> bool:
-    """Return whether an integrator derives from ``ADIntegrator``, as ``prb`` does; its ``sample`` takes a mode."""
+    """Return whether an integrator derives from ``ADIntegrator``; its ``sample`` takes a mode."""
     import mitsuba as mi
 
     return isinstance(integrator, mi.ad.integrators.common.ADIntegrator)
@@ -455,13 +451,13 @@ def build_as(config, parallel: bool, optimize: bool) -> None:
     config.parallel, config.merge_equivalent, config.merge_meshes = parallel, optimize, optimize
 
 
-def properties_of(state, kind=None) -> list:
+def properties_of(state, object_type=None) -> list:
     """
     Return the properties (``mi.Properties``) of all objects of a parsed scene, or of one ``mi.ObjectType``.
 
     Changing them changes the scene.
     """
-    return [node.props for node in state.nodes if kind is None or node.type == kind]
+    return [node.props for node in state.nodes if object_type is None or node.type == object_type]
 
 
 def parsed_files(state) -> list[str]:
@@ -471,17 +467,18 @@ def parsed_files(state) -> list[str]:
 
 def property_kind(props, key: str) -> str:
     """
-    Return the type of a parsed parameter: ``number``, ``colour``, ``text``, ``object`` (nested or referred to) or
-    ``other``.
+    Return the type of a parsed parameter as a word.
+
+    It is ``number``, ``colour``, ``text``, ``object`` (nested or referred to) or ``other``.
     """
     import mitsuba as mi
 
-    kinds, found = mi.Properties.Type, props.type(key)
-    if found in (kinds.Float, kinds.Integer):
+    types, parameter = mi.Properties.Type, props.type(key)
+    if parameter in (types.Float, types.Integer):
         return "number"
-    if found in (kinds.Reference, kinds.ResolvedReference):
+    if parameter in (types.Reference, types.ResolvedReference):
         return "object"
-    return {kinds.Color: "colour", kinds.String: "text"}.get(found, "other")
+    return {types.Color: "colour", types.String: "text"}.get(parameter, "other")
 
 
 @contextlib.contextmanager

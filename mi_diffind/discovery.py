@@ -27,14 +27,14 @@ def modules(package: str, ignored: tuple[str, ...] = ()) -> dict[str, str]:
     """
     path = importlib.import_module(package).__path__
     names = sorted(m.name for m in pkgutil.iter_modules(path))
-    found = {n: f"{package}.{n}" for n in names if n not in ignored and not n.startswith("_")}
+    named = {n: f"{package}.{n}" for n in names if n not in ignored and not n.startswith("_")}
     for entry in sorted(importlib.metadata.entry_points(group=package), key=lambda e: e.name):
-        if entry.name in found:
-            if found[entry.name] != entry.module:
-                _warn(f'"{entry.name}" ({entry.module}) is left out: {package} has {found[entry.name]} of that name')
+        if entry.name in named:
+            if named[entry.name] != entry.module:
+                _warn(f'"{entry.name}" ({entry.module}) is left out: {package} has {named[entry.name]} of that name')
         else:
-            found[entry.name] = entry.module
-    return found
+            named[entry.name] = entry.module
+    return named
 
 
 def load(
@@ -42,7 +42,7 @@ def load(
     attribute: str,
     ignored: tuple[str, ...] = (),
     only: Iterable[str] | None = None,
-    kind: type = object,
+    expected: type = object,
 ) -> dict:
     """
     Import :func:`modules` (or ``only`` some of them) and return name → the ``attribute`` that each declares.
@@ -50,7 +50,7 @@ def load(
     A declaration is an instance of ``expected`` with that ``name``. A module of another package that cannot be imported
     or lacks the attribute is left out with a warning; one of this package that lacks it declares nothing.
     """
-    found, others, known = {}, {}, modules(package, ignored)
+    shipped, others, known = {}, {}, modules(package, ignored)
     for name in known if only is None else only:
         ours = known[name].startswith(f"{package.partition('.')[0]}.")
         try:
@@ -58,19 +58,19 @@ def load(
             if ours and not hasattr(module, attribute):
                 continue
             declared = getattr(module, attribute)
-            if not isinstance(declared, kind):
-                raise TypeError(f"its {attribute} is a {type(declared).__name__}, a {kind.__name__} is needed")
+            if not isinstance(declared, expected):
+                raise TypeError(f"its {attribute} is a {type(declared).__name__}, a {expected.__name__} is needed")
             declared_name = getattr(declared, "name", name)
             if not ours and declared_name != name:
                 raise ValueError(f'its {attribute} is called "{declared_name}"')
-            (found if ours else others)[declared_name] = declared
+            (shipped if ours else others)[declared_name] = declared
         except Exception as e:
             if ours:
                 raise
             _warn(f'"{name}" ({known[name]}) is left out: {type(e).__name__}: {e}')
-    for name in found.keys() & others.keys():
+    for name in shipped.keys() & others.keys():
         _warn(f'"{name}" ({known[name]}) is left out: {package} has one of that name')
-    return {**dict(sorted(found.items())), **{name: each for name, each in others.items() if name not in found}}
+    return {**dict(sorted(shipped.items())), **{name: each for name, each in others.items() if name not in shipped}}
 
 
 def _warn(message: str) -> None:

@@ -27,8 +27,8 @@ def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
         if create and path.parent.is_dir() and not path.exists():
             path.mkdir()
         if not path.is_dir():
-            kind = "is not a folder" if path.exists() else "does not exist"
-            raise OutputError(f'output folder "{path}" {kind}')
+            fault = "is not a folder" if path.exists() else "does not exist"
+            raise OutputError(f'output folder "{path}" {fault}')
         with tempfile.TemporaryFile(dir=path):
             pass
     except OutputError:

@@ -189,7 +189,7 @@ def fit(
             raise FittingError(f'the checkpoint "{checkpoint}" would replace a file that is not one')
     trainer, plateau = _Trainer(problem, settings), _Plateau(settings)
     best, best_measured, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
-    references = {}  # running means of the loss by kind of step; from the first on, lest an explosion after it sets one
+    references = {}  # running mean of the loss of each phase, from its first step on, lest an explosion sets it
     if resume:
         if checkpoint is None:
             raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
@@ -241,7 +241,7 @@ def fit(
             if seconds is not None:
                 measured = int(10 * trainer.share) > int(10 * share_before)
             due = trainer.step % settings.check_every == 0 or measured
-            reference = references.get(trainer.kind)
+            reference = references.get(trainer.phase)
             if not (due or last or reference is None):
                 continue
             value = float(loss[0])
@@ -262,7 +262,7 @@ def fit(
                 trainer.share = share()
                 bar.show(trainer)
                 continue
-            references[trainer.kind] = value if reference is None else 0.5 * (reference + value)
+            references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
@@ -345,7 +345,7 @@ class _Trainer:
 
     def __init__(self, problem: Problem, settings: FitSettings):
         self.problem, self.settings = problem, settings
-        self.step, self.lr_scale, self.restarts, self.kind = 0, 1.0, 0, ""
+        self.step, self.lr_scale, self.restarts, self.phase = 0, 1.0, 0, ""
         self.share = 0.0  # of the training that is over
         self.optimizer = Adam(lr=settings.lr)
         self.optimizer.update(problem.net)
@@ -365,7 +365,7 @@ class _Trainer:
         seed = dr.opaque(self.module.UInt64, (settings.seed << 32) + self.restarts * settings.steps + self.step)
         rng = dr.rng(seed=seed)
         net.update(self.optimizer)
-        self.kind = self.problem.begin(self.step, self.share)
+        self.phase = self.problem.begin(self.step, self.share)
         losses = self.problem.loss(net, rng, settings.batch)
         losses = losses if isinstance(losses, list) else [losses]
         losses = [values.array if dr.is_tensor_v(values) else values for values in losses]

@@ -462,9 +462,7 @@ class Indirection(nn.Module):
         return Indirection(primary, cascaded, self.inputs), channels
 
     def to(self, storage: str, cascaded: str | None = None) -> Indirection:
-        """
-        Return a copy with primaries stored as ``storage``, the cascaded array as ``cascaded`` (default: the same).
-        """
+        """Return a copy with other storage forms of the primaries and of the cascaded array (default: the same)."""
         return Indirection([p.to(storage) for p in self.primary], self.cascaded.to(cascaded or storage), self.inputs)
 
     @property
@@ -530,7 +528,9 @@ def stored_form(net: Indirection, bits: Sequence[int] | None = None) -> Indirect
 
 def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.ndarray:
     """
-    Return entries equal to their own position, ``(N_1, …, N_d, channels)``; channel ``k`` runs along axis ``k mod d``.
+    Return entries equal to their own position, ``(N_1, …, N_d, channels)``.
+
+    Channel ``k`` runs along axis ``k mod d``.
     """
     grids = np.meshgrid(
         *[

@@ -85,12 +85,12 @@ def library_version(path: str) -> int | None:
 
 def pip_libraries() -> list[str]:
     """Return the paths of the LLVM libraries that pip installed into this environment, newest first."""
-    found = []
+    paths = []
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         files = importlib.metadata.distribution("karellen-llvm-core").files or ()
-        found += [str(Path(f.locate()).resolve()) for f in files if _named_version(f.name) is not None]
-    found += glob.glob(os.path.join(sys.prefix, "lib", "libLLVM*.so*"))
-    return _newest_first(found)
+        paths += [str(Path(f.locate()).resolve()) for f in files if _named_version(f.name) is not None]
+    paths += glob.glob(os.path.join(sys.prefix, "lib", "libLLVM*.so*"))
+    return _newest_first(paths)
 
 
 def system_libraries(patterns=_SYSTEM_PATTERNS) -> list[str]:
@@ -116,12 +116,12 @@ def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, 
     """
     explicit = environ.get(ENV)
     if explicit:
-        found = version(explicit)
-        if found is None:
+        major = version(explicit)
+        if major is None:
             problem = f"{ENV}={explicit} is not a loadable LLVM library: {_CORRECT}."
-        elif found < MIN_LLVM:
+        elif major < MIN_LLVM:
             problem = (
-                f"{ENV}={explicit} is LLVM {found if found > 15 else '15 or older'}, with which Dr.Jit aborts: "
+                f"{ENV}={explicit} is LLVM {major if major > 15 else '15 or older'}, with which Dr.Jit aborts: "
                 f"version {MIN_LLVM} or newer is needed: {_CORRECT}."
             )
         else:
@@ -134,8 +134,8 @@ def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, 
     too_old = []
     for origin, paths in (("pip", pip()), ("system", system())):
         for path in paths:
-            found = version(path)
-            if found is not None and found >= MIN_LLVM:
+            major = version(path)
+            if major is not None and major >= MIN_LLVM:
                 return Choice(path, origin)
             too_old.append(path)
     seen = f" (found only {too_old[0]}, which is too old)" if too_old else ""

@@ -191,9 +191,7 @@ class Task:
     # -- training ---------------------------------------------------------------------------------------------------
 
     def settings(self, preset: str, given: Mapping, options: Mapping) -> FitSettings:
-        """
-        Return the settings of a preset with the ``given`` ones in place of its own; ``options`` are the task's own.
-        """
+        """Return the settings of a preset with the ``given`` ones in place; ``options`` are the task's own."""
         return dataclasses.replace(self.presets[preset], **given)
 
     def check(self, request: FitRequest) -> None:
@@ -229,8 +227,8 @@ class Task:
         if request.seconds is not None:
             table.settings["steps"] = result.steps
         table = table.to(request.storage) if request.storage else table
-        found = self.model(table, request.types.TensorXf).measure()
-        table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
+        measured = self.model(table, request.types.TensorXf).measure()
+        table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
         return Fitted(table, result)
 
     # -- files ------------------------------------------------------------------------------------------------------
@@ -266,9 +264,9 @@ class Task:
             package = sys.modules[cls.__module__].__package__
             for module in modules if package else ():
                 if importlib.util.find_spec(f"{package}.{module}") is not None:
-                    found = getattr(importlib.import_module(f"{package}.{module}"), name, None)
-                    if found is not None:
-                        return found
+                    implementation = getattr(importlib.import_module(f"{package}.{module}"), name, None)
+                    if implementation is not None:
+                        return implementation
         return None
 
     def model(self, table: Table, dtype, storage: str = "") -> Model:
@@ -277,7 +275,9 @@ class Task:
 
     def file(self, filename: str | os.PathLike = "", preset: str = "") -> Path:
         """
-        Return the path ``filename``, or of the file that ships for ``preset`` ("": the default). Raises ``ValueError``.
+        Return the path ``filename``, or of the file that ships for ``preset`` ("": the default).
+
+        Raises ``ValueError`` if no such file ships.
         """
         if str(filename):
             return Path(filename)
@@ -325,7 +325,7 @@ def _open(task: Task, path: Path, stamp: tuple, dtype, storage: str) -> Model:
 @functools.lru_cache
 def tasks() -> dict[str, Task]:
     """Return all tasks by name: the package's own first, then those of entry points."""
-    return discovery.load(f"{__package__}.tasks", "TASK", kind=Task)
+    return discovery.load(f"{__package__}.tasks", "TASK", expected=Task)
 
 
 def task_of(table: Table) -> Task:

@@ -164,7 +164,7 @@ def _load() -> list[Plugin]:
     """Execute the modules of plugins afresh, and return what they declare."""
     for name in discovery.modules(__name__, IGNORED).values():  # all of them first, since one may build upon another
         sys.modules.pop(name, None)
-    return list(discovery.load(__name__, "PLUGIN", IGNORED, kind=Plugin).values())
+    return list(discovery.load(__name__, "PLUGIN", IGNORED, expected=Plugin).values())
 
 
 def _refusal(name: str, variant: str):

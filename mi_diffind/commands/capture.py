@@ -66,17 +66,17 @@ def run(arguments) -> dict:
         settings.check()
     except ValueError as e:
         raise UsageError(f"--{e}") from None
-    found = capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
-    print("\n".join(capture.lines(found)))
+    captured = capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
+    print("\n".join(capture.lines(captured)))
     return {
-        "interrupted": len(found.files) < found.total,
+        "interrupted": len(captured.files) < captured.total,
         "scene": arguments.scene,
-        "output": str(found.folder),
-        "files": found.files,
-        "views": found.total,
-        "rendered": found.rendered,
-        "seconds": found.seconds,
-        "radius": found.radius,
-        "centre": found.centre.tolist(),
-        "box": found.box.tolist(),
+        "output": str(captured.folder),
+        "files": captured.files,
+        "views": captured.total,
+        "rendered": captured.rendered,
+        "seconds": captured.seconds,
+        "radius": captured.radius,
+        "centre": captured.centre.tolist(),
+        "box": captured.box.tolist(),
     }

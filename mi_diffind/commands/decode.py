@@ -34,11 +34,11 @@ def run(arguments) -> dict:
     from ..runtime import array_module
     from ..tables import load_table
 
-    own = {argument.name for argument in task_of(load_table(arguments.file)).decode_arguments}
+    accepted = {argument.name for argument in task_of(load_table(arguments.file)).decode_arguments}
     given = {a.name: getattr(arguments, a.name) for task in tasks().values() for a in task.decode_arguments}
     given = {name: value for name, value in given.items() if value is not None}
     for name in given:
-        if name not in own:
+        if name not in accepted:
             raise UsageError(f"{arguments.file}: --{name.replace('_', '-')} is of no use for this kind of file")
     set_variant(arguments.variant)
     model = load_model(arguments.file, array_module(arguments.variant).TensorXf)

@@ -43,8 +43,8 @@ def _add(sub, task: Task) -> None:
     length = sub.add_mutually_exclusive_group()
     length.add_argument("--steps", type=positive, help=f"optimisation steps (default: {_default(task, 'steps')})")
     length.add_argument("--seconds", type=positive, help="time of the training, in place of steps")
-    for name, text, kind in SETTINGS:
-        sub.add_argument(f"--{name}", **kind, help=f"{text} (default: {_default(task, name)})")
+    for name, text, options in SETTINGS:
+        sub.add_argument(f"--{name}", **options, help=f"{text} (default: {_default(task, name)})")
     sub.add_argument("--all-cores", action="store_true", help="faster, but not the same bytes each time")
     sub.add_argument("--checkpoint", metavar="FILE", help="keep the state of the training in FILE")
     sub.add_argument("--resume", action="store_true", help="go on from --checkpoint, with the same settings")

@@ -149,15 +149,15 @@ def _choose_depth(arguments, defines: dict[str, str]) -> dict:
 
     if arguments.depth == "auto":
         tolerance = arguments.depth_tolerance or depth.TOLERANCE
-        found = depth.auto_depth(arguments.scene, tolerance, arguments.seed, defines=defines)
-        print("\n".join(depth.summary(found)))
-        return {"requested": "auto", **found}
-    own = None
+        probe = depth.auto_depth(arguments.scene, tolerance, arguments.seed, defines=defines)
+        print("\n".join(depth.summary(probe)))
+        return {"requested": "auto", **probe}
+    scene_depth = None
     with contextlib.suppress(scenes.SceneError):  # no integrator with a depth: fine, unless one is asked for
-        own = scenes.integrator_of(arguments.scene, defines=defines)[1]
-    chosen = own if arguments.depth == "scene" else arguments.depth
+        scene_depth = scenes.integrator_of(arguments.scene, defines=defines)[1]
+    chosen = scene_depth if arguments.depth == "scene" else arguments.depth
     unknown = ("tolerance", "shares", "left_out", "left_out_in_a_tile", "probe_seconds")
-    return {"requested": arguments.depth, "chosen": chosen, "scene": own, **dict.fromkeys(unknown)}
+    return {"requested": arguments.depth, "chosen": chosen, "scene": scene_depth, **dict.fromkeys(unknown)}
 
 
 def _depth(text: str) -> int | str:

@@ -16,4 +16,4 @@ from ..measure.study import Study
 @functools.lru_cache
 def studies() -> dict[str, Study]:
     """All studies by name: those of this package, then those that entry points add."""
-    return discovery.load(__name__, "STUDY", ignored=("baselines", "equal_memory"), kind=Study)
+    return discovery.load(__name__, "STUDY", ignored=("baselines", "equal_memory"), expected=Study)
