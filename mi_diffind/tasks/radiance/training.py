@@ -86,10 +86,10 @@ class ImagesProblem(Problem):
         seen = differentiable(self.field_of(net), o, d, 0, dr.inf, True, offset)
         total = types.Float(0)
         for c in range(3):
-            wanted = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1))
+            wanted = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1), fused=False)
             found = seen.colour[c] + seen.transmittance * grey
             # Beyond white, all is white; the slope goes on, so that it comes back
-            total += dr.square(srgb.from_linear(found) - wanted)
+            total += dr.square(srgb.from_linear(found, fused=False) - wanted)
         return total * (1 / (3 * count))
 
     def measure(self, net):
