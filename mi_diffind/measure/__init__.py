@@ -1,7 +1,6 @@
 """
-The one frame that measures accuracy against time: a clock, a store for what is measured, reports and pictures.
+Measurement of accuracy against time: clock, benchmark, store of partial results, reports and pictures.
 
-A study (:class:`.study.Study`, in :mod:`mi_diffind.studies`) says what is measured; :mod:`.frame` does it,
-:mod:`.store` keeps what is done, :mod:`.report` writes it; :mod:`.curves` draws errors of several kinds in equal bytes.
-Nothing here knows a task.
+A study (:class:`.study.Study`, in :mod:`mi_diffind.studies`) declares its candidates and cases; :mod:`.benchmark`
+measures them, :mod:`.store` keeps partial results, :mod:`.report` writes the result. No module here knows a task.
 """

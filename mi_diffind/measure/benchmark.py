@@ -1,14 +1,11 @@
 """
-What a representation costs and what it gives: time, memory and operations of each candidate beside its accuracy.
+Benchmark of a :class:`.study.Plan`: time, memory and operations of each candidate beside its accuracy.
 
-This is the frame; what fills it in is a :class:`.study.Plan`: candidates, each a representation at a setting, and
-cases, each a situation in which all of them are timed.
-
-*Time* is that of the kernels alone (:mod:`.clock`). All candidates run in turn, one round of all before the next of
-any, so that a change of clock or of load hits all of them alike; given are medians and quartiles of the rounds. The
-*floor* is a kernel with the same inputs and outputs that computes nothing else: it is measured likewise, shown, and
-subtracted; what is hidden behind it is said to be below a bound (:mod:`.statistics`). Where a ratio of two candidates
-is given, it is the median of the ratios of the rounds.
+*Time* is that of the kernels alone (:mod:`.clock`). All candidates run in turn, one round of all before the next round,
+so that a change of clock rate or of load affects all of them alike; results are medians and quartiles of the rounds.
+The *floor* is a kernel with the same inputs and outputs that computes nothing else. It is measured in the same rounds,
+shown, and subtracted; a time that is hidden behind the floor is given as a bound (:mod:`.statistics`). A ratio of two
+candidates is the median of the ratios of the rounds.
 """
 
 from __future__ import annotations
@@ -30,10 +27,10 @@ from .statistics import pareto, ratio, spread, timing
 from .store import Store, fingerprint, models_folder, sources
 from .study import FLOOR, Case, Plan
 
-#: What a whole pass is called where the names of queries stand: kernels alone, and everything.
+#: Names of a whole pass among the queries: time of its kernels, and time from beginning to end.
 PASS, PASS_WALL = "render", "render, with tracing"
 
-#: Times that differ by a smaller factor count as equal: less is noise, and not worth an error.
+#: Times that differ by a smaller factor count as equal on the Pareto front.
 SAME_TIME = 1.05
 
 SECTIONS = ("jobs", "errors", "operations", "queries", "passes")
@@ -41,10 +38,7 @@ SECTIONS = ("jobs", "errors", "operations", "queries", "passes")
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """
-    How much is measured: ``lanes`` of a kernel, ``rounds`` of the queries, ``passes`` of whole jobs, ``samples`` for
-    the errors.
-    """
+    """Amount of measurement: ``lanes`` a kernel, ``rounds`` of queries, ``passes`` and ``samples`` for the errors."""
 
     lanes: int
     rounds: int = 31
@@ -54,29 +48,30 @@ class BenchmarkSettings:
 
     @classmethod
     def choose(cls, variant: str, quick: bool = False) -> BenchmarkSettings:
-        """For this machine: enough lanes that each core, or the GPU, gets several blocks of them."""
+        """Return settings for this machine: enough lanes that each core, or the GPU, gets several blocks of them."""
         blocks = 2 ** math.ceil(math.log2(max(dr.thread_count(), 2)))
         lanes = 2**22 if variant.startswith("cuda") else blocks * 2**16
         return cls(lanes // 4, 3, 2, 2**17, True) if quick else cls(lanes)
 
 
 class Stopped(Exception):
-    """The first Ctrl-C has been seen."""
+    """The first Ctrl-C stopped the measurement."""
 
 
 def measure(
     plan: Plan, settings: BenchmarkSettings, folder: str | os.PathLike | None = None, progress: bool = True
 ) -> dict:
     """
-    Measure everything that ``plan`` asks for, or what is missing of it, if ``folder`` holds an interrupted run. What
-    is measured stays there until :func:`.report.write` has written the result.
+    Measure a plan, or the rest of it if ``folder`` holds partial results of an interrupted run.
+
+    Partial results stay in ``folder`` until :func:`.report.write` has written the result.
 
     Returns the result, a tree of numbers and strings (JSON): ``task`` (the study), ``interrupted``, ``resumed``,
-    ``machine``, ``settings``, ``details``; ``candidates``: name → what it is and its ``errors``; ``cases``: name →
+    ``machine``, ``settings``, ``details``; ``candidates``: name → description and ``errors``; ``cases``: name →
     ``queries``: name → candidate → ``time``, ``q1``, ``q3`` (ns a lane, floor subtracted), ``with_floor``, ``floor``,
     ``rounds``, ``hidden`` (``time`` is only a bound), ``operations``, ``on_front``; ``passes``: candidate → likewise in
     ms; ``ratios``: query → ``"a / b"`` → ``median``, ``q1``, ``q3``, ``with_floor``, ``hidden``; ``jobs``: their
-    records. After Ctrl-C it is what there is up to then.
+    records. After Ctrl-C the result is incomplete.
 
     Raises :class:`~mi_diffind.files.OutputError` if the folder cannot be written.
     """
@@ -122,13 +117,13 @@ def measure(
 
 
 class BenchmarkSteps:
-    """The steps of a run; each does what is missing, and raises :class:`Stopped` where it may be left off."""
+    """The steps of a benchmark; each measures the rest of its part, and raises :class:`Stopped` after Ctrl-C."""
 
     def __init__(self, plan: Plan, settings: BenchmarkSettings, store: Store, stop: threading.Event, progress: bool):
         self.plan, self.settings, self.store, self.stop, self.progress = plan, settings, store, stop, progress
 
     def bar(self, cases: list[Case]) -> tqdm:
-        """The progress of all that follows the jobs; a unit is a kernel, an error or a pass."""
+        """Return the progress bar of all steps after the jobs; a unit is a kernel, an error or a pass."""
         units = sum(c.errors is not None for c in self.plan.candidates)
         for case in cases:
             units += len(self._kernels(case)) * (1 + self.settings.rounds)
@@ -141,8 +136,9 @@ class BenchmarkSteps:
         return [(q, name) for q in case.query_names for name in (FLOOR, *self.plan.takers(case, q))]
 
     def _in_passes(self, case: Case) -> list[str]:
-        found = [c.name for c in self.plan.candidates if c.in_passes and c.name in case.candidates]
-        return found if case.passes is not None else []
+        if case.passes is None:
+            return []
+        return [c.name for c in self.plan.candidates if c.in_passes and c.name in case.candidates]
 
     def _tick(self) -> None:
         self._bar.update(1)
@@ -150,7 +146,7 @@ class BenchmarkSteps:
             raise Stopped
 
     def jobs(self) -> None:
-        """Each has a progress bar of its own."""
+        """Run the jobs; each has a progress bar of its own."""
         plan, done = self.plan, self.store.data["jobs"]
         folder = None
         if self.store.folder is not None and plan.jobs:
@@ -178,8 +174,8 @@ class BenchmarkSteps:
             self._tick()
 
     def queries(self, case: Case) -> None:
-        """Count, which compiles, then time in rounds."""
-        own = {c.name: c.operations for c in self.plan.candidates}
+        """Count operations, which compiles the kernels, then time the queries in rounds."""
+        known_operations = {c.name: c.operations for c in self.plan.candidates}
         operations = self.store.data["operations"].setdefault(case.name, {})
         times = self.store.data["queries"].setdefault(case.name, [])
         if len(times) >= self.settings.rounds:
@@ -190,8 +186,9 @@ class BenchmarkSteps:
         for (query, name), function in flat.items():
             counted = operations.setdefault(query, {})
             if name not in counted:
-                found = count_query(function)
-                counted[name] = (own[name](query) if own.get(name) else found).asdict()
+                in_kernel = count_query(function)
+                known = known_operations.get(name)
+                counted[name] = (known(query) if known else in_kernel).asdict()
             self._tick()
 
         def seconds(key) -> float:
@@ -200,7 +197,7 @@ class BenchmarkSteps:
         self._rounds(times, list(flat), self.settings.rounds, seconds)
 
     def passes(self, case: Case) -> None:
-        """Whole jobs, the first of each to compile it."""
+        """Time whole passes in rounds, after a first pass of each candidate that compiles it."""
         names = self._in_passes(case)
         times = self.store.data["passes"].setdefault(case.name, [])
         if len(times) >= self.settings.passes:
@@ -212,24 +209,24 @@ class BenchmarkSteps:
             self._tick()
 
         def seconds(key) -> float:
-            found = timed(lambda: functions[key[1]](1 + len(times)))
-            extra[key[1]] = found.seconds_wall
-            return found.seconds
+            one_pass = timed(lambda: functions[key[1]](1 + len(times)))
+            walls[key[1]] = one_pass.seconds_wall
+            return one_pass.seconds
 
-        extra: dict[str, float] = {}
-        self._rounds(times, [(PASS, name) for name in names], self.settings.passes, seconds, extra)
+        walls: dict[str, float] = {}
+        self._rounds(times, [(PASS, name) for name in names], self.settings.passes, seconds, walls)
 
     def _rounds(self, times: list, keys: list, number: int, seconds, walls: dict | None = None) -> None:
-        """Append what is missing to ``times``: of each round, query → name → seconds; every other one backwards."""
+        """Append the missing rounds to ``times``: query → name → seconds; every other round runs backwards."""
         self._bar.update(len(keys) * len(times))
         while len(times) < number:
-            found: dict[str, dict[str, float]] = {}
+            this_round: dict[str, dict[str, float]] = {}
             for key in keys if len(times) % 2 == 0 else reversed(keys):
-                found.setdefault(key[0], {})[key[1]] = seconds(key)
+                this_round.setdefault(key[0], {})[key[1]] = seconds(key)
                 self._tick()
             if walls:
-                found[PASS_WALL] = dict(walls)
-            times.append(found)
+                this_round[PASS_WALL] = dict(walls)
+            times.append(this_round)
             self.store.save(5)
 
 
@@ -241,7 +238,7 @@ def _assemble(plan: Plan, cases: list[Case], settings: BenchmarkSettings, data: 
     for c in plan.candidates:
         record = records.get(c.job, {})
         if c.job and not record and c.errors is None:
-            continue  # not made yet
+            continue  # its job has not run yet
         candidates[c.name] = {
             **{k: getattr(c, k) for k in ("representation", "setting", "job", "is_truth", "is_reference", "competes")},
             **{"label": c.label or c.name, "in_picture": c.in_picture, "note": c.note},
@@ -251,40 +248,40 @@ def _assemble(plan: Plan, cases: list[Case], settings: BenchmarkSettings, data: 
             "details": {**c.details, **record.get("details", {})},
             "errors": {**record.get("errors", {}), **data["errors"].get(c.name, {})},
         }
-    found_cases = {}
+    measured_cases = {}
     for case in cases:
         rounds, passes = data["queries"].get(case.name, []), data["passes"].get(case.name, [])
         if not rounds:
             continue
         accuracy = case.accuracy or plan.accuracy
-        found = {"details": case.details, "in_picture": case.in_picture, "accuracy": accuracy,
+        measured = {"details": case.details, "in_picture": case.in_picture, "accuracy": accuracy,
                  "of_passes": case.of_passes, "queries": {}, "passes": {}, "ratios": {}}  # fmt: skip
         for query in case.query_names:
             ns = _by_name(rounds, query, 1e9 / settings.lanes)
             floor = spread(ns.pop(FLOOR))["median"]
             counted = data["operations"][case.name][query]
-            found["queries"][query] = {
+            measured["queries"][query] = {
                 name: timing(values, floor) | {"operations": counted[name]} for name, values in ns.items()
             }
-            _mark_front(found["queries"][query], candidates, accuracy)
-            found["ratios"][query] = _ratios(plan.ratios, ns, floor)
-        for kind in (PASS, PASS_WALL) if passes else ():
-            ms = _by_name(passes, kind, 1e3)
-            found["passes"][kind] = {name: timing(values) for name, values in ms.items()}
+            _mark_front(measured["queries"][query], candidates, accuracy)
+            measured["ratios"][query] = _ratios(plan.ratios, ns, floor)
+        for query in (PASS, PASS_WALL) if passes else ():
+            ms = _by_name(passes, query, 1e3)
+            measured["passes"][query] = {name: timing(values) for name, values in ms.items()}
             if case.of_passes:
-                _mark_front(found["passes"][kind], candidates, accuracy)
-            found["ratios"][kind] = _ratios(plan.ratios, ms, 0.0)
-        found_cases[case.name] = found
-    return {"candidates": candidates, "cases": found_cases, "jobs": records}
+                _mark_front(measured["passes"][query], candidates, accuracy)
+            measured["ratios"][query] = _ratios(plan.ratios, ms, 0.0)
+        measured_cases[case.name] = measured
+    return {"candidates": candidates, "cases": measured_cases, "jobs": records}
 
 
 def _by_name(rounds: list[dict], query: str, scale: float) -> dict[str, list[float]]:
-    """In the order of the first round, which is that of the plan."""
+    """Return the scaled times of all rounds by name, in the order of the plan, which the first round has."""
     return {name: [r[query][name] * scale for r in rounds] for name in rounds[0][query]}
 
 
 def _mark_front(timings: dict, candidates: dict, accuracy: str) -> None:
-    """Set ``on_front``, ``None`` for what is not in competition, as references and the truth."""
+    """Set ``on_front``: ``None`` for candidates that do not compete, such as references and the truth."""
     competing = {
         name: (math.log(max(timings[name]["time"], 1e-6)), -c["errors"][accuracy])
         for name, c in candidates.items()
@@ -296,7 +293,7 @@ def _mark_front(timings: dict, candidates: dict, accuracy: str) -> None:
 
 
 def in_competition(candidate: dict) -> bool:
-    """May a candidate of a result be on the Pareto front?"""
+    """Return whether a candidate of a result may be on the Pareto front."""
     return candidate["competes"] and not (candidate["is_reference"] or candidate["is_truth"])
 
 

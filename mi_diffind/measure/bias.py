@@ -1,23 +1,24 @@
 """
-Noise or bias? What a render with learned tables differs by from the truth: the noise of its samples, which more time
-makes smaller, and the bias of the approximation, which no time makes smaller; and where the two are equal.
+Noise and bias of renders with learned tables, and the sample count at which the two are equal.
+
+Noise is that of the samples, which more time reduces; bias is that of the approximation, which no time reduces.
 
 *The error* of an image ``a`` against the truth ``r`` is the relative mean squared error, over pixels and channels,
 
     mse = mean((a − r)² / (m² + 0.01)),        shown as its root, the relative RMS error,
 
-where ``m`` is the brightness around the pixel, a mean over 5 × 5 pixels of an exact pass that serves nothing else. The
-denominator depends on none of the images that are compared, and nothing is clipped, so that squares add up exactly:
+where ``m`` is the brightness around the pixel, a mean over 5 × 5 pixels of an exact pass that is used for nothing
+else. The denominator depends on none of the compared images, and nothing is clipped, so squares add up exactly:
 E[mse] = bias² + noise², and for independent samples noise² = σ² / spp. (A denominator made of the truth itself would
-be large just where the truth is too bright, and hide a part of the noise.) The PSNR of :mod:`mi_diffind.metrics` clips
-to [0, 1]; a clipped noisy image has another mean, so there is no such sum. It is given beside the rest; that of the
-bias is made of the values up to 1 of the truth, where the clipped difference is the linear one. A dark pixel that one
+be large where the noise of the truth is positive, and hide a part of the noise.) The PSNR of
+:mod:`mi_diffind.metrics` clips to [0, 1]; a clipped noisy image has another mean, so PSNR does not add up. It is given
+as well; the PSNR of the bias uses values of the truth up to 1, where clipping changes nothing. A dark pixel that one
 rare bright path hits may outweigh all others: errors are those of several images with different seeds, given as median
 and quartiles. The median of few samples therefore tends to be below the noise σ² / spp, which is a mean.
 
-*The truth* is the mean of all exact passes at the highest sample count. These are independent, so their scatter is
-its own noise, which is subtracted: E|a − r|² = bias² + noise² of ``a`` + noise² of ``r``. The passes are themselves
-the images at that count, and each is measured against the mean of the others: no image is compared with its own seeds.
+*The truth* is the mean of all exact passes at the highest sample count. They are independent, so their scatter gives
+the noise of the truth, which is subtracted: E|a − r|² = bias² + noise² of ``a`` + noise² of ``r``. The passes are also
+the images at that count; each is measured against the mean of the others, so no image is compared with its own seeds.
 
 *The bias* is measured with common random numbers. Each exact pass has a learned twin with the same seed; most of the
 noise is in both, and not in their difference ``d``. Of K independent differences, the mean of the scalar products
@@ -45,24 +46,26 @@ EPSILON = 0.01
 #: The brightness is a mean over the pixels at most so far away in x and in y.
 RADIUS = 2
 
-#: A bias counts as measured if it is this many standard errors above zero, and else is below that many.
+#: Standard errors above zero from which a bias counts as measured; otherwise they bound it.
 CONFIDENCE = 2.0
 
-#: A relative error that the arithmetic of 32-bit floats makes in a render.
+#: Relative error of a render by the arithmetic of 32-bit floats.
 ROUNDING = 1e-6
 
-#: Nobody takes more samples of a pixel: where only they would show a bias, that is all there is to say about it.
+#: Largest practical number of samples per pixel; a bias that only more samples would show does not matter.
 PRACTICAL = 1_000_000
 
-#: Of fewer images there is no standard error.
+#: Fewest images that have a standard error.
 LEAST = 3
 
 
 @dataclass(frozen=True)
 class Estimate:
     """
-    What :func:`estimate` found: the ``square`` of the mean image (unbiased, so it may be negative), its
-    ``standard_error``, and the ``noise`` of one image, likewise a mean square.
+    Result of :func:`estimate`.
+
+    ``square``: mean square of the mean image, unbiased, so it may be negative; its ``standard_error``; ``noise``: mean
+    square of the noise of one image.
     """
 
     square: float
@@ -71,23 +74,23 @@ class Estimate:
 
     @property
     def measured(self) -> bool:
-        """Is the mean image different from zero?"""
+        """Whether the mean image differs from zero."""
         return self.square > CONFIDENCE * self.standard_error
 
     @property
     def bound(self) -> float:
-        """What ``square`` is below, as far as can be told."""
+        """Upper bound of ``square``."""
         return max(self.square, 0.0) + CONFIDENCE * self.standard_error
 
 
 def estimate(images: Sequence[np.ndarray], weights: np.ndarray | float = 1.0) -> Estimate:
     """
-    The mean square of what independent ``images`` of the same distribution (K ≥ 3, of any one shape) have in common,
-    and of what they do not: mean(weights · E[image]²) and mean(weights · Var[image]).
+    Return estimates of mean(weights · E[image]²) and mean(weights · Var[image]).
 
-    With Gᵢⱼ = mean(weights · imageᵢ · imageⱼ), these are the mean of Gᵢⱼ over all i ≠ j and the mean of Gᵢᵢ less that;
-    both are unbiased for any distribution of the noise. The standard error is the jackknife's, leaving out one image.
-    Raises ``ValueError`` if there are fewer than three images.
+    ``images`` are K ≥ 3 independent ones of the same distribution and shape. With
+    Gᵢⱼ = mean(weights · imageᵢ · imageⱼ), the estimates are the mean of Gᵢⱼ over all i ≠ j, and the mean of Gᵢᵢ minus
+    that; both are unbiased for any distribution of the noise. The standard error is the jackknife's, leaving out one
+    image. Raises ``ValueError`` for fewer than three images.
     """
     k = len(images)
     if k < LEAST:
@@ -107,8 +110,9 @@ def estimate(images: Sequence[np.ndarray], weights: np.ndarray | float = 1.0) ->
 
 def weights_of(image: np.ndarray) -> np.ndarray:
     """
-    The weights of the relative error, 1 / (m² + 0.01), like ``image`` ``(height, width, channels)``, linear; m is its
-    mean over 5 × 5 pixels, or as many as there are of them at its edges.
+    Return the weights of the relative error, 1 / (m² + 0.01), of a linear ``image`` ``(height, width, channels)``.
+
+    m is the mean of the image over 5 × 5 pixels, at its edges over those that exist.
     """
     sums, number = image.astype(np.float64), np.ones(image.shape)
     for axis in (0, 1):
@@ -117,7 +121,7 @@ def weights_of(image: np.ndarray) -> np.ndarray:
 
 
 def _along(values: np.ndarray, axis: int) -> np.ndarray:
-    """Sums over the neighbours along an axis."""
+    """Return sums over the neighbours along an axis."""
     width = [(RADIUS, RADIUS) if k == axis else (0, 0) for k in range(values.ndim)]
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, width), 2 * RADIUS + 1, axis)
     return windows.sum(axis=-1)
@@ -125,75 +129,80 @@ def _along(values: np.ndarray, axis: int) -> np.ndarray:
 
 def error(image: np.ndarray, truth: np.ndarray, weights: np.ndarray, truth_noise: float) -> float:
     """
-    mean(weights · (image − truth)²) − ``truth_noise``, of images of one shape: the relative MSE against what ``truth``
-    would be without its noise, whose weighted mean square is ``truth_noise``.
+    Return the relative MSE of an image against a noisy truth, mean(weights · (image − truth)²) − ``truth_noise``.
+
+    ``truth_noise`` is the weighted mean square of the noise of ``truth``, which has the shape of ``image``.
     """
     return float(np.mean(weights * (image.astype(np.float64) - truth) ** 2)) - truth_noise
 
 
-# -- what it comes to -------------------------------------------------------------------------------------------------
+# -- results -------------------------------------------------------------------------------------------------
 
 
 def root(square: float) -> float:
-    """The root of an estimate of a square, 0 if that is negative."""
+    """Return the root of an estimate of a square, 0 if the estimate is negative."""
     return math.sqrt(max(square, 0.0))
 
 
 def describe(relative: Estimate, displayed: Estimate) -> dict:
     """
-    The bias as numbers, from estimates with the weights of the relative error and with those of what a display shows:
-    ``measured`` (can it be told from zero?), ``mse`` (may be negative), ``mse_standard_error``; ``rmse`` and
-    ``rmse_standard_error`` and ``rounding_only`` (no more than that of 32-bit floats), or else ``rmse_below``;
-    ``psnr_db``, or else ``psnr_db_above``.
+    Return the bias as numbers, from estimates with relative weights and with those of displayed values.
+
+    ``measured`` (whether it differs from zero), ``mse`` (may be negative), ``mse_standard_error``; ``rmse``,
+    ``rmse_standard_error`` and ``rounding_only`` (no more than the rounding of 32-bit floats), or the bound
+    ``rmse_below``; ``psnr_db``, or the bound ``psnr_db_above``.
     """
-    found = {
+    bias = {
         "measured": relative.measured,
         "mse": relative.square,
         "mse_standard_error": relative.standard_error,
     }
     if relative.measured:
         rmse = math.sqrt(relative.square)
-        found |= {"rmse": rmse, "rmse_standard_error": relative.standard_error / (2 * rmse)}
-        found["rounding_only"] = rmse < ROUNDING
+        bias |= {"rmse": rmse, "rmse_standard_error": relative.standard_error / (2 * rmse)}
+        bias["rounding_only"] = rmse < ROUNDING
     else:
-        found["rmse_below"] = math.sqrt(relative.bound)
+        bias["rmse_below"] = math.sqrt(relative.bound)
     if displayed.measured:
-        found["psnr_db"] = -10 * math.log10(displayed.square)
+        bias["psnr_db"] = -10 * math.log10(displayed.square)
     else:
-        found["psnr_db_above"] = -10 * math.log10(displayed.bound) if displayed.bound else math.inf
-    return found
+        bias["psnr_db_above"] = -10 * math.log10(displayed.bound) if displayed.bound else math.inf
+    return bias
 
 
 def crossover(bias: Estimate, noise_of_a_sample: float, points: list[dict]) -> dict:
     """
-    Where the noise of the learned render equals the bias: ``spp`` with ``spp_low`` and ``spp_high`` (two standard
-    errors), ``seconds``, ``seconds_wall``, ``extrapolated``; if no bias was measured, ``spp_above`` alone. ``points``:
-    ``version``, ``spp``, ``timed``, ``seconds``, ``seconds_wall``, by ascending ``spp``.
+    Return the sample count at which the noise of the learned render equals the bias.
+
+    ``spp`` with ``spp_low`` and ``spp_high`` (two standard errors), ``seconds``, ``seconds_wall``, ``extrapolated``; if
+    no bias was measured, only ``spp_above``. ``points`` are dictionaries with ``version``, ``spp``, ``timed``,
+    ``seconds`` and ``seconds_wall``, by ascending ``spp``.
     """
     if not bias.measured:
         return {"spp_above": noise_of_a_sample / bias.bound if bias.bound else math.inf}
     spp, low = (noise_of_a_sample / square for square in (bias.square, bias.bound))
-    found = {
+    result = {
         "spp": spp,
         "spp_low": low,
         "spp_high": noise_of_a_sample / (bias.square - CONFIDENCE * bias.standard_error),
         "extrapolated": spp > points[-1]["spp"],
     }
-    for kind in ("seconds", "seconds_wall"):
-        seconds = {p["spp"]: p[kind] for p in points if p["version"] == "learned" and p["timed"]}
-        found[kind] = seconds_of(spp, seconds)
-    return found
+    for clock in ("seconds", "seconds_wall"):
+        seconds = {p["spp"]: p[clock] for p in points if p["version"] == "learned" and p["timed"]}
+        result[clock] = seconds_of(spp, seconds)
+    return result
 
 
-def practical(found: dict) -> bool:
-    """Is a :func:`crossover` at a number of samples that anybody takes (:data:`PRACTICAL`)?"""
-    return (found.get("spp", found.get("spp_above")) or math.inf) <= PRACTICAL
+def practical(at: dict) -> bool:
+    """Return whether a :func:`crossover` is at a practical number of samples (:data:`PRACTICAL`)."""
+    return (at.get("spp", at.get("spp_above")) or math.inf) <= PRACTICAL
 
 
 def seconds_of(spp: float, seconds: dict[int, float]) -> float | None:
     """
-    The time of a render of ``spp`` samples per pixel, any number, from those measured (count → seconds): linear between
-    them, and beyond with the slope from the first to the last; ``None`` below the first, or if there are none.
+    Return the time of a render of ``spp`` samples per pixel, from measured times (count → seconds).
+
+    Linear between them, and beyond with the slope from the first to the last; ``None`` below the first or without any.
     """
     if not seconds or spp < min(seconds):
         return None

@@ -1,4 +1,4 @@
-"""What is timed of BSDFs: their methods at random directions and places."""
+"""Queries of BSDFs for the benchmark: their methods at random directions and texture coordinates."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import numpy as np
 
 from .study import FLOOR
 
-#: The methods that are timed.
+#: Methods of a BSDF that are timed.
 QUERIES = ("eval", "sample", "pdf")
 
-#: Texels of a side of the textures; read at random, they come from the cache, and what they cost is the reading itself.
+#: Texels along a side of textures: small enough for the cache, so that the lookup itself is timed.
 TEXTURE_SIZE = 64
 
 
 def directions(lanes: int, seed: int = 7):
     """
-    So many interactions ``si`` with ``wi`` uniform over the hemisphere and ``uv`` uniform, as many ``wo`` like ``wi``,
-    and random numbers for ``sample``: ``(si, wo, sample1, sample2)``, all evaluated.
+    Return random inputs of BSDFs, ``(si, wo, sample1, sample2)``, for so many ``lanes``, evaluated.
+
+    ``si.wi`` and ``wo`` are uniform over the hemisphere, ``si.uv`` and the random numbers over [0, 1].
     """
     rng = dr.rng(seed=dr.opaque(mi.UInt64, seed))
     si = dr.zeros(mi.SurfaceInteraction3f, lanes)
@@ -35,8 +36,9 @@ def directions(lanes: int, seed: int = 7):
 
 def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dict[str, dict]:
     """
-    The queries (:data:`QUERIES`) of BSDFs by name; ``inputs`` are those of :func:`directions`.
-    The floor has as many inputs, ``uv`` among them if the materials are ``textured``.
+    Return query (:data:`QUERIES`) → name of a BSDF → function; ``inputs`` are those of :func:`directions`.
+
+    The floor has the same inputs, ``uv`` among them if the materials are ``textured``.
     """
     si, wo, sample1, sample2 = inputs
     context = mi.BSDFContext()
@@ -46,21 +48,21 @@ def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dic
         "sample": [si.wi, sample1, sample2, *uv, *wavelengths],
         "pdf": [si.wi, wo, *uv],
     }
-    found = {query: {FLOOR: lambda values=values: values} for query, values in floors.items()}
+    queries = {query: {FLOOR: lambda values=values: values} for query, values in floors.items()}
 
     def sample(bsdf):
         bs, weight = bsdf.sample(context, si, sample1, sample2)
         return [bs.wo, bs.pdf, mi.Float(bs.sampled_component), weight]
 
     for name, bsdf in bsdfs.items():
-        found["eval"][name] = lambda b=bsdf: b.eval(context, si, wo)
-        found["sample"][name] = lambda b=bsdf: sample(b)
-        found["pdf"][name] = lambda b=bsdf: b.pdf(context, si, wo)
-    return found
+        queries["eval"][name] = lambda b=bsdf: b.eval(context, si, wo)
+        queries["sample"][name] = lambda b=bsdf: sample(b)
+        queries["pdf"][name] = lambda b=bsdf: b.pdf(context, si, wo)
+    return queries
 
 
 def noise_texture(values: Sequence[float], rng: np.random.Generator) -> dict:
-    """A bitmap (for ``mi.load_dict``) that varies around ``values``, of its channels, by 0.1 at most; a new tensor."""
+    """Return a bitmap (for ``mi.load_dict``) whose channels vary around ``values`` by at most 0.1."""
     noise = rng.uniform(-0.1, 0.1, (TEXTURE_SIZE, TEXTURE_SIZE, len(values)))
     data = np.clip(np.asarray(values) + noise, 0.01, 0.99).astype(np.float32)
     return {"type": "bitmap", "data": mi.TensorXf(data), "raw": not mi.is_spectral or len(values) == 1}

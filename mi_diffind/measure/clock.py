@@ -1,8 +1,7 @@
 """
-The clock, the same for all studies: seconds of kernels, as Dr.Jit's own clock has them, on a machine that is described.
+Clock of all studies: seconds of kernels by Dr.Jit's own measurement, and a description of the machine.
 
-Tracing, code generation and compilation are left out of a time of kernels; what was compiled on the way is said. No
-derivatives are asked for.
+A time of kernels does not include tracing, code generation and compilation. No derivatives are computed.
 """
 
 from __future__ import annotations
@@ -20,15 +19,17 @@ import drjit as dr
 
 from .. import compat
 
-#: A function whose result, any tree of arrays, is evaluated to measure it.
+#: Function to measure: its result, any tree of arrays, is evaluated.
 Query = Callable[[], object]
 
 
 @dataclass(frozen=True)
 class Timed:
     """
-    What a function returned, evaluated; ``seconds`` that its kernels took, and ``seconds_wall`` from beginning to end;
-    whether any kernel was ``compiled``, or read from the cache on disk.
+    Result and times of a function.
+
+    ``value``: its evaluated result; ``seconds`` of its kernels, ``seconds_wall`` from beginning to end; ``compiled``:
+    whether a kernel was compiled or read from the cache on disk.
     """
 
     value: object
@@ -38,7 +39,7 @@ class Timed:
 
 
 def timed(function: Query) -> Timed:
-    """Time ``function()`` and the evaluation of its result."""
+    """Call ``function()``, evaluate its result and measure the time."""
     with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.sync_thread()
         dr.kernel_history_clear()
@@ -51,15 +52,8 @@ def timed(function: Query) -> Timed:
     return Timed(value, compat.kernel_seconds(history), wall, compat.was_compiled(history))
 
 
-def kernel_seconds(function: Query) -> float:
-    """Seconds that the kernels take which ``function()`` and the evaluation of its result launch."""
-    return timed(function).seconds
-
-
 def total(values) -> tuple[object, int]:
-    """
-    The sum of all numbers in a tree of arrays, and how many additions it is: little output, and the same for all.
-    """
+    """Return the sum of all numbers in a tree of arrays, a small output of equal size for all, and its additions."""
     leaves = list(_leaves(values))
     result = leaves[0]
     for leaf in leaves[1:]:
@@ -76,7 +70,7 @@ def _leaves(values):
 
 
 def machine(variant: str) -> dict:
-    """The machine and the versions that figures are quoted with."""
+    """Return the machine and the versions that figures are quoted with."""
     gpu = None
     for path in Path("/proc/driver/nvidia/gpus").glob("*/information"):
         gpu = _line(path, r"^Model:\s*(.+)$") or gpu
@@ -95,16 +89,16 @@ def machine(variant: str) -> dict:
 
 def _line(path: Path, pattern: str) -> str | None:
     with contextlib.suppress(OSError):
-        found = re.search(pattern, path.read_text(encoding="utf-8"), re.MULTILINE)
-        return found[1].strip() if found else None
+        match = re.search(pattern, path.read_text(encoding="utf-8"), re.MULTILINE)
+        return match[1].strip() if match else None
     return None
 
 
 def _target() -> str | None:
-    """The processor that Dr.Jit compiles for on the CPU, as LLVM calls it, and its vector width."""
+    """Return LLVM's name of the processor that Dr.Jit compiles for, and the vector width."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         dr.eval(dr.arange(dr.llvm.Float, 64) + 0.5)
         code = "".join(map(compat.kernel_code, dr.kernel_history([dr.KernelType.JIT])))
-    found = compat.llvm_target(code)
-    return f"{found[0]}, {found[1]} lanes a vector" if found else None
+    target = compat.llvm_target(code)
+    return f"{target[0]}, {target[1]} lanes a vector" if target else None

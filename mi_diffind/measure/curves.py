@@ -1,4 +1,4 @@
-"""What pictures of kinds (:mod:`.kinds`) show below: an error against bytes, a line for each kind, and against time."""
+"""Plots of equal-memory comparisons: an error against bytes, a line for each method, and against time."""
 
 from __future__ import annotations
 
@@ -6,25 +6,26 @@ from collections.abc import Callable, Iterable, Mapping
 
 from . import plot
 
-#: Kind → colour, marker and line; markers are white where the line is dotted.
+#: Method → colour, marker and line; markers are white where the line is dotted.
 Styles = Mapping[str, tuple[str, str, str]]
 
 
-def curves(axes, made: Iterable[dict], styles: Styles, place: Callable[[dict], tuple], size: float = 4) -> None:
-    """The candidates ``made`` of each kind at ``place(candidate)``, in order; ours thicker."""
-    made = list(made)
-    for kind, (colour, marker, line) in styles.items():
-        own = [c for c in made if c["details"]["kind"] == kind]
-        if own:
-            axes.plot(*zip(*sorted(map(place, own)), strict=True), color=colour, marker=marker, markersize=size,
-                      linestyle=line, label=own[0]["label"], linewidth=2.0 if kind == "ours" else 1.0,
+def curves(axes, candidates: Iterable[dict], styles: Styles, place: Callable[[dict], tuple], size: float = 4) -> None:
+    """Draw a line through the candidates of each method at ``place(candidate)``; ours is thicker."""
+    candidates = list(candidates)
+    for method, (colour, marker, line) in styles.items():
+        trained = [c for c in candidates if c["details"]["kind"] == method]
+        if trained:
+            axes.plot(*zip(*sorted(map(place, trained)), strict=True), color=colour, marker=marker, markersize=size,
+                      linestyle=line, label=trained[0]["label"], linewidth=2.0 if method == "ours" else 1.0,
                       markerfacecolor="white" if line == ":" else colour)  # fmt: skip
 
 
 def against_time(axes, result: dict, timings: Mapping, styles: Styles, error: str, axis: str) -> list[plot.Label]:
     """
-    The ``error`` of candidates against their times, whose ``axis`` is labelled so; references as lines. Returns labels,
-    to be placed.
+    Draw an ``error`` of candidates against their times; references are vertical lines.
+
+    ``axis`` is the label of the time axis. Returns the labels of points, for :func:`.plot.place_labels`.
     """
     labels = []
     for name, t in timings.items():
@@ -49,7 +50,7 @@ def against_time(axes, result: dict, timings: Mapping, styles: Styles, error: st
 
 
 def finish(axes, label: str) -> None:
-    """The vertical axis is labelled so; a light grid."""
+    """Label the vertical axis and add a light grid."""
     axes.set_ylabel(label, fontsize=8)
     axes.tick_params(labelsize=7)
     axes.minorticks_off()

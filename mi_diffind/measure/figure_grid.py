@@ -1,4 +1,4 @@
-"""Several pictures on one sheet: images, maps with a colour bar and lines of text, in a grid."""
+"""Grid of pictures in one figure: images, maps with a colour bar and lines of text."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from .. import srgb
 from . import plot
 
-#: What draws one cell: a function of a Matplotlib figure and of the axes of the cell.
+#: Function that draws one cell, of a Matplotlib figure and of the cell's axes.
 Cell = Callable[[object, object], None]
 
 
 def picture(title: str, image: np.ndarray) -> Cell:
-    """A linear image, ``(height, width, 3)`` or ``(height, width, 1)``, as displayed."""
+    """Return a cell with a linear image, ``(height, width, 3)`` or ``(height, width, 1)``, as displayed."""
 
-    def draw(sheet, axes):
+    def draw(figure, axes):
         axes.imshow(srgb.for_display(np.repeat(image, 3, -1) if image.shape[-1] == 1 else image))
         axes.set_title(title)
 
@@ -25,20 +25,20 @@ def picture(title: str, image: np.ndarray) -> Cell:
 
 
 def colour_map(title: str, values: np.ndarray, extend: str = "neither", **options) -> Cell:
-    """Values, ``(height, width)``, with a colour bar; ``options`` are those of Matplotlib's ``imshow``."""
+    """Return a cell with values, ``(height, width)``, and a colour bar; ``options`` are those of ``imshow``."""
 
-    def draw(sheet, axes):
+    def draw(figure, axes):
         shown = axes.imshow(values, **options)
         axes.set_title(title)
-        sheet.colorbar(shown, ax=axes, extend=extend, shrink=0.9)
+        figure.colorbar(shown, ax=axes, extend=extend, shrink=0.9)
 
     return draw
 
 
 def text(lines: Sequence[str]) -> Cell:
-    """Lines of text."""
+    """Return a cell with lines of text."""
 
-    def draw(sheet, axes):
+    def draw(figure, axes):
         axes.text(0.02, 0.95, "\n".join(lines), va="top", family="monospace", fontsize=12, transform=axes.transAxes)
 
     return draw
@@ -46,17 +46,18 @@ def text(lines: Sequence[str]) -> Cell:
 
 def write(path: str | os.PathLike, cells: Sequence[Cell], columns: int, shape: Sequence[int]) -> None:
     """
-    Draw ``cells`` row by row, seven inches wide each, ``shape`` (height, width, …) being that of the pictures, and
-    write ``path`` (``.png``). Raises :class:`~mi_diffind.files.OutputError`.
+    Draw ``cells`` row by row, each seven inches wide, and write ``path`` (``.png``).
+
+    ``shape`` is that of the pictures, (height, width, …). Raises :class:`~mi_diffind.files.OutputError`.
     """
     from matplotlib.figure import Figure
 
     rows = -(-len(cells) // columns)
     size = (7 * columns, rows * (7 * shape[0] / shape[1] + 0.35))
-    sheet = Figure(figsize=size, dpi=110, layout="constrained")
-    grid = list(sheet.subplots(rows, columns, squeeze=False).flat)
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axes in grid:
         axes.set_axis_off()
     for cell, axes in zip(cells, grid, strict=False):
-        cell(sheet, axes)
-    plot.save(sheet, path)
+        cell(figure, axes)
+    plot.save(figure, path)

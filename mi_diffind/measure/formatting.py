@@ -1,4 +1,4 @@
-"""How numbers are written for people."""
+"""Numbers, times, tables and sentences as text."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 
 def percent(value: float, digits: int = 3) -> str:
-    """``0.0123`` → ``"1.23%"``: so many digits; powers of ten where there would be many zeros."""
+    """Return a share as text, ``0.0123`` → ``"1.23%"``; very small shares are written with a power of ten."""
     value = 100 * value
     return f"{value:.{digits}g}%" if value == 0 or abs(value) >= 1e-4 else f"{value:.1e}%"
 
 
 def rounded(number: float) -> str:
-    """A count with two digits: ``"1.3"``, ``"12,000"``, ``"3.4 million"``; powers of ten from 10¹⁵ on."""
+    """Return a count with two digits: ``"1.3"``, ``"12,000"``, ``"3.4 million"``; from 10¹⁵ on a power of ten."""
     if number >= 1e15:
         return f"{number:.1e}"
     for size, name in ((1e12, " trillion"), (1e9, " billion"), (1e6, " million")):
@@ -24,7 +24,7 @@ def rounded(number: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds with two digits, in the unit that suits them: ``"0.35 s"``, ``"1.7 min"``, ``"3.2 years"``."""
+    """Return seconds with two digits in a readable unit: ``"0.35 s"``, ``"1.7 min"``, ``"3.2 years"``."""
     year = 365.25 * 86400
     units = ((year, year, "years"), (86400, 86400, "days"), (5400, 3600, "h"), (90, 60, "min"), (0.1, 1, "s"))
     size, name = next((unit[1:] for unit in units if seconds >= unit[0]), (1e-3, "ms"))
@@ -32,13 +32,13 @@ def duration(seconds: float) -> str:
 
 
 def enumeration(values: Sequence[object], last: str = "and") -> str:
-    """``[1, 4, 16]`` → ``"1, 4 and 16"``."""
+    """Return an enumeration: ``[1, 4, 16]`` → ``"1, 4 and 16"``."""
     *before, end = map(str, values)
     return f"{', '.join(before)} {last} {end}" if before else end
 
 
 def time_cell(t: dict | None, digits: int = 2) -> str:
-    """A time (:func:`.statistics.timing`) with half the interquartile range, or, if it is hidden, what it is below."""
+    """Return a time (:func:`.statistics.timing`) ± half its interquartile range, or the bound of a hidden time."""
     if t is None:
         return ""
     if t["hidden"]:
@@ -47,7 +47,7 @@ def time_cell(t: dict | None, digits: int = 2) -> str:
 
 
 def ratio_cell(r: dict | None, floor: bool = True) -> str:
-    """A ratio of times (:func:`.statistics.ratio`), and in brackets, if there is a ``floor``, that with it."""
+    """Return a ratio of times (:func:`.statistics.ratio`); with ``floor`` in brackets the ratio with the floor."""
     if r is None:
         return ""
     median = f"{'below ' * r['hidden']}{r['median']:.2f}" if math.isfinite(r["median"]) else "-"
@@ -55,14 +55,14 @@ def ratio_cell(r: dict | None, floor: bool = True) -> str:
 
 
 def grid(rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
-    """Rows of cells as lines, each column as wide as it has to be: the first to the left, the others to the right."""
+    """Return rows of cells as aligned lines: the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ([f"{cell:>{w + 2}}" for cell, w in zip(row[1:], widths[1:], strict=True)] for row in rows)
     return [f"{indent}{row[0]:{widths[0]}}{''.join(line)}".rstrip() for row, line in zip(rows, lines, strict=True)]
 
 
 def machine_line(result: dict) -> str:
-    """``machine`` (:func:`.clock.machine`) and ``date`` of a result, as a sentence."""
+    """Return the machine (:func:`.clock.machine`) and the date of a result as a sentence."""
     m = result["machine"]
     device = m["gpu"] if m["variant"].startswith("cuda") else f"{m['cpu']} ({m['instructions']}), {m['cores']} cores"
     llvm = f", LLVM {m['llvm']}" if m["llvm"] else ""
@@ -73,6 +73,6 @@ def machine_line(result: dict) -> str:
 
 
 def state(result: dict) -> str:
-    """What a caption has to say about a run that is not whole: ``quick`` settings, ``interrupted``."""
+    """Return the caption's sentences about a quick or interrupted run, "" for a complete one."""
     quick = " A smoke run (--quick): times are not to be quoted." if result["settings"]["quick"] else ""
     return quick + (" Interrupted: less was measured than asked for." if result["interrupted"] else "")

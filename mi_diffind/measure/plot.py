@@ -1,6 +1,7 @@
 """
-Pictures of measurements that can be printed: panels of accuracy against time or bytes, with labelled points, the Pareto
-front and a caption; courses of trainings; and what other pictures need of that: sheets, logarithmic ticks, labels.
+Printable plots of measurements: panels of accuracy against time or bytes, with labels, Pareto front and caption.
+
+Also training curves, and the parts of other plots: figures with a caption, logarithmic ticks, placement of labels.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from ..files import replacing
 
-#: Colour and marker of each representation, in the order in which they appear: told apart also without colour.
+#: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
     ("#b2182b", "o"),
     ("#2166ac", "s"),
@@ -27,19 +28,19 @@ STYLES = (
     ("#12908e", "X"),
 )
 
-#: Points (1/72 inch) from an anchor to the nearest edge of its label that are tried.
+#: Distances from an anchor to the nearest edge of its label that are tried, in points (1/72 inch).
 RADII = (6, 9, 12, 18, 26, 36, 48, 62, 80)
 
-#: From so many points on, a thin line leads from an anchor to its label.
+#: Distance in points from which on a thin line leads from an anchor to its label.
 _LEADER = 12
 
-#: Where around an anchor a label may be, in sixteenths of a turn from the angle that is best.
+#: Places of a label around its anchor, in sixteenths of a turn from the best angle.
 _TURNS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6, -7, 7, -8)
 
 
 @dataclass(frozen=True)
 class Point:
-    """A candidate: its time (median and quartiles), its accuracy, and whether it is on the Pareto front."""
+    """Point of a panel: time (median and quartiles) and accuracy of a candidate, and whether it is on the front."""
 
     name: str
     time: float
@@ -52,7 +53,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Line:
-    """Something without an error to show: the time of the truth itself, or of a reference."""
+    """Vertical line of a panel: the time of the truth, or of a reference."""
 
     name: str
     time: float
@@ -61,6 +62,8 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
+    """Panel of a plot: accuracy against time or bytes."""
+
     title: str
     x_label: str
     points: Sequence[Point]
@@ -69,7 +72,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Label:
-    """A text to be placed near ``at`` (data coordinates), best at ``angle`` from the right; ``radii`` are in points."""
+    """Text near ``at`` (data coordinates), best at an ``angle`` from the right; ``radii`` are in points."""
 
     text: str
     at: tuple[float, float]
@@ -79,42 +82,43 @@ class Label:
     angle: float = 0.0
 
 
-# -- sheets -----------------------------------------------------------------------------------------------------------
+# -- figures -----------------------------------------------------------------------------------------------------------
 
 
 def figure(title: str, caption: str, width: float, height: float, above: float = 0.3, dpi: int = 200):
     """
-    A Matplotlib figure of ``width`` × ``height`` inches for axes, ``above`` which is the title and below which is the
-    caption; its layout is constrained until :func:`fix_layout`.
+    Return a Matplotlib figure with ``width`` × ``height`` inches for axes, a title above and a caption below.
+
+    The title takes ``above`` inches. The layout is constrained until :func:`fix_layout`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     text = "\n".join(textwrap.wrap(caption, int(17.3 * width)))
     below = 0.16 * (text.count("\n") + 1) + 0.15
-    found = Figure(figsize=(width, height + above + below), dpi=dpi, layout="constrained")
-    FigureCanvasAgg(found)
-    whole = found.get_figheight()
-    found.get_layout_engine().set(rect=(0, below / whole, 1, 1 - (above + below) / whole), w_pad=0.08, h_pad=0.08)
-    found.text(0.5, 1 - 0.08 / whole, title, fontsize=12, fontweight="bold", ha="center", va="top")
-    found.text(0.012, 0.06 / whole, text, fontsize=7.5, va="bottom", ha="left", color="0.25")
-    return found
+    framed = Figure(figsize=(width, height + above + below), dpi=dpi, layout="constrained")
+    FigureCanvasAgg(framed)
+    whole = framed.get_figheight()
+    framed.get_layout_engine().set(rect=(0, below / whole, 1, 1 - (above + below) / whole), w_pad=0.08, h_pad=0.08)
+    framed.text(0.5, 1 - 0.08 / whole, title, fontsize=12, fontweight="bold", ha="center", va="top")
+    framed.text(0.012, 0.06 / whole, text, fontsize=7.5, va="bottom", ha="left", color="0.25")
+    return framed
 
 
-def fix_layout(sheet) -> None:
-    """Fix the layout, in which labels are placed."""
-    sheet.draw_without_rendering()
-    sheet.set_layout_engine("none")
+def fix_layout(figure) -> None:
+    """Fix the layout, before labels are placed in it."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
 
 
-def save(sheet, path: str | os.PathLike) -> None:
-    """Write ``path`` (``.png``). Raises :class:`~mi_diffind.files.OutputError`."""
+def save(figure, path: str | os.PathLike) -> None:
+    """Write a figure to ``path`` (``.png``). Raises :class:`~mi_diffind.files.OutputError`."""
     with replacing(path) as temporary:
-        sheet.savefig(temporary, format=Path(path).suffix[1:])
+        figure.savefig(temporary, format=Path(path).suffix[1:])
 
 
 def log_ticks(axis, low: float, high: float, shown: Callable[[float], str]) -> None:
-    """Ticks of a logarithmic axis from ``low`` to ``high``, as many as there is room for."""
+    """Set ticks of a logarithmic axis from ``low`` to ``high``, written by ``shown``, finer for shorter ranges."""
     decades = math.log10(high / low)
     fine: Sequence[float] = (1, *np.arange(1.2, 9.8, 0.4))
     for limit, ticks in ((0.6, (1, 1.5, 2, 3, 4, 5, 7)), (1.1, (1, 2, 5)), (2.5, (1, 3)), (4, (1,))):
@@ -125,7 +129,7 @@ def log_ticks(axis, low: float, high: float, shown: Callable[[float], str]) -> N
 
 
 def plain(value: float) -> str:
-    """A number at a tick."""
+    """Return the text of a number at a tick."""
     return f"{value:,.0f}" if value >= 1000 else f"{value:g}"
 
 
@@ -134,8 +138,9 @@ def plain(value: float) -> str:
 
 def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str):
     """
-    A Matplotlib figure with up to two panels a row, and with time or bytes on a logarithmic axis (accuracies in dB are
-    logarithms already). If there are several representations, a legend names them.
+    Return a Matplotlib figure with up to two panels a row; time or bytes are on a logarithmic axis.
+
+    If there are several representations, a legend names them.
     """
     from matplotlib.lines import Line2D
 
@@ -144,30 +149,30 @@ def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str)
     styles: dict[str, tuple[str, str]] = {}
     for point in (x for panel in panels for x in panel.points):
         styles.setdefault(point.representation, STYLES[len(styles) % len(STYLES)])
-    found = figure(title, caption, 6.4 * columns, 4.6 * rows, 0.55 if len(styles) > 1 else 0.3)
+    plot = figure(title, caption, 6.4 * columns, 4.6 * rows, 0.55 if len(styles) > 1 else 0.3)
     if len(styles) > 1:
         shown = [
             Line2D([], [], color=colour, marker=marker, linestyle="none", markersize=6.5, label=name)
             for name, (colour, marker) in styles.items()
         ]
-        legend = found.legend(handles=shown, loc="upper center", fontsize=8.5, frameon=False, ncols=len(shown),
-                              bbox_to_anchor=(0.5, 1 - 0.24 / found.get_figheight()))  # fmt: skip
+        legend = plot.legend(handles=shown, loc="upper center", fontsize=8.5, frameon=False, ncols=len(shown),
+                              bbox_to_anchor=(0.5, 1 - 0.24 / plot.get_figheight()))  # fmt: skip
         legend.set_in_layout(False)
     accuracies = [x.accuracy for p in panels for x in p.points]
     for k, panel in enumerate(panels):
-        axes = found.add_subplot(rows, columns, k + 1)
+        axes = plot.add_subplot(rows, columns, k + 1)
         _draw(axes, panel, styles, accuracies)
         axes.set_title(panel.title, fontsize=10)
         axes.set_xlabel(panel.x_label, fontsize=9)
         axes.set_ylabel(y_label, fontsize=9)
-    fix_layout(found)
-    for axes, panel in zip(found.axes, panels, strict=True):
+    fix_layout(plot)
+    for axes, panel in zip(plot.axes, panels, strict=True):
         _label(axes, panel, styles)
-    return found
+    return plot
 
 
 def _draw(axes, panel: Panel, styles: dict, accuracies: list) -> None:
-    """All but the labels."""
+    """Draw a panel without its labels."""
     axes.set_xscale("log")
     times = [x.time for x in (*panel.points, *panel.lines)] or [1.0]
     room = (max(times) / min(times)) ** 0.12 * 1.25  # for labels beside points
@@ -202,7 +207,7 @@ def _draw(axes, panel: Panel, styles: dict, accuracies: list) -> None:
 
 
 def _label(axes, panel: Panel, styles: dict) -> None:
-    """Name lines at the top, and points: first those on the front."""
+    """Label lines at the top, then points, those on the front first."""
     labels = []
     at_top = (axes.bbox.x0, axes.bbox.y1 - 9 * axes.figure.dpi / 72)
     height = axes.transData.inverted().transform(at_top)[1]
@@ -261,7 +266,7 @@ def place_labels(
         box = np.hstack([start + offset - size / 2, start + offset + size / 2])
         cost = 50 * (size.prod() - _overlap(box, inside)) + (radius + np.abs(turn) / 4) * scale
         cost += 30 * (_overlap(box, hard) + _overlap(box, placed)) + 20 * _overlap(box, soft)
-        # Whose label it is has to be plain: no other point nearer, nothing across the line that leads to it
+        # A label is nearest to its own point, and nothing crosses the line that leads to it
         end = np.clip(start, box[:, :2], box[:, 2:])
         to_others = others - np.clip(others, box[:, None, :2], box[:, None, 2:])
         nearer = np.hypot(*(start - end).T)[:, None] + 4 * scale - np.hypot(*np.moveaxis(to_others, -1, 0))
@@ -281,12 +286,12 @@ def place_labels(
 _OUT = np.array([-1, -1, 1, 1])
 
 
-def _boxes(found: list) -> np.ndarray:
-    return np.reshape(np.array(found, dtype=float), (-1, 4))
+def _boxes(rows: list) -> np.ndarray:
+    return np.reshape(np.array(rows, dtype=float), (-1, 4))
 
 
 def _chain(line, scale: float):
-    """Small boxes along a line."""
+    """Yield small boxes along a line."""
     pixels = line.get_transform().transform(np.column_stack([np.asarray(v, dtype=float) for v in line.get_data()]))
     for a, b in zip(pixels, [*pixels[1:], pixels[-1]], strict=True):
         if np.isfinite([*a, *b]).all():
@@ -295,12 +300,12 @@ def _chain(line, scale: float):
 
 
 def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """The area that each of some boxes shares with each of others, in sum."""
+    """Return for each box the sum of the areas that it shares with the others."""
     sides = np.minimum(boxes[:, None, 2:], others[:, 2:]) - np.maximum(boxes[:, None, :2], others[:, :2])
     return np.maximum(sides, 0).prod(axis=-1).sum(axis=1)
 
 
-# -- courses of trainings ---------------------------------------------------------------------------------------------
+# -- training curves ---------------------------------------------------------------------------------------------
 
 
 def draw_training_curves(title: str, records: dict[str, dict], caption: str):
@@ -312,10 +317,10 @@ def draw_training_curves(title: str, records: dict[str, dict], caption: str):
     """
     columns = min(5, len(records))
     rows = -(-len(records) // columns)
-    about = "PSNR in dB over training steps; each line is a run of its own, twice as long as that before."
-    found = figure(title, f"{about} {caption}", 2.6 * columns, 1.9 * rows, 0.4, 160)
+    about = "PSNR in dB over training steps; each line is a separate run, twice as long as the previous one."
+    plot = figure(title, f"{about} {caption}", 2.6 * columns, 1.9 * rows, 0.4, 160)
     for k, (name, record) in enumerate(records.items()):
-        axes = found.add_subplot(rows, columns, k + 1)
+        axes = plot.add_subplot(rows, columns, k + 1)
         runs = record["runs"]
         for i, run in enumerate(runs):
             shade = str(0.75 * (1 - (i + 1) / len(runs)))
@@ -330,4 +335,4 @@ def draw_training_curves(title: str, records: dict[str, dict], caption: str):
         axes.set_ylim(top - 20, top + 2)
         axes.tick_params(labelsize=6.5)
         axes.grid(color="0.92", linewidth=0.5)
-    return found
+    return plot

@@ -1,4 +1,4 @@
-"""What was measured, for people: tables, pictures, lines of text; and the files of a study, named after it."""
+"""Report of a result: tables, pictures and lines of text, and the files of a study, which bear its name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .statistics import finite, pareto
 from .store import Store
 from .study import Plan
 
-#: Columns of the table, before those of the errors and of the candidates' details.
+#: Columns of the table before those of errors and of the candidates' details.
 COLUMNS = (
     *("task", "case", "query", "candidate", "representation", "setting"),
     *("unit", "time", "time_q1", "time_q3", "time_with_floor", "floor", "hidden", "rounds"),
@@ -24,7 +24,7 @@ COLUMNS = (
     *("bytes", "training_seconds", "converged", "on_front", "note"),
 )
 
-#: What accuracy may be drawn against beside time: the label of the axis, and of the panel.
+#: Quantities beside time that accuracy may be drawn against: the label of the axis, and the title of the panel.
 QUANTITIES = {"bytes": ("bytes", "bytes"), "training_seconds": ("seconds of training", "training")}
 
 
@@ -40,9 +40,10 @@ def write_files(
     pictures: dict[str, Callable[[], object]],
 ) -> dict[str, str]:
     """
-    Write ``tradeoff_NAME.csv`` (``rows``), ``.json`` (``result``), and ``pictures``, functions that draw a Matplotlib
-    figure: ``"png"`` (``tradeoff_NAME.png``) or another KIND (``tradeoff_NAME_KIND.png``). Of a run that is complete,
-    nothing else stays in ``folder`` but trained models. Returns the paths. Raises
+    Write ``tradeoff_NAME.csv`` (``rows``), ``.json`` (``result``) and pictures, and return the paths.
+
+    ``pictures`` maps ``"png"`` (``tradeoff_NAME.png``) or another word (``tradeoff_NAME_WORD.png``) to a function that
+    draws a Matplotlib figure. Partial results of a complete run are removed from ``folder``. Raises
     :class:`~mi_diffind.files.OutputError`.
     """
     folder = writable_folder(folder, create=True)
@@ -55,16 +56,16 @@ def write_files(
         temporary.write_text(text.getvalue(), encoding="utf-8")
     write_json(f"{start}.json", finite(result))
     paths = {"csv": f"{start}.csv", "json": f"{start}.json"}
-    for kind, draw in pictures.items():
-        paths[kind] = f"{start}.png" if kind == "png" else f"{start}_{kind}.png"
-        plot.save(draw(), paths[kind])
+    for word, draw in pictures.items():
+        paths[word] = f"{start}.png" if word == "png" else f"{start}_{word}.png"
+        plot.save(draw(), paths[word])
     if not result["interrupted"]:
         Store.remove(folder, name)
     return paths
 
 
 def publish(result: dict, paths: dict[str, str], lines: list[str]) -> dict:
-    """Print ``lines`` and ``paths``; returns the result, ready for JSON, with its ``files``."""
+    """Print ``lines`` and ``paths``, and return the result for JSON with its ``files``."""
     print("\n".join(lines))
     print("\nwritten     " + ", ".join(paths.values()))
     return {**finite(result), "files": paths}
@@ -72,31 +73,32 @@ def publish(result: dict, paths: dict[str, str], lines: list[str]) -> dict:
 
 def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> dict[str, str]:
     """
-    :func:`write_files` of a result of :func:`.frame.measure`: the table (:func:`rows`), the picture, if there is
-    anything to draw, the courses of trainings, if there were any, and the pictures of a ``plan`` that is complete.
+    Write the files (:func:`write_files`) of a result of :func:`.benchmark.measure`, and return their paths.
+
+    The pictures are the panels, training curves, and those of the ``plan`` if the run is complete.
     """
     table, pictures = rows(result), {}
-    courses = {name: record for name, record in result["jobs"].items() if "runs" in record}
-    found = panels(result)
-    if found:
-        pictures["png"] = lambda: plot.draw_panels(result["title"], found, result["accuracy_label"], caption(result))
-    if courses:
+    trainings = {name: record for name, record in result["jobs"].items() if "runs" in record}
+    drawn = panels(result)
+    if drawn:
+        pictures["png"] = lambda: plot.draw_panels(result["title"], drawn, result["accuracy_label"], caption(result))
+    if trainings:
         title = f"{result['title']}: training"
-        pictures["training"] = lambda: plot.draw_training_curves(title, courses, machine_line(result))
+        pictures["training"] = lambda: plot.draw_training_curves(title, trainings, machine_line(result))
     if plan is not None and not result["interrupted"]:
-        pictures |= {kind: (lambda draw=draw: draw(result)) for kind, draw in plan.pictures.items()}
+        pictures |= {word: (lambda draw=draw: draw(result)) for word, draw in plan.pictures.items()}
     names = dict.fromkeys(name for row in table for name in row if name not in COLUMNS)
     return write_files(result["task"], folder, result, table, (*COLUMNS, *names), pictures)
 
 
 def rows(result: dict) -> list[dict]:
     """
-    The result as a table: one row for each case, query (or whole pass) and candidate, and one for each candidate that
-    is in no case; with the columns :data:`COLUMNS`, one for each error and one for each number or text among the
-    details of candidates. ``time`` is in ``unit``, floor subtracted (``hidden``: it is only what the time is below);
-    what does not apply is missing.
+    Return the result as rows of a table: one for each case, query (or whole pass) and candidate.
+
+    Candidates of no case have one row. The columns are :data:`COLUMNS`, one for each error and one for each number or
+    text among the details of candidates. ``time`` is in ``unit``, floor subtracted (``hidden``: it is only a bound).
     """
-    found, timed = [], set()
+    table, timed = [], set()
     for case, measured in result["cases"].items():
         for query, timings in {**measured["queries"], **measured["passes"]}.items():
             whole = query in measured["passes"]
@@ -105,7 +107,7 @@ def rows(result: dict) -> list[dict]:
                 if operations:
                     operations = {"reads": operations.pop("gathers"), **operations}
                 timed.add(name)
-                found.append({
+                table.append({
                     **{"task": result["task"], "case": case, "query": query, **_candidate_cells(result, name)},
                     "unit": "ms a pass" if whole else "ns",
                     **{"time": t["time"], "time_q1": t["q1"], "time_q3": t["q3"], "time_with_floor": t["with_floor"]},
@@ -115,7 +117,7 @@ def rows(result: dict) -> list[dict]:
                     **operations,
                 })  # fmt: skip
     others = [name for name in result["candidates"] if name not in timed]
-    return found + [{"task": result["task"], **_candidate_cells(result, name)} for name in others]
+    return table + [{"task": result["task"], **_candidate_cells(result, name)} for name in others]
 
 
 def _candidate_cells(result: dict, name: str) -> dict:
@@ -130,17 +132,17 @@ def _candidate_cells(result: dict, name: str) -> dict:
 
 def panels(result: dict) -> list[plot.Panel]:
     """
-    Accuracy against the quantities asked for, of all candidates, then against time of the first query or of a pass, one
-    panel a case: candidates labelled, quartiles as bars, the Pareto front drawn, references as vertical lines.
+    Return the panels of a result: accuracy against the plan's quantities, then against time, one panel a case.
+
+    Times are those of the first query, or of a pass. Candidates have labels and quartiles, references vertical lines.
     """
     candidates = list(result["candidates"].values())
-    found = [_against(quantity, candidates, result, QUANTITIES[quantity][1]) for quantity in result["panels"]]
+    drawn = [_against(quantity, candidates, result, QUANTITIES[quantity][1]) for quantity in result["panels"]]
     for case, measured in result["cases"].items():
         if not measured["in_picture"]:
             continue
         of_passes, accuracy = bool(measured.get("of_passes")), measured.get("accuracy") or result["accuracy"]
-        kind = "passes" if of_passes else "queries"
-        query, timings = next(iter(measured[kind].items()), ("", {}))
+        query, timings = next(iter(measured["passes" if of_passes else "queries"].items()), ("", {}))
         points, lines = [], []
         for name, t in timings.items():
             c = result["candidates"][name]
@@ -151,10 +153,10 @@ def panels(result: dict) -> list[plot.Panel]:
                 lines.append(plot.Line(label, t["time"], c["is_truth"]))
             elif accuracy in c["errors"]:
                 points.append(_point(c, accuracy, t["time"], t["q1"], t["q3"], bool(t["on_front"])))
-        found.append(plot.Panel(case, f"time of one {query}, {'ms' if of_passes else 'ns'}", points, lines))
+        drawn.append(plot.Panel(case, f"time of one {query}, {'ms' if of_passes else 'ns'}", points, lines))
         if result["bytes_by_case"]:
-            found.append(_against("bytes", [result["candidates"][name] for name in timings], result, case))
-    return [panel for panel in found if panel.points or panel.lines]
+            drawn.append(_against("bytes", [result["candidates"][name] for name in timings], result, case))
+    return [panel for panel in drawn if panel.points or panel.lines]
 
 
 def _point(c: dict, accuracy: str, x: float, low: float, high: float, on_front: bool) -> plot.Point:
@@ -162,7 +164,7 @@ def _point(c: dict, accuracy: str, x: float, low: float, high: float, on_front: 
 
 
 def _against(quantity: str, candidates: list[dict], result: dict, title: str) -> plot.Panel:
-    """A panel of what differs in accuracy or in ``quantity`` only: two forms of one thing are one point."""
+    """Return a panel of accuracy against ``quantity``; candidates equal in both, or of one job, are one point."""
     distinct: dict[tuple, dict] = {}
     for c in candidates:
         accuracy = c["errors"].get(result["accuracy"])
@@ -180,9 +182,9 @@ def _against(quantity: str, candidates: list[dict], result: dict, title: str) ->
 
 
 def caption(result: dict) -> str:
-    """What the figures were measured on and how, as one paragraph."""
-    s, made = result["settings"], result["jobs"]
-    sampled = any(c["errors"] and "errors" not in made.get(c["job"], {}) for c in result["candidates"].values())
+    """Return one paragraph on the machine, the settings and the notes of a result."""
+    s, jobs = result["settings"], result["jobs"]
+    sampled = any(c["errors"] and "errors" not in jobs.get(c["job"], {}) for c in result["candidates"].values())
     sampled &= result.get("sampled", True)
     errors = f"; errors from {s['samples']:,} samples" if sampled else ""
     return " ".join([
@@ -196,7 +198,7 @@ def caption(result: dict) -> str:
 
 
 def summary(result: dict, plan: Plan | None = None) -> list[str]:
-    """The result as lines of text: the plan's own table, times, ratios, and the plan's conclusions."""
+    """Return the result as lines of text: the plan's table, times, ratios, and the plan's conclusions."""
     lines = list(plan.table(result)) if plan else []
     for case, measured in result["cases"].items():
         queries, passes = measured["queries"], measured["passes"].get(PASS, {})
@@ -221,7 +223,7 @@ def summary(result: dict, plan: Plan | None = None) -> list[str]:
     lines += ["", *notes] if notes else []
     for case, measured in result["cases"].items():
         ratios = measured["ratios"]
-        pairs = dict.fromkeys(pair for found in ratios.values() for pair in found)
+        pairs = dict.fromkeys(pair for by_pair in ratios.values() for pair in by_pair)
         if pairs:
             lines += ["", f"{case}: ratios, medians of the rounds, floor subtracted [with the floor]"]
             cells = [[ratio_cell(r.get(pair), q in measured["queries"]) for q, r in ratios.items()] for pair in pairs]

@@ -1,4 +1,4 @@
-"""Numbers made of measurements: medians and quartiles, times without what input and output cost, the Pareto front."""
+"""Statistics of measurements: medians and quartiles, times and ratios without the floor, the Pareto front."""
 
 from __future__ import annotations
 
@@ -7,28 +7,30 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-#: What takes less than this part of the floor beyond it is hidden behind input and output: all that is said of it is
-#: that it takes less, and no ratio to it is made.
+#: A time that exceeds the floor by less than this part of the floor is hidden behind input and output: only a bound of
+#: it is given, and no ratio to it.
 HIDDEN = 0.2
 
 
 def spread(values: Iterable[float]) -> dict[str, float]:
-    """Median and quartiles of the finite ones among ``values``: ``median``, ``q1``, ``q3``, NaN if there are none."""
+    """Return ``median``, ``q1`` and ``q3`` of the finite ``values``, NaN if there are none."""
     values = [v for v in values if math.isfinite(v)]
     q1, median, q3 = np.percentile(values, [25, 50, 75]) if values else [math.nan] * 3
     return {"median": float(median), "q1": float(q1), "q3": float(q3)}
 
 
-def named(name: str, values: Iterable[float]) -> dict[str, float]:
-    """:func:`spread`, flat: the median as ``NAME``, the quartiles as ``NAME_q1`` and ``NAME_q3``."""
+def flat_spread(name: str, values: Iterable[float]) -> dict[str, float]:
+    """Return :func:`spread` with flat names: the median as ``NAME``, the quartiles as ``NAME_q1``, ``NAME_q3``."""
     median, q1, q3 = spread(values).values()
     return {name: median, f"{name}_q1": q1, f"{name}_q3": q3}
 
 
 def timing(values: Iterable[float], floor: float = 0.0) -> dict:
     """
-    The time that rounds took, in their unit: ``time``, ``q1``, ``q3`` without the ``floor`` and not less than
-    :data:`HIDDEN` of it; ``with_floor``; ``floor``; ``rounds``; and ``hidden``: ``time`` is only what it is below.
+    Return the time of rounds without the ``floor``, in the unit of ``values``.
+
+    ``time``, ``q1``, ``q3`` are at least :data:`HIDDEN` of the floor; ``with_floor`` is the median with it, ``floor``
+    and ``rounds`` are as given; ``hidden``: ``time`` is only an upper bound.
     """
     values = list(values)
     s, least = spread(values), HIDDEN * floor
@@ -40,25 +42,27 @@ def timing(values: Iterable[float], floor: float = 0.0) -> dict:
 
 def ratio(a: Sequence[float], b: Sequence[float], floor: float = 0.0) -> dict:
     """
-    How many times the time of ``b`` is that of ``a``, round by round, without the ``floor``: ``median``, ``q1``, ``q3``
-    (NaN if ``b`` is hidden behind the floor); ``with_floor``, the median with it; ``hidden``: ``a`` is hidden, so that
-    the median is only what the ratio is below.
+    Return the ratio ``a / b`` of times, round by round, without the ``floor``.
+
+    ``median``, ``q1``, ``q3`` are NaN if ``b`` is hidden behind the floor; ``with_floor`` is the median of the ratios
+    with it; ``hidden``: ``a`` is hidden, so that the median is only an upper bound.
     """
     both = list(zip(a, b, strict=True))
     least = HIDDEN * floor
     if floor > 0 and spread(b)["median"] - floor < least:
-        found = spread([])
+        ratios = spread([])
     else:
-        found = spread(max(x - floor, least) / (y - floor) if y > floor else math.nan for x, y in both)
+        ratios = spread(max(x - floor, least) / (y - floor) if y > floor else math.nan for x, y in both)
     with_floor = spread(x / y if y > 0 else math.nan for x, y in both)["median"]
-    return {**found, "with_floor": with_floor, "hidden": floor > 0 and spread(a)["median"] - floor < least}
+    return {**ratios, "with_floor": with_floor, "hidden": floor > 0 and spread(a)["median"] - floor < least}
 
 
 def pareto(points: Sequence[Sequence[float]], slack: Sequence[float] | float = 0.0) -> list[bool]:
     """
-    Which ``points`` are on the Pareto front, all coordinates being better when smaller: those that no other point
-    beats in one coordinate without being beaten in another. Coordinates that differ by no more than ``slack`` (for
-    each, or for all) are equal, and equal points share their fate; a point with a NaN is not on the front.
+    Return for each of ``points`` whether it is on the Pareto front; smaller coordinates are better.
+
+    A point is on the front if no other point is better in one coordinate and at least equal in all. Coordinates that
+    differ by at most ``slack`` (for each coordinate, or for all) are equal; a point with a NaN is not on the front.
     """
     p = np.asarray(points, dtype=np.float64)
     if p.size == 0:
@@ -72,7 +76,7 @@ def pareto(points: Sequence[Sequence[float]], slack: Sequence[float] | float = 0
 
 
 def finite(value):
-    """A tree of numbers without NaN and infinities, which JSON does not have, and with lists for tuples."""
+    """Return a tree with ``None`` for NaN and infinities, which JSON does not have, and with lists for tuples."""
     if isinstance(value, dict):
         return {k: finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

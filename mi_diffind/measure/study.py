@@ -1,8 +1,9 @@
 """
-What a study is: how it declares itself, and what it gives to the frame (:mod:`.frame`) to be measured.
+Declaration of studies: a study, its plan, and the candidates, jobs and cases of the plan.
 
 A module of :mod:`mi_diffind.studies`, or one that an entry point of the group ``mi_diffind.studies`` names, has a
-:class:`Study` as its ``STUDY``. Declaring it imports neither Mitsuba nor Dr.Jit: the command line asks all of them.
+:class:`Study` as its ``STUDY``. The command line imports all of them, so a declaration imports neither Mitsuba nor
+Dr.Jit.
 """
 
 from __future__ import annotations
@@ -13,19 +14,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-#: The name under which a case has its floor.
+#: Name of the floor among the queries of a case.
 FLOOR = "floor"
 
 
 class Study:
     """
-    A study as it declares itself: ``name``, that of the subcommand and of the files that it writes
-    (``tradeoff_NAME.…``), and ``title``, what is measured against what, a phrase for the help.
+    Base class of studies.
 
-    One that compares candidates gives a :meth:`plan`; one of another kind has a :meth:`run` of its own. With
-    ``of_scene`` it is about a scene file: the command has the argument ``scene`` and the options of scenes, and
-    ``arguments.defines`` is a dictionary. All arguments of the command are in ``arguments``: ``out``, the folder,
-    ``quick`` and what :meth:`add_arguments` adds.
+    ``name``: the word of the command and of the files (``tradeoff_NAME.…``); ``title``: a phrase for the help.
+
+    A study that compares candidates has a :meth:`plan`; any other study overrides :meth:`run`. A study ``of_scene``
+    measures a scene file: its command has the argument ``scene`` and the options of scenes, and ``arguments.defines``
+    is a dictionary. ``arguments`` holds all arguments of the command: ``out`` (the folder), ``quick``, and those of
+    :meth:`add_arguments`.
     """
 
     name = ""
@@ -33,19 +35,21 @@ class Study:
     of_scene = False
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add the arguments that only this study has."""
+        """Add the study's own arguments to the parser of its command."""
 
     def check(self, arguments) -> None:
-        """Refuse arguments, before anything is loaded or made, by a ``ValueError`` with a sentence."""
+        """Raise ``ValueError`` with a sentence for bad arguments, before any work."""
 
     def plan(self, arguments) -> Plan:
-        """What is to be measured, in the variant that is set."""
+        """Return the plan, in the variant that is set."""
         raise NotImplementedError(f'the study "{self.name}" has no plan')
 
     def run(self, arguments) -> dict | None:
         """
-        Of a study that has no plan: measure, write the files, print what was found. Returns the result with its
-        ``files``; after Ctrl-C, what there is up to then, with ``interrupted``. ``None``: its plan is to be measured.
+        Run a study that has no plan: measure, write the files and print the result.
+
+        Returns the result with its ``files``, after Ctrl-C an incomplete one with ``interrupted``. ``None``, the
+        default: the command measures the plan.
         """
         return None
 
@@ -53,14 +57,14 @@ class Study:
 @dataclass
 class Candidate:
     """
-    A representation at a setting.
+    Candidate of a comparison: a representation at a setting.
 
-    ``errors(samples)`` measures it against the truth; missing, its job does, or it has none: it is the truth itself
-    (``is_truth``), or it computes something else, as ``note`` should say. ``is_reference``: it is not in competition,
-    but what the others are compared with; so is the truth. ``competes``: it may be on the Pareto front. ``bytes`` and
-    ``training_seconds`` (``None``: not known) are what it takes beside time, unless its job says. ``job`` is the name
-    of the one that makes it; ``queries`` are those that it takes part in (default: all); ``operations(query)`` counts
-    what a kernel does not show; ``details`` are kept with it.
+    ``errors(samples)`` measures its errors against the truth. Without it, the errors are those of its job's record, or
+    it has none: the truth (``is_truth``), or a candidate that computes something else, which ``note`` explains.
+    ``is_reference``: others are compared with it, and it does not compete, like the truth. ``competes``: it may be on
+    the Pareto front. ``bytes`` and ``training_seconds`` (``None``: not known) are those of its job's record, if any.
+    ``job``: name of the job that trains it; ``queries`` that it takes part in (default: all); ``operations(query)``
+    counts operations that a kernel does not show; ``details`` go to the result.
     """
 
     name: str
@@ -84,32 +88,34 @@ class Candidate:
 
 class Job:
     """
-    What has to be done before anything can be measured, as a training: shared by the candidates that name it.
+    Work that is done before the measurement, such as a training; shared by the candidates that name it.
 
-    A record is a tree for JSON: ``seconds``, and optionally ``bytes``, ``errors``, ``converged``, ``details``, and
-    ``runs``, courses of trainings (:mod:`.training`).
+    Its record is a tree for JSON: ``seconds``, and optionally ``bytes``, ``errors``, ``converged``, ``details``, and
+    ``runs``, the curves of trainings (:mod:`.training`).
     """
 
     name: str
 
     def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
-        """The record if all is done: it is in the store (``record``), or what it made is in ``folder``."""
+        """Return the record if the work is done: ``record`` is that of the store, ``folder`` holds models."""
         return record
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        """Do it, and return the record, or ``None`` after Ctrl-C; files that are kept go to ``folder``."""
+        """Do the work, write models to ``folder``, and return the record, or ``None`` after Ctrl-C."""
         raise NotImplementedError
 
 
 @dataclass
 class Case:
     """
-    A situation. ``queries(lanes)`` maps the name of each query to the names of all candidates and :data:`FLOOR`, and
-    these to functions; ``passes()``, if there are any, maps candidates (those with ``in_passes``) to functions of the
-    number of the pass, which do one pass of a whole job. Both are called when they are needed. ``candidates`` are the
-    names of those that take part (default: all), ``query_names`` those of its queries (default: the plan's);
-    ``in_picture``: it has a panel, which shows the error ``accuracy`` (default: the plan's) against the time of its
-    first query, or if it is ``of_passes`` of a pass; so does the Pareto front. ``details`` are kept with it.
+    Situation in which candidates are timed.
+
+    ``queries(lanes)`` returns query → name of a candidate, or :data:`FLOOR` → function. ``passes()``, if given, returns
+    name of a candidate (those with ``in_passes``) → function of the pass number that does one whole pass, such as a
+    render. Both are called when they are needed. ``candidates``: names of those that take part (default: all);
+    ``query_names`` (default: the plan's). ``in_picture``: the case has a panel, of the error ``accuracy`` (default: the
+    plan's) against the time of its first query, or of a pass if ``of_passes``; the Pareto front uses the same two.
+    ``details`` go to the result.
     """
 
     name: str
@@ -126,16 +132,15 @@ class Case:
 @dataclass
 class Plan:
     """
-    What a study asks for.
+    Plan of a measurement: candidates, cases, jobs, and the reports of a study.
 
-    ``accuracy`` names the error that pictures show and the Pareto front is made with, one that is larger for better
-    candidates, as a PSNR is. ``ratios`` are pairs of candidates, a time divided by another. ``details`` and the
-    ``fingerprint`` of ``sources`` (files beside those of this package) tell whether what is measured is still the same.
-    ``jobs`` come first; ``jobs_fingerprint`` is that of the models they keep. ``panels``: what accuracy is drawn
-    against, for all candidates (``"bytes"``, ``"training_seconds"``); ``bytes_by_case``: also against bytes, for those
-    of each case. ``table(result)`` are lines to print before the times, ``conclusions(result)`` after them.
-    ``pictures`` are further ones: kind → a function of the result that draws a Matplotlib figure. ``sampled``: errors
-    are those of so many samples as the settings say.
+    ``accuracy`` names the error of pictures and of the Pareto front; larger is better, as for a PSNR. ``ratios`` are
+    pairs of candidates whose times are divided. Partial results are continued only if ``details`` and the fingerprint
+    of ``sources`` (files beside those of this package) are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is.
+    ``panels``: quantities that the accuracy of all candidates is drawn against (``"bytes"``, ``"training_seconds"``);
+    ``bytes_by_case``: also against bytes, for the candidates of each case. ``table(result)`` returns lines to print
+    before the times, ``conclusions(result)`` lines after them. ``pictures`` maps further names to functions of the
+    result that draw a Matplotlib figure. ``sampled``: errors are those of as many samples as the settings say.
     """
 
     study: str
@@ -160,11 +165,11 @@ class Plan:
     conclusions: Callable[[dict], list[str]] = lambda result: []
 
     def resolved(self, case: Case) -> Case:
-        """``case`` with the names of its candidates and queries."""
-        known = tuple(c.name for c in self.candidates if case.candidates is None or c.name in case.candidates)
-        return dataclasses.replace(case, candidates=known, query_names=case.query_names or self.queries)
+        """Return ``case`` with the names of its candidates and queries."""
+        names = tuple(c.name for c in self.candidates if case.candidates is None or c.name in case.candidates)
+        return dataclasses.replace(case, candidates=names, query_names=case.query_names or self.queries)
 
     def takers(self, case: Case, query: str) -> list[str]:
-        """The names of the candidates that take part in a query of a case that is :meth:`resolved`."""
-        found = [c for c in self.candidates if c.name in case.candidates]
-        return [c.name for c in found if c.queries is None or query in c.queries]
+        """Return the names of the candidates that take part in a query of a :meth:`resolved` case."""
+        in_case = [c for c in self.candidates if c.name in case.candidates]
+        return [c.name for c in in_case if c.queries is None or query in c.queries]

@@ -1,9 +1,9 @@
 """
-Training until it has converged: twice as many steps, again and again, until that gains next to nothing.
+Training to convergence: runs of twice as many steps, until a run gains next to nothing.
 
-Whether a representation is better than another can only be said of two that were trained to convergence. Here that
-means: a run of twice as many steps, with the same schedule stretched to them, gained less than :data:`GAIN` dB. What
-has not converged at the longest run that is tried is marked so. The courses of all runs are kept, to be shown.
+Only representations that are trained to convergence can be compared. A representation has converged if a run of twice
+as many steps, with the same schedule stretched to them, gained less than :data:`GAIN` dB; if the longest run gained
+more, the record says so. The records keep the curves of all runs.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from ..fitting import FitSettings, Problem, fit
 from .store import file_name
 from .study import Job
 
-#: dB that twice as many steps may still gain.
+#: Gain of a run of twice as many steps, in dB, below which a training has converged.
 GAIN = 0.5
 
 
 class ConvergenceTraining(Job):
     """
-    A representation that is trained to convergence.
+    Training of a representation to convergence.
 
-    ``problem()`` makes the problem anew, with untrained parameters; ``settings`` are those of the first, shortest run,
-    ``longest`` the steps of the longest that is tried; each is measured ``measurements`` times. After :meth:`run` or
+    ``problem()`` returns a new problem with untrained parameters; ``settings`` are those of the first, shortest run,
+    ``longest`` is the largest number of steps; each run is measured ``measurements`` times. After :meth:`run` or
     :meth:`cached_record`, ``net`` is the trained module of the best run.
     """
 
@@ -42,7 +42,7 @@ class ConvergenceTraining(Job):
         self.net = None
 
     def cached_record(self, folder: Path | None, record: dict | None = None) -> dict | None:
-        """The record that :meth:`run` left in ``folder``, if there is one of the same settings."""
+        """Return the record that :meth:`run` wrote to ``folder``, if its settings are the same."""
         if folder is None or not self._file(folder).is_file():
             return None
         with contextlib.suppress(Exception):  # damaged, or of other settings: train again
@@ -51,7 +51,7 @@ class ConvergenceTraining(Job):
 
     def run(self, folder: Path | None = None, progress: bool = True) -> dict | None:
         """
-        Train, going on from the checkpoint if ``folder`` has one.
+        Train, from the checkpoint if ``folder`` has one.
 
         Returns the record, or ``None`` after Ctrl-C: ``name``, ``steps``, ``seconds`` and ``psnr_db`` of the best run,
         ``gain_db`` of the last doubling (``None``: there was none), ``converged``, ``entries`` (numbers trained), and
@@ -115,7 +115,7 @@ class ConvergenceTraining(Job):
         with np.load(file, allow_pickle=False) as data:
             record = json.loads(data["record"].tobytes())
             if record["settings"] != json.loads(json.dumps(self._settings())):
-                raise ValueError("trained with other settings")
+                raise ValueError("the file is of other settings")
             net = self.problem().net
             for key in net:
                 net[key] = type(net[key])(data[f"parameter/{key}"])

@@ -89,7 +89,7 @@ def test_command_interrupted_and_gone_on_with(small, tmp_path, capsys):
     log.stop_at = None
     assert main(["tradeoff", "small", "--out", out, *variant]) == 0
     captured = capsys.readouterr()
-    assert "going on from" in captured.err and "Interrupted" not in captured.out
+    assert "continuing from" in captured.err and "Interrupted" not in captured.out
     assert sorted(os.listdir(out)) == [f"tradeoff_small.{kind}" for kind in ("csv", "json", "png")]
 
 

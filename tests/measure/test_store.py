@@ -31,7 +31,7 @@ def test_goes_on(kept, capsys):
     store = made(kept, progress=True)
     assert store.resumed and store.data == {"errors": {"a": {"db": 20.0}}, "rounds": {}}
     assert np.array_equal(store.arrays["image"]["exact"], np.arange(6.0).reshape(2, 3))
-    assert capsys.readouterr().err == f"going on from {kept / 'tradeoff_small.partial.json'}\n"
+    assert capsys.readouterr().err == f"continuing from {kept / 'tradeoff_small.partial.json'}\n"
     Store.remove(kept, "small")
     assert os.listdir(kept) == ["other.txt"]
 

@@ -207,7 +207,7 @@ def test_a_run_goes_on(folder, tmp_path, capfd, monkeypatch):
     capfd.readouterr()
     assert main(command) == 0
     out, err = capfd.readouterr()
-    assert "going on from" in err and "1 of 2" not in err and "2 of 2: paper" in err
+    assert "continuing from" in err and "1 of 2" not in err and "2 of 2: paper" in err
     assert "paper 12x 1 s" in out
 
 

@@ -176,7 +176,7 @@ def test_interruption_and_the_same_errors_in_the_end(scene, whole, tmp_path, mon
     capsys.readouterr()
     renders = Renders(monkeypatch)
     finished = study.measure(scene, QUICK, out)
-    assert "going on from" in capsys.readouterr().err
+    assert "continuing from" in capsys.readouterr().err
     assert finished["resumed"] and not finished["interrupted"]
     assert len(renders) <= RENDERS - stop_at + 2 + 1  # compiled again, and the pair that was being rendered
     assert errors_of(finished) == errors_of(whole)

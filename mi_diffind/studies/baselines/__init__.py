@@ -1,1 +1,1 @@
-"""What learned tables are compared with: codecs of images, and networks."""
+"""Baselines that learned tables are compared with: codecs, classical filters, grids and networks."""

@@ -1,6 +1,7 @@
 """
-Hash grids with a network behind them (``drjit.nn``; Müller et al., *Instant Neural Graphics Primitives*, 2022) as
-signed distance fields.
+Signed distance fields of a hash grid and a network (``drjit.nn``).
+
+Source: Müller et al., *Instant Neural Graphics Primitives with a Multiresolution Hash Encoding*, 2022.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from ...tasks.sdf.mesh import Mesh
 from ...units import largest_fitting
 from .networks import Network
 
-#: Half the range of distances that are learned.
+#: Largest distance that is learned.
 BAND = 0.02
 
-#: How far beyond the mesh's box there is a field.
+#: Padding of the mesh's box, of which the field is defined.
 PADDING = 0.01
 
 #: Width and hidden layers of the network, levels of the grid, its coarsest resolution, and the finest one in 1 MiB.
@@ -29,7 +30,7 @@ WIDTH, LAYERS, LEVELS, COARSEST, FINEST = 32, 2, 8, 8, 256
 
 
 def network(nbytes: int) -> Network:
-    """The largest of its kind with 2 bytes for each parameter (not yet allocated)."""
+    """Return the largest network with hash grid of ``nbytes``, 2 bytes a parameter, not yet allocated."""
     finest = max(2 * COARSEST, FINEST * math.sqrt(nbytes / 2**20))
     scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
     features = 2
@@ -51,7 +52,7 @@ def network(nbytes: int) -> Network:
 
 
 class HashDistanceField(DistanceField):
-    """The field of a trained ``net``, whose outputs are distances divided by :data:`BAND`. It knows no slope."""
+    """Field of a trained ``net`` with distances divided by :data:`BAND`; no bound of its slope is known."""
 
     def __init__(self, types, net: Network, mesh: Mesh):
         finest = net.grid["base_resolution"] * net.grid["per_level_scale"] ** (net.grid["n_levels"] - 1)
@@ -61,18 +62,18 @@ class HashDistanceField(DistanceField):
 
     def value(self, p, active=True):
         active = self.inside(p) & active
-        found = self.net([(x - a) for x, a in zip(p, self.lower, strict=True)])[0]
-        return dr.select(active, dr.clip(found * BAND, -BAND, BAND), BAND)
+        value = self.net([(x - a) for x, a in zip(p, self.lower, strict=True)])[0]
+        return dr.select(active, dr.clip(value * BAND, -BAND, BAND), BAND)
 
     def gradient(self, p, active=True):
         active = self.inside(p) & active
         with dr.resume_grad():
             q = self.types.Array3f(dr.detach(p))
             dr.enable_grad(q)
-            found = self.net([(x - a) for x, a in zip(q, self.lower, strict=True)])[0] * BAND
-            dr.backward(found)
+            value = self.net([(x - a) for x, a in zip(q, self.lower, strict=True)])[0] * BAND
+            dr.backward(value)
             slope = dr.detach(dr.grad(q))
-        value = dr.clip(dr.detach(found), -BAND, BAND)
+        value = dr.clip(dr.detach(value), -BAND, BAND)
         return dr.select(active, value, BAND), dr.select(active, slope, 0)
 
     def look(self, p, d, active=True):
@@ -87,10 +88,7 @@ def halved(net: Network) -> None:
 
 
 class HashProblem(Problem):
-    """
-    The training of a :class:`Network` on distances to a ``mesh``: those of a ``pool`` of points, measured at those of
-    another one (:func:`pool`).
-    """
+    """Training of a :class:`Network` on a ``pool`` of points with distances, measured on another (:func:`pool`)."""
 
     def __init__(self, net: Network, types, mesh: Mesh, pool: tuple, held: tuple, seed: int = 1):
         self.net, self.types = net.alloc(types.TensorXf, 3, dr.rng(seed=seed)), types
@@ -119,8 +117,9 @@ class HashProblem(Problem):
 
 def pool(distances: Distances, lower, upper, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """
-    ``count`` points and their distances, three quarters near the surface (normal distributions of 0.002 and 0.01), the
-    others anywhere in the box.
+    Return ``count`` points in a box and their distances, ``(count, 3)`` and ``(count,)``.
+
+    Three quarters are near the surface (normal distributions of 0.002 and 0.01), the others uniform.
     """
     rng = np.random.default_rng(seed)
     near = [samples.near(distances.mesh, 3 * count // 8, width, rng) for width in (0.002, 0.01)]

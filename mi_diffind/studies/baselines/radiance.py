@@ -14,7 +14,7 @@ import numpy as np
 
 from ...tasks.radiance.field import VolumeField, colour_of, density_of
 from ...tasks.radiance.nodes import Nodes
-from .node_codes import Steps
+from .node_codes import QuantisationSteps
 
 #: Raw numbers of density that are told apart: below is nothing, above is opaque.
 RAW = (-8.0, 12.0)
@@ -79,7 +79,9 @@ class ByteField(VolumeField):
     none. ``nbytes``: all that is read, in memory.
     """
 
-    def __init__(self, nodes: Nodes, density, colour, steps: tuple[Steps, Steps], matrix=None, rows=None):
+    def __init__(
+        self, nodes: Nodes, density, colour, steps: tuple[QuantisationSteps, QuantisationSteps], matrix=None, rows=None
+    ):
         super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, {})
         types = self.types
         self.nodes = (

@@ -14,7 +14,7 @@ from drjit import nn
 
 from ...tasks.radiance.field import VolumeField, colour_of, density_of
 from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, corners_of, distances
-from .node_codes import Steps, deflated, mask_bytes
+from .node_codes import QuantisationSteps, deflated, mask_bytes
 from .radiance_fits import HEADER, Grid, nodes_of, nodes_state
 
 #: Raw density of a field that is not trained yet.
@@ -188,7 +188,7 @@ class PlanesFit:
         for k in (0, 1):
             low, high = (float(f(self._scaled(self.net, k).numpy())) for f in (np.min, np.max))
             step = (high - low) / 255
-            self.steps.append(Steps(np.float32([low]), np.float32([step]), np.array([256])))
+            self.steps.append(QuantisationSteps(np.float32([low]), np.float32([step]), np.array([256])))
 
     def field_of(self, net) -> PlanesField:
         values = [self._scaled(net, k) for k in (0, 1)]
@@ -211,7 +211,7 @@ class PlanesFit:
         nodes = nodes_of(types, state)
         occupancy = Occupancy(nodes)
         matrix = types.TensorXf(np.ascontiguousarray(state["matrix"], np.float32))
-        steps = [Steps(state[f"{n}_low"], state[f"{n}_step"], np.array([256])) for n in TABLES]
+        steps = [QuantisationSteps(state[f"{n}_low"], state[f"{n}_step"], np.array([256])) for n in TABLES]
         shape, ranks = map(tuple, (state["sides"].tolist(), state["ranks"].tolist()))
         found = PlanesField(nodes, shape, {"matrix": matrix}, ranks, occupancy, steps)
         found.words = [types.UInt32(np.ascontiguousarray(state[n]).view("<u4").reshape(-1)) for n in TABLES]

@@ -19,7 +19,7 @@ from ...tasks.radiance.field import GridField
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
 from ...tasks.radiance.nodes import Nodes, cells_of, corners_of
-from .node_codes import Steps, coded_bytes, deflated
+from .node_codes import QuantisationSteps, coded_bytes, deflated
 from .radiance import RAW, ByteField, CoefficientField
 
 #: Colours of nodes that nothing is seen of have this weight, so that they are known, too.
@@ -121,11 +121,13 @@ def visibility(field: GridField, images, every: int = 2) -> np.ndarray:
 
 class NodesFit:
     """
-    A grid of bytes: density and, of each node or of each of ``rows``, coefficients of colour, with :class:`.Steps` of
-    their own; ``matrix`` makes twelve numbers of them, if there is one.
+    A grid of bytes: density and, of each node or of each of ``rows``, coefficients of colour, each with its
+    :class:`.QuantisationSteps`; ``matrix`` makes twelve numbers of them, if there is one.
     """
 
-    def __init__(self, nodes: Nodes, density, colour, steps: tuple[Steps, Steps], matrix=None, rows=None):
+    def __init__(
+        self, nodes: Nodes, density, colour, steps: tuple[QuantisationSteps, QuantisationSteps], matrix=None, rows=None
+    ):
         self.nodes, self.rows, self.steps = nodes, rows, steps
         types = self.types = nodes.types
         self.first = int(nodes.stored is not None)
@@ -135,7 +137,7 @@ class NodesFit:
         colour = np.pad(colour, ((0 if rows is not None else self.first, 0), (0, spare)))
         ones = {"constant_values": 1}
         padded = [np.pad(steps[1].low, (0, spare)), np.pad(steps[1].step, (0, spare), **ones)]
-        self.rounding = Steps(*padded, np.pad(steps[1].levels, (0, spare), **ones))
+        self.rounding = QuantisationSteps(*padded, np.pad(steps[1].levels, (0, spare), **ones))
         self.net = {
             "density": types.TensorXf(np.pad(density, (self.first, 0)).astype(np.float32)[:, None] / DENSITY_SCALE),
             "colour": types.TensorXf(colour.astype(np.float32)),
@@ -181,7 +183,7 @@ class NodesFit:
     def field(types, state: dict) -> ByteField:
         """The field that reads what :meth:`state` returned."""
         names = ("low", "step", "levels")
-        steps = tuple(Steps(*(state[f"{kind}_{n}"] for n in names)) for kind in ("density", "colour"))
+        steps = tuple(QuantisationSteps(*(state[f"{kind}_{n}"] for n in names)) for kind in ("density", "colour"))
         return ByteField(nodes_of(types, state), state["density"][:, 0], state["colour"], steps, state.get("matrix"),
                          state.get("rows"))  # fmt: skip
 
@@ -216,13 +218,13 @@ def bits_of(numbers: np.ndarray, count: int) -> bytes:
     return pack_bits(numbers, max(1, int(count - 1).bit_length())).tobytes()
 
 
-def density_steps(levels: int = 256) -> Steps:
-    return Steps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / (levels - 1)]), np.array([levels]))
+def density_steps(levels: int = 256) -> QuantisationSteps:
+    return QuantisationSteps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / (levels - 1)]), np.array([levels]))
 
 
 def plain(grid: Grid, levels: int = 256) -> NodesFit:
     """Thirteen numbers a node, those of colour in so many equal steps."""
-    steps = density_steps(), Steps.over(grid.colour, levels, grid.seen + LEAST, 1e-3)
+    steps = density_steps(), QuantisationSteps.over(grid.colour, levels, grid.seen + LEAST, 1e-3)
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), grid.colour, steps)
 
 
@@ -246,7 +248,7 @@ def components(grid: Grid, width: float, count: int = 12) -> NodesFit:
     values, vectors = np.linalg.eigh(np.cov(centred.T, aweights=seen))
     vectors = vectors[:, np.argsort(values)[::-1][:count]]
     found = centred @ vectors
-    steps = density_steps(), Steps.of_width(found, np.full(count, width))
+    steps = density_steps(), QuantisationSteps.of_width(found, np.full(count, width))
     matrix = np.concatenate([vectors.T / scale, mean[None]])
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), found, steps, matrix)
 
@@ -256,7 +258,7 @@ def codebook(grid: Grid, count: int, seed: int = 1, rounds: int = 10) -> NodesFi
     scale = display(grid)
     centres, rows = k_means((grid.colour * scale).astype(np.float32), grid.seen + LEAST, count, seed, rounds)
     colour = centres / scale
-    steps = density_steps(), Steps.over(colour)
+    steps = density_steps(), QuantisationSteps.over(colour)
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), colour, steps, None, rows)
 
 

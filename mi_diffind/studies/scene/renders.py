@@ -25,7 +25,7 @@ from ...interrupt import interruptible
 from ...measure.benchmark import Stopped
 from ...measure.bias import LEAST, crossover, describe, error, estimate, root, weights_of
 from ...measure.clock import machine, timed
-from ...measure.statistics import finite, named, spread
+from ...measure.statistics import finite, flat_spread, spread
 from ...measure.store import Store, fingerprint, sources
 from .verdict import verdict
 
@@ -281,14 +281,14 @@ def _assemble(store: Store, counts: list[int]) -> dict:
 
 def _point(rounds: list[dict]) -> dict:
     timed = [r for r in rounds if r["seconds"] is not None]
-    mse = named("mse", (r["mse"] for r in rounds))
+    mse = flat_spread("mse", (r["mse"] for r in rounds))
     return {
         **mse,
         "rmse": root(mse["mse"]),
         "psnr_db": float(np.median([r["psnr_db"] for r in rounds])),
         "images": len(rounds),
-        **named("seconds", (r["seconds"] for r in timed)),
-        **named("seconds_wall", (r["seconds_wall"] for r in timed)),
+        **flat_spread("seconds", (r["seconds"] for r in timed)),
+        **flat_spread("seconds_wall", (r["seconds_wall"] for r in timed)),
         "timed": len(timed),
     }
 
