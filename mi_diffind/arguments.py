@@ -7,8 +7,7 @@ import math
 
 
 class Argument:
-    """
-    Argument of ``fit`` or ``decode`` that a task adds.
+    """Argument of ``fit`` or ``decode`` that a task adds.
 
     Flags and options are those of ``argparse.ArgumentParser.add_argument``; of the arguments of one ``group``, at most
     one may be given.
@@ -104,8 +103,7 @@ def define(text: str) -> tuple[str, str]:
 
 
 def checked(parse):
-    """
-    Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown.
+    """Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown.
 
     The type returns the text itself.
     """

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ValueBounds:
-    """
-    Bounds of a parameter: its values lie in ``[low, high]``.
+    """Bounds of a parameter: its values lie in ``[low, high]``.
 
     ``optimised``: a derivative with respect to it is tracked, and it may take any value. ``grey``: its channels are
     equal, if it is a colour.

@@ -1,5 +1,4 @@
-"""
-``mi-diffind``: one verb a module of :mod:`mi_diffind.commands`.
+"""``mi-diffind``: one verb a module of :mod:`mi_diffind.commands`.
 
 Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
 """

@@ -1,5 +1,4 @@
-"""
-Hooks into what Mitsuba 3.9 and Dr.Jit 1.5 do not promise, one a function or constant.
+"""Hooks into what Mitsuba 3.9 and Dr.Jit 1.5 do not promise, one a function or constant.
 
 Each has a test that names the hook which broke (``tests/test_compat.py``). Where another version differs, this file
 changes and no other.
@@ -27,8 +26,7 @@ from pathlib import Path
 
 
 def llvm_version() -> tuple[int, int, int]:
-    """
-    Return the version of the LLVM that Dr.Jit has loaded, -1 first if none; waits for its start.
+    """Return the version of the LLVM that Dr.Jit has loaded, -1 first if none; waits for its start.
 
     ``dr.detail`` is not part of the interface; a public function would replace this.
     """
@@ -38,8 +36,7 @@ def llvm_version() -> tuple[int, int, int]:
 
 
 def core_library() -> str:
-    """
-    Return the path of Dr.Jit's native library, whose name and place in the package are not promised.
+    """Return the path of Dr.Jit's native library, whose name and place in the package are not promised.
 
     A public way to choose LLVM again would replace this and :class:`JitCore`.
     """
@@ -50,8 +47,7 @@ def core_library() -> str:
 
 
 class JitCore:
-    """
-    C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures.
+    """C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures.
 
     These are ``jit_shutdown(int)``, ``jit_init(uint32_t)``, ``jit_launch_stats(size_t *, size_t *, size_t *)``,
     ``jit_registry_id_bound(const char *, const char *)`` and
@@ -97,8 +93,7 @@ class JitCore:
 
 
 def limit_code_generation(target: str) -> None:
-    """
-    Generate LLVM code for the processor ``target``, written as name, features and lanes: ``haswell:+avx2,+fma:8``.
+    """Generate LLVM code for the processor ``target``, written as name, features and lanes: ``haswell:+avx2,+fma:8``.
 
     Names and features are LLVM's; this processor must have all of the features. Lanes of single precision, a power of
     two. Call it before the first kernel and the first scene. Dr.Jit has no Python function for this. Raises
@@ -116,8 +111,7 @@ def limit_code_generation(target: str) -> None:
 
 
 def new_scope(dtype) -> None:
-    """
-    Start a scope: Dr.Jit merges no later computation of the backend of ``dtype`` with an earlier one.
+    """Start a scope: Dr.Jit merges no later computation of the backend of ``dtype`` with an earlier one.
 
     ``dr.detail`` is not part of the interface; no public function does this.
     """
@@ -127,8 +121,7 @@ def new_scope(dtype) -> None:
 
 
 def kernel_code(entry: dict) -> str:
-    """
-    Return the intermediate code of an entry of ``dr.kernel_history()``: LLVM's or PTX.
+    """Return the intermediate code of an entry of ``dr.kernel_history()``: LLVM's or PTX.
 
     Its form is not promised (:func:`is_ptx`, :func:`llvm_target`, :mod:`.operations`). Counters kept by Dr.Jit would
     replace reading it.
@@ -159,8 +152,7 @@ def was_compiled(history: list[dict]) -> bool:
 
 @contextlib.contextmanager
 def room_for_sums(entries: int):
-    """
-    Let each core sum the gradients of arrays by itself, up to ``entries`` in the copies of all cores together.
+    """Let each core sum the gradients of arrays by itself, up to ``entries`` in the copies of all cores together.
 
     ``dr.set_expand_threshold`` takes the entries of one copy; its meaning has changed between versions.
     """
@@ -175,8 +167,7 @@ def room_for_sums(entries: int):
 
 
 def use_threads(count: int) -> None:
-    """
-    Compute on ``count`` cores, after waiting for all computations.
+    """Compute on ``count`` cores, after waiting for all computations.
 
     A sum in progress has a place for each thread at its start, and Dr.Jit does not check for one.
     """
@@ -192,8 +183,7 @@ def use_threads(count: int) -> None:
 
 
 def module_of(array):
-    """
-    Return the module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``.
+    """Return the module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``.
 
     It is the module of the class, by convention. ``dr.replace_type_t`` and its like, with all types, would replace it.
     """
@@ -201,8 +191,7 @@ def module_of(array):
 
 
 def has_gradient(value) -> bool:
-    """
-    Return whether a derivative with respect to this array is tracked, also where derivatives are suspended.
+    """Return whether a derivative with respect to this array is tracked, also where derivatives are suspended.
 
     ``dr.grad_enabled`` says no in the latter case; ``index_ad`` is an internal number.
     """
@@ -216,8 +205,7 @@ def has_gradient(value) -> bool:
 
 
 def identity(value) -> tuple:
-    """
-    Return numbers that identify the content of an array as long as the array is kept.
+    """Return numbers that identify the content of an array as long as the array is kept.
 
     They are the indices of Dr.Jit's variables (``index``), which are used again once a variable is gone. A counter of
     changes would replace them.
@@ -232,8 +220,7 @@ def identity(value) -> tuple:
 
 
 def adam_state(optimizer) -> dict[str, tuple]:
-    """
-    Return the state of an ``Adam``: name → ``(value, t, m, v)``.
+    """Return the state of an ``Adam``: name → ``(value, t, m, v)``.
 
     ``value`` is the parameter, ``t`` the number of the step, ``m`` and ``v`` are the moments (flat). The tuples in
     ``optimizer.state`` are Dr.Jit's own; a public way to save an optimiser would replace this.
@@ -256,8 +243,7 @@ def set_adam_state(optimizer, key: str, value, t, m, v) -> None:
 
 
 def on_variant_change(callback) -> None:
-    """
-    Call ``callback(old, new)`` after each ``mi.set_variant``; the same function is registered once.
+    """Call ``callback(old, new)`` after each ``mi.set_variant``; the same function is registered once.
 
     ``mi.detail`` is not part of the interface; plugins found by Mitsuba itself would replace it.
     """
@@ -272,8 +258,7 @@ CONSTANT_TEXTURES = ("UniformSpectrum", "SRGBReflectanceSpectrum")
 
 
 def texture_class(texture) -> str:
-    """
-    Return Mitsuba's name of a texture's class, ``""`` for a class written in Python, which may have any name.
+    """Return Mitsuba's name of a texture's class, ``""`` for a class written in Python, which may have any name.
 
     Names of classes are not promised; names of plugins are, but a loaded object does not know its own.
     """
@@ -296,8 +281,7 @@ def is_bitmap(texture) -> bool:
 
 
 def srgb_coefficients() -> tuple:
-    """
-    Return Mitsuba's table for spectra from colours (Jakob and Hanika 2019).
+    """Return Mitsuba's table for spectra from colours (Jakob and Hanika 2019).
 
     Returned are its side ``n``, the positions ``(n,)`` along the largest component, and the coefficients ``(3·n³, 3)``,
     all float32. Neither place nor form of the file is promised; ``mi.srgb_model_fetch`` for arrays would replace it.
@@ -317,8 +301,7 @@ def srgb_coefficients() -> tuple:
 
 
 def normal_edges(pi, si, ray, active) -> tuple:
-    """
-    Return two vectors in space along which the shading normal changes by ``si.dn_du`` and ``si.dn_dv``.
+    """Return two vectors in space along which the shading normal changes by ``si.dn_du`` and ``si.dn_dv``.
 
     They are ``mi.Vector3f``; ``si`` is of ``pi.compute_surface_interaction(ray)`` with ``RayFlags.dNSdUV``. The vectors
     are ``dp_du`` and ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in
@@ -350,8 +333,7 @@ def replay_integrator() -> type:
 
 
 def written_in_python(integrator) -> bool:
-    """
-    Return whether an integrator is written in Python upon Mitsuba's base classes.
+    """Return whether an integrator is written in Python upon Mitsuba's base classes.
 
     ``sample`` of such an integrator takes a mode. These classes are loaded anew with a variant, so that ``isinstance``
     cannot name them; ``CppADIntegrator``, their common base, is an internal class.
@@ -374,8 +356,7 @@ def samples_in_python(integrator) -> bool:
 
 
 def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
-    """
-    Put samples into an image block, with further channels ``aovs``.
+    """Put samples into an image block, with further channels ``aovs``.
 
     Mitsuba's integrators in Python do this in a function of their own, for all variants and films
     (``ADIntegrator._splat_to_block``).
@@ -390,8 +371,7 @@ def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
 
 
 def objects_of(scene) -> list:
-    """
-    Return all objects of a loaded scene, each once, wherever they hide (in a ``twosided``, a ``bumpmap``, …).
+    """Return all objects of a loaded scene, each once, wherever they hide (in a ``twosided``, a ``bumpmap``, …).
 
     They are the keys of ``hierarchy`` of ``mi.traverse``, which is not in the manual and lists some twice.
     """
@@ -401,15 +381,12 @@ def objects_of(scene) -> list:
 
 
 def is_instance(shape) -> bool:
-    """
-    Return whether a shape is an ``instance`` of a ``shapegroup``, by the name of its class, which is not promised.
-    """
+    """Return whether a shape is an ``instance`` of a ``shapegroup``, by the name of its class (not promised)."""
     return shape.class_name() == "Instance"
 
 
 def is_shared(holder: list) -> bool:
-    """
-    Return whether anything but the list ``holder`` refers to its first item, an object of Mitsuba's own.
+    """Return whether anything but the list ``holder`` refers to its first item, an object of Mitsuba's own.
 
     Classes of Mitsuba's objects allow no weak references, but references from C++ count in Python, too. The number that
     ``sys.getrefcount`` adds by itself differs between versions of Python, so it is measured on a new object.
@@ -422,8 +399,7 @@ def _references(holder: list) -> int:
 
 
 def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -> tuple:
-    """
-    Return the configuration and the state of a parsed scene file, before anything is built.
+    """Return the configuration and the state of a parsed scene file, before anything is built.
 
     ``defines`` are its ``<default>`` values. ``mi.parser`` is new in 3.8 and still changes.
     """
@@ -452,8 +428,7 @@ def build_as(config, parallel: bool, optimize: bool) -> None:
 
 
 def properties_of(state, object_type=None) -> list:
-    """
-    Return the properties (``mi.Properties``) of all objects of a parsed scene, or of one ``mi.ObjectType``.
+    """Return the properties (``mi.Properties``) of all objects of a parsed scene, or of one ``mi.ObjectType``.
 
     Changing them changes the scene.
     """
@@ -466,8 +441,7 @@ def parsed_files(state) -> list[str]:
 
 
 def property_kind(props, key: str) -> str:
-    """
-    Return the type of a parsed parameter as a word.
+    """Return the type of a parsed parameter as a word.
 
     It is ``number``, ``colour``, ``text``, ``object`` (nested or referred to) or ``other``.
     """
@@ -483,8 +457,7 @@ def property_kind(props, key: str) -> str:
 
 @contextlib.contextmanager
 def film_size(sensor, width: int, height: int):
-    """
-    Give the film of a loaded sensor another size (pixels) while the context is open; yield whether that is possible.
+    """Give the film of a loaded sensor another size (pixels) while the context is open; yield whether that is possible.
 
     The parameter ``film.size`` is not in the manual, and a film with a crop window keeps its size.
     """
@@ -505,8 +478,7 @@ def film_size(sensor, width: int, height: int):
 
 
 def one_sentence(error: BaseException) -> str:
-    """
-    Return the message of an error without the layers around it, whose form is not promised.
+    """Return the message of an error without the layers around it, whose form is not promised.
 
     Mitsuba prefixes source lines (``[file.cpp:12]``), embeds Python tracebacks, and hides the cause of an error at
     render time behind ``drjit.custom(...) error``. Errors that keep their type would replace this.

@@ -1,5 +1,4 @@
-"""
-Discovery of tasks, plugins and studies, which are never listed.
+"""Discovery of tasks, plugins and studies, which are never listed.
 
 A part that ships is found by its place, a module of a package (``mi_diffind.tasks``, ``mi_diffind.plugins``,
 ``mi_diffind.studies``); a part of another package by an entry point of the group of that name, in its
@@ -19,8 +18,7 @@ from collections.abc import Iterable
 
 
 def modules(package: str, ignored: tuple[str, ...] = ()) -> dict[str, str]:
-    """
-    Return name → full name of the modules of ``package`` and of the entry points of the group ``package``.
+    """Return name → full name of the modules of ``package`` and of the entry points of the group ``package``.
 
     The package's own modules come first, in alphabetical order, without the ``ignored`` ones and those that begin with
     an underscore. Nothing is imported but the package itself. A name that exists already is left out with a warning.
@@ -44,8 +42,7 @@ def load(
     only: Iterable[str] | None = None,
     expected: type = object,
 ) -> dict:
-    """
-    Import :func:`modules` (or ``only`` some of them) and return name → the ``attribute`` that each declares.
+    """Import :func:`modules` (or ``only`` some of them) and return name → the ``attribute`` that each declares.
 
     A declaration is an instance of ``expected`` with that ``name``. A module of another package that cannot be imported
     or lacks the attribute is left out with a warning; one of this package that lacks it declares nothing.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 
 class DiffindError(Exception):
-    """
-    Bad input, or a place that cannot be written.
+    """Bad input, or a place that cannot be written.
 
     The message is one sentence: the file or the parameter, what was found, what is allowed. The command line prints it
     and ends with exit code 2.
@@ -17,8 +16,7 @@ class UsageError(DiffindError):
 
 
 def reason(error: BaseException, **names: str) -> str:
-    """
-    Return the message of ``error`` on one line of at most 100 characters, to be quoted in a sentence.
+    """Return the message of ``error`` on one line of at most 100 characters, to be quoted in a sentence.
 
     ``names`` (shown → in the error) are shown in place of longer ones.
     """

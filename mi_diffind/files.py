@@ -16,8 +16,7 @@ class OutputError(DiffindError, OSError):
 
 
 def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
-    """
-    Return the folder ``path``, made if ``create`` is set and its parent exists.
+    """Return the folder ``path``, made if ``create`` is set and its parent exists.
 
     Raises :class:`OutputError` if it does not exist or cannot be written. It is called before long work starts, so that
     a typing error costs seconds and not the result.
@@ -49,8 +48,7 @@ def writable_file(path: str | os.PathLike) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike):
-    """
-    Yield the path of a temporary file beside ``path``; rename it to ``path`` on success, remove it on failure.
+    """Yield the path of a temporary file beside ``path``; rename it to ``path`` on success, remove it on failure.
 
     The temporary file has the same extension. Raises :class:`OutputError` if the folder or the file cannot be written,
     as on a full disk.

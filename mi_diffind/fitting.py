@@ -1,5 +1,4 @@
-"""
-The training loop, one for all tasks: Adam on random batches, with schedules, checkpoints and guards.
+"""The training loop, one for all tasks: Adam on random batches, with schedules, checkpoints and guards.
 
 A task describes itself as a :class:`Problem`; :func:`fit` does the rest. Everything random is drawn from the seed, the
 step and the number of restarts, so that a run is repeatable and an interrupted one continues exactly where it stopped.
@@ -40,8 +39,7 @@ def exponential_like(u, rate: float = EXPONENTIAL_RATE):
 
 
 class Problem:
-    """
-    Base class of problems: the arrays that a task trains, its loss and its measurement.
+    """Base class of problems: the arrays that a task trains, its loss and its measurement.
 
     Most problems draw samples (:meth:`batch`) and evaluate the tables for them (:meth:`predict`). Other problems
     replace :meth:`loss`, for instance by the loss of a render: ``net`` may then be the parameters of a loaded scene
@@ -84,16 +82,14 @@ class Problem:
         raise NotImplementedError(f"{type(self).__name__} has neither batch() and predict() nor a loss() of its own")
 
     def predict(self, net, inputs) -> dict[str, list]:
-        """
-        Evaluate the tables for ``inputs``, in the form of the targets.
+        """Evaluate the tables for ``inputs``, in the form of the targets.
 
         ``net`` is a copy of the problem's, with entries that are folded already (:func:`.indirection.unfolded`).
         """
         raise NotImplementedError
 
     def loss(self, net, rng, size: int):
-        """
-        Return the loss of a step that may draw ``size`` samples from ``rng``.
+        """Return the loss of a step that may draw ``size`` samples from ``rng``.
 
         It is differentiable with respect to ``net``, an array or a list of arrays, whose entries are summed. By default
         it is the weighted mean of the differences between :meth:`predict` and the targets of :meth:`batch`, absolute or
@@ -115,8 +111,7 @@ class Problem:
 
 @dataclass
 class FitResult:
-    """
-    Record of a training: the best state and the history.
+    """Record of a training: the best state and the history.
 
     ``measured`` are the figures of the best state, reached at ``step`` of ``steps``. ``history`` lists the figures of
     all measurements with the loss (``None`` if it was not known).
@@ -148,8 +143,7 @@ class FitResult:
 
 @dataclass
 class _State:
-    """
-    State of a training: parameters and, for each, Adam's step count and moments.
+    """State of a training: parameters and, for each, Adam's step count and moments.
 
     They are Dr.Jit arrays (never written in place, so a snapshot costs nothing) or, from a checkpoint, NumPy arrays.
     """
@@ -170,8 +164,7 @@ def fit(
     title=None,
     seconds: float | None = None,
 ) -> FitResult:
-    """
-    Train ``problem.net`` in place and leave the best state of the training in it.
+    """Train ``problem.net`` in place and leave the best state of the training in it.
 
     ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
     read first (it must belong to the same settings). ``title`` stands before the progress bar. With ``seconds``, the

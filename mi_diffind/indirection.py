@@ -1,5 +1,4 @@
-"""
-Differentiable arrays, and the indirection: one read with the output of another.
+"""Differentiable arrays, and the indirection: one read with the output of another.
 
 Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH Asia 2023. Both classes are
 ``drjit.nn`` modules: PyTrees with dotted parameter names, so that ``opt.update(net)`` hands the tables to an optimiser,
@@ -28,8 +27,7 @@ INITIALISATIONS = ("ramp", "constant", "random")
 
 
 def fold(x):
-    """
-    Fold any real number into ``[0, 1)`` by a triangle wave of period 2 and slope ±1.
+    """Fold any real number into ``[0, 1)`` by a triangle wave of period 2 and slope ±1.
 
     ``fold(x) = x`` on ``[0, 1)``, ``fold(1) = 1 − 2⁻²³``, ``fold(−x) = fold(x)`` up to rounding. NaN and infinities
     become 0.
@@ -43,8 +41,7 @@ def fold(x):
 
 
 class DifferentiableArray(nn.Module):
-    """
-    Table that is read at a continuous coordinate by multilinear interpolation.
+    """Table that is read at a continuous coordinate by multilinear interpolation.
 
     It is differentiable with respect to its entries and to the coordinate.
 
@@ -160,8 +157,7 @@ class DifferentiableArray(nn.Module):
         return result
 
     def unfolded(self, change=None) -> DifferentiableArray:
-        """
-        Return a copy that holds its entries folded already, after ``change`` (a function of a flat array) if given.
+        """Return a copy that holds its entries folded already, after ``change`` (a function of a flat array) if given.
 
         It is differentiable with respect to the entries of this array. For floats.
         """
@@ -173,8 +169,7 @@ class DifferentiableArray(nn.Module):
         return result
 
     def rounded(self, bits: int) -> DifferentiableArray:
-        """
-        Return a copy whose entries in [0, 1], after the fold, are rounded as :meth:`quantised` stores them.
+        """Return a copy whose entries in [0, 1], after the fold, are rounded as :meth:`quantised` stores them.
 
         Gradients are those of the unrounded entries (straight-through estimation): training takes rounding into
         account.
@@ -188,8 +183,7 @@ class DifferentiableArray(nn.Module):
         return self.unfolded(change)
 
     def quantised(self, bits: int) -> DifferentiableArray:
-        """
-        Return a copy in ``"uint8"`` storage, of entries that are numbers in [0, 1] after the fold.
+        """Return a copy in ``"uint8"`` storage, of entries that are numbers in [0, 1] after the fold.
 
         Each entry is stored in ``bits`` bits, 1 to 8, which stand for multiples of ``1 / (2^bits − 1)``, whatever range
         is used; :attr:`is_pointer` holds.
@@ -200,8 +194,7 @@ class DifferentiableArray(nn.Module):
         return self.from_numpy(codes, type(self.data), self.border, "uint8", False, affine, bits, **self._form())
 
     def to(self, storage: str) -> DifferentiableArray:
-        """
-        Return a copy in another storage form.
+        """Return a copy in another storage form.
 
         Leaving ``"float32"`` applies the fold for good: quantised entries are ``fold(entry)``, and inference needs no
         non-linearity. ``"uint8"`` is for reading only.
@@ -218,8 +211,7 @@ class DifferentiableArray(nn.Module):
 
     @classmethod
     def from_numpy(cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None, bits=8):
-        """
-        Return an allocated array holding ``values`` of shape ``(N_1, …, N_d, channels)``.
+        """Return an allocated array holding ``values`` of shape ``(N_1, …, N_d, channels)``.
 
         With ``storage="uint8"``, ``quantization = (scale, offset)`` says that ``values`` are already bytes, and
         ``bits`` < 8 that they need only so many bits each in memory.
@@ -271,8 +263,7 @@ class DifferentiableArray(nn.Module):
         return lookup.unpack(self.data.numpy(), self.resolution, self.channels)
 
     def at(self, x) -> DifferentiableArray:
-        """
-        Fix the *last* coordinate at ``x``, an array of size 1, and return the array of one dimension less.
+        """Fix the *last* coordinate at ``x``, an array of size 1, and return the array of one dimension less.
 
         ``array.at(x)([a]) == array([a, x])`` up to rounding. The result is in single precision, its entries folded
         already, differentiable with respect to the entries and to ``x``. Raises ``ValueError`` for an array of one
@@ -300,8 +291,7 @@ class DifferentiableArray(nn.Module):
         return result
 
     def entry(self, index, active=True) -> list:
-        """
-        Return the channels of entries without interpolation, folded.
+        """Return the channels of entries without interpolation, folded.
 
         ``index`` is the number of an existing entry, the last axis fastest. Differentiable with respect to the entries
         of float storage.
@@ -347,8 +337,7 @@ class DifferentiableArray(nn.Module):
 
     @property
     def memory_nbytes(self) -> int:
-        """
-        Bytes in memory, with padded channels and repeated entries.
+        """Bytes in memory, with padded channels and repeated entries.
 
         Packed tables repeat entries so that one gather brings several corners
         (:func:`mi_diffind.lookup.packed_layout`).
@@ -363,8 +352,7 @@ class DifferentiableArray(nn.Module):
     # -- reading ----------------------------------------------------------------------------------------------------
 
     def __call__(self, x, active=True, inside=False):
-        """
-        Read at ``x`` (see the class).
+        """Read at ``x`` (see the class).
 
         ``active`` masks lanes that must not access memory; they return 0. ``inside``: all coordinates are known to lie
         in [0, 1], as those from bytes may be.
@@ -409,8 +397,7 @@ class DifferentiableArray(nn.Module):
 
 
 class Indirection(nn.Module):
-    """
-    Differentiable indirection, ``y = C[fold(P)[x]]``.
+    """Differentiable indirection, ``y = C[fold(P)[x]]``.
 
     A read of the primary arrays ``P`` gives the coordinate at which the cascaded array ``C`` is read.
 
@@ -511,8 +498,7 @@ def unfolded(net):
 
 
 def rounded(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
-    """
-    Return a copy of ``net`` for training that takes rounding into account (:meth:`.DifferentiableArray.rounded`).
+    """Return a copy of ``net`` for training that takes rounding into account (:meth:`.DifferentiableArray.rounded`).
 
     Entries of each primary are rounded to its ``bits`` (default: 8), the cascaded array's to 8.
     """
@@ -527,8 +513,7 @@ def stored_form(net: Indirection, bits: Sequence[int] | None = None) -> Indirect
 
 
 def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.ndarray:
-    """
-    Return entries equal to their own position, ``(N_1, …, N_d, channels)``.
+    """Return entries equal to their own position, ``(N_1, …, N_d, channels)``.
 
     Channel ``k`` runs along axis ``k mod d``.
     """
@@ -560,8 +545,7 @@ def padded_tensor(dtype, values: np.ndarray, resolution, channels: int):
 
 
 def aligned(shape, dtype) -> np.ndarray:
-    """
-    Return an uninitialised NumPy array that starts at a multiple of 64 bytes.
+    """Return an uninitialised NumPy array that starts at a multiple of 64 bytes.
 
     On the CPU, Dr.Jit uses NumPy's memory as it is, and from memory that is aligned less it gathers number by number
     instead of packet by packet: half the speed in single precision, a fifth in half precision.
@@ -573,8 +557,7 @@ def aligned(shape, dtype) -> np.ndarray:
 
 
 def coordinates_of(x, default=None):
-    """
-    Return coordinates as a list of single-precision arrays, and whether they were a cooperative vector.
+    """Return coordinates as a list of single-precision arrays, and whether they were a cooperative vector.
 
     Numbers become arrays like the others, or like ``default``.
     """

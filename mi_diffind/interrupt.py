@@ -10,8 +10,7 @@ import threading
 
 @contextlib.contextmanager
 def interruptible():
-    """
-    Yield a ``threading.Event`` that the first Ctrl-C sets; a second one raises ``KeyboardInterrupt`` as usual.
+    """Yield a ``threading.Event`` that the first Ctrl-C sets; a second one raises ``KeyboardInterrupt`` as usual.
 
     Outside of the main thread, where no signal arrives, the event is never set.
     """

@@ -1,5 +1,4 @@
-"""
-Multilinear reads of small tables: 1 to 4 dimensions, any number of channels, three storage forms.
+"""Multilinear reads of small tables: 1 to 4 dimensions, any number of channels, three storage forms.
 
 Conventions, the same everywhere in this package:
 
@@ -33,8 +32,7 @@ BORDERS = ("clamp", "repeat")
 
 
 def clamp(x, low: float, high: float):
-    """
-    Limit ``x`` to ``[low, high]``; NaN becomes ``low``.
+    """Limit ``x`` to ``[low, high]``; NaN becomes ``low``.
 
     Unlike ``dr.clip``, which propagates NaN, and unlike ``dr.fmin``/``dr.fmax``, whose gradient at a tie belongs to the
     bound, this keeps the gradient of ``x`` at the bounds themselves.
@@ -54,8 +52,7 @@ WIDE_BYTES = 2**20
 
 
 def packed_layout(resolution: Sequence[int], channels: int) -> tuple[int, int, int]:
-    """
-    Return the layout of a packed table of bytes: ``(inner, stride, words)``.
+    """Return the layout of a packed table of bytes: ``(inner, stride, words)``.
 
     A texel stores the ``2^inner`` corners of a cell along the last ``inner`` axes, each in ``stride`` bytes, in
     ``words`` words of 32 bits. One word may hold what fits (a one-channel bilinear read is a single gather), and up to
@@ -87,8 +84,7 @@ def gathers(resolution: Sequence[int], channels: int, storage: str, bits: int = 
 
 
 def _axis(x, n: int, border: str, inside: bool = False):
-    """
-    Return the cell, the next cell and the weight of the next one along an axis with ``n`` entries.
+    """Return the cell, the next cell and the weight of the next one along an axis with ``n`` entries.
 
     ``inside``: ``x`` is in [0, 1].
     """
@@ -108,8 +104,7 @@ def _axis(x, n: int, border: str, inside: bool = False):
 
 
 def _corners(axes, resolution):
-    """
-    Return the ``2^d`` pairs (texel index, weight) of a cell, built axis by axis so that products are shared.
+    """Return the ``2^d`` pairs (texel index, weight) of a cell, built axis by axis so that products are shared.
 
     Along an axis whose coordinate is a number that Dr.Jit knows, such as 0, only corners of weight other than zero.
     """
@@ -152,8 +147,7 @@ def read_float(
     transform=None,
     stored: int | None = None,
 ):
-    """
-    Read a table of 16- or 32-bit floats.
+    """Read a table of 16- or 32-bit floats.
 
     ``data`` is the flat array of shape ``(N_1·…·N_d·stored,)``, where ``stored`` is ``padded_channels(channels)``
     unless given, ``x`` the ``d`` coordinates. Returns a list of ``channels`` arrays of the coordinates' (single
@@ -167,8 +161,7 @@ def read_float(
 
 
 def fetch_float(data, channels: int, stored: int, active, transform, Float, index) -> list:
-    """
-    Return the channels of an entry of a flat array of floats as ``Float``.
+    """Return the channels of an entry of a flat array of floats as ``Float``.
 
     The array holds ``stored`` numbers an entry.
     """
@@ -196,8 +189,7 @@ def read_packed(
     active=True,
     inside: bool = False,
 ):
-    """
-    Read a table of bytes packed in ``UInt32`` words (:func:`pack`).
+    """Read a table of bytes packed in ``UInt32`` words (:func:`pack`).
 
     Channel ``k`` of the result is ``offset[k] + scale[k] · (interpolated byte)``. Differentiable with respect to ``x``
     only. ``inside``: all coordinates are known to lie in [0, 1], which saves a comparison.
@@ -284,8 +276,7 @@ def read_bits(
     inside: bool = False,
     bits: int = 4,
 ):
-    """
-    Read a table of fewer than 8 ``bits`` a channel (:func:`.bits.pack_bits`, in words of 32 bits and one word more).
+    """Read a table of fewer than 8 ``bits`` a channel (:func:`.bits.pack_bits`, in words of 32 bits and one word more).
 
     The table takes no more memory than these bits. A corner takes one gather if entries never cross the end of a word,
     else two. Otherwise like :func:`read_packed`.
@@ -339,8 +330,7 @@ def entry_packed(
 
 
 def quantize(values, channels: int):
-    """
-    Quantise a NumPy array of shape ``(…, channels)`` to bytes, with one affine map a channel.
+    """Quantise a NumPy array of shape ``(…, channels)`` to bytes, with one affine map a channel.
 
     Returns ``(codes, scale, offset)`` with ``values ≈ offset + scale · codes``, at most half a ``scale`` off; the
     smallest and the largest value of each channel are hit exactly.
@@ -357,8 +347,7 @@ def quantize(values, channels: int):
 
 
 def pack(codes, border: Sequence[str]):
-    """
-    Pack a NumPy ``uint8`` array of shape ``(N_1, …, N_d, c)`` into the words that :func:`read_packed` reads.
+    """Pack a NumPy ``uint8`` array of shape ``(N_1, …, N_d, c)`` into the words that :func:`read_packed` reads.
 
     Returns a flat ``uint32`` array in the layout of :func:`packed_layout`, the last axis fastest. See :func:`unpack`
     for the bits.
@@ -382,8 +371,7 @@ def pack(codes, border: Sequence[str]):
 
 
 def unpack(words, resolution: Sequence[int], channels: int):
-    """
-    Return the bytes of a packed table, ``(N_1, …, N_d, channels)``.
+    """Return the bytes of a packed table, ``(N_1, …, N_d, channels)``.
 
     Byte 0 of a word lies in bits 15 to 22, byte 1 in bits 7 to 14, and bytes 2 and 3 there once the word is rotated by
     16.

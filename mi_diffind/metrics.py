@@ -21,8 +21,7 @@ def mae(reference: np.ndarray, image: np.ndarray) -> float:
 
 
 def flip(reference: np.ndarray, image: np.ndarray) -> float:
-    """
-    Return the mean LDR-FLIP (Andersson et al. 2020; 0: equal to the eye) of linear images as a screen displays them.
+    """Return the mean LDR-FLIP (Andersson et al. 2020; 0: equal to the eye) of linear images as a screen displays them.
 
     They are encoded by :func:`.srgb.for_display`; the viewing distance is the default one, 67 pixels per degree.
     """
@@ -39,8 +38,7 @@ def flip_shown(reference: np.ndarray, image: np.ndarray) -> float:
 
 
 def ssim(reference: np.ndarray, image: np.ndarray) -> float | None:
-    """
-    Return the structural similarity (Wang et al. 2004) of values in [0, 1], the mean over channels.
+    """Return the structural similarity (Wang et al. 2004) of values in [0, 1], the mean over channels.
 
     ``None`` if scikit-image is not installed or the image is smaller than the window of 7 texels.
     """
@@ -62,8 +60,4 @@ def angle(reference: np.ndarray, image: np.ndarray) -> float:
 
 def compare(reference: np.ndarray, image: np.ndarray) -> dict[str, float]:
     """Return ``psnr_db``, ``flip`` and ``mae`` of two images."""
-    return {
-        "psnr_db": psnr(reference, image),
-        "flip": flip(reference, image),
-        "mae": mae(reference, image),
-    }
+    return {"psnr_db": psnr(reference, image), "flip": flip(reference, image), "mae": mae(reference, image)}

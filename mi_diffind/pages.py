@@ -1,5 +1,4 @@
-"""
-Arrays whose resolution follows the content: pages of different resolutions behind a small index.
+"""Arrays whose resolution follows the content: pages of different resolutions behind a small index.
 
 The domain is divided into ``A × B × …`` pages. Each has its own grid of entries, which includes the borders of the
 page: one entry makes it constant, and two neighbouring pages both hold the values on their border, so that they join
@@ -50,8 +49,7 @@ PART, ESTIMATED = 4096, 1024
 
 
 class PagedArray(DifferentiableArray):
-    """
-    A :class:`.DifferentiableArray` of 1 to 3 dimensions that consists of pages of different resolutions.
+    """A :class:`.DifferentiableArray` of 1 to 3 dimensions that consists of pages of different resolutions.
 
     Parameters:
         sizes: entries along each side of each page, whole numbers of shape ``(A, B, …, d)``, at most 256, 32 or 16 in
@@ -114,8 +112,7 @@ class PagedArray(DifferentiableArray):
         return result, self.channels
 
     def _words(self, dtype):
-        """
-        Return the index: for each page, its first entry and, in the lower bits, its sides less one.
+        """Return the index: for each page, its first entry and, in the lower bits, its sides less one.
 
         The last side has the lowest bits.
         """
@@ -144,8 +141,7 @@ class PagedArray(DifferentiableArray):
         sizes=None,
         shift=0.0,
     ):
-        """
-        Return an allocated array of pages of ``sizes`` that holds ``values``, ``(entries, channels)``.
+        """Return an allocated array of pages of ``sizes`` that holds ``values``, ``(entries, channels)``.
 
         Other parameters are those of :meth:`.DifferentiableArray.from_numpy`. Bytes are never held several times.
         """
@@ -286,8 +282,7 @@ def page_counts(shape: Sequence[int]) -> tuple[int, ...]:
 
 
 def page_sizes(values: np.ndarray, border: tuple[str, str], entries: float) -> np.ndarray:
-    """
-    Choose the resolutions, ``(A, B, 2)``, of the pages of an image ``values``, ``(height, width, k)``.
+    """Choose the resolutions, ``(A, B, 2)``, of the pages of an image ``values``, ``(height, width, k)``.
 
     All pages together have at most ``entries`` entries, but at least one each. The choice has the smallest squared
     error of all channels together, if entries are fitted to the image and read linearly.
@@ -296,8 +291,7 @@ def page_sizes(values: np.ndarray, border: tuple[str, str], entries: float) -> n
 
 
 def page_sizes_of(images: Sequence[np.ndarray], border: tuple[str, str], entries: float) -> list[np.ndarray]:
-    """
-    Choose the resolutions of the pages of several images that share the ``entries``.
+    """Choose the resolutions of the pages of several images that share the ``entries``.
 
     The choice has the smallest sum of the mean squared errors of the images; otherwise like :func:`page_sizes`.
     """
@@ -311,8 +305,7 @@ def page_sizes_of(images: Sequence[np.ndarray], border: tuple[str, str], entries
 
 
 def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest: float = 0.0) -> tuple[float, float]:
-    """
-    Estimate the gain of pages over one grid of as many ``entries``, in dB, and the PSNR of the pages.
+    """Estimate the gain of pages over one grid of as many ``entries``, in dB, and the PSNR of the pages.
 
     Entries of both are fitted to an image ``values``, ``(height, width, k)``, and read linearly. ``rest`` is a mean
     squared error that both have in addition. Errors are those of all channels together. The estimate uses at most 1024
@@ -333,8 +326,7 @@ def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest:
 
 
 def _allocated(errors: np.ndarray, entries: float) -> np.ndarray:
-    """
-    Return the option that each page takes, by Lagrange's method.
+    """Return the option that each page takes, by Lagrange's method.
 
     A page takes the option that minimises ``error + λ · entries``, with the smallest λ that leads to at most
     ``entries``. Where many equal pages want more at the same λ, the first of them get it.
@@ -354,8 +346,7 @@ def _allocated(errors: np.ndarray, entries: float) -> np.ndarray:
 
 
 def page_entries(values: np.ndarray, border: tuple[str, str], sizes: np.ndarray) -> np.ndarray:
-    """
-    Return the entries, ``(entries, k)``, of pages of ``sizes``, ``(A, B, 2)``, that reproduce an image best.
+    """Return the entries, ``(entries, k)``, of pages of ``sizes``, ``(A, B, 2)``, that reproduce an image best.
 
     They have the smallest squared error to ``values``, ``(height, width, k)``, when they are read with a ``shift`` of
     half a texel (:func:`page_shift`).
@@ -403,8 +394,7 @@ def _tents(n: int) -> np.ndarray:
 
 
 def _windows(values: np.ndarray, border: tuple[str, str]) -> np.ndarray:
-    """
-    Return the samples of each page, its border included, ``(pages, k, SAMPLES + 1, SAMPLES + 1)``.
+    """Return the samples of each page, its border included, ``(pages, k, SAMPLES + 1, SAMPLES + 1)``.
 
     They are texels, or interpolated between texels if pages are no whole number of texels wide.
     """

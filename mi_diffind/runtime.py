@@ -1,5 +1,4 @@
-"""
-Choice of the LLVM library that Dr.Jit loads, and registration of the plugins.
+"""Choice of the LLVM library that Dr.Jit loads, and registration of the plugins.
 
 On a CPU, Dr.Jit compiles through LLVM, which it looks for the moment ``drjit`` is imported. Dr.Jit 1.5 accepts LLVM 15
 to 18, but the first kernel with a minimum or maximum then aborts the whole process (``Cannot select: fminimum``), which
@@ -52,8 +51,7 @@ _CORRECT = "correct the path, or unset the variable to use the one of 'pip insta
 
 @dataclass(frozen=True)
 class Choice:
-    """
-    Outcome of the search for LLVM.
+    """Outcome of the search for LLVM.
 
     ``path`` is the library to use, or ``None`` to leave the search to Dr.Jit (platforms that we do not search);
     ``origin`` says where it was found; ``problem`` is a sentence for the user if no library is usable.
@@ -65,8 +63,7 @@ class Choice:
 
 
 def library_version(path: str) -> int | None:
-    """
-    Return the major version of the LLVM library at ``path``.
+    """Return the major version of the LLVM library at ``path``.
 
     15 if it is older than 16 (when ``LLVMGetVersion`` was added), ``None`` if it is no loadable LLVM library.
     """
@@ -109,8 +106,7 @@ def _newest_first(paths) -> list[str]:
 
 
 def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, version=library_version) -> Choice:
-    """
-    Choose the LLVM library: an explicit setting wins, then pip's, then the system's. Changes nothing.
+    """Choose the LLVM library: an explicit setting wins, then pip's, then the system's. Changes nothing.
 
     The arguments exist for tests: the environment, the two searches and the function that reads a version.
     """
@@ -140,9 +136,7 @@ def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, 
             too_old.append(path)
     seen = f" (found only {too_old[0]}, which is too old)" if too_old else ""
     return Choice(
-        None,
-        "none",
-        f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}.",
+        None, "none", f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}."
     )
 
 
@@ -155,8 +149,7 @@ def llvm_problem() -> str | None:
 
 
 def install(register_plugins: Callable[[], None]) -> None:
-    """
-    Make Dr.Jit start with a usable LLVM, and register the plugins as soon as Mitsuba is imported.
+    """Make Dr.Jit start with a usable LLVM, and register the plugins as soon as Mitsuba is imported.
 
     ``import mi_diffind`` calls this, whether Dr.Jit and Mitsuba have been imported already or will be; it imports
     neither.
@@ -175,8 +168,7 @@ def install(register_plugins: Callable[[], None]) -> None:
 
 
 class _Hook(importlib.abc.MetaPathFinder):
-    """
-    Context around the first import of each of some packages.
+    """Context around the first import of each of some packages.
 
     A search for a package (``importlib.util.find_spec``) is no import, and an import that fails may be tried again.
     """
@@ -226,8 +218,7 @@ def _starting_drjit():
 
 
 def correct_llvm() -> Choice:
-    """
-    Make Dr.Jit, which has been imported already, use the library that :func:`choose_llvm` names.
+    """Make Dr.Jit, which has been imported already, use the library that :func:`choose_llvm` names.
 
     Raises ``ImportError`` with one sentence if Dr.Jit already runs kernels on, or holds objects of, an LLVM that would
     abort. Warns (``RuntimeWarning``) and switches the LLVM backend off if there is no usable library.
@@ -267,8 +258,7 @@ def _hidden_llvm():
 
 
 def _restart_llvm(path: str | None) -> None:
-    """
-    Stop Dr.Jit's LLVM backend and start it again with the library at ``path`` (``None``: leave it off).
+    """Stop Dr.Jit's LLVM backend and start it again with the library at ``path`` (``None``: leave it off).
 
     Dr.Jit has no Python function for this, its library has (:class:`.compat.JitCore`). Variables survive the restart,
     registered scene objects and kernels do not.
@@ -302,8 +292,7 @@ def _restart_llvm(path: str | None) -> None:
 
 
 def array_module(variant: str | None = None):
-    """
-    Return the module of differentiable Dr.Jit types to compute with outside of Mitsuba.
+    """Return the module of differentiable Dr.Jit types to compute with outside of Mitsuba.
 
     It is ``drjit.llvm.ad`` or ``drjit.cuda.ad``, that of a Mitsuba ``variant``; ``None`` means the GPU if there is one.
     Raises :class:`~mi_diffind.errors.UsageError` if that cannot run here.

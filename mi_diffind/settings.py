@@ -17,8 +17,7 @@ class FittingError(DiffindError, RuntimeError):
 
 @dataclass(frozen=True)
 class FitSettings:
-    """
-    Settings of a training.
+    """Settings of a training.
 
     ``lr`` is Adam's learning rate; ``schedule`` changes it: ``"constant"``, ``"cosine"`` (to zero) or ``"plateau"``
     (halved when the loss has not improved for a tenth of the steps). ``measure_every`` and ``check_every`` are the

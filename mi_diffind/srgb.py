@@ -1,5 +1,4 @@
-"""
-The sRGB transfer function (IEC 61966-2-1) and its inverse, for numbers, NumPy arrays and Dr.Jit arrays.
+"""The sRGB transfer function (IEC 61966-2-1) and its inverse, for numbers, NumPy arrays and Dr.Jit arrays.
 
 Importing this module imports no Dr.Jit: an array that is not NumPy's brings its own.
 """
@@ -16,8 +15,7 @@ POLYNOMIAL = (
 
 
 def from_linear(values, fused: bool = True):
-    """
-    Encode linear ``values``. Values above 1 follow the same power, negative ones the straight part.
+    """Encode linear ``values``. Values above 1 follow the same power, negative ones the straight part.
 
     For Dr.Jit arrays, ``fused`` rounds the last product and difference once, not twice; trainings differ in that.
     """

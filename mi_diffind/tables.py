@@ -1,5 +1,4 @@
-"""
-The table file: a ``.npz`` archive of one trained result (readable by ``numpy.load``, never pickled).
+"""The table file: a ``.npz`` archive of one trained result (readable by ``numpy.load``, never pickled).
 
 It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``;
 entries with fewer than 8 bits are packed one after the other (:func:`.bits.pack_bits`). An array ``meta`` of UTF-8
@@ -42,8 +41,7 @@ class TableError(DiffindError, ValueError):
 
 @dataclass(frozen=True)
 class StoredArray:
-    """
-    One array as a file holds it.
+    """One array as a file holds it.
 
     ``entries`` have the shape ``(N_1, …, N_d, c)`` and the dtype of the ``storage`` form; ``border`` is one word an
     axis (default: ``"clamp"``). Bytes stand for ``offset + scale · byte``, one number a channel, and are stored with
@@ -68,8 +66,7 @@ class StoredArray:
         return StoredArray(array.numpy().astype(_DTYPES[array.storage]), array.border)
 
     def allocate(self, dtype, storage: str = "", fold: bool = False) -> DifferentiableArray:
-        """
-        Return an array of the tensor type ``dtype`` with these entries, in a storage form ("": this one).
+        """Return an array of the tensor type ``dtype`` with these entries, in a storage form ("": this one).
 
         ``fold``: float entries pass through the fold, so that an optimiser may leave the range.
         """
@@ -126,8 +123,7 @@ PAGES = "_pages"
 
 
 def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArray]:
-    """
-    Return the stored form of an allocated array by name.
+    """Return the stored form of an allocated array by name.
 
     An array of pages gives two: its entries, and as ``NAME_pages`` the sizes of the pages, ``(A, …, d)``, with the
     borders.
@@ -145,8 +141,7 @@ def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArra
 def allocate_pages(
     entries: StoredArray, pages: StoredArray, dtype, shift=0.0, storage: str = "", fold: bool = False
 ) -> PagedArray:
-    """
-    Return the array of pages whose ``entries`` and sizes are stored (:func:`stored_arrays`).
+    """Return the array of pages whose ``entries`` and sizes are stored (:func:`stored_arrays`).
 
     Other parameters are those of :meth:`.StoredArray.allocate`. Raises ``ValueError`` if the two arrays do not match.
     """
@@ -182,8 +177,7 @@ def gathers_of(table: Table, name: str) -> int:
 
 @dataclass
 class Table:
-    """
-    Content of a table file.
+    """Content of a table file.
 
     Named ``arrays``, the ``task`` and the ``preset`` that they belong to, the ``settings`` of the training and its
     ``seed``, and the ``measured`` figures (units in the names, e.g. ``psnr_db``). ``path`` is the file that it was read
@@ -249,8 +243,7 @@ def save_table(path: str | os.PathLike, table: Table) -> None:
 
 
 def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[str, tuple] | None = None) -> Table:
-    """
-    Read and check a table file.
+    """Read and check a table file.
 
     ``task`` and ``shapes`` (array name → shape, ``None`` in place of a free dimension) say what is expected. Raises
     :class:`TableError` with one sentence on anything else: a file that is missing, truncated or no archive, an
@@ -391,10 +384,7 @@ def _array(archive, info, path, name: str, dtype: np.dtype, shape: tuple | None)
     with archive.open(info) as stream:
         try:
             version = np.lib.format.read_magic(stream)
-            reader = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }[version]
+            reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
             stored_shape, fortran, stored_dtype = reader(stream)
         except (ValueError, KeyError) as e:
             raise TableError(f'{path}: array "{name}" has a damaged header ({reason(e)})') from None

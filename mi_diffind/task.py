@@ -1,5 +1,4 @@
-"""
-Base classes of tasks, the registry of all tasks, and the function ``fit``.
+"""Base classes of tasks, the registry of all tasks, and the function ``fit``.
 
 A task is a ground truth, arrays that are fitted to it, and a table file that holds them. It declares itself as
 ``TASK``, a :class:`Task`, in the package ``mi_diffind/tasks/NAME`` or in a module that an entry point of the group
@@ -51,8 +50,7 @@ DATA = Path(__file__).resolve().parent / "data"
 
 @dataclass
 class FitRequest:
-    """
-    Request for one training.
+    """Request for one training.
 
     ``preset`` and its ``settings`` as they were changed, the module of Dr.Jit ``types`` to train with, the ``storage``
     form of the result ("": the task's own), and the task's own arguments (``options``, all of them). ``seconds`` limits
@@ -94,8 +92,7 @@ class Fitted:
 
 
 class Model:
-    """
-    Base class of the content of a table file, ready to be evaluated.
+    """Base class of the content of a table file, ready to be evaluated.
 
     ``table`` is what was read and checked, ``arrays`` its arrays by name, allocated for the tensor type ``dtype``. A
     task's own class builds from them what can be evaluated (:meth:`build`).
@@ -140,16 +137,14 @@ class Model:
         return {}, []
 
     def measure(self, **options) -> dict[str, float]:
-        """
-        Return errors against the truth, with units in the names (``psnr_db``).
+        """Return errors against the truth, with units in the names (``psnr_db``).
 
         Raises :class:`~mi_diffind.tables.TableError` if there is no truth at hand.
         """
         self._refuse("cannot be measured")
 
     def decode(self, output: Path, **options) -> list[tuple[Path, str]]:
-        """
-        Write the content in an ordinary format, and return each file with a line about it.
+        """Write the content in an ordinary format, and return each file with a line about it.
 
         Raises :class:`~mi_diffind.tables.TableError` if there is no such format, and
         :class:`~mi_diffind.errors.UsageError` for bad options.
@@ -163,8 +158,7 @@ class Model:
 
 
 class Task:
-    """
-    Base class of tasks. Class attributes describe the task, methods carry it out.
+    """Base class of tasks. Class attributes describe the task, methods carry it out.
 
     A task has to have a ``name`` (that of its package), a ``title`` (for help texts), its ``section`` in the paper,
     ``presets`` (the first is the default), and either :meth:`problem` and :meth:`table` or a ``fit.py``.
@@ -195,8 +189,7 @@ class Task:
         return dataclasses.replace(self.presets[preset], **given)
 
     def check(self, request: FitRequest) -> None:
-        """
-        Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
+        """Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
 
         Calls ``check`` of the task's ``fit.py`` if there is one.
         """
@@ -212,8 +205,7 @@ class Task:
         raise NotImplementedError
 
     def fit(self, request: FitRequest) -> Fitted:
-        """
-        Train, and measure the result in its storage form.
+        """Train, and measure the result in its storage form.
 
         Calls ``fit`` of the task's ``fit.py`` if there is one, else trains :meth:`problem` once.
         """
@@ -234,8 +226,7 @@ class Task:
     # -- files ------------------------------------------------------------------------------------------------------
 
     def load(self, path: str | os.PathLike) -> Table:
-        """
-        Read and check a file of this task, by ``load`` of ``files.py`` if there is one.
+        """Read and check a file of this task, by ``load`` of ``files.py`` if there is one.
 
         Raises :class:`~mi_diffind.tables.TableError`.
         """
@@ -249,8 +240,7 @@ class Task:
         return self._implementation("MODEL", self.files, "model") or Model
 
     def allocate(self, table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
-        """
-        Return the arrays of a checked table for the tensor type ``dtype``, by ``allocate`` of ``files.py`` if any.
+        """Return the arrays of a checked table for the tensor type ``dtype``, by ``allocate`` of ``files.py`` if any.
 
         ``storage`` is the storage form ("": the file's own).
         """
@@ -274,8 +264,7 @@ class Task:
         return self.model_class()(table, self.allocate(table, dtype, storage), dtype)
 
     def file(self, filename: str | os.PathLike = "", preset: str = "") -> Path:
-        """
-        Return the path ``filename``, or of the file that ships for ``preset`` ("": the default).
+        """Return the path ``filename``, or of the file that ships for ``preset`` ("": the default).
 
         Raises ``ValueError`` if no such file ships.
         """
@@ -288,8 +277,7 @@ class Task:
         return DATA / self.shipped[preset or next(iter(self.shipped))]
 
     def open(self, dtype, filename: str | os.PathLike = "", preset: str = "", storage: str = "") -> Model:
-        """
-        Return the model of ``filename``, or of the shipped tables of ``preset``, for the tensor type ``dtype``.
+        """Return the model of ``filename``, or of the shipped tables of ``preset``, for the tensor type ``dtype``.
 
         ``storage`` is the storage form ("": the file's own). Raises :class:`~mi_diffind.tables.TableError` or
         ``ValueError``.
@@ -329,8 +317,7 @@ def tasks() -> dict[str, Task]:
 
 
 def task_of(table: Table) -> Task:
-    """
-    Return the task of a table that was read.
+    """Return the task of a table that was read.
 
     Raises :class:`~mi_diffind.tables.TableError` if it is not installed.
     """
@@ -362,8 +349,7 @@ def fit(
     output: str | os.PathLike | None = None,
     **given,
 ) -> Fitted:
-    """
-    Train the tables of the task ``name`` by one of its presets ("": the default).
+    """Train the tables of the task ``name`` by one of its presets ("": the default).
 
     ``given`` are settings of the training (``steps``, ``lr``, …, see :class:`~mi_diffind.settings.FitSettings`) and the
     task's own arguments, in place of the preset's. Nothing is written but the ``checkpoint``; ``output`` only says

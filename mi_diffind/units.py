@@ -23,8 +23,7 @@ def parse_bpp(text: str | float) -> float:
 
 
 def parse_bytes(text: str | float) -> int:
-    """
-    Return a number of bytes, written as ``262144``, ``256k`` or ``1.5M``.
+    """Return a number of bytes, written as ``262144``, ``256k`` or ``1.5M``.
 
     k = 1024, M = 1024², G = 1024³, in either case, with or without ``B`` or ``iB``. Raises ``ValueError``.
     """
@@ -44,8 +43,7 @@ def parse_size(
     nbytes: str | float | None = None,
     bpp: str | float | None = None,
 ) -> int:
-    """
-    Return a size in bytes (at least 1) from exactly one of a compression ratio, bytes and bits per texel.
+    """Return a size in bytes (at least 1) from exactly one of a compression ratio, bytes and bits per texel.
 
     ``compression`` divides ``uncompressed_bytes``, ``bpp`` counts bits for each of ``texels``. Raises ``ValueError``.
     """

@@ -1,5 +1,4 @@
-"""
-Verbs of ``mi-diffind``, one a module.
+"""Verbs of ``mi-diffind``, one a module.
 
 Each module has two functions: ``add(commands)`` defines its options; ``run(arguments)`` does the work and returns what
 ``--json`` writes. The keys ``interrupted`` and ``failed`` of the result decide the exit code.

@@ -44,8 +44,7 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Render the views that are missing and return what is printed.
+    """Render the views that are missing and return what is printed.
 
     After Ctrl-C, the result lists the views that exist. Raises :class:`UsageError`, and as :mod:`mi_diffind.capture`
     does.

@@ -62,8 +62,7 @@ def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
 
 
 def set_variant(name: str | None) -> None:
-    """
-    Set the Mitsuba variant ``name``; ``None``: the RGB variant of the GPU if there is one, else of the CPU.
+    """Set the Mitsuba variant ``name``; ``None``: the RGB variant of the GPU if there is one, else of the CPU.
 
     Raises :class:`UsageError` if it cannot run here.
     """

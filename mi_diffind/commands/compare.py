@@ -24,8 +24,7 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Render the scene twice, write the pictures, and return the figures and the ``files``.
+    """Render the scene twice, write the pictures, and return the figures and the ``files``.
 
     Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.compare` does.
     """

@@ -25,8 +25,7 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Write the files and return their names as ``files``.
+    """Write the files and return their names as ``files``.
 
     Raises :class:`UsageError`, :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.files.OutputError`.
     """

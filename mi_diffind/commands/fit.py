@@ -59,8 +59,7 @@ def _default(task: Task, name: str) -> str:
 
 
 def run(arguments) -> dict:
-    """
-    Train, write the table file, and return its size, its accuracy and the history of the training.
+    """Train, write the table file, and return its size, its accuracy and the history of the training.
 
     After Ctrl-C, these are of the best state so far. Raises :class:`UsageError`,
     :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.

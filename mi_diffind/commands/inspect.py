@@ -26,8 +26,7 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Print what the file holds and return it.
+    """Print what the file holds and return it.
 
     Raises :class:`UsageError`, and :class:`~mi_diffind.tables.TableError` or :class:`~mi_diffind.scenes.SceneError` for
     a file that cannot be read.

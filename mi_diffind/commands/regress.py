@@ -25,8 +25,7 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Check each scene, or store its reference again.
+    """Check each scene, or store its reference again.
 
     Returns the result of each in ``scenes`` and the number that ``failed``. Raises :class:`UsageError`, and as
     :mod:`mi_diffind.regress` does.

@@ -51,8 +51,7 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Render the scene and write the image.
+    """Render the scene and write the image.
 
     Returns what is printed, the learned plugins of the scene and the times; after Ctrl-C, of the passes that are done.
     Raises :class:`UsageError`, and as :mod:`mi_diffind.scenes` does.
