@@ -1,10 +1,9 @@
 """
-Images of a scene from all sides, with the poses of the cameras, in the layout of NeRF's Blender data (Mildenhall et al.
-2020): ``transforms_train.json``, ``transforms_test.json`` and an image each view, with alpha.
+Views of a scene from all sides, with camera poses, in the layout of NeRF's Blender data (Mildenhall et al. 2020).
 
-What is captured is what the scene's surfaces look like in its light; lights, environments among them, are hidden and
-leave alpha 0. Poses and boxes are in the scene's own coordinates. A folder says in ``capture.json`` how it was made,
-and is gone on with, view by view, by the same call.
+A folder holds ``transforms_train.json``, ``transforms_test.json`` and an image with alpha for each view. Images show
+the scene's surfaces in its light; lights, environments included, are hidden and leave alpha 0. Poses and boxes are in
+the scene's own coordinates. ``capture.json`` records the settings; the same call continues a folder, view by view.
 """
 
 from __future__ import annotations
@@ -15,58 +14,58 @@ import itertools
 import json
 import math
 import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
 
 from . import __version__, compat, scenes, srgb
 from .errors import DiffindError, reason
 from .files import replacing, writable_folder, write_json
 from .interrupt import interruptible
 from .plugins.support import footprint
+from .poses import frame_of, orbit_directions, pose, sphere_directions
 
+#: Shapes of the camera path.
 PATHS = ("sphere", "orbit")
+#: Formats of the images.
 FORMATS = ("png", "exr")
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
 
-#: By so much of its longest side the box of what is captured is enlarged on each side, for what is written with it.
+#: Margin of the box that is written with the views, on each side, as a part of its longest side.
 MARGIN = 0.01
 
-#: Surfaces of others that a camera ray passes through to reach the objects that are asked for.
+#: Surfaces of other shapes that a camera ray may pass through on its way to the captured objects.
 THROUGH = 8
 
-#: The angle between neighbours on a Fibonacci lattice: the golden one.
-GOLDEN = math.pi * (3 - math.sqrt(5))
-
-#: The largest number of a half float, the type of the colours of an EXR.
+#: Largest number of a half float, the type of the colours of an EXR.
 LARGEST = 65504.0
 
-#: The file that says how a folder was made.
+#: File that records the settings of a folder.
 RECORD = "capture.json"
 
 
 class CaptureError(DiffindError, RuntimeError):
-    """A scene cannot be captured so, or not in this folder; the message is one sentence."""
+    """A scene cannot be captured with these settings, or not in this folder; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class CaptureSettings:
     """
-    How a scene is captured: ``views`` for training and ``test`` views, square images of ``resolution`` pixels and a
-    field of view ``fov`` (degrees), ``spp`` samples a pixel.
+    Settings of a capture: number and size of the views, samples, camera path.
 
-    Of ``objects``, ids of shapes, others only cast light and shadow on them; none: all surfaces that do not shine.
-    Cameras look at ``centre`` (default: that of their box) from a distance ``radius`` (default: from where a sphere
-    around them fills the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``.
-    ``elevation``: the lowest and the highest, degrees above the plane that ``up`` is normal to; an orbit swings from
-    the one to the other (default: −90, 90 for a sphere, 20, 20 for an orbit). ``format``: "png", as displayed, 8 bits,
-    or "exr", linear half floats.
+    ``views`` are for training, ``test`` further ones for tests: square images of ``resolution`` pixels with a field of
+    view ``fov`` (degrees) and ``spp`` samples a pixel. ``objects`` are the ids of the captured shapes (none: all
+    surfaces that do not shine); all other shapes only cast light and shadow on them. Cameras look at ``centre``
+    (default: the centre of the objects' box) from the distance ``radius`` (default: a sphere around the objects fills
+    the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and
+    the highest, degrees above the plane normal to ``up``; an orbit swings between them (default: −90, 90 for a sphere,
+    20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats.
     """
 
     views: int = 60
@@ -84,7 +83,7 @@ class CaptureSettings:
     format: str = "png"
 
     def check(self) -> None:
-        """Raise ``ValueError`` for what is not allowed."""
+        """Raise ``ValueError`` for values that are not allowed."""
         if self.path not in PATHS:
             raise ValueError(f'path: found "{self.path}", allowed are {", ".join(PATHS)}')
         if self.format not in FORMATS:
@@ -108,71 +107,15 @@ class CaptureSettings:
 
     @property
     def elevations(self) -> tuple[float, float]:
-        """``elevation`` or its default, degrees."""
+        """Lowest and highest elevation, degrees: ``elevation`` or its default."""
         return self.elevation or ((20.0, 20.0) if self.path == "orbit" else (-90.0, 90.0))
 
-
-# -- places -----------------------------------------------------------------------------------------------------------
-
-
-def directions(settings: CaptureSettings) -> tuple[np.ndarray, np.ndarray]:
-    """
-    From the centre to the cameras, unit vectors ``(views, 3)`` and ``(test, 3)``; z is up.
-
-    On a sphere, both are Fibonacci lattices; the one for training is turned about the axis by an angle that the seed
-    gives, that of the test views to where the nearest view for training is farthest. On an orbit, test views are
-    between those for training, as evenly as their numbers allow.
-    """
-    low, high = np.radians(settings.elevations)
-    if settings.path == "orbit":
-        test = (
-            np.floor((np.arange(settings.test) + 0.5) * settings.views / max(settings.test, 1)) + 0.5
-        ) / settings.views
-        return _orbit(np.arange(settings.views) / settings.views, low, high), _orbit(test, low, high)
-    turn = np.random.default_rng(settings.seed).uniform(0, 2 * np.pi)
-    train = _lattice(settings.views, low, high, turn)
-    turns = [_lattice(settings.test, low, high, turn + t) for t in np.linspace(0, 2 * np.pi, 90, endpoint=False)]
-    if not settings.test:
-        return train, turns[0]
-    return train, max(turns, key=lambda test: np.arccos(np.clip(test @ train.T, -1, 1)).min())
-
-
-def _lattice(count: int, low: float, high: float, turn: float) -> np.ndarray:
-    i = np.arange(count)
-    z = math.sin(low) + (math.sin(high) - math.sin(low)) * (i + 0.5) / max(count, 1)
-    return _unit(GOLDEN * i + turn, np.arcsin(z))
-
-
-def _orbit(turns: np.ndarray, low: float, high: float) -> np.ndarray:
-    azimuth = 2 * np.pi * turns
-    return _unit(azimuth, (low + high) / 2 - (high - low) / 2 * np.cos(azimuth))
-
-
-def _unit(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    flat = np.cos(elevation)
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
-
-
-def frame_of(up) -> np.ndarray:
-    """A rotation ``(3, 3)`` that takes z to ``up``; y up: azimuth 0 is z, and grows towards x."""
-    z = np.array(up, np.float64) / np.linalg.norm(up)
-    y = np.eye(3)[(int(np.argmax(np.abs(z))) + 2) % 3]
-    x = np.cross(y, z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-def pose(origin: np.ndarray, target: np.ndarray, up) -> np.ndarray:
-    """Camera to world, ``(4, 4)``, of a camera at ``origin`` that looks at ``target``, along its −z; y is up."""
-    z = (origin - target) / np.linalg.norm(origin - target)
-    x = np.cross(np.array(up, np.float64) / np.linalg.norm(up), z)
-    if np.linalg.norm(x) < 1e-6:  # straight from above or below
-        x = frame_of(up)[:, 0]
-    x = x - (x @ z) * z
-    x /= np.linalg.norm(x)
-    found = np.eye(4)
-    found[:3] = np.stack([x, np.cross(z, x), z, origin], axis=1)
-    return found
+    def directions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return unit vectors from the centre to the cameras, ``(views, 3)`` and ``(test, 3)``; z is up."""
+        low, high = np.radians(self.elevations)
+        if self.path == "orbit":
+            return orbit_directions(self.views, self.test, low, high)
+        return sphere_directions(self.views, self.test, low, high, self.seed)
 
 
 # -- capture ----------------------------------------------------------------------------------------------------------
@@ -181,8 +124,10 @@ def pose(origin: np.ndarray, target: np.ndarray, up) -> np.ndarray:
 @dataclass
 class Captured:
     """
-    What there is in a folder: files of images and how many there will be; those ``rendered`` now, in ``seconds``;
-    ``radius``, ``centre`` and ``box`` ``(2, 3)``; ``opaque``: no pixel that was rendered has alpha below 1.
+    State of a folder after a capture.
+
+    ``files`` of images and their ``total`` once complete; the number ``rendered`` now, in ``seconds``; ``radius``,
+    ``centre`` and ``box`` ``(2, 3)`` of the cameras' target; ``opaque``: no rendered pixel has alpha below 1.
     """
 
     folder: Path
@@ -204,25 +149,24 @@ def capture(
     progress: bool = True,
 ) -> Captured:
     """
-    Render the views of a scene file into ``folder``, made if its parent exists, in the variant that is set. Views that
-    are there, made with the same settings of the same scene, are kept; after Ctrl-C the one that is rendered is the
-    last.
+    Render the views of a scene file into ``folder``, in the variant that is set.
 
-    Raises :class:`CaptureError`, also for a folder that was made otherwise, ``ValueError`` for settings, and
-    :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.files.OutputError`.
+    The folder is created if its parent exists. Views of an earlier capture with the same settings of the same scene are
+    kept; after Ctrl-C the current view is the last. Raises :class:`CaptureError`, also for a folder with other
+    settings, ``ValueError`` for bad settings, and :class:`~mi_diffind.scenes.SceneError` and
+    :class:`~mi_diffind.files.OutputError`.
     """
-    import time
-
     settings.check()
     folder = writable_folder(folder, create=True)
-    record = _record(scene, settings, defines)
+    parsed = scenes.ParsedScene(scene, defines)
+    record = _record(parsed, settings)
     _check_record(folder, record)
-    loaded = _load(scene, defines)
+    loaded = _load(parsed)
     box = bounds(loaded, settings.objects)
     centre = box.mean(axis=0) if settings.centre is None else np.array(settings.centre, np.float64)
     radius = settings.radius or _reach(loaded, settings.objects, centre) / math.sin(math.radians(settings.fov) / 2)
     if not radius > 0:
-        raise CaptureError(f"{scene}: what is captured has no extent, --radius has to be given")
+        raise CaptureError(f"{scene}: the captured objects have no extent, --radius has to be given")
     camera = CaptureCamera(loaded, settings)
     write_json(folder / RECORD, record)
     splits, left = _plan(settings, centre, radius), []
@@ -230,7 +174,7 @@ def capture(
         writable_folder(folder / split, create=True)
         left += [(split, i) for i in range(len(views)) if not (folder / _name(split, i, settings)).is_file()]
     total, start, rendered, opaque = sum(map(len, splits.values())), time.perf_counter(), 0, bool(left)
-    bar = tqdm(total=total, initial=total - len(left), desc="capture", unit="view", disable=None if progress else True)
+    bar = scenes.progress_bar("capture", total, "view", progress, initial=total - len(left))
     _write_lists(folder, settings, splits, box)
     with interruptible() as stop, bar:
         for split, i in left:
@@ -247,13 +191,13 @@ def capture(
 
 
 def shapes_of(scene, objects: tuple[str, ...] = ()) -> list:
-    """The shapes with the ids ``objects``; of none: all shapes that are no lights. Raises :class:`CaptureError`."""
+    """Return the shapes with the ids ``objects`` (none: all that are no lights). Raises :class:`CaptureError`."""
     shapes = [s for s in scene.shapes() if not s.is_emitter()]
     if objects:
-        found = {s.id() for s in scene.shapes()}
+        ids = {s.id() for s in scene.shapes()}
         for name in objects:
-            if name not in found:
-                named = ", ".join(sorted(n for n in found if n and not n.startswith("_"))) or "none has one"
+            if name not in ids:
+                named = ", ".join(sorted(n for n in ids if n and not n.startswith("_"))) or "none has one"
                 raise CaptureError(f'objects: found "{name}", the ids of the scene\'s shapes are: {named}')
         shapes = [s for s in scene.shapes() if s.id() in objects]
     if not shapes:
@@ -262,11 +206,11 @@ def shapes_of(scene, objects: tuple[str, ...] = ()) -> list:
 
 
 def bounds(scene, objects: tuple[str, ...] = ()) -> np.ndarray:
-    """The corners ``(2, 3)`` of the box of :func:`shapes_of`. Raises :class:`CaptureError`."""
+    """Return the corners ``(2, 3)`` of the box of :func:`shapes_of`. Raises :class:`CaptureError`."""
     boxes = [_box(s) for s in shapes_of(scene, objects)]
     box = np.stack([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
     if not np.isfinite(box).all():
-        raise CaptureError("the box around what is captured is not finite: name the objects")
+        raise CaptureError("the box around the captured objects is not finite: name the objects")
     return box
 
 
@@ -275,8 +219,8 @@ def _box(shape) -> np.ndarray:
 
 
 def _reach(scene, objects: tuple[str, ...], centre: np.ndarray) -> float:
-    """How far shapes reach from a point: the vertices of meshes, the corners of the boxes of others."""
-    found = 0.0
+    """Return the largest distance of shapes from a point: of the vertices of meshes, of the corners of other boxes."""
+    reach = 0.0
     for shape in shapes_of(scene, objects):
         vertices = "vertex_positions"
         parameters = mi.traverse(shape) if isinstance(shape, mi.Mesh) and shape.vertex_count() else {}
@@ -284,34 +228,33 @@ def _reach(scene, objects: tuple[str, ...], centre: np.ndarray) -> float:
             points = np.array(parameters[vertices], np.float64).reshape(-1, 3)
         else:
             points = np.array(list(itertools.product(*_box(shape).T)))
-        found = max(found, float(np.linalg.norm(points - centre, axis=1).max()))
-    return found
+        reach = max(reach, float(np.linalg.norm(points - centre, axis=1).max()))
+    return reach
 
 
 def _plan(settings: CaptureSettings, centre: np.ndarray, radius: float) -> dict[str, list[np.ndarray]]:
-    """Split → poses."""
+    """Return the poses of each split, ``"train"`` and ``"test"``."""
     frame = frame_of(settings.up)
-    places = (d @ frame.T * radius + centre for d in directions(settings))
+    places = (d @ frame.T * radius + centre for d in settings.directions())
     return {
         split: [pose(origin, centre, settings.up) for origin in origins]
         for split, origins in zip(("train", "test"), places, strict=True)
     }
 
 
-def _load(path, defines: dict[str, str] | None):
-    """A scene whose integrators hide its lights."""
+def _load(parsed: scenes.ParsedScene):
+    """Load a scene so that its integrators hide its lights, and its meshes keep their ids."""
 
     def hide(state) -> None:
         for props in compat.properties_of(state, mi.ObjectType.Integrator):
-            # One that nests another leaves it to that one
-            if not any(compat.property_kind(props, key) == "object" for key in props):
+            if not scenes.nests_another(props):  # the nested one follows the paths
                 props["hide_emitters"] = True
 
-    return scenes.load(path, defines=defines, change=hide, merge=False)
+    return parsed.load(change=hide, merge=False)
 
 
 class CaptureCamera:
-    """A camera of its own for a loaded scene."""
+    """Camera of a capture, beside the sensors of the loaded scene."""
 
     def __init__(self, scene, settings: CaptureSettings):
         self.scene, self.settings = scene, settings
@@ -333,7 +276,7 @@ class CaptureCamera:
             self.integrator = _only(self.integrator, shapes_of(scene, settings.objects))
 
     def render(self, pose: np.ndarray, seed: int) -> np.ndarray:
-        """``(height, width, 4)``, float32: linear colours, multiplied by alpha, and alpha."""
+        """Render a view, ``(height, width, 4)``, float32: linear colours, multiplied by alpha, and alpha."""
         matrix = pose @ np.diag([-1.0, 1.0, -1.0, 1.0])  # Mitsuba's cameras look along +z, x to the left
         self.parameters["to_world"] = type(self.parameters["to_world"])(mi.ScalarTransform4f(matrix))
         self.parameters.update()
@@ -357,8 +300,10 @@ class CaptureCamera:
 
 def _only(inner, shapes: list):
     """
-    An integrator to which camera rays see but these ``shapes``: they pass through all others, up to :data:`THROUGH`
-    surfaces. ``inner``, which it hands the rays to right before the surface that they meet, knows all.
+    Return an integrator whose camera rays see only these ``shapes``, and pass through all others.
+
+    Rays pass through up to :data:`THROUGH` surfaces. Right before the first surface of the shapes, ``inner`` takes
+    over, which sees everything.
     """
     for shape in shapes:
         if hasattr(shape, "seen_by"):
@@ -370,9 +315,9 @@ def _only(inner, shapes: list):
         raise CaptureError(f"objects: the integrator {inner.class_name()} follows no rays from a camera, as path does")
     replays = compat.samples_in_python(inner)
 
-    class Only(mi.SamplingIntegrator):
+    class ObjectsOnly(mi.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):
-            ray, found = mi.Ray3f(ray), mi.Bool(False)
+            ray, hit = mi.Ray3f(ray), mi.Bool(False)
             left = mi.Bool(active)
             for _ in range(THROUGH):
                 si = scene.ray_intersect(ray, left)
@@ -380,34 +325,34 @@ def _only(inner, shapes: list):
                 for shape in shapes:
                     wanted |= (si.shape == mi.ShapePtr(shape)) | (si.instance == mi.ShapePtr(shape))
                 left &= si.is_valid()
-                found |= left & wanted
+                hit |= left & wanted
                 left &= ~wanted
                 ray.o = dr.select(left, si.spawn_ray(ray.d).o, ray.o)
             beginning = mi.RayDifferential3f(ray)
             if replays:
                 light, valid, *_ = inner.sample(
                     mode=dr.ADMode.Primal, scene=scene, sampler=sampler, ray=beginning,
-                    δL=None, δaovs=None, state_in=None, active=found,
+                    δL=None, δaovs=None, state_in=None, active=hit,
                 )  # fmt: skip
             else:
-                light, valid, _ = inner.sample(scene, sampler, beginning, medium, found)
-            return dr.select(found, light, 0), valid & found, []
+                light, valid, _ = inner.sample(scene, sampler, beginning, medium, hit)
+            return dr.select(hit, light, 0), valid & hit, []
 
-    return Only(mi.Properties("only"))
+    return ObjectsOnly(mi.Properties("only"))
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def _record(scene, settings: CaptureSettings, defines: dict[str, str] | None) -> dict:
-    """How a folder is made: the settings, and what else its images depend on."""
+def _record(parsed: scenes.ParsedScene, settings: CaptureSettings) -> dict:
+    """Return the record of a folder: the settings, and everything else that its images depend on."""
     digest = hashlib.sha256()
-    for file in scenes.files_of(scene, defines):
+    for file in parsed.files():
         digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
     return {
-        "scene": Path(scene).name,
+        "scene": parsed.path.name,
         "settings": json.loads(json.dumps(dataclasses.asdict(settings))),
-        "defines": dict(sorted((defines or {}).items())),
+        "defines": dict(sorted(parsed.defines.items())),
         "variant": mi.variant(),
         "versions": {"mitsuba": mi.__version__, "mi_diffind": __version__},
         "digest": digest.hexdigest(),
@@ -415,7 +360,7 @@ def _record(scene, settings: CaptureSettings, defines: dict[str, str] | None) ->
 
 
 def _check_record(folder: Path, record: dict) -> None:
-    """Raise :class:`CaptureError` if a folder holds a capture that was made otherwise, or another one's."""
+    """Raise :class:`CaptureError` if a folder holds a capture with other settings, or views of another program."""
     path = folder / RECORD
     if not path.is_file():
         if next(folder.glob("transforms*.json"), None) is not None:
@@ -433,18 +378,18 @@ def _check_record(folder: Path, record: dict) -> None:
 
 
 def _changed(before: dict, now: dict) -> list[str]:
-    found = []
+    changes = []
     for key, value in now.items():
         was = before.get(key)
         if key == "digest" and was != value:
-            found.append("the scene's files have changed")
+            changes.append("the scene's files have changed")
         elif isinstance(value, dict):
             was = was or {}
             keys = dict.fromkeys([*value, *was])
-            found += [f"{k}: {was.get(k)}, now {value.get(k)}" for k in keys if was.get(k) != value.get(k)]
+            changes += [f"{k}: {was.get(k)}, now {value.get(k)}" for k in keys if was.get(k) != value.get(k)]
         elif was != value:
-            found.append(f"{key}: {was}, now {value}")
-    return found
+            changes.append(f"{key}: {was}, now {value}")
+    return changes
 
 
 def _name(split: str, i: int, settings: CaptureSettings) -> str:
@@ -452,7 +397,7 @@ def _name(split: str, i: int, settings: CaptureSettings) -> str:
 
 
 def _write_lists(folder: Path, settings: CaptureSettings, splits: dict, box: np.ndarray) -> list[str]:
-    """Write ``transforms_*.json`` of the images that are there; returns their names."""
+    """Write ``transforms_*.json`` of the rendered images, and return their names."""
     margin = MARGIN * (box[1] - box[0]).max()
     head = {
         "camera_angle_x": math.radians(settings.fov),
@@ -460,18 +405,18 @@ def _write_lists(folder: Path, settings: CaptureSettings, splits: dict, box: np.
         "h": settings.resolution,
         "aabb": [(box[0] - margin).tolist(), (box[1] + margin).tolist()],
     }
-    found = []
+    names = []
     for split, poses in splits.items():
         there = [i for i in range(len(poses)) if (folder / _name(split, i, settings)).is_file()]
         frames = [{"file_path": f"./{_name(split, i, settings)}", "transform_matrix": poses[i].tolist()} for i in there]
-        found += [_name(split, i, settings) for i in there]
+        names += [_name(split, i, settings) for i in there]
         if poses:
             write_json(folder / f"transforms_{split}.json", {**head, "frames": frames})
-    return found
+    return names
 
 
 def _write(path: Path, image: np.ndarray) -> None:
-    """An image ``(height, width, 4)``, linear and multiplied by alpha: as sRGB, not multiplied, or as it is."""
+    """Write a linear image ``(height, width, 4)``, multiplied by alpha: PNG as sRGB with straight alpha, or EXR."""
     with replacing(path) as temporary:
         if path.suffix == ".png":
             from PIL import Image
@@ -489,16 +434,16 @@ def _write(path: Path, image: np.ndarray) -> None:
 
 
 def lines(captured: Captured) -> list[str]:
-    """What there is to say, as lines of text."""
+    """Return a summary as lines of text."""
     box = " to ".join(map(_point, captured.box))
     count = f"{len(captured.files)} of {captured.total} views"
-    found = [
+    text = [
         f"{captured.folder}: {count}, {captured.rendered} rendered now, {captured.seconds:.1f} s",
         f"  from a distance of {captured.radius:.4g} around {_point(captured.centre)}, box {box}",
     ]
     if captured.opaque:
-        found.append("  alpha is 1 everywhere: what is behind the objects became part of the views")
-    return found
+        text.append("  alpha is 1 everywhere: surfaces behind the objects became part of the views")
+    return text
 
 
 def _point(p: np.ndarray) -> str:

@@ -409,6 +409,13 @@ def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -
     return config, mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in (defines or {}).items()})
 
 
+def copy_parsed(state) -> tuple:
+    """Return a configuration and a copy of a parsed scene's state, since :func:`instantiate` changes the state."""
+    import mitsuba as mi
+
+    return mi.parser.ParserConfig(mi.variant()), mi.parser.ParserState(state)
+
+
 def instantiate(config, state):
     """Build the parsed scene: transform and merge it, in place, as ``mi.load_file`` does."""
     import mitsuba as mi

@@ -1,29 +1,29 @@
 """
-How deep the light of a scene has to be followed: the share of each bounce, and the depth that leaves out almost none.
+Light of a scene by path depth: the share of each bounce, and the smallest depth that leaves out almost nothing.
 
-Depths are counted as Mitsuba's ``max_depth`` counts them: 1 is emitted light alone, 2 adds direct light, 3 adds what
+Depths are counted like Mitsuba's ``max_depth``: 1 is emitted light alone, 2 adds direct light, 3 adds light that
 bounced twice, and so on.
 
-:func:`probe` follows paths through a coarse image once, to the scene's own depth, and books what each brings under the
-depth at which it arrived. The depths are therefore parts of the same paths: their differences are added bounces, never
+:func:`probe` follows paths through a coarse image once, to the scene's own depth, and adds the light of each vertex to
+the depth at which it arrives. All depths are parts of the same paths: their differences are added bounces, never
 noise, and one kernel serves all of them (an image for each depth would compile one for each).
 
-What a share is of (:func:`bounces`):
+Shares (:func:`bounces`) are parts of the scattered light:
 
-- *Scattered light*, which reached the camera by way of a surface. Emitted light seen directly (lamps, the sky) is in
-  the image at any depth, costs nothing, and is not counted: however bright, it hides nothing.
+- *Scattered light* reached the camera by way of a surface. Emitted light that is seen directly (lamps, the sky) is in
+  the image at any depth and costs nothing; it is not counted, so bright lamps hide no error.
 - Brightness is exposed as a photographer would, the median of the lit pixels at middle grey (0.18), and clipped at 1,
-  so that a few brilliant highlights do not hide the rest either. The unit of light in the file has no influence.
-- A mean hides what happens in a corner. The image is therefore also divided into tiles, 16 along its longer side, and
-  the tile that would lose most of its own light is reported. Tiles darker than a tenth of middle grey count as that.
+  so that a few brilliant highlights hide no error either. The unit of light in the file has no influence.
+- A mean hides errors in a corner. The image is therefore also divided into tiles, 16 along its longer side, and the
+  largest loss of any tile is reported. Tiles darker than a tenth of middle grey count as if they had that brightness.
 
-:func:`choose` takes the smallest depth at which the rest of the whole image is below the tolerance, and that of each
-tile below ten times the tolerance.
+:func:`choose` returns the smallest depth at which the rest of the whole image is below the tolerance, and the rest of
+each tile below ten times the tolerance.
 """
 
 from __future__ import annotations
 
-import os
+import dataclasses
 import threading
 import time
 from collections.abc import Callable
@@ -32,35 +32,37 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
 
 from . import scenes
 from .interrupt import interruptible
 
-#: Part of the scattered light that may be left out, and how many times that a single tile may lose of its own.
+#: Part of the scattered light that may be left out, and the multiple of it that a single tile may lose of its light.
 TOLERANCE, IN_A_TILE = 0.005, 10
 
-#: Integrators whose light the probe computes; those for media follow other paths.
+#: Integrators whose light the probe computes; integrators for media follow other paths.
 INTEGRATORS = ("path", "prb", "prb_basic", "prb_projective", "ptracer")
 
-#: Probe: tiles along the longer side of the image, pixels along the side of a tile, paths in a pixel, passes.
+#: Settings of the probe: tiles along the longer side of the image, pixels along the side of a tile, paths per pixel,
+#: passes.
 TILES, TILE, SPP, PASSES = 16, 8, 16, 4
 
-#: Depths told apart; what arrives deeper is booked under the last.
+#: Number of depths that are distinguished; light of deeper paths counts at the last.
 MAX_BINS = 64
 
-#: From this vertex on, a path goes on with a probability of its throughput, at most 0.95 (Russian roulette, unbiased).
+#: First vertex of Russian roulette: a path continues with the probability of its throughput, at most 0.95 (unbiased).
 ROULETTE = 8
 
+#: Luminance of middle grey, to which images are exposed.
 MIDDLE_GREY = 0.18
 
 
 @dataclass(frozen=True)
 class Bounce:
     """
-    The light that arrives at one ``depth`` (an emitter is seen at depth 1), as parts of all scattered light, 0 to 1:
-    its ``share``, the ``rest`` that a render up to this depth leaves out, and ``rest_in_a_tile``, the largest part that
-    any tile would lose of its own light. Emitted light has no share.
+    Light that arrives at one ``depth`` (1: an emitter is seen), as parts of all scattered light, 0 to 1.
+
+    ``share``: of this depth (emitted light has none); ``rest``: left out by a render up to this depth;
+    ``rest_in_a_tile``: the largest part that any tile would lose of its own light.
     """
 
     depth: int
@@ -70,7 +72,7 @@ class Bounce:
 
     @property
     def name(self) -> str:
-        """What kind of light it is, in the field's words."""
+        """Name of the light: emitted, direct, or the number of bounces."""
         return {1: "emitted", 2: "direct"}.get(self.depth, f"{self.depth - 1} bounces")
 
 
@@ -84,14 +86,15 @@ def probe(
     stop: threading.Event | None = None,
 ) -> np.ndarray:
     """
-    Luminance of a coarse image by depth, ``(depths, height, width)``, float64: ``[k]`` holds what arrives at depth
-    ``k + 1``. There are ``max_depth`` depths, at most :data:`MAX_BINS`: more, or infinitely many (-1), are followed all
-    the same, and the last entry gathers them.
+    Return the luminance of a coarse image by depth, ``(depths, height, width)``, float64; ``[k]`` is depth ``k + 1``.
 
-    A path tracer with emitter sampling and multiple importance sampling, as Mitsuba's ``path``: surfaces only, without
-    polarisation, and with the emitters that ``hide_emitters`` hides. Spectral variants scale all by one factor. ``spp``
-    paths start in each pixel, in ``passes``; ``on_pass()`` is called after each. The same seed gives the same numbers.
-    Raises :class:`~mi_diffind.scenes.SceneError`, and ``KeyboardInterrupt`` after a pass if ``stop`` is set.
+    There are ``max_depth`` depths, at most :data:`MAX_BINS`; deeper paths, or infinitely deep ones (-1), are followed
+    as well, and the last entry sums them.
+
+    The path tracer samples emitters and uses multiple importance sampling, as Mitsuba's ``path``: surfaces only,
+    without polarisation, and with the emitters that ``hide_emitters`` hides. Spectral variants scale all by one factor.
+    ``spp`` paths start in each pixel, in ``passes``; ``on_pass()`` is called after each. The same seed gives the same
+    numbers. Raises :class:`~mi_diffind.scenes.SceneError`, and ``KeyboardInterrupt`` after a pass if ``stop`` is set.
     """
     sensor = scene.sensors()[0]
     size = sensor.film().crop_size()
@@ -113,26 +116,25 @@ def probe(
 
 
 def _pass(scene, sensor, width: int, height: int, spp: int, seed: int, max_depth: int, depths: int):
-    """One pass of :func:`probe`: the sums over the paths of each pixel, ``depths · height · width`` numbers."""
+    """Return the sums over the paths of each pixel of one pass, ``depths · height · width`` numbers."""
     paths = width * height * spp
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, seed), paths)
     path = dr.arange(mi.UInt32, paths)
-    pixel = path // spp
+    pixel = path // dr.opaque(mi.UInt32, spp)  # opaque like all numbers that differ between probes: one kernel for all
     position = mi.Point2f(pixel % width, pixel // width) + sampler.next_2d()
     moment = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
     position /= mi.Point2f(width, height)
     ray, weight = sensor.sample_ray(moment, sampler.next_1d(), position, sampler.next_2d())
     light = dr.zeros(mi.Float, depths * paths)  # each path adds to its own entries: the same sums each time
-    limit = mi.UInt32(0xFFFFFFFF if max_depth < 0 else max_depth)
-    _follow(scene, sampler, mi.Ray3f(ray), mi.unpolarized_spectrum(weight), light, path, paths, depths, limit)
+    limits = [dr.opaque(mi.UInt32, n) for n in (paths, depths - 1, 0xFFFFFFFF if max_depth < 0 else max_depth)]
+    _follow(scene, sampler, mi.Ray3f(ray), mi.unpolarized_spectrum(weight), light, path, *limits)
     return dr.block_sum(light, spp)
 
 
 @dr.syntax
-def _follow(scene, sampler, ray, β, light, path, paths, depths, limit):
-    """Follow paths as ``mi.ad.integrators.prb`` does, and add the luminance that arrives at depth ``k + 1`` to
-    ``light[k · paths + path]``."""
+def _follow(scene, sampler, ray, β, light, path, paths, deepest, limit):
+    """Follow paths as ``mi.ad.integrators.prb`` does; add luminance of depth ``k + 1`` to ``light[k·paths + path]``."""
     context = mi.BSDFContext()
     depth, η, active = mi.UInt32(0), mi.Float(1), mi.Bool(True)
     si_prev = dr.zeros(mi.SurfaceInteraction3f)
@@ -146,7 +148,7 @@ def _follow(scene, sampler, ray, β, light, path, paths, depths, limit):
         ds = mi.DirectionSample3f(scene, si=si, ref=si_prev)
         mis = _mis(pdf_prev, scene.pdf_emitter_direction(si_prev, ds, ~delta_prev))
         Le = β * mis * mi.unpolarized_spectrum(ds.emitter.eval(si, active))
-        _add(light, Le, ray.wavelengths, dr.minimum(depth, depths - 1) * paths + path, active)
+        _add(light, Le, ray.wavelengths, dr.minimum(depth, deepest) * paths + path, active)
 
         # Emitters sampled from this vertex: one bounce more
         active &= (depth + 1 < limit) & si.is_valid()
@@ -156,7 +158,7 @@ def _follow(scene, sampler, ray, β, light, path, paths, depths, limit):
         value, pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), lit)
         mis = dr.select(ds.delta, 1, _mis(ds.pdf, pdf))
         Lr = β * mis * mi.unpolarized_spectrum(value) * mi.unpolarized_spectrum(weight)
-        _add(light, Lr, ray.wavelengths, dr.minimum(depth + 1, depths - 1) * paths + path, lit)
+        _add(light, Lr, ray.wavelengths, dr.minimum(depth + 1, deepest) * paths + path, lit)
 
         # The next vertex
         bs, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), active)
@@ -164,15 +166,15 @@ def _follow(scene, sampler, ray, β, light, path, paths, depths, limit):
         η *= bs.eta
         ray = si.spawn_ray(si.to_world(bs.wo))
         si_prev, pdf_prev, delta_prev = si, bs.pdf, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        going = dr.minimum(dr.max(β) * η * η, 0.95)
-        going = dr.select(depth >= ROULETTE, going, 1)
-        active &= (dr.max(β) != 0) & (sampler.next_1d() < going)
-        β *= dr.rcp(going)
+        survival = dr.minimum(dr.max(β) * η * η, 0.95)
+        survival = dr.select(depth >= ROULETTE, survival, 1)
+        active &= (dr.max(β) != 0) & (sampler.next_1d() < survival)
+        β *= dr.rcp(survival)
         depth += 1
 
 
 def _mis(a, b):
-    """Weight of the strategy with density ``a``: the power heuristic (Veach 1997), without a square that overflows."""
+    """Return the weight of the strategy with density ``a``: the power heuristic (Veach 1997), without overflow."""
     return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)
 
 
@@ -182,7 +184,7 @@ def _add(light, radiance, wavelengths, index, active):
 
 
 def bounces(light: np.ndarray) -> list[Bounce]:
-    """The shares of a :func:`probe`, one :class:`Bounce` a depth, from 1. Without scattered light all are 0."""
+    """Return one :class:`Bounce` for each depth of a :func:`probe`. Without scattered light all shares are 0."""
     scattered = light.copy()
     scattered[0] = 0
     images = np.cumsum(scattered, axis=0)
@@ -200,93 +202,75 @@ def bounces(light: np.ndarray) -> list[Bounce]:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raises ``ValueError`` unless the tolerance is between 0 and 1."""
+    """Raise ``ValueError`` unless the tolerance is between 0 and 1."""
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance: found {tolerance:g}, allowed is more than 0 and less than 1")
 
 
-def choose(found: list[Bounce], max_depth: int, tolerance: float = TOLERANCE) -> int:
+def choose(shares: list[Bounce], max_depth: int, tolerance: float = TOLERANCE) -> int:
     """
-    The smallest depth whose ``rest`` is below ``tolerance`` and whose ``rest_in_a_tile`` is below ten times that; else
-    the scene's own ``max_depth`` (-1: infinite). Raises ``ValueError`` as :func:`check_tolerance`.
+    Return the smallest depth with a ``rest`` below ``tolerance`` and ``rest_in_a_tile`` below ten times that.
+
+    If there is none, the scene's own ``max_depth`` (-1: infinite). Raises ``ValueError`` as :func:`check_tolerance`.
     """
     check_tolerance(tolerance)
-    for bounce in found[:-1]:
+    for bounce in shares[:-1]:
         if bounce.rest < tolerance and bounce.rest_in_a_tile < IN_A_TILE * tolerance:
             return bounce.depth
     return max_depth
 
 
-def auto_depth(
-    path: str | os.PathLike,
-    tolerance: float = TOLERANCE,
-    seed: int = 0,
-    progress: bool = True,
-    defines: dict[str, str] | None = None,
-) -> dict:
+def auto_depth(parsed: scenes.ParsedScene, tolerance: float = TOLERANCE, seed: int = 0, progress: bool = True) -> dict:
     """
-    Probe the scene file ``path`` and choose its depth; ``defines`` replace its ``<default>`` values.
+    Probe a scene and choose the depth of its paths.
 
-    Returns what was found: ``chosen`` and ``scene`` (its own depth, never exceeded; -1: infinite), ``tolerance``,
-    ``shares`` (of each depth: ``depth``, ``light``, and the figures of a :class:`Bounce`), ``left_out`` and
-    ``left_out_in_a_tile`` (``rest`` and ``rest_in_a_tile`` of the chosen depth), ``probe_seconds`` (with compilation).
-    Ctrl-C ends it after the current pass with ``KeyboardInterrupt``. Raises :class:`~mi_diffind.scenes.SceneError`,
-    also if the scene's integrator is not in :data:`INTEGRATORS`, and ``ValueError`` as :func:`choose`.
+    Returns ``chosen`` and ``scene`` (its own depth, never exceeded; -1: infinite), ``tolerance``, ``shares`` (of each
+    depth: ``depth``, ``light``, and the figures of a :class:`Bounce`), ``left_out`` and ``left_out_in_a_tile``
+    (``rest`` and ``rest_in_a_tile`` of the chosen depth), ``probe_seconds`` (with compilation). Ctrl-C ends the probe
+    after the current pass with ``KeyboardInterrupt``. Raises :class:`~mi_diffind.scenes.SceneError`, also if the
+    scene's integrator is not in :data:`INTEGRATORS`, and ``ValueError`` as :func:`choose`.
     """
     check_tolerance(tolerance)
-    defines = defines or {}
-    integrator, own = scenes.integrator_of(path, defines=defines)
+    integrator, max_depth = parsed.path_integrator()
     if integrator not in INTEGRATORS:
         names = ", ".join(INTEGRATORS)
         raise scenes.SceneError(
-            f'{path}: the integrator "{integrator}" also follows light through media, and bounces can be measured for '
-            f"{names} alone; a number sets its depth"
+            f'{parsed.path}: the integrator "{integrator}" also follows light through media, and bounces can be '
+            f"measured for {names} alone; a number sets its depth"
         )
-    scene = scenes.load(path, defines=defines)
+    scene = parsed.load()
     start = time.perf_counter()
-    with (
-        interruptible() as stop,
-        tqdm(total=PASSES, desc="probe", unit="pass", disable=None if progress else True) as bar,
-    ):
-        found = bounces(probe(scene, own, seed=seed, on_pass=bar.update, stop=stop))
+    with interruptible() as stop, scenes.progress_bar("probe", PASSES, progress=progress) as bar:
+        shares = bounces(probe(scene, max_depth, seed=seed, on_pass=bar.update, stop=stop))
     seconds = time.perf_counter() - start
-    chosen = choose(found, own, tolerance)
-    at = found[chosen - 1] if chosen != own else Bounce(own, 0.0, 0.0, 0.0)
+    chosen = choose(shares, max_depth, tolerance)
+    kept = shares[chosen - 1] if chosen != max_depth else Bounce(max_depth, 0.0, 0.0, 0.0)
     return {
         "chosen": chosen,
-        "scene": own,
+        "scene": max_depth,
         "tolerance": tolerance,
-        "shares": [
-            {
-                "depth": b.depth,
-                "light": b.name,
-                "share": b.share,
-                "rest": b.rest,
-                "rest_in_a_tile": b.rest_in_a_tile,
-            }
-            for b in found
-        ],
-        "left_out": at.rest,
-        "left_out_in_a_tile": at.rest_in_a_tile,
+        "shares": [{"depth": bounce.depth, "light": bounce.name, **dataclasses.asdict(bounce)} for bounce in shares],
+        "left_out": kept.rest,
+        "left_out_in_a_tile": kept.rest_in_a_tile,
         "probe_seconds": seconds,
     }
 
 
 def summary(f: dict) -> list[str]:
-    """What :func:`auto_depth` found, as lines of text."""
+    """Return the result of :func:`auto_depth` as lines of text."""
     lines = ["depth  light        share      rest   in a tile"]
     shown = [s for s in f["shares"] if s["depth"] <= 2 or s["share"] >= 5e-6 or s["depth"] == f["chosen"]]
     for s in shown:
         share = f"{s['share']:8.3%}" if s["depth"] > 1 else "       –"
         mark = "  <- chosen" if s["depth"] == f["chosen"] else ""
         lines.append(f"{s['depth']:5}  {s['light']:10} {share}  {s['rest']:8.3%}    {s['rest_in_a_tile']:8.3%}{mark}")
-    own = "infinite depth" if f["scene"] < 0 else f"depth {f['scene']}"
+    scene_depth = "infinite depth" if f["scene"] < 0 else f"depth {f['scene']}"
     tolerance = f"tolerance {f['tolerance']:.3g}, in a tile {IN_A_TILE * f['tolerance']:.3g}"
     if f["chosen"] == f["scene"]:
-        found = f"the scene's {own} is kept and nothing left out"
+        outcome = f"the scene's {scene_depth} is kept and nothing left out"
     else:
-        found = (
-            f"depth {f['chosen']} instead of the scene's {own} leaves out {f['left_out']:.3%} of the scattered light, "
-            f"at most {f['left_out_in_a_tile']:.2%} in a tile"
+        outcome = (
+            f"depth {f['chosen']} instead of the scene's {scene_depth} leaves out {f['left_out']:.3%} of the scattered "
+            f"light, at most {f['left_out_in_a_tile']:.2%} in a tile"
         )
-    return [*lines, f"{found} ({tolerance}; probed in {f['probe_seconds']:.1f} s)"]
+    return [*lines, f"{outcome} ({tolerance}; probed in {f['probe_seconds']:.1f} s)"]

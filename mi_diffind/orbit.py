@@ -1,4 +1,4 @@
-"""A scene from a camera that goes once around it: frames, and how they are kept, as a film strip or as a film."""
+"""Orbit of a camera around a scene: rendered frames, and a film or a film strip of them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ import numpy as np
 from . import scenes, srgb
 from .files import replacing
 from .plugins.support import footprint
+from .poses import rotation
 
-#: Extensions of files that move.
+#: Extensions of films.
 FILMS = (".webp", ".gif")
 
-#: Frames in a row of a film strip, at most.
+#: Largest number of frames in a row of a film strip.
 COLUMNS = 6
 
 
@@ -32,11 +33,13 @@ def orbit(
     stop: threading.Event | None = None,
 ) -> list[np.ndarray]:
     """
-    Render a loaded scene ``frames`` times, its first camera turned about the axis ``up`` through ``centre`` by 360°
-    divided by their number each time; the first is what the camera sees as it stands, where it is again in the end.
-    By default, the axis goes through the middle of all that is no light.
+    Render a loaded scene ``frames`` times, while its first camera moves once around the scene.
 
-    Returns the linear images; once ``stop`` is set, those that are done. Raises
+    For each frame, the camera turns about the axis ``up`` through ``centre`` (default: the middle of all shapes that
+    are no lights) by 360° divided by the number of frames. The first frame is the camera's own view, to which it
+    returns at the end.
+
+    Returns the linear images; once ``stop`` is set, the frames that are done. Raises
     :class:`~mi_diffind.scenes.SceneError` if there is no camera that can be moved.
     """
     if not scene.sensors():
@@ -46,29 +49,29 @@ def orbit(
     if "to_world" not in parameters:
         raise scenes.SceneError(f"orbit: the sensor {sensor.class_name()} cannot be moved")
     centre = middle(scene) if centre is None else np.array(centre, np.float64)
-    kind, before = type(parameters["to_world"]), np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
+    transform, before = type(parameters["to_world"]), np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
 
     def move(matrix: np.ndarray) -> None:
-        parameters["to_world"] = kind(mi.ScalarTransform4f(matrix))
+        parameters["to_world"] = transform(mi.ScalarTransform4f(matrix))
         parameters.update()
         footprint.attach(scene, 0, spp)
 
-    found = []
+    images = []
     try:
         for i in range(frames):
-            move(turned(centre, up, 360 * i / frames) @ before)
-            found.append(scenes.render(scene, spp, seed)[0])
+            move(rotation(up, 360 * i / frames, centre) @ before)
+            images.append(scenes.render(scene, spp, seed)[0])
             if on_frame is not None:
                 on_frame()
             if stop is not None and stop.is_set():
                 break
     finally:
         move(before)
-    return found
+    return images
 
 
 def middle(scene) -> np.ndarray:
-    """The middle of the box of all shapes that are no lights, ``(3,)``; the origin if there is none."""
+    """Return the middle of the box of all shapes that are no lights, ``(3,)``; the origin without such shapes."""
     boxes = [s.bbox() for s in scene.shapes() if not s.is_emitter()]
     corners = np.array([[b.min, b.max] for b in boxes], np.float64).reshape(-1, 2, 3)
     if not len(corners) or not np.isfinite(corners).all():
@@ -76,31 +79,22 @@ def middle(scene) -> np.ndarray:
     return (corners[:, 0].min(axis=0) + corners[:, 1].max(axis=0)) / 2
 
 
-def turned(centre, axis, degrees: float) -> np.ndarray:
-    """A rotation about an axis through a point, ``(4, 4)`` (Rodrigues)."""
-    unit = np.array(axis, np.float64) / np.linalg.norm(axis)
-    k, angle = np.cross(np.eye(3), unit), np.radians(degrees)
-    found = np.eye(4)
-    found[:3, :3] += np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
-    found[:3, 3] = centre - found[:3, :3] @ centre
-    return found
-
-
 def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
-    """One image of all frames, at most ``columns`` in a row, nothing (0) where there is none."""
+    """Return one image of all frames, at most ``columns`` in a row; missing cells are 0."""
     columns = min(columns, len(frames))
     rows = -(-len(frames) // columns)
     height, width, channels = frames[0].shape
-    found = np.zeros((rows, height, columns, width, channels), np.float32)
+    grid = np.zeros((rows, height, columns, width, channels), np.float32)
     for i, frame in enumerate(frames):
-        found[i // columns, :, i % columns] = frame
-    return found.reshape(rows * height, columns * width, channels)
+        grid[i // columns, :, i % columns] = frame
+    return grid.reshape(rows * height, columns * width, channels)
 
 
 def write(path: str | os.PathLike, frames: Sequence[np.ndarray], seconds: float = 4.0) -> None:
     """
-    Write linear frames as a film that runs for ``seconds`` again and again (``.webp``, ``.gif``), or as one image
-    (:func:`strip`). Alpha is kept where the file has it.
+    Write linear frames as a film that loops every ``seconds`` (``.webp``, ``.gif``), or as one image (:func:`strip`).
+
+    Alpha is kept in formats that support it.
     """
     path = Path(path)
     if path.suffix.lower() not in (*FILMS, ".png"):
@@ -124,7 +118,7 @@ def write(path: str | os.PathLike, frames: Sequence[np.ndarray], seconds: float 
 
 
 def displayed(image: np.ndarray) -> np.ndarray:
-    """Bytes ``(height, width, 3)`` of an image; of one of 2 or 4 channels, which are multiplied by alpha, 4."""
+    """Return an image as displayed: bytes ``(height, width, 3)``, or 4 channels for an image with alpha (2 or 4)."""
     channels = image.shape[2]
     has_alpha = channels in (2, 4)
     colours, alpha = (image[..., :-1], image[..., -1:]) if has_alpha else (image, np.ones_like(image[..., :1]))

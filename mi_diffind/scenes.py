@@ -1,5 +1,5 @@
 """
-Scene files: load them, render them, say which tables they read, swap every learned plugin for its exact counterpart.
+Scene files: parsing, loading, rendering, and the learned plugins and tables that they name.
 
 Everything here runs in the variant that is set.
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from tqdm import tqdm
 
 from . import compat, plugins
 from .errors import DiffindError
@@ -23,7 +24,7 @@ from .measure.operations import bsdf_operations
 from .plugins.support import footprint
 from .task import tasks
 
-#: Integrators that follow paths to a ``max_depth``, with the depth that each takes if none is given (-1: infinite).
+#: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
 MAX_DEPTHS = {
     **dict.fromkeys(("path", "volpath", "volpathmis", "ptracer", "path_footprint", "path_sdf", "neural_field"), -1),
     **dict.fromkeys(("prb", "prb_basic", "prb_projective", "prbvolpath"), 6),
@@ -34,61 +35,199 @@ class SceneError(DiffindError, RuntimeError):
     """A scene cannot be loaded or rendered; the message is one sentence that names the file and the fault."""
 
 
-def load(
-    path: str | os.PathLike,
-    exact: bool = False,
-    longest_path: int | None = None,
-    defines: dict[str, str] | None = None,
-    against: str = "exact",
-    change: Callable[[object], object] | None = None,
-    merge: bool = True,
-):
+class ParsedScene:
     """
-    Load a scene as :func:`load_file` does; with ``exact``, every learned plugin is replaced by its exact counterpart,
-    or by the one that ``against`` names (:func:`swap`).
+    Scene file ``path``, parsed once, with ``defines`` (name → value) in place of its ``<default>`` values.
 
-    ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
-    infinite), and ``defines`` (name → value) the scene's ``<default>`` values. ``change(state)`` may change the parsed
-    scene (``mi.parser.ParserState``) before anything else does. Without ``merge``, no meshes are made one, and each
-    keeps its id.
-
-    Shapes that the scene's integrator does not see as they are stored are decoded to what it does see, unless the scene
-    says that they are not to be; a warning says what that takes. Raises :class:`SceneError`.
+    Answers questions about the file, and builds any number of scenes from it: each from a copy of the parsed state.
+    All methods raise :class:`SceneError`, as does the constructor for a file that cannot be parsed.
     """
-    with scene_errors(path), _resolving(path):
-        config, state = _parse(path, defines)
-        if not merge:
-            compat.keep_meshes(config)
-        if change is not None:
-            change(state)
-        if exact:
-            swap(state, against)
-        if longest_path is not None:
-            _path_integrator(state)["max_depth"] = longest_path
-        integrators = _integrators(state) or ["path"]  # which commands take that need none in the scene
-        decoded = _decode_unseen(state, integrators)
-        loaded = compat.instantiate(config, state)
-        if not isinstance(loaded, mi.Scene):
-            raise RuntimeError(f"{path}: holds a {type(loaded).__name__}, a scene is expected")
+
+    def __init__(self, path: str | os.PathLike, defines: dict[str, str] | None = None):
+        self.path = Path(path)
+        self.defines = {name: str(value) for name, value in (defines or {}).items()}
+        with self._errors():
+            if not self.path.is_file():
+                raise RuntimeError(f"{path}: no such scene file")
+            _, self._state = compat.parse_file(path, self.defines)
+
+    @contextlib.contextmanager
+    def _errors(self):
+        """Resolve file names beside the scene, and turn errors into a :class:`SceneError`."""
+        with scene_errors(self.path), _resolving(self.path):
+            yield
+
+    def load(
+        self,
+        exact: bool = False,
+        longest_path: int | None = None,
+        against: str = "exact",
+        change: Callable[[object], object] | None = None,
+        merge: bool = True,
+    ):
+        """
+        Return a loaded scene, as :func:`load_file` does.
+
+        With ``exact``, every learned plugin is replaced by its exact counterpart, or by the one that ``against`` names.
+        ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
+        infinite). ``change(state)`` may change the parsed scene (``mi.parser.ParserState``) before anything else does.
+        Without ``merge``, Mitsuba joins no meshes, and each keeps its id.
+
+        Shapes whose stored arrays the scene's integrator cannot trace are decoded, with a warning that states the
+        memory, unless the scene forbids decoding; then this is an error.
+        """
+        with self._errors():
+            config, state = compat.copy_parsed(self._state)
+            if not merge:
+                compat.keep_meshes(config)
+            if change is not None:
+                change(state)
+            if exact:
+                for props, plugin in _replaceable(state, against):
+                    plugin.counterpart(against).replace(props)
+            if longest_path is not None:
+                _path_integrator(state)["max_depth"] = longest_path
+            integrators = _integrators(state) or ["path"]  # used by commands for a scene without an integrator
+            loaded = _build(config, state, integrators, _refuse)
+            if not isinstance(loaded, mi.Scene):
+                raise RuntimeError(f"{self.path}: holds a {type(loaded).__name__}, a scene is expected")
+            return loaded
+
+    def path_integrator(self) -> tuple[str, int]:
+        """
+        Return the plugin name and the ``max_depth`` of the integrator that follows the scene's paths.
+
+        It may be nested in others, like ``aov``. A scene with none of :data:`MAX_DEPTHS`, or with several, is an error.
+        """
+        with self._errors():
+            props = _path_integrator(self._state)
+            name = props.plugin_name()
+            return name, int(props.get("max_depth", MAX_DEPTHS[name]))
+
+    def learned_plugins(self, against: str = "exact") -> list[dict]:
+        """
+        Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
+
+        With ``against``, of all plugins that have the counterpart of this name.
+        """
+        with self._errors():
+            return [plugin.described(props) for props, plugin in _replaceable(self._state, against)]
+
+    def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
+        """
+        Return the distinct tables that learned plugins read: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`.
+
+        ``learned`` are descriptions from :meth:`learned_plugins`.
+        """
+        tables = {}
+        for entry in learned:
+            plugin = plugins.declared()[entry["plugin"]]
+            if not plugin.task:
+                continue
+            name, storage = entry.get("filename", ""), entry.get("storage", "") or plugin.storage
+            task = tasks()[plugin.task]
+            file = task.file(name and self.path.resolve().parent / name, entry.get("preset", ""))
+            if (str(file), storage) not in tables:
+                table = task.load(file)
+                tables[str(file), storage] = table.to(storage) if storage else table
+        return tables
+
+    def table_bytes(self, learned: list[dict]) -> int:
+        """Return the bytes of all distinct tables that learned plugins read, in their storage forms."""
+        return sum(table.nbytes for table in self.tables(learned).values())
+
+    def files(self) -> list[Path]:
+        """Return the files that the scene consists of: itself, the files that it includes and those that it names."""
+        with self._errors():
+            files = [Path(file).resolve() for file in compat.parsed_files(self._state)]
+            for props in compat.properties_of(self._state):
+                texts = (props[k] for k in props if compat.property_kind(props, k) == "text")
+                for file in (self.path.resolve().parent / text for text in texts if text):
+                    with contextlib.suppress(OSError, ValueError):  # most texts are no names of files
+                        if file.is_file():
+                            files.append(file.resolve())
+            return list(dict.fromkeys(files))
+
+
+def load(path: str | os.PathLike, defines: dict[str, str] | None = None, **options):
+    """Return the loaded scene of a file; ``options`` are those of :meth:`ParsedScene.load`."""
+    return ParsedScene(path, defines).load(**options)
+
+
+def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = True, **defines):
+    """
+    Load a scene file as ``mi.load_file`` does, prepared for filtering textures and for stored shapes.
+
+    ``defines`` replace the scene's ``<default>`` values; ``parallel`` and ``optimize`` are Mitsuba's own arguments.
+    Beyond ``mi.load_file``, textures that filter themselves learn which sensor sees them: the first one of the scene,
+    at the samples of its sampler (:func:`.plugins.support.footprint.attach`). Shapes whose stored arrays the scene's
+    integrator cannot trace are decoded, with a warning that states the memory. If the scene forbids decoding, or has
+    no integrator (another one may be meant), a warning says that such shapes stay invisible. Raises what
+    ``mi.load_file`` raises.
+    """
+    if not Path(path).is_file():
+        return mi.load_file(str(path))
+    with _resolving(path):
+        config, state = compat.parse_file(path, defines)
+        compat.build_as(config, parallel, optimize)
+        return _build(config, state, _integrators(state), plugins.warn)
+
+
+def _build(config, state, integrators: list[str], report: Callable[[str], None]):
+    """Instantiate a parsed scene; ``report`` is called with a sentence about a shape that no integrator traces."""
+    decoded = _decode_unseen(state, integrators) if integrators else []
+    loaded = compat.instantiate(config, state)
+    if isinstance(loaded, mi.Scene):
         unseen = _unseen(loaded, integrators)
         if unseen:
-            raise RuntimeError(unseen)
-        _say_decoded(loaded, decoded, integrators)
+            report(unseen)
+        _warn_of_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
-        return loaded
+    return loaded
+
+
+def _refuse(sentence: str):
+    raise RuntimeError(sentence)
 
 
 def _integrators(state) -> list[str]:
-    """The names of all integrators of a parsed scene, those within others, too."""
+    """Return the plugin names of all integrators of a parsed scene, nested ones included."""
     return [props.plugin_name() for props in compat.properties_of(state, mi.ObjectType.Integrator)]
+
+
+def _path_integrator(state):
+    """Return the properties of the one integrator that follows the paths of a parsed scene."""
+    integrators = compat.properties_of(state, mi.ObjectType.Integrator)
+    following = [
+        props for props in integrators if props.plugin_name() in MAX_DEPTHS
+        # A radiance field leaves the paths to the integrator that is nested in it
+        and not (props.plugin_name() == "neural_field" and nests_another(props))
+    ]  # fmt: skip
+    if len(following) != 1:
+        names = ", ".join(props.plugin_name() for props in integrators) or "none"
+        raise RuntimeError(f"a depth needs one integrator of {', '.join(MAX_DEPTHS)}; found {names}")
+    return following[0]
+
+
+def nests_another(props) -> bool:
+    """Return whether the properties of an integrator contain another object."""
+    return any(compat.property_kind(props, key) == "object" for key in props)
+
+
+def _replaceable(state, against: str) -> list[tuple]:
+    """Return ``(properties, plugin)`` of all nodes whose plugin has the counterpart ``against``."""
+    declared = plugins.declared()
+    nodes = [(props, declared.get(props.plugin_name())) for props in compat.properties_of(state)]
+    return [(props, plugin) for props, plugin in nodes if plugin and plugin.counterpart(against)]
 
 
 def _decode_unseen(state, integrators: list[str]) -> list[str]:
     """
-    Have the shapes that none of the ``integrators`` sees (their plugins' ``seen_by``) decoded, if the parsed scene does
-    not say how they are traced, nor that their arrays are optimised; returns their ids.
+    Have shapes decoded whose arrays none of the ``integrators`` traces, and return their ids.
+
+    Left out are shapes for which the scene states how they are traced, or that their arrays are optimised.
     """
-    found = []
+    ids = []
     for props in compat.properties_of(state):
         plugin = plugins.declared().get(props.plugin_name())
         if plugin is None or plugin.otherwise is None or set(plugin.seen_by) & set(integrators):
@@ -96,157 +235,76 @@ def _decode_unseen(state, integrators: list[str]) -> list[str]:
         key, value = plugin.otherwise
         if key not in props and not ("storage" in props and props["storage"] == "float32"):
             props[key] = value
-            found.append(props.id())
-    return found
+            ids.append(props.id())
+    return ids
 
 
-def _say_decoded(scene, ids: list[str], integrators: list[str]) -> None:
-    """A warning for each shape that was decoded so that the ``integrators`` see it."""
+def _warn_of_decoded(scene, ids: list[str], integrators: list[str]) -> None:
+    """Warn of each shape that was decoded because the ``integrators`` cannot trace its arrays."""
     names = ", ".join(f'"{name}"' for name in integrators)
-    for made in instances(scene) if ids else ():
-        origin, said = plugins.origin(made), plugins.report(made) or {}
-        if origin["id"] in ids and "decoded" in said:
-            plugins.warn(f"{origin['filename']}, whose arrays {names} does not see, is {said['decoded']}")
+    for instance in instances(scene) if ids else ():
+        origin, report = plugins.origin(instance), plugins.report(instance) or {}
+        if origin["id"] in ids and "decoded" in report:
+            plugins.warn(f"{origin['filename']}, whose arrays {names} does not see, is {report['decoded']}")
 
 
 def _unseen(scene, integrators: list[str]) -> str:
-    """A sentence about a shape that is seen by none of the ``integrators`` (names of plugins), "" if there is none."""
-    for made in instances(scene):
-        seen_by = getattr(made, "seen_by", None)
+    """Return a sentence about a shape that none of the ``integrators`` traces, "" if there is none."""
+    for instance in instances(scene):
+        seen_by = getattr(instance, "seen_by", None)
         if seen_by and not set(seen_by) & set(integrators):
             allowed = " or ".join(f'"{name}"' for name in seen_by)
-            found = ", ".join(f'"{name}"' for name in integrators) or "none"
+            present = ", ".join(f'"{name}"' for name in integrators) or "none"
             return (
-                f'the shape "{made.id()}" ({plugins.origin(made)["plugin"]}) is seen by the integrator {allowed} '
-                f'alone, found {found}: take that one, or trace="grid"'
+                f'the shape "{instance.id()}" ({plugins.origin(instance)["plugin"]}) is seen by the integrator '
+                f'{allowed} alone, found {present}: take that one, or trace="grid"'
             )
     return ""
 
 
-def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = True, **defines):
-    """
-    Load a scene file as ``mi.load_file`` does, with ``defines`` for its ``<default>`` values (and ``parallel`` and
-    ``optimize``, which are Mitsuba's own), and do what that does not: tell textures that filter themselves which sensor
-    sees them, the first one of the scene, at the samples of its sampler (:func:`.plugins.support.footprint.attach`);
-    decode shapes that the scene's integrator does not see as they are stored, if the scene does not say that they are
-    not to be, with a warning that says what that takes. Where it says so, and in a scene without an integrator (another
-    one may be meant), a warning says that they are left out. Raises what ``mi.load_file`` raises.
-    """
-    if not Path(path).is_file():
-        return mi.load_file(str(path))
-    with _resolving(path):
-        config, state = compat.parse_file(path, defines)
-        compat.build_as(config, parallel, optimize)
-        integrators = _integrators(state)
-        decoded = _decode_unseen(state, integrators) if integrators else []
-        loaded = compat.instantiate(config, state)
-    if isinstance(loaded, mi.Scene):
-        unseen = _unseen(loaded, integrators)
-        if unseen:
-            plugins.warn(unseen)
-        _say_decoded(loaded, decoded, integrators)
-        footprint.attach(loaded)
-    return loaded
-
-
-def swap(state, against: str = "exact") -> int:
-    """
-    Replace the plugins of a parsed scene (``mi.parser.ParserState``) that have one by their exact counterpart, or by
-    the one that ``against`` names, such as ``"principled"``; returns how many.
-    """
-    found = _declared_nodes(state, against)
-    for props, plugin in found:
-        plugin.counterpart(against).replace(props)
-    return len(found)
-
-
-def _declared_nodes(state, against: str) -> list:
-    """The properties of a parsed scene's nodes that are plugins of ours with such a counterpart, and the plugins."""
-    declared = plugins.declared()
-    found = [(props, declared.get(props.plugin_name())) for props in compat.properties_of(state)]
-    return [(props, plugin) for props, plugin in found if plugin and plugin.counterpart(against)]
-
-
-def integrator_of(path: str | os.PathLike, defines: dict[str, str] | None = None) -> tuple[str, int]:
-    """
-    The integrator that follows the scene's paths (others, like ``aov``, may contain it) and its ``max_depth``.
-
-    Raises :class:`SceneError`, also if there is none of :data:`MAX_DEPTHS`, or more than one.
-    """
-    with scene_errors(path), _resolving(path):
-        props = _path_integrator(_parse(path, defines)[1])
-        name = props.plugin_name()
-        return name, int(props.get("max_depth", MAX_DEPTHS[name]))
-
-
-def learned_plugins(
-    path: str | os.PathLike, defines: dict[str, str] | None = None, against: str = "exact"
-) -> list[dict]:
-    """
-    The learned plugins that a scene file names, in the file's order: ``plugin``, ``kind``, ``id``, ``parameters``
-    (constants as numbers, textures as ``"texture"``), and ``preset``, ``filename``, ``storage``, … as far as they are
-    given. With ``against``, all plugins that have the counterpart of that name. Raises :class:`SceneError`.
-    """
-    with scene_errors(path), _resolving(path):
-        _, state = _parse(path, defines)
-        return [plugin.described(props) for props, plugin in _declared_nodes(state, against)]
-
-
 def instances(scene) -> list:
     """
-    What the package's plugins made in a loaded scene, wherever it hides (in a ``twosided``, a ``bumpmap``, …): objects
-    of Mitsuba, each once.
+    Return all Mitsuba objects of a loaded scene that the package's plugins created, each once.
+
+    Nested objects (in a ``twosided``, a ``bumpmap``, …) are included.
     """
-    # Not only nodes that own a parameter: tables of bytes are none
+    # All nodes, not only owners of parameters: tables of bytes are no parameters
     return [node for node in compat.objects_of(scene) if plugins.origin(node) is not None]
 
 
 def learned_instances(scene) -> list:
-    """Those of :func:`instances` that learned plugins made."""
+    """Return the :func:`instances` of learned plugins."""
     learned = plugins.with_counterpart()
-    return [made for made in instances(scene) if plugins.origin(made)["plugin"] in learned]
+    return [instance for instance in instances(scene) if plugins.origin(instance)["plugin"] in learned]
 
 
 def reports(scene) -> list[dict]:
     """
-    What each learned plugin of a loaded scene does: ``plugin``, ``kind``, ``id`` and ``parameters`` as in
-    :func:`learned_plugins`; what it reports, ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason),
-    ``evaluated_once``, ``storage``, ``table_bytes`` and more; and for a BSDF the ``operations`` of ``eval``, ``pdf``
-    and ``sample`` (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance
-    field, how many steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.counting.Counts`).
+    Return a report on each learned plugin of a loaded scene.
+
+    It has the description of :meth:`ParsedScene.learned_plugins`; the plugin's own report, ``preset``,
+    ``effects_in_use``, ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage``, ``table_bytes`` and
+    more; for a BSDF the ``operations`` of ``eval``, ``pdf`` and ``sample``
+    (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance field, how many
+    steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.march.RayCounts`).
     """
-    found = []
-    for made in learned_instances(scene):
-        counts = bsdf_operations(made) if isinstance(made, mi.BSDF) else {}
-        found.append({
-            **plugins.origin(made),
-            "id": made.id(),
-            **(plugins.report(made) or {}),
+    descriptions = []
+    for instance in learned_instances(scene):
+        counts = bsdf_operations(instance) if isinstance(instance, mi.BSDF) else {}
+        descriptions.append({
+            **plugins.origin(instance),
+            "id": instance.id(),
+            **(plugins.report(instance) or {}),
             "operations": {method: n.asdict() for method, n in counts.items()},
-            **({"rays": made.counts(scene)} if hasattr(made, "counts") and scene.sensors() else {}),
+            **({"rays": instance.counts(scene)} if hasattr(instance, "counts") and scene.sensors() else {}),
         })  # fmt: skip
-    return found
+    return descriptions
 
 
-def table_bytes(scene: str | os.PathLike, learned: list[dict]) -> int:
-    """Bytes of all distinct tables that the learned plugins of a scene read, in their storage forms."""
-    return sum(table.nbytes for table in tables_of(scene, learned).values())
-
-
-def tables_of(scene: str | os.PathLike, learned: list[dict]) -> dict[tuple[str, str], object]:
-    """The distinct tables of a scene's learned plugins: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`."""
-    found = {}
-    for entry in learned:
-        plugin = plugins.declared()[entry["plugin"]]
-        if not plugin.task:
-            continue
-        name, storage = entry.get("filename", ""), entry.get("storage", "") or plugin.storage
-        task = tasks()[plugin.task]
-        file = task.file(name and Path(scene).resolve().parent / name, entry.get("preset", ""))
-        if (str(file), storage) not in found:
-            table = task.load(file)
-            found[str(file), storage] = table.to(storage) if storage else table
-    return found
+def film_size(scene) -> tuple[int, int]:
+    """Return the width and height, in pixels, of the images of a scene's first sensor."""
+    width, height = scene.sensors()[0].film().crop_size()
+    return int(width), int(height)
 
 
 def render(
@@ -258,13 +316,13 @@ def render(
     stop: threading.Event | None = None,
 ) -> tuple[np.ndarray, list[float]]:
     """
-    Render in ``passes`` of about ``spp / passes`` samples each and average them.
+    Render in ``passes`` of about ``spp / passes`` samples a pixel each and average them.
 
-    Returns the linear image ``(height, width, channels)``, float32, and the seconds that each pass took (the first
-    includes compilation). ``on_pass()`` is called after each; once ``stop`` is set, the pass that is running is the
-    last, and the image is the average of those done, ``len(seconds) · spp // passes`` samples. The same arguments give
-    the same image, if the film's filter is a box (other filters add up samples of neighbouring pixels in any order) and
-    the samples of a pass are a power of two (else the last bit of a few pixels varies).
+    Returns the linear image ``(height, width, channels)``, float32, and the seconds of each pass (the first includes
+    compilation). ``on_pass()`` is called after each pass. Once ``stop`` is set, the running pass is the last, and the
+    image is the average of ``len(seconds) · spp // passes`` samples. The same arguments give the same image if the
+    film's filter is a box (other filters add up samples of neighbouring pixels in any order) and the samples of a pass
+    are a power of two (else the last bit of a few pixels varies).
     """
     spp = spp or scene.sensors()[0].sampler().sample_count()
     passes = max(1, min(passes, spp))
@@ -283,9 +341,20 @@ def render(
 
 
 def render_pass(scene, spp: int, seed: int) -> np.ndarray:
-    """One pass, ``(height, width, channels)``, float64; ``seed`` is Mitsuba's own, modulo 2³². Raises SceneError."""
+    """Render one pass, ``(height, width, channels)``, float64; ``seed`` is Mitsuba's own, modulo 2³²."""
     with scene_errors(None):
         return mi.render(scene, spp=spp, seed=seed % 2**32).numpy().astype(np.float64)
+
+
+def colour_channels(image):
+    """Drop alpha and other channels that are no colour from an image ``(height, width, channels)``, array or tensor."""
+    count = 3 if image.shape[2] >= 3 else 1
+    return image if image.shape[2] == count else image[:, :, :count]
+
+
+def progress_bar(title: str, total: int, unit: str = "pass", progress: bool = True, initial: int = 0) -> tqdm:
+    """Return a progress bar on stderr; without ``progress`` it stays hidden, as it does outside of a terminal."""
+    return tqdm(total=total, initial=initial, desc=title, unit=unit, disable=None if progress else True)
 
 
 def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
@@ -296,43 +365,6 @@ def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
             bitmap.write(str(temporary))
         else:
             mi.util.write_bitmap(str(temporary), bitmap, write_async=False)
-
-
-def files_of(path: str | os.PathLike, defines: dict[str, str] | None = None) -> list[Path]:
-    """The files that a scene consists of: itself, what it includes and what it names. Raises :class:`SceneError`."""
-    folder = Path(path).resolve().parent
-    with scene_errors(path), _resolving(path):
-        _, state = _parse(path, defines)
-    found = [Path(file).resolve() for file in compat.parsed_files(state)]
-    for props in compat.properties_of(state):
-        texts = (props[k] for k in props if compat.property_kind(props, k) == "text")
-        for file in (folder / text for text in texts if text):
-            with contextlib.suppress(OSError, ValueError):  # any text may be asked for, and few are names of files
-                if file.is_file():
-                    found.append(file.resolve())
-    return list(dict.fromkeys(found))
-
-
-def _parse(path, defines: dict[str, str] | None) -> tuple:
-    if not Path(path).is_file():
-        raise RuntimeError(f"{path}: no such scene file")
-    return compat.parse_file(path, defines)
-
-
-def _path_integrator(state):
-    integrators = compat.properties_of(state, mi.ObjectType.Integrator)
-    found = [props for props in integrators if props.plugin_name() in MAX_DEPTHS]
-    # One that has another integrator for its paths leaves the depth to that
-    found = [
-        props
-        for props in found
-        if props.plugin_name() != "neural_field"
-        or not any(compat.property_kind(props, key) == "object" for key in props)
-    ]
-    if len(found) != 1:
-        names = ", ".join(props.plugin_name() for props in integrators) or "none"
-        raise RuntimeError(f"a depth needs one integrator of {', '.join(MAX_DEPTHS)}; found {names}")
-    return found[0]
 
 
 @contextlib.contextmanager
@@ -350,7 +382,7 @@ def _resolving(path):
 
 @contextlib.contextmanager
 def scene_errors(path):
-    """Turn Mitsuba's nested messages into one sentence."""
+    """Turn Mitsuba's nested messages into a :class:`SceneError` of one sentence that names ``path``."""
     try:
         yield
     except SceneError:

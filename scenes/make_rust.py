@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 from scene_xml import element, head, lying, plugin, transform, write
 
-from mi_diffind.studies.shading.materials import made
+from mi_diffind.studies.shading.materials import generated_source
 
 ABOUT = """Hammered metal with rust, minified: what a texture that is trained for its shading is for. Written by
 make_rust.py: change that file.
@@ -28,7 +28,7 @@ SIDE, PLATE, REPEATS = 256, 5.0, 24.0
 
 def write_maps() -> None:
     """Write rust_*.png and rust.json."""
-    source, files = made("hammered", SIDE), {}
+    source, files = generated_source("hammered", SIDE), {}
     for m in source.maps:
         files[m.name] = f"rust_{m.name}.png"
         values = np.rint(255 * m.values).astype(np.uint8)

@@ -209,7 +209,7 @@ def test_meshes_of_one_material_keep_their_ids(mi_rgb, tmp_path):
     cubes = [cube.format(name, f'<translate x="{x}"/></transform></shape>') for name, x in (("a", -2), ("b", 3))]
     path.write_text(f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{"".join(cubes)}</scene>')
     assert len(scenes.load(path).shapes()) == 1
-    loaded = capture._load(path, None)
+    loaded = capture._load(scenes.ParsedScene(path))
     assert capture.bounds(loaded).tolist() == [[-3, -1, -1], [4, 1, 1]]
     assert capture.bounds(loaded, ("b",)).tolist() == [[2, -1, -1], [4, 1, 1]]
     # As far as their vertices, which is nearer than the corners of a box around both
@@ -309,9 +309,9 @@ def angles(a, b):
 
 
 def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
-    from mi_diffind.capture import CaptureSettings, directions
+    from mi_diffind.capture import CaptureSettings
 
-    train, test = directions(CaptureSettings(seed=1))
+    train, test = CaptureSettings(seed=1).directions()
     assert train.shape == (60, 3) and test.shape == (20, 3)
     assert np.allclose(np.linalg.norm(train, axis=1), 1)
     apart = angles(train, train) + 360 * np.eye(60)
@@ -319,28 +319,28 @@ def test_views_on_a_sphere_are_even_and_test_views_between_them(mi_rgb):
     assert apart.min() > 0.7 * even and np.abs(train.mean(axis=0)).max() < 0.02
     assert angles(test, train).min() > 0.2 * even
     assert angles(test, train).min(axis=1).max() < 0.9 * even
-    other = directions(CaptureSettings(seed=2))[0]
+    other = CaptureSettings(seed=2).directions()[0]
     assert np.abs(other - train).max() > 0.1 and np.allclose(other[:, 2], train[:, 2])
-    upper = np.degrees(np.arcsin(directions(CaptureSettings(elevation=(10.0, 50.0)))[0][:, 2]))
+    upper = np.degrees(np.arcsin(CaptureSettings(elevation=(10.0, 50.0)).directions()[0][:, 2]))
     assert upper.min() > 10 and upper.max() < 50 and upper.min() < 12 and upper.max() > 48
 
 
 def test_an_orbit_closes_and_swings(mi_rgb):
-    from mi_diffind.capture import CaptureSettings, directions
+    from mi_diffind.capture import CaptureSettings
 
-    train, test = directions(CaptureSettings(path="orbit", views=12, test=6, elevation=(0.0, 60.0)))
+    train, test = CaptureSettings(path="orbit", views=12, test=6, elevation=(0.0, 60.0)).directions()
     azimuth = np.degrees(np.arctan2(train[:, 1], train[:, 0])) % 360
     assert np.allclose(azimuth, np.arange(12) * 30)
     elevation = np.degrees(np.arcsin(train[:, 2]))
     assert elevation[0] == pytest.approx(0) and elevation[6] == pytest.approx(60) and elevation[3] == pytest.approx(30)
     between = np.degrees(np.arctan2(test[:, 1], test[:, 0])) % 360
     assert np.allclose(between % 30, 15) and len(np.unique(between.round())) == 6
-    assert np.allclose(directions(CaptureSettings(path="orbit"))[0][:, 2], np.sin(np.radians(20)))
+    assert np.allclose(CaptureSettings(path="orbit").directions()[0][:, 2], np.sin(np.radians(20)))
 
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 2), (1, 1, -1)])
 def test_poses_are_rigid_and_upright(mi_rgb, up):
-    from mi_diffind.capture import frame_of, pose
+    from mi_diffind.poses import frame_of, pose
 
     frame = frame_of(up)
     axis = np.array(up) / np.linalg.norm(up)

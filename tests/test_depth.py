@@ -103,19 +103,19 @@ def test_deeper_than_the_bins(mi_rgb, tmp_path):
 
 
 def test_one_bounce_alone(mi_rgb, tmp_path):
-    from mi_diffind import depth
+    from mi_diffind import depth, scenes
 
-    found = depth.auto_depth(scene_file(tmp_path, CONVEX), progress=False)
+    found = depth.auto_depth(scenes.ParsedScene(scene_file(tmp_path, CONVEX)), progress=False)
     assert found["chosen"] == 2 and found["scene"] == -1 and found["left_out"] == 0
     assert [s["share"] for s in found["shares"][:3]] == [0, 1, 0]
-    assert depth.auto_depth(scene_file(tmp_path, CONVEX, depth=1), progress=False)["chosen"] == 1
-    assert depth.auto_depth(scene_file(tmp_path, CONVEX, depth=0), progress=False)["chosen"] == 0
+    assert depth.auto_depth(scenes.ParsedScene(scene_file(tmp_path, CONVEX, depth=1)), progress=False)["chosen"] == 1
+    assert depth.auto_depth(scenes.ParsedScene(scene_file(tmp_path, CONVEX, depth=0)), progress=False)["chosen"] == 0
 
 
 def test_without_scattered_light(mi_rgb, tmp_path):
-    from mi_diffind import depth
+    from mi_diffind import depth, scenes
 
-    found = depth.auto_depth(scene_file(tmp_path, '<emitter type="constant"/>'), progress=False)
+    found = depth.auto_depth(scenes.ParsedScene(scene_file(tmp_path, '<emitter type="constant"/>')), progress=False)
     assert found["chosen"] == 1 and found["left_out"] == 0
 
 
@@ -155,7 +155,7 @@ def test_left_out_is_what_a_render_lacks(mi_rgb, name):
     from mi_diffind import depth, scenes
 
     file = SCENES / f"{name}.xml"
-    found = depth.auto_depth(file, 0.05, progress=False)
+    found = depth.auto_depth(scenes.ParsedScene(file), 0.05, progress=False)
     assert 2 < found["chosen"] < found["scene"] == 5
     emitted, chosen, full = (
         luminance(scenes.render(scenes.load(file, longest_path=d, defines=SMALL), 64)[0])
@@ -216,7 +216,7 @@ def test_tolerance():
         with pytest.raises(ValueError, match="allowed is more than 0 and less than 1"):
             depth.choose(found, 5, bad)
         with pytest.raises(ValueError, match="tolerance"):
-            depth.auto_depth("nowhere.xml", bad)
+            depth.auto_depth(None, bad)
 
 
 # -- the command -------------------------------------------------------------------------------------------------------

@@ -100,8 +100,8 @@ def test_what_is_refused(mi_rgb, path, tmp_path, capsys):
 
 
 def test_a_rotation_leaves_its_axis_in_place():
-    from mi_diffind.orbit import turned
+    from mi_diffind.poses import rotation
 
-    matrix = turned((1, 2, 3), (0, 1, 0), 90)
+    matrix = rotation((0, 1, 0), 90, (1, 2, 3))
     assert matrix @ [1, 7, 3, 1] == pytest.approx([1, 7, 3, 1])
     assert matrix @ [1, 2, 5, 1] == pytest.approx([3, 2, 3, 1])  # z goes to x

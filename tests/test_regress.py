@@ -6,12 +6,14 @@ import re
 import signal
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from commands import refused
 from variants import set_variant
 
 from mi_diffind.cli import main
+from mi_diffind.reference_files import write_reference
 
 TESTS = Path(__file__).resolve().parent
 SCENES = TESTS.parent / "scenes"
@@ -49,74 +51,7 @@ def noise(rng, variance, spp):
     return rng.standard_normal(variance.shape) * np.sqrt(variance / spp)
 
 
-# -- the statistics ----------------------------------------------------------------------------------------------------
-
-
-def test_p_values_are_those_of_scipy(regress, rng):
-    from scipy.stats import norm
-
-    reference, variance = rng.random((9, 7, 3)), 10 ** rng.uniform(-6, 0, (9, 7, 3))
-    deviation = np.sqrt(np.maximum(variance, 1e-4) * (1 / 40 + 1 / 160))
-    image = reference + deviation * rng.normal(0, 2, reference.shape)
-    test = regress.z_test(image, reference, variance, 40, 160)
-    expected = 2 * norm.sf(np.abs(image - reference) / deviation)
-    assert np.allclose(test.p_values, expected, rtol=1e-5, atol=0)
-    assert test.alpha == pytest.approx(1 - 0.99 ** (1 / 63), rel=1e-9)
-    failing = (expected <= test.alpha).any(axis=-1)
-    assert 0 < failing.sum() < 63 and np.array_equal(test.failing, failing)
-    assert test.fraction == pytest.approx(1 - failing.mean())
-    exact = regress.z_test(image, reference, variance, 40)  # a reference free of noise
-    deviation = np.sqrt(np.maximum(variance, 1e-4) / 40)
-    assert np.allclose(exact.p_values, 2 * norm.sf(np.abs(image - reference) / deviation), rtol=1e-5)
-
-
-def test_p_values_are_uniform_if_nothing_changed(regress, rng):
-    """Both the image and the reference are noisy, the reference as much as the image."""
-    from scipy.stats import kstest
-
-    variance = 10 ** rng.uniform(-3, 1, (60, 80, 3))
-    truth = rng.random(variance.shape)
-    image, reference = truth + noise(rng, variance, 16), truth + noise(rng, variance, 16)
-    assert kstest(regress.z_test(image, reference, variance, 16, 16).p_values.ravel(), "uniform").pvalue > 0.01
-    assert kstest(regress.z_test(image, reference, variance, 16).p_values.ravel(), "uniform").pvalue < 1e-9
-
-
-def test_one_image_in_a_hundred_has_a_failing_pixel(regress, rng):
-    """What Šidák's correction promises, for one channel."""
-    variance = np.ones((10, 12, 1))
-    failing = [regress.z_test(noise(rng, variance, 4), 0 * variance, variance, 4).failing.any() for _ in range(3000)]
-    assert 15 <= sum(failing) <= 48  # 30 expected, three standard deviations
-
-
-def test_a_quarter_of_a_percent_may_fail(regress):
-    """Two pixels of 800 may, three may not; a pixel fails with any of its channels, and if one is not finite."""
-    reference, variance = np.full((20, 40, 3), 0.5), np.full((20, 40, 3), 0.04)
-    for wrong in (1.0, np.nan, np.inf, -np.inf):
-        image = reference.copy()
-        image[3, 4:6, 1] = wrong
-        test = regress.z_test(image, reference, variance, 64, 1024)
-        assert test.passed and test.failing.sum() == 2 and test.failing[3, 4]
-        image[19, 39, 2] = wrong
-        test = regress.z_test(image, reference, variance, 64, 1024)
-        assert not test.passed and test.failing.sum() == 3
-    with pytest.raises(ValueError, match="shapes differ"):
-        regress.z_test(reference, reference[:1], variance, 64)
-
-
-def test_changes_above_the_noise_are_caught(regress, rng):
-    """A hundredth of the pixels, changed by eight standard deviations of the mean; not if changed by one."""
-    variance = np.full((60, 80, 3), 0.25)
-    for deviations, passes in ((1, True), (8, False)):
-        image = noise(rng, variance, 100)
-        image[:6, :8] += deviations * 0.5 / 10
-        assert regress.z_test(image, 0 * variance, variance, 100, 1600).passed == passes
-
-
-def test_small_variances_are_raised_to_the_floor(regress):
-    """Without noise, differences of 0.01 / sqrt(spp) times the quantile (here 4.4) pass."""
-    zero = np.zeros((30, 40, 3))
-    assert regress.z_test(zero + 4.2 * 0.01 / 10, zero, zero, 100).passed
-    assert not regress.z_test(zero + 4.6 * 0.01 / 10, zero, zero, 100).passed
+# -- passes ------------------------------------------------------------------------------------------------------------
 
 
 def test_mean_and_variance_of_passes(regress, rng, monkeypatch):
@@ -200,12 +135,11 @@ def test_references_are_small():
 def test_a_broken_table_entry_is_caught(regress, tmp_path, capsys, monkeypatch):
     """Of a table of the paper's layout, the entry that matters most for the image is changed by 10%; no other."""
     import drjit as dr
-    import mitsuba as mi
 
-    original = regress.scenes.load
+    original = regress.scenes.ParsedScene.load
 
-    def broken(path, **defines):
-        scene = original(path, **defines)
+    def broken(parsed):
+        scene = original(parsed)
         params = mi.traverse(scene)
         keys = [k for k in params.keys() if k.endswith("tables.masking") and params[k].shape[0] == 16]
         assert len(keys) == 2  # the two materials in that quality
@@ -227,7 +161,7 @@ def test_a_broken_table_entry_is_caught(regress, tmp_path, capsys, monkeypatch):
     arguments = ["regress", str(TESTS / "lamp.xml"), "--out", str(out), "--json", str(report)]
     assert main(arguments) == 0 and not out.exists()
     assert "passed" in capsys.readouterr().out
-    monkeypatch.setattr(regress.scenes, "load", broken)
+    monkeypatch.setattr(regress.scenes.ParsedScene, "load", broken)
     assert main(arguments) == 1
     text = capsys.readouterr().out
     assert "FAILED" in text and str(out / "lamp.llvm_ad_rgb.png") in text
@@ -355,9 +289,9 @@ def rare_bright_paths(tmp_path):
 def test_a_probe_foretells_the_check(regress, tmp_path):
     """What checks find against references of 16 times their samples, within a factor of two; other sizes included."""
     scene = regress.scenes.load(rare_bright_paths(tmp_path))
-    params = regress.mi.traverse(scene.sensors()[0])
+    params = mi.traverse(scene.sensors()[0])
     for spp, width in ((64, 48), (8, 160)):  # the second has more pixels than a probe
-        params["film.size"] = regress.mi.ScalarVector2u(width, width * 3 // 4)
+        params["film.size"] = mi.ScalarVector2u(width, width * 3 // 4)
         params.update()
         before = regress.scenes.render_pass(scene, 1, 0)
         foretold = regress.probe(scene, spp)
@@ -369,21 +303,24 @@ def test_a_probe_foretells_the_check(regress, tmp_path):
         assert foretold > 5e-4
 
 
-def test_too_few_samples_are_refused_early(regress, tmp_path, capsys, monkeypatch):
-    """Before the reference is rendered, with the samples that do."""
-    monkeypatch.setattr(regress, "PROBE_SAMPLES", 1 << 20)
-    path, taken, original = rare_bright_paths(tmp_path), [], regress.scenes.render_pass
-    monkeypatch.setattr(regress.scenes, "render_pass", lambda *a: taken.append(a[1]) or original(*a))
-    message = refused(capsys, "regress", path, "--update", "--spp", "12")
+def test_too_few_samples_are_refused_early(regress, tmp_path, monkeypatch):
+    """Before the reference is rendered, with the number of samples that suffices."""
+    path, rendered, original = rare_bright_paths(tmp_path), [], regress.scenes.render_pass
+    monkeypatch.setattr(regress.scenes, "render_pass", lambda *a: rendered.append(a[1]) or original(*a))
+    options = {"progress": False, "probe_samples": 1 << 20}
+    with pytest.raises(regress.scenes.SceneError) as caught:
+        regress.update_reference(path, spp=12, **options)
+    message = str(caught.value)
     assert "would fail the check at 12 samples a pixel although nothing has changed (about " in message
     assert "0.25% may" in message and "fewer bounces (the scene's max_depth)" in message
     assert not list((tmp_path / "references").iterdir())
-    factor = len(taken) // regress.PROBE_PASSES  # of the samples that do; 2 to 16
+    factor = len(rendered) // regress.PROBE_PASSES  # of the samples that do; 2 to 16
     wanted = int(re.search(r"--spp (\d+) should do", message)[1])
-    assert len(taken) % regress.PROBE_PASSES == 0 and wanted == 12 * 2 ** (factor - 1) > 12
-    assert main(["regress", path, "--update", "--spp", str(wanted)]) == 0
+    assert len(rendered) % regress.PROBE_PASSES == 0 and wanted == 12 * 2 ** (factor - 1) > 12
+    assert regress.update_reference(path, spp=wanted, **options)["expected_fraction"] >= 0.9975
     monkeypatch.setattr(regress, "probe", lambda *_: 0.02)
-    assert "not even 16 times the samples would do: give fewer" in refused(capsys, "regress", path, "--update")
+    with pytest.raises(regress.scenes.SceneError, match="not even 16 times the samples would do: give fewer"):
+        regress.update_reference(path, **options)
 
 
 def test_a_reference_that_would_fail_unchanged_is_refused(regress, rng, tmp_path, capsys, monkeypatch):
@@ -458,9 +395,9 @@ def test_references_serve_both_backends(regress, tmp_path, monkeypatch):
     path = scene_file(tmp_path)
     regress.update_reference(path, spp=8, progress=False)
     stored = regress.read_reference(path)
-    monkeypatch.setattr(regress.mi, "variant", lambda: "cuda_ad_rgb")
+    monkeypatch.setattr(mi, "variant", lambda: "cuda_ad_rgb")
     assert np.array_equal(regress.read_reference(path).image, stored.image)
-    monkeypatch.setattr(regress.mi, "variant", lambda: "llvm_ad_spectral")
+    monkeypatch.setattr(mi, "variant", lambda: "llvm_ad_spectral")
     with pytest.raises(regress.BadReference, match=r'no reference ".*scene.llvm_ad_spectral.exr"; run'):
         regress.read_reference(path)
 
@@ -492,7 +429,7 @@ def test_bad_references(regress, tmp_path, capsys):
     about = {"scene": "scene", "variant": "llvm_ad_rgb", "defines": {}, "budget": 8, "spp": 128, "seed": 0}
     picture = np.zeros((12, 16, 3), np.float32)
     for image, wrong in ((picture, {"budget": 0}), (picture, {"spp": "many"}), (picture + np.nan, {})):
-        regress._write(file, regress.Reference(image, picture, {**about, **wrong}))
+        write_reference(file, regress.Reference(image, picture, {**about, **wrong}))
         assert "is a damaged reference" in refused(capsys, "regress", path, *out)
     assert not (tmp_path / "out").exists()
 

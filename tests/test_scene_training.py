@@ -18,15 +18,16 @@ from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import load_source
 from mi_diffind.plugins.support import footprint
 from mi_diffind.runtime import array_module
-from mi_diffind.scene_training import arguments
-from mi_diffind.scene_training import references as references_module
-from mi_diffind.scene_training.arguments import SCENE_ARGUMENTS, views_of
-from mi_diffind.scene_training.fit import fit_scene, recipe_of, size_of, texture_problem
+from mi_diffind.scene_training import recipe as scene_recipe
+from mi_diffind.scene_training import reference_renders
+from mi_diffind.scene_training.fit import fit_scene
 from mi_diffind.scene_training.problem import SceneProblem, exposure_of
-from mi_diffind.scene_training.recipe import SceneRecipe, View, ViewDistribution
-from mi_diffind.scene_training.references import ReferenceRenders, colours
+from mi_diffind.scene_training.recipe import SCENE_ARGUMENTS, SceneRecipe
+from mi_diffind.scene_training.reference_renders import ReferenceRenders
 from mi_diffind.scene_training.rig import Rig
-from mi_diffind.scene_training.texture import TrainedScene, texture_file
+from mi_diffind.scene_training.stored_texture import budget_of, recipe_of, texture_file, texture_problem
+from mi_diffind.scene_training.trained_scene import TrainedScene
+from mi_diffind.scene_training.views import View, ViewDistribution, views_of
 from mi_diffind.settings import FitSettings
 from mi_diffind.tables import load_table, save_table
 from mi_diffind.task import FitRequest
@@ -68,10 +69,11 @@ def path(folder):
 @pytest.fixture(scope="module")
 def trained(folder, path):
     """The scene with its arrays as parameters, and the problem of the texture."""
-    file, _ = texture_file(path)
+    parsed = scenes.ParsedScene(path)
+    file, _ = texture_file(parsed)
     table = load(file)
     problem = texture_problem(table, load_source(folder / "material.json"))
-    scene = TrainedScene(path, file, ORBIT, 1, table)
+    scene = TrainedScene(parsed, file, ORBIT, 1, table)
     return scene, problem
 
 
@@ -133,7 +135,7 @@ def parsed(*words):
 
 
 def test_arguments():
-    assert views_of(parsed()) == ViewDistribution() and arguments.recipe_of(parsed(), FitSettings()).bound == 1
+    assert views_of(parsed()) == ViewDistribution() and scene_recipe.recipe_of(parsed(), FitSettings()).bound == 1
     found = parsed(
         "--views", "3", "--azimuth=-30:30", "--elevation", "40", "--target=-1,0,2.5", "--light-elevation", "10:80",
         "--bound", "none", "--spp", "4", "--begin", "untrained",
@@ -142,7 +144,7 @@ def test_arguments():
         3, azimuth=(-30, 30), elevation=(40, 40), target=(-1, 0, 2.5), light_elevation=(10, 80), seed=7
     )
     assert views_of(found, 7) == expected
-    recipe = arguments.recipe_of({**found, "share": 0.5}, FitSettings(steps=9))
+    recipe = scene_recipe.recipe_of({**found, "share": 0.5}, FitSettings(steps=9))
     assert recipe == SceneRecipe(0.5, 4, None, start="untrained", settings=FitSettings(steps=9))
     assert views_of(parsed("--origins", "0,0,0:1,1,1")).origins == ((0, 0, 0), (1, 1, 1))
 
@@ -243,11 +245,18 @@ def test_rigs_that_cannot_be():
 
 # -- references -------------------------------------------------------------------------------------------------------
 
+#: Samples of an image in passes of four samples a pixel.
+FOUR = 4 * 24 * 24
+
+
+def references_of(path, *arguments, **options):
+    """References of a scene file, without a progress bar."""
+    return ReferenceRenders(scenes.ParsedScene(path), *arguments, progress=False, **options)
+
 
 @pytest.fixture
 def passes(monkeypatch):
-    """Passes of four samples, and the number of those that were rendered."""
-    monkeypatch.setattr(references_module, "PASS", 4 * 24 * 24)
+    """Seeds of the rendered passes, of which one can be made to fail."""
     render, seeds = scenes.render_pass, []
 
     def counted(scene, spp, seed):
@@ -263,18 +272,18 @@ def passes(monkeypatch):
 
 def test_references_are_rendered_once(path, tmp_path, passes):
     def references(spp=10, **more):
-        return ReferenceRenders(path, ORBIT, spp, tmp_path / "kept", progress=False, **more)
+        return references_of(path, ORBIT, spp, tmp_path / "kept", pass_samples=FOUR, **more)
 
     views = ORBIT.trained()[:2]
     first = references()
     images = first.images(views)
-    assert first.rendered == 6 and first.found == 0 and len(set(passes.seeds)) == 6
-    assert min(passes.seeds) >= references_module.SEEDS
+    assert first.rendered == 6 and first.reused == 0 and len(set(passes.seeds)) == 6
+    assert min(passes.seeds) >= reference_renders.SEEDS
     files = sorted((tmp_path / "kept").iterdir())
     assert [file.suffix for file in files] == [".npz"] * 2
     again = references()
     np.testing.assert_array_equal(images, again.images(views))
-    assert again.rendered == 0 and again.found == 2
+    assert again.rendered == 0 and again.reused == 2
     # Other samples, a scene that is written otherwise: other images; not for what is trained
     unchanged = references(without=(path.with_name("material.npz"),))
     assert not {references(11).path(v) for v in views} & set(files)
@@ -291,24 +300,27 @@ def test_references_are_rendered_once(path, tmp_path, passes):
 
 
 def test_references_go_on_after_an_interruption(path, tmp_path, passes):
-    view, uninterrupted = ORBIT.trained()[0], ReferenceRenders(path, ORBIT, 10, progress=False)
+    view, uninterrupted = (
+        ORBIT.trained()[0],
+        references_of(path, ORBIT, 10, pass_samples=FOUR),
+    )
     expected = uninterrupted.images([view])[0]
     seeds = list(passes.seeds)
-    kept = ReferenceRenders(path, ORBIT, 10, tmp_path, progress=False)
+    kept = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR)
     passes.stop = len(seeds) + 2
     with pytest.raises(KeyboardInterrupt):
         kept.images([view])
     assert [file.name for file in tmp_path.iterdir()] == [kept.path(view).name]  # nothing half-written beside it
     passes.stop = 0
-    again = ReferenceRenders(path, ORBIT, 10, tmp_path, progress=False)
+    again = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR)
     np.testing.assert_array_equal(again.images([view])[0], expected)
-    assert again.found == 1 and again.rendered == 2
+    assert again.reused == 1 and again.rendered == 2
     assert passes.seeds[-4:] == [seeds[0], seeds[1], seeds[1], seeds[2]]
 
 
 def test_references_are_the_exact_scene(path, passes):
     """Against the scene rendered as it is written, in the view that it has."""
-    image = ReferenceRenders(path, ViewDistribution(), 64, progress=False).images([View()])[0]
+    image = references_of(path, ViewDistribution(), 64).images([View()])[0]
     expected = mi.render(scenes.load(path, exact=True), spp=64, seed=9).numpy()
     assert np.abs(image - expected).mean() < 0.05 * expected.mean() and not np.array_equal(image, expected)
 
@@ -317,18 +329,16 @@ def test_only_colours_count(path):
     """Of a film with transparency, too."""
     with_alpha = path.with_name("alpha.xml")
     with_alpha.write_text(path.read_text().replace('value="rgb"', 'value="rgba"'))
-    image, expected = (
-        ReferenceRenders(p, ViewDistribution(), 16, progress=False).images([View()])[0] for p in (with_alpha, path)
-    )
+    image, expected = (references_of(p, ViewDistribution(), 16).images([View()])[0] for p in (with_alpha, path))
     assert image.shape == (24, 24, 3)
     assert np.abs(image - expected).mean() < 0.1 * expected.mean()
-    assert colours(mi.TensorXf(np.zeros((2, 2, 4)))).shape == (2, 2, 3)
-    assert colours(np.zeros((2, 2, 2))).shape == (2, 2, 1)
+    assert scenes.colour_channels(mi.TensorXf(np.zeros((2, 2, 4)))).shape == (2, 2, 3)
+    assert scenes.colour_channels(np.zeros((2, 2, 2))).shape == (2, 2, 1)
 
 
 def test_a_folder_for_references_that_cannot_be(path, tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
-        ReferenceRenders(path, ViewDistribution(), 4, tmp_path / "nowhere" / "kept")
+        references_of(path, ViewDistribution(), 4, tmp_path / "nowhere" / "kept")
 
 
 # -- training, while no other scene is there ---------------------------------------------------------------------------
@@ -346,13 +356,21 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     table.arrays["cascaded"] = dataclasses.replace(entries, entries=255 - entries.entries)
     save_table(tmp_path / "material.npz", table)
     scene = scene_file(tmp_path / "material.npz", NAMES)
+    parsed = scenes.ParsedScene(scene)
     recipe = SceneRecipe(share=1.0, reference_spp=16)
     changed = {"steps": 6, "measure_every": 3, "batch": 2048, "lr": 0.1, "schedule": "constant"}
     recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
 
     def fitted_scene(**more):
         request = FitRequest("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
-        return fit_scene(scene, ORBIT, recipe, request, references=tmp_path / "kept", preview=tmp_path / "preview.png")
+        return fit_scene(
+            parsed,
+            ORBIT,
+            recipe,
+            request,
+            references=tmp_path / "kept",
+            preview=tmp_path / "preview.png",
+        )
 
     found, result = fitted_scene()
     history = [h["psnr_db"] for h in result.history]
@@ -372,9 +390,9 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     (tmp_path / "after.xml").write_text(scene.read_text().replace("material.npz", "trained.npz"))
     plain, view = scenes.load(tmp_path / "after.xml"), ORBIT.measured()[0]
     own = {"without": (tmp_path / "material.npz",), "inputs": (found.settings["source"],)}
-    references = ReferenceRenders(scene, ORBIT, 16, tmp_path / "kept", progress=False, **own)
+    references = references_of(scene, ORBIT, 16, tmp_path / "kept", **own)
     (truth,) = references.images([view])
-    assert references.found == 1
+    assert references.reused == 1
     Rig(plain, ORBIT).place(view)
     footprint.attach(plain)
     images = [np.clip(found.settings["exposure"] * mi.render(plain, spp=1, seed=i).numpy(), 0, 1) for i in range(16)]
@@ -512,14 +530,14 @@ def test_gradients_against_differences(trained, weights):
 
 
 def test_which_texture(path, folder):
-    assert texture_file(path) == (folder / "material.npz", "")
-    assert texture_file(path, folder / "material.npz")[0] == folder / "material.npz"
+    assert texture_file(scenes.ParsedScene(path)) == (folder / "material.npz", "")
+    assert texture_file(scenes.ParsedScene(path), folder / "material.npz")[0] == folder / "material.npz"
     with pytest.raises(UsageError, match=r"no neural_texture reads .*other\.npz, the files are material\.npz"):
-        texture_file(path, folder / "other.npz")
+        texture_file(scenes.ParsedScene(path), folder / "other.npz")
     plain = folder / "plain.xml"
     plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     with pytest.raises(UsageError, match="names 0 files of neural_texture"):
-        texture_file(plain)
+        texture_file(scenes.ParsedScene(plain))
 
 
 # -- its parts --------------------------------------------------------------------------------------------------------
@@ -564,5 +582,5 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
     table = to_table(CompressedTexture(layout, stored_form(net)), {**own, "loss": "mae"})  # a render's
     save_table(tmp_path / "x.npz", table)
     table = load(tmp_path / "x.npz")
-    assert size_of(table) == wanted
+    assert budget_of(table) == wanted
     assert recipe_of(table) == recipe

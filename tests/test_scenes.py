@@ -59,7 +59,7 @@ def test_reports_have_the_parameters_of_their_own_node(mi_rgb, tmp_path):
         "neural_ggx tables copper": {"material": "Cu"},
     }
     assert {f"{r['plugin']} {r['preset']} {r['id']}".strip(): r["parameters"] for r in found} == expected
-    assert sorted(map(str, (r["parameters"] for r in scenes.learned_plugins(path)))) == sorted(
+    assert sorted(map(str, (r["parameters"] for r in scenes.ParsedScene(path).learned_plugins()))) == sorted(
         map(str, expected.values())
     )
     (image,) = [r for r in found if r["kind"] == "texture"]
@@ -158,7 +158,7 @@ def test_materials_cover_the_ten_parameters(mi_rgb):
     from mi_diffind import scenes
     from mi_diffind.tasks.disney.model import PARAMETERS
 
-    learned = scenes.learned_plugins(SCENES / "materials.xml")
+    learned = scenes.ParsedScene(SCENES / "materials.xml").learned_plugins()
     for name in PARAMETERS:
         row = [e["parameters"][name] for e in learned if e["id"].rpartition("_")[0] == name]
         assert np.allclose(sorted(row), np.linspace(0, 1, 6), atol=1e-3), name

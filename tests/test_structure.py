@@ -18,7 +18,7 @@ FLOORS = (
     ("maps",),
     ("tasks",),
     ("plugins",),
-    ("scenes", "capture", "orbit", "compare", "regress", "depth", "encode", "measure"),
+    ("poses", "scenes", "capture", "orbit", "compare", "z_test", "reference_files", "regress", "depth", "measure"),
     ("scene_training",),
     ("studies",),
     ("commands",),

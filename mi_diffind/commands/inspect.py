@@ -97,7 +97,7 @@ def _inspect_table(arguments) -> dict:
 
 
 def _print_rays(n: dict) -> None:
-    """Print what camera rays read of a radiance field (:class:`mi_diffind.tasks.radiance.counting.Counts`)."""
+    """Print what camera rays read of a radiance field (:class:`mi_diffind.tasks.radiance.march.RayCounts`)."""
     total = max(1, n["steps"])
     print(
         f"    rays      {n['crossing']:,} of {n['rays']:,} cross the field, {n['opaque']:,} of them end opaque\n"
@@ -110,10 +110,10 @@ def _inspect_scene(arguments) -> dict:
     set_variant(arguments.variant)
     from .. import scenes
 
-    defines = dict(arguments.defines)
-    learned = scenes.learned_plugins(arguments.file, defines=defines)
-    tables = scenes.tables_of(arguments.file, learned)
-    reports = scenes.reports(scenes.load(arguments.file, defines=defines))
+    parsed = scenes.ParsedScene(arguments.file, dict(arguments.defines))
+    learned = parsed.learned_plugins()
+    tables = parsed.tables(learned)
+    reports = scenes.reports(parsed.load())
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned plugin(s), {total:,} bytes of tables in {len(tables)} file(s)")
     for report in reports:

@@ -74,12 +74,12 @@ def run(arguments) -> dict:
 
     from .. import scenes
 
-    defines = dict(arguments.defines)
-    depth = _choose_depth(arguments, defines)
+    parsed = scenes.ParsedScene(arguments.scene, dict(arguments.defines))
+    depth = _choose_depth(arguments, parsed)
     start = time.perf_counter()
-    learned = scenes.learned_plugins(arguments.scene, defines=defines)
+    learned = parsed.learned_plugins()
     changed = depth["chosen"] != depth["scene"]
-    scene = scenes.load(arguments.scene, longest_path=depth["chosen"] if changed else None, defines=defines)
+    scene = parsed.load(longest_path=depth["chosen"] if changed else None)
     loaded = time.perf_counter()
     spp = arguments.spp or scene.sensors()[0].sampler().sample_count()
     if arguments.orbit:
@@ -107,7 +107,7 @@ def run(arguments) -> dict:
         "seconds_render": rendered - loaded,
         "learned_plugins": learned,
         "reports": scenes.reports(scene) if arguments.json is not None else [],
-        "table_bytes": scenes.table_bytes(arguments.scene, learned),
+        "table_bytes": parsed.table_bytes(learned),
     }
 
 
@@ -142,18 +142,18 @@ def _orbit(arguments, output: Path, scene, spp: int) -> dict:
     }
 
 
-def _choose_depth(arguments, defines: dict[str, str]) -> dict:
+def _choose_depth(arguments, parsed) -> dict:
     """Choose the depth to render to and say why; what was not measured is None."""
     from .. import depth, scenes
 
     if arguments.depth == "auto":
         tolerance = arguments.depth_tolerance or depth.TOLERANCE
-        probe = depth.auto_depth(arguments.scene, tolerance, arguments.seed, defines=defines)
+        probe = depth.auto_depth(parsed, tolerance, arguments.seed)
         print("\n".join(depth.summary(probe)))
         return {"requested": "auto", **probe}
     scene_depth = None
     with contextlib.suppress(scenes.SceneError):  # no integrator with a depth: fine, unless one is asked for
-        scene_depth = scenes.integrator_of(arguments.scene, defines=defines)[1]
+        scene_depth = parsed.path_integrator()[1]
     chosen = scene_depth if arguments.depth == "scene" else arguments.depth
     unknown = ("tolerance", "shares", "left_out", "left_out_in_a_tile", "probe_seconds")
     return {"requested": arguments.depth, "chosen": chosen, "scene": scene_depth, **dict.fromkeys(unknown)}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from .. import units
 from ..arguments import Argument, checked, decibels, positive
 from ..errors import UsageError
@@ -33,6 +35,11 @@ SOURCES = (
     ),
 )  # fmt: skip
 
+#: Picture of a training that is written at each measurement.
+PREVIEW = Argument(
+    "--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"
+)
+
 #: What is decoded.
 DECODED = (
     Argument("--map", action="append", metavar="NAME", help="only this map; may be repeated (default: all)"),
@@ -50,3 +57,10 @@ def asked_bytes(options, source: Source) -> int:
         return units.parse_size(source.nbytes, source.texels, **given)
     except ValueError as e:
         raise UsageError(str(e)) from None
+
+
+def preview_path(request) -> Path | None:
+    """Return the file of :data:`PREVIEW`: the given one, or ``…_preview.png`` beside the output (``None`` without)."""
+    if request.options["preview"] is not None:
+        return Path(request.options["preview"])
+    return None if request.output is None else request.output.with_name(f"{request.output.stem}_preview.png")

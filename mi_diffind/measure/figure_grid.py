@@ -35,6 +35,13 @@ def colour_map(title: str, values: np.ndarray, extend: str = "neither", **option
     return draw
 
 
+def error_map(error: np.ndarray) -> Cell:
+    """Draw an absolute difference ``(height, width)``, the mean of the channels, up to its 99.5% quantile."""
+    top = max(float(np.quantile(error, 0.995)), 1e-6)
+    title = "absolute difference, mean of the channels (linear)"
+    return colour_map(title, error, "max", cmap="magma", vmin=0, vmax=top)
+
+
 def text(lines: Sequence[str]) -> Cell:
     """Return a cell with lines of text."""
 

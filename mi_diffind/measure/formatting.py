@@ -76,3 +76,8 @@ def state(result: dict) -> str:
     """Return the caption's sentences about a quick or interrupted run, "" for a complete one."""
     quick = " A smoke run (--quick): times are not to be quoted." if result["settings"]["quick"] else ""
     return quick + (" Interrupted: less was measured than asked for." if result["interrupted"] else "")
+
+
+def figure_caption(result: dict) -> str:
+    """Return the caption of a figure: the notes of a result, its machine, and its :func:`state`."""
+    return f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"

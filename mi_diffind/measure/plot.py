@@ -128,6 +128,15 @@ def log_ticks(axis, low: float, high: float, shown: Callable[[float], str]) -> N
     axis.minorticks_off()
 
 
+def image_panel(axes, image: np.ndarray, title: str = "", label: str = "") -> None:
+    """Draw an image of displayed values in [0, 1], without ticks, with a title above and a label on the left."""
+    axes.imshow(image.clip(0, 1), vmin=0, vmax=1, interpolation="nearest")
+    axes.set_title(title, fontsize=8)
+    axes.set_ylabel(label, fontsize=7.5)
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
 def plain(value: float) -> str:
     """Return the text of a number at a tick."""
     return f"{value:,.0f}" if value >= 1000 else f"{value:g}"

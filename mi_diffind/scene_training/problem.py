@@ -1,13 +1,13 @@
 """
-The training problem of a scene: (1 − λ) · the loss of the texture + λ · the difference of renders from references.
+Training problem of a scene: (1 − λ) · loss of the texture + λ · difference between renders and references.
 
-*Unbiased.* The derivative of a squared error is 2 (I − R) ∂I: a product of two random numbers if I is a render of few
-samples, right on average only if they are independent. So the value I comes from one set of samples, its derivative
-∂I from another (``seed`` and ``seed_grad`` of ``mi.render``), and the reference R from a third. That does what the loss
-(I₁ − R)(I₂ − R) of two renders does, at the price of one derivative. An error beyond the bound, and an absolute one,
-counts by its sign: a number that noise changes, however its samples are drawn. What the bound is good for: no pixel,
-such as a highlight on metal or a firefly, pulls with more than the bound. (In a scene, a component of the BSDF has no
-gradient of its own that could be clipped; that of the image has.)
+*Unbiased.* The derivative of a squared error is 2 (I − R) ∂I, a product of two random numbers if I is a render of few
+samples. The product is right on average only if both are independent: the value I comes from one set of samples, its
+derivative ∂I from another (``seed`` and ``seed_grad`` of ``mi.render``), and the reference R from a third. The result
+equals the loss (I₁ − R)(I₂ − R) of two renders, at the price of one derivative. An absolute error, and an error beyond
+the bound, contributes its sign, which noise biases however the samples are drawn. In return, no pixel (a highlight on
+metal, a firefly) has a larger gradient than the bound. A component of a BSDF in a scene has no gradient of its own that
+could be clipped; the image has.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from .. import scenes
 from ..fitting import Problem
 from ..indirection import unfolded
 from ..tasks.texture.training import TextureProblem, rounded
-from .recipe import SceneRecipe, View
-from .references import SEEDS
-from .texture import TrainedScene
+from .recipe import SceneRecipe
+from .reference_renders import SEEDS
+from .trained_scene import TrainedScene
+from .views import View
 
-#: Of the references' pixels, the share that may be brighter than white.
+#: Share of the references' pixels that may be brighter than white.
 BRIGHTER = 0.05
 
-#: Samples a pixel, at least, of a render that is measured, in two halves.
+#: Smallest number of samples per pixel of a measured render, in two halves.
 MEASURED = 16
 
-#: How much brighter differences are shown than they are.
+#: Factor by which differences are amplified in the preview.
 SHOWN = 4
 
 
 def exposure_of(references: Sequence[np.ndarray]) -> float:
-    """The factor that makes 1 of the largest channel that :data:`BRIGHTER` of the pixels exceed; 1 for black images."""
+    """Return the factor that maps to 1 the channel value that :data:`BRIGHTER` of the pixels exceed (1 if black)."""
     brightest = np.concatenate([image.max(axis=2).ravel() for image in references])
     white = float(np.quantile(brightest, 1 - BRIGHTER))
     return 1 / white if white > 0 else 1.0
@@ -48,13 +49,15 @@ def exposure_of(references: Sequence[np.ndarray]) -> float:
 
 class SceneProblem(Problem):
     """
-    The training problem of :mod:`mi_diffind.fitting`. ``texture`` is the problem of the same arrays without a scene,
-    whose ``net`` is trained; ``scene`` the scene that reads them. ``trained`` and ``measured`` are pairs of a view and
-    its reference, ``(height, width, channels)``. ``preview``: a picture that is written at each measurement, of the
-    first view that is measured: reference | render | :data:`SHOWN` times their difference.
+    Training problem (:mod:`mi_diffind.fitting`) of a texture in a scene.
+
+    ``texture`` is the problem of the same arrays without a scene, whose ``net`` is trained; ``scene`` reads the arrays.
+    ``trained`` and ``measured`` are pairs of a view and its reference, ``(height, width, channels)``. ``preview`` is a
+    picture of the first measured view, written at each measurement: reference | render | :data:`SHOWN` times their
+    difference.
     """
 
-    #: dB of renders.
+    #: Tolerance of the PSNR of renders, dB.
     tolerance = 0.02
 
     def __init__(
@@ -72,16 +75,16 @@ class SceneProblem(Problem):
         self.views = [view for view, _ in trained]
         self.references = [mi.TensorXf(np.ascontiguousarray(self.exposure * image)) for _, image in trained]
         self.measured = [(view, self.exposure * image) for view, image in measured]
-        own = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
-        self.identity = {**texture.identity, "scene": digest, "shading": own, "exposure": self.exposure}
+        recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
+        self.identity = {**texture.identity, "scene": digest, "shading": recorded, "exposure": self.exposure}
         self._view = 0
 
     def begin(self, step: int, share: float) -> str:
-        """Which view it is: each once, in an order drawn anew each time."""
-        kind, n = self.texture.begin(step, share), len(self.views)
+        """Choose the view of a step: each once per round, in a new random order each round."""
+        texture_step, n = self.texture.begin(step, share), len(self.views)
         order = np.random.default_rng((self.settings.seed, 2, step // n)).permutation(n)
         self._view = int(order[step % n])
-        return f"{kind}, view {self._view}"
+        return f"{texture_step}, view {self._view}"
 
     def loss(self, net, rng, size: int):
         share, losses = self.recipe.share, []
@@ -93,7 +96,7 @@ class SceneProblem(Problem):
         return losses
 
     def image_loss(self, net, rng):
-        """The loss of the render of the step's view: an array of the shares of all pixels."""
+        """Return the loss of the render of the step's view: one value for each pixel and channel, to be summed."""
         seeds = rng.integers(mi.UInt32, 2, 0, SEEDS - 1)
         value, derivative = (dr.gather(mi.UInt32, seeds, i) for i in range(2))
         self.scene.hold(self.texture.seen(unfolded(net)))
@@ -102,7 +105,7 @@ class SceneProblem(Problem):
         return self.errors(error.array) * (1 / math.prod(error.shape))
 
     def errors(self, error):
-        """Absolute or squared (``settings.loss``), the latter beyond the bound as the tangent goes on."""
+        """Return absolute or squared errors (``settings.loss``); squares continue linearly beyond the bound."""
         size, bound = dr.abs(error), self.recipe.bound
         if self.settings.loss == "mae":
             return size
@@ -112,8 +115,10 @@ class SceneProblem(Problem):
 
     def measure(self, net) -> dict[str, float]:
         """
-        ``psnr_db`` of renders of the views that are measured, values clipped to [0, 1], with the variance of two halves
-        of their samples taken out, entries rounded; and the PSNR of the texture.
+        Return ``psnr_db`` of renders of the measured views, with rounded entries, and the PSNR of the texture.
+
+        Values are clipped to [0, 1]. The errors of two halves of the samples are multiplied, so that their variance
+        does not count.
         """
         with dr.suspend_grad():
             self.scene.hold(rounded(unfolded(net)))
@@ -130,7 +135,7 @@ class SceneProblem(Problem):
         return {"psnr_db": decibels, **{f"texture_{name}": value for name, value in texture.items()}}
 
     def _sampled(self, number: int) -> np.ndarray:
-        """A render of half the samples of a measurement, the same for the same number."""
+        """Render half the samples of a measurement, the same for the same number."""
         spp = max(MEASURED // 2, self.scene.spp)
         seed = dr.opaque(mi.UInt32, SEEDS - 1 - number)
         return self.exposure * np.nan_to_num(self.scene.render(seed, seed + SEEDS, spp).numpy())

@@ -1,27 +1,29 @@
-"""The camera and the lights of a loaded scene, moved to where a view has them."""
+"""Rig of a loaded scene: its camera and lights, moved to the places of a view."""
 
 from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
 
+from ..poses import rotation
 from ..scenes import SceneError
-from .recipe import View, ViewDistribution
+from .views import View, ViewDistribution
 
-#: Of two directions, the sine of the angle below which they count as parallel.
+#: Sine of the angle between two directions below which they count as parallel.
 PARALLEL = 1e-4
 
 
 class Rig:
     """
-    Moves the first sensor and the lights of a loaded scene, by its parameters: nothing is loaded or compiled anew.
-    Raises :class:`~mi_diffind.scenes.SceneError` where there is nothing to move, or to look at.
+    First sensor and lights of a loaded scene, moved through scene parameters: nothing is loaded or compiled again.
+
+    Raises :class:`~mi_diffind.scenes.SceneError` if the scene has nothing that could be moved, or looked at.
     """
 
     def __init__(self, scene: mi.Scene, views: ViewDistribution):
         self.scene, self.views = scene, views
         if not scene.sensors():
-            raise SceneError("the scene has no sensor that views could be of")
+            raise SceneError("the scene has no sensor, views need one")
         self.up = np.array(views.up, np.float64) / np.linalg.norm(views.up)
         self.sensor = _Movable(scene.sensors()[0])
         if views.moves_camera and not self.sensor.matrix:
@@ -41,7 +43,7 @@ class Rig:
             self.target = self._target()
 
     def _target(self) -> np.ndarray:
-        """What the middle of the image shows, unless it is given."""
+        """Return the target of the views: the given one, or the surface in the middle of the scene's image."""
         if self.views.target is not None:
             return np.array(self.views.target, np.float64)
         sensor = self.scene.sensors()[0]
@@ -52,7 +54,7 @@ class Rig:
         return np.array(hit.p, np.float64).ravel()
 
     def place(self, view: View) -> None:
-        """Move all to a view."""
+        """Move camera and lights to a view."""
         if self.views.moves_camera:
             self.sensor.move(self._camera(view))
         for light in self.lights:
@@ -65,48 +67,50 @@ class Rig:
             to = np.array(view.origin)
         else:
             to = self.target + self._turned(origin - self.target, view.azimuth, view.elevation, view.distance)
-        # What the scene's camera is rolled, scaled or turned away from the target by stays as it is
+        # Roll, scale and the angle to the target of the scene's own camera are preserved
         return self._looking(to) @ np.linalg.inv(self._looking(origin)) @ before
 
     def _light(self, light: _Movable, view: View) -> np.ndarray:
         before, centre = light.before, self.target
         if light.environment:
-            return _about(centre, _rotation(self.up, view.light_azimuth or 0.0)) @ before
+            return rotation(self.up, view.light_azimuth or 0.0, centre) @ before
         towards = -before[:3, 2] if light.at_infinity else before[:3, 3] - centre
         turned = self._turned(towards, view.light_azimuth, view.light_elevation, None)
-        return _about(centre, _between(towards, turned, self.up, view.light_azimuth or 0.0)) @ before
+        turn = _between(towards, turned, self.up, view.light_azimuth or 0.0)
+        turn[:3, 3] = centre - turn[:3, :3] @ centre
+        return turn @ before
 
     def _turned(self, offset: np.ndarray, azimuth, elevation, distance) -> np.ndarray:
-        """An offset from the target turned about ``up``, raised to an elevation and brought to a distance."""
+        """Return an offset from the target after a turn about ``up``, at an elevation and a distance."""
         length = np.linalg.norm(offset)
         if length == 0:
-            raise SceneError("target: it is where the camera, or a light, is")
+            raise SceneError("target: found the place of the camera or of a light, another point is needed")
         height = offset @ self.up
         flat = offset - height * self.up
         if np.linalg.norm(flat) < PARALLEL * length:
             flat = np.eye(3)[np.argmin(np.abs(self.up))]
             flat = flat - (flat @ self.up) * self.up
-        flat = _rotation(self.up, azimuth or 0.0)[:3, :3] @ (flat / np.linalg.norm(flat))
+        flat = rotation(self.up, azimuth or 0.0)[:3, :3] @ (flat / np.linalg.norm(flat))
         angle = np.arcsin(np.clip(height / length, -1, 1)) if elevation is None else np.radians(elevation)
         return (distance or length) * (np.cos(angle) * flat + np.sin(angle) * self.up)
 
     def _looking(self, origin: np.ndarray) -> np.ndarray:
-        """As ``look_at`` from ``origin`` to the target."""
+        """Return the ``look_at`` matrix from ``origin`` to the target."""
         axis = self.target - origin
         if np.linalg.norm(axis) == 0:
-            raise SceneError("target: it is where the camera is")
+            raise SceneError("target: found the place of the camera, another point is needed")
         axis = axis / np.linalg.norm(axis)
         left = np.cross(self.up, axis)
         if np.linalg.norm(left) < PARALLEL:
             left = np.cross(np.eye(3)[np.argmin(np.abs(axis))], axis)
         left = left / np.linalg.norm(left)
-        found = np.eye(4)
-        found[:3] = np.stack([left, np.cross(axis, left), axis, origin], axis=1)
-        return found
+        matrix = np.eye(4)
+        matrix[:3] = np.stack([left, np.cross(axis, left), axis, origin], axis=1)
+        return matrix
 
 
 class _Movable:
-    """A sensor or a light: ``before`` is where it is in the scene, a 4×4 matrix; ``parameter`` "" if it has none."""
+    """A sensor or light; ``before``: its 4×4 matrix in the scene; ``parameter``: key of its place ("": fixed)."""
 
     def __init__(self, node):
         self.parameters = mi.traverse(node)
@@ -122,33 +126,18 @@ class _Movable:
             self.before[:3, 3] = np.array(self.parameters[self.parameter], np.float64).ravel()
 
     def move(self, matrix: np.ndarray) -> None:
-        kind = type(self.parameters[self.parameter])
+        parameter_type = type(self.parameters[self.parameter])
         value = mi.ScalarTransform4f(matrix) if self.matrix else [float(x) for x in matrix[:3, 3]]
-        self.parameters[self.parameter] = kind(value)
+        self.parameters[self.parameter] = parameter_type(value)
         self.parameters.update()
 
 
-def _rotation(axis: np.ndarray, degrees: float) -> np.ndarray:
-    """About a unit vector, 4×4 (Rodrigues)."""
-    k = np.cross(np.eye(3), axis)
-    angle, found = np.radians(degrees), np.eye(4)
-    found[:3, :3] += np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
-    return found
-
-
-def _about(centre: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """A rotation about a point."""
-    found = rotation.copy()
-    found[:3, 3] = centre - rotation[:3, :3] @ centre
-    return found
-
-
 def _between(before: np.ndarray, after: np.ndarray, up: np.ndarray, degrees: float) -> np.ndarray:
-    """The rotation by ``degrees`` about ``up``, then the shortest one that takes a vector to where another points."""
-    turn = _rotation(up, degrees)
+    """Return the rotation by ``degrees`` about ``up``, then the shortest one that aligns ``before`` with ``after``."""
+    turn = rotation(up, degrees)
     a, b = turn[:3, :3] @ before, after
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis)
     if sine < 1e-12 * np.linalg.norm(a) * np.linalg.norm(b):
         return turn
-    return _rotation(axis / sine, np.degrees(np.arctan2(sine, a @ b))) @ turn
+    return rotation(axis, np.degrees(np.arctan2(sine, a @ b))) @ turn

@@ -1,9 +1,10 @@
 """
-Studies of ``mi-diffind tradeoff``: comparisons of accuracy, time and memory.
+Studies of ``mi-diffind tradeoff``: each compares candidates by accuracy, bytes and time.
 
 Each module here, and each that an entry point of the group ``mi_diffind.studies`` names, declares a study as its
-``STUDY`` (:class:`mi_diffind.measure.study.Study`). Studies use the plugins, so this package lies above them;
-:mod:`.baselines` are other methods that tables are compared with, :mod:`.equal_memory` compares methods in equal bytes.
+``STUDY`` (:class:`mi_diffind.measure.study.Study`). Studies load plugins, so this package lies above them.
+:mod:`.baselines` are the methods that tables compete with, :mod:`.equal_memory` the contenders of comparisons in equal
+bytes, :mod:`.maps` the shared parts of studies of maps.
 """
 
 from __future__ import annotations
@@ -16,5 +17,5 @@ from ..measure.study import Study
 
 @functools.lru_cache
 def studies() -> dict[str, Study]:
-    """Return all studies by name: those of this package, then those that entry points add."""
-    return discovery.load(__name__, "STUDY", ignored=("baselines", "equal_memory"), expected=Study)
+    """Return all studies by name: those of this package, then those of entry points."""
+    return discovery.load(__name__, "STUDY", ignored=("baselines", "equal_memory", "maps"), expected=Study)

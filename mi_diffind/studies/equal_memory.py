@@ -14,7 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
 from .. import task
+from ..files import replacing
 from ..measure.study import Candidate, Job
 
 # -- selection --------------------------------------------------------------------------------------------------------
@@ -102,6 +105,12 @@ class Contender(Job):
     def load(self, path: Path):
         """Return the representation that a file of the models folder holds."""
         raise NotImplementedError
+
+    def save_arrays(self, **arrays) -> None:
+        """Write arrays to ``file``, if there is a folder for models."""
+        if self.file is not None:
+            with replacing(self.file) as temporary, open(temporary, "wb") as stream:
+                np.savez(stream, **arrays)
 
 
 class PresetContender(Contender):

@@ -27,11 +27,14 @@ from mi_diffind.compat import use_threads
 from mi_diffind.fitting import fit
 from mi_diffind.indirection import unfolded
 from mi_diffind.maps.source import load_source
-from mi_diffind.scene_training.fit import fit_scene, texture_problem
+from mi_diffind.scene_training.fit import fit_scene
 from mi_diffind.scene_training.problem import SceneProblem
-from mi_diffind.scene_training.recipe import SceneRecipe, View, ViewDistribution
-from mi_diffind.scene_training.references import ReferenceRenders
-from mi_diffind.scene_training.texture import TrainedScene
+from mi_diffind.scene_training.recipe import SceneRecipe
+from mi_diffind.scene_training.reference_renders import ReferenceRenders
+from mi_diffind.scene_training.stored_texture import texture_problem
+from mi_diffind.scene_training.trained_scene import TrainedScene
+from mi_diffind.scene_training.views import View, ViewDistribution
+from mi_diffind.scenes import ParsedScene
 from mi_diffind.tables import save_table
 from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture.compressed import load
@@ -63,7 +66,7 @@ def opened(folder: Path, light: str, names=NAMES, preset="ours", fine="0:2:4", d
     problem = texture_problem(table, load_source(folder / "material.json"))
     path = scene_file(file, names, light, FILM, depth)
     views = ORBIT if light == "directional" else ViewDistribution()
-    return TrainedScene(path, file, views, 1, table), problem, path
+    return TrainedScene(ParsedScene(path), file, views, 1, table), problem, path
 
 
 def inside(net):
@@ -247,7 +250,9 @@ def convergence(folder: Path, steps=240) -> dict:
         recipe = dataclasses.replace(recipe, settings=settings)
         request = FitRequest("ours", settings, None, progress=False)
         begin = time.perf_counter()
-        _, result = fit_scene(path, ORBIT, recipe, request, references=folder / "kept", preview=folder / "p.png")
+        _, result = fit_scene(
+            ParsedScene(path), ORBIT, recipe, request, references=folder / "kept", preview=folder / "p.png"
+        )
         histories[start] = [(h["step"], h["psnr_db"], h["texture_psnr_db"]) for h in result.history]
         say(
             what="run", start=start, seconds=time.perf_counter() - begin, restarts=result.restarts,
@@ -286,7 +291,7 @@ def losses(folder: Path, count=120) -> dict:
                 settings = dataclasses.replace(settings, loss=loss)
             recipe = dataclasses.replace(recipe, settings=settings)
             request = FitRequest("ours", settings, None, progress=False)
-            _, result = fit_scene(path, views, recipe, request, references=folder / "kept")
+            _, result = fit_scene(ParsedScene(path), views, recipe, request, references=folder / "kept")
             found[light, loss, bound] = say(
                 what="losses", light=light, loss=loss, bound=bound, restarts=result.restarts,
                 psnr_db=[round(h["psnr_db"], 2) for h in result.history],
@@ -310,10 +315,10 @@ def steps(folder: Path, count=2000) -> dict:
     views = dataclasses.replace(ORBIT, count=4, held_out=1)
     del scene
     gc.collect()
-    rendered = ReferenceRenders(path, views, 64, progress=False)
+    rendered = ReferenceRenders(ParsedScene(path), views, 64, progress=False)
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
-    scene = TrainedScene(path, path.parent / "material.npz", views, 1, load(path.parent / "material.npz"))
+    scene = TrainedScene(ParsedScene(path), path.parent / "material.npz", views, 1, load(path.parent / "material.npz"))
     problem = SceneProblem(texture, scene, [*zip(trained, images, strict=False)], [(measured[0], images[-1])], recipe)
     marks, begin = [], problem.begin
 

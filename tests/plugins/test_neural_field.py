@@ -534,7 +534,7 @@ def test_frozen(mi_rgb, fields, no_garbage_collection):
         ({"max_depth": 3, "c": {"type": "path"}}, 'parameter "max_depth": belongs to the nested integrator'),
         ({"c": {"type": "path"}, "d": {"type": "path"}}, "found 2 nested integrators"),
         ({"c": {"type": "ptracer"}}, "does not follow rays from a camera"),
-        ({"c": {"type": "test_field", "field": "fog"}}, "the boxes of two fields overlap"),
+        ({"c": {"type": "test_field", "field": "fog"}}, "the boxes of two nested fields overlap"),
         ({"c": {"type": "test_field", "field": "fog", "aovs": "depth"}}, "has AOVs of its own"),
         ({"c": {"type": "aov", "aovs": "dd:depth"}}, "has AOVs of its own"),
         ({"to_world": [1.0, 1.0, 2.0]}, 'parameter "to_world": found'),
@@ -593,10 +593,10 @@ def test_a_file_in_a_scene(mi_rgb, file, tmp_path):
     inner = """<integrator type="neural_field"><string name="filename" value="ball.npz"/>
         <transform name="to_world"><translate y="4"/></transform></integrator>"""
     (tmp_path / "two.xml").write_text(text.replace("INNER", inner))
-    assert scenes.integrator_of(tmp_path / "two.xml") == ("neural_field", -1)
+    assert scenes.ParsedScene(tmp_path / "two.xml").path_integrator() == ("neural_field", -1)
     assert len(scenes.load(tmp_path / "two.xml", longest_path=3).integrator().fields) == 2
-    assert scenes.integrator_of(tmp_path / "scene.xml") == ("neural_field", -1)
-    assert scenes.integrator_of(tmp_path / "nested.xml") == ("prb", 3)
+    assert scenes.ParsedScene(tmp_path / "scene.xml").path_integrator() == ("neural_field", -1)
+    assert scenes.ParsedScene(tmp_path / "nested.xml").path_integrator() == ("prb", 3)
     loaded = scenes.load(tmp_path / "scene.xml", longest_path=2)
     assert loaded.integrator().surfaces.max_depth == 2
     image = render(mi, loaded, 4)

@@ -1473,7 +1473,7 @@ def test_comparison(mi_rgb, scene_file):
 
 
 def test_what_is_known_of_a_scene(mi_rgb, scene_file):
-    learned = scenes.learned_plugins(scene_file)
+    learned = scenes.ParsedScene(scene_file).learned_plugins()
     assert [entry["id"] for entry in learned] == ["copper", "gold", "checked"]
     assert learned[0]["parameters"] == {"material": "Cu", "alpha": pytest.approx(0.15)}
     assert learned[0]["storage"] == "uint8" and learned[2]["parameters"]["alpha"] == "texture"

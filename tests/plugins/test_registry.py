@@ -172,7 +172,7 @@ def test_plugins_of_other_packages(mi_toys, tmp_path):
     mi = mi_toys
     assert {"toy_ball", "toy_field", "toy_fog", "neural_disney"} <= set(plugins.declared())
     (tmp_path / "scene.xml").write_text(SCENE)
-    found = scenes.learned_plugins(tmp_path / "scene.xml")
+    found = scenes.ParsedScene(tmp_path / "scene.xml").learned_plugins()
     assert [(e["plugin"], e["id"], e.get("preset"), e.get("size")) for e in found] == [
         ("toy_ball", "ball", "paper", None), ("toy_ball", "", None, "0.25"), ("toy_field", "", None, None)
     ]  # fmt: skip

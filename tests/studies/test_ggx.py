@@ -2,15 +2,14 @@
 
 import copy
 import csv
-import json
 import os
 
 import drjit as dr
 import numpy as np
 import pytest
-from variants import BACKENDS
+from study_runs import quick_result
+from variants import BACKENDS, VARIANTS
 
-from mi_diffind.cli import main
 from mi_diffind.fitting import FitSettings, fit
 from mi_diffind.runtime import array_module
 from mi_diffind.studies.baselines.networks import Network
@@ -19,7 +18,7 @@ from mi_diffind.studies.ggx import plan as plans
 from mi_diffind.tasks.ggx.model import Encoding
 from mi_diffind.tasks.ggx.training import GGXProblem
 
-GRID = {**plans.GRID, "hashmap_size": 64}
+HASH_GRID = {**plans.HASH_GRID, "hashmap_size": 64}
 
 
 @pytest.fixture
@@ -52,7 +51,7 @@ def test_network_is_what_numpy_computes(ad, rng, width, layers):
         assert np.allclose(found.numpy(), y[0], atol=1e-5)
 
 
-@pytest.mark.parametrize("options", [{"grid": GRID}, {"table": 8}, {"grid": GRID, "table": 8}])
+@pytest.mark.parametrize("options", [{"grid": HASH_GRID}, {"table": 8}, {"grid": HASH_GRID, "table": 8}])
 def test_both_forms_agree(ad, rng, options):
     net = Network(2, 8, 1, **options).alloc(ad.TensorXf, 2, dr.rng(seed=2))
     if "table" in options:
@@ -64,7 +63,7 @@ def test_both_forms_agree(ad, rng, options):
 
 def test_all_parameters_are_trained(ad):
     """A hash grid keeps its entries to itself, so that an optimiser would not see them."""
-    net = Network(2, 8, 1, GRID, table=8).alloc(ad.TensorXf, 2, dr.rng(seed=2))
+    net = Network(2, 8, 1, HASH_GRID, table=8).alloc(ad.TensorXf, 2, dr.rng(seed=2))
     problem = GGXProblem(net, ad, "tables", Encoding())
     before = {key: net[key].numpy().copy() for key in net}
     assert {"entries", "table.data", "mlp.layers.0.weights", "mlp.layers.0.bias"} <= set(before)
@@ -85,12 +84,12 @@ def test_operations_of_products(ad):
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
     """Folder and result of a smoke run, of few steps."""
+    import mitsuba as mi
+
+    mi.set_variant(VARIANTS[0])
     folder = tmp_path_factory.mktemp("ggx") / "out"
-    report = folder.parent / "report.json"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plans, "QUICK_STEPS", 10)
-        assert main(["tradeoff", "ggx", "--quick", "--out", str(folder), "--json", str(report)]) == 0
-    return folder, json.loads(report.read_text(encoding="utf-8"))
+    result, _ = quick_result(plans.plan(quick=True, quick_steps=10), folder)
+    return folder, result
 
 
 def test_quick_run_writes_what_it_promises(quick):
@@ -140,31 +139,31 @@ def test_of_what_has_not_converged_nothing_is_claimed(quick):
     assert not any("wins" in line for line in report["conclusions"])
 
 
-def verdicts(report, **changes):
+def equal_quality_lines(report, **changes):
     """The lines about equal quality when candidates had the given accuracies; what is not given has converged."""
     result = copy.deepcopy(report)
     for name, c in result["candidates"].items():
         c["converged"] = True
-        found = changes.get(name, c["errors"].get("psnr_db"))
-        if found == "unconverged":
-            c["converged"], found = False, 60.0
+        psnr = changes.get(name, c["errors"].get("psnr_db"))
+        if psnr == "unconverged":
+            c["converged"], psnr = False, 60.0
         if "psnr_db" in c["errors"]:
-            c["errors"]["psnr_db"] = found
+            c["errors"]["psnr_db"] = psnr
     lines = conclusions.conclusions(result, "16→8")
     return {line[2:22].strip(): line for line in lines if line.startswith("  ")}, lines
 
 
 def test_equal_quality(quick):
     _, report = quick
-    lines, everything = verdicts(
+    lines, everything = equal_quality_lines(
         report, **{"16→8": 40.0, "24²": 38.0, "48²": 45.0, "MLP 8x2": 20.0, "grid + MLP 16": "unconverged"}
     )
     assert "48²" in lines["single table"] and "4.00x" in lines["single table"] and "512x" in lines["single table"]
     assert "does NOT reach it" in lines["network"] and "113.7x, 256x, 4x" in lines["network"]
     assert "no statement" in lines["hash grid + network"]
     assert any("indirection 40.0 dB, single table 38.0 dB: indirection wins by 2.0 dB" in line for line in everything)
-    lines, everything = verdicts(report, **{"16→8": 40.0, "24²": 41.0, "48²": 45.0})
+    lines, everything = equal_quality_lines(report, **{"16→8": 40.0, "24²": 41.0, "48²": 45.0})
     assert "24²" in lines["single table"] and "1.00x" in lines["single table"]
     assert any("the single table wins by 1.0 dB" in line for line in everything)
-    lines, _ = verdicts(report, **{"16→8": 40.0, "24²": 39.8})  # equal, as far as that can be told
+    lines, _ = equal_quality_lines(report, **{"16→8": 40.0, "24²": 39.8})  # equal, as far as that can be told
     assert "24²" in lines["single table"] and "NOT" not in lines["single table"]

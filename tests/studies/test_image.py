@@ -35,10 +35,10 @@ def asked():
     """The seconds that trainings were asked to take; they take :data:`STEPS` steps."""
     seconds, fit_image = [], training.fit_image
 
-    def stepwise(source, size, recipe, request, **options):
+    def stepwise(source, size, recipe, request, *options):
         seconds.append(request.seconds)
         recipe = replaced(recipe, steps=STEPS, batch=2**12)
-        return fit_image(source, size, recipe, dataclasses.replace(request, seconds=None), **options)
+        return fit_image(source, size, recipe, dataclasses.replace(request, seconds=None), *options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "fit_image", stepwise)
@@ -119,7 +119,7 @@ def test_what_is_left_out_is_said(mi_rgb, monkeypatch):
 
     source = from_arrays({"albedo": smooth(32, 32, 3)})
     monkeypatch.setattr(codecs, "available", lambda: ("jpeg", "bicubic"))
-    plan = plans.plan(source, "a.png", plans.Request())
+    plan = plans.plan(source, "a.png", plans.ImageStudySettings())
     assert [c.name for c in plan.candidates if c.name.startswith(("ASTC", "BC7", "WebP"))] == []
     assert plan.notes[1].startswith("Left out, not being installed: ASTC, BC7, WebP")
     assert 'pip install "mi-diffind[compare]"' in plan.notes[1]
@@ -127,16 +127,16 @@ def test_what_is_left_out_is_said(mi_rgb, monkeypatch):
     assert plan.notes[1] in lines
 
 
-def test_candidates_of_a_request(mi_rgb):
+def test_names_of_trainings(mi_rgb):
     from mi_diffind.studies.image import plan as plans
 
     source = from_arrays({"albedo": smooth(32, 32, 3)})
-    request = plans.Request((12.0, 6.0), (5.0, 2.0), (7.0,), (4, 3), ablation=True)
-    names = [job.name for job in plans._trainings(source, request)]
+    settings = plans.ImageStudySettings((12.0, 6.0), (5.0, 2.0), (7.0,), (4, 3), ablation=True)
+    names = [job.name for job in plans._trainings(plans.ImageStudyContext(source, "a", settings))]
     assert names[:4] == ["ours 12x 2 s", "ours 12x 5 s", "paper 12x 7 s", "ours 2D→3D 12x 2 s"]
     assert names[4:-1] == [f"ours without {name} 12x 2 s" for name in IMPROVEMENTS]
     assert names[-1] == "ours 6x 2 s"
-    assert not any(c.in_picture for c in plans.plan(source, "a", request).candidates if " without " in c.name)
+    assert not any(c.in_picture for c in plans.plan(source, "a", settings).candidates if " without " in c.name)
 
 
 def test_errors(mi_rgb):

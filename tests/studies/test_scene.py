@@ -19,8 +19,8 @@ from mi_diffind.measure.statistics import finite
 from mi_diffind.scenes import SceneError
 from mi_diffind.studies.scene import picture, report
 from mi_diffind.studies.scene import renders as study
-from mi_diffind.studies.scene.renders import VERSIONS, Settings
-from mi_diffind.studies.scene.verdict import verdict
+from mi_diffind.studies.scene.renders import VERSIONS, SceneStudySettings
+from mi_diffind.studies.scene.report import verdict
 
 FILES = ["tradeoff_scene.csv", "tradeoff_scene.json", "tradeoff_scene.png"]
 
@@ -28,12 +28,12 @@ FILES = ["tradeoff_scene.csv", "tradeoff_scene.json", "tradeoff_scene.png"]
 
 
 def test_sample_counts_are_powers_of_two():
-    full, quick = Settings.choose(), Settings.choose(quick=True)
+    full, quick = SceneStudySettings.choose(), SceneStudySettings.choose(quick=True)
     assert full.counts(64) == [1, 4, 16, 64] and full.counts(100) == [1, 4, 16, 64]
     assert full.counts(32) == [2, 8, 32] and full.counts(1) == [1] and full.counts(2) == [2]
     assert quick.counts(64) == [1, 2, 4] and quick.counts(1) == [1]
-    assert Settings.choose(spp=300).counts(64) == [1, 4, 16, 64, 256]
-    assert Settings.choose(quick=True, spp=16).counts(4) == [1, 2, 4, 8, 16]
+    assert SceneStudySettings.choose(spp=300).counts(64) == [1, 4, 16, 64, 256]
+    assert SceneStudySettings.choose(quick=True, spp=16).counts(4) == [1, 2, 4, 8, 16]
 
 
 # -- whole runs -------------------------------------------------------------------------------------------------------
@@ -80,7 +80,7 @@ def whole(scene, wholes, mi_rgb):
     return wholes[mi_rgb.variant()]
 
 
-QUICK = Settings.choose(quick=True)
+QUICK = SceneStudySettings.choose(quick=True)
 PASSES = 1 + 2 + 2 * QUICK.passes  # the first is for the brightness, and two compile
 RENDERS = PASSES + 2 * QUICK.rounds * 2
 
@@ -207,9 +207,8 @@ def test_a_run_of_something_else_is_not_gone_on_with(scene, tmp_path, monkeypatc
 
 
 def test_large_images_are_rendered_in_several_launches(scene, monkeypatch):
-    monkeypatch.setattr(study, "_LAUNCH", 16 * 12 * 2)
     renders = Renders(monkeypatch)
-    result = study.measure(scene, replace(QUICK, rounds=1), progress=False)
+    result = study.measure(scene, replace(QUICK, rounds=1), progress=False, launch_samples=16 * 12 * 2)
     assert {spp for spp, _ in renders} == {1, 2}
     top = [seed for spp, seed in renders if spp == 2][: 2 * (1 + 2 * QUICK.passes)]
     lower = [seed for _, seed in renders][2 + len(top) :]
@@ -233,7 +232,8 @@ def test_values_that_are_not_finite_are_counted(scene, monkeypatch):
 
 
 def test_one_sample_count(scene, tmp_path):
-    result = study.measure(scene, Settings.choose(quick=True, spp=1), tmp_path, progress=False, defines={"spp": 2})
+    settings = SceneStudySettings.choose(quick=True, spp=1)
+    result = study.measure(scene, settings, tmp_path, progress=False, defines={"spp": 2})
     assert result["counts"] == [1] and len(result["points"]) == 2 and result["defines"] == {"spp": "2"}
 
 

@@ -14,8 +14,8 @@ from mi_diffind.studies.shading import conclusions, materials
 
 def test_made_materials():
     """They repeat, have unit normals and are what they are called."""
-    for name in materials.MADE:
-        found = {m.name: m for m in materials.made(name, 64).maps}
+    for name in materials.MATERIALS:
+        found = {m.name: m for m in materials.generated_source(name, 64).maps}
         normal = 2 * found["normal"].values - 1
         assert np.linalg.norm(normal, axis=-1) == pytest.approx(1, abs=0.02)
         assert found["albedo"].color_space == "srgb" and found["albedo"].values.std() > 0.02
@@ -24,8 +24,8 @@ def test_made_materials():
             across = np.abs(np.take(normal, 0, axis) - np.take(normal, -1, axis)).mean()
             assert across < 1.5 * inside
         assert ("metallic" in found) == (name == "hammered")
-    assert materials.made("lacquer", 64).digest == materials.made("lacquer", 64).digest
-    assert {m.name: m.values.mean() for m in materials.made("lacquer", 64).maps}["roughness"] < 0.35
+    assert materials.generated_source("lacquer", 64).digest == materials.generated_source("lacquer", 64).digest
+    assert {m.name: m.values.mean() for m in materials.generated_source("lacquer", 64).maps}["roughness"] < 0.35
 
 
 def test_noise_has_the_spectrum_that_was_asked_for(rng):
@@ -121,16 +121,16 @@ def test_the_zoom_is_what_the_camera_sees(mi_rgb):
     """Pixels of a frame, against a ray of a pinhole camera above the plane; points stay where they are."""
     from mi_diffind.maps.pyramid import Pyramid
     from mi_diffind.runtime import array_module
-    from mi_diffind.studies.shading import motion
+    from mi_diffind.studies.shading import zoom
     from mi_diffind.tasks.shading.material import effects_of
 
-    source = materials.made("lacquer", 64)
+    source = materials.generated_source("lacquer", 64)
     pyramid = Pyramid.of(source, types=array_module(mi_rgb.variant()))
-    found = motion.Motion(pyramid, effects_of(pyramid.layout)[0], 3, 8)
-    spacings = [2 ** found.lanes(k)[2].numpy()[0] for k in range(3)]
-    assert spacings == pytest.approx([motion.FAR, np.sqrt(motion.FAR * motion.NEAR), motion.NEAR], rel=1e-5)
-    u, v, _, wi, wo = found.lanes(2)
-    height = 4 * spacings[2] / np.tan(np.radians(motion.FOV / 2))  # of the camera, in texels
+    view = zoom.ShadedZoom(pyramid, effects_of(pyramid.layout)[0], 3, 8)
+    spacings = [2 ** view.lanes(k)[2].numpy()[0] for k in range(3)]
+    assert spacings == pytest.approx([zoom.FAR, np.sqrt(zoom.FAR * zoom.NEAR), zoom.NEAR], rel=1e-5)
+    u, v, _, wi, wo = view.lanes(2)
+    height = 4 * spacings[2] / np.tan(np.radians(zoom.FOV / 2))  # of the camera, in texels
     camera = np.array([32, 32, height])
     for pixel in (0, 7, 37, 63):
         way = np.array([wi.x.numpy()[pixel], wi.y.numpy()[pixel], wi.z.numpy()[pixel]])
@@ -142,8 +142,8 @@ def test_the_zoom_is_what_the_camera_sees(mi_rgb):
     for k in range(3):  # a pattern of the plane that is linear, which bilinear reads keep
         u, v = (np.arange(8) + 0.5 - 4) * spacings[k], (np.arange(8) + 0.5 - 4) * spacings[k]
         frames.append(np.stack(np.broadcast_arrays(u[None], v[:, None], 0.0), -1))
-    aligned = found.aligned(np.stack(frames))
-    inner = np.abs(aligned[2]).max(axis=-1) < 3.4 * motion.NEAR
+    aligned = view.aligned(np.stack(frames))
+    inner = np.abs(aligned[2]).max(axis=-1) < 3.4 * zoom.NEAR
     np.testing.assert_allclose(aligned[0][inner], aligned[2][inner], atol=1e-3)
 
 

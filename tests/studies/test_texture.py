@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
+from study_runs import quick_result
 
 from mi_diffind.cli import main
 from mi_diffind.measure.report import panels
@@ -27,27 +28,27 @@ def smooth(height, width, channels, seed=0):
     return np.rint(255 * values).astype(np.uint8)
 
 
-def directions(stage, film, x, y):
+def directions(scene, film, x, y):
     """Rays through places of the image in [0, 1], by the rules of a pinhole camera: up is up, right is right."""
-    forward = np.subtract(stage.target, stage.origin)
+    forward = np.subtract(scene.target, scene.origin)
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0, 1, 0])
     right = right / np.linalg.norm(right)
-    tangent = math.tan(math.radians(stage.fov) / 2)
+    tangent = math.tan(math.radians(scene.fov) / 2)
     across, down = (2 * x - 1) * tangent, (2 * y - 1) * tangent * film[1] / film[0]
     return forward + across[..., None] * right - down[..., None] * np.cross(right, forward)
 
 
 def test_areas_of_pixels(mi_rgb):
     """Those of the plane, by hand: uv is 1 over the width of the square."""
-    from mi_diffind.studies.texture.test_scenes import stages
+    from mi_diffind.studies.texture.test_scenes import still_scenes
 
-    stage = stages()["plane"]
-    area, inside = stage.seen(FILM)
+    scene = still_scenes()["plane"]
+    area, inside = scene.pixel_areas(FILM)
     x, y = np.meshgrid(np.arange(FILM[0] + 1) / FILM[0], np.arange(FILM[1] + 1) / FILM[1])
-    way = directions(stage, FILM, x, y)
+    way = directions(scene, FILM, x, y)
     with np.errstate(divide="ignore"):
-        places = stage.origin + way * (-stage.origin[1] / way[..., 1:2])
+        places = scene.origin + way * (-scene.origin[1] / way[..., 1:2])
     ahead = way[..., 1] < 0
     near = ahead & (np.abs(places[..., [0, 2]]) < 900).all(axis=-1)
     corners = near[:-1, :-1] & near[1:, :-1] & near[:-1, 1:] & near[1:, 1:]
@@ -57,22 +58,22 @@ def test_areas_of_pixels(mi_rgb):
     expected = 0.5 * np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
     rows = corners & (np.arange(FILM[1])[:, None] >= FILM[1] // 3)  # further away, single precision is not enough
     np.testing.assert_allclose(area[rows], expected[rows], rtol=0.02)
-    repeats = stage.repeats(FILM, (64, 32))
+    repeats = scene.repeats(FILM, (64, 32))
     assert repeats[0] * 64 == pytest.approx(repeats[1] * 32)  # texels are square
     texels = expected * repeats[0] * 64 * repeats[1] * 32
-    assert texels[-1, FILM[0] // 2] == pytest.approx(stage.texels, rel=0.02)
+    assert texels[-1, FILM[0] // 2] == pytest.approx(scene.texels, rel=0.02)
     far = rows & (np.abs(texels - 1) > 0.05)
-    assert np.array_equal(stage.counted(FILM, (64, 32))[far], texels[far] >= 1)
+    assert np.array_equal(scene.counted(FILM, (64, 32))[far], texels[far] >= 1)
 
 
 def test_light_has_no_noise(mi_rgb):
     """A constant texture is shown as it is, whatever the seed; a sphere as bright as it faces the light."""
-    from mi_diffind.studies.texture.test_scenes import Reader, stages
+    from mi_diffind.studies.texture.test_scenes import TextureReader, still_scenes
 
-    reader = Reader(lambda repeats: {"type": "rgb", "value": [0.8, 0.3, 0.1]})
-    for name, stage in stages().items():
-        images = [reader.render(stage, FILM, (8, 8), seed) for seed in (0, 1)]
-        inside = stage.seen(FILM)[1]
+    reader = TextureReader(lambda repeats: {"type": "rgb", "value": [0.8, 0.3, 0.1]})
+    for name, scene in still_scenes().items():
+        images = [reader.render(scene, FILM, (8, 8), seed) for seed in (0, 1)]
+        inside = scene.pixel_areas(FILM)[1]
         if name == "sphere":
             assert images[0].max() <= 0.91 and images[0][inside].min() < 0.5
             continue
@@ -82,7 +83,7 @@ def test_light_has_no_noise(mi_rgb):
 
 
 def test_errors_are_those_of_counted_pixels():
-    from mi_diffind.studies.texture.test_scenes import decibel, errors
+    from mi_diffind.studies.texture.test_scenes import errors
 
     truth = np.random.default_rng(1).random((12, 10, 3)).astype(np.float32)
     counted = np.zeros((12, 10), bool)
@@ -92,42 +93,41 @@ def test_errors_are_those_of_counted_pixels():
     image[4, 5, 1] += 0.25
     found = errors(truth, image, counted)
     assert found["mse"] == pytest.approx(0.25**2 / (24 * 3), rel=1e-4) and found["flip"] > 0
-    assert decibel(1e-3) == pytest.approx(30)
 
 
 def test_points_stay_where_they_are(mi_rgb):
     """A ray of Mitsuba's through the place where a frame shows a point hits it; all are within all frames."""
     import mitsuba as mi
 
-    from mi_diffind.studies.texture.test_scenes import zoom_stage
-    from mi_diffind.studies.texture.zoom import NEARER, Zoom
+    from mi_diffind.studies.texture.test_scenes import zoom_scene
+    from mi_diffind.studies.texture.zoom import NEARER, TextureZoom
 
-    motion = Zoom(zoom_stage(), FILM, (8, 8), 5)
-    points, origins = motion.points(), motion.origins()
-    distances = np.linalg.norm(origins - motion.stage.target, axis=1)
+    zoom = TextureZoom(zoom_scene(), FILM, (8, 8), 5)
+    points, origins = zoom.points(), zoom.origins()
+    distances = np.linalg.norm(origins - zoom.scene.target, axis=1)
     assert distances[0] / distances[-1] == pytest.approx(NEARER) and np.ptp(np.diff(np.log(distances))) < 1e-12
     assert np.abs(points[:, 1]).max() < 1e-9
     for frame in (0, 2, 4):
-        places = motion.places(frame)
+        places = zoom.places(frame)
         assert (places > 0.5).all() and (places < np.array(FILM) - 0.5).all()
-        scene = motion.stage.scene({"type": "rgb", "value": 0.5}, FILM)
-        scene["sensor"]["to_world"] = motion.stage.look(origins[frame])
-        si = motion.stage.hits(mi.load_dict(scene), *(places / FILM).T)
+        scene = zoom.scene.scene({"type": "rgb", "value": 0.5}, FILM)
+        scene["sensor"]["to_world"] = zoom.scene.camera_at(origins[frame])
+        si = zoom.scene.hits(mi.load_dict(scene), *(places / FILM).T)
         np.testing.assert_allclose(np.array(si.p).T, points, atol=2e-3)
 
 
 def test_flicker():
     """Bilinear reads against SciPy's; the variance of what is known."""
-    from mi_diffind.studies.texture import zoom
+    from mi_diffind.measure import flicker
 
     image = np.random.default_rng(2).random((9, 7, 3))
     places = np.random.default_rng(3).uniform([0.5, 0.5], [6.5, 8.5], (50, 2))
     expected = [map_coordinates(image[..., c], [places[:, 1] - 0.5, places[:, 0] - 0.5], order=1) for c in range(3)]
-    np.testing.assert_allclose(zoom.bilinear(image, places), np.stack(expected, -1), atol=1e-12)
+    np.testing.assert_allclose(flicker.bilinear(image, places), np.stack(expected, -1), atol=1e-12)
     frames = np.zeros((8, 4, 3))
-    assert zoom.flicker(frames + image[0, :4]) < 1e-30
+    assert flicker.flicker(frames + image[0, :4]) < 1e-30
     frames[::2, 1] = 0.2  # one point of four, half of the time
-    assert zoom.flicker(frames) == pytest.approx(0.01 / 4)
+    assert flicker.flicker(frames) == pytest.approx(0.01 / 4)
 
 
 @pytest.mark.skipif("astc" not in codecs.available(), reason="needs astc-encoder-py")
@@ -223,40 +223,41 @@ def test_crops_show_what_differs():
 
 @pytest.fixture
 def small(tmp_path, monkeypatch):
-    """A material, and a study of one stage and one filter, all of whose trainings are one of :data:`STEPS` steps."""
+    """A material, whose trainings are all one training of :data:`STEPS` steps."""
     import mitsuba as mi
 
-    from mi_diffind.studies.texture import plan as plans
-    from mi_diffind.studies.texture import test_scenes
+    from mi_diffind import task
 
     mi.set_variant("llvm_ad_rgb")
     maps = {"albedo": smooth(32, 32, 3, 1), "roughness": smooth(32, 32, 1, 2)}
     for name, values in maps.items():
         mi.Bitmap(values if values.shape[-1] > 1 else values[..., 0]).write(str(tmp_path / f"{name}.png"))
     (tmp_path / "m.json").write_text(json.dumps({name: f"{name}.png" for name in maps}))
-    plane, fit, asked, made = {"plane": test_scenes.stages()["plane"]}, plans.task.fit, [], []
+    fit, requests, fitted = task.fit, [], []
 
     def once(name, preset="", variant=None, seconds=None, **options):
-        asked.append((name, preset, seconds))
+        requests.append((name, preset, seconds))
         options.pop("footprint_samples")
-        if not made:
-            made.append(fit(name, "", variant, steps=STEPS, batch=2**12, **options))
-        return made[0]
+        if not fitted:
+            fitted.append(fit(name, "", variant, steps=STEPS, batch=2**12, **options))
+        return fitted[0]
 
-    monkeypatch.setattr(plans.task, "fit", once)
-    monkeypatch.setattr(test_scenes, "stages", lambda: plane)
-    monkeypatch.setattr(plans, "WAYS", plans.WAYS[:1])
-    monkeypatch.setattr(plans, "MORE", ())
-    return tmp_path, asked
+    monkeypatch.setattr(task, "fit", once)
+    return tmp_path, requests
 
 
-def test_what_is_written(small, capsys):
-    folder, asked = small
-    command = ["tradeoff", "texture", str(folder / "m.json"), "--quick", "--width", "24", "--frames", "2"]
-    command += ["--out", str(folder / "out"), "--json", str(folder / "r.json"), "--seconds", "3"]
-    assert main(command) == 0
-    assert asked == [("texture", "", 3), ("texture", "paper", 3)]
-    result = json.loads((folder / "r.json").read_text())
+def test_what_is_written(small):
+    """One scene and one filter."""
+    from mi_diffind.maps.source import load_source
+    from mi_diffind.studies.texture import plan as plans
+    from mi_diffind.studies.texture.test_scenes import still_scenes
+
+    folder, requests = small
+    settings = plans.TextureStudySettings("albedo", (12.0,), 3.0, "fast", "fast", (24, 16), (12, 8), 2, 64, 1)
+    path, scenes = folder / "m.json", {"plane": still_scenes()["plane"]}
+    plan = plans.plan(load_source(path), str(path), settings, reads=plans.READS[:1], more_reads=(), scenes=scenes)
+    result, summary = quick_result(plan, folder / "out")
+    assert requests == [("texture", "", 3), ("texture", "paper", 3)]
     made = result["candidates"]
     blocks = ["ASTC 12x, trilinear"] * ("astc" in codecs.available())
     filtered = ["mipmap, trilinear", "ours 12x, trilinear", "paper 12x, trilinear", *blocks]
@@ -290,8 +291,7 @@ def test_what_is_written(small, capsys):
     for kind in ("", "_crops", "_zoom", "_levels"):
         assert (folder / "out" / f"tradeoff_texture{kind}.png").stat().st_size > 10_000
     assert not list((folder / "out").glob("*.partial*"))
-    out = capsys.readouterr().out
-    assert "PSNR by level" in out and "plane, ours 12x, trilinear:" in out
+    assert "PSNR by level" in summary and "plane, ours 12x, trilinear:" in summary
 
 
 def test_a_table_in_place_of_a_training(mi_rgb):
@@ -301,8 +301,8 @@ def test_a_table_in_place_of_a_training(mi_rgb):
     path = ASSETS / "tiles.json"
     source = load_source(path)
     tables = plans.tables_of([str(ASSETS / "tiles_filtered.npz")], source)
-    request = plans.Request("albedo", (), film=FILM, zoom_film=FILM, frames=2)
-    plan = plans.plan(source, str(path), request, tables)
+    settings = plans.TextureStudySettings("albedo", (), film=FILM, zoom_film=FILM, frames=2)
+    plan = plans.plan(source, str(path), settings, tables)
     mark = f"ours {source.nbytes / tables[0].nbytes:.3g}x"
     assert [job.name for job in plan.jobs if "truth" not in job.name and "ASTC" not in job.name] == [mark]
     names = [c.name for c in plan.candidates if c.job == mark]
@@ -322,6 +322,6 @@ def test_a_table_in_place_of_a_training(mi_rgb):
     ],
 )
 def test_bad_options(small, options, message, capsys):
-    folder, asked = small
+    folder, requests = small
     assert main(["tradeoff", "texture", str(folder / "m.json"), "--out", str(folder / "out"), *options]) == 2
-    assert message in capsys.readouterr().err and not asked
+    assert message in capsys.readouterr().err and not requests

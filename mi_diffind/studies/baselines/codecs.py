@@ -1,14 +1,15 @@
 """
-What learned textures are compared with: thin layers over maintained codecs, each of which is optional.
+Image codecs that learned textures are compared with: thin layers over maintained packages, each of them optional.
 
 An image is float32, ``(height, width, channels)`` with 1 to 4 channels and values in [0, 1], and is rounded to 8 bits
-first. What is decoded are the stored values, without any transfer function; errors are meant to be measured of these.
-Sizes that blocks do not divide are padded by repeating the edge and cropped after; the padded blocks count. All
-functions raise ``ValueError`` for another image and :class:`CodecError` if a package is missing.
+before it is encoded. Decoded values are the stored ones, without any transfer function; errors are meant to be measured
+on them. An image whose sides are no multiples of the block size is padded by repeating the edge and cropped afterwards;
+padded blocks count. All functions raise ``ValueError`` for other images and :class:`CodecError` for a missing package.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import io
@@ -22,7 +23,7 @@ import numpy as np
 from ...errors import DiffindError
 from ...units import largest_fitting
 
-#: The 2D block sizes of ASTC, width × height, from the finest on, and their bits per texel.
+#: Block size of ASTC in 2D, width × height, finest first → bits per texel.
 ASTC_BLOCKS = {
     f"{w}x{h}": 128 / (w * h)
     for w, h in (
@@ -31,7 +32,7 @@ ASTC_BLOCKS = {
     )
 }
 
-#: Codec → what pip installs, what is imported.
+#: Codec → its packages, each as a distribution and a module.
 _PACKAGES = {
     "astc": (("astc-encoder-py", "astc_encoder"),),
     "bc7": (("ispc_texcomp", "ispc_texcomp"), ("texture2ddecoder", "texture2ddecoder")),
@@ -39,22 +40,27 @@ _PACKAGES = {
     "webp": (("pillow", "PIL.Image"), ("pillow", "PIL._webp")),
     "bicubic": (("pillow", "PIL.Image"),),
 }
-#: File format → its name, the longest side, the qualities, the options tried by :func:`at_bytes`.
+#: Codec → its name in notes and legends.
+TITLES = {"astc": "ASTC", "bc7": "BC7", "jpeg": "JPEG", "webp": "WebP", "bicubic": "bicubic scaling"}
+
+#: File format → its longest side, its qualities, and the options that :func:`at_bytes` tries.
 _FILES = {
-    "jpeg": ("JPEG", 65535, range(1, 101), ({"subsampling": "4:4:4"}, {"subsampling": "4:2:0"})),
-    "webp": ("WebP", 16383, range(0, 101), ({},)),
+    "jpeg": (65535, range(1, 101), ({"subsampling": "4:4:4"}, {"subsampling": "4:2:0"})),
+    "webp": (16383, range(0, 101), ({},)),
 }
 
 
 class CodecError(DiffindError, RuntimeError):
-    """A codec is not installed or cannot store an image; the message is one sentence."""
+    """A codec that is not installed or cannot store an image; the message is one sentence."""
 
 
 @dataclass
 class Encoded:
     """
-    An image after ``codec`` (e.g. ``"ASTC 8x8"``): the ``nbytes`` stored (payload of blocks and samples, whole files),
-    the decoded ``image`` (float32 in [0, 1], shape of the input).
+    Result of encoding and decoding an image with ``codec``, for example ``"ASTC 8x8"``.
+
+    ``nbytes`` counts the payload of blocks or samples, or whole files; ``image`` is decoded, float32 in [0, 1], of the
+    input's shape.
     """
 
     codec: str
@@ -63,32 +69,32 @@ class Encoded:
 
 
 def available() -> tuple[str, ...]:
-    """The codecs whose packages are installed, of ``astc``, ``bc7``, ``jpeg``, ``webp``, ``bicubic``."""
-    found = []
+    """Return the codecs whose packages are installed, of ``astc``, ``bc7``, ``jpeg``, ``webp``, ``bicubic``."""
+    names = []
     for codec in _PACKAGES:
-        try:
+        with contextlib.suppress(CodecError):
             _modules(codec)
-        except CodecError:
-            continue
-        found.append(codec)
-    return tuple(found)
+            names.append(codec)
+    return tuple(names)
 
 
-def missing() -> list[str]:
-    """The names of the codecs that are not installed."""
-    return [{"bicubic": "bicubic scaling", "webp": "WebP"}.get(c, c.upper()) for c in _PACKAGES if c not in available()]
+def install_notes(codecs: Iterable[str] = tuple(_PACKAGES)) -> list[str]:
+    """Return a note, in a list, about those of ``codecs`` that are not installed; an empty list if all are."""
+    missing = [TITLES[codec] for codec in codecs if codec not in available()]
+    note = f'Left out, not being installed: {", ".join(missing)}; pip install "mi-diffind[compare]"'
+    return [note] if missing else []
 
 
 def astc(
     image: np.ndarray, block: str = "8x8", quality: str = "exhaustive", normal: bool = False, reduce: int = 1
 ) -> Encoded:
     """
-    ASTC, linear LDR profile, on one core (the package's threads do not run at once): one channel as luminance, two as
-    luminance and alpha with equal weights. ``block`` is one of :data:`ASTC_BLOCKS`, ``quality`` a
-    preset of the encoder, from ``fastest`` to ``exhaustive``.
+    Encode an image with ASTC, linear LDR profile, on one core.
 
-    ``normal``: of the three channels only x and y are stored, z is the square root of 1 - x² - y². ``reduce``: stored
-    at a width and height that many times smaller (rounded up), read with bicubic filtering.
+    One channel is stored as luminance, two as luminance and alpha with equal weights. ``block`` is one of
+    :data:`ASTC_BLOCKS`, ``quality`` a preset of the encoder, from ``fastest`` to ``exhaustive``. With ``normal``, only
+    x and y of the three channels are stored; z is the square root of 1 - x² - y². With ``reduce``, width and height
+    are divided by that number (rounded up) before encoding, and the result is scaled up with bicubic filtering.
     """
     (package,) = _modules("astc")
     texels = _texels(image)
@@ -118,7 +124,7 @@ def astc(
 
 @functools.lru_cache(maxsize=2 * len(ASTC_BLOCKS))
 def _context(block: str, quality: str, pair: bool):
-    """An ASTC encoder and decoder, which takes longer to make than a small image to encode."""
+    """Return an ASTC encoder and decoder; creating one takes longer than encoding a small image."""
     (package,) = _modules("astc")
     flags = package.ASTCConfigFlags.USE_DECODE_UNORM8
     if pair:
@@ -128,14 +134,14 @@ def _context(block: str, quality: str, pair: bool):
 
 
 def astc_bytes(shape: tuple[int, ...], block: str, reduce: int = 1) -> int:
-    """What :func:`astc` stores for an image of that shape, ``(height, width, ...)``."""
+    """Return the bytes that :func:`astc` stores for an image of shape ``(height, width, ...)``."""
     height, width = _reduced(shape, reduce)
     w, h = map(int, block.split("x"))
     return 16 * -(-width // w) * -(-height // h)
 
 
 def bc7(image: np.ndarray) -> Encoded:
-    """BC7 with the slowest preset: 16 bytes for 4×4 texels, one channel stored as grey, two as red and green."""
+    """Encode an image with BC7's slowest preset: 16 bytes for 4×4 texels; one channel is grey, two red and green."""
     encoder, decoder = _modules("bc7")
     texels = _texels(image)
     height, width, channels = texels.shape
@@ -154,24 +160,28 @@ def bc7(image: np.ndarray) -> Encoded:
 
 def jpeg(image: np.ndarray, quality: int, subsampling: str = "4:4:4") -> Encoded:
     """
-    JPEG, progressive, Huffman tables optimised, ``quality`` from 1 to 100. Two channels are two files, four are one of
-    three channels and one of one; bytes add up.
+    Encode an image as progressive JPEG with optimised Huffman tables; ``quality`` is from 1 to 100.
+
+    Two channels become two files, four channels one file of three and one of one; their bytes are added.
     """
     return _files("jpeg", image, quality, progressive=True, optimize=True, subsampling=subsampling)
 
 
 def webp(image: np.ndarray, quality: int) -> Encoded:
     """
-    Lossy WebP (which halves the resolution of colour), slowest method, ``quality`` from 0 to 100. Two channels are two
-    files, four are one of three channels and one of one; bytes add up.
+    Encode an image as lossy WebP by the slowest method; ``quality`` is from 0 to 100.
+
+    WebP halves the resolution of colour. Files are as in :func:`jpeg`.
     """
     return _files("webp", image, quality, method=6)
 
 
 def bicubic(image: np.ndarray, nbytes: int) -> Encoded:
     """
-    The image at the highest resolution of the same aspect whose 8-bit samples fit into ``nbytes`` (1×1 if none does),
-    read with bicubic filtering. Downscaled by the antialiased Lanczos or bicubic filter, whichever errs less.
+    Scale an image down until its 8-bit samples fit into ``nbytes`` (1×1 if none does), and up by bicubic filtering.
+
+    The aspect ratio is kept. The image is scaled down by an antialiased Lanczos or bicubic filter, whichever has the
+    smaller error.
     """
     _modules("bicubic")
     samples = _texels(image) / np.float32(255)
@@ -184,29 +194,32 @@ def bicubic(image: np.ndarray, nbytes: int) -> Encoded:
     if (h, w) != (height, width):
         for down in ("LANCZOS", "BICUBIC"):
             small = _rounded(_resized(samples, h, w, down)) / np.float32(255)
-            found = _resized(small, height, width, "BICUBIC")
-            if (error := _squared(samples, found)) < least:
-                best, least = found, error
+            enlarged = _resized(small, height, width, "BICUBIC")
+            if (error := _squared(samples, enlarged)) < least:
+                best, least = enlarged, error
     return Encoded(f"bicubic {w}x{h}", h * w * channels, best)
 
 
 def at_bytes(codec: str, image: np.ndarray, nbytes: int) -> Encoded:
     """
-    ``image`` in ``nbytes`` by one of the codecs ``jpeg`` and ``webp``: the highest quality that fits, else the lowest
-    (JPEG: with or without chroma subsampling, whichever errs less); ``bicubic`` as it is; ``bc7`` at its only size.
+    Encode an image in at most ``nbytes`` with a codec other than ASTC.
+
+    ``jpeg`` and ``webp`` take the highest quality that fits, else the lowest; JPEG is tried with and without chroma
+    subsampling. ``bc7`` has one size only.
     """
     if codec not in _FILES:
         return bc7(image) if codec == "bc7" else bicubic(image, nbytes)
     encode = {"jpeg": jpeg, "webp": webp}[codec]
-    _, _, qualities, tries = _FILES[codec]
-    found = [_fitting(lambda q, o=o: encode(image, q, **o), qualities, nbytes) for o in tries]
-    fitting = [e for e in found if e.nbytes <= nbytes] or [min(found, key=lambda e: e.nbytes)]
+    _, qualities, tries = _FILES[codec]
+    results = [_highest_quality(lambda q, o=o: encode(image, q, **o), qualities, nbytes) for o in tries]
+    fitting = [e for e in results if e.nbytes <= nbytes] or [min(results, key=lambda e: e.nbytes)]
     reference = _texels(image) / np.float32(255)
     return min(fitting, key=lambda e: _squared(reference, e.image))
 
 
-#: One way to store a map (its name, whether only x and y, block size, reduction), or several: bytes, squared error.
-_Way = tuple[int, float, tuple[tuple[str, bool, str, int], ...]]
+#: A choice of encodings: bytes, squared error, and for each map its name, whether only x and y are stored, its block
+#: size, and its reduction or number of dropped levels.
+AstcChoice = tuple[int, float, tuple[tuple[str, bool, str, int], ...]]
 
 
 def astc_material(
@@ -220,55 +233,46 @@ def astc_material(
     cache: dict | None = None,
 ) -> tuple[dict[str, Encoded], int]:
     """
-    The ``maps`` of a material, name → image, in ``nbytes`` together, with the least squared error over all their texels
-    and channels: each map at its own block size and resolution (one of ``reduces``, see :func:`astc`), three equal
-    channels as luminance, the maps named in ``normals`` with or without z. ``uniform``: one block size and resolution
-    for all maps instead, the best one.
+    Encode the ``maps`` of a material, name → image, with ASTC in ``nbytes`` together, with the least squared error.
 
-    The choice is the best one for the errors with the preset ``choose``, for which each map is encoded some dozens of
-    times; ``quality`` is for the result. A ``cache``, only for calls with the same maps, saves encoding twice. Returns
-    the encoded maps by name, and their bytes. Raises :class:`CodecError` if no choice fits.
+    Each map has its own block size and resolution (one of ``reduces``, see :func:`astc`); three equal channels are
+    stored as luminance, the maps named in ``normals`` with or without z. With ``uniform``, all maps share the best
+    block size and resolution. The error is summed over all texels and channels.
+
+    The choice is optimal for errors with the preset ``choose``, by which each map is encoded some dozens of times;
+    ``quality`` is the preset of the result. A ``cache``, for calls with the same maps only, avoids encoding twice.
+    Returns the encoded maps by name, and their bytes. Raises :class:`CodecError` if no choice fits.
     """
     _modules("astc")
     cache = {} if cache is None else cache
     rounded = {name: _texels(image) / np.float32(255) for name, image in maps.items()}
     settings = list(itertools.product(ASTC_BLOCKS, reduces))
 
-    def cached(kind: Callable, *part):
-        if (key := (kind.__name__, *part)) not in cache:
-            cache[key] = kind(rounded[part[0]], *part[1:])
+    def size(name: str, block: str, reduce: int) -> int:
+        return astc_bytes(rounded[name].shape, block, reduce)
+
+    def error(name: str, *options) -> float:
+        if (key := ("error", name, *options, choose)) not in cache:
+            cache[key] = _squared(rounded[name], _encode(rounded[name], *options, choose).image)
         return cache[key]
 
-    known: dict[str, list[_Way]] = {}
-    for name, image in rounded.items():
-        both = (False, True) if name in normals and image.shape[2] == 3 else (False,)
-        for normal, (block, reduce) in itertools.product(both, settings):
-            size = astc_bytes(image.shape, block, reduce)
-            if size <= nbytes:
-                error = cached(_error, name, normal, block, reduce, choose)
-                known.setdefault(name, []).append((size, error, ((name, normal, block, reduce),)))
+    def encoded(name: str, *options) -> Encoded:
+        if (key := ("image", name, *options, quality)) not in cache:
+            cache[key] = _encode(rounded[name], *options, quality)
+        return cache[key]
 
-    def ways(allowed) -> list[_Way]:
-        """The ways to store the material that nothing beats, at the block sizes and resolutions allowed."""
-        front: list[_Way] = [(0, 0.0, ())]
-        for name in rounded:
-            one = [way for way in known.get(name, ()) if way[2][0][2:] in allowed]
-            front = _front(itertools.product(front, one), nbytes)
-        return front
-
-    found = [way for setting in settings for way in ways([setting])] if uniform else ways(settings)
-    if not found:
+    choices = _choices(rounded, normals, settings, nbytes, size, error)
+    allowed = [[setting] for setting in settings] if uniform else [settings]
+    best = min((choice for group in allowed for choice in _front(choices, nbytes, group)), key=_error, default=None)
+    if best is None:
         raise CodecError(f"ASTC cannot store {', '.join(maps)} in {nbytes:,} bytes")
-    result = {part[0]: cached(_encode, *part, quality) for part in min(found, key=lambda way: way[1])[2]}
+    result = {part[0]: encoded(*part) for part in best[2]}
     return result, sum(e.nbytes for e in result.values())
 
 
 @dataclass
 class EncodedLevels:
-    """
-    A map and its mip maps after ``codec``: the ``nbytes`` stored, and all ``levels`` decoded, as :class:`Encoded` has
-    an image.
-    """
+    """Result of encoding a map with its mip maps: as :class:`Encoded`, with all ``levels`` decoded."""
 
     codec: str
     nbytes: int
@@ -285,9 +289,10 @@ def astc_levels(
     dropped: Iterable[int] = (0, 1, 2),
 ) -> tuple[dict[str, EncodedLevels], int]:
     """
-    The ``maps`` of a material with their mip maps, name → all levels from the finest on, in ``nbytes`` together: each
-    map at its own block size, with or without its finest levels (so many may be ``dropped``; they are read from the
-    first that is stored with bicubic filtering), such that the squared errors of the finest levels are least. Otherwise
+    Encode the ``maps`` of a material with their mip maps, name → levels, finest first, in ``nbytes`` together.
+
+    Each map has its own block size and may drop some of its finest levels (one of ``dropped``), which are then read
+    from the first stored level with bicubic filtering. The squared error of the finest levels is minimised. Otherwise
     as :func:`astc_material`.
     """
     _modules("astc")
@@ -295,77 +300,88 @@ def astc_levels(
     rounded = {name: [_texels(level) / np.float32(255) for level in levels] for name, levels in maps.items()}
 
     def coded(name: str, level: int, normal: bool, block: str, quality: str) -> Encoded:
-        key = ("level", name, level, normal, block, quality)
-        if key not in cache:
+        if (key := ("level", name, level, normal, block, quality)) not in cache:
             cache[key] = _encode(rounded[name][level], normal, block, 1, quality)
         return cache[key]
 
-    def finest(name: str, normal: bool, block: str, drop: int, quality: str) -> np.ndarray:
-        image, (height, width) = coded(name, drop, normal, block, quality).image, rounded[name][0].shape[:2]
-        return _resized(image, height, width, "BICUBIC") if drop else image
+    def size(name: str, block: str, drop: int) -> float:
+        levels = rounded[name]
+        return sum(astc_bytes(v.shape, block) for v in levels[drop:]) if drop < len(levels) else math.inf
 
-    front: list[_Way] = [(0, 0.0, ())]
-    for name, levels in rounded.items():
-        ways = []
-        both = (False, True) if name in normals and levels[0].shape[2] == 3 else (False,)
-        for normal, block, drop in itertools.product(both, ASTC_BLOCKS, dropped):
-            size = sum(astc_bytes(level.shape, block) for level in levels[drop:])
-            if drop < len(levels) and size <= nbytes:
-                error = _squared(levels[0], finest(name, normal, block, drop, choose))
-                ways.append((size, error, ((name, normal, block, drop),)))
-        front = _front(itertools.product(front, ways), nbytes)
+    def read(name: str, level: int, stored: Encoded, drop: int) -> np.ndarray:
+        return _resized(stored.image, *rounded[name][level].shape[:2], "BICUBIC") if drop else stored.image
+
+    def error(name: str, normal: bool, block: str, drop: int) -> float:
+        return _squared(rounded[name][0], read(name, 0, coded(name, drop, normal, block, choose), drop))
+
+    finest = {name: levels[0] for name, levels in rounded.items()}
+    choices = _choices(finest, normals, list(itertools.product(ASTC_BLOCKS, dropped)), nbytes, size, error)
+    front = _front(choices, nbytes)
     if not front:
         raise CodecError(f"ASTC cannot store {', '.join(maps)} with mip maps in {nbytes:,} bytes")
-    found = {}
-    for name, normal, block, drop in min(front, key=lambda way: way[1])[2]:
-        parts = [coded(name, i, normal, block, quality) for i in range(drop, len(rounded[name]))]
-        above = []
-        for level in rounded[name][:drop]:
-            above.append(_resized(parts[0].image, *level.shape[:2], "BICUBIC"))
-        codec = f"{parts[0].codec}{f' from level {drop} on' if drop else ''}"
-        found[name] = EncodedLevels(codec, sum(p.nbytes for p in parts), [*above, *(p.image for p in parts)])
-    return found, sum(e.nbytes for e in found.values())
+    result = {}
+    for name, normal, block, drop in min(front, key=_error)[2]:
+        stored = [coded(name, i, normal, block, quality) for i in range(drop, len(rounded[name]))]
+        levels = [*(read(name, i, stored[0], drop) for i in range(drop)), *(e.image for e in stored)]
+        codec = stored[0].codec + (f" from level {drop} on" if drop else "")
+        result[name] = EncodedLevels(codec, sum(e.nbytes for e in stored), levels)
+    return result, sum(e.nbytes for e in result.values())
+
+
+def _choices(
+    images: Mapping[str, np.ndarray],
+    normals: Collection[str],
+    settings: Iterable[tuple[str, int]],
+    nbytes: int,
+    size: Callable,
+    error: Callable,
+) -> dict[str, list[AstcChoice]]:
+    """Return, for each map, the choices at all ``settings`` that fit into ``nbytes`` alone."""
+    choices = {}
+    for name, image in images.items():
+        both = (False, True) if name in normals and image.shape[2] == 3 else (False,)
+        options = [(size(name, *setting), normal, setting) for normal in both for setting in settings]
+        choices[name] = [(n, error(name, w, *s), ((name, w, *s),)) for n, w, s in options if n <= nbytes]
+    return choices
+
+
+def _front(
+    choices: Mapping[str, list[AstcChoice]], nbytes: int, settings: Collection | None = None
+) -> list[AstcChoice]:
+    """Return the joint choices for all maps that no other choice beats in bytes and error; only of ``settings``."""
+    front: list[AstcChoice] = [(0, 0.0, ())]
+    for options in choices.values():
+        allowed = [choice for choice in options if settings is None or choice[2][0][2:] in settings]
+        joined = [(a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in itertools.product(front, allowed)]
+        front, least = [], math.inf
+        for choice in sorted((c for c in joined if c[0] <= nbytes), key=lambda c: c[:2]):
+            if choice[1] < least:
+                front.append(choice)
+                least = choice[1]
+    return front
+
+
+def _error(choice: AstcChoice) -> float:
+    return choice[1]
 
 
 def _encode(image: np.ndarray, normal: bool, block: str, reduce: int, quality) -> Encoded:
-    """An image by :func:`astc`, three equal channels as luminance."""
-    if not _grey(image):
+    """Encode an image by :func:`astc`, three equal channels as luminance."""
+    if image.shape[2] != 3 or not (image[..., :1] == image).all():
         return astc(image, block, quality, normal, reduce)
     coded = astc(image[..., :1], block, quality, False, reduce)
     return replace(coded, image=np.repeat(coded.image, 3, -1))
 
 
-def _error(image: np.ndarray, *options) -> float:
-    """The squared error of :func:`_encode`."""
-    return _squared(image, _encode(image, *options).image)
-
-
-def _grey(image: np.ndarray) -> bool:
-    """Whether there are three equal channels."""
-    return image.shape[2] == 3 and bool((image[..., :1] == image).all())
-
-
-def _front(pairs: Iterable[tuple[_Way, _Way]], nbytes: int) -> list[_Way]:
-    """Two ways at a time put together, of these the ones within ``nbytes`` that nothing beats."""
-    joined = [(a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in pairs if a[0] + b[0] <= nbytes]
-    kept, least = [], math.inf
-    for way in sorted(joined, key=lambda w: w[:2]):
-        if way[1] < least:
-            kept.append(way)
-            least = way[1]
-    return kept
-
-
-def _fitting(encode: Callable[[int], Encoded], qualities: range, nbytes: int) -> Encoded:
+def _highest_quality(encode: Callable[[int], Encoded], qualities: range, nbytes: int) -> Encoded:
     """Encode at the highest quality that takes at most ``nbytes``, else at the lowest."""
     coded = functools.cache(encode)
     return coded(largest_fitting(lambda quality: coded(quality).nbytes <= nbytes, qualities[0], qualities[-1] + 1))
 
 
-def _files(kind: str, image: np.ndarray, quality: int, **options) -> Encoded:
-    """An image as one or two files that Pillow writes."""
-    pillow = _modules(kind)[0]
-    name, longest, *_ = _FILES[kind]
+def _files(codec: str, image: np.ndarray, quality: int, **options) -> Encoded:
+    """Encode an image as one or two files that Pillow writes."""
+    pillow, name, longest = _modules(codec)[0], TITLES[codec], _FILES[codec][0]
     texels = _texels(image)
     height, width, channels = texels.shape
     if max(height, width) > longest:
@@ -377,7 +393,7 @@ def _files(kind: str, image: np.ndarray, quality: int, **options) -> Encoded:
         plane = texels[..., group[0]] if mode == "L" else texels[..., group]
         source = pillow.fromarray(np.ascontiguousarray(plane))
         file = io.BytesIO()
-        source.save(file, kind.upper(), quality=quality, **options)
+        source.save(file, codec.upper(), quality=quality, **options)
         nbytes += file.tell()
         with pillow.open(file) as opened:
             decoded[..., group] = np.asarray(opened.convert(mode)).reshape(height, width, -1) / np.float32(255)
@@ -385,18 +401,18 @@ def _files(kind: str, image: np.ndarray, quality: int, **options) -> Encoded:
 
 
 def _modules(codec: str) -> list:
-    """The modules a codec needs. Raises :class:`CodecError` that says how to install what is missing."""
-    found = []
+    """Return the modules that a codec needs; raise :class:`CodecError` with the ``pip`` command if one is missing."""
+    modules = []
     for package, module in _PACKAGES[codec]:
         try:
-            found.append(importlib.import_module(module))
+            modules.append(importlib.import_module(module))
         except ImportError:
             raise CodecError(f'the codec {codec} needs {package}, which "pip install {package}" installs') from None
-    return found
+    return modules
 
 
 def _texels(image: np.ndarray) -> np.ndarray:
-    """An image in 8 bits. Raises ``ValueError`` if it is none."""
+    """Return an image in 8 bits; raise ``ValueError`` for a wrong shape or values outside [0, 1]."""
     image = np.asarray(image)
     if image.ndim != 3 or not 1 <= image.shape[2] <= 4 or 0 in image.shape:
         raise ValueError(f"image: found the shape {image.shape}, (height, width, 1 to 4 channels) is needed")
@@ -406,17 +422,17 @@ def _texels(image: np.ndarray) -> np.ndarray:
 
 
 def _rounded(image: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] in 8 bits."""
+    """Return values in [0, 1] in 8 bits."""
     return np.rint(image * np.float32(255)).astype(np.uint8)
 
 
 def _reduced(shape: tuple[int, ...], reduce: int) -> tuple[int, int]:
-    """Height and width, a whole number of times smaller, rounded up."""
+    """Return height and width divided by ``reduce``, rounded up."""
     return -(-shape[0] // reduce), -(-shape[1] // reduce)
 
 
 def _resized(image: np.ndarray, height: int, width: int, resampling: str) -> np.ndarray:
-    """Each channel at another size (antialiased when that is smaller), clipped to [0, 1]."""
+    """Resize each channel (with antialiasing if it becomes smaller), clipped to [0, 1]."""
     pillow = importlib.import_module("PIL.Image")
     resampling = getattr(pillow.Resampling, resampling)
     planes = [pillow.fromarray(np.ascontiguousarray(plane, np.float32)) for plane in np.moveaxis(image, -1, 0)]
@@ -424,5 +440,5 @@ def _resized(image: np.ndarray, height: int, width: int, resampling: str) -> np.
 
 
 def _squared(reference: np.ndarray, image: np.ndarray) -> float:
-    """Sum of squared differences."""
+    """Return the sum of squared differences."""
     return float(np.sum((reference - image) ** 2, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""Competitors of tables: networks of ``drjit.nn``, alone, after a hash grid, and in front of a table."""
+"""Networks of ``drjit.nn`` that tables are compared with: alone, after a hash grid, and in front of a table."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ...measure.operations import Operations
 
 class Network(nn.Module):
     """
-    A multilayer perceptron from ``inputs`` coordinates to one number: ``layers`` hidden layers of ``width`` leaky
-    rectified units.
+    Multilayer perceptron from ``inputs`` coordinates to one number.
 
-    ``grid``, the options of ``nn.HashGridEncoding``, puts one before it; ``table``, entries of a side, lets it point
-    into a square :class:`~mi_diffind.indirection.DifferentiableArray`, as the primary array of an indirection does.
-    Called with a list of coordinates, it returns a list of one array. As allocated it computes with tensors, which is
-    the faster form to train; :meth:`cooperative` gives it in cooperative vectors.
+    There are ``layers`` hidden layers of ``width`` leaky rectified units. With ``grid``, the options of
+    ``nn.HashGridEncoding``, a hash grid encodes the coordinates. With ``table``, a number of entries on a side, the
+    network's outputs point into a square :class:`~mi_diffind.indirection.DifferentiableArray`, as the primary array of
+    an indirection does. A call with a list of coordinates returns a list of one array. As allocated, the network
+    computes with tensors, the faster form to train; :meth:`cooperative` returns it in cooperative vectors.
     """
 
     DRJIT_STRUCT = {"entries": object, "mlp": nn.Module, "table": object}  # noqa: RUF012
@@ -61,7 +61,7 @@ class Network(nn.Module):
         return y if self.table is None else self.table([fold(v) for v in y], active)
 
     def cooperative(self) -> Network:
-        """A copy in cooperative vectors, for reading only."""
+        """Return a copy in cooperative vectors, for inference only."""
         result = Network(self.inputs, self.width, self.layers, self.grid, self.table_size)
         for name in ("entries", "table", "encoding"):
             setattr(result, name, getattr(self, name))
@@ -80,10 +80,11 @@ class Network(nn.Module):
 
     def products(self) -> Operations:
         """
-        The multiplications by weights and their sums, which a kernel does not show (they are calls or loops): one
-        multiplication and one addition a weight, each weight and bias read once.
+        Return the operations of the matrix products, which a kernel's code does not show: they are calls or loops.
+
+        Each weight counts as one multiplication and one addition, each weight and bias as one read.
         """
         weights = [self.mlp[key] for key in self.mlp if key.endswith("weights")]
         macs = sum(dr.width(w) for w in weights)
-        read = sum(dr.width(self.mlp[key]) for key in self.mlp)
-        return Operations(add=macs, mul=macs, gathers=len(weights), bytes_gathered=4 * read, instructions=macs)
+        values = sum(dr.width(self.mlp[key]) for key in self.mlp)
+        return Operations(add=macs, mul=macs, gathers=len(weights), bytes_gathered=4 * values, instructions=macs)

@@ -1,20 +1,20 @@
 """
-What shading-aware textures are compared with: classical ways to keep a surface's look where its normals are averaged.
+Classical filters of normal maps that shading-aware textures are compared with.
 
-Each takes the maps of a material at every level of detail, uncompressed, and gives a reader, as
-:mod:`mi_diffind.tasks.shading.evaluation` has them: ``(u, v, level, wi, wo) → Array3f`` of shaded values.
+Each filter takes the maps of a material at every level of detail, uncompressed, and returns a reader, as in
+:mod:`mi_diffind.tasks.shading.evaluation`: ``(u, v, level, wi, wo) → Array3f`` of shaded values.
 
-- :func:`filtered`: filtered parameters, normals brought to length 1: what a mip map does;
-- :func:`toksvig`: the length of the mean normal makes it rougher (Toksvig, *Mipmapping Normal Maps*, 2005);
+- :func:`filtered`: filtered parameters with normals brought to length 1, as a mip map does;
+- :func:`toksvig`: roughness increased by the length of the mean normal (Toksvig, *Mipmapping Normal Maps*, 2005);
 - :func:`lean`: first and second moments of slopes, filtered linearly, make an anisotropic lobe (Olano and Baker, *LEAN
   Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased Displacement and
   Reflectance Mapping*, 2013);
-- :func:`baked`: each texel of each level has the roughness with which it looks most like the converged truth;
-- :func:`biased`: any of these at other levels of detail, chosen on training pairs: what filtered parameters gain by it
-  is a matter of the filter's kernel, not of shading.
+- :func:`bake`: each texel of each level has the roughness with which it looks most like the converged truth;
+- :func:`biased`: any of these at other levels of detail, chosen on training pairs; its gain over filtered parameters
+  is due to the filter's kernel, not to shading.
 
-Toksvig's and LEAN's know the source's moments, not compressed ones. A GGX lobe has no variance of slopes; what is said
-of one is that of the Beckmann lobe of the same α, which is α²/2 along each axis.
+Toksvig's and LEAN's filters know the source's moments, not compressed ones. The variance of slopes of a GGX lobe is
+infinite; in its place stands that of the Beckmann lobe of the same α, which is α²/2 along each axis.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 
-from ...indirection import aligned
 from ...lookup import clamp
 from ...maps.layout import FROM_NORMAL, Layout, MapLayout
-from ...maps.pyramid import Pyramid, around, halved, level_sizes
+from ...maps.pyramid import Pyramid, halved, level_sizes
 from ...maps.source import Source
 from ...tasks.disney.decoder import Decoder, ggx_coefficients
 from ...tasks.disney.effects import Effects
@@ -38,73 +37,41 @@ from ...tasks.shading.evaluation import ShadedReader, reader
 from ...tasks.shading.material import DEFAULTS, SurfaceParameters, frame, maps_of, shaded, shadowing, surface_of
 from ...tasks.shading.reference import reference
 
-#: The least third component that a normal's slope is made of: a slope of 10.
+#: Least third component in the slope of a normal: a slope of 10.
 STEEPEST = 0.1
 
-#: Biases of the level of detail that are tried.
+#: Biases of the level of detail that :func:`choose_biases` tries.
 BIASES = tuple(np.arange(-8, 5) / 8)
 
-#: Values of roughness that are tried for each texel, between its own (0) and 1; a parabola through three errors makes
-#: the best one more precise.
+#: Shares of the way from a texel's filtered roughness (0) to 1 that :func:`bake` tries; a parabola through the errors
+#: of three of them refines the best one.
 TRIED = np.linspace(0, 1, 28)
 
-#: Views and lights that roughness and biases are chosen for, and the seed that they are drawn from, no other's.
+#: Pairs of a view and a light that :func:`bake` averages over, and the seed of pairs and places; no other uses it.
 PAIRS, SEED = 32, 20050711
 
-#: Places of each level, each under a view and a light of its own, that a bias is chosen for, and levels that have one.
+#: Places of each level, each with its own view and light, that a bias is chosen for; number of levels with a bias.
 PLACES, BIASED = 2**14, 7
 
-#: Places along each side of a texel where its moments are averaged.
+#: Samples along each side of a texel at which moments are averaged.
 INSIDE = 4
 
-#: Lanes that are looked at in one go.
+#: Lanes of one evaluation in :func:`bake`.
 CHUNK = 2**22
 
 
-class Moments:
-    """
-    Channels of any meaning at every level of detail, ``values``, ``(height, width, k)`` each: what is read between
-    texels and levels is interpolated linearly.
-    """
-
-    def __init__(self, values: Sequence[np.ndarray], types, border):
-        self.types, self.border, self.levels = types, tuple(border), len(values)
-        self.height, self.width, self.channels = values[0].shape
-        self._groups = -(-self.channels // 4)
-        flat = np.concatenate([level.reshape(-1, self.channels) for level in values])
-        padded = aligned((len(flat), 4 * self._groups), np.float32)
-        padded[:, : self.channels], padded[:, self.channels :] = flat, 0
-        starts = np.cumsum([0] + [level.shape[0] * level.shape[1] for level in values[:-1]]).astype(np.uint32)
-        self._texels, self._starts = types.TensorXf(padded).array, types.UInt32(starts)
-
-    def read(self, u, v, level) -> list:
-        """The channels at (u, v) and a level of detail."""
-        level = clamp(level, 0.0, float(self.levels - 1))
-        lower = dr.floor(level)
-        below = self._bilinear(u, v, lower)
-        above = self._bilinear(u, v, dr.minimum(lower + 1, self.levels - 1))
-        return [dr.fma(level - lower, b - a, a) for a, b in zip(below, above, strict=True)]
-
-    def _bilinear(self, u, v, level) -> list:
-        UInt32, Array4f = self.types.UInt32, self.types.Array4f
-        level = UInt32(level)
-        rows, columns = (dr.maximum(UInt32(n) >> level, 1) for n in (self.height, self.width))
-        start = dr.gather(UInt32, self._starts, level)
-        total = [0.0] * self.channels
-        across = around(u, columns, self.border[1])
-        for row, a in around(v, rows, self.border[0]):
-            for column, b in across:
-                index = (start + row * columns + column) * self._groups
-                found = [c for group in range(self._groups) for c in dr.gather(Array4f, self._texels, index + group)]
-                total = [dr.fma(a * b, f, t) for f, t in zip(found[: self.channels], total, strict=True)]
-        return total
+def moment_pyramid(levels: Sequence[np.ndarray], types, border) -> Pyramid:
+    """Return a pyramid of channels of any meaning, ``(height, width, k)`` for each level, interpolated linearly."""
+    height, width, count = levels[0].shape
+    maps = (MapLayout("moments", "other", "linear", 1, tuple(range(count))),)
+    return Pyramid(Layout(width, height, maps, (0.5,) * count, ("moments",) * count), levels, types, border)
 
 
 # -- the source -------------------------------------------------------------------------------------------------------
 
 
 def unit_normals(source: Source) -> np.ndarray | None:
-    """The source's normals, ``(height, width, 3)``, each of length 1; ``None`` without a normal map."""
+    """Return the source's normals, ``(height, width, 3)``, of length 1; ``None`` without a normal map."""
     m = next((m for m in source.maps if m.role == "normal"), None)
     if m is None:
         return None
@@ -114,13 +81,13 @@ def unit_normals(source: Source) -> np.ndarray | None:
 
 
 def slopes(normals: np.ndarray) -> np.ndarray:
-    """Slopes ``(x/z, y/z)`` and their products ``(xx, yy, xy)/z²`` of unit normals, ``(…, 5)``."""
+    """Return slopes ``(x/z, y/z)`` and their products ``(xx, yy, xy)/z²`` of unit normals, ``(…, 5)``."""
     b = normals[..., :2] / np.maximum(normals[..., 2:], STEEPEST)
     return np.concatenate([b, b**2, b[..., :1] * b[..., 1:]], axis=-1)
 
 
 def roughness(source: Source) -> np.ndarray:
-    """The source's roughness, ``(height, width, 1)``."""
+    """Return the source's roughness, ``(height, width, 1)``."""
     m = next((m for m in source.maps if m.role == "roughness"), None)
     if m is None:
         return np.full((source.height, source.width, 1), DEFAULTS["roughness"])
@@ -128,7 +95,7 @@ def roughness(source: Source) -> np.ndarray:
 
 
 def slope_moments(normals: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """:func:`slopes` and α²."""
+    """Return :func:`slopes` and α², ``(…, 6)``."""
     return np.concatenate([slopes(normals), np.maximum(roughness**2, ALPHA_MIN) ** 2], axis=-1)
 
 
@@ -136,28 +103,28 @@ def interpolated(
     function: Callable, normals: np.ndarray, roughness: np.ndarray, border, two: bool = False
 ) -> np.ndarray:
     """
-    Means over texels of a ``function`` of normals and roughness, ``(height, width, k)``, which are interpolated between
-    the texels' centres: at :data:`INSIDE` places along each side of a texel. ``two``: the third component of normals is
-    not interpolated, but follows from the others.
+    Return means over each texel of a ``function`` of normals and roughness, ``(height, width, k)``.
+
+    Normals and roughness are interpolated bilinearly at :data:`INSIDE` positions along each side of a texel. With
+    ``two``, the third component of normals is not interpolated but computed from the other two.
     """
     total, places = 0.0, (np.arange(INSIDE) + 0.5) / INSIDE - 0.5
     for dy in places:
         for dx in places:
             n, r = (_shifted(_shifted(base, dy, 0, border), dx, 1, border) for base in (normals, roughness))
             if two:
-                n = np.concatenate(
-                    [n[..., :2], np.sqrt(np.maximum(1 - (n[..., :2] ** 2).sum(-1, keepdims=True), 0))], -1
-                )
+                z = np.sqrt(np.maximum(1 - (n[..., :2] ** 2).sum(-1, keepdims=True), 0))
+                n = np.concatenate([n[..., :2], z], -1)
             n = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6)
             total = total + function(n, r)
     return total / INSIDE**2
 
 
-def _shifted(base: np.ndarray, by: float, axis: int, way: str) -> np.ndarray:
-    """What is interpolated ``by`` texels further along an axis, less than one."""
+def _shifted(base: np.ndarray, by: float, axis: int, border: Sequence[str]) -> np.ndarray:
+    """Return values interpolated ``by`` (less than one) texels further along an axis."""
     edges = [(0, 0)] * base.ndim
     edges[axis] = (1, 0) if by < 0 else (0, 1)
-    padded = np.pad(base, edges, "wrap" if way[axis] == "repeat" else "edge")
+    padded = np.pad(base, edges, "wrap" if border[axis] == "repeat" else "edge")
     n = base.shape[axis]
     first, second = (np.take(padded, np.arange(n) + i, axis) for i in (0, 1))
     share = by + 1 if by < 0 else by
@@ -165,48 +132,45 @@ def _shifted(base: np.ndarray, by: float, axis: int, way: str) -> np.ndarray:
 
 
 def means(base: np.ndarray) -> list[np.ndarray]:
-    """All levels of a level 0, ``(height, width, k)``: each texel is the mean of what it covers."""
-    found = [base]
+    """Return all levels of a level 0, ``(height, width, k)``: each texel is the mean of the texels that it covers."""
+    levels = [base]
     for _ in level_sizes(*base.shape[:2])[1:]:
-        found.append(halved(found[-1]))
-    return found
+        levels.append(halved(levels[-1]))
+    return levels
 
 
-# -- classical --------------------------------------------------------------------------------------------------------
+# -- analytic filters -------------------------------------------------------------------------------------------------
 
 
 def filtered(pyramid: Pyramid, effects: Effects) -> ShadedReader:
-    """Filtered parameters."""
+    """Return the reader that shades filtered parameters."""
     return reader(pyramid, effects)
 
 
 def toksvig_alpha2(alpha2, length):
     """
-    α² of a GGX lobe whose normals have a mean of ``length`` (0, 1].
+    Return α² of a GGX lobe whose normals have a mean of ``length`` (0, 1].
 
-    Toksvig scales the exponent s of a Blinn–Phong lobe: s' = s r / (r + s (1 − r)). That of the lobe of an α is
-    s = 2/α² − 2 (Walter et al. 2007), so α'² = 2/(s' + 2).
+    Toksvig scales the exponent s of a Blinn–Phong lobe: s' = s r / (r + s (1 − r)). The exponent of a lobe with
+    roughness α is s = 2/α² − 2 (Walter et al. 2007), so α'² = 2/(s' + 2).
     """
     exponent = 2 / alpha2 - 2
     scaled = exponent * length / (length + exponent * (1 - length))
     return 2 / (scaled + 2)
 
 
-def toksvig(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> ShadedReader:
-    """
-    Roughness from the length of the mean normal (:func:`toksvig_alpha2`), which is read unnormalised. ``smooth``: the
-    mean is over what is :func:`interpolated` between texels, as the truth has it.
-    """
+def toksvig(source: Source, pyramid: Pyramid, effects: Effects) -> ShadedReader:
+    """Return the reader whose roughness is :func:`toksvig_alpha2` of the length of the mean normal."""
     if unit_normals(source) is None:
         return filtered(pyramid, effects)
-    moments = _moments(lambda n, r: n, source, pyramid, smooth)
+    moments = _moments(lambda n, r: n, source, pyramid, False)
 
     def read(u, v, level, wi, wo):
         surface = surface_of(pyramid, pyramid.filtered(u, v, level))
-        mean = pyramid.types.Array3f(moments.read(u, v, level))
+        mean = pyramid.types.Array3f(moments.filtered(u, v, level))
         length = clamp(dr.norm(mean), 1e-3, 1.0)
-        found = toksvig_alpha2(_alpha2(surface.roughness, type(u)), length)
-        return shaded(None, replace(surface, roughness=dr.sqrt(dr.sqrt(found))), wi, wo, effects)
+        alpha2 = toksvig_alpha2(_alpha2(surface.roughness, type(u)), length)
+        return shaded(None, replace(surface, roughness=dr.sqrt(dr.sqrt(alpha2))), wi, wo, effects)
 
     return read
 
@@ -215,20 +179,23 @@ def _alpha2(roughness, Float):
     return dr.square(dr.maximum(dr.square(Float(roughness)), ALPHA_MIN))
 
 
-def _moments(function: Callable, source: Source, pyramid: Pyramid, smooth: bool) -> Moments:
-    """The moments that a ``function`` makes of normals and roughness."""
-    given, two = (unit_normals(source), roughness(source)), FROM_NORMAL in maps_of(pyramid.layout)["normal"].where
-    base = interpolated(function, *given, pyramid.border, two) if smooth else function(*given)
-    return Moments(means(base), pyramid.types, pyramid.border)
+def _moments(function: Callable, source: Source, pyramid: Pyramid, smooth: bool) -> Pyramid:
+    """Return all levels of a ``function`` of normals and roughness."""
+    maps, two = (unit_normals(source), roughness(source)), FROM_NORMAL in maps_of(pyramid.layout)["normal"].where
+    base = interpolated(function, *maps, pyramid.border, two) if smooth else function(*maps)
+    return moment_pyramid(means(base), pyramid.types, pyramid.border)
 
 
 def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> ShadedReader:
     """
-    An anisotropic lobe around the normal of the mean slope. The covariance of slopes is that in the surface's tangent
-    plane; about a tilted normal n slopes are, to first order, n_z times what the tangents of its frame see of them. To
-    it is added the mean of α²/2, and the eigenvectors of the sum are the axes of the lobe, twice the eigenvalues its
-    α². All else is that of filtered parameters, times the length of the mean normal: a cosine is linear in the normal,
-    and so is its mean (worth 0.8 dB on bricks and cloth). ``smooth``: as in :func:`toksvig`.
+    Return the reader of an anisotropic lobe around the normal of the mean slope.
+
+    The covariance of slopes is measured in the surface's tangent plane; in the frame of a tilted normal n, slopes are,
+    to first order, n_z times their projections onto the frame's tangents. The mean of α²/2 is added to the covariance;
+    the eigenvectors of the sum are the axes of the lobe, twice the eigenvalues its α². All other lobes are those of
+    filtered parameters, times the length of the mean normal: a cosine is linear in the normal, and so is its mean
+    (worth 0.8 dB on bricks and cloth). With ``smooth``, moments are those of interpolated normals
+    (:func:`interpolated`), as in the truth.
     """
     if unit_normals(source) is None:
         return filtered(pyramid, effects)
@@ -239,7 +206,7 @@ def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = Fals
     def read(u, v, level, wi, wo):
         surface = surface_of(pyramid, pyramid.filtered(u, v, level))
         material, albedo = _parameters(surface, type(u))
-        bx, by, xx, yy, xy, a2, *mean = moments.read(u, v, level)
+        bx, by, xx, yy, xy, a2, *mean = moments.filtered(u, v, level)
         covariance = (dr.maximum(xx - bx * bx, 0), dr.maximum(yy - by * by, 0), xy - bx * by)
         s, t, n = frame(Array3f(bx, by, 1), wi)
         ax, ay, s, t = lobe(covariance, a2, s, t, n)
@@ -254,15 +221,16 @@ def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = Fals
 
 def lobe(covariance, alpha2, s, t, n) -> tuple:
     """
-    ``α_x, α_y`` and their axes: of slopes whose ``covariance`` in the surface is ``(xx, yy, xy)``, and of facets of
-    ``alpha2`` on them, about a normal ``n`` with tangents ``s``, ``t``.
+    Return ``α_x, α_y`` and the two axes of a lobe about a normal ``n`` with tangents ``s``, ``t``.
+
+    ``covariance`` is that of the slopes in the surface, ``(xx, yy, xy)``, ``alpha2`` the α² of facets on them.
     """
     xx, yy, xy = covariance
 
-    def seen(a, b):
+    def projected(a, b):
         return dr.square(n.z) * (xx * a.x * b.x + yy * a.y * b.y + xy * (a.x * b.y + a.y * b.x))
 
-    p, q, r = seen(s, s) + 0.5 * alpha2, seen(t, t) + 0.5 * alpha2, seen(s, t)
+    p, q, r = projected(s, s) + 0.5 * alpha2, projected(t, t) + 0.5 * alpha2, projected(s, t)
     mean, half = 0.5 * (p + q), 0.5 * (p - q)
     root = dr.sqrt(half * half + r * r + 1e-20)
     angle = 0.5 * dr.atan2(r, half)
@@ -272,7 +240,7 @@ def lobe(covariance, alpha2, s, t, n) -> tuple:
 
 
 def specular(material: Material, albedo, ax, ay, wi, wo, effects: Effects):
-    """The specular lobe times the cosine, of a material with other α, along the axes of the frame."""
+    """Return the specular lobe times the cosine, with ``ax``, ``ay`` along the frame's axes as α."""
     p, decoder = Shaded.of(material, albedo), Decoder()
     c = {"ggx": ggx_coefficients(ax, ay)}
     if "f0" in decoder.required(effects):
@@ -281,13 +249,13 @@ def specular(material: Material, albedo, ax, ay, wi, wo, effects: Effects):
 
 
 def _parameters(surface: SurfaceParameters, Float) -> tuple:
-    given = {"roughness": surface.roughness, "metallic": surface.metallic}
-    material = Material(**{name: Float(given.get(name, DEFAULTS[name])) for name in PARAMETERS})
+    values = {**DEFAULTS, "roughness": surface.roughness, "metallic": surface.metallic}
+    material = Material(**{name: Float(values[name]) for name in PARAMETERS})
     return sanitize(material), dr.maximum(surface.albedo, 0)
 
 
 def _in_frame(axes, wi, wo, value: Callable):
-    """A value in a perturbed frame, with what shading by it takes (:func:`.material.shaded`)."""
+    """Return a value in a perturbed frame, masked and shadowed as in :func:`.material.shaded`."""
     i, o = (type(w)(*(dr.dot(w, axis) for axis in axes)) for w in (wi, wo))
     visible = (wi.z > 0) & (wo.z > 0) & (i.z > 0) & (o.z > 0)
     up = type(wi)(0, 0, 1)
@@ -295,46 +263,43 @@ def _in_frame(axes, wi, wo, value: Callable):
     return dr.select(visible, shadowing(axes[2], wo) * value(i, o), 0)
 
 
-# -- roughness that was fitted ----------------------------------------------------------------------------------------
+# -- fitted roughness -------------------------------------------------------------------------------------------------
 
 
 def roughness_reader(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray]) -> ShadedReader:
-    """Filtered parameters, but for roughness, of which all levels are given, ``(height, width)`` each."""
-    moments = Moments([level[..., None] for level in levels], pyramid.types, pyramid.border)
+    """Return the reader of filtered parameters with another roughness, ``(height, width)`` for each level."""
+    baked = moment_pyramid([level[..., None] for level in levels], pyramid.types, pyramid.border)
 
     def read(u, v, level, wi, wo):
         surface = surface_of(pyramid, pyramid.filtered(u, v, level))
-        return shaded(None, replace(surface, roughness=moments.read(u, v, level)[0]), wi, wo, effects)
+        return shaded(None, replace(surface, roughness=baked.filtered(u, v, level)[0]), wi, wo, effects)
 
     return read
 
 
-def baked(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray] | None = None) -> ShadedReader:
-    """Filtered parameters with roughness as :func:`bake` has it, made now unless its ``levels`` are given."""
-    return roughness_reader(pyramid, effects, bake(pyramid, effects) if levels is None else levels)
-
-
 def directions(types, count: int = PAIRS, seed: int = SEED) -> list[tuple]:
-    """Pairs of a view and a light, uniform over the hemisphere, the cosines of each one stratified."""
+    """Return pairs of a view and a light, uniform over the hemisphere, each with stratified cosines."""
     rng = np.random.default_rng(seed)
     numbers = rng.random((4, count))
     for row in (0, 2):
         numbers[row] = (rng.permutation(count) + numbers[row]) / count
-    made = [[dr.opaque(types.Float, float(x)) for x in column] for column in numbers.T]
-    return [(uniform_hemisphere(types, a, b), uniform_hemisphere(types, c, d)) for a, b, c, d in made]
+    columns = [[dr.opaque(types.Float, float(x)) for x in column] for column in numbers.T]
+    return [(uniform_hemisphere(types, a, b), uniform_hemisphere(types, c, d)) for a, b, c, d in columns]
 
 
 def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndarray]:
     """
-    The roughness, ``(height, width)`` for each level, with which filtered parameters at a texel's centre look most like
-    the converged truth: the least squares of values clipped to [0, 1], over ``pairs`` of a view and a light. It is
-    never below what is filtered (where light is lost, least squares would have no highlight at all), and the same on
-    level 0.
+    Return the roughness, ``(height, width)`` for each level, that minimises the error against the converged truth.
+
+    The error is that of filtered parameters at a texel's centre: the squared error of values clipped to [0, 1], over
+    ``pairs`` of a view and a light. The roughness is never below the filtered one (where light is lost, least squares
+    would have no highlight at all), and equal to it on level 0.
     """
-    types, found = pyramid.types, [np.array(roughness_of(pyramid)[0])]
+    types, filtered_levels = pyramid.types, roughness_of(pyramid)
+    baked_levels = [np.array(filtered_levels[0])]
     Float, UInt32 = types.Float, types.UInt32
-    made, tried = directions(types, pairs), len(TRIED)
-    values = Float(TRIED.astype(np.float32))
+    view_lights, tried = directions(types, pairs), len(TRIED)
+    shares = Float(TRIED.astype(np.float32))
     for level, texels in enumerate(pyramid.values[1:], 1):
         rows, columns, _ = texels.shape
         side = _side(level)
@@ -347,49 +312,47 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndar
             n, m = dr.opaque(UInt32, columns), dr.opaque(UInt32, rows)
             u, v = (Float(index % n) + 0.5) / Float(n), (Float(index // n) + 0.5) / Float(m)
             detail = dr.opaque(Float, level, count)
-            place, own = _outer(UInt32, count, tried)
-            parts = [dr.gather(Float, x, place) for x in (u, v, detail)]
-            surface = surface_of(pyramid, pyramid.filtered(*parts))
-            filtered = Float(surface.roughness)
-            surface = replace(surface, roughness=dr.lerp(filtered, 1, dr.gather(Float, values, own)))
+            texel, trial = _outer(UInt32, count, tried)
+            surface = surface_of(pyramid, pyramid.filtered(*(dr.gather(Float, x, texel) for x in (u, v, detail))))
+            roughness = dr.lerp(Float(surface.roughness), 1, dr.gather(Float, shares, trial))
+            surface = replace(surface, roughness=roughness)
             dr.eval(surface.albedo, surface.normal, surface.roughness, surface.metallic)
             total = dr.zeros(Float, count * tried)
-            for wi, wo in made:
-                wanted = reference("converged", pyramid, u, v, detail, *_wide(count, wi, wo), effects, side=side)
-                wanted = dr.gather(types.Array3f, dr.clip(wanted, 0, 1), place)
-                got = dr.clip(shaded(None, surface, *_wide(count * tried, wi, wo), effects), 0, 1)
-                total += dr.squared_norm(got - wanted)
+            for wi, wo in view_lights:
+                truth = reference("converged", pyramid, u, v, detail, *_wide(count, wi, wo), effects, side=side)
+                truth = dr.gather(types.Array3f, dr.clip(truth, 0, 1), texel)
+                value = dr.clip(shaded(None, surface, *_wide(count * tried, wi, wo), effects), 0, 1)
+                total += dr.squared_norm(value - truth)
                 dr.eval(total)
             errors.append(total.numpy().reshape(count, tried))
-        own = roughness_of(pyramid)[level]
-        share = _least(np.concatenate(errors)).reshape(rows, columns)
-        found.append((own + share * (1 - own)).astype(np.float32))
-    return found
+        share = _refined_minimum(np.concatenate(errors)).reshape(rows, columns)
+        base = filtered_levels[level]
+        baked_levels.append((base + share * (1 - base)).astype(np.float32))
+    return baked_levels
 
 
 def _side(level: int) -> int:
     """
-    Samples along the side of a footprint, two for each texel or more: with one, they might all be at centres of texels,
-    or all at corners, where normals vary less.
+    Return the samples along the side of a footprint: at least two for each texel.
+
+    With one, all samples might lie at centres of texels, or all at corners, where normals vary less.
     """
     return min(max(8, 2 << level), 128)
 
 
 def _outer(UInt32, count: int, tried: int) -> tuple:
-    """Of ``count × tried`` lanes, which of the first and which of the second each is."""
-    lane = dr.arange(UInt32, count * tried)
-    n = dr.opaque(UInt32, tried)
-    place = lane // n
-    return place, lane - place * n
+    """Return, for ``count × tried`` lanes, the index of each lane in the first and in the second range."""
+    lane, n = dr.arange(UInt32, count * tried), dr.opaque(UInt32, tried)
+    return lane // n, lane - lane // n * n
 
 
 def _wide(count: int, *directions) -> list:
-    """Directions, one for each of ``count`` lanes."""
+    """Return directions repeated for ``count`` lanes."""
     return [dr.gather(type(w), w, dr.zeros(dr.uint32_array_t(type(w.x)), count)) for w in directions]
 
 
-def _least(errors: np.ndarray) -> np.ndarray:
-    """The value among :data:`TRIED`, which are equidistant, with the least error of each row, made more precise."""
+def _refined_minimum(errors: np.ndarray) -> np.ndarray:
+    """Return the minimum of a parabola around the best of :data:`TRIED` (equidistant), for each row of errors."""
     best = errors.argmin(axis=1)
     middle, lane = np.clip(best, 1, len(TRIED) - 2), np.arange(len(errors))
     before, at, after = (errors[lane, middle + i].astype(np.float64) for i in (-1, 0, 1))
@@ -399,30 +362,31 @@ def _least(errors: np.ndarray) -> np.ndarray:
 
 
 def toksvig_levels(source: Source, pyramid: Pyramid) -> list[np.ndarray]:
-    """The roughness of :func:`toksvig` at the texels of each level, ``(height, width)``."""
-    normals, own = unit_normals(source), roughness_of(pyramid)
+    """Return the roughness of :func:`toksvig` at the texels of each level, ``(height, width)``."""
+    normals, filtered_levels = unit_normals(source), roughness_of(pyramid)
     if normals is None:
-        return own
+        return filtered_levels
     lengths = [np.clip(np.linalg.norm(n, axis=-1), 1e-3, 1) for n in means(normals)]
-    alpha2s = [np.maximum(r.astype(np.float64) ** 2, ALPHA_MIN) ** 2 for r in own]
+    alpha2s = [np.maximum(r.astype(np.float64) ** 2, ALPHA_MIN) ** 2 for r in filtered_levels]
     return [toksvig_alpha2(a, r) ** 0.25 for a, r in zip(alpha2s, lengths, strict=True)]
 
 
 def roughness_of(pyramid: Pyramid) -> list[np.ndarray]:
-    """The roughness of each level of a pyramid, ``(height, width)``."""
-    m, found = maps_of(pyramid.layout).get("roughness"), []
+    """Return the roughness of each level of a pyramid, ``(height, width)``."""
+    m, levels = maps_of(pyramid.layout).get("roughness"), []
     for values in pyramid.values:
         value = DEFAULTS["roughness"]
         if m is not None:
             (value,) = pyramid.layout.decode(m.name, np.moveaxis(values, -1, 0))
-        found.append(np.broadcast_to(np.asarray(value, np.float32), values.shape[:2]))
-    return found
+        levels.append(np.broadcast_to(np.asarray(value, np.float32), values.shape[:2]))
+    return levels
 
 
 def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
     """
-    A pyramid with another roughness, all levels of which are given, in a stored channel of its own: what is compressed
-    in place of the source's.
+    Return a pyramid with another roughness, ``(height, width)`` for each level, in a stored channel of its own.
+
+    The pyramid is meant to be compressed in place of the source's.
     """
     layout = pyramid.layout
     old = maps_of(layout).get("roughness")
@@ -443,43 +407,42 @@ def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
     return Pyramid(changed, values, pyramid.types, pyramid.border)
 
 
-# -- the kernel -------------------------------------------------------------------------------------------------------
+# -- biases of the level of detail ------------------------------------------------------------------------------------
 
 
 def biased(read: ShadedReader, biases: Sequence[float]) -> ShadedReader:
-    """
-    What ``read`` shows of another level of detail: ``biases`` (:func:`choose_biases`), one for each whole level, are
-    added, and interpolated between them.
-    """
+    """Return ``read`` with ``biases`` added to the level of detail, one for each whole level, interpolated between."""
 
     def at(u, v, level, wi, wo):
         Float = type(u)
         table = Float(np.append(biases, biases[-1]).astype(np.float32))
-        own = clamp(level, 0.0, float(len(biases) - 1))
-        lower = dr.uint32_array_t(Float)(own)
+        position = clamp(level, 0.0, float(len(biases) - 1))
+        lower = dr.uint32_array_t(Float)(position)
         a, b = dr.gather(Float, table, lower), dr.gather(Float, table, lower + 1)
-        return read(u, v, dr.maximum(level + dr.lerp(a, b, own - Float(lower)), 0), wi, wo)
+        return read(u, v, dr.maximum(level + dr.lerp(a, b, position - Float(lower)), 0), wi, wo)
 
     return at
 
 
 def choose_biases(read: ShadedReader, pyramid: Pyramid, effects: Effects, places: int = PLACES) -> list[float]:
     """
-    Of each level, the one of :data:`BIASES` with which ``read`` errs least against the converged truth, at random
-    ``places``, views and lights. Few of these see a highlight, so that the same ones are used for all levels.
+    Return, for each level, the one of :data:`BIASES` with the smallest error of ``read`` against the converged truth.
+
+    The error is measured at random ``places``, views and lights. Few of them see a highlight, so the same ones are used
+    for all levels.
     """
-    types, found = pyramid.types, []
+    types, chosen = pyramid.types, []
     rng = np.random.default_rng(SEED)
     numbers = [types.Float(x) for x in rng.random((6, places), dtype=np.float32)]
     u, v = numbers[:2]
-    ways = [uniform_hemisphere(types, numbers[i], numbers[i + 1]) for i in (2, 4)]
-    dr.eval(ways)
+    view_light = [uniform_hemisphere(types, numbers[i], numbers[i + 1]) for i in (2, 4)]
+    dr.eval(view_light)
     for level in range(min(BIASED, pyramid.levels)):
         detail = dr.opaque(types.Float, level, places)
-        truth = dr.clip(reference("converged", pyramid, u, v, detail, *ways, effects, side=_side(level)), 0, 1)
+        truth = dr.clip(reference("converged", pyramid, u, v, detail, *view_light, effects, side=_side(level)), 0, 1)
         errors = []
         for bias in BIASES:
-            got = read(u, v, dr.opaque(types.Float, max(level + bias, 0), places), *ways)
-            errors.append(float(dr.mean(dr.squared_norm(dr.clip(got, 0, 1) - truth))[0]))
-        found.append(float(BIASES[int(np.argmin(errors))]))
-    return found
+            value = read(u, v, dr.opaque(types.Float, max(level + bias, 0), places), *view_light)
+            errors.append(float(dr.mean(dr.squared_norm(dr.clip(value, 0, 1) - truth))[0]))
+        chosen.append(float(BIASES[int(np.argmin(errors))]))
+    return chosen

@@ -1,6 +1,8 @@
 """
-The Disney BRDF: ``disney``, ``neural_disney`` with each preset and in each storage form, and Mitsuba's ``principled``;
-with constant and with textured materials. :mod:`.candidates` says more.
+Study ``tradeoff disney``: accuracy of the Disney BRDF against time.
+
+Candidates are ``disney``, ``neural_disney`` with each preset and in each storage form, and Mitsuba's ``principled``,
+with constant and with textured materials. :mod:`.plan` describes them.
 """
 
 from __future__ import annotations

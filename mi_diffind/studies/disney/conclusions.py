@@ -1,4 +1,4 @@
-"""What the study of the Disney BRDF concludes: operations beside the paper's, speed, whether a table pays."""
+"""Conclusions of the Disney study: operations beside the paper's, required ratios of times, and whether tables pay."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ PAPER = {
     "tables, the paper's": Operations(add=11, mul=26, div=2, gathers=5),
 }
 
-#: What has to hold of ``eval`` with a constant material, floor subtracted: the cases, a ratio of times, what it is at
-#: least. `disney` computes; the default of `neural_disney` is not slower than `principled`, by 5% of noise.
+#: Required ratios of the times of ``eval`` with a constant material, floor subtracted: lobes, pair, least ratio.
+#: ``disney`` is much faster than ``principled``; the default of ``neural_disney`` is at most 5% (noise) slower.
 BARS = (
     (("all lobes",), ("principled", "disney"), 2.5),
     (("all lobes", "diffuse + specular"), ("principled", "tables, uint8"), 1 / 1.05),
 )
 
-#: Counts as printed: name → title.
+#: Operation counts in the order of the table: name → column title.
 _OPERATIONS = {
     **{name: name for name in ("add", "mul", "div", "sqrt", "log", "flops")},
     "gathers": "reads",
@@ -30,18 +30,18 @@ _OPERATIONS = {
 
 
 def conclusions(result: dict) -> list[str]:
-    """Operations beside the paper's, whether the bars hold, and whether a table earns its place."""
+    """Return operations beside the paper's, whether the required ratios hold, and whether a table saves time."""
     lines = []
     for case, measured in result["cases"].items():
         details = measured["details"]
         if details["material"] != "constant":
             continue
         lines.append(f"operations of one eval, {case} (add, mul 1 flop; div 2; sqrt, log 4)")
-        found = {name: t["operations"] for name, t in measured["queries"]["eval"].items() if "float16" not in name}
+        counts = {name: t["operations"] for name, t in measured["queries"]["eval"].items() if "float16" not in name}
         if details["lobes"] == "all lobes":
             unknown = dict.fromkeys(("bytes_gathered", "instructions"), "")
-            found = {name: o.asdict() | unknown for name, o in PAPER.items()} | found
-        cells = ([name, *(str(o[key]) for key in _OPERATIONS)] for name, o in found.items())
+            counts = {name: o.asdict() | unknown for name, o in PAPER.items()} | counts
+        cells = ([name, *(str(o[key]) for key in _OPERATIONS)] for name, o in counts.items())
         lines += [*grid([["", *_OPERATIONS.values()], *cells]), ""]
     return [*lines, *_bars(result), *_verdict(result)]
 
@@ -61,14 +61,14 @@ def _bars(result: dict) -> list[str]:
 
 
 def _verdict(result: dict) -> list[str]:
-    """Does any table give something that arithmetic does not give for less?"""
+    """Compare the fastest table with arithmetic, case by case."""
     lines = []
     accuracy = {name: c["errors"].get(result["accuracy"]) for name, c in result["candidates"].items()}
     for case, measured in result["cases"].items():
         timings = measured["queries"]["eval"]
         reads = {name: t["operations"]["gathers"] for name, t in timings.items()}
-        # A table that is read once for a constant material is not read here
-        learned = [name for name, a in accuracy.items() if a is not None and reads[name] > reads["disney"]]
+        # Excludes tables that are read only once because the material is constant
+        learned = [name for name, n in reads.items() if accuracy[name] is not None and n > reads["disney"]]
         if not learned or timings["disney"]["time"] <= 0:
             continue
         best = min(learned, key=lambda name: timings[name]["time"])

@@ -1,8 +1,8 @@
 """
-The Disney BRDF: ``disney``, which computes; ``neural_disney`` with each preset and in each storage form, and with one
-of its tables only; and Mitsuba's ``principled`` with the same parameters; with constant and with textured materials.
+Plan of the Disney study: ``disney``, ``neural_disney`` and ``principled`` with constant and with textured materials.
 
-The truth of all errors are the model's formulas (:mod:`~mi_diffind.tasks.disney.model`), which no plugin is made of.
+``disney`` evaluates formulas; ``neural_disney`` is measured with each preset, in each storage form, and with one of its
+tables only. Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no plugin shares.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ...tasks.disney.model import PARAMETERS, Material
 from ...tasks.disney.training import measure, shade
 from .conclusions import PAPER, conclusions
 
-#: A material that makes use of every part of the model, and one of the two lobes that most materials have.
+#: Parameters of a material that uses every part of the model, and of one with the two lobes that most materials have.
 ALL_LOBES = {
     "roughness": 0.43,
     "anisotropic": 0.5,
@@ -39,14 +39,18 @@ ALL_LOBES = {
 DIFFUSE_SPECULAR = {"roughness": 0.43, "specular": 0.6}
 BASE_COLOR = (0.8, 0.3, 0.2)
 
-#: The truth as a candidate; it is timed in ``eval`` only, with constant materials, in RGB.
+#: Name of the truth as a candidate, which is timed in ``eval`` only, with constant materials, in RGB.
 FORMULAS = "formulas"
 
+#: Presets of ``neural_disney`` that are measured.
 PRESETS = ("tables", "paper")
+
+_PRINCIPLED_NOTE = "another model (full Fresnel terms, no flatness without `thin`): no error against this one"
+_FORMULAS_NOTE = "the formulas alone, without a plugin's checks of directions and selection of lobes"
 
 
 def plan(quick: bool = False) -> Plan:
-    """What is measured in the variant that is set; ``quick``: fewer cases, fewer and smaller pictures."""
+    """Return the plan of the study in the current variant; ``quick``: fewer cases, fewer and smaller renders."""
     candidates, plugins = _candidates(quick)
     lobes = {"all lobes": ALL_LOBES, "diffuse + specular": DIFFUSE_SPECULAR}
     combinations = [(m, l) for m in ("constant", "textured") for l in lobes]
@@ -59,10 +63,13 @@ def plan(quick: bool = False) -> Plan:
     for material, name in combinations:
         parameters = lobes[name]
         names = [*plugins, *([FORMULAS] if material == "constant" and mi.is_rgb else [])]
+        if quick and cases:
+            names = ["principled", "disney", "tables"]
+        timed = {n: plugins[n] for n in names if n in plugins}
         cases.append(
             Case(
                 f"{material}, {name}",
-                lambda lanes, m=material, p=parameters: _queries(plugins, m, p, lanes),
+                lambda lanes, t=timed, m=material, p=parameters: _queries(t, m, p, lanes),
                 None if quick and cases else lambda m=material, p=parameters: _passes(rendered, m, p, quick),
                 {"material": material, "lobes": name, "base_color": BASE_COLOR, **parameters},
                 tuple(names),
@@ -99,20 +106,21 @@ def plan(quick: bool = False) -> Plan:
 
 def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
     """
-    The candidates (``quick``: without half precision), and for each plugin a function that makes its BSDF of parameters
-    (as for ``mi.load_dict``).
+    Return the candidates (``quick``: without half precision) and the builders of their BSDFs.
+
+    A builder is a function from parameters, as for ``mi.load_dict``, to a BSDF.
     """
     types = runtime.array_module(mi.variant())
 
     def errors(decoder):
-        def measured(samples: int) -> dict[str, float]:
-            found = {}
+        def measure_errors(samples: int) -> dict[str, float]:
+            values = {}
             for distribution in ("training", "uniform"):
                 m = measure(decoder, types, samples, distribution)
-                found |= {f"psnr_db_{distribution}": m["psnr_db"], f"mae_{distribution}": m["mae"]}
-            return found
+                values |= {f"psnr_db_{distribution}": m["psnr_db"], f"mae_{distribution}": m["mae"]}
+            return values
 
-        return measured
+        return measure_errors
 
     def loaded(**plugin):
         return lambda parameters: mi.load_dict({**plugin, **parameters})
@@ -121,26 +129,14 @@ def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
         def build(parameters):
             bsdf = mi.load_dict({"type": "neural_disney", "preset": "tables", "storage": "float32", **parameters})
             bsdf.decoder = decoder(bsdf.decoder.arrays)
-            bsdf.parameters_changed()  # what is evaluated once depends on the decoder
+            bsdf.parameters_changed()  # evaluates constant factors again, with this decoder
             return bsdf
 
         return build
 
     candidates = [
-        Candidate(
-            "principled",
-            "Mitsuba",
-            is_reference=True,
-            note="another model (full Fresnel terms, no flatness without `thin`): no error against this one",
-        ),
-        Candidate(
-            FORMULAS,
-            "formulas",
-            is_truth=True,
-            in_passes=False,
-            queries=("eval",),
-            note="the formulas alone, without what a plugin adds: checks of directions, lobes that are asked for",
-        ),
+        Candidate("principled", "Mitsuba", is_reference=True, note=_PRINCIPLED_NOTE),
+        Candidate(FORMULAS, "formulas", is_truth=True, in_passes=False, queries=("eval",), note=_FORMULAS_NOTE),
         Candidate("disney", "arithmetic", errors=errors(Decoder())),
     ]
     plugins = {"principled": loaded(type="principled"), "disney": loaded(type="disney")}
@@ -162,11 +158,11 @@ def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
     return candidates, plugins
 
 
-# -- what is timed ----------------------------------------------------------------------------------------------------
+# -- cases ------------------------------------------------------------------------------------------------------------
 
 
 def _material(material: str, parameters: dict) -> dict:
-    """Parameters as ``mi.load_dict`` takes them: numbers, or textures that vary around these."""
+    """Return parameters for ``mi.load_dict``: numbers, or for ``"textured"`` textures that vary around them."""
     if material == "constant":
         return {"base_color": {"type": "rgb", "value": list(BASE_COLOR)}, **parameters}
     rng = np.random.default_rng(1)
@@ -180,19 +176,19 @@ def _material(material: str, parameters: dict) -> dict:
 def _queries(plugins: dict, material: str, parameters: dict, lanes: int) -> dict:
     bsdfs = {name: build(_material(material, parameters)) for name, build in plugins.items()}
     inputs = directions(lanes)
-    found = bsdf_queries(bsdfs, inputs, material == "textured")
-    values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}  # each one number for all lanes, as a plugin has them
+    functions = bsdf_queries(bsdfs, inputs, material == "textured")
+    values = {**dict.fromkeys(PARAMETERS, 0.0), **parameters}  # each one number for all lanes, as in a plugin
     constants, albedo = {name: dr.opaque(mi.Float, value) for name, value in values.items()}, mi.Color3f(BASE_COLOR)
     dr.make_opaque(albedo)
-    found["eval"][FORMULAS] = lambda: shade(None, Material(**constants), albedo, inputs[0].wi, inputs[1])
-    return found
+    functions["eval"][FORMULAS] = lambda: shade(None, Material(**constants), albedo, inputs[0].wi, inputs[1])
+    return functions
 
 
 def _passes(plugins: dict, material: str, parameters: dict, quick: bool) -> dict:
-    """A sphere on a plane, both of the material, in light from everywhere and from one lamp."""
+    """Return renders of a sphere on a plane, both of the material, lit by a constant sky and one lamp."""
     size, spp = (64, 4) if quick else (256, 16)
-    place = mi.ScalarTransform4f
-    found = {}
+    transform = mi.ScalarTransform4f
+    renders = {}
     for name, build in plugins.items():
         bsdf = build(_material(material, parameters))
         scene = mi.load_dict({
@@ -201,18 +197,18 @@ def _passes(plugins: dict, material: str, parameters: dict, quick: bool) -> dict
             "sensor": {
                 "type": "perspective",
                 "fov": 40,
-                "to_world": place().look_at(origin=[0, -4.5, 2.2], target=[0, 0, 0.8], up=[0, 0, 1]),
+                "to_world": transform().look_at(origin=[0, -4.5, 2.2], target=[0, 0, 0.8], up=[0, 0, 1]),
                 "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
                 "sampler": {"type": "independent", "sample_count": spp},
             },
             "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}},
             "lamp": {
                 "type": "rectangle",
-                "to_world": place().look_at(origin=[2, -2, 4], target=[0, 0, 0.5], up=[0, 1, 0]).scale(0.6),
+                "to_world": transform().look_at(origin=[2, -2, 4], target=[0, 0, 0.5], up=[0, 1, 0]).scale(0.6),
                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 12.0}},
             },
-            "floor": {"type": "rectangle", "to_world": place().scale(6), "bsdf": bsdf},
+            "floor": {"type": "rectangle", "to_world": transform().scale(6), "bsdf": bsdf},
             "ball": {"type": "sphere", "center": [0, 0, 1], "bsdf": bsdf},
         })  # fmt: skip
-        found[name] = lambda number, scene=scene: mi.render(scene, spp=spp, seed=number)
-    return found
+        renders[name] = lambda number, scene=scene: mi.render(scene, spp=spp, seed=number)
+    return renders

@@ -1,6 +1,8 @@
 """
-The GGX distribution of normals: indirection at several sizes and in each storage form, single tables, networks and the
-formula, trained until that has converged; and the rough conductor that is made of it. :mod:`.candidates` says more.
+Study ``tradeoff ggx``: accuracy of the GGX distribution of normals against time and bytes.
+
+Candidates are indirection at several sizes and in each storage form, single tables, networks and the formula, all
+trained to convergence, and the rough conductor that uses the distribution. :mod:`.plan` describes them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the study of the GGX distribution concludes: equal bytes, 8-bit reads, and equal quality beside the paper's."""
+"""Conclusions of the GGX study: equal bytes, 8-bit reads, and equal quality beside the paper's ratios."""
 
 from __future__ import annotations
 
@@ -7,51 +7,51 @@ import math
 from ...lookup import STORAGES
 from ...measure.formatting import grid
 
-#: The reference of the equal-quality comparison: the paper's sizes.
+#: Sides of the primary and the cascaded array of the equal-quality reference: the paper's sizes.
 PRIMARY, CASCADED = 16, 8
 
-#: Numbers in its arrays.
+#: Entries of the reference's arrays together.
 ENTRIES = 2 * PRIMARY**2 + CASCADED**2
 
-#: The cases of the two kinds of input.
+#: Names of the cases, one for each parametrisation of the inputs.
 PLAIN, LOGARITHMIC = "inputs as in the paper", "logarithmic inputs"
 
 #: The paper's ratios to its own indirection at equal quality: flops, bytes read by a query, bytes stored.
 PAPER = {"network": (113.7, 256, 4), "single table": (0.33, 0.5, 512), "network + table": (28.4, 64, 0.5)}
 PAPER_FLOPS, PAPER_BYTES_READ, PAPER_BYTES = 36, 16, 1024
 
-#: dB by which a candidate may be worse and still count as of equal quality.
+#: PSNR, in dB, by which a candidate may be worse and still count as of equal quality.
 EQUAL_DB = 0.25
 
 
 def conclusions(result: dict, reference: str) -> list[str]:
-    """Equal bytes, 8-bit reads, and equal quality beside the paper's ratios."""
-    return [*_equal_bytes(result), *_bytes_of_reads(result), "", *_equal_quality(result, reference)]
+    """Return lines about equal bytes, 8-bit reads, and equal quality with the candidate ``reference``."""
+    return [*_equal_bytes(result), *_eight_bit_reads(result), "", *_equal_quality(result, reference)]
 
 
-def _accuracy(result: dict, name: str) -> float | None:
+def _psnr(result: dict, name: str) -> float | None:
     return result["candidates"].get(name, {}).get("errors", {}).get("psnr_db")
 
 
 def _equal_bytes(result: dict) -> list[str]:
-    """Indirection against a single table of as many entries."""
+    """Compare indirection with a single table of as many entries."""
     lines, side = [], math.isqrt(ENTRIES)
-    for what, mark in (("plain inputs", ""), ("plain inputs, raw output", " raw"), ("logarithmic inputs", ", log")):
-        names = [name + mark for name in (f"{PRIMARY}→{CASCADED}", f"{side}²")]
-        ours, table = (_accuracy(result, name) for name in names)
+    for title, suffix in (("plain inputs", ""), ("plain inputs, raw output", " raw"), ("logarithmic inputs", ", log")):
+        names = [name + suffix for name in (f"{PRIMARY}→{CASCADED}", f"{side}²")]
+        ours, table = (_psnr(result, name) for name in names)
         if ours is None or table is None:
             continue
         verdict = f"{'indirection' if ours > table else 'the single table'} wins by {abs(ours - table):.1f} dB"
         if not all(result["candidates"][name]["converged"] for name in names):
             verdict = "not both have converged: no statement is made"
-        lines.append(f"equal bytes, {what}: indirection {ours:.1f} dB, single table {table:.1f} dB: {verdict}")
+        lines.append(f"equal bytes, {title}: indirection {ours:.1f} dB, single table {table:.1f} dB: {verdict}")
     return lines
 
 
-def _bytes_of_reads(result: dict) -> list[str]:
+def _eight_bit_reads(result: dict) -> list[str]:
     lines = []
-    for case, mark in ((PLAIN, ""), (LOGARITHMIC, ", log")):
-        pair = f"{PRIMARY}→{CASCADED} u8{mark} / {PRIMARY}→{CASCADED}{mark}"
+    for case, suffix in ((PLAIN, ""), (LOGARITHMIC, ", log")):
+        pair = f"{PRIMARY}→{CASCADED} u8{suffix} / {PRIMARY}→{CASCADED}{suffix}"
         ratio = result["cases"].get(case, {}).get("ratios", {}).get("read", {}).get(pair)
         if ratio is not None:
             lines.append(
@@ -62,17 +62,17 @@ def _bytes_of_reads(result: dict) -> list[str]:
 
 
 def _equal_quality(result: dict, reference: str) -> list[str]:
-    """For each family: the smallest that is as good as the reference, and what it costs in units of the reference's."""
-    measured = result["cases"].get(PLAIN)
-    if measured is None or _accuracy(result, reference) is None:
+    """List, for each family, the smallest member as good as the reference and its cost relative to the reference."""
+    measured, goal = result["cases"].get(PLAIN), _psnr(result, reference)
+    if measured is None or goal is None:
         return []
     timings, candidates = measured["queries"]["read"], result["candidates"]
-    own, goal = timings[reference], _accuracy(result, reference)
-    flops, read = own["operations"]["flops"], own["operations"]["bytes_gathered"]
+    operations, time = timings[reference]["operations"], timings[reference]["time"]
+    nbytes, flops, bytes_read = candidates[reference]["bytes"], operations["flops"], operations["bytes_gathered"]
     head = (
-        f"equal quality with indirection {reference} ({goal:.1f} dB; {flops} flops, {read} bytes read, "
-        f"{candidates[reference]['bytes']:,} bytes, {own['time']:.2f} ns), plain inputs; the paper's own: "
-        f"{PAPER_FLOPS} flops, {PAPER_BYTES_READ} bytes read, {PAPER_BYTES:,} bytes"
+        f"equal quality with indirection {reference} ({goal:.1f} dB; {flops} flops, {bytes_read} bytes read, "
+        f"{nbytes:,} bytes, {time:.2f} ns), plain inputs; the paper's own: {PAPER_FLOPS} flops, {PAPER_BYTES_READ} "
+        f"bytes read, {PAPER_BYTES:,} bytes"
     )
     if not candidates[reference]["converged"]:
         return [head, f"  {reference} has not converged: no statement is made"]
@@ -85,18 +85,18 @@ def _equal_quality(result: dict, reference: str) -> list[str]:
         ]  # fmt: skip
         if not members:
             continue
-        good = [name for name in members if _accuracy(result, name) >= goal - EQUAL_DB]
-        name = min(good or members, key=lambda n: candidates[n]["bytes"] if good else -_accuracy(result, n))
-        t, c = timings[name], candidates[name]
+        good = [name for name in members if _psnr(result, name) >= goal - EQUAL_DB]
+        name = min(good or members, key=lambda n: candidates[n]["bytes"] if good else -_psnr(result, n))
+        timing, candidate = timings[name], candidates[name]
         ratios = (
-            t["operations"]["flops"] / flops, t["operations"]["bytes_gathered"] / read,
-            c["bytes"] / candidates[reference]["bytes"], t["time"] / own["time"],
+            timing["operations"]["flops"] / flops, timing["operations"]["bytes_gathered"] / bytes_read,
+            candidate["bytes"] / nbytes, timing["time"] / time,
         )  # fmt: skip
-        cells.append([family, name, f"{_accuracy(result, name):.1f}", *(f"{r:.2f}x" for r in ratios)])
-        text = "   " + ", ".join(f"{r:g}x" for r in paper) if paper else ""
-        if not c["converged"]:
-            text += "; has not converged: no statement about equal quality"
+        cells.append([family, name, f"{_psnr(result, name):.1f}", *(f"{r:.2f}x" for r in ratios)])
+        note = "   " + ", ".join(f"{r:g}x" for r in paper) if paper else ""
+        if not candidate["converged"]:
+            note += "; has not converged: no statement about equal quality"
         elif not good:
-            text += "; the best of its family, which does NOT reach it"
-        notes.append(text)
+            note += "; the best of its family, which does NOT reach it"
+        notes.append(note)
     return [head, *(line + note for line, note in zip(grid(cells), notes, strict=True))]

@@ -1,11 +1,11 @@
 """
-The GGX distribution of normals: indirection at several sizes and in each storage form, single tables, networks, and
-the formula; and the rough conductor that is made of it.
+Plan of the GGX study: indirection, single tables, networks and the formula, trained to convergence, at two inputs.
 
-Everything is compared twice, on two kinds of *inputs*: plain ones, (cos θ_h, α) as the paper has them, and the
-logarithmic ones of ``neural_ggx`` (:class:`.ggx.Encoding`). All learn the same output, the bounded root of D, with the
-same error measure and samples, in the two kinds of input alike; what is marked *raw* learns D itself, as the paper's
-recipe does. All of them are trained until that has converged (:mod:`~mi_diffind.measure.training`).
+Every representation is measured with two parametrisations of its *inputs*: the plain one, (cos θ_h, α) as in the
+paper, and the logarithmic one of ``neural_ggx`` (:class:`~mi_diffind.tasks.ggx.model.Encoding`). All learn the same
+output, the bounded root of D, from the same samples with the same error measure; candidates marked *raw* learn D
+itself, as the paper's recipe does. All are trained until they converge (:mod:`~mi_diffind.measure.training`). The rough
+conductor that is built from the distribution is timed beside Mitsuba's.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -55,8 +55,8 @@ MULTIPLES = (1, 4, 16, 64, 512)
 #: Width and hidden layers of the networks. The last has about as many parameters as the paper's.
 NETWORKS = ((8, 2), (16, 2), (32, 3))
 
-#: How each is trained, found by trying: indirection gains from a large rate where its inputs are plain, networks from
-#: many small steps. ``steps`` are those of the first run, ``longest`` those of the longest.
+#: Training settings of each representation, chosen by experiment: indirection with plain inputs gains from a high
+#: learning rate, networks from many small steps. ``steps`` is the length of the first run, ``longest`` of the longest.
 SETTINGS = {
     "indirection, plain": {"lr": 5e-2, "batch": 16384, "steps": 2000, "longest": 16000},
     "indirection, logarithmic": {"lr": 1e-2, "batch": 16384, "steps": 2000, "longest": 16000},
@@ -66,46 +66,51 @@ SETTINGS = {
     "wide network": {"lr": 5e-3, "batch": 1024, "steps": 8000, "longest": 32000},
 }
 
-#: Those of the first run of a quick study, the longest takes twice as many.
+#: Steps of the first run of a quick study; the longest run takes twice as many.
 QUICK_STEPS = 80
 
-GRID = {
+#: Options of the hash grid in front of a network.
+HASH_GRID = {
     "n_levels": 4, "n_features_per_level": 2, "hashmap_size": 2**12, "base_resolution": 4, "per_level_scale": 2,
     "align_corners": True, "init_scale": 1e-2,
 }  # fmt: skip
 
-#: Storage form → its mark in labels, bytes of an entry.
+#: Storage form → its suffix in labels, bytes of an entry.
 _STORED = {"float32": ("", 4), "float16": (" f16", 2), "uint8": (" u8", 1)}
 
 
-def plan(quick: bool = False) -> Plan:
-    """What is measured in the variant that is set; ``quick``: fewer candidates, trained for seconds."""
-    types = runtime.array_module(mi.variant())
-    made = _Made(types, quick)
+def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
+    """
+    Return the plan of the study in the current variant.
+
+    ``quick``: fewer candidates, whose first training takes ``quick_steps`` steps and whose longest twice as many.
+    """
+    builder = GGXCandidates(runtime.array_module(mi.variant()), quick, quick_steps)
     for inputs in INPUTS[::-1]:
-        _add_tables(made, inputs)
-        _add_networks(made, inputs)
-    _add_formula(made)
+        builder.add_tables(inputs)
+        builder.add_networks(inputs)
+    builder.add_formula()
     cases = [
-        made.case(PLAIN, "plain", {"inputs": "cos θ_h and α, both vary", "output": "root, or raw where marked"}),
-        made.case(LOGARITHMIC, "logarithmic", {"inputs": "logarithms of sin²θ_h and α, both vary", "output": "root"}),
-        *_conductors(made),
+        builder.case(PLAIN, "plain", {"inputs": "cos θ_h and α, both vary", "output": "root, or raw where marked"}),
+        builder.case(
+            LOGARITHMIC, "logarithmic", {"inputs": "logarithms of sin²θ_h and α, both vary", "output": "root"}
+        ),
+        *builder.conductors(),
     ]
     package = Path(__file__).resolve().parents[2]
-    trained_by = [package / f"{name}.py" for name in ("lookup", "indirection", "fitting")]
-    trained_by += [*(package / "tasks").glob("*.py"), *(package / "tasks" / "ggx").glob("*.py")]
-    trained_by += [package / "studies" / "baselines" / "networks.py"]
-    reference = made.name(f"{PRIMARY}→{CASCADED}", "plain")
+    training_sources = [package / f"{name}.py" for name in ("lookup", "indirection", "fitting")]
+    training_sources += [*(package / "tasks").glob("*.py"), *(package / "tasks" / "ggx").glob("*.py")]
+    training_sources += [package / "studies" / "baselines" / "networks.py"]
     return Plan(
         study="ggx",
         title="GGX distribution of normals: accuracy against time and bytes",
         variant=mi.variant(),
-        candidates=made.candidates,
+        candidates=builder.candidates,
         cases=cases,
         queries=("read",),
         accuracy="psnr_db",
         accuracy_label="PSNR of D clipped to [0, 1], dB",
-        ratios=made.ratios,
+        ratios=builder.ratios,
         details={
             "flops": FLOPS,
             "paper": {"flops": PAPER_FLOPS, "bytes_read": PAPER_BYTES_READ, "bytes": PAPER_BYTES, "ratios": PAPER},
@@ -113,21 +118,22 @@ def plan(quick: bool = False) -> Plan:
             "exponential-like roughness; and by bands of roughness: the largest relative error at the normal, and the "
             "99th percentile of it where D is at least a tenth of the peak",
         },
-        jobs=made.trainings,
-        jobs_fingerprint=fingerprint(trained_by),
+        jobs=builder.trainings,
+        jobs_fingerprint=fingerprint(training_sources),
         bytes_by_case=True,
-        conclusions=lambda result: conclusions(result, reference),
+        conclusions=lambda result: conclusions(result, builder.reference("plain")),
     )
 
 
-class _Made:
-    """The plan while it is made: candidates, their trainings, and how each is read."""
+class GGXCandidates:
+    """Builder of the plan: the candidates, their trainings, and the function that reads each of them."""
 
-    def __init__(self, types, quick: bool):
-        self.types, self.quick = types, quick
+    def __init__(self, types, quick: bool, quick_steps: int):
+        self.types, self.quick, self.quick_steps = types, quick, quick_steps
         self.candidates: list[Candidate] = []
         self.trainings: list[ConvergenceTraining] = []
         self.ratios: list[tuple[str, str]] = []
+        #: Name of a candidate → function that returns its reader; and the inputs that it is read at.
         self.readers: dict[str, Callable[[], Callable]] = {}
         self.inputs: dict[str, str] = {}
 
@@ -135,13 +141,17 @@ class _Made:
     def name(label: str, inputs: str) -> str:
         return label if inputs == "plain" else f"{label}, log"
 
-    def train(self, label: str, net: Callable, how: str, encoding: Encoding) -> ConvergenceTraining:
-        """Register a training; ``how`` is a key of :data:`SETTINGS`."""
-        options = dict(SETTINGS[how])
+    def reference(self, inputs: str) -> str:
+        """Return the name of the indirection of the paper's sizes."""
+        return self.name(f"{PRIMARY}→{CASCADED}", inputs)
+
+    def train(self, label: str, net: Callable, settings_key: str, encoding: Encoding) -> ConvergenceTraining:
+        """Register a training by the settings :data:`SETTINGS` ``[settings_key]``."""
+        options = dict(SETTINGS[settings_key])
         longest = options.pop("longest")
         settings = FitSettings(seed=1, schedule="cosine", deterministic=False, **options)
         if self.quick:
-            settings, longest = dataclasses.replace(settings, steps=QUICK_STEPS), 2 * QUICK_STEPS
+            settings, longest = dataclasses.replace(settings, steps=self.quick_steps), 2 * self.quick_steps
         samples = "tables" if encoding.inputs == "logarithmic" else "paper"
 
         def problem():
@@ -152,7 +162,7 @@ class _Made:
         return self.trainings[-1]
 
     def add(self, label, representation, setting, size, training, form, encoding, operations=None, note=""):
-        """Register a candidate; ``form(net)`` turns the trained module into what is read."""
+        """Register a candidate; ``form(net)`` turns the trained module into the module to read."""
         name = self.name(label, encoding.inputs)
         reader = functools.cache(lambda: LearnedGGX(form(training.net), encoding, tail=False))
         self.candidates.append(
@@ -164,131 +174,130 @@ class _Made:
         )  # fmt: skip
         self.readers[name], self.inputs[name] = reader, encoding.inputs
 
+    # -- candidates ---------------------------------------------------------------------------------------------------
+
+    def add_tables(self, inputs: str) -> None:
+        """Register indirection at several sizes and single tables; with plain inputs also with raw output."""
+        plain = inputs == "plain"
+        sizes, multiples = (SIZES, MULTIPLES) if plain else ((PRIMARY, 2 * PRIMARY), (1, 4))
+        if self.quick:
+            sizes, multiples = sizes[:2] if plain else sizes[:1], multiples[:2] if plain else multiples[:1]
+        encoding, reference = Encoding(inputs, "root"), self.reference(inputs)
+        for side in sizes:
+            self._add_table(side, f"indirection, {inputs}", encoding, STORAGES)
+        self.ratios += [
+            (self.name(f"{PRIMARY}→{CASCADED}{_STORED[storage][0]}", inputs), reference) for storage in STORAGES[1:]
+        ]
+        for multiple in multiples:
+            storages = STORAGES if multiple == 1 else STORAGES[:1]
+            self._add_table(math.isqrt(ENTRIES * multiple), "single table", encoding, storages)
+        self.ratios.append((self.name(f"{math.isqrt(ENTRIES)}²", inputs), reference))
+        if plain and not self.quick:
+            for side, representation in ((PRIMARY, "indirection"), (math.isqrt(ENTRIES), "single table")):
+                self._add_table(side, "raw", Encoding("plain", "raw"), STORAGES[:1], representation)
+
+    def _add_table(
+        self, side: int, settings_key: str, encoding: Encoding, storages: Sequence[str], representation: str = ""
+    ) -> None:
+        """Register a training, and a candidate in each storage form, of indirection or of a single table."""
+        representation = representation or settings_key.split(",")[0]
+        if representation == "indirection":
+            label, entries = f"{side}→{side // 2}", 2 * side**2 + (side // 2) ** 2
+            net = functools.partial(indirection, side, side // 2)
+        else:
+            label, entries = f"{side}²", side**2
+            net = functools.partial(DifferentiableArray, (side, side), 1, "constant", 0.5)
+        note = "learns D as it is, at the paper's learning rate" if settings_key == "raw" else ""
+        label += " raw" * (settings_key == "raw")
+        training = self.train(label, net, settings_key, encoding)
+        for storage in storages:
+            suffix, size = _STORED[storage]
+            form = lambda net, s=storage: net.to(s)  # noqa: E731
+            self.add(label + suffix, representation, storage, size * entries, training, form, encoding, note=note)
+
+    def add_networks(self, inputs: str) -> None:
+        """Register networks as tensors and as cooperative vectors, after a hash grid, and in front of a table."""
+        plain = inputs == "plain"
+        networks = [(f"MLP {w}x{n}", "network", Network(2, w, n)) for w, n in (NETWORKS if plain else NETWORKS[1:])]
+        if plain:
+            networks.append(("grid + MLP 16", "hash grid + network", Network(2, 16, 1, HASH_GRID)))
+            networks.append((f"MLP 8 + {PRIMARY}²", "network + table", Network(2, 8, 2, table=PRIMARY)))
+        if self.quick:
+            networks = [networks[0], *networks[-2:]] if plain else []
+        encoding = Encoding(inputs, "root")
+        for label, representation, network in networks:
+            settings_key = "network" if network.width < 32 else "wide network"
+            training = self.train(label, lambda n=network: n, settings_key, encoding)
+            size = network.alloc(self.types.TensorXf, 2, dr.rng(seed=1)).nbytes
+            operations = self._network_operations(training, encoding)
+            self.add(label, representation, "cooperative vectors", size, training, Network.cooperative, encoding,
+                     operations)  # fmt: skip
+            self.add(f"{label} tensor", representation, "tensors", size, training, lambda net: net, encoding,
+                     operations)  # fmt: skip
+
+    def _network_operations(self, training: ConvergenceTraining, encoding: Encoding) -> Callable[[str], Operations]:
+        """Return a counter of the operations in a kernel and of the matrix products, which a kernel does not show."""
+
+        def counted(query: str) -> Operations:
+            read, inputs = LearnedGGX(training.net.cooperative(), encoding), self.directions(64)
+            return count_query(lambda: [read(*inputs)]) + training.net.products()
+
+        return counted
+
+    def add_formula(self) -> None:
+        """Register the formula: the truth, read at both kinds of inputs."""
+        self.candidates.append(Candidate("formula", "formula", is_truth=True, label="formula", in_passes=False))
+        self.readers["formula"] = lambda: lambda cos, sin2, alpha: ggx(sin2, alpha)
+        self.inputs["formula"] = "any"
+        self.ratios += [(self.reference(inputs), "formula") for inputs in INPUTS[::-1]]
+
+    # -- cases --------------------------------------------------------------------------------------------------------
+
     def case(self, name: str, inputs: str, details: dict) -> Case:
         names = [n for n in self.readers if self.inputs[n] in (inputs, "any")]
         return Case(name, lambda lanes: self._queries(names, lanes), None, details, tuple(names))
 
     def _queries(self, names: list[str], lanes: int) -> dict:
         cos, sin2, alpha = directions = self.directions(lanes)
-        found = {FLOOR: lambda: list(directions)}
+        functions = {FLOOR: lambda: list(directions)}
         for name in names:
             distribution = self.readers[name]()
-            found[name] = lambda d=distribution: [d(cos, sin2, alpha)]
-        return {"read": found}
+            functions[name] = lambda d=distribution: [d(cos, sin2, alpha)]
+        return {"read": functions}
 
     def directions(self, lanes: int) -> tuple:
-        """Inputs of ``lanes`` reads, evaluated."""
-        found = draw(dr.rng(seed=dr.opaque(self.types.UInt64, 7)), self.types, lanes)
-        dr.make_opaque(*found)
-        return found
+        """Return ``(cos θ_h, sin² θ_h, α)`` of ``lanes`` reads, evaluated."""
+        samples = draw(dr.rng(seed=dr.opaque(self.types.UInt64, 7)), self.types, lanes)
+        dr.make_opaque(*samples)
+        return samples
+
+    def conductors(self) -> list[Case]:
+        """Register ``neural_ggx`` with its shipped tables and ``roughconductor``; return a case per roughness."""
+        plugins = {"roughconductor": {"type": "roughconductor", "distribution": "ggx"}}
+        self.candidates.append(Candidate("roughconductor", "Mitsuba", is_truth=True, in_passes=False))
+        for storage in STORAGES:
+            name = "neural_ggx" + ("" if storage == "float32" else f", {storage}")
+            plugins[name] = {"type": "neural_ggx", "storage": storage}
+            model = TASK.open(self.types.TensorXf, storage=storage)
+            self.candidates.append(
+                Candidate(name, "indirection", storage, model.nbytes, None, model.measure, in_passes=False)
+            )
+            self.ratios.append((name, "roughconductor"))
+        return [
+            Case(
+                f"conductor, {roughness} roughness",
+                lambda lanes, r=roughness: _conductor_queries(plugins, r, lanes),
+                None,
+                {"material": "Cu", "alpha": 0.2, "roughness": roughness},
+                tuple(plugins),
+                QUERIES,
+                False,
+            )
+            for roughness in (("constant",) if self.quick else ("constant", "textured"))
+        ]
 
 
-# -- candidates -------------------------------------------------------------------------------------------------------
-
-
-def _add_tables(made: _Made, inputs: str) -> None:
-    """Indirection at several sizes, single tables at multiples of the bytes; with plain inputs also the raw output."""
-    plain = inputs == "plain"
-    sizes, multiples = (SIZES, MULTIPLES) if plain else ((PRIMARY, 2 * PRIMARY), (1, 4))
-    if made.quick:
-        sizes, multiples = sizes[:2] if plain else sizes[:1], multiples[:2] if plain else multiples[:1]
-    encoding, own = Encoding(inputs, "root"), made.name(f"{PRIMARY}→{CASCADED}", inputs)
-    for n in sizes:
-        _add_table(made, n, f"indirection, {inputs}", encoding, STORAGES)
-    made.ratios += [(made.name(f"{PRIMARY}→{CASCADED}{_STORED[s][0]}", inputs), own) for s in STORAGES[1:]]
-    for multiple in multiples:
-        forms = STORAGES if multiple == 1 else STORAGES[:1]
-        _add_table(made, math.isqrt(ENTRIES * multiple), "single table", encoding, forms)
-    made.ratios.append((made.name(f"{math.isqrt(ENTRIES)}²", inputs), own))
-    if plain and not made.quick:
-        for n, representation in ((PRIMARY, "indirection"), (math.isqrt(ENTRIES), "single table")):
-            _add_table(made, n, "raw", Encoding("plain", "raw"), STORAGES[:1], representation)
-
-
-def _add_table(made: _Made, n: int, how: str, encoding: Encoding, forms, representation: str = "") -> None:
-    """A training, and a candidate in each of ``forms``: indirection of a primary of side ``n``, or a table of it."""
-    representation = representation or how.split(",")[0]
-    if representation == "indirection":
-        label, entries, net = f"{n}→{n // 2}", 2 * n**2 + (n // 2) ** 2, lambda: indirection(n, n // 2)
-    else:
-        label, entries, net = f"{n}²", n**2, lambda: DifferentiableArray((n, n), 1, "constant", 0.5)
-    note = "learns D as it is, at the paper's learning rate" if how == "raw" else ""
-    label += " raw" * (how == "raw")
-    training = made.train(label, net, how, encoding)
-    for storage in forms:
-        mark, size = _STORED[storage]
-        form = lambda net, s=storage: net.to(s)  # noqa: E731
-        made.add(label + mark, representation, storage, size * entries, training, form, encoding, note=note)
-
-
-def _add_networks(made: _Made, inputs: str) -> None:
-    """Networks as tensors and as cooperative vectors, after a hash grid, and in front of a table."""
-    plain = inputs == "plain"
-    kinds = [(f"MLP {w}x{n}", "network", Network(2, w, n)) for w, n in (NETWORKS if plain else NETWORKS[1:])]
-    if plain:
-        kinds.append(("grid + MLP 16", "hash grid + network", Network(2, 16, 1, GRID)))
-        kinds.append((f"MLP 8 + {PRIMARY}²", "network + table", Network(2, 8, 2, table=PRIMARY)))
-    if made.quick:
-        kinds = [kinds[0], *kinds[-2:]] if plain else []
-    encoding = Encoding(inputs, "root")
-    for label, representation, network in kinds:
-        how = "network" if network.width < 32 else "wide network"
-        training = made.train(label, lambda n=network: n, how, encoding)
-        size = network.alloc(made.types.TensorXf, 2, dr.rng(seed=1)).nbytes
-        for form, setting in ((Network.cooperative, "cooperative vectors"), (lambda net: net, "tensors")):
-            shown = label if form is Network.cooperative else f"{label} tensor"
-            operations = _network_operations(made, training, encoding)
-            made.add(shown, representation, setting, size, training, form, encoding, operations)
-
-
-def _network_operations(made: _Made, training: ConvergenceTraining, encoding: Encoding) -> Callable[[str], Operations]:
-    """What a kernel of cooperative vectors shows, and the products by weights that it does not."""
-
-    def counted(query: str) -> Operations:
-        read, inputs = LearnedGGX(training.net.cooperative(), encoding), made.directions(64)
-        return count_query(lambda: [read(*inputs)]) + training.net.products()
-
-    return counted
-
-
-def _add_formula(made: _Made) -> None:
-    made.candidates.append(Candidate("formula", "formula", is_truth=True, label="formula", in_passes=False))
-    made.readers["formula"] = lambda: lambda cos, sin2, alpha: ggx(sin2, alpha)
-    made.inputs["formula"] = "any"
-    for inputs in INPUTS[::-1]:
-        made.ratios.append((made.name(f"{PRIMARY}→{CASCADED}", inputs), "formula"))
-
-
-# -- the rough conductor ----------------------------------------------------------------------------------------------
-
-
-def _conductors(made: _Made) -> list[Case]:
-    """``neural_ggx`` with the tables that ship, and ``roughconductor``, of constant and of textured roughness."""
-    plugins = {"roughconductor": {"type": "roughconductor", "distribution": "ggx"}}
-    made.candidates.append(Candidate("roughconductor", "Mitsuba", is_truth=True, in_passes=False))
-    for storage in STORAGES:
-        name = "neural_ggx" + ("" if storage == "float32" else f", {storage}")
-        plugins[name] = {"type": "neural_ggx", "storage": storage}
-        model = TASK.open(made.types.TensorXf, storage=storage)
-        made.candidates.append(
-            Candidate(name, "indirection", storage, model.nbytes, None, model.measure, in_passes=False)
-        )
-        made.ratios.append((name, "roughconductor"))
-    return [
-        Case(
-            f"conductor, {roughness} roughness",
-            lambda lanes, r=roughness: _bsdf_queries(plugins, r, lanes),
-            None,
-            {"material": "Cu", "alpha": 0.2, "roughness": roughness},
-            tuple(plugins),
-            QUERIES,
-            False,
-        )
-        for roughness in ("constant", "textured")
-    ]
-
-
-def _bsdf_queries(plugins: dict, roughness: str, lanes: int) -> dict:
+def _conductor_queries(plugins: dict, roughness: str, lanes: int) -> dict:
     def load(plugin: dict):
         alpha = noise_texture([0.2], np.random.default_rng(1)) if roughness == "textured" else 0.2
         return mi.load_dict({**plugin, "material": "Cu", "alpha": alpha})

@@ -1,6 +1,7 @@
 """
-``tradeoff image``: quality of a compressed image or material against bytes, seconds of training and time of a read,
-beside what codecs make of the same maps in the same bytes. :mod:`.candidates` says more.
+Study ``tradeoff image``: quality of a compressed image or material against bytes, seconds of training and read time.
+
+Codecs encode the same maps in the same bytes. :mod:`.plan` describes the contenders.
 """
 
 from __future__ import annotations
@@ -9,16 +10,15 @@ import argparse
 
 from ...arguments import positive
 from ...measure.study import Plan, Study
+from ..maps import add_astc_option
 
-#: Option → what it is of, what kind of value it takes and which.
+#: Options that may be repeated → help, type, choices.
 _REPEATED = {
-    "--compression": ("12x (default)", str, None),
-    "--seconds": ("of each training by our preset (default: 60; --quick: 2)", positive, None),
-    "--paper-seconds": ("of each by the paper's preset (default: the longest of --seconds)", positive, None),
+    "--compression": ("compression ratio, such as 12x (default)", str, None),
+    "--seconds": ("seconds of each training by our preset (default: 60; --quick: 2)", positive, None),
+    "--paper-seconds": ("seconds of each by the paper's preset (default: the longest of --seconds)", positive, None),
     "--dims": ("dimensions of the cascaded array, 2, 3 or 4 (default: all)", int, (2, 3, 4)),
 }
-
-ASTC_PRESETS = ("fastest", "fast", "medium", "thorough", "verythorough", "exhaustive")
 
 
 class ImageStudy(Study):
@@ -29,16 +29,14 @@ class ImageStudy(Study):
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("source", metavar="IMAGE|MATERIAL.json")
-        for option, (text, kind, choices) in _REPEATED.items():
-            parser.add_argument(option, action="append", default=[], type=kind, choices=choices, metavar="N",
+        for option, (text, value_type, choices) in _REPEATED.items():
+            parser.add_argument(option, action="append", default=[], type=value_type, choices=choices, metavar="N",
                                 help=f"{text}; may be repeated")  # fmt: skip
-        parser.add_argument("--astc", choices=ASTC_PRESETS, default="exhaustive",
-                            help="preset of the ASTC encoder (default: exhaustive; faster ones are up to several dB "
-                            "worse)")  # fmt: skip
+        add_astc_option(parser)
         parser.add_argument("--ablation", action="store_true", help="also switch off each improvement of our preset")
 
     def check(self, arguments) -> None:
-        """Also reads the source, before anything is made of it; raises what :func:`.load_source` does."""
+        """Check the options and load the source; raise as :func:`.load_source` does."""
         from ...maps.source import load_source
         from ...units import parse_compression
 
@@ -46,11 +44,11 @@ class ImageStudy(Study):
         arguments.loaded = load_source(arguments.source)
 
     def plan(self, arguments) -> Plan:
-        from .plan import Request, plan
+        from .plan import ImageStudySettings, plan
 
         quick = arguments.quick
         seconds = tuple(map(float, arguments.seconds)) or (2.0 if quick else 60.0,)
-        request = Request(
+        settings = ImageStudySettings(
             arguments.compressions[:1] if quick else arguments.compressions,
             seconds,
             tuple(map(float, arguments.paper_seconds)) or (max(seconds),),
@@ -59,7 +57,7 @@ class ImageStudy(Study):
             "fast" if quick else arguments.astc,
             "fast" if quick else "medium",
         )
-        return plan(arguments.loaded, arguments.source, request)
+        return plan(arguments.loaded, arguments.source, settings)
 
 
 STUDY = ImageStudy()

@@ -1,10 +1,11 @@
-"""What the study of compressed images says: a table of all candidates, and verdicts against ASTC."""
+"""Conclusions of the image study: a table of all contenders, and verdicts against ASTC."""
 
 from __future__ import annotations
 
 from ...measure.formatting import grid
+from ..maps import source_line
 
-#: What verdicts are about: a name, the error, how it is written, whether more is better.
+#: Measures of the verdicts: title, key of the error, format, whether higher is better.
 MEASURES = (
     ("PSNR", "psnr_db", ".2f", True),
     ("between texels", "psnr_between_db", ".2f", True),
@@ -14,42 +15,39 @@ MEASURES = (
 
 
 def table(result: dict) -> list[str]:
-    """All candidates: bytes, seconds and errors."""
-    d, made = result["details"], {n: c for n, c in result["candidates"].items() if "psnr_db" in c["errors"]}
-    cells = [
-        ["", "bytes", "ratio", "seconds", "PSNR", "between", "mean", "FLIP", "SSIM", *(f"PSNR {n}" for n in d["maps"])]
-    ]
+    """Return a table of all contenders: bytes, seconds and errors."""
+    maps = result["details"]["maps"]
+    measured = {name: c for name, c in result["candidates"].items() if "psnr_db" in c["errors"]}
+    cells = [["", "bytes", "ratio", "seconds", "PSNR", "between", "mean", "FLIP", "SSIM", *(f"PSNR {n}" for n in maps)]]
     for name, c in sorted(
-        made.items(), key=lambda m: (m[1]["details"]["compression"] or 0, -m[1]["errors"]["psnr_db"])
+        measured.items(), key=lambda m: (m[1]["details"]["compression"] or 0, -m[1]["errors"]["psnr_db"])
     ):
-        e, known = c["errors"], c["details"]
-        angles = {n: f", {e[f'angle_{n}_deg']:.2f}°" if f"angle_{n}_deg" in e else "" for n in d["maps"]}
+        e, details = c["errors"], c["details"]
+        angles = {n: f", {e[f'angle_{n}_deg']:.2f}°" if f"angle_{n}_deg" in e else "" for n in maps}
         cells.append([
-            name + ("" if known["random_access"] else " (no random access)"), f"{c['bytes']:,}",
-            f"{known['ratio']:.2f}x", f"{c['training_seconds'] or known['encoding_seconds']:.1f}",
+            name + ("" if details["random_access"] else " (no random access)"), f"{c['bytes']:,}",
+            f"{details['ratio']:.2f}x", f"{c['training_seconds'] or details['encoding_seconds']:.1f}",
             *(f"{e[key]:.2f}" for key in ("psnr_db", "psnr_between_db", "psnr_mean_db")), f"{e['flip']:.4f}",
             "-" if e["ssim"] is None else f"{e['ssim']:.3f}",
-            *(f"{e[f'psnr_{n}_db']:.1f}{angles[n]}" for n in d["maps"]),
+            *(f"{e[f'psnr_{n}_db']:.1f}{angles[n]}" for n in maps),
         ])  # fmt: skip
-    maps = ", ".join(f"{n} ({c})" for n, c in d["maps"].items())
-    head = f"{d['source']}: {d['width']} x {d['height']}, {maps}, {d['source_bytes']:,} bytes"
-    return [head, *result["notes"][1:], "", *grid(cells, "")]
+    return [source_line(result["details"]), *result["notes"][1:], "", *grid(cells, "")]
 
 
 def conclusions(result: dict) -> list[str]:
-    """Ours against the best ASTC at each ratio."""
-    lines = []
-    made = {n: c for n, c in result["candidates"].items() if c["details"].get("compression") and c["in_picture"]}
-    for compression in dict.fromkeys(c["details"]["compression"] for c in made.values()):
-        here = {n: c for n, c in made.items() if c["details"]["compression"] == compression}
-        ours = [n for n, c in here.items() if c["details"]["kind"] == "indirection"]
-        blocks = [n for n, c in here.items() if c["details"]["kind"] == "ASTC"]
-        best = max(ours, key=lambda n: here[n]["errors"]["psnr_db"], default=None)
-        for block in blocks if ours else ():
-            a, b = here[best]["errors"], here[block]["errors"]
+    """Return verdicts on our best contender against each ASTC contender at each compression ratio."""
+    lines, by_ratio = [], {}
+    for name, c in result["candidates"].items():
+        if c["details"].get("compression") and c["in_picture"]:
+            by_ratio.setdefault(c["details"]["compression"], {})[name] = c
+    for compression, contenders in by_ratio.items():
+        ours = [n for n, c in contenders.items() if c["details"]["kind"] == "indirection"]
+        best = max(ours, key=lambda n: contenders[n]["errors"]["psnr_db"], default=None)
+        for block in (n for n, c in contenders.items() if c["details"]["kind"] == "ASTC" and ours):
+            a, b = contenders[best]["errors"], contenders[block]["errors"]
             texts = [
-                f"{label} {a[k]:{form}} against {b[k]:{form}}: {'ours' if (a[k] > b[k]) == more else 'ASTC'}"
-                for label, k, form, more in MEASURES
+                f"{title} {a[k]:{form}} against {b[k]:{form}}: {'ours' if (a[k] > b[k]) == more else 'ASTC'}"
+                for title, k, form, more in MEASURES
             ]
             lines.append(f"{compression:g}x, {best} and {block}: " + "; ".join(texts))
     return lines

@@ -1,53 +1,52 @@
 """
-What the study of compressed images compares: bytes, seconds and reads of each, and its errors.
+Plan of the image study: contenders in equal bytes, with their errors, seconds of training and time of a read.
 
-Three measurements. *Bytes*: at each compression ratio, indirection into cascaded arrays of 2, 3 and 4 dimensions by our
-preset and the paper's, and codecs (:mod:`..baselines.codecs`) at the largest size that is not above; ASTC with one
-block size for all maps and with the best that can be had by giving each map its own. *Seconds*: both presets, trainings
-of several lengths, each with a schedule of its own. *Time*: kernels that read all maps of a material at random and at
-coherent places, :class:`bitmap` with 8 bits and with floats beside ``neural_image``.
+*Bytes*: at each compression ratio, indirection into cascaded arrays of 2, 3 and 4 dimensions by our preset and the
+paper's is compared with codecs (:mod:`..baselines.codecs`) at the largest size that is not above; ASTC with one block
+size for all maps and with the best block size of each map. *Seconds*: trainings of several lengths by both presets,
+each with its own schedule. *Time*: kernels read all maps of a material at random and at coherent places, from
+``neural_image`` and from ``bitmap`` with 8 bits and with floats.
 
-Errors are those of values as they are in the source's files; FLIP and SSIM are means over maps, each shown as a
-picture.
+Errors are those of the values in the source's files; FLIP and SSIM are means over maps, each shown as a picture.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import importlib.util
 import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ... import metrics, task
+from ... import metrics
+from ...maps.compressed import decibel
 from ...maps.source import Source
-from ...measure.store import file_name
-from ...measure.study import FLOOR, Candidate, Case, Job, Plan
+from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...runtime import array_module
-from ...tables import save_table
-from ...tasks.image import search, training
-from ...tasks.image.compressed import CompressedImage
-from ...tasks.image.presets import IMPROVEMENTS, PRESETS, ImageRecipe, replaced, without
+from ...tasks.image.presets import IMPROVEMENTS
 from ..baselines import codecs
+from ..equal_memory import Contender, PresetContender
+from ..maps import source_details
 from .conclusions import conclusions, table
 
-#: The bitmaps that reads are compared with.
+#: Bitmaps whose reads are timed → whether they hold 8-bit values.
 BITMAPS = {"bitmap, 8 bits": True, "bitmap, floats": False}
 
 
 @dataclass(frozen=True)
-class Request:
+class ImageStudySettings:
     """
-    ``compressions`` asked for, ``seconds`` of the trainings, ``paper_seconds`` of those by the paper's preset, ``dims``
-    of the cascaded arrays that are compared (4: all trainings, others: the shortest); ``ablation``: also train our
-    preset with each of its improvements switched off; ``astc``: the preset of its encoder, ``astc_choice``: that by
-    which block sizes are chosen (presets differ by dB, and not by the same for each block size).
+    Settings of the image study.
+
+    ``compressions`` are the compression ratios, ``seconds`` and ``paper_seconds`` the lengths of trainings by our and
+    by the paper's preset, ``dims`` the dimensions of the cascaded array (4: all trainings, others: the shortest).
+    ``ablation`` adds our preset with each improvement switched off. ``astc`` is the preset of the ASTC encoder,
+    ``astc_choice`` the one that selects block sizes.
     """
 
     compressions: tuple[float, ...] = (12.0,)
@@ -59,33 +58,45 @@ class Request:
     astc_choice: str = "medium"
 
 
-def plan(source: Source, name: str, request: Request) -> Plan:
-    """What is measured of ``source``, of the file ``name``, in the variant that is set."""
-    jobs = [*_trainings(source, request), *_codecs(source, request)]
+@dataclass
+class ImageStudyContext:
+    """The source, the file ``name`` that it was read from, the settings, and the module of Dr.Jit ``types``."""
+
+    source: Source
+    name: str
+    settings: ImageStudySettings
+
+    @cached_property
+    def types(self):
+        return array_module(mi.variant())
+
+
+def plan(source: Source, name: str, settings: ImageStudySettings) -> Plan:
+    """Return the plan for ``source``, read from the file ``name``, in the current variant."""
+    context = ImageStudyContext(source, name, settings)
+    jobs = [*_trainings(context), *_codecs(context)]
     candidates = [job.candidate() for job in jobs]
     candidates += [
         Candidate(label, "Mitsuba", is_reference=True, bytes=source.nbytes * (1 if eight else 4), in_passes=False)
         for label, eight in BITMAPS.items()
     ]
-
-    read = [j for j in jobs if isinstance(j, _Training) and j.compression == request.compressions[0]]
-    read = {job.name: job for job in read if job.candidate().in_picture}
+    timed = {
+        job.name: job for job in jobs
+        if isinstance(job, TrainedImage) and job.budget == settings.compressions[0] and job.candidate().in_picture
+    }  # fmt: skip
     cases = [
         Case(
             f"{place} places",
-            lambda lanes, p=place: _reads(source, read, p, lanes),
-            candidates=(*read, *BITMAPS),
+            lambda lanes, p=place: _reads(source, timed, p, lanes),
+            candidates=(*timed, *BITMAPS),
             in_picture=place == "random",
         )
         for place in ("random", "coherent")
     ]
-    missing = [*codecs.missing(), *(["SSIM"] if importlib.util.find_spec("skimage") is None else [])]
-    notes = [
+    note = (
         f"{name}, {source.width} × {source.height}, {len(source.maps)} map(s), {source.nbytes:,} bytes. PSNR of all "
         "channels together. JPEG and WebP have no random access."
-    ]
-    if missing:
-        notes.append(f'Left out, not being installed: {", ".join(missing)}; pip install "mi-diffind[compare]"')
+    )
     return Plan(
         study="image",
         title=f"Compressed image: {Path(name).stem}",
@@ -96,35 +107,27 @@ def plan(source: Source, name: str, request: Request) -> Plan:
         accuracy="psnr_db",
         accuracy_label="PSNR, dB",
         ratios=[(c.name, "bitmap, 8 bits") for c in candidates if c.name != "bitmap, 8 bits"],
-        details={
-            "source": name, "source_digest": source.digest, "source_bytes": source.nbytes, "width": source.width,
-            "height": source.height, "maps": {m.name: m.channels for m in source.maps}, "request": asdict(request),
-            "codecs": list(codecs.available()),
-        },
-        notes=notes,
+        details={**source_details(source, name), "request": asdict(settings), "codecs": list(codecs.available())},
+        notes=[note, *codecs.install_notes()],
         jobs=jobs,
         jobs_fingerprint=source.digest,
         panels=("bytes", "training_seconds"),
         table=table,
         conclusions=conclusions,
-    )  # fmt: skip
+    )
 
 
-# -- candidates -------------------------------------------------------------------------------------------------------
+# -- contenders -------------------------------------------------------------------------------------------------------
 
 
 @dataclass
-class _Made(Job):
-    """A candidate of its own, of a ``representation`` and at the ``compression`` asked for (0: whatever comes out)."""
+class ImageContender(Contender):
+    """The maps of the source encoded by a method at a compression ratio (``budget``; 0: the method has one size)."""
 
-    name: str
-    representation: str
-    compression: float
-    source: Source
     random_access: bool = True
 
     def candidate(self) -> Candidate:
-        label = self.representation + ("" if self.random_access else " (no random access)")
+        label = self.method + ("" if self.random_access else " (no random access)")
         return Candidate(
             self.name, label, job=self.name, competes=self.random_access, in_passes=False,
             in_picture=" without " not in self.name,
@@ -133,97 +136,96 @@ class _Made(Job):
     def record(
         self, nbytes: int, seconds: float | None, maps: dict[str, np.ndarray], between_db=None, **details
     ) -> dict:
-        errors = errors_of(self.source, maps)
-        errors["psnr_between_db"] = between(self.source, maps) if between_db is None else between_db
-        details |= {"compression": self.compression or None, "ratio": self.source.nbytes / nbytes}
-        details |= {"random_access": self.random_access, "kind": self.representation}
+        """Return the record of an encoding with its errors; ``maps`` are the decoded maps by name."""
+        source = self.context.source
+        errors = errors_of(source, maps)
+        errors["psnr_between_db"] = between(source, maps) if between_db is None else between_db
+        details |= {"compression": self.budget or None, "ratio": source.nbytes / nbytes}
+        details |= {"random_access": self.random_access, "kind": self.method}
         return {"bytes": nbytes, "seconds": seconds, "errors": errors, "details": details}
 
 
 @dataclass
-class _Training(_Made):
-    """A training of so many seconds on all cores; its file stays in the folder of models."""
+class TrainedImage(PresetContender, ImageContender):
+    """Indirection, trained for ``seconds`` by a preset of ``fit image`` with further ``options``."""
 
-    recipe: ImageRecipe | None = None
+    task_name = "image"
     preset: str = ""
     seconds: float = 0.0
-    file: str = ""
+    options: dict | None = None
 
-    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
-        self.file = str(folder / f"{file_name(self.name)}.npz") if folder else ""
-        return record if record and Path(self.file).is_file() else None
+    def arguments(self) -> dict:
+        context = self.context
+        return {"source": context.name, "compression": self.budget, "seconds": self.seconds, **(self.options or {})}
 
-    def run(self, folder: Path | None, progress: bool) -> dict | None:
-        source, own = self.source, replaced(self.recipe, deterministic=False)
-        types = array_module(mi.variant())
-        asked = task.FitRequest(self.preset, own.settings, types, seconds=self.seconds, progress=progress)
-        size = search.default_size(source, source.nbytes / self.compression, own)
-        table, result = training.fit_image(source, size, own, asked, title=self.name)
-        if result.interrupted:
-            return None
-        if self.file:
-            save_table(self.file, table)
-        image = CompressedImage.of(table, types.TensorXf)
-        course = [(h["step"] * result.seconds / result.steps, h["psnr_db"]) for h in result.history]
+    def representation(self, task_model):
+        return task_model.image
+
+    def fit_record(self, task_model, fitted, seconds: float) -> dict:
+        table, result, image = fitted.table, fitted.result, task_model.image
+        primary, *_, cascaded = (array.shape for array in table.arrays.values())
+        curve = [(h["step"] * result.seconds / result.steps, h["psnr_db"]) for h in result.history]
         return self.record(
-            table.nbytes, result.seconds, image.decode(), table.measured["psnr_between_db"], file=self.file,
-            seconds_asked=self.seconds, steps=result.steps, structure=table.settings["structure"],
-            dims=size.dims, rows=size.rows, cascaded=size.cascaded, course=course,
-            memory_bytes=sum(a.memory_nbytes for a in (*image.net.primary, image.net.cascaded)),
+            table.nbytes, result.seconds, image.decode(), table.measured["psnr_between_db"], file=str(self.file),
+            seconds_asked=self.seconds, steps=result.steps, structure=table.settings["structure"], course=curve,
+            rows=primary[0], cascaded=cascaded[0], dims=len(cascaded) - 1, memory_bytes=task_model.memory_nbytes,
         )  # fmt: skip
 
 
 @dataclass
-class _Codec(_Made):
-    """What a codec makes: ``encode()`` returns the encoded maps by name, and their bytes."""
+class EncodedImage(ImageContender):
+    """Maps encoded by a codec; ``encode()`` returns the encoded maps by name, and their bytes."""
 
+    has_file = False
     encode: Callable[[], tuple[dict[str, codecs.Encoded], int]] | None = None
 
     def run(self, folder: Path | None, progress: bool) -> dict:
         start = time.perf_counter()
         encoded, nbytes = self.encode()
         seconds = time.perf_counter() - start
-        how = ", ".join(f"{name} {e.codec}" for name, e in encoded.items())
+        names = ", ".join(f"{name} {e.codec}" for name, e in encoded.items())
         maps = {name: e.image for name, e in encoded.items()}
-        return self.record(nbytes, None, maps, how=how, encoding_seconds=seconds)
+        return self.record(nbytes, None, maps, how=names, encoding_seconds=seconds)
 
 
-def _trainings(source: Source, request: Request) -> list[_Training]:
-    jobs = []
-    shortest, ours, paper = min(request.seconds), PRESETS["ours"], PRESETS["paper"]
-    for compression in request.compressions:
+def _trainings(context: ImageStudyContext) -> list[TrainedImage]:
+    jobs, settings = [], context.settings
+    shortest = min(settings.seconds)
 
-        def train(name: str, recipe, seconds: float, kind="indirection", compression=compression):
-            full, preset = f"{name} {compression:g}x {seconds:g} s", name.split()[0]
-            jobs.append(_Training(full, kind, compression, source, recipe=recipe, preset=preset, seconds=seconds))
+    def train(name: str, compression: float, seconds: float, method: str = "indirection", **options) -> None:
+        jobs.append(
+            TrainedImage(method, compression, context, f"{name} {compression:g}x {seconds:g} s",
+                         preset=name.split()[0], seconds=seconds, options=options)
+        )  # fmt: skip
 
-        first = compression == request.compressions[0]
-        for seconds in sorted(request.seconds) if first else [shortest]:
-            train("ours", ours, seconds)
-        if not first:
-            continue
-        for seconds in request.paper_seconds:
-            train("paper", paper, seconds, "indirection, paper's preset")
-        for dims in sorted({*request.dims} - {4}):
-            train(f"ours 2D→{dims}D", dataclasses.replace(ours, dims=dims), shortest)
-        for name in IMPROVEMENTS if request.ablation else ():
-            train(f"ours without {name}", without(ours, [name]), shortest)
+    first, *others = settings.compressions
+    for seconds in sorted(settings.seconds):
+        train("ours", first, seconds)
+    for seconds in settings.paper_seconds:
+        train("paper", first, seconds, "indirection, paper's preset")
+    for dims in sorted({*settings.dims} - {4}):
+        train(f"ours 2D→{dims}D", first, shortest, dims=dims)
+    for name in IMPROVEMENTS if settings.ablation else ():
+        train(f"ours without {name}", first, shortest, without=[name])
+    for compression in others:
+        train("ours", compression, shortest)
     return jobs
 
 
-def _codecs(source: Source, request: Request) -> list[_Codec]:
-    """What of the codecs is installed; all maps together take at most the bytes that are asked for."""
-    values = {m.name: _shown(m.values) for m in source.maps}
+def _codecs(context: ImageStudyContext) -> list[EncodedImage]:
+    """Return a contender for each installed codec at each ratio; all maps together take at most the bytes of it."""
+    source, settings = context.source, context.settings
+    values = {m.name: _clipped(m.values) for m in source.maps}
     normals = [m.name for m in source.maps if m.role == "normal"]
-    found, cache, jobs = codecs.available(), {}, []
+    installed, cache, jobs = codecs.available(), {}, []
     if any(v.shape[-1] > 4 for v in values.values()):
         return []
-    for compression in request.compressions:
+    for compression in settings.compressions:
         nbytes = source.nbytes / compression
 
         def blocks(uniform: bool, nbytes=nbytes):
             return codecs.astc_material(
-                values, nbytes, request.astc, uniform, normals, (1, 2), request.astc_choice, cache
+                values, nbytes, settings.astc, uniform, normals, (1, 2), settings.astc_choice, cache
             )
 
         def maps(codec: str, nbytes=nbytes):
@@ -231,76 +233,78 @@ def _codecs(source: Source, request: Request) -> list[_Codec]:
             parts = {name: codecs.at_bytes(codec, v, shares[name]) for name, v in values.items()}
             return parts, sum(p.nbytes for p in parts.values())
 
-        def add(name: str, kind: str, encode, access=True, asked=compression):
-            jobs.append(_Codec(name, kind, asked, source, access, encode=encode))
+        def add(name: str, method: str, encode, random_access=True, compression=compression):
+            jobs.append(EncodedImage(method, compression, context, name, random_access=random_access, encode=encode))
 
-        mark = f"{compression:g}x"
-        if "astc" in found:
-            add(f"ASTC {mark}, one block size", "ASTC", lambda b=blocks: b(True))
+        ratio = f"{compression:g}x"
+        if "astc" in installed:
+            add(f"ASTC {ratio}, one block size", "ASTC", lambda b=blocks: b(True))
             if len(values) > 1:
-                add(f"ASTC {mark}, each map its own", "ASTC", lambda b=blocks: b(False))
-        if "bc7" in found and compression == request.compressions[0]:
-            add("BC7", "BC7", lambda m=maps: m("bc7"), asked=0.0)
-        for codec, name, access in (("jpeg", "JPEG", False), ("webp", "WebP", False), ("bicubic", "bicubic", True)):
-            if codec in found:
-                add(f"{name} {mark}", name, lambda m=maps, c=codec: m(c), access)
+                add(f"ASTC {ratio}, each map its own", "ASTC", lambda b=blocks: b(False))
+        if "bc7" in installed and compression == settings.compressions[0]:
+            add("BC7", "BC7", lambda m=maps: m("bc7"), compression=0.0)
+        for codec, name in (("jpeg", "JPEG"), ("webp", "WebP"), ("bicubic", "bicubic")):
+            if codec in installed:
+                add(f"{name} {ratio}", name, lambda m=maps, c=codec: m(c), codec == "bicubic")
     return jobs
 
 
-def _shown(values: np.ndarray) -> np.ndarray:
-    """What codecs of 8 bits can hold."""
+# -- errors -----------------------------------------------------------------------------------------------------------
+
+
+def _clipped(values: np.ndarray) -> np.ndarray:
+    """Return values in the range that codecs of 8 bits can hold."""
     return np.clip(values, 0, 1).astype(np.float32)
 
 
 def errors_of(source: Source, maps: dict[str, np.ndarray]) -> dict:
     """
-    ``psnr_db`` of all channels together, ``psnr_mean_db`` over maps, ``flip`` and ``ssim``, means over maps, and of
-    each map ``psnr_NAME_db``, ``flip_NAME``, ``ssim_NAME``, of normal maps ``angle_NAME_deg``, the mean angle.
+    Return the errors of decoded maps, rounded to 8 bits.
+
+    ``psnr_db`` is that of all channels together; ``psnr_mean_db``, ``flip`` and ``ssim`` are means over maps. Each map
+    has ``psnr_NAME_db``, ``flip_NAME``, ``ssim_NAME``, and normal maps ``angle_NAME_deg``, the mean angle.
     """
-    found, errors, weights = {}, [], []
+    errors, squares, weights = {}, [], []
     for m in source.maps:
-        reference, image = _shown(m.values), _shown(np.round(np.clip(maps[m.name], 0, 1) * 255) / 255)
-        errors.append(float(np.mean((reference - image) ** 2, dtype=np.float64)))
+        reference, image = _clipped(m.values), _clipped(np.round(np.clip(maps[m.name], 0, 1) * 255) / 255)
+        squares.append(float(np.mean((reference - image) ** 2, dtype=np.float64)))
         weights.append(m.channels)
-        found[f"psnr_{m.name}_db"] = -10 * math.log10(max(errors[-1], 1e-12))
-        found[f"flip_{m.name}"] = metrics.flip_shown(_picture(reference), _picture(image))
-        found[f"ssim_{m.name}"] = metrics.ssim(reference, image)
+        errors[f"psnr_{m.name}_db"] = decibel(squares[-1])
+        errors[f"flip_{m.name}"] = metrics.flip_shown(_picture(reference), _picture(image))
+        errors[f"ssim_{m.name}"] = metrics.ssim(reference, image)
         if m.role == "normal" and m.channels == 3:
-            found[f"angle_{m.name}_deg"] = metrics.angle(reference, image)
+            errors[f"angle_{m.name}_deg"] = metrics.angle(reference, image)
 
     def mean(measure: str) -> float | None:
-        values = [v for k, v in found.items() if k.startswith(f"{measure}_")]
+        values = [v for k, v in errors.items() if k.startswith(f"{measure}_")]
         return float(np.mean(values)) if None not in values else None
 
-    joint = float(np.average(errors, weights=weights))
-    return {"psnr_db": -10 * math.log10(max(joint, 1e-12)), "psnr_mean_db": mean("psnr"), "flip": mean("flip"),
-            "ssim": mean("ssim"), **found}  # fmt: skip
+    joint = decibel(float(np.average(squares, weights=weights)))
+    return {"psnr_db": joint, "psnr_mean_db": mean("psnr"), "flip": mean("flip"), "ssim": mean("ssim"), **errors}
 
 
 def between(source: Source, maps: dict[str, np.ndarray]) -> float:
-    """PSNR, in dB, of all channels between texels, one place in each: bilinear interpolation of ``maps`` and source."""
+    """Return the PSNR, in dB, of all channels between texels: bilinear reads of maps and source, one in each texel."""
     total, random = 0.0, np.random.default_rng(2023)
     a, b = random.random((2, source.height, source.width, 1), dtype=np.float32)
     for m in source.maps:
-        e = _shown(maps[m.name]) - _shown(m.values)
+        e = _clipped(maps[m.name]) - _clipped(m.values)
         e = (1 - a) * e + a * np.roll(e, -1, axis=0)  # the interpolation of the difference
         e = (1 - b) * e + b * np.roll(e, -1, axis=1)
         total += float(np.mean(e**2, dtype=np.float64)) * m.channels / source.channels
-    return -10 * math.log10(max(total, 1e-12))
+    return decibel(total)
 
 
 def _picture(values: np.ndarray) -> np.ndarray:
-    """Three channels to look at."""
-    if values.shape[-1] >= 3:
-        return values[..., :3]
-    return np.repeat(values[..., :1], 3, axis=-1)
+    """Return three channels to show a map as a picture."""
+    return values[..., :3] if values.shape[-1] >= 3 else np.repeat(values[..., :1], 3, axis=-1)
 
 
 # -- time of a read ---------------------------------------------------------------------------------------------------
 
 
-def _reads(source: Source, jobs: dict[str, _Training], place: str, lanes: int) -> dict:
-    """All maps at a place, by each training's file and by bitmaps."""
+def _reads(source: Source, jobs: dict[str, TrainedImage], place: str, lanes: int) -> dict:
+    """Return functions that read all maps, at places of a kind, from each trained file and from bitmaps."""
     rng, index = dr.rng(seed=dr.opaque(mi.UInt64, 3)), dr.arange(mi.UInt32, lanes)
     si = dr.zeros(mi.SurfaceInteraction3f, lanes)
     if place == "random":
@@ -313,23 +317,23 @@ def _reads(source: Source, jobs: dict[str, _Training], place: str, lanes: int) -
     def read(textures: list):
         return lambda: [_evaluated(texture, si, channels) for texture, channels in textures]
 
-    found = {FLOOR: lambda: [si.uv.x, si.uv.y]}
-    found |= {name: read(_bitmaps(source, eight)) for name, eight in BITMAPS.items()}
+    functions = {FLOOR: lambda: [si.uv.x, si.uv.y]}
+    functions |= {name: read(_bitmaps(source, eight)) for name, eight in BITMAPS.items()}
     for name, job in jobs.items():
-        plugin = {"type": "neural_image", "filename": job.file, "raw": True}
-        found[name] = read([(mi.load_dict({**plugin, "channels": m.name}), m.channels) for m in source.maps])
-    return {"read": found}
+        plugin = {"type": "neural_image", "filename": str(job.file), "raw": True}
+        functions[name] = read([(mi.load_dict({**plugin, "channels": m.name}), m.channels) for m in source.maps])
+    return {"read": functions}
 
 
 def _bitmaps(source: Source, eight: bool) -> list:
-    """Mitsuba's textures of the maps, of those with 1 or 3 channels, or parts of them."""
-    found = []
+    """Return ``(texture, channels)`` for each map: Mitsuba's bitmap of 1 or 3 of its channels."""
+    textures = []
     for m in source.maps:
-        values = _shown(m.values[..., :3] if m.channels >= 3 else m.values[..., :1])
+        values = _clipped(m.values[..., :3] if m.channels >= 3 else m.values[..., :1])
         data = np.ascontiguousarray(np.rint(values * 255).astype(np.uint8) if eight else values)
         bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True}
-        found.append((mi.load_dict(bitmap), values.shape[-1]))
-    return found
+        textures.append((mi.load_dict(bitmap), values.shape[-1]))
+    return textures
 
 
 def _evaluated(texture, si, channels: int):

@@ -1,8 +1,8 @@
 """
-Noise or bias? A scene as written and with exact plugins, at several sample counts: error against render time.
+Study ``tradeoff scene``: error against render time of a scene, as written and with exact plugins.
 
-``mi-diffind tradeoff scene SCENE.xml`` answers what an approximation means for a picture: the noise of its samples
-becomes smaller with time, the bias of learned tables does not (:mod:`~mi_diffind.measure.bias`).
+Monte Carlo noise decreases with render time, the bias of learned tables does not; the study measures both and the
+sample count at which they are equal (:mod:`~mi_diffind.measure.bias`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class SceneStudy(Study):
         from ...measure.report import publish
         from . import renders, report
 
-        settings = renders.Settings.choose(arguments.quick, arguments.spp)
+        settings = renders.SceneStudySettings.choose(arguments.quick, arguments.spp)
         result = renders.measure(arguments.scene, settings, arguments.out, arguments.seed, arguments.defines)
         return publish(result, report.write(result, arguments.out), report.summary(result))
 

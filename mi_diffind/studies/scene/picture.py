@@ -1,4 +1,4 @@
-"""The picture of the study of a scene: error against render time, learned and exact, with bias and crossover."""
+"""Figure of the scene study: error against render time, learned and exact, with bias and crossover."""
 
 from __future__ import annotations
 
@@ -12,33 +12,36 @@ from ...measure import plot
 from ...measure.bias import seconds_of
 from ...measure.formatting import duration, percent, rounded
 
-#: Colour and marker of each version.
-VERSIONS = {"exact": plot.STYLES[1], "learned": plot.STYLES[0]}
+#: Versions of the scene: with the exact counterparts of learned plugins, and as written; with colour and marker.
+VERSION_STYLES = {"exact": plot.STYLES[1], "learned": plot.STYLES[0]}
+VERSIONS = tuple(VERSION_STYLES)
 
-#: The crossover is drawn if it takes at most so many times the samples of the last point; else a note says where it is.
+#: Largest ratio of the crossover's sample count to that of the last point at which the crossover is still drawn.
 REACH = 100
 
-_GREY, _DASHES = "0.35", (0, (4, 2.5))
+_GREY, _PURPLE, _DARK_PURPLE, _DASHES = "0.35", "#7a3b8f", "#5e2a70", (0, (4, 2.5))
 
 
 def draw(result: dict, caption: str):
     """
-    A Matplotlib figure of a result of :func:`.renders.measure` that has timed points: both axes logarithmic,
-    points with quartiles; dashed, what noise and bias add up to beyond the last; the bias as a horizontal band, or the
-    line that it is below; the crossover as a vertical line, if it is not too far away.
+    Return a Matplotlib figure of a result of :func:`.renders.measure` that has timed points.
+
+    Both axes are logarithmic, points have quartiles. Dashed curves extrapolate the sum of noise and bias beyond the
+    last point. The bias is a horizontal band, or a line if only its upper bound is known; the crossover is a vertical
+    line unless it is beyond :data:`REACH`.
     """
     title = f"{Path(result['scene']).stem}: noise and bias at a given render time"
-    sheet = plot.figure(title, caption, 7.6, 4.9)
-    axes = sheet.add_subplot()
+    figure = plot.figure(title, caption, 7.6, 4.9)
+    axes = figure.add_subplot()
     axes.set_xlabel("seconds of a render (kernels)", fontsize=9)
     axes.set_ylabel("relative RMS error", fontsize=9)
     curves = {name: _curve(result, name) for name in VERSIONS}
     _limits(axes, result, curves)
     labels = _draw(axes, result, curves)
     _legend(axes, curves)
-    plot.fix_layout(sheet)
+    plot.fix_layout(figure)
     plot.place_labels(axes, labels, [(p["seconds"], p["rmse"]) for curve in curves.values() for p in curve])
-    return sheet
+    return figure
 
 
 def _curve(result: dict, name: str) -> list[dict]:
@@ -46,16 +49,16 @@ def _curve(result: dict, name: str) -> list[dict]:
 
 
 def _floor(result: dict) -> float:
-    """The bias, or what it is below; 0 if there is none."""
+    """Return the bias, or its upper bound if no bias was measured."""
     bias = result["bias"]
     return bias["rmse"] if bias["measured"] else bias["rmse_below"]
 
 
 def _crossover(result: dict) -> tuple[float, float] | None:
-    """Sample count and time of a crossover that is drawn."""
-    found = result["crossover"]
-    near = found.get("seconds") is not None and found["spp"] <= REACH * result["counts"][-1]
-    return (found["spp"], found["seconds"]) if near else None
+    """Return the sample count and time of the crossover, ``None`` if it is not drawn."""
+    crossover = result["crossover"]
+    near = crossover.get("seconds") is not None and crossover["spp"] <= REACH * result["counts"][-1]
+    return (crossover["spp"], crossover["seconds"]) if near else None
 
 
 def _limits(axes, result: dict, curves: dict[str, list[dict]]) -> None:
@@ -79,29 +82,29 @@ def _limits(axes, result: dict, curves: dict[str, list[dict]]) -> None:
 
 
 def _draw(axes, result: dict, curves: dict[str, list[dict]]) -> list[plot.Label]:
-    """All but the labels; returns these in the order in which they are placed."""
+    """Draw everything but the labels; return these in the order in which they are placed."""
     labels = []
     low = axes.get_ylim()[0]
     bias, floor, crossover = result["bias"], _floor(result), _crossover(result)
     if floor > low:
         if bias["measured"]:
             spread = 2 * bias["rmse_standard_error"]
-            axes.axhspan(max(floor - spread, low), floor + spread, color="#7a3b8f", alpha=0.18, linewidth=0, zorder=1.5)
+            axes.axhspan(max(floor - spread, low), floor + spread, color=_PURPLE, alpha=0.18, linewidth=0, zorder=1.5)
             name = f"bias of the approximation: {percent(floor)}"
         else:
-            axes.axhspan(low, floor, color="#7a3b8f", alpha=0.08, linewidth=0, zorder=1.5)
+            axes.axhspan(low, floor, color=_PURPLE, alpha=0.08, linewidth=0, zorder=1.5)
             name = f"bias of the approximation: none found, below {percent(floor)}"
-        axes.axhline(floor, color="#7a3b8f", linewidth=1.1, zorder=2)
+        axes.axhline(floor, color=_PURPLE, linewidth=1.1, zorder=2)
         axes.annotate(f"{name}, {decibel(bias)}", (0, floor), (5, -3), xycoords=axes.get_yaxis_transform(), va="top",
-                      textcoords="offset points", fontsize=8, color="#5e2a70")  # fmt: skip
+                      textcoords="offset points", fontsize=8, color=_DARK_PURPLE)  # fmt: skip
     else:
         note = "▼ " + "\n    ".join(textwrap.wrap(f"{result['verdict']} {decibel(bias)}", 100))
-        axes.annotate(note, (0.012, 0.02), xycoords="axes fraction", fontsize=8, color="#5e2a70", va="bottom",
+        axes.annotate(note, (0.012, 0.02), xycoords="axes fraction", fontsize=8, color=_DARK_PURPLE, va="bottom",
                       linespacing=1.35)  # fmt: skip
     for name, curve in curves.items():
         if not curve:
             continue
-        colour, marker = VERSIONS[name]
+        colour, marker = VERSION_STYLES[name]
         xs, ys = [p["seconds"] for p in curve], [p["rmse"] for p in curve]
         roots = [[math.sqrt(max(p[k], 1e-30)) for p in curve] for k in ("mse_q1", "mse_q3")]
         times = [[p[k] for p in curve] for k in ("seconds_q1", "seconds_q3")]
@@ -115,9 +118,10 @@ def _draw(axes, result: dict, curves: dict[str, list[dict]]) -> list[plot.Label]
     for spp in result["counts"]:
         pair = [p for curve in curves.values() for p in curve if p["spp"] == spp]
         if pair:
-            axes.plot([p["seconds"] for p in pair], [p["rmse"] for p in pair], color="0.6", linewidth=0.6, zorder=2.4)
-            anchor = max(p["seconds"] for p in pair), max(p["rmse"] for p in pair)
-            labels.append(plot.Label(f"{spp} spp", anchor, "0.15", "bold", angle=math.pi / 4))  # the curves fall
+            xs, ys = [p["seconds"] for p in pair], [p["rmse"] for p in pair]
+            axes.plot(xs, ys, color="0.6", linewidth=0.6, zorder=2.4)
+            anchor = max(xs), max(ys)
+            labels.append(plot.Label(f"{spp} spp", anchor, "0.15", "bold", angle=math.pi / 4))  # curves fall
     if crossover:
         spp, seconds = crossover
         axes.axvline(seconds, color=_GREY, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=2)
@@ -134,7 +138,7 @@ def _legend(axes, curves: dict[str, list[dict]]) -> None:
     handles = []
     for name, curve in curves.items():
         if curve:
-            colour, marker = VERSIONS[name]
+            colour, marker = VERSION_STYLES[name]
             handles.append(Line2D([], [], color=colour, marker=marker, markersize=5.5, markerfacecolor="white",
                                   markeredgewidth=1.3, linewidth=1.1, label=name))  # fmt: skip
     handles.append(Line2D([], [], color=_GREY, linewidth=0.9, linestyle=_DASHES, label="extrapolated"))
@@ -142,23 +146,23 @@ def _legend(axes, curves: dict[str, list[dict]]) -> None:
 
 
 def _continued(result: dict, name: str, curve: list[dict], end: float, crossover) -> tuple[list, list]:
-    """What noise (and bias, if learned) add up to from the last point on: times and errors."""
+    """Extrapolate noise (and, of the learned version, bias) from the last point on; return times and errors."""
     times = {p["spp"]: p["seconds"] for p in curve}
     last = curve[-1]
     noise = result["noise"][name]["mse_of_a_sample"]
     square = max(result["bias"]["mse"], 0.0) if name == "learned" and result["bias"]["measured"] else 0.0
-    law = last["mse"] - square - noise / last["spp"]  # begins where the last point is
+    offset = last["mse"] - square - noise / last["spp"]  # makes the curve begin at the last point
     xs, ys = [], []
     for spp in last["spp"] * np.geomspace(1, 4 * REACH, 200):
         seconds = seconds_of(spp, times)
         if seconds <= end:
             xs.append(seconds)
-            ys.append(math.sqrt(max(square + noise / spp + law * last["spp"] / spp, 0)))
+            ys.append(math.sqrt(max(square + noise / spp + offset * last["spp"] / spp, 0)))
     return xs, ys
 
 
 def decibel(bias: dict) -> str:
-    """The PSNR of a bias, or what it is above."""
+    """Return the PSNR of a bias, or its lower bound, as text."""
     if "psnr_db" in bias:
         return f"PSNR {bias['psnr_db']:.1f} dB"
     return "PSNR infinite" if bias["psnr_db_above"] is None else f"PSNR above {bias['psnr_db_above']:.1f} dB"

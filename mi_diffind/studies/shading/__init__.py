@@ -1,7 +1,8 @@
 """
-``tradeoff shading``: textures that are trained for what they look like when they are shaded, for several weights λ of
-that, beside textures that are not, and beside classical filters of normals: the paper's figure 2. :mod:`.candidates`
-says more.
+Study ``tradeoff shading``: textures trained for shading at several weights λ of the shading loss.
+
+They are compared with textures trained without it and with classical filters of normals, as in the paper's figure 2.
+:mod:`.plan` describes the contenders.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import argparse
 from ...arguments import fraction, positive
 from ...measure.study import Plan, Study
 
-#: λ of the paper's figure 2.
+#: Weights λ of the paper's figure 2.
 LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 
 
@@ -24,48 +25,52 @@ class ShadingStudy(Study):
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             "materials", nargs="*", default=[], metavar="MATERIAL.json|NAME",
-            help="manifests of maps, or names of materials that are made: hammered, weave, lacquer "
-            "(default: scenes/assets/tiles.json, if it is there, and these; --quick: hammered)",
+            help="manifests of maps, or names of generated materials: hammered, weave, lacquer "
+            "(default: scenes/assets/tiles.json, if the file exists, and these; --quick: hammered)",
         )  # fmt: skip
         parser.add_argument("--lambda", action="append", type=fraction, dest="lambdas", metavar="X",
                             help="weight of the shading loss; may be repeated; 0 is always among them (default: "
                             "0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1; --quick: 0, 0.9)")  # fmt: skip
-        parser.add_argument("--seeds", type=positive, metavar="N", help="of each training (default: 3; --quick: 1)")
+        parser.add_argument("--seeds", type=positive, metavar="N",
+                            help="number of seeds of each training (default: 3; --quick: 1)")  # fmt: skip
         parser.add_argument("--seconds", type=positive, metavar="N",
-                            help="of training for shading (default: 15; --quick: 1)")  # fmt: skip
+                            help="seconds of training for shading (default: 15; --quick: 1)")  # fmt: skip
         parser.add_argument("--pretrain-seconds", type=positive, metavar="N",
-                            help="of training as a texture, before (default: 20; --quick: 1)")  # fmt: skip
+                            help="seconds of training as a texture before (default: 20; --quick: 1)")  # fmt: skip
         parser.add_argument("--steps", type=positive, metavar="N",
-                            help="of training for shading in place of seconds, which repeats on any machine; "
-                            "--pretrain-steps needs to be given, too")  # fmt: skip
-        parser.add_argument("--pretrain-steps", type=positive, metavar="N", help="of training as a texture")
-        parser.add_argument("--compression", default="12x", metavar="N", help="of all trainings (default: 12x)")
+                            help="steps of training for shading in place of seconds, independent of the machine's "
+                            "speed; needs --pretrain-steps")  # fmt: skip
+        parser.add_argument("--pretrain-steps", type=positive, metavar="N",
+                            help="steps of training as a texture")  # fmt: skip
+        parser.add_argument("--compression", default="12x", metavar="N",
+                            help="compression ratio of all trainings (default: 12x)")  # fmt: skip
         parser.add_argument("--remedies", choices=("all", "both", "on"), default="all",
                             help="clipped derivatives and a falling rate: all four combinations, both or none, or both "
                             "only (default: all)")  # fmt: skip
         parser.add_argument("--side", type=positive, metavar="N",
-                            help="texels along each side of what is made (default: 512; --quick: 64)")  # fmt: skip
-        parser.add_argument("--frames", type=positive, metavar="N", help="of the zoom (default: 60; --quick: 4)")
+                            help="texels on a side of generated materials (default: 512; --quick: 64)")  # fmt: skip
+        parser.add_argument("--frames", type=positive, metavar="N",
+                            help="frames of the zoom (default: 60; --quick: 4)")  # fmt: skip
 
     def check(self, arguments) -> None:
-        """Also reads the materials, before anything is made of them; raises what :func:`.load_source` does."""
+        """Check the options and load the materials; raise as :func:`.load_source` does."""
         from ...units import parse_compression
         from .plan import materials_of
 
         if (arguments.steps is None) != (arguments.pretrain_steps is None):
-            raise ValueError("--steps and --pretrain-steps: one is given, both or none are allowed")
+            raise ValueError("--steps and --pretrain-steps: found one of them, both or none are allowed")
         if arguments.steps and (arguments.seconds or arguments.pretrain_seconds):
-            raise ValueError("--steps: given beside seconds, one of them is allowed")
+            raise ValueError("--steps: found beside seconds, only one of them is allowed")
         arguments.ratio = parse_compression(arguments.compression)
         arguments.loaded = materials_of(arguments.materials, arguments.side or (64 if arguments.quick else 512),
                                         arguments.quick)  # fmt: skip
 
     def plan(self, arguments) -> Plan:
-        from .plan import WAYS, Request, plan
+        from .plan import REMEDIES, ShadingStudySettings, plan
 
         quick = arguments.quick
-        ways = {"all": WAYS, "both": (WAYS[0], WAYS[-1]), "on": WAYS[:1]}[arguments.remedies]
-        request = Request(
+        ways = {"all": REMEDIES, "both": (REMEDIES[0], REMEDIES[-1]), "on": REMEDIES[:1]}[arguments.remedies]
+        settings = ShadingStudySettings(
             tuple(sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))})),
             ways[:: len(ways) - 1] if quick and len(ways) > 1 else ways,
             arguments.seeds or (1 if quick else 3),
@@ -76,7 +81,7 @@ class ShadingStudy(Study):
             quick,
             "steps" if arguments.steps else "s",
         )
-        return plan(arguments.loaded, request)
+        return plan(arguments.loaded, settings)
 
 
 STUDY = ShadingStudy()

@@ -1,9 +1,9 @@
 """
-Materials to study, made by arithmetic from a seed: what shading-aware training is for, in three kinds.
+Procedural materials of the shading study, computed from a seed.
 
-All maps are 8-bit, as files have them, and repeat. ``hammered`` is a metal with texel-scale normals and rust, where it
-is none; ``weave`` is a fabric of two colours of yarn; ``lacquer`` is a glossy dielectric with a pattern under a coat
-that is not quite even.
+All maps are 8-bit, as in files, and repeat. ``hammered`` is a metal with texel-scale normals and dielectric rust;
+``weave`` is a fabric of two colours of yarn; ``lacquer`` is a glossy dielectric with a pattern under a slightly uneven
+coat.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ SIDE = 512
 
 def noise(rng, side: int, slope: float, low: float = 1.0, high: float = 1e9) -> np.ndarray:
     """
-    A random field that repeats, mean 0 and variance 1, ``(side, side)``: amplitudes fall with the frequency to the
-    power of ``slope``, none are below ``low`` or above ``high`` periods along the side.
+    Return a random field that repeats, mean 0 and variance 1, ``(side, side)``.
+
+    Amplitudes are proportional to the frequency to the power of −``slope``, between ``low`` and ``high`` periods along
+    the side, and zero elsewhere.
     """
     f = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None]) * side
     spectrum = np.where((f >= low) & (f <= high), np.maximum(f, 1) ** -slope, 0)
@@ -30,7 +32,7 @@ def noise(rng, side: int, slope: float, low: float = 1.0, high: float = 1e9) -> 
 
 
 def normals(height: np.ndarray, strength: float) -> np.ndarray:
-    """Unit normals, ``(side, side, 3)``, of a height that repeats, whose slopes get that standard deviation."""
+    """Return unit normals, ``(side, side, 3)``, of a repeating height; ``strength`` is the slopes' deviation."""
     rows = 0.5 * (np.roll(height, -1, 0) - np.roll(height, 1, 0))
     columns = 0.5 * (np.roll(height, -1, 1) - np.roll(height, 1, 1))
     scale = strength / max(np.sqrt(0.5 * (rows.var() + columns.var())), 1e-9)
@@ -48,7 +50,7 @@ def _mixed(a, b, share: np.ndarray) -> np.ndarray:
 
 
 def hammered(side: int, seed: int = 1) -> dict[str, np.ndarray]:
-    """Metal with bumps of all sizes down to a texel, scratches along one axis, and rust in places."""
+    """Return maps of a metal with bumps down to the size of a texel, scratches along one axis, and rust in places."""
     rng = np.random.default_rng(seed)
     rust = _step(noise(rng, side, 1.6, 2, side / 8), 1.0, 0.5)
     scratches = np.tile(noise(rng, side, 0.3, 4)[:1], (side, 1)) * _step(noise(rng, side, 1.5, 2, 24), 0.0, 1.0)
@@ -62,7 +64,7 @@ def hammered(side: int, seed: int = 1) -> dict[str, np.ndarray]:
 
 
 def weave(side: int, seed: int = 2) -> dict[str, np.ndarray]:
-    """Plain weave, eight texels a yarn: round yarns that pass over and under each other, with fibres along them."""
+    """Return maps of a plain weave, eight texels a yarn: round yarns over and under each other, with fibres."""
     rng = np.random.default_rng(seed)
     yarn = 8
     y, x = np.mgrid[:side, :side] + 0.5 + yarn / 2
@@ -81,7 +83,7 @@ def weave(side: int, seed: int = 2) -> dict[str, np.ndarray]:
 
 
 def lacquer(side: int, seed: int = 3) -> dict[str, np.ndarray]:
-    """Rings of dark wood under a gloss that has orange peel and dust in it."""
+    """Return maps of dark wood with rings under a gloss with orange peel and dust."""
     rng = np.random.default_rng(seed)
     rings = 0.5 + 0.5 * np.sin(10 * noise(rng, side, 2.2, 1, 12) + 0.6 * noise(rng, side, 1.0, 4))
     colour = _mixed([0.30, 0.13, 0.06], [0.58, 0.34, 0.16], rings)
@@ -91,16 +93,18 @@ def lacquer(side: int, seed: int = 3) -> dict[str, np.ndarray]:
     return {"albedo": colour, "normal": normals(height, 0.2), "roughness": roughness}
 
 
-#: Name → what makes the maps, linear floats, of a side.
-MADE: dict[str, Callable[[int], dict[str, np.ndarray]]] = {"hammered": hammered, "weave": weave, "lacquer": lacquer}
+#: Name → function that returns the maps, linear floats, for a side.
+MATERIALS: dict[str, Callable[[int], dict[str, np.ndarray]]] = {
+    "hammered": hammered, "weave": weave, "lacquer": lacquer,
+}  # fmt: skip
 
 
-def made(name: str, side: int = SIDE) -> Source:
-    """One of :data:`MADE` as a source of 8-bit maps: albedo sRGB-encoded, normals as (n + 1)/2."""
+def generated_source(name: str, side: int = SIDE) -> Source:
+    """Return one of :data:`MATERIALS` as a source of 8-bit maps: albedo sRGB-encoded, normals as (n + 1)/2."""
     from ...srgb import for_display
 
-    found = {}
-    for key, values in MADE[name](side).items():
+    maps = {}
+    for key, values in MATERIALS[name](side).items():
         values = for_display(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values
-        found[key] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
-    return from_arrays(found)
+        maps[key] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    return from_arrays(maps)

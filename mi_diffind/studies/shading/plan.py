@@ -1,22 +1,22 @@
 """
-What the study of shading compares, and how.
+Plan of the shading study: textures trained for shading at several weights λ, and classical filters of normals.
 
-For each material, a texture is trained as task 4 has it, and gone on with from there for the same time each: by task 5,
-at several weights λ of the shading loss, λ = 0 among them, which is more of task 4. Two remedies of what is unstable at
-a large λ are on or off: derivatives that are clipped on their way through the specular lobe, and a learning rate that
-falls. All of it for several seeds, those of λ = 0 too.
+For each material, a texture is trained as task 4 trains it, and then continued for the same time by task 5 at several
+weights λ of the shading loss; λ = 0 continues task 4. Two remedies against instability at a large λ are on or off:
+clipped derivatives through the specular lobe, and a falling learning rate. All runs are repeated for several seeds.
 
-Beside them stand classical filters of normals (:mod:`..baselines.normals`), uncompressed, and those that an ordinary
-texture can hold, compressed as λ = 0 is, with as much time: Toksvig's and baked roughness. The *kernel* control reads
-at other levels of detail, those with which it errs least; λ = 0 is read so, too.
+Classical filters of normals (:mod:`..baselines.normals`) are measured uncompressed; those that an ordinary texture can
+hold, Toksvig's and baked roughness, also compressed as λ = 0 is, in as much time. The *kernel* control reads at other
+levels of detail, those with the smallest error; λ = 0 is read in this way, too.
 
-*Errors* are those of :class:`.ShadedEvaluation`: PSNR of shaded values and FLIP, under
-views and lights of no training, against C, converged, and P, the paper's reference. *Flicker*: :mod:`.motion`.
+*Errors* are those of :class:`~mi_diffind.tasks.shading.evaluation.ShadedEvaluation`: PSNR of shaded values and FLIP,
+under views and lights of no training, against C, the converged truth, and P, the paper's reference. *Flicker*:
+:mod:`.zoom`.
 
-A run is in *trouble* if its loss became NaN or exploded, so that it was restarted (``restarts``), or given up
-(``diverged``: what counts then is where it started from); if a measurement was not finite (``nan``); if the loss was
-above ten times its median (``spike``); if in the end it was worse than on the way (``drift``, more than :data:`DRIFT`
-dB); or if it ends below λ = 0 of the same seed (``below``).
+A run is in *trouble* if its loss became NaN or exploded and it was restarted (``restarts``), or given up (``diverged``:
+its result is its start); if a measurement was not finite (``nan``); if the loss exceeded ten times its median
+(``spike``); if its end is more than :data:`DRIFT` dB below its best state (``drift``); or if its end is below λ = 0 of
+the same seed (``below``).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from ...fitting import FitResult
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, SourceError, load_source
 from ...measure.store import file_name
-from ...measure.study import Candidate, Job, Plan
+from ...measure.study import Candidate, Plan
 from ...runtime import array_module
 from ...settings import FitSettings, FittingError
 from ...tables import Table, save_table
@@ -52,24 +52,25 @@ from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
 from ...tasks.texture.fit import size_of
 from ..baselines import normals
+from ..equal_memory import Contender
 from . import pictures
 from .conclusions import conclusions, table
-from .materials import MADE, made
-from .motion import Motion
+from .materials import MATERIALS, generated_source
+from .zoom import ShadedZoom
 
 #: The material that ships.
 SHIPPED = "scenes/assets/tiles.json"
 
-#: dB that a run may end below its best state.
+#: dB by which a run may end below its best state.
 DRIFT = 0.2
 
-#: The specular lobe's derivatives are limited to this where they are, unless our preset says to what.
+#: Limit of clipped derivatives of the specular lobe, unless our preset has one.
 CLIP = 0.1
 
 
 @dataclass(frozen=True)
-class Way:
-    """How it is trained: with clipped derivatives, with a rate that falls."""
+class Remedies:
+    """Remedies against instability: ``clip``, clipped derivatives; ``schedule``, a falling learning rate."""
 
     clip: bool
     schedule: bool
@@ -80,19 +81,21 @@ class Way:
 
 
 #: Both remedies, one of them, none.
-WAYS = (Way(True, True), Way(False, True), Way(True, False), Way(False, False))
+REMEDIES = (Remedies(True, True), Remedies(False, True), Remedies(True, False), Remedies(False, False))
 
 
 @dataclass(frozen=True)
-class Request:
+class ShadingStudySettings:
     """
-    What is asked for: ``lambdas``, 0 among them; ``ways``; ``seeds``, so many; the ``length`` of training for shading,
-    and of ``pretraining``, training as a texture before it, in the ``unit`` ``"s"`` or ``"steps"``; ``compression``;
-    ``frames`` of the zoom; ``quick``, a smoke run.
+    Settings of the shading study.
+
+    ``lambdas`` are the weights λ, 0 among them, ``ways`` the combinations of remedies, ``seeds`` the number of seeds.
+    ``length`` is that of the training for shading, ``pretraining`` that of the training as a texture before it, in the
+    ``unit`` ``"s"`` or ``"steps"``. ``frames`` is the length of the zoom; ``quick`` makes it a smoke run.
     """
 
     lambdas: tuple[float, ...]
-    ways: tuple[Way, ...] = WAYS
+    ways: tuple[Remedies, ...] = REMEDIES
     seeds: int = 3
     length: float = 15.0
     pretraining: float = 20.0
@@ -102,43 +105,46 @@ class Request:
     unit: str = "s"
 
 
-def materials_of(given: Sequence[str], side: int, quick: bool = False) -> dict[str, Source]:
-    """Name → source, of manifests and of materials that are made. Raises ``SourceError`` and ``ValueError``."""
-    if not given:
-        given = ["hammered"] if quick else [*([SHIPPED] if Path(SHIPPED).is_file() else []), *MADE]
-    found = {}
-    for text in given:
-        name = text if text in MADE else Path(text).stem
-        if name in found:
+def materials_of(names: Sequence[str], side: int, quick: bool = False) -> dict[str, Source]:
+    """
+    Return the sources of manifests and of generated materials, by name; a default list if ``names`` is empty.
+
+    Raises ``SourceError`` and ``ValueError``.
+    """
+    if not names:
+        names = ["hammered"] if quick else [*([SHIPPED] if Path(SHIPPED).is_file() else []), *MATERIALS]
+    sources = {}
+    for text in names:
+        name = text if text in MATERIALS else Path(text).stem
+        if name in sources:
             raise ValueError(f'materials: found "{name}" twice')
-        if text not in MADE and not text.endswith(".json"):
-            raise SourceError(f'materials: found "{text}", allowed are manifests (.json) and {", ".join(MADE)}')
-        found[name] = made(text, side) if text in MADE else load_source(text)
-    return found
+        if text not in MATERIALS and not text.endswith(".json"):
+            raise SourceError(f'materials: found "{text}", allowed are manifests (.json) and {", ".join(MATERIALS)}')
+        sources[name] = generated_source(text, side) if text in MATERIALS else load_source(text)
+    return sources
 
 
-class _Images(ShadedEvaluation):
-    """Images of a material; those by which trainings choose among their states are made once for all trainings."""
+class CachedEvaluation(ShadedEvaluation):
+    """Evaluation whose images for the choice among states of a training are rendered once for all trainings."""
 
-    _others: ShadedEvaluation | None = None
+    _another: ShadedEvaluation | None = None
 
     def another(self) -> ShadedEvaluation:
-        self._others = self._others or super().another()
-        return self._others
+        self._another = self._another or super().another()
+        return self._another
 
 
 # -- a material -------------------------------------------------------------------------------------------------------
 
 
 @dataclass
-class Setting:
-    """A material, and what all of its candidates share; made when it is first asked for."""
+class ShadingStudyContext:
+    """A material, the data that its contenders share, and their jobs by name."""
 
     name: str
     source: Source
-    request: Request
-    #: What was made of it: name of a job → its reader.
-    readers: dict[str, Callable[[], ShadedReader]] = field(default_factory=dict)
+    settings: ShadingStudySettings
+    jobs: dict[str, ShadingContender] = field(default_factory=dict)
 
     @cached_property
     def types(self):
@@ -162,170 +168,154 @@ class Setting:
 
     @cached_property
     def evaluation(self) -> ShadedEvaluation:
-        levels, pairs, side = (3, 2, 16) if self.request.quick else (6, 16, 64)
-        return _Images(self.pyramid, self.effects, levels, pairs, side)
+        levels, pairs, side = (3, 2, 16) if self.settings.quick else (6, 16, 64)
+        return CachedEvaluation(self.pyramid, self.effects, levels, pairs, side)
 
     @cached_property
-    def motion(self) -> Motion:
-        return Motion(self.pyramid, self.effects, self.request.frames, 32 if self.request.quick else 96)
+    def zoom(self) -> ShadedZoom:
+        return ShadedZoom(self.pyramid, self.effects, self.settings.frames, 32 if self.settings.quick else 96)
 
     def reader_of(self, table: Table) -> ShadedReader:
-        """A compressed texture, shaded by the tables of the BRDF that it was trained through."""
+        """Return the reader of a compressed texture, shaded by the tables of the BRDF that it was trained through."""
         return reader(CompressedTexture.of(table, self.types.TensorXf), self.effects, self.decoder)
 
-    def measured(self, read: ShadedReader) -> dict:
-        """Errors of shaded images, for the details of a record."""
-        return {"material": self.name, **self.evaluation.measure(read)}
-
-    def training(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.FitRequest:
-        """A request for a training of a ``length``, by ``settings`` as they are changed for it."""
+    def request(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.FitRequest:
+        """Return the request for a training of a ``length``, with ``settings`` changed for it."""
         settings, seconds = dataclasses.replace(settings, seed=seed, deterministic=False), length
-        if self.request.unit == "steps":
+        if self.settings.unit == "steps":
             every = max(1, int(length) // 10)
             settings, seconds = dataclasses.replace(settings, steps=int(length), measure_every=every), None
-        return task.FitRequest("ours", settings, self.types, seconds=seconds, progress=progress, options=self.options)
+        options = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
+        options["compression"] = self.settings.compression
+        return task.FitRequest("ours", settings, self.types, seconds=seconds, progress=progress, options=options)
 
-    @cached_property
-    def options(self) -> dict:
-        """The options of task 4 that sizes are chosen by."""
-        known = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
-        return {**known, "compression": self.request.compression}
-
-    def texture(self, pyramid: Pyramid, length: float, seed: int, progress: bool) -> tuple:
-        """A training of task 4, on a pyramid in place of the source's: the table and the run's record."""
-        request = self.training(self.recipe.settings, length, seed, progress)
+    def fit_texture(self, pyramid: Pyramid, length: float, seed: int, progress: bool) -> tuple[Table, FitResult]:
+        """Train a texture as task 4 does, on a pyramid in place of the source's."""
+        request = self.request(self.recipe.settings, length, seed, progress)
         recipe = dataclasses.replace(self.recipe, settings=request.settings)
-        nbytes = self.source.nbytes / self.request.compression
-        size = size_of(self.source, pyramid, nbytes, recipe, self.options)
+        nbytes = self.source.nbytes / self.settings.compression
+        size = size_of(self.source, pyramid, nbytes, recipe, request.options)
         problem = textures.problem_of(self.source, size, recipe, pyramid)
         result = request.train(problem, f"{self.name}: texture, seed {seed}")
         stored = CompressedTexture(pyramid.layout, textures.stored_form(problem.net))
-        made = textures.to_table(stored, {**request.recorded(), "source": self.source.digest, "steps": result.steps})
-        made.preset, made.seed = "ours", seed
-        return made, result
+        trained = textures.to_table(stored, {**request.recorded(), "source": self.source.digest, "steps": result.steps})
+        trained.preset, trained.seed = "ours", seed
+        return trained, result
 
 
 # -- jobs -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
-class _Made(Job):
-    """Something that is measured when it is made; ``record`` stays with it."""
+class ShadingContender(Contender):
+    """A filter or a training of a material; its ``model`` is a reader of shaded values, its ``record`` has errors."""
 
-    name: str
-    setting: Setting
+    label: str = ""
     record: dict | None = None
 
-    def kept(self, nbytes: int, start: float, read: ShadedReader, **details) -> dict:
-        """The record of what was made since ``start``."""
-        found = {**self.setting.measured(read), **details}
-        self.record = {"bytes": nbytes, "seconds": time.perf_counter() - start, "details": found}
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
+        self.record = super().cached_record(folder, record)
+        return self.record
+
+    def measure(self, nbytes: int, start: float, **details) -> dict:
+        """Measure ``model``; return the record of a job that began at ``start``."""
+        errors = self.context.evaluation.measure(self.model)
+        details = {"material": self.context.name, **errors, "kind": self.method, **details}
+        details |= {"label": self.label} if self.label else {}
+        self.record = {"bytes": nbytes, "seconds": time.perf_counter() - start, "details": details}
         return self.record
 
 
 @dataclass
-class _Classical(_Made):
-    """A classical filter, uncompressed: ``make`` its reader; it needs ``channels`` beyond the maps of a mip map."""
+class ClassicalFilter(ShadingContender):
+    """An uncompressed filter: ``build(folder)`` returns its reader; it needs ``channels`` beside those of the maps."""
 
-    label: str = ""
-    make: Callable[[Path | None], ShadedReader] = lambda folder: None
+    has_file = False
+    build: Callable[[Path | None], ShadedReader] = lambda folder: None
     channels: int = 0
 
-    def cached_record(self, folder, record):
-        self.record = record
-        if record is not None:
-            self.setting.readers[self.name] = lambda: self.make(folder)
-        return record
+    def load(self, path: Path | None) -> ShadedReader:
+        return self.build(path.parent if path else None)
 
-    def run(self, folder, progress):
-        start = time.perf_counter()
-        read = self.make(folder)
-        self.setting.readers[self.name] = lambda: read
-        nbytes = self.setting.pyramid.nbytes + self.channels * sum(v[..., 0].size for v in self.setting.pyramid.values)
-        return self.kept(nbytes, start, read, label=self.label, kind="classical")
+    def run(self, folder: Path | None, progress: bool) -> dict:
+        start, pyramid = time.perf_counter(), self.context.pyramid
+        return self.measure(pyramid.nbytes + self.channels * sum(v[..., 0].size for v in pyramid.values), start)
 
 
 @dataclass
-class _Trained(_Made):
-    """A table, which stays in the folder of models."""
+class ShadingTraining(ShadingContender):
+    """A trained texture; its table stays in the folder of models."""
 
-    table: Table | None = None
+    @cached_property
+    def table(self) -> Table:
+        return task.tasks()["texture"].load(self.file)
 
-    def file(self, folder: Path) -> Path:
-        return folder / f"{file_name(self.name)}.npz"
+    def load(self, path: Path) -> ShadedReader:
+        return self.context.reader_of(self.table)
 
-    def cached_record(self, folder, record):
-        if record is None or folder is None or not self.file(folder).is_file():
-            return None
-        self.record, self.table = record, task.tasks()["texture"].load(self.file(folder))
-        self.setting.readers[self.name] = lambda: self.setting.reader_of(self.table)
-        return record
-
-    def trained(self, folder, table: Table, result, start: float, **details) -> dict | None:
-        """Keep what a training made, unless it was interrupted."""
+    def measure_table(self, table: Table, result: FitResult, start: float, **details) -> dict | None:
+        """Store and measure a trained table, unless the training was interrupted; return the record."""
         if result.interrupted:
             return None
         self.table = table
-        if folder is not None:
-            save_table(self.file(folder), table)
-        read = self.setting.reader_of(table)
-        self.setting.readers[self.name] = lambda: read
-        known = {"steps": result.steps, "kept_step": result.step, "restarts": result.restarts,
-                 "history": result.history, "training_seconds": result.seconds}  # fmt: skip
-        return self.kept(table.nbytes, start, read, **known, **details)
+        if self.file is not None:
+            save_table(self.file, table)
+        self.model = self.context.reader_of(table)
+        training = {"steps": result.steps, "kept_step": result.step, "restarts": result.restarts,
+                    "history": result.history, "training_seconds": result.seconds}  # fmt: skip
+        return self.measure(table.nbytes, start, **training, **details)
 
 
 @dataclass
-class _Start(_Trained):
-    """A texture that is trained as task 4 has it."""
+class TextureStart(ShadingTraining):
+    """A texture trained as task 4 trains it: the start of the runs of a seed."""
 
     seed: int = 0
 
-    def run(self, folder, progress):
-        start, setting = time.perf_counter(), self.setting
-        made, result = setting.texture(setting.pyramid, setting.request.pretraining, self.seed, progress)
-        return self.trained(folder, made, result, start, kind="start", seed=self.seed)
+    def run(self, folder: Path | None, progress: bool) -> dict | None:
+        start, context = time.perf_counter(), self.context
+        trained, result = context.fit_texture(context.pyramid, context.settings.pretraining, self.seed, progress)
+        return self.measure_table(trained, result, start, seed=self.seed)
 
 
 @dataclass
-class _Compressed(_Trained):
-    """A texture of task 4 of another ``pyramid`` than the source's, with the time of both trainings."""
+class CompressedFilter(ShadingTraining):
+    """A texture of task 4 trained on the pyramid of a classical filter, for the time of start and run together."""
 
-    label: str = ""
     pyramid: Callable[[Path | None], Pyramid] = lambda folder: None
 
-    def run(self, folder, progress):
-        start, setting, request = time.perf_counter(), self.setting, self.setting.request
-        pyramid = self.pyramid(folder)
-        made, result = setting.texture(pyramid, request.pretraining + request.length, 0, progress)
-        return self.trained(folder, made, result, start, kind="compressed", label=self.label)
+    def run(self, folder: Path | None, progress: bool) -> dict | None:
+        start, settings = time.perf_counter(), self.context.settings
+        length = settings.pretraining + settings.length
+        trained, result = self.context.fit_texture(self.pyramid(folder), length, 0, progress)
+        return self.measure_table(trained, result, start)
 
 
 @dataclass
-class _Run(_Trained):
-    """A training for shading, from a ``start``."""
+class ShadingRun(ShadingTraining):
+    """A training for shading with weight ``share``; ``base`` is the run of the same seed with λ = 0."""
 
-    start: _Start | None = None
-    way: Way = WAYS[0]
+    start: TextureStart | None = None
+    remedies: Remedies = REMEDIES[0]
     share: float = 0.0
     seed: int = 0
-    base: _Run | None = None
+    base: ShadingRun | None = None
 
-    def run(self, folder, progress):
-        begin, setting = time.perf_counter(), self.setting
-        own = presets.PRESETS["ours"]
-        settings = dataclasses.replace(own.settings, schedule="cosine" if self.way.schedule else "constant")
-        request = setting.training(settings, setting.request.length, self.seed, progress)
-        clip = (own.clip or CLIP) if self.way.clip else None
-        recipe = dataclasses.replace(own, share=self.share, clip=clip, settings=request.settings)
-        net = start_of(self.start.table, setting.pyramid)
+    def run(self, folder: Path | None, progress: bool) -> dict | None:
+        begin, context, preset = time.perf_counter(), self.context, presets.PRESETS["ours"]
+        schedule = "cosine" if self.remedies.schedule else "constant"
+        settings = dataclasses.replace(preset.settings, schedule=schedule)
+        request = context.request(settings, context.settings.length, self.seed, progress)
+        clip = (preset.clip or CLIP) if self.remedies.clip else None
+        recipe = dataclasses.replace(preset, share=self.share, clip=clip, settings=request.settings)
+        net = start_of(self.start.table, context.pyramid)
         try:
-            made, result = fit_shading(setting.source, net, recipe, request, setting.pyramid, setting.evaluation)
-        except FittingError:  # it diverged again and again: nothing was gained over where it started from
-            made, result = self.start.table, FitResult({}, 0, 0, 0.0, False, 0, [])
-        details = {"kind": "run", "share": self.share, "clip": self.way.clip, "schedule": self.way.schedule,
-                   "seed": self.seed, "way": self.way.name}  # fmt: skip
-        record = self.trained(folder, made, result, begin, **details)
+            trained, result = fit_shading(context.source, net, recipe, request, context.pyramid, context.evaluation)
+        except FittingError:  # diverged repeatedly: the result is the start
+            trained, result = self.start.table, FitResult({}, 0, 0, 0.0, False, 0, [])
+        details = {"share": self.share, "clip": self.remedies.clip, "schedule": self.remedies.schedule,
+                   "seed": self.seed, "way": self.remedies.name}  # fmt: skip
+        record = self.measure_table(trained, result, begin, **details)
         if record is not None:
             base = self.base.record["details"] if self.base is not None and self.base.record else None
             record["details"]["trouble"] = troubles(record["details"], base)
@@ -333,66 +323,57 @@ class _Run(_Trained):
 
 
 @dataclass
-class _Shifted(_Made):
-    """λ = 0 read at other levels of detail, those that suit the truth's kernel best: nothing is trained."""
+class BiasedRun(ShadingContender):
+    """λ = 0 read at the levels of detail that suit the truth's kernel best; nothing is trained."""
 
-    label: str = ""
-    base: _Run | None = None
-    kernel: Callable = lambda make: make
+    has_file = False
+    base: ShadingRun | None = None
+    biased: Callable = lambda build: build
 
-    def _read(self) -> ShadedReader:
-        return self.kernel(lambda folder: self.setting.readers[self.base.name]())(None)
+    def load(self, path: Path | None) -> ShadedReader:
+        return self.biased(lambda folder: self.base.model)(None)
 
-    def cached_record(self, folder, record):
-        self.record = record
-        if record is not None:
-            self.setting.readers[self.name] = self._read
-        return record
-
-    def run(self, folder, progress):
-        start, read = time.perf_counter(), self._read()
-        self.setting.readers[self.name] = lambda: read
-        return self.kept(self.base.table.nbytes, start, read, kind="compressed", label=self.label)
+    def run(self, folder: Path | None, progress: bool) -> dict:
+        return self.measure(self.base.table.nbytes, time.perf_counter())
 
 
 def troubles(details: dict, base: dict | None) -> list[str]:
-    """What went wrong in a run, in words (see above); ``base`` is λ = 0 of the same seed."""
-    history, found = details["history"], []
+    """Return the troubles of a run, by their names above; ``base`` are the details of λ = 0 of the same seed."""
+    history, names = details["history"], []
     if not history:
-        found.append("diverged")
+        names.append("diverged")
     numbers = [v for h in history for k, v in h.items() if k != "step" and v is not None]
     if not np.isfinite(np.asarray([*numbers, details["C"]["mean_db"]], float)).all():
-        found.append("nan")
+        names.append("nan")
     if details["restarts"]:
-        found.append("restarts")
+        names.append("restarts")
     losses = [h["loss"] for h in history if h["loss"] is not None and math.isfinite(h["loss"])]
     if losses and max(losses) > 10 * float(np.median(losses)) + 1e-9:
-        found.append("spike")
+        names.append("spike")
     if history:
         key = next(k for k in history[-1] if k not in ("step", "loss"))
         values = [h[key] for h in history if math.isfinite(h[key])]
         if values and max(values) - history[-1][key] > DRIFT:
-            found.append("drift")
+            names.append("drift")
     if base is not None and details["C"]["mean_db"] < base["C"]["mean_db"]:
-        found.append("below")
-    return found
+        names.append("below")
+    return names
 
 
 # -- the plan ---------------------------------------------------------------------------------------------------------
 
 
-def plan(sources: dict[str, Source], request: Request) -> Plan:
-    """What is measured of the materials, in the variant that is set."""
-    jobs: list[Job] = []
+def plan(sources: dict[str, Source], settings: ShadingStudySettings) -> Plan:
+    """Return the plan for the materials in the current variant."""
+    contexts = {name: ShadingStudyContext(name, source, settings) for name, source in sources.items()}
     candidates: list[Candidate] = []
-    settings = {name: Setting(name, source, request) for name, source in sources.items()}
-    for setting in settings.values():
-        own = _jobs(setting)
-        jobs += own
-        candidates += _candidates(setting, own)
-    sizes = ", ".join(f"{s.name} ({s.source.width} × {s.source.height})" for s in settings.values())
-    asked = json.loads(json.dumps(asdict(request)))
+    for context in contexts.values():
+        context.jobs = {job.name: job for job in _jobs(context)}
+        candidates += _candidates(context)
+    sizes = ", ".join(f"{name} ({s.width} × {s.height})" for name, s in sources.items())
+    request = json.loads(json.dumps(asdict(settings)))
     digests = {name: s.digest for name, s in sources.items()}
+    evaluation = "3 levels, 2 pairs" if settings.quick else "6 levels, 16 pairs of a view and a light"
     return Plan(
         study="shading",
         title="Textures trained for their shading",
@@ -402,36 +383,29 @@ def plan(sources: dict[str, Source], request: Request) -> Plan:
         queries=(),
         accuracy="c_mean_db",
         accuracy_label="PSNR of shaded values against converged truth, mean of levels, dB",
-        details={"sources": digests, "request": asked, "evaluation": _seen(request)},
+        details={"sources": digests, "request": request, "evaluation": evaluation},
         notes=[
-            f"{sizes}; {request.compression:g}x, {request.pretraining:g} {request.unit} of training as a texture, then "
-            f"{request.length:g} {request.unit} for shading; C: converged truth, P: the paper's reference."
+            f"{sizes}; {settings.compression:g}x, {settings.pretraining:g} {settings.unit} of training as a texture, "
+            f"then {settings.length:g} {settings.unit} for shading; C: converged truth, P: the paper's reference."
         ],
-        jobs=jobs,
-        jobs_fingerprint=f"{digests} {asked}",
-        pictures=pictures.of(settings),
+        jobs=[job for context in contexts.values() for job in context.jobs.values()],
+        jobs_fingerprint=f"{digests} {request}",
+        pictures=pictures.pictures_of(contexts),
         sampled=False,
         table=table,
         conclusions=conclusions,
     )
 
 
-def _seen(request: Request) -> str:
-    return "3 levels, 2 pairs" if request.quick else "6 levels, 16 pairs of a view and a light"
-
-
-def _jobs(setting: Setting) -> list[Job]:
-    """Of one material, in the order in which they are done: cheap ones first, then λ from seed to seed."""
-    name, request = setting.name, setting.request
-    pyramid, found = (lambda: setting.pyramid), []
-
-    def classical(label: str, make: Callable[[Path | None], ShadedReader], channels: int = 0) -> None:
-        found.append(_Classical(f"{name}, {label}", setting, label=label, make=make, channels=channels))
+def _jobs(context: ShadingStudyContext) -> list[ShadingContender]:
+    """Return the jobs of a material in their order: cheap ones first, then all λ of each seed."""
+    name, source, settings = context.name, context.source, context.settings
+    jobs: list[ShadingContender] = []
 
     def bake(folder: Path | None) -> list[np.ndarray]:
-        """The fitted roughness, kept in the folder."""
+        """Return the fitted roughness, kept in the folder."""
         if folder is None:
-            return normals.bake(pyramid(), setting.effects, _pairs(request))
+            return normals.bake(context.pyramid, context.effects, 4 if settings.quick else normals.PAIRS)
         file = folder / f"{file_name(name)}_roughness.npz"
         if not file.is_file():
             levels = bake(None)
@@ -440,97 +414,100 @@ def _jobs(setting: Setting) -> list[Job]:
         with np.load(file, allow_pickle=False) as data:
             return [data[f"arr_{i}"] for i in range(len(data.files))]
 
-    def shifted(make: Callable[[Path | None], ShadedReader]) -> Callable[[Path | None], ShadedReader]:
-        """The same with the kernel that suits the truth best."""
+    def biased(build: Callable[[Path | None], ShadedReader]) -> Callable[[Path | None], ShadedReader]:
+        """Return the filter read at the levels of detail with the smallest error."""
 
-        def biased(folder: Path | None) -> ShadedReader:
-            read = make(folder)
-            places = 2**10 if request.quick else normals.PLACES
-            return normals.biased(read, normals.choose_biases(read, pyramid(), setting.effects, places))
+        def build_biased(folder: Path | None) -> ShadedReader:
+            read, places = build(folder), 2**10 if settings.quick else normals.PLACES
+            return normals.biased(read, normals.choose_biases(read, context.pyramid, context.effects, places))
 
-        return biased
+        return build_biased
 
     def filtered(folder: Path | None) -> ShadedReader:
-        return normals.filtered(pyramid(), setting.effects)
+        return normals.filtered(context.pyramid, context.effects)
 
-    def baked(folder: Path | None) -> ShadedReader:
-        return normals.baked(pyramid(), setting.effects, bake(folder))
+    def toksvig(folder: Path | None) -> ShadedReader:
+        return normals.toksvig(source, context.pyramid, context.effects)
 
     def lean(folder: Path | None, smooth: bool = False) -> ShadedReader:
-        return normals.lean(source, pyramid(), setting.effects, smooth)
+        return normals.lean(source, context.pyramid, context.effects, smooth)
 
-    def rough(levels: Callable[[Path | None], list[np.ndarray]]) -> Callable[[Path | None], Pyramid]:
-        return lambda folder: normals.with_roughness(pyramid(), levels(folder))
+    def baked(folder: Path | None) -> ShadedReader:
+        return normals.roughness_reader(context.pyramid, context.effects, bake(folder))
 
-    source = setting.source
-    classical("filtered", filtered)
-    classical("kernel", shifted(filtered))
-    classical("Toksvig", lambda folder: normals.toksvig(source, pyramid(), setting.effects))
-    classical("LEAN", lean, 6)
-    classical("LEAN, kernel", shifted(lambda folder: lean(folder, True)), 6)
-    classical("baked", baked)
-    if not request.quick:
-        classical("baked, kernel", shifted(baked))
-    made = {"Toksvig, compressed": rough(lambda folder: normals.toksvig_levels(source, pyramid()))}
-    if not request.quick:
-        made["baked, compressed"] = rough(bake)
-    for label, make in made.items():
-        found.append(_Compressed(f"{name}, {label}", setting, label=label, pyramid=make))
-    for seed in range(request.seeds):
-        start = _Start(f"{name}, texture, seed {seed}", setting, seed=seed)
-        found.append(start)
-        bases = {}
-        for share in request.lambdas:
-            for way in request.ways:
+    classical = [
+        ("filtered", filtered, 0), ("kernel", biased(filtered), 0), ("Toksvig", toksvig, 0), ("LEAN", lean, 6),
+        ("LEAN, kernel", biased(lambda folder: lean(folder, True)), 6), ("baked", baked, 0),
+        *([] if settings.quick else [("baked, kernel", biased(baked), 0)]),
+    ]  # fmt: skip
+    roughness = {"Toksvig, compressed": lambda folder: normals.toksvig_levels(source, context.pyramid)}
+    if not settings.quick:
+        roughness["baked, compressed"] = bake
+    for label, build, channels in classical:
+        jobs.append(
+            ClassicalFilter("classical", 1, context, f"{name}, {label}", label=label, build=build, channels=channels)
+        )
+    for label, levels in roughness.items():
+        pyramid = lambda folder, levels=levels: normals.with_roughness(context.pyramid, levels(folder))  # noqa: E731
+        jobs.append(
+            CompressedFilter("compressed", settings.compression, context, f"{name}, {label}", label=label,
+                             pyramid=pyramid)
+        )  # fmt: skip
+    for seed in range(settings.seeds):
+        start = TextureStart("start", settings.compression, context, f"{name}, texture, seed {seed}", seed=seed)
+        jobs.append(start)
+        bases: dict[bool, ShadingRun] = {}
+        for share in settings.lambdas:
+            for way in settings.ways:
                 if share == 0 and way.schedule in bases:
-                    continue  # there is nothing to clip
-                run = _Run(f"{name}, lambda {share:g}, {way.name}, seed {seed}", setting, start=start, way=way,
-                           share=share, seed=seed, base=bases.get(way.schedule))  # fmt: skip
-                found.append(run)
+                    continue  # without a shading loss, there is nothing to clip
+                run = ShadingRun(
+                    "run", settings.compression, context, f"{name}, lambda {share:g}, {way.name}, seed {seed}",
+                    start=start, remedies=way, share=share, seed=seed, base=bases.get(way.schedule),
+                )  # fmt: skip
+                jobs.append(run)
                 if share == 0:
                     if not bases and seed == 0:
-                        found.append(_Shifted(f"{name}, kernel, compressed", setting, label="kernel, compressed",
-                                              base=run, kernel=shifted))  # fmt: skip
+                        label = "kernel, compressed"
+                        jobs.append(
+                            BiasedRun("compressed", settings.compression, context, f"{name}, {label}", label=label,
+                                      base=run, biased=biased)
+                        )  # fmt: skip
                     bases[way.schedule] = run
-    return found
+    return jobs
 
 
-def _pairs(request: Request) -> int:
-    return 4 if request.quick else normals.PAIRS
-
-
-def _candidates(setting: Setting, jobs: list[Job]) -> list[Candidate]:
-    found = []
-    for job in jobs:
-        if isinstance(job, (_Classical, _Compressed, _Shifted)):
-            found.append(_candidate(setting, job.name, [job], job.label, {"kind": job.label}))
-    groups: dict[tuple, list[_Run]] = {}
-    for job in jobs:
-        if isinstance(job, _Run):
-            groups.setdefault((job.share, job.way), []).append(job)
+def _candidates(context: ShadingStudyContext) -> list[Candidate]:
+    candidates, groups = [], {}
+    for job in context.jobs.values():
+        if job.label:
+            candidates.append(_candidate(context, job.name, [job], job.label, {"kind": job.label}))
+        elif isinstance(job, ShadingRun):
+            groups.setdefault((job.share, job.remedies), []).append(job)
     for (share, way), runs in groups.items():
         details = {"lambda": share, "way": way.name, "kind": "run"}
-        found.append(_candidate(setting, f"{setting.name}, lambda {share:g}, {way.name}", runs, "lambda", details))
-    return found
+        name = f"{context.name}, lambda {share:g}, {way.name}"
+        candidates.append(_candidate(context, name, runs, "lambda", details))
+    return candidates
 
 
-def _candidate(setting: Setting, name: str, jobs: list, representation: str, details: dict) -> Candidate:
+def _candidate(context: ShadingStudyContext, name: str, jobs: list, representation: str, details: dict) -> Candidate:
+    """Return the candidate of the runs of all seeds; its bytes, seconds and flicker are those of the first seed."""
+
     def errors(samples: int) -> dict[str, float]:
-        made = [j.record["details"] for j in jobs]
-        found = {}
+        records, values = [job.record["details"] for job in jobs], {}
         for letter in "CP":
-            for what in ("mean_db", "coarse_db"):
-                values = [d[letter][what] for d in made]
-                key = f"{letter.lower()}_{what}"
-                found |= {key: float(np.mean(values)), f"{key}_low": min(values), f"{key}_high": max(values)}
-            flips = [np.mean(d[letter]["flip"]) for d in made if d[letter]["flip"]]
+            for key in ("mean_db", "coarse_db"):
+                psnr = [d[letter][key] for d in records]
+                name = f"{letter.lower()}_{key}"
+                values |= {name: float(np.mean(psnr)), f"{name}_low": min(psnr), f"{name}_high": max(psnr)}
+            flips = [np.mean(d[letter]["flip"]) for d in records if d[letter]["flip"]]
             if flips:
-                found[f"{letter.lower()}_flip"] = float(np.mean(flips))
-            for i in range(len(made[0][letter]["psnr_db"])):
-                found[f"{letter.lower()}_l{i}_db"] = float(np.mean([d[letter]["psnr_db"][i] for d in made]))
-        return {**found, **setting.motion.errors(setting.readers[jobs[0].name]())}
+                values[f"{letter.lower()}_flip"] = float(np.mean(flips))
+            for i in range(len(records[0][letter]["psnr_db"])):
+                values[f"{letter.lower()}_l{i}_db"] = float(np.mean([d[letter]["psnr_db"][i] for d in records]))
+        return {**values, **context.zoom.errors(context.zoom.render(jobs[0].model), context.zoom.truth)}
 
-    # Bytes and seconds are those of the first seed's
     return Candidate(
-        name, representation, job=jobs[0].name, errors=errors, details={**details, "material": setting.name}
+        name, representation, job=jobs[0].name, errors=errors, details={**details, "material": context.name}
     )

@@ -1,7 +1,9 @@
 """
-``tradeoff texture``: a texture that filters itself beside supersampled bitmaps and uncompressed mip maps, and ASTC with
-mip maps at equal bytes: error against the time of a render, error of each level of detail, flicker of a moving camera.
-:mod:`.candidates` says more.
+Study ``tradeoff texture``: error and time of renders with filtered, compressed textures against bitmaps.
+
+A texture that filters itself is compared with supersampled bitmaps, uncompressed mip maps, and ASTC with mip maps in
+equal bytes: by the error against the time of a render, the error of each level of detail, and the flicker of a moving
+camera. :mod:`.plan` describes the contenders.
 """
 
 from __future__ import annotations
@@ -10,8 +12,7 @@ import argparse
 
 from ...arguments import positive
 from ...measure.study import Plan, Study
-
-ASTC_PRESETS = ("fastest", "fast", "medium", "thorough", "verythorough", "exhaustive")
+from ..maps import add_astc_option
 
 
 class TextureStudy(Study):
@@ -26,45 +27,43 @@ class TextureStudy(Study):
             help="8-bit maps, one of which has colours (default: scenes/assets/tiles.json)",
         )  # fmt: skip
         parser.add_argument("--map", default="", metavar="NAME", help="the map that is rendered (default: the albedo)")
-        parser.add_argument("--compression", action="append", default=[], metavar="N",
-                            help="3x, 6x, 12x and 24x by default, the first that is named is shown most; may be "
-                            "repeated (--quick: 12x)")  # fmt: skip
-        parser.add_argument("--table", action="append", default=[], metavar="FILE.npz",
-                            help="a table of the source that was trained already (with --border repeat, as renders "
-                            "repeat it), in place of a training; may be repeated; nothing is trained unless "
-                            "--compression is given, too")  # fmt: skip
-        parser.add_argument("--seconds", type=positive, metavar="N",
-                            help="of each training (default: 60; --quick: 2)")  # fmt: skip
-        parser.add_argument("--astc", choices=ASTC_PRESETS, default="exhaustive",
-                            help="preset of the ASTC encoder (default: exhaustive)")  # fmt: skip
         parser.add_argument(
-            "--footprints",
-            action="store_true",
-            help="also train with each distribution of footprints, and draw levels beside them",
-        )
-        parser.add_argument("--frames", type=positive, metavar="N", help="of the zoom (default: 60; --quick: 6)")
+            "--compression", action="append", default=[], metavar="N",
+            help="compression ratio; may be repeated (default: 12x, 3x, 6x and 24x; --quick: 12x); only the first is "
+            "measured with all filters",
+        )  # fmt: skip
+        parser.add_argument(
+            "--table", action="append", default=[], metavar="FILE.npz",
+            help="use a trained table of the source (trained with --border repeat, as in the renders) in place of a "
+            "training; may be repeated; nothing is trained unless --compression is given, too",
+        )  # fmt: skip
+        parser.add_argument("--seconds", type=positive, metavar="N",
+                            help="seconds of each training (default: 60; --quick: 2)")  # fmt: skip
+        add_astc_option(parser)
+        parser.add_argument("--footprints", action="store_true",
+                            help="also train with each distribution of footprints and draw both")  # fmt: skip
+        parser.add_argument("--frames", type=positive, metavar="N", help="frames of the zoom (default: 60; --quick: 6)")
         parser.add_argument("--width", type=positive, metavar="N",
-                            help="of the stills, the height is two thirds (default: 480; --quick: 96)")  # fmt: skip
+                            help="width of the stills; the height is 2/3 (default: 480; --quick: 96)")  # fmt: skip
 
     def check(self, arguments) -> None:
-        """Also reads the source, before anything is made of it; raises what :func:`.load_source` does."""
+        """Check the options and load the source and tables; raise as :func:`.load_source` does."""
         from ...maps.source import load_source
         from ...units import parse_compression
         from .plan import colour_map, tables_of
 
-        given = tuple(map(parse_compression, arguments.compression))
         default = () if arguments.table else (12.0,) if arguments.quick else (12.0, 3.0, 6.0, 24.0)
-        arguments.compressions = given or default
+        arguments.compressions = tuple(map(parse_compression, arguments.compression)) or default
         arguments.loaded = load_source(arguments.source)
         arguments.map = colour_map(arguments.loaded, arguments.map)
         arguments.tables = tables_of(arguments.table, arguments.loaded)
 
     def plan(self, arguments) -> Plan:
-        from .plan import Request, plan
+        from .plan import TextureStudySettings, plan
 
         quick = arguments.quick
         width = arguments.width or (96 if quick else 480)
-        request = Request(
+        settings = TextureStudySettings(
             arguments.map,
             arguments.compressions,
             float(arguments.seconds or (2 if quick else 60)),
@@ -77,7 +76,7 @@ class TextureStudy(Study):
             1 if quick else 4,
             arguments.footprints,
         )
-        return plan(arguments.loaded, arguments.source, request, arguments.tables)
+        return plan(arguments.loaded, arguments.source, settings, arguments.tables)
 
 
 STUDY = TextureStudy()

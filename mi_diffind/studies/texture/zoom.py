@@ -1,11 +1,4 @@
-"""
-Flicker: a camera that moves along its axis towards a plane, and what the same points of the plane look like meanwhile.
-
-The frames are aligned by reprojection: a grid of points of the plane, all of which every frame shows, is projected into
-each frame, where the image is read with bilinear interpolation. *Flicker* is the variance of a point's displayed values
-over the frames, the mean over points and channels. The truth's is not zero, since a point shows more detail the nearer
-the camera is; so the same is measured of the difference to the truth's frames.
-"""
+"""Zoom of the texture study: a camera that moves along its axis towards a plane, rendered frame by frame."""
 
 from __future__ import annotations
 
@@ -14,79 +7,58 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from .test_scenes import Reader, Stage, shown
+from ...measure.flicker import POINTS, MovingView
+from .test_scenes import TextureReader, TextureScene, displayed
 
-#: How much nearer the camera is in the last frame than in the first.
+#: Ratio of the camera's distances to the plane in the first and in the last frame.
 NEARER = 2.0
-
-#: Points of the plane along x and y.
-GRID = 96
 
 
 @dataclass(frozen=True)
-class Zoom:
-    """``frames`` of a ``film`` (width, height), of a stage and a texture (width, height)."""
+class TextureZoom(MovingView):
+    """A zoom into a scene: ``frames`` of a ``film`` (width, height), with a ``texture`` of (width, height) texels."""
 
-    stage: Stage
+    scene: TextureScene
     film: tuple[int, int]
     texture: tuple[int, int]
     frames: int
 
     def origins(self) -> np.ndarray:
-        """Where the camera is, ``(frames, 3)``: each frame is nearer by the same factor."""
-        start, target = (np.asarray(v, float) for v in (self.stage.origin, self.stage.target))
+        """Return the camera's positions, ``(frames, 3)``; its distance decreases by the same factor each frame."""
+        start, target = (np.asarray(v, float) for v in (self.scene.origin, self.scene.target))
         distance = NEARER ** (-np.arange(self.frames) / max(self.frames - 1, 1))
         return target + distance[:, None] * (start - target)
 
-    def render(self, reader: Reader, seed: int = 0) -> np.ndarray:
-        """The frames as displayed, ``(frames, height, width, 3)``, each with random numbers of its own."""
-        scene = reader.loaded(self.stage, self.film, self.texture)
-        parameters, found = mi.traverse(scene), []
-        for k, origin in enumerate(self.origins()):
-            parameters["sensor.to_world"] = mi.Transform4f(self.stage.look(origin))
+    def render(self, reader: TextureReader, seed: int = 0) -> np.ndarray:
+        """Return the frames as displayed, ``(frames, height, width, 3)``, each with its own random numbers."""
+        loaded = reader.loaded(self.scene, self.film, self.texture)
+        parameters, images = mi.traverse(loaded), []
+
+        def move(origin) -> None:
+            parameters["sensor.to_world"] = mi.Transform4f(self.scene.camera_at(origin))
             parameters.update()
-            reader.prepare(scene)
-            found.append(shown(mi.render(scene, spp=reader.spp, seed=(seed << 12) + k)))
-        parameters["sensor.to_world"] = mi.Transform4f(self.stage.look(self.stage.origin))
-        parameters.update()
-        reader.prepare(scene)
-        return np.stack(found)
+            reader.prepare(loaded)
+
+        for k, origin in enumerate(self.origins()):
+            move(origin)
+            images.append(displayed(mi.render(loaded, spp=reader.spp, seed=(seed << 12) + k)))
+        move(self.scene.origin)
+        return np.stack(images)
 
     def points(self) -> np.ndarray:
-        """Points of the plane, ``(n, 3)``, that are well within the last frame, and so within all."""
+        """Return points of the plane, ``(n, 3)``, well within the last frame, and so within all."""
         last = self.origins()[-1]
-        x, y = np.meshgrid(*[np.linspace(0.06, 0.94, GRID)] * 2)
-        axes = np.array(self.stage.look(last).matrix, float)[:3, :3].T  # rows: right to left, up, forward
-        tangent = np.tan(np.radians(self.stage.fov) / 2)
+        x, y = np.meshgrid(*[np.linspace(0.06, 0.94, POINTS)] * 2)
+        axes = np.array(self.scene.camera_at(last).matrix, float)[:3, :3].T  # rows: right to left, up, forward
+        tangent = np.tan(np.radians(self.scene.fov) / 2)
         width, height = tangent, tangent * self.film[1] / self.film[0]
-        way = np.stack([(1 - 2 * x) * width, (1 - 2 * y) * height, np.ones_like(x)], -1).reshape(-1, 3) @ axes
-        return last + way * (-last[1] / way[:, 1:2])  # the plane is y = 0
+        rays = np.stack([(1 - 2 * x) * width, (1 - 2 * y) * height, np.ones_like(x)], -1).reshape(-1, 3) @ axes
+        return last + rays * (-last[1] / rays[:, 1:2])  # the plane is y = 0
 
     def places(self, frame: int) -> np.ndarray:
-        """Where a frame shows the points: ``(n, 2)``, x and y in pixels, of whose centres the first is at 0.5."""
         origin = self.origins()[frame]
-        axes = np.array(self.stage.look(origin).matrix, float)[:3, :3]
+        axes = np.array(self.scene.camera_at(origin).matrix, float)[:3, :3]
         local = (self.points() - origin) @ axes
-        slope = local[:, :2] / local[:, 2:] / np.tan(np.radians(self.stage.fov) / 2)
+        slope = local[:, :2] / local[:, 2:] / np.tan(np.radians(self.scene.fov) / 2)
         slope[:, 1] *= self.film[0] / self.film[1]
         return (1 - slope) / 2 * self.film
-
-    def aligned(self, frames: np.ndarray) -> np.ndarray:
-        """What the points look like, ``(frames, n, 3)``."""
-        return np.stack([bilinear(image, self.places(k)) for k, image in enumerate(frames)])
-
-
-def flicker(frames: np.ndarray) -> float:
-    """The variance over aligned frames, the mean over points and channels."""
-    return float(np.var(frames, axis=0, dtype=np.float64).mean())
-
-
-def bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    height, width = image.shape[:2]
-    position = places - 0.5
-    lower = np.floor(position).astype(int)
-    a, b = (position - lower).T[..., None]
-    x0, x1 = (np.clip(lower[:, 0] + i, 0, width - 1) for i in (0, 1))
-    y0, y1 = (np.clip(lower[:, 1] + i, 0, height - 1) for i in (0, 1))
-    upper, under = (image[y, x0] * (1 - a) + image[y, x1] * a for y in (y0, y1))
-    return upper * (1 - b) + under * b

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 
 from ...arguments import Argument, fraction, positive_or_none
-from ...maps.arguments import SIZES, SOURCES
+from ...maps.arguments import PREVIEW, SIZES, SOURCES
 from ...task import Task
 from .presets import PRESETS, REFERENCES
 
@@ -55,9 +55,7 @@ class Shading(Task):
             "prefiltered ones (default of paper), or 256 unfiltered ones (converged)",
         ),
         *SOURCES,
-        Argument(
-            "--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"
-        ),
+        PREVIEW,
     )  # fmt: skip
 
     def settings(self, preset, given, options):

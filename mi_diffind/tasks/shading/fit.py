@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 
 from ...errors import UsageError
-from ...maps.arguments import asked_bytes
+from ...maps.arguments import asked_bytes, preview_path
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ...tables import MAX_BYTES, Table
@@ -72,7 +72,7 @@ def fit(request: FitRequest) -> Fitted:
         if own.resume and not os.path.exists(own.checkpoint or ""):
             own.resume = False  # it was the training as a texture that was interrupted
         evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
-        preview = preview_of(request)
+        preview = preview_path(request)
         try:
             net = training.start_of(start, pyramid)
         except ValueError as e:
@@ -96,13 +96,6 @@ def fit(request: FitRequest) -> Fitted:
         "bits": {name: a.bits for name, a in table.arrays.items()},
     }
     return Fitted(table, result, lines, figures)
-
-
-def preview_of(request: FitRequest) -> Path | None:
-    """The picture that is written on the way: beside the output, unless it was named."""
-    if request.options["preview"] is not None:
-        return Path(request.options["preview"])
-    return None if request.output is None else request.output.with_name(f"{request.output.stem}_preview.png")
 
 
 def started(path, source, request: FitRequest) -> Table:

@@ -1,65 +1,58 @@
-"""What a scene looks like: each view rendered once by exact plugins, kept in a folder, gone on with if interrupted."""
+"""Reference images of a scene: each view rendered once by exact plugins, and kept in a folder."""
 
 from __future__ import annotations
 
 import gc
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
 
 from .. import __version__, plugins, scenes
 from ..files import replacing, writable_folder
 from ..measure.store import fingerprint
 from ..plugins.support import footprint
 from ..tasks import disney
-from .recipe import View, ViewDistribution
 from .rig import Rig
+from .views import View, ViewDistribution
 
-#: Samples of the whole image in one pass; what is interrupted loses a pass at most.
+#: Samples of the whole image in one pass; an interruption loses one pass at most.
 PASS = 1 << 23
 
-#: Seeds of references are this and above, those of trained renders below.
+#: First seed of references; trained renders use smaller ones.
 SEEDS = 1 << 31
-
-
-def colours(image):
-    """An image, an array or a tensor ``(height, width, channels)``, without transparency and what else is no colour."""
-    found = image.shape[2]
-    wanted = 3 if found >= 3 else 1
-    return image if found == wanted else image[:, :, :wanted]
 
 
 @dataclass
 class ReferenceRenders:
     """
-    Images of the views of a scene file with exact plugins, or those that ``against`` names, at ``spp`` samples a pixel.
-    ``folder``, which is made if its parent exists, keeps a file for each (``None``: nothing is kept), under a name that
-    changes with whatever an image depends on: the scene, the files that it names but those ``without`` any influence,
-    such as the table that is trained, ``inputs`` (texts that stand for further ones), the view, the samples, versions
-    and the code of plugins. Files are replaced in one piece, after each pass.
+    Images of the views of a scene, rendered with exact plugins at ``spp`` samples a pixel.
+
+    ``against`` names other counterparts than the exact ones. ``folder`` (created if its parent exists; ``None``: keep
+    nothing) holds one file for each image. The name of a file depends on everything that the image depends on: the
+    scene and the files that it names, except those ``without`` influence, such as the table that is trained;
+    ``inputs``, texts that stand for further files; the view, the samples, versions and the code of plugins. Files are
+    replaced in one piece, after each pass. ``pass_samples``: samples of the whole image in one pass.
 
     Raises :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.files.OutputError`.
     """
 
-    scene: str | os.PathLike
+    scene: scenes.ParsedScene
     views: ViewDistribution
     spp: int
-    folder: str | os.PathLike | None = None
-    defines: dict[str, str] | None = None
+    folder: str | Path | None = None
     against: str = "exact"
     without: Sequence[Path] = ()
     inputs: Sequence[str] = ()
     progress: bool = True
-    #: Passes that were rendered, and those that were there already.
+    pass_samples: int = PASS
+    #: Number of passes that were rendered, and of images that were kept from an earlier run.
     rendered: int = 0
-    found: int = 0
+    reused: int = 0
     _loaded: tuple | None = field(default=None, repr=False)
 
     def __post_init__(self):
@@ -68,21 +61,21 @@ class ReferenceRenders:
         self.digest = self._digest()
 
     def _digest(self) -> str:
-        """Of all that the images of all views have in common."""
+        """Return a hash of everything that the images of all views depend on."""
         code = [*Path(plugins.__file__).resolve().parent.rglob("*.py"), *Path(disney.__file__).parent.glob("*.py")]
         common = {
-            "defines": dict(sorted((self.defines or {}).items())), "against": self.against, "inputs": list(self.inputs),
+            "defines": dict(sorted(self.scene.defines.items())), "against": self.against, "inputs": list(self.inputs),
             "spp": self.spp, "target": self.views.target, "up": self.views.up, "variant": mi.variant(),
-            "versions": [mi.__version__, __version__, fingerprint(code)], "pass": PASS,
+            "versions": [mi.__version__, __version__, fingerprint(code)], "pass": self.pass_samples,
         }  # fmt: skip
         digest = hashlib.sha256(json.dumps(common).encode())
-        for file in scenes.files_of(self.scene, self.defines):
+        for file in self.scene.files():
             if file not in self.without:
                 digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
         return digest.hexdigest()
 
     def path(self, view: View) -> Path | None:
-        """The file of a view, if files are kept."""
+        """Return the file of a view, ``None`` if files are not kept."""
         return None if self.folder is None else self.folder / f"{self._key(view)[:24]}.npz"
 
     def _key(self, view: View) -> str:
@@ -90,10 +83,11 @@ class ReferenceRenders:
 
     def images(self, views: Sequence[View]) -> list[np.ndarray]:
         """
-        The linear images, ``(height, width, channels)``, float32; what is missing is rendered. The exact scene is gone
-        then: Dr.Jit compiles the materials of all scenes that there are into every kernel.
+        Return the linear images, ``(height, width, channels)``, float32; missing ones are rendered.
+
+        The exact scene is dropped afterwards: Dr.Jit compiles the materials of all loaded scenes into every kernel.
         """
-        bar = tqdm(total=len(views) * self.spp, desc="references", unit="spp", disable=None if self.progress else True)
+        bar = scenes.progress_bar("references", len(views) * self.spp, "spp", self.progress)
         try:
             with bar:
                 return [self._image(view, bar) for view in views]
@@ -101,10 +95,10 @@ class ReferenceRenders:
             self._loaded = None
             gc.collect()
 
-    def _image(self, view: View, bar: tqdm) -> np.ndarray:
+    def _image(self, view: View, bar) -> np.ndarray:
         path = self.path(view)
         total, done = self._kept(path)
-        self.found += done > 0
+        self.reused += done > 0
         bar.update(done)
         if done < self.spp:
             scene, rig, samples = self._scene()
@@ -113,7 +107,7 @@ class ReferenceRenders:
             seed = int(self._key(view)[:8], 16) % 2**19 << 12
             while done < self.spp:
                 n = min(samples, self.spp - done)
-                # The number of the pass by what is done: the same again after an interruption
+                # The pass number follows from the finished samples: the same after an interruption
                 image = scenes.render_pass(scene, n, SEEDS + seed + done // samples % 2**12)
                 total = total + n * np.where(np.isfinite(image), image, 0)
                 done += n
@@ -122,10 +116,10 @@ class ReferenceRenders:
                 if path is not None:
                     with replacing(path) as temporary:
                         np.savez(temporary, total=total, done=np.int64(done))
-        return colours((total / done).astype(np.float32))
+        return scenes.colour_channels((total / done).astype(np.float32))
 
     def _kept(self, path: Path | None) -> tuple:
-        """The sum of the samples that are kept for a view, and their number; a damaged file counts as none."""
+        """Return the sum of the kept samples of a view, and their number; a damaged file counts as none."""
         if path is None or not path.is_file():
             return 0.0, 0
         try:
@@ -136,9 +130,9 @@ class ReferenceRenders:
         return (total, done) if total.ndim == 3 and 0 < done <= self.spp else (0.0, 0)
 
     def _scene(self) -> tuple:
-        """The exact scene, loaded when it is needed, what moves it, and the samples of a pixel in one pass."""
+        """Return the exact scene, loaded on the first call, its rig, and the samples per pixel of one pass."""
         if self._loaded is None:
-            scene = scenes.load(self.scene, exact=True, defines=self.defines, against=self.against)
-            width, height = scene.sensors()[0].film().crop_size()
-            self._loaded = scene, Rig(scene, self.views), max(1, PASS // int(width * height))
+            scene = self.scene.load(exact=True, against=self.against)
+            width, height = scenes.film_size(scene)
+            self._loaded = scene, Rig(scene, self.views), max(1, self.pass_samples // (width * height))
         return self._loaded
