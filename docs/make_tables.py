@@ -67,18 +67,22 @@ def page_of_tasks() -> str:
 def disney_forms() -> str:
     """Return accuracy, bytes and time of each form of the Disney BRDF."""
     study = measured("tradeoff_disney")
-    timings = {name: case["queries"]["eval"] for name, case in study["cases"].items()}
-    cases = [name for name in ("constant, all lobes", "constant, diffuse + specular") if name in timings]
-    reference = {case: timings[case]["principled"]["time"] for case in cases}
+    columns = {
+        "constant, all lobes": ("eval",),
+        "constant, diffuse + specular": ("eval",),
+        "textured, diffuse + specular": ("eval", "pdf"),
+    }
+    cases = study["cases"]
+    timings = {f"{q}: {case}": cases[case]["queries"][q] for case, queries in columns.items() for q in queries}
     rows = []
     for name, candidate in study["candidates"].items():
-        if candidate["representation"] == "one table" or not all(name in timings[case] for case in cases):
+        if candidate["representation"] == "one table":
             continue
         errors = candidate["errors"]
         accuracy = " / ".join(f"{errors[k]:.1f}" for k in ("psnr_db_training", "psnr_db_uniform") if k in errors)
-        times = [f"{timings[case][name]['time'] / reference[case]:.2f}" for case in cases]
+        times = [f"{t[name]['time'] / t['principled']['time']:.2f}" if name in t else "–" for t in timings.values()]
         rows.append([f"`{name}`", f"{candidate['bytes']:,}", accuracy or "–", *times])
-    return table(["form", "bytes", "PSNR, dB: training / uniform", *(f"eval, {c.split(', ')[1]}" for c in cases)], rows)
+    return table(["form", "bytes", "PSNR, dB: training / uniform", *timings], rows)
 
 
 def comparisons() -> str:
@@ -105,13 +109,32 @@ def image_pages() -> str:
     return table(["source", "one grid, the better of two", "what auto chooses"], rows)
 
 
+def image_bytes() -> str:
+    """Sizes of the sources: raw, as the PNG files of the repository, and compressed."""
+    assets, rows = DOCS.parent / "scenes" / "assets", []
+    for source in ("tiles", "wood_color", "vase_color", "hammered_normal"):
+        fit = measured(f"fit_image_{source}_auto")
+        files = [assets / f"{source}.png"] if source != "tiles" else sorted(assets.glob("tiles_*.png"))
+        sizes = (fit["source_bytes"], sum(f.stat().st_size for f in files), fit["bytes"])
+        rows.append([source, *(f"{n:,}" for n in sizes), f"{sizes[1] / sizes[2]:.1f}x"])
+    return table(["source", "raw bytes", "bytes of the PNG files", "bytes at 12x", "of PNG"], rows)
+
+
+#: Rows of the pages' tables of renders; all others are in the JSON files.
+RENDERS = (
+    "bitmap, 1 spp", "bitmap, 4 spp", "bitmap, 16 spp", "bitmap, 4 spp, multijittered", "bitmap, 16 spp, multijittered",
+    "mipmap, trilinear", "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, trilinear",
+    "ASTC 12x, anisotropic, centred",
+)  # fmt: skip
+
+
 def texture_renders(study: dict) -> str:
     """Return errors, flicker and times of renders with filtered textures."""
     stages, base, steady = list(study["details"]["counted"]), "bitmap, 1 spp", "bitmap, 4 spp"
     flicker = study["candidates"][steady]["errors"]["flicker_error"]
     rows = []
     for name, c in study["candidates"].items():
-        if "flicker" not in c["errors"]:
+        if "flicker" not in c["errors"] or name not in RENDERS:
             continue
         e = c["errors"]
         times = [study["cases"][s]["ratios"]["render"].get(f"{name} / {base}", {"median": 1})["median"] for s in stages]
@@ -129,7 +152,7 @@ def texture_factors(study: dict) -> str:
 
     stages, rows = [s for s, c in study["cases"].items() if c["in_picture"]], []
     for name, c in study["candidates"].items():
-        if c["representation"].startswith("bitmap") or not c["errors"]:
+        if c["representation"].startswith("bitmap") or not c["errors"] or name not in RENDERS:
             continue
         cells = []
         for stage in stages:
@@ -350,7 +373,7 @@ def mean(values) -> float:
     return sum(values) / len(values)
 
 
-TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_pages, texture_memory, texture_presets)}
+TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_bytes, image_pages, texture_memory, texture_presets)}
 for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))

@@ -1,17 +1,16 @@
-"""``fit shading``: from what was asked for to a texture that is trained for what it looks like."""
+"""``fit shading``: training of a texture for its shaded appearance, as requested on the command line."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import os
-from pathlib import Path
 
 from ...errors import UsageError
-from ...maps.arguments import asked_bytes, preview_path
+from ...maps.arguments import preview_path, record_source, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
-from ...tables import MAX_BYTES, Table
+from ...tables import Table
 from ...task import FitRequest, Fitted
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
@@ -23,21 +22,22 @@ from .presets import PRESETS, ShadingRecipe
 
 
 def recipe_of(preset: str, settings, options) -> ShadingRecipe:
-    """The recipe of a preset with what the options change."""
-    own = PRESETS[preset]
+    """Return the recipe of a preset with the given options in place of its own."""
+    recipe = PRESETS[preset]
     given = {"share": options["share"], "reference": options["reference"]}
     given = {k: v for k, v in given.items() if v is not None}
     if options["clip"] is not None:
         given["clip"] = None if options["clip"] == math.inf else options["clip"]
-    return dataclasses.replace(own, settings=settings or own.settings, **given)
+    return dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
 
 
-#: Images that measure: of many views and lights, since a few that are almost mirrors decide what a PSNR is.
+#: Number of pairs of view and light, and size, of the images that measure. Many, since a few pairs near the mirror
+#: direction dominate the PSNR.
 PAIRS, SIDE = 32, 48
 
 
 def check(request: FitRequest) -> None:
-    """Raise :class:`UsageError` for options that do not go together."""
+    """Raise :class:`UsageError` for options that exclude each other."""
     options = request.options
     if options["source"] is None:
         raise UsageError("source: not given, a manifest of the maps of a material is needed")
@@ -49,16 +49,16 @@ def check(request: FitRequest) -> None:
 
 def fit(request: FitRequest) -> Fitted:
     """
-    Train as a texture, unless arrays are given that were, then for shading, and measure. With a time, half of it goes
-    to each. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
+    Train as a texture, unless a trained one is given, then for shading, and measure the result.
+
+    Each training takes half of a given time. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
     :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.fitting.FittingError`.
     """
-    options, folder = request.options, (request.output or Path("x")).resolve().parent
+    options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
     texture = TEXTURES[recipe.texture]
-    border = None if options["border"] == "auto" else (options["border"],) * 2
-    pyramid = Pyramid.of(source, textures.layout_of(source, texture), request.types, border)
+    pyramid = Pyramid.of(source, textures.layout_of(source, texture), request.types, requested_border(options))
     effects, reasons = material.effects_of(pyramid.layout)
     if not pyramid.layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
@@ -68,19 +68,21 @@ def fit(request: FitRequest) -> Fitted:
         start, result = pretrained(source, pyramid, recipe, request)
     if result is None or not result.interrupted:
         seconds = request.seconds
-        own = dataclasses.replace(request, seconds=seconds if result is None or seconds is None else seconds / 2)
-        if own.resume and not os.path.exists(own.checkpoint or ""):
-            own.resume = False  # it was the training as a texture that was interrupted
+        shading_request = dataclasses.replace(
+            request, seconds=seconds if result is None or seconds is None else seconds / 2
+        )
+        if shading_request.resume and not os.path.exists(shading_request.checkpoint or ""):
+            shading_request.resume = False  # the training as a texture was interrupted
         evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
         preview = preview_path(request)
         try:
             net = training.start_of(start, pyramid)
         except ValueError as e:
             raise UsageError(str(e)) from None
-        table, result = training.fit_shading(source, net, recipe, own, pyramid, evaluation, preview)
+        table, result = training.fit_shading(source, net, recipe, shading_request, pyramid, evaluation, preview)
     else:
         table = start
-    table.settings["source_path"] = os.path.relpath(Path(options["source"]).resolve(), folder)
+    record_source(request, table)
     lines = [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
@@ -99,7 +101,7 @@ def fit(request: FitRequest) -> Fitted:
 
 
 def started(path, source, request: FitRequest) -> Table:
-    """A texture's file to start from. Raises :class:`UsageError` if it is of another source."""
+    """Return the texture to start from. Raises :class:`UsageError` for a texture of another source."""
     table = TEXTURE.load(path)
     if table.settings.get("source", source.digest) != source.digest:
         raise UsageError(f"{path}: was made from another source than {request.options['source']}")
@@ -107,19 +109,18 @@ def started(path, source, request: FitRequest) -> Table:
 
 
 def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequest) -> tuple:
-    """A training as a texture alone, with a checkpoint of its own: its table, and its record."""
-    own = TEXTURES[recipe.texture]
-    settings = dataclasses.replace(own.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic)
-    own = dataclasses.replace(own, settings=settings)
+    """Train as a texture alone, with a separate checkpoint; return the table and the run's record."""
+    texture = TEXTURES[recipe.texture]
+    settings = dataclasses.replace(
+        texture.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic
+    )
+    texture = dataclasses.replace(texture, settings=settings)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(request.options)
-    asked = asked_bytes(options, source)
-    size = texture_fit.size_of(source, pyramid, asked, own, options)
-    if size.nbytes > MAX_BYTES:
-        raise UsageError(f"the arrays would take {size.nbytes:,} bytes, allowed are {MAX_BYTES:,}")
+    size = texture_fit.size_of(source, pyramid, requested_bytes(options, source), texture, options)
     checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
     first = dataclasses.replace(
         request, preset=recipe.texture, checkpoint=checkpoint, options=options,
         resume=request.resume and os.path.exists(checkpoint or ""),
         seconds=None if request.seconds is None else request.seconds / 2,
     )  # fmt: skip
-    return textures.fit_texture(source, size, own, first, pyramid)
+    return textures.fit_texture(source, size, texture, first, pyramid)
