@@ -1,11 +1,11 @@
 """
-Write the tables of the documentation: ``tasks.md`` from what tasks declare, and in the other pages what stands between
-``<!-- table NAME -->`` and ``<!-- end -->`` from the JSON in ``docs/measured/``.
+Write the tables of the documentation.
 
     python docs/make_tables.py [--check]
 
-Each file of ``docs/measured/`` was written by ``mi-diffind … --json docs/measured/NAME.json``; the commands are in the
-pages. With ``--check`` nothing is written; exit code 1 if a page is not as it would be written.
+``tasks.md`` is made from the declarations of tasks. In the other pages, the text between ``<!-- table NAME -->`` and
+``<!-- end -->`` is made from JSON in ``docs/measured/``, which ``mi-diffind … --json docs/measured/NAME.json`` wrote;
+the pages show the commands. With ``--check`` nothing is written, and the exit code is 1 if a page would change.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ DOCS = Path(__file__).resolve().parent
 
 
 def measured(name: str) -> dict:
-    """What a command wrote."""
+    """Return the JSON that a command wrote."""
     return json.loads((DOCS / "measured" / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def table(head: list[str], rows: list[list]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
 def page_of_tasks() -> str:
-    """All tasks: presets, and the files that ship."""
+    """Return the page of all tasks: their presets, and the files that ship."""
     parts = [
         "# All tasks\n\nMade from the declarations of the tasks by `python docs/make_tables.py`: "
         "change those, not this page.\n"
@@ -49,11 +49,11 @@ def page_of_tasks() -> str:
         if task.shipped:
             rows = []
             for preset in task.shipped:
-                found = task.load(task.file(preset=preset))
+                shipped = task.load(task.file(preset=preset))
                 rows.append([
-                    f"`{found.path.name}`", f"`{preset}`", f"{found.nbytes:,}",
-                    f"{found.measured['psnr_db']:.1f}",
-                    f"`mi-diffind fit {task.name} --preset {preset} -o {found.path.name}`",
+                    f"`{shipped.path.name}`", f"`{preset}`", f"{shipped.nbytes:,}",
+                    f"{shipped.measured['psnr_db']:.1f}",
+                    f"`mi-diffind fit {task.name} --preset {preset} -o {shipped.path.name}`",
                 ])  # fmt: skip
             parts.append(table(["file that ships", "preset", "bytes of entries", "PSNR, dB", "made by"], rows) + "\n")
         if task.arguments:
@@ -65,7 +65,7 @@ def page_of_tasks() -> str:
 
 
 def disney_forms() -> str:
-    """Accuracy, bytes and time of each form of the Disney BRDF."""
+    """Return accuracy, bytes and time of each form of the Disney BRDF."""
     study = measured("tradeoff_disney")
     timings = {name: case["queries"]["eval"] for name, case in study["cases"].items()}
     cases = [name for name in ("constant, all lobes", "constant, diffuse + specular") if name in timings]
@@ -82,7 +82,7 @@ def disney_forms() -> str:
 
 
 def comparisons() -> str:
-    """What ``compare`` found for the scenes."""
+    """Return errors and time ratios of the scenes by ``compare``."""
     rows = []
     for path in sorted((DOCS / "measured").glob("compare_*.json")):
         f = measured(path.stem)
@@ -95,23 +95,42 @@ def comparisons() -> str:
 
 
 def image_pages() -> str:
-    """Images and materials as one grid and as pages, in equal bytes and seconds."""
+    """Return PSNR of images and materials as one grid and as pages, in equal bytes and seconds."""
     rows = []
     for source in ("boombox", "tiles", "wood_color", "vase_color", "hammered_normal"):
-        grid, pages = (measured(f"fit_image_{source}_{kind}") for kind in ("grid", "auto"))
+        grid, pages = (measured(f"fit_image_{source}_{structure}") for structure in ("grid", "auto"))
         cells = [f"{f['measured']['psnr_db']:.1f} / {f['measured']['psnr_between_db']:.1f}" for f in (grid, pages)]
-        chosen = [f["settings"]["structure"] for f in (grid, pages)]
-        rows.append([source, *(f"{c} ({n})" for c, n in zip(cells, chosen, strict=True))])
+        structures = [f["settings"]["structure"] for f in (grid, pages)]
+        rows.append([source, *(f"{c} ({n})" for c, n in zip(cells, structures, strict=True))])
     return table(["source", "one grid, the better of two", "what auto chooses"], rows)
 
 
+def image_bytes() -> str:
+    """Sizes of the sources: raw, as the PNG files of the repository, and compressed."""
+    assets, rows = DOCS.parent / "scenes" / "assets", []
+    for source in ("tiles", "wood_color", "vase_color", "hammered_normal"):
+        fit = measured(f"fit_image_{source}_auto")
+        files = [assets / f"{source}.png"] if source != "tiles" else sorted(assets.glob("tiles_*.png"))
+        sizes = (fit["source_bytes"], sum(f.stat().st_size for f in files), fit["bytes"])
+        rows.append([source, *(f"{n:,}" for n in sizes), f"{sizes[1] / sizes[2]:.1f}x"])
+    return table(["source", "raw bytes", "bytes of the PNG files", "bytes at 12x", "of PNG"], rows)
+
+
+#: Rows of the pages' tables of renders; all others are in the JSON files.
+RENDERS = (
+    "bitmap, 1 spp", "bitmap, 4 spp", "bitmap, 16 spp", "bitmap, 4 spp, multijittered", "bitmap, 16 spp, multijittered",
+    "mipmap, trilinear", "ours 12x, trilinear", "ours 12x, anisotropic, centred", "ASTC 12x, trilinear",
+    "ASTC 12x, anisotropic, centred",
+)  # fmt: skip
+
+
 def texture_renders(study: dict) -> str:
-    """Errors, flicker and times of renders with filtered textures."""
+    """Return errors, flicker and times of renders with filtered textures."""
     stages, base, steady = list(study["details"]["counted"]), "bitmap, 1 spp", "bitmap, 4 spp"
     flicker = study["candidates"][steady]["errors"]["flicker_error"]
     rows = []
     for name, c in study["candidates"].items():
-        if "flicker" not in c["errors"]:
+        if "flicker" not in c["errors"] or name not in RENDERS:
             continue
         e = c["errors"]
         times = [study["cases"][s]["ratios"]["render"].get(f"{name} / {base}", {"median": 1})["median"] for s in stages]
@@ -124,36 +143,36 @@ def texture_renders(study: dict) -> str:
 
 
 def texture_factors(study: dict) -> str:
-    """How many times as long a bitmap takes for the same error."""
+    """Return how many times as long a bitmap takes for the same error."""
     from mi_diffind.studies.texture.conclusions import speed
 
     stages, rows = [s for s, c in study["cases"].items() if c["in_picture"]], []
     for name, c in study["candidates"].items():
-        if c["representation"].startswith("bitmap") or not c["errors"]:
+        if c["representation"].startswith("bitmap") or not c["errors"] or name not in RENDERS:
             continue
         cells = []
         for stage in stages:
-            found = [speed(study, stage, name, against) for against in ("bitmap", "bitmap, multijittered")]
-            cells.append(" / ".join(f"{'> ' * more}{value:.1f}" for value, more in found))
+            speeds = [speed(study, stage, name, against) for against in ("bitmap", "bitmap, multijittered")]
+            cells.append(" / ".join(f"{'> ' * more}{value:.1f}" for value, more in speeds))
         rows.append([f"`{name}`", *cells])
     return table(["", *(f"{s}: independent / multijittered" for s in stages)], rows)
 
 
 def texture_levels(study: dict) -> str:
-    """PSNR of each level of detail."""
+    """Return PSNR of each level of detail."""
     from mi_diffind.studies.texture.conclusions import levels
 
-    found = levels(study)
-    count = max(len(v["all"]) for v in found.values())
+    by_name = levels(study)
+    count = max(len(v["all"]) for v in by_name.values())
     rows = [
         [name, f"{study['jobs'][name]['details']['ratio']:.1f}x", *(f"{v:.1f}" for v in values["all"])]
-        for name, values in found.items()
+        for name, values in by_name.items()
     ]
     return table(["", "ratio", *(f"L{i}" for i in range(count))], rows)
 
 
 def texture_presets() -> str:
-    """Our preset and the paper's, trained as long."""
+    """Return PSNR of our preset and of the paper's, trained as long."""
     rows = []
     for source in ("boombox", "boombox_albedo"):
         for preset in ("ours", "paper"):
@@ -168,68 +187,69 @@ def texture_presets() -> str:
 
 
 def texture_memory() -> str:
-    """Resident memory of a scene with many textures."""
-    found = measured("texture_memory")
+    """Return the resident memory of a scene with many textures."""
+    memory = measured("texture_memory")
     rows = [
         [f"`{name}`", f"{row['bytes'] / 2**20:.1f}", f"{row['times_less']:.1f}"]
-        for name, row in found["textures"].items()
+        for name, row in memory["textures"].items()
     ]
-    return table([f"{found['count']} textures of {found['side']}²", "MiB", "times less"], rows)
+    return table([f"{memory['count']} textures of {memory['side']}²", "MiB", "times less"], rows)
 
 
 def shading_curves(study: str) -> dict:
-    """What the study of shading found, by material."""
+    """Return the results of the study of shading by material."""
     from mi_diffind.studies.shading.conclusions import curves
 
     return curves(measured(study))
 
 
 def shading_filters(study: str) -> str:
-    """Trained for the shading beside filters that are not learned, and a texture that is not trained for it."""
+    """Return errors of textures trained for shading, beside classical filters and a texture trained for its values."""
     from mi_diffind.studies.shading.conclusions import COMBINED, PLAIN
 
     rows = []
-    for name, own in shading_curves(study).items():
-        kinds = [(f"{label}, uncompressed", [own.classical[label]]) for label in ("filtered", *PLAIN, *COMBINED)
-                 if label in own.classical]  # fmt: skip
-        kinds += [(label, [details]) for label, details in own.compressed.items()]
-        way, best = own.best()
-        kinds += [("texture, λ = 0", own.runs[way, 0.0]), (f"trained, λ = {best:g}", own.runs[way, best])]
-        for label, found in kinds:
-            cells = [f"{mean(d['C']['mean_db'] for d in found):.2f}", f"{mean(d['C']['coarse_db'] for d in found):.2f}"]
-            cells += [f"{mean(mean(d['C']['flip']) for d in found):.3f}"]
-            cells += [f"{mean(d['C']['psnr_db'][level] for d in found):.1f}" for level in range(6)]
-            cells += [f"{mean(d['P']['mean_db'] for d in found):.2f}"]
+    for name, material in shading_curves(study).items():
+        methods = [(f"{label}, uncompressed", [material.classical[label]]) for label in ("filtered", *PLAIN, *COMBINED)
+                 if label in material.classical]  # fmt: skip
+        methods += [(label, [details]) for label, details in material.compressed.items()]
+        way, best = material.best()
+        methods += [("texture, λ = 0", material.runs[way, 0.0]), (f"trained, λ = {best:g}", material.runs[way, best])]
+        for label, runs in methods:
+            cells = [f"{mean(d['C']['mean_db'] for d in runs):.2f}", f"{mean(d['C']['coarse_db'] for d in runs):.2f}"]
+            cells += [f"{mean(mean(d['C']['flip']) for d in runs):.3f}"]
+            cells += [f"{mean(d['C']['psnr_db'][level] for d in runs):.1f}" for level in range(6)]
+            cells += [f"{mean(d['P']['mean_db'] for d in runs):.2f}"]
             rows.append([name, label, *cells])
     head = ["material", "", "C, dB", "C, L2 on", "FLIP", *(f"L{i}" for i in range(6)), "P, dB"]
     return table(head, rows)
 
 
 def shading_shares(study: str) -> str:
-    """The paper's figure 2: quality by λ, with the spread over seeds."""
+    """Return the paper's figure 2 as a table: quality by λ, with the spread over seeds."""
     rows = []
-    for name, own in shading_curves(study).items():
-        for way in own.remedies:
+    for name, material in shading_curves(study).items():
+        for way in material.remedies:
             for letter in "CP":
                 cells = []
-                for share in own.shares(way):
-                    values = own.values(way, share, letter)
+                for share in material.shares(way):
+                    values = material.values(way, share, letter)
                     spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
                     cells.append(f"{mean(values):.2f}{spread}")
                 rows.append([name, way, letter, *cells])
-    shares = max((own.shares(way) for own in shading_curves(study).values() for way in own.remedies), key=len)
+    curves = shading_curves(study).values()
+    shares = max((material.shares(way) for material in curves for way in material.remedies), key=len)
     return table(["material", "", "", *(f"λ {share:g}" for share in shares)], rows)
 
 
 def sdf_errors(study: str) -> str:
-    """Distance fields in equal bytes: IoU, IoU near the surface, normals."""
+    """Return errors of distance fields in equal bytes: IoU, IoU near the surface, normals."""
     from mi_diffind.studies.equal_memory import candidates_by_budget
     from mi_diffind.studies.sdf.conclusions import size_text
 
     sizes = candidates_by_budget(measured(study))
     rows: dict[str, dict[int, str]] = {}
-    for size, made in sizes.items():
-        for c in made.values():
+    for size, candidates in sizes.items():
+        for c in candidates.values():
             e = c["errors"]
             cell = f"{e['iou']:.4f} / {e['iou_near']:.4f} / {e['normal_deg']:.2f}°"
             rows.setdefault(c["label"], {})[size] = cell
@@ -237,7 +257,7 @@ def sdf_errors(study: str) -> str:
 
 
 def sdf_times(study: str) -> str:
-    """Distance fields of one size: seconds until there is one, reads, rays, renders."""
+    """Return times of distance fields of one size: seconds of the fit, reads, rays, renders."""
     result = measured(study)
     reads, rays = (result["cases"][case] for case in ("reads", "rays"))
     rows = []
@@ -253,7 +273,7 @@ def sdf_times(study: str) -> str:
 
 
 def sdf_parts(study: str) -> str:
-    """What the parts of our distance fields are worth, in equal bytes."""
+    """Return errors of distance fields with parts of ours left out or changed, in equal bytes."""
     rows = []
     for c in measured(study)["candidates"].values():
         e = c["errors"]
@@ -265,14 +285,14 @@ def sdf_parts(study: str) -> str:
 
 
 def sdf_rays() -> str:
-    """Rays through the arrays of distance fields, and through ``sdfgrid``, beside Embree."""
+    """Return times of rays through the arrays of distance fields and through ``sdfgrid``, beside Embree."""
     rows = []
     for file in measured("bench_sdf")["files"]:
-        for kind in ("primary", "random"):
-            mesh, *others = (row for row in file["rows"] if row["rays"] == kind)
+        for rays in ("primary", "random"):
+            mesh, *others = (row for row in file["rows"] if row["rays"] == rays)
             arrays = others.pop()
             rows.append([
-                f"{file['name']}, {file['triangles']:,} triangles", kind, f"{mesh['ns']:.0f}", f"{arrays['ratio']:.1f}",
+                f"{file['name']}, {file['triangles']:,} triangles", rays, f"{mesh['ns']:.0f}", f"{arrays['ratio']:.1f}",
                 *(f"{row['ratio']:.1f}" for row in others), f"{100 * arrays['hits_differ']:.3f}%",
             ])  # fmt: skip
     times = (f"{row['name']}, times that" for row in (arrays, *others))
@@ -280,14 +300,14 @@ def sdf_rays() -> str:
 
 
 def field_errors(study: str) -> str:
-    """Radiance fields, by how many times smaller than a dense grid: PSNR before white, and of the foreground."""
+    """Return PSNR of radiance fields by how many times smaller than a dense grid they are."""
     from mi_diffind.studies.equal_memory import candidates_by_budget
     from mi_diffind.studies.radiance.conclusions import ratio_text, references
 
     result = measured(study)
     rows = []
-    for found in (references(result), *candidates_by_budget(result).values()):
-        for c in found.values():
+    for candidates in (references(result), *candidates_by_budget(result).values()):
+        for c in candidates.values():
             e, d = c["errors"], c["details"]
             rows.append([
                 c["label"], ratio_text(d["asked"]) if d.get("asked") else "", f"{d['memory_bytes'] / 1e6:.2f}",
@@ -297,7 +317,7 @@ def field_errors(study: str) -> str:
 
 
 def field_times(study: str) -> str:
-    """Radiance fields of one size: seconds of training, a sample, a picture."""
+    """Return times of radiance fields of one size: seconds of training, a sample, a picture."""
     result = measured(study)
     reads = result["cases"]["reads"]
     both, passes = reads["queries"]["both"], next(iter(reads["passes"].values()), {})
@@ -312,7 +332,7 @@ def field_times(study: str) -> str:
 
 
 def field_parts() -> str:
-    """What the parts of compressing a radiance field are worth."""
+    """Return errors of radiance fields with parts of the compression left out."""
     rows = [
         [
             row["name"], f"{row['bytes'] / 1e6:.2f}" if "bytes" in row else "", f"{row['psnr_white_db']:.2f}",
@@ -324,30 +344,32 @@ def field_parts() -> str:
 
 
 def field_captures() -> str:
-    """Three captures: the grid, and what it was compressed to."""
+    """Return errors and bytes of three captures, as a grid and compressed."""
     rows = []
-    for name, what in (
+    for name, content in (
         ("group", "Suzanne, a painted vase, a knot, a pear"), ("thin", "a plant in a globe of wires"),
         ("glossy", "clear-coated, golden, steel and plastic things"),
     ):  # fmt: skip
-        grid, own = measured(f"inspect_field_{name}_grid"), measured(f"inspect_field_{name}")
+        grid, compressed = measured(f"inspect_field_{name}_grid"), measured(f"inspect_field_{name}")
         figures = [
-            f"{f['measured']['psnr_white_db']:.2f} / {f['measured']['psnr_foreground_db']:.2f}" for f in (grid, own)
+            f"{f['measured']['psnr_white_db']:.2f} / {f['measured']['psnr_foreground_db']:.2f}"
+            for f in (grid, compressed)
         ]
         sizes = [
-            f"{own[key] / 1e6:.2f} ({own['dense_bytes'] / own[key]:.0f}x)" for key in ("memory_bytes", "file_bytes")
-        ]  # fmt: skip
-        rows.append([f"{name}: {what}", *figures, *sizes])
+            f"{nbytes / 1e6:.2f} ({compressed['dense_bytes'] / nbytes:.0f}x)"
+            for nbytes in (compressed["memory_bytes"], compressed["file_bytes"])
+        ]
+        rows.append([f"{name}: {content}", *figures, *sizes])
     return table(["", "grid, dB", "compressed, dB", "MB in memory", "MB on disk"], rows)
 
 
 def mean(values) -> float:
-    """The mean of an iterable."""
+    """Return the mean of an iterable."""
     values = list(values)
     return sum(values) / len(values)
 
 
-TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_pages, texture_memory, texture_presets)}
+TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_bytes, image_pages, texture_memory, texture_presets)}
 for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
@@ -368,7 +390,7 @@ for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boo
 
 
 def written() -> dict[Path, str]:
-    """Page → its text."""
+    """Return the text of each page by its path."""
     pages = {DOCS / "tasks.md": page_of_tasks()}
     for path in sorted(DOCS.glob("*.md")):
         text = pages.get(path) or path.read_text(encoding="utf-8")
@@ -379,10 +401,10 @@ def written() -> dict[Path, str]:
 
 
 def main(check: bool) -> int:
-    """Write the pages that differ, or with ``check`` name them; returns the exit code."""
+    """Write the pages that differ, or with ``check`` name them; return the exit code."""
     differing = [p for p, text in written().items() if not p.is_file() or p.read_text(encoding="utf-8") != text]
     for path in differing:
-        print(f"{path.name}: {'is not as it would be written' if check else 'written'} ({mi_diffind.__version__})")
+        print(f"{path.name}: {'would change' if check else 'written'} ({mi_diffind.__version__})")
         if not check:
             path.write_text(written()[path], encoding="utf-8")
     return int(check and bool(differing))

@@ -1,3 +1,5 @@
+"""Plugin ``neural_field``: an integrator that renders radiance fields among surfaces."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 from dataclasses import dataclass
@@ -16,19 +18,18 @@ from .path_footprint import relative
 from .support import properties
 from .support import solids as sdf
 from .support.differentials import Differentials
-from .support.field_grids import to_grid
-from .support.fields import Light, PlacedField
+from .support.placed_fields import PlacedField, VariantLight, to_grid
 
-#: What the default inner integrator takes of the properties.
+#: Properties that the default integrator of surfaces takes.
 INNER = ("max_depth", "rr_depth", "hide_emitters", "jitter")
 
-#: Channels that may be asked for.
+#: Allowed names of further channels.
 AOVS = ("depth", "opacity")
 
-#: How many fields there may be: each may be met at each place of a sequence.
+#: Largest number of nested fields; a kernel contains each field at each place of the order along a ray.
 MOST = 4
 
-#: How many smooth surfaces a ray is followed across, by default.
+#: Default number of smooth surfaces that a ray is followed across.
 SMOOTH = 8
 
 MANUAL = r"""
@@ -46,67 +47,66 @@ Radiance field among surfaces (:monosp:`neural_field`)
 
  * - to_world
    - |transform|
-   - From the place and size of the capture to the world: rotations, uniform scales and translations; reflections, too.
+   - Transform from the frame of the capture to the world: rotations, uniform scales, translations and reflections.
      (Default: none)
    - --
 
  * - (nested plugin)
    - |integrator|
-   - For the surfaces: any that follows rays from a camera. (Default: :monosp:`path_footprint`, with the
+   - Integrator of the surfaces: any that follows rays from a camera. (Default: :monosp:`path_footprint`, with the
      ``max_depth``, ``rr_depth``, ``hide_emitters`` and ``jitter`` given here)
    - --
 
  * - smooth_depth
    - |int|
-   - How many smooth mirrors and panes a ray is followed across to meet the field, 0 to 64. (Default: 8)
+   - Number of smooth mirrors and panes that a ray is followed across to meet the field, 0 to 64. (Default: 8)
    - --
 
  * - aovs
    - |string|
-   - More channels of the film, separated by commas: ``opacity``, that of the field before the first surface;
-     ``depth``, the distance to field and first surface, each times its share of what is seen. Where emitters are
-     hidden, ``depth`` divided by alpha is the mean distance. (Default: none)
+   - Further channels of the film, separated by commas. ``opacity`` is that of the field before the first surface.
+     ``depth`` is the distance to field and first surface, each times its weight in the pixel. If emitters are hidden,
+     ``depth`` divided by alpha is the mean distance. (Default: none)
    - --
 
  * - storage
    - |string|
-   - ``uint8``, as in the file; ``float32``, which can be optimised. (Default: ``uint8``)
+   - ``uint8``: the form of the file. ``float32``: arrays that can be optimised. (Default: ``uint8``)
    - --
 
  * - tables.*
    - |tensor|
-   - The arrays of the field; with ``storage`` ``float32`` they can be optimised.
+   - Arrays of the field, with ``storage`` ``float32``: ``density`` and ``colour`` (paper: ``density_primary``, …).
    - |exposed|, |differentiable|
 
 A captured radiance field (Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH
-Asia 2023, task 7) among ordinary surfaces. Each camera ray is marched through the field up to the first surface; what
-the field emits is added up from front to back, and the radiance of the inner integrator is added, times the
-transmittance that is left. A ray that the field makes opaque (a transmittance below :math:`10^{-4}`) never sees a
-surface, one that misses the field's box is the inner integrator's alone. On the film, alpha is one minus the
-transmittance where there is nothing behind.
+Asia 2023, task 7) among ordinary surfaces. Each camera ray is marched through the field up to the first surface. The
+emission of the field is summed from front to back; the radiance of the inner integrator is added, times the remaining
+transmittance. A ray that becomes opaque in the field (a transmittance below :math:`10^{-4}`) sees no surface. A ray
+that misses the box of the field shows the inner integrator alone. Where there is no surface behind the field, alpha on
+the film is one minus the transmittance.
 
 **Mirrors and glass.** Rays are followed across surfaces that are smooth throughout (:monosp:`conductor`,
 :monosp:`dielectric`, :monosp:`thindielectric`, :monosp:`null`, no medium inside), and marched through the field between
-them. Other surfaces, those with a smooth lobe and another one among them
-(:monosp:`plastic`, :monosp:`mask`), are the inner integrator's, to which there is no field: it is not seen in
-them and through them, casts no light and no shadow, and is not seen in rough mirrors. Paths of a limited ``max_depth``
-may be longer by the smooth surfaces before. Participating media count as being behind the field. Footprints go with the
-rays, over mirrors, too.
+them. All other surfaces, including those with a smooth lobe and another lobe (:monosp:`plastic`, :monosp:`mask`), are
+rendered by the inner integrator, which does not see the field: the field is not visible in or through them, casts no
+light and no shadow, and is not visible in rough mirrors. Paths of a limited ``max_depth`` may be longer by the smooth
+surfaces before. Participating media count as being behind the field. Rays keep their footprints across mirrors.
 
-**Spectral variants** take radiance for that of an emitter of this colour: upsampled, times D65. ``mono`` takes the
-luminance. Not for polarised variants.
+**Spectral variants** treat the radiance as that of an emitter of this colour: upsampled, times D65. ``mono`` variants
+take the luminance. Polarised variants are not supported.
 
-**Several fields** are nested in one another, the integrator for surfaces in the last; ``smooth_depth`` and ``aovs`` are
-those of the outermost. Up to four, the boxes of which may not overlap.
+**Several fields**, up to four, are nested in one another, with the integrator of surfaces in the innermost;
+``smooth_depth`` and ``aovs`` are those of the outermost. Their boxes may not overlap.
 
 **Derivatives** with respect to the field's arrays replay the rays (Vicini et al., *Path Replay Backpropagation*,
-SIGGRAPH 2021), of the radiance, of alpha and of the channels of ``aovs``. An inner integrator that replays paths, too
-(:monosp:`path_footprint`, :monosp:`path_sdf`, :monosp:`prb`, …) adds those of materials, textures and emitters; any
-other one is a constant, and so is the geometry.
+SIGGRAPH 2021). They cover the radiance, alpha and the channels of ``aovs``. If the inner integrator replays paths, too
+(:monosp:`path_footprint`, :monosp:`path_sdf`, :monosp:`prb`, …), it adds the derivatives of materials, textures and
+emitters; any other inner integrator is constant, and so is the geometry.
 
-Mitsuba's own base classes write an alpha of 0 or 1 and fail with AOVs in the backward pass, because they multiply AOVs,
-which are numbers, by the ray's weight, which is a spectrum. This integrator has passes of its own. Within another
-integrator, such as :monosp:`aov`, alpha is 0 or 1.
+The base classes of Mitsuba write an alpha of 0 or 1, and they fail with AOVs in the backward pass, since they multiply
+AOVs, which are numbers, by the weight of the ray, which is a spectrum. This integrator has render passes of its
+own. Inside another integrator, such as :monosp:`aov`, alpha is 0 or 1.
 
 .. tabs::
     .. code-tab:: xml
@@ -128,15 +128,16 @@ integrator, such as :monosp:`aov`, alpha is 0 or 1.
 
 
 @dataclass  # which is what loops of Dr.Jit take for state
-class Followed:
+class FollowedRays:
     """
-    Rays of a wavefront on their way: ``ray``, whether it goes on (``active``) or has ended where the inner integrator
-    takes over (``handed``), its ``throughput``, the product of the transmittances as long as nothing but them changed
-    it (``clear``), whether it has been ``turned`` by a surface, of how many smooth ones there were (``count``).
-    ``light`` and ``depth``: what was seen so far; in the differential phases, what is still to come, and ``opacity`` is
-    the whole there. ``change``: the derivative of ``light``;
-    ``change_clear``: that of ``clear``, over ``clear``; and those of the further channels. ``differentials``: those of
-    the rays, where textures ask for footprints.
+    State of the rays of a wavefront while they are followed.
+
+    ``active`` rays continue; ``handed`` rays have ended where the inner integrator takes over. ``clear`` is the product
+    of the transmittances up to the first surface that changed the ray, ``turned`` tells whether one did, and ``count``
+    is the number of smooth surfaces. ``light`` and ``depth`` are sums so far; in the differential phases they are the
+    parts still to come, and ``opacity`` is the total. ``change`` is the derivative of ``light``, ``change_clear`` that
+    of ``clear`` divided by ``clear``, followed by those of the further channels. ``differentials`` are those of the
+    rays, if textures need footprints.
     """
 
     ray: mi.Ray3f
@@ -157,18 +158,18 @@ class Followed:
 
 
 def carries(ray) -> bool:
-    """Does it carry differentials, for textures that ask for footprints?"""
+    """Return whether a ray carries differentials, for textures that need footprints."""
     return bool(getattr(ray, "has_differentials", False))
 
 
 def is_smooth(bsdf):
-    """Is it a mirror or a pane, and nothing else, wherever it is?"""
+    """Return whether all lobes of a BSDF are those of a mirror or a pane, everywhere."""
     flags = bsdf.flags()
     return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
 
 
 def has_smooth(scene: mi.Scene) -> bool:
-    """Is there a surface in the scene across which rays are followed? One that is instanced counts in any case."""
+    """Return whether the scene has a smooth surface that rays are followed across; an instance counts as one."""
     for shape in scene.shapes():
         bsdf = shape.bsdf()
         if compat.is_instance(shape):
@@ -180,8 +181,9 @@ def has_smooth(scene: mi.Scene) -> bool:
 
 def in_order(fields: list, entered: list) -> list:
     """
-    The fields, in the order in which rays enter them, with the rays that enter one at this place: ``entered`` holds the
-    distance to each, and whether it is crossed.
+    Return pairs of a field and the rays that enter it at this place of the order along a ray.
+
+    ``entered`` holds, for each of ``fields``, the distance at which rays enter it and whether they do.
     """
     if len(fields) == 1:
         return [(fields[0], entered[0][1])]
@@ -192,38 +194,38 @@ def in_order(fields: list, entered: list) -> list:
             if j != i:
                 rank += dr.select(crossed & ((other < near) | ((other == near) & (j < i))), mi.UInt32(1), 0)
         ranks.append(rank)
-    found = []
+    pairs = []
     for place in range(len(fields)):
-        found += [(field, entered[i][1] & (ranks[i] == place)) for i, field in enumerate(fields)]
-    return found
+        pairs += [(field, entered[i][1] & (ranks[i] == place)) for i, field in enumerate(fields)]
+    return pairs
 
 
 def named(integrator) -> str:
-    """The name of an integrator's class, in Python or C++."""
+    """Return the name of an integrator's class, in Python or C++."""
     return type(integrator).__name__ if compat.written_in_python(integrator) else integrator.class_name()
 
 
 def with_holes(scene: mi.Scene) -> list[str]:
-    """Names of shapes whose material is a surface in part and nothing in part, as a ``mask`` makes it."""
-    found = []
+    """Return the names of shapes whose material has holes, such as a ``mask``."""
+    names = []
     for shape in scene.shapes():
         bsdf = shape.bsdf()
         if bsdf is not None:
             flags = bsdf.flags()
             if mi.has_flag(flags, mi.BSDFFlags.Null) and mi.has_flag(flags, mi.BSDFFlags.Smooth):
-                found.append(shape.id())
-    return found
+                names.append(shape.id())
+    return names
 
 
 @cache
 def integrator() -> type:
-    """The class, in the variant that is set."""
+    """Return the class of the plugin in the current variant."""
 
     class NeuralField(compat.replay_integrator()):
         __doc__ = MANUAL
 
         def __init__(self, props: mi.Properties, field=None):
-            """``field``, a ``VolumeField``, takes the place of a file's."""
+            """Create the integrator; ``field``, a ``VolumeField``, replaces that of a file."""
             if mi.is_polarized:
                 raise RuntimeError("neural_field: does not run in polarised variants")
             super().__init__(props)
@@ -233,13 +235,13 @@ def integrator() -> type:
                 raise RuntimeError(
                     f'parameter "smooth_depth": found {self.smooth_depth}, allowed are whole numbers from 0 to 64'
                 )
-            self.aovs = self._asked(str(props.get("aovs", "")))
+            self.aovs = self._channels(str(props.get("aovs", "")))
             self.model = None
             if field is None:
                 self.model = open_model(props)
                 field = self.model.field
             self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
-            self.light = Light()
+            self.light = VariantLight()
             self.held = self.placed.held()
             self.fields = [self.placed]
             if isinstance(self.nested, NeuralField):
@@ -249,38 +251,40 @@ def integrator() -> type:
                 raise RuntimeError(f"found {len(self.fields)} nested fields, allowed are {MOST}")
             for other in self.fields[1:]:
                 if self.placed.overlaps(other):
-                    raise RuntimeError("the boxes of two fields overlap, where their order along a ray is not known")
+                    raise RuntimeError(
+                        "the boxes of two nested fields overlap, allowed are boxes without a common volume"
+                    )
             self._warned = False
             self._shapes = {name: tuple(values.shape) for name, values in self.placed.exposed.items()}
 
         @staticmethod
         def _inner(props: mi.Properties):
-            """The integrator of surfaces. Raises ``RuntimeError`` if it cannot be one."""
+            """Return the integrator of surfaces. Raises ``RuntimeError`` if the nested one is not suitable."""
             given = [child for _, child in props.objects() if isinstance(child, mi.Integrator)]
-            own = [name for name in INNER if name in props]
+            parameters = [name for name in INNER if name in props]
             if not given:
                 inner = mi.Properties("path_footprint")
-                for name in own:
+                for name in parameters:
                     inner[name] = props[name]
                 return path_footprint()(inner)
             if len(given) > 1:
                 raise RuntimeError(f"found {len(given)} nested integrators, allowed is one, for the surfaces")
-            if own:
-                raise RuntimeError(f'parameter "{own[0]}": belongs to the nested integrator')
-            found = given[0]
-            if not isinstance(found, mi.SamplingIntegrator):
+            if parameters:
+                raise RuntimeError(f'parameter "{parameters[0]}": belongs to the nested integrator')
+            inner = given[0]
+            if not isinstance(inner, mi.SamplingIntegrator):
                 raise RuntimeError(
-                    f"the nested integrator {named(found)}: does not follow rays from a camera, as path does"
+                    f"the nested integrator {named(inner)}: does not follow rays from a camera, as path does"
                 )
-            if found.aov_names():
+            if inner.aov_names():
                 raise RuntimeError(
-                    f"the nested integrator {named(found)}: has AOVs of its own, which are not passed on; put "
-                    f"neural_field into it"
+                    f"the nested integrator {named(inner)}: has AOVs of its own, which are not passed on; nest "
+                    f"neural_field in it instead"
                 )
-            return found
+            return inner
 
         @staticmethod
-        def _asked(text: str) -> list[str]:
+        def _channels(text: str) -> list[str]:
             names = [name.strip() for name in text.split(",") if name.strip()]
             for name in names:
                 if name not in AOVS or names.count(name) > 1:
@@ -296,23 +300,23 @@ def integrator() -> type:
 
         def parameters_changed(self, keys=()) -> None:
             for name, values in self.placed.exposed.items():
-                found, expected = tuple(values.shape), self._shapes[name]
-                if found != expected:
-                    raise RuntimeError(f'parameter "tables.{name}": has the shape {found}, expected {expected}')
+                shape, expected = tuple(values.shape), self._shapes[name]
+                if shape != expected:
+                    raise RuntimeError(f'parameter "tables.{name}": has the shape {shape}, expected {expected}')
 
         def aov_names(self) -> list[str]:
             return list(self.aovs)
 
         def report(self) -> dict:
             field = self.placed.field
-            said = {"voxel": field.voxel * self.placed.placement.size, "surfaces": named(self.surfaces)}
+            report = {"voxel": field.voxel * self.placed.placement.size, "surfaces": named(self.surfaces)}
             if self.model is None:
-                return said
+                return report
             return {
                 "preset": self.model.table.preset,
                 "storage": self.model.storage,
                 "table_bytes": self.model.nbytes,
-                **said,
+                **report,
             }
 
         def to_string(self) -> str:
@@ -324,7 +328,7 @@ def integrator() -> type:
             )
 
         def counts(self, scene, sensor=0) -> dict:
-            """What the camera's rays, one through each pixel, read of the field (:class:`.counting.Counts`)."""
+            """Return the counts (:class:`.march.RayCounts`) of camera rays, one for each pixel."""
             with dr.suspend_grad():
                 _, _, _, ray, _, _ = self._begin(scene, sensor, 0, 1)
                 pi = scene.ray_intersect_preliminary(ray, coherent=True, active=True)
@@ -333,7 +337,7 @@ def integrator() -> type:
         # -- the film ---------------------------------------------------------------------------------------------
 
         def sample_rays(self, scene, sensor, sampler):
-            """As the inner integrator does."""
+            """Sample camera rays as the inner integrator does."""
             if compat.written_in_python(self.surfaces):
                 return self.surfaces.sample_rays(scene, sensor, sampler)
             return super().sample_rays(scene, sensor, sampler)
@@ -343,7 +347,7 @@ def integrator() -> type:
                 self._warned = True
                 holes = with_holes(scene)
                 if holes:
-                    warn(f'neural_field: no field is seen through the holes of "{holes[0]}"')
+                    warn(f'neural_field: the field is not visible through the holes of "{holes[0]}"')
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
             ray, weight, place = self.sample_rays(scene, sensor, sampler)
@@ -351,7 +355,7 @@ def integrator() -> type:
 
         @staticmethod
         def _developed(film, spp, place, light, alpha, aovs, wavelengths):
-            """The image of these samples. AOVs are no light: the weight of a ray has nothing to do with them."""
+            """Return the image of samples. The weight of a ray applies to its light, not to its AOVs."""
             block = film.create_block()
             block.set_coalesce(block.coalesce() and spp >= 4)
             compat.splat(block, film, place, light, alpha, aovs, wavelengths)
@@ -360,7 +364,7 @@ def integrator() -> type:
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             if not develop:
-                raise RuntimeError("neural_field: renders with develop=True only")
+                raise RuntimeError("neural_field: found develop=False, allowed is develop=True")
             with dr.suspend_grad():
                 film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
                 light, alpha, aovs, _ = self.primal(scene, sampler, ray)
@@ -378,7 +382,7 @@ def integrator() -> type:
             with dr.suspend_grad():
                 film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
                 surfaces = self._surfaces_optimised(scene)
-                # What reaches the film is linear in these, so that their values do not matter
+                # The film is linear in light, alpha and channels, so that their values do not matter
                 with dr.resume_grad():
                     count = dr.width(ray)
                     light, alpha = dr.full(mi.Spectrum, 1, count), dr.full(mi.Float, 1, count)
@@ -395,17 +399,19 @@ def integrator() -> type:
                 dr.eval()
 
         def _surfaces_optimised(self, scene) -> bool:
-            """Is a derivative with respect to anything but the field asked for?"""
-            own = {compat.identity(values) for placed in self.fields for values in placed.exposed.values()}
+            """Return whether a derivative with respect to another parameter than the fields' arrays is requested."""
+            field_arrays = {compat.identity(values) for placed in self.fields for values in placed.exposed.values()}
             params = mi.traverse(scene)
             values = [params[key] for key in params.keys()]
             attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
-            return any(compat.identity(v) not in own for v in attached)
+            return any(compat.identity(v) not in field_arrays for v in attached)
 
         def sample(self, mode, scene, sampler, ray, δL=None, δaovs=None, state_in=None, active=True, **kwargs):
-            """See ``ADIntegrator.sample``; for integrators that this one is nested in, which derive nothing."""
+            """Sample as ``ADIntegrator.sample`` does, for an integrator around this one, in the primal mode only."""
             if mode != dr.ADMode.Primal:
-                raise RuntimeError("neural_field: has passes of its own for derivatives, and cannot be nested for them")
+                raise RuntimeError(
+                    "neural_field: has no derivatives inside another integrator, make it the outermost one"
+                )
             light, alpha, aovs, state = self.primal(scene, sampler, ray, active)
             return light, alpha > 0, aovs, state
 
@@ -413,8 +419,9 @@ def integrator() -> type:
 
         def primal(self, scene, sampler, ray, active=True) -> tuple:
             """
-            Light, alpha and the further channels of camera rays, and what the differential phases need to know: the
-            light, one minus alpha, depth and opacity, and the state of the inner integrator.
+            Return light, alpha and further channels of camera rays, and the state for the differential phases.
+
+            The state holds light, one minus alpha, depth, opacity and the state of the inner integrator.
             """
             path = self._start(ray, active)
             sampler, path = self._follow(None, scene, sampler, path, None, carries(ray))
@@ -427,15 +434,17 @@ def integrator() -> type:
 
         def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
             """
-            For ``Forward``, the derivatives of light, alpha and channels; for ``Backward``, those with respect to these
-            are given (``adjoint``, the channels as a dictionary), and carried on to the parameters.
+            Run a differential phase.
+
+            ``Forward`` returns the derivatives of light, alpha and channels. ``Backward`` propagates the derivatives
+            with respect to these, ``adjoint`` (channels as a dictionary), to the parameters.
             """
             light, clear, depth, opacity, inner_state = state
             path = self._start(ray, True)
             path.light, path.depth, path.opacity = mi.Spectrum(light), mi.Float(depth), mi.Float(opacity)
             more = dr.zeros(mi.Float), dr.zeros(mi.Float)
             if mode == dr.ADMode.Backward:
-                # Of alpha, that of the logarithm of a transmittance is the same at all of them
+                # All transmittances of a ray have the same derivative of alpha by their logarithm
                 aovs = adjoint[2]
                 path.change = mi.Spectrum(adjoint[0])
                 path.change_clear = mi.Float(-adjoint[1] * clear)
@@ -453,8 +462,8 @@ def integrator() -> type:
             aovs = {"depth": path.change_depth, "opacity": path.change_opacity}
             return change, -clear * path.change_clear, [aovs[name] for name in self.aovs]
 
-        def _start(self, ray, active) -> Followed:
-            path = dr.zeros(Followed)
+        def _start(self, ray, active) -> FollowedRays:
+            path = dr.zeros(FollowedRays)
             path.ray = mi.Ray3f(dr.detach(ray))
             path.active, path.handed, path.turned = mi.Bool(active), mi.Bool(False), mi.Bool(False)
             path.throughput, path.clear = mi.Spectrum(1), mi.Float(1)
@@ -462,13 +471,13 @@ def integrator() -> type:
             return path
 
         def _surfaces(self, mode, scene, sampler, ray, path, δL=None, state=None) -> tuple:
-            """What the inner integrator says of the rays that are handed to it: light, whether it is valid, state."""
+            """Return light, validity and state of the inner integrator for the rays that are handed to it."""
             onward = mi.RayDifferential3f(path.ray)
             onward.has_differentials = carries(ray)
             if onward.has_differentials:
-                found = path.differentials
-                onward.o_x, onward.o_y = onward.o + found.ox, onward.o + found.oy
-                onward.d_x, onward.d_y = onward.d + found.dx, onward.d + found.dy
+                offsets = path.differentials
+                onward.o_x, onward.o_y = onward.o + offsets.ox, onward.o + offsets.oy
+                onward.d_x, onward.d_y = onward.d + offsets.dx, onward.d + offsets.dy
             if not compat.written_in_python(self.surfaces):
                 light, valid, _ = self.surfaces.sample(scene, sampler, onward, None, path.handed)
                 return light, valid, None
@@ -480,8 +489,9 @@ def integrator() -> type:
 
         def _follow(self, mode, scene, sampler, path, surfaces, carried: bool) -> tuple:
             """
-            Rays up to where the inner integrator takes over: the primal phase if there is no ``mode``. One piece is
-            enough where nothing is smooth.
+            Follow rays up to the surfaces at which the inner integrator takes over.
+
+            A ``mode`` of ``None`` is the primal phase. Without smooth surfaces, a single piece is enough.
             """
             solids = sdf.solids_of(scene) if hasattr(self.surfaces, "sample_solids") else []
             if self.smooth_depth == 0 or not has_smooth(scene):
@@ -495,10 +505,11 @@ def integrator() -> type:
                 (sampler, path), lambda _, path: path.active, body, max_iterations=self.smooth_depth + 1, label=label
             )
 
-        def _piece(self, mode, scene, sampler, path, solids, surfaces, onward: bool, carried: bool) -> Followed:
+        def _piece(self, mode, scene, sampler, path, solids, surfaces, onward: bool, carried: bool) -> FollowedRays:
             """
-            A piece of each ray, up to a surface; if ``onward``, beyond it where that is smooth. ``carried``: with
-            differentials.
+            Follow a piece of each ray up to a surface and, if ``onward``, across it where it is smooth.
+
+            ``carried``: the rays have differentials.
             """
             ray, active = path.ray, path.active
             first = path.count == 0
@@ -556,9 +567,9 @@ def integrator() -> type:
             path.ray = dr.select(going, si.spawn_ray(out), ray)
             if carried:
                 edges = compat.normal_edges(pi, si, ray, going)
-                found = path.differentials.at(ray, si)
-                found = found.bounced(ray, si, out, bs.eta, bs.pdf, mi.Bool(True), mi.Float(1), edges)
-                path.differentials = dr.select(going, found, path.differentials)
+                arriving = path.differentials.at(ray, si)
+                leaving = arriving.bounced(ray, si, out, bs.eta, bs.pdf, mi.Bool(True), mi.Float(1), edges)
+                path.differentials = dr.select(going, leaving, path.differentials)
             path.throughput = dr.select(going, passed * beyond, passed)
             path.clear = dr.select(turned, 0, path.clear)
             path.turned |= turned
@@ -568,10 +579,10 @@ def integrator() -> type:
             return path
 
         def _meet(self, scene, solids, ray, active, turned) -> tuple:
-            """What rays meet first, its distance (``maxt`` if nothing), and whether that is a solid of ``path_sdf``."""
+            """Return the first hit of rays, its distance (or ``maxt``), and whether it is a solid of ``path_sdf``."""
             pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
             if self.surfaces.hide_emitters:
-                # As the inner integrator does with what it sees first
+                # The inner integrator hides emitters that a camera ray meets first
                 hidden = active & ~turned & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711  (lane by lane)
                 at = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, hidden)
                 after = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
@@ -585,9 +596,7 @@ def integrator() -> type:
             return pi, met.t, met.which > 0
 
         def _see(self, mode, path, placed, ray, far, crossed, first, before):
-            """
-            What a field adds to a piece, of which ``before`` is transmitted up to there; returns what is, beyond it.
-            """
+            """Add the light of a field behind a transmittance ``before``; return the transmittance behind the field."""
             marched = placed.march(ray, far, crossed)
             through = dr.select(marched.transmittance > OPAQUE, marched.transmittance, 0)
             light = dr.select(crossed, path.throughput * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
@@ -602,9 +611,9 @@ def integrator() -> type:
             return before * through
 
         def _derive(self, mode, path, placed, ray, far, crossed, first, before, marched, through) -> None:
-            """The derivatives of what a field adds to a piece, with what is still to come behind it in ``path``."""
+            """Propagate the derivatives of the light that a field adds; ``path`` holds the light behind the field."""
             inverse = dr.select(through > 0, dr.rcp(through), 0)
-            # Of the logarithm of a transmittance: all that is transmitted
+            # The derivative by the logarithm of a transmittance is all that is transmitted
             behind, clear = dr.select(first, path.depth, 0), dr.select(first, 1 - path.opacity, 0)
             if mode == dr.ADMode.Backward:
                 d_colour = self.light.adjoint(marched.colour, ray.wavelengths, path.change * path.throughput, crossed)
@@ -625,7 +634,7 @@ def integrator() -> type:
 
 
 def open_model(props: mi.Properties):
-    """The model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    """Return the model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit field" is needed')

@@ -96,7 +96,7 @@ def _inspect_table(arguments) -> dict:
 
 
 def _print_rays(n: dict) -> None:
-    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.radiance.counting.Counts`)."""
+    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.radiance.march.RayCounts`)."""
     total = max(1, n["steps"])
     print(
         f"    rays      {n['crossing']:,} of {n['rays']:,} cross the field, {n['opaque']:,} of them end opaque\n"

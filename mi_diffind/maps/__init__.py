@@ -1,7 +1,7 @@
 """
-Images and the maps of materials, which several tasks store: where they come from and what of them is stored.
+Images and the maps of materials, which several tasks store.
 
-- :mod:`.source`: an image, or the maps that a manifest lists; :mod:`.layout`: which of their channels are stored;
-- :mod:`.components`: borders, smaller versions and principal components of them;
-- :mod:`.compressed`: maps that are read from arrays, decoded and measured, however the arrays are laid out.
+- :mod:`.source`: reads an image, or the maps of a manifest; :mod:`.layout`: chooses the stored channels.
+- :mod:`.pyramid`: mip pyramids; :mod:`.components`: borders, smaller versions and principal components.
+- :mod:`.compressed`: maps that are read from arrays; :mod:`.model`: their table files; :mod:`.arguments`: options.
 """

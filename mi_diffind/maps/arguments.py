@@ -1,7 +1,8 @@
-"""The arguments of tasks that store maps: what is compressed, to which size, and what is decoded."""
+"""Arguments of tasks that store maps, and the figures that their fits report."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from .. import units
@@ -13,21 +14,21 @@ _SIZES = (
     ("compression", units.parse_compression, "how many times smaller than the source, uncompressed (default: 12x)"),
     ("bytes", units.parse_bytes, "size of the arrays, as in 256k or 1.5M"),
     ("bpp", units.parse_bpp, "bits a texel of the image, all channels together"),
-    ("psnr", decibels, "the smallest file that reaches so many dB (several trainings)"),
+    ("psnr", decibels, "the smallest file of at least so many dB (several trainings)"),
 )
 
 SOURCE = Argument("source", metavar="IMAGE|MATERIAL.json", help="an image, or a manifest of the maps of a material")
 
-#: The size of the arrays, in one way or another.
+#: Ways to give the size of the arrays, of which at most one is allowed.
 SIZES = tuple(
-    Argument(f"--{name}", group="size", type=checked(kind), metavar="N", help=text) for name, kind, text in _SIZES
+    Argument(f"--{name}", group="size", type=checked(parse), metavar="N", help=text) for name, parse, text in _SIZES
 )
 
-#: How a source is read.
+#: Options of reading a source.
 SOURCES = (
     Argument(
         "--border", choices=["auto", "repeat", "clamp"], default="auto",
-        help="does the image go on at its other side? (default: auto, along u and v each)",
+        help="texels beyond the border: repeat the image, or its last texel (default: auto, along u and v each)",
     ),
     Argument(
         "--nonfinite", choices=NONFINITE, default="error",
@@ -40,16 +41,16 @@ PREVIEW = Argument(
     "--preview", metavar="FILE.png", help="write reference | render | 4x their difference at measurements"
 )
 
-#: What is decoded.
+#: Options of decoding maps.
 DECODED = (
     Argument("--map", action="append", metavar="NAME", help="only this map; may be repeated (default: all)"),
-    Argument("--width", type=positive, help="width in texels (default: that of the source)"),
-    Argument("--height", type=positive, help="height in texels (default: that of the source)"),
+    Argument("--width", type=positive, help="width in texels (default: the source's)"),
+    Argument("--height", type=positive, help="height in texels (default: the source's)"),
 )
 
 
-def asked_bytes(options, source: Source) -> int:
-    """The bytes that the options (:data:`SIZES`) ask for; a twelfth of the source's by default. Raises UsageError."""
+def requested_bytes(options, source: Source) -> int:
+    """Return the bytes of the options :data:`SIZES`, by default a twelfth of the source's. Raises UsageError."""
     given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
     if not any(given.values()):
         given["compression"] = 12
@@ -57,6 +58,31 @@ def asked_bytes(options, source: Source) -> int:
         return units.parse_size(source.nbytes, source.texels, **given)
     except ValueError as e:
         raise UsageError(str(e)) from None
+
+
+def requested_border(options) -> tuple[str, str] | None:
+    """Return the border along v and u of the options :data:`SOURCES`; ``None`` if it is chosen by the content."""
+    return None if options["border"] == "auto" else (options["border"],) * 2
+
+
+def record_source(request, table) -> None:
+    """Store the path of the source in the settings of ``table``, relative to the folder of the output."""
+    folder = (request.output or Path("x")).resolve().parent
+    table.settings["source_path"] = os.path.relpath(Path(request.options["source"]).resolve(), folder)
+
+
+def size_figures(source: Source, table, requested: float | None) -> tuple[dict, str]:
+    """Return the sizes of a trained table for ``--json``, and a line of text; ``requested`` are the bytes wanted."""
+    achieved = source.nbytes / table.nbytes if table.nbytes else None
+    figures = {
+        "source_bytes": source.nbytes,
+        "compression": achieved,
+        "compression_asked": source.nbytes / requested if requested else None,
+        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
+        "bits": {name: a.bits for name, a in table.arrays.items()},
+    }
+    wanted = f" ({source.nbytes / requested:.2f}x requested)" if requested else ""
+    return figures, (f"{achieved:.2f}x" if achieved else "of one colour") + wanted
 
 
 def preview_path(request) -> Path | None:

@@ -1,4 +1,4 @@
-"""Maps of a material that are read from arrays, however these are laid out: decoded, and measured against a source."""
+"""Maps of a material that are read from arrays: base classes, which decode them and measure their errors."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from .. import lookup
 from .layout import Layout
 from .source import Source
 
-#: Texels that are decoded at a time.
+#: Texels decoded at a time.
 CHUNK = 2**20
 
 
 class CompressedMaps:
     """
-    The maps of a material that are stored in arrays; the base class. ``layout`` says which there are; ``types`` is the
-    module of the Dr.Jit types that they are read with, ``None`` if nothing is stored, since all is constant; ``border``
-    that of the image along v and u.
+    Base class of maps that are stored in arrays.
+
+    ``layout`` lists the maps; ``types`` is the module of the Dr.Jit types of a read, ``None`` if all channels are
+    constant; ``border`` is that of the image along v and u.
     """
 
     layout: Layout
@@ -31,32 +32,30 @@ class CompressedMaps:
     # -- reading ----------------------------------------------------------------------------------------------------
 
     def stored(self, u, v, active=True) -> list:
-        """
-        The stored channels at (u, v) in [0, 1]², without filtering; v runs down, (0, 0) is the upper left corner of the
-        first texel.
-        """
+        """Return the stored channels at (u, v) in [0, 1]²; v runs down from the upper left corner of the image."""
         raise NotImplementedError
 
     def maps(self, stored: list, names: Sequence[str]) -> dict[str, list]:
-        """The channels of some maps, in the color space of each, from the stored ones."""
+        """Return the channels of some maps, in the color space of each, from the stored channels."""
         return {name: self.layout.decode(name, stored, dr.exp2, root) for name in names}
 
     def read(self, u, v, names: Sequence[str] | None = None, active=True) -> dict[str, list]:
-        """The channels of the maps ``names`` (default: all) at (u, v)."""
+        """Return the channels of the maps ``names`` (default: all) at (u, v)."""
         return self.maps(self.stored(u, v, active), names or self.layout.names)
 
     def decode(self, names: Sequence[str] | None = None, width: int = 0, height: int = 0) -> dict[str, np.ndarray]:
         """
-        The maps as images, float32, ``(height, width, channels)``, in the color space of each: their values at texel
-        centres of an image of that size (default: the source's).
+        Return the maps at the texel centres of an image, by default of the source's size.
+
+        float32, ``(height, width, channels)``, in the color space of each map.
         """
         return self._decoded(self.stored, names, width or self.layout.width, height or self.layout.height)
 
     def _decoded(self, stored, names: Sequence[str] | None, width: int, height: int) -> dict[str, np.ndarray]:
-        """:meth:`decode` of what the function ``stored`` says at (u, v)."""
+        """Return :meth:`decode` with the function ``stored`` in place of :meth:`stored`."""
         layout = self.layout
         names = tuple(names or layout.names)
-        found = {name: np.empty((height * width, layout[name].channels), np.float32) for name in names}
+        images = {name: np.empty((height * width, layout[name].channels), np.float32) for name in names}
         types = self.types
         for start in range(0, height * width, CHUNK):
             count = min(CHUNK, height * width - start)
@@ -64,43 +63,43 @@ class CompressedMaps:
                 values = self.maps([], names)
             else:
                 index = dr.arange(types.UInt32, count) + dr.opaque(types.UInt32, start)
-                # Opaque, so that images of all sizes are read by one kernel
+                # Opaque, so that one kernel reads images of all sizes
                 columns, rows = dr.opaque(types.UInt32, width), dr.opaque(types.UInt32, height)
                 u = (types.Float(index % columns) + 0.5) / types.Float(columns)
                 v = (types.Float(index // columns) + 0.5) / types.Float(rows)
                 values = self.maps(stored(u, v), names)
             for name, channels in values.items():
                 for c, value in enumerate(channels):
-                    found[name][start : start + count, c] = value if isinstance(value, float) else value.numpy()
-        return {name: image.reshape(height, width, -1) for name, image in found.items()}
+                    images[name][start : start + count, c] = value if isinstance(value, float) else value.numpy()
+        return {name: image.reshape(height, width, -1) for name, image in images.items()}
 
-    # -- what it costs, how good it is ------------------------------------------------------------------------------
+    # -- errors -----------------------------------------------------------------------------------------------------
 
     def measure(self, source: Source) -> dict[str, float]:
         """
-        Errors at texel centres against ``source``: ``psnr_db`` of all channels together, ``psnr_MAP_db`` of each map,
-        ``psnr_mean_db``, the mean of those, and ``psnr_between_db``, of all channels at 2²⁰ random places against the
-        bilinear interpolation of the source. Values are compared as they are in the file (sRGB-encoded if it is), those
-        of high dynamic range as the logarithms that stand for them.
+        Return the errors at texel centres against ``source``.
+
+        - ``psnr_db``: all channels together; ``psnr_MAP_db``: each map; ``psnr_mean_db``: the mean over maps.
+        - ``psnr_between_db``: all channels at 2²⁰ random places, against the bilinear interpolation of the source.
+
+        Values are compared in the encoding of the file (sRGB, where it is), values of high dynamic range as logarithms.
         """
         decoded = self.decode()
-        found, errors, weights = {}, [], []
+        by_map, errors, weights = {}, [], []
         for m, layout in zip(source.maps, self.layout.maps, strict=True):
             error = layout.encode(decoded[m.name]) - layout.encode(m.values)
             errors.append(float(np.mean(error**2, dtype=np.float64)))
             weights.append(layout.channels)
-            found[f"psnr_{m.name}_db"] = decibel(errors[-1])
-        joint = float(np.average(errors, weights=weights))
-        mean = float(np.mean([found[f"psnr_{m.name}_db"] for m in source.maps]))
+            by_map[f"psnr_{m.name}_db"] = decibel(errors[-1])
         return {
-            "psnr_db": decibel(joint),
-            "psnr_mean_db": mean,
-            **found,
+            "psnr_db": decibel(float(np.average(errors, weights=weights))),
+            "psnr_mean_db": float(np.mean(list(by_map.values()))),
+            **by_map,
             "psnr_between_db": decibel(self._between(source)),
         }
 
     def _between(self, source: Source, count: int = 2**20) -> float:
-        """Mean squared error at random places against the bilinear interpolation of the source."""
+        """Return the mean squared error at random places against the bilinear interpolation of the source."""
         types = self.types
         if types is None:
             return 0.0
@@ -114,63 +113,61 @@ class CompressedMaps:
             for c in range(layout.channels):
                 plane = values[..., c]
                 expected = sum(a * b * plane[i, j] for i, a in rows for j, b in columns)
-                got = read[m.name][c]
-                got = np.full(count, got) if isinstance(got, float) else got.numpy()
-                total += float(np.mean((layout.encode(got) - expected) ** 2, dtype=np.float64))
+                actual = read[m.name][c]
+                actual = np.full(count, actual) if isinstance(actual, float) else actual.numpy()
+                total += float(np.mean((layout.encode(actual) - expected) ** 2, dtype=np.float64))
                 channels += 1
         return total / channels
 
 
 class FilteredMaps(CompressedMaps):
     """
-    Maps that can be read at any level of detail; the base class. There are ``levels``, each half as large as the one
-    before it: level 0 is the source, ``levels - 1`` one texel.
+    Base class of maps that are read at any level of detail.
+
+    Each of the ``levels`` is half as large as the one before it; level 0 is the source, ``levels - 1`` one texel.
     """
 
     levels: int
 
     def filtered(self, u, v, level, active=True) -> list:
         """
-        The stored channels at (u, v) in [0, 1]² and the level of detail ``level``, a real number for each place: linear
-        between levels. Numbers beyond the levels mean the nearest, NaN means 0.
+        Return the stored channels at (u, v) in [0, 1]² and a level of detail, a real number for each place.
+
+        Linear between levels. Numbers beyond the levels mean the nearest level, NaN means 0.
         """
         raise NotImplementedError
 
     def clamped(self, level, Float):
-        """A level of detail within those that there are, as an array."""
+        """Return a level of detail limited to the existing levels, as an array."""
         return lookup.clamp(Float(level), 0.0, float(self.levels - 1))
 
     def level_size(self, level: int) -> tuple[int, int]:
-        """Rows and columns of a level."""
+        """Return rows and columns of a level."""
         return max(1, self.layout.height >> level), max(1, self.layout.width >> level)
 
     def decode(
         self, names: Sequence[str] | None = None, width: int = 0, height: int = 0, level: float = 0
     ) -> dict[str, np.ndarray]:
-        """
-        The maps as images, as in the base class, at a level of detail; their size is by default that of the level.
-        """
+        """Return the maps as images at a level of detail, by default in the size of that level."""
         rows, columns = self.level_size(int(level))
         stored = self.stored if level == 0 else lambda u, v: self.filtered(u, v, dr.opaque(type(u), level))
         return self._decoded(stored, names, width or columns, height or rows)
 
 
 def taps(x: np.ndarray, n: int, border: str) -> list:
-    """The two texels around each place and their weights."""
+    """Return the two of ``n`` texels around each place in [0, 1] along an axis, with their weights."""
     position = x * n - 0.5
     lower = np.floor(position).astype(np.int64)
     weight = (position - lower).astype(np.float32)
-    both = (
-        [lower % n, (lower + 1) % n] if border == "repeat" else [np.clip(lower, 0, n - 1), np.clip(lower + 1, 0, n - 1)]
-    )
-    return [(both[0], 1 - weight), (both[1], weight)]
+    first, second = ((i % n if border == "repeat" else np.clip(i, 0, n - 1)) for i in (lower, lower + 1))
+    return [(first, 1 - weight), (second, weight)]
 
 
 def root(v):
-    """A square root of what may be negative, whose derivative is finite everywhere."""
+    """Return the square root, 0 for negative numbers; its derivative is finite everywhere."""
     return dr.select(v > 1e-6, dr.sqrt(dr.maximum(v, 1e-6)), 0)
 
 
 def decibel(mse: float) -> float:
-    """PSNR for a peak of 1, at most 120 dB."""
+    """Return the PSNR of a mean squared error, for a peak of 1, at most 120 dB."""
     return -10 * math.log10(max(mse, 1e-12))

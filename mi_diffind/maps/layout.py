@@ -1,10 +1,9 @@
 """
-Which channels of a material are stored, and how its maps come back from them.
+Stored channels of a material, and the maps as functions of them.
 
-The maps of a material (:mod:`.source`) have more channels than they have content: a grey base colour is the same
-channel three times, the third component of a normal follows from the other two, a metallic map may be black. A
-:class:`Layout` names the channels that are stored, each brought to [0, 1], and for each map where its channels come
-from. Nothing here knows whether numbers are NumPy's or Dr.Jit's.
+The maps of a material (:mod:`.source`) have more channels than content: a grey base colour is one channel three times,
+the third component of a normal follows from the other two, a metallic map may be black. A :class:`Layout` lists the
+stored channels, each scaled to [0, 1], and the origin of each channel of each map.
 """
 
 from __future__ import annotations
@@ -17,26 +16,28 @@ import numpy as np
 
 from .source import ROLES, Map, Source
 
-#: dB. A normal map is stored as two channels if the third follows from them at least as precisely.
+#: Least PSNR, in dB, of the third component of a normal that is derived from the other two.
 NORMAL_FLOOR_DB = 45.0
 
-#: Largest magnitude that is told apart: half of what single precision holds, so that no difference overflows.
+#: Largest magnitude of a value: half of the largest single-precision number, so that no difference overflows.
 LARGEST = 1.7e38
 
-#: Data of more than 8 bits whose range is narrower than this is stored relative to its range, not to [0, 1].
+#: Linear data of more than 8 bits with a narrower range than this is stored relative to its range.
 NARROW = 0.25
 
-#: What a channel of a map can be in place of the number of a stored one.
+#: Origin of a channel that follows from the first two channels of a normal map.
 FROM_NORMAL = "z"
 
 
 @dataclass(frozen=True)
 class MapLayout:
     """
-    One map. ``where`` says of each channel which stored channel holds it, or ``"z"``: the third component of a unit
-    normal whose others are the map's first two channels, or ``("constant", value)``. A stored number s in [0, 1] stands
-    for ``low + (high − low)·s``, or with ``knee`` > 0, for values beyond 1 in high dynamic range, for
-    ``knee·((1 + high/knee)^s − 1)``.
+    Origin and range of the channels of one map.
+
+    ``where`` holds, for each channel, the index of a stored channel, or :data:`FROM_NORMAL`, the third component of a
+    unit normal whose others are the map's first two channels, or ``("constant", value)``. A stored number s in [0, 1]
+    means ``low + (high − low)·s``; with ``knee`` > 0, in high dynamic range, ``knee·((1 + high/knee)^s − 1)``. The
+    other fields are those of :class:`.source.Map`.
     """
 
     name: str
@@ -50,7 +51,7 @@ class MapLayout:
 
     @property
     def channels(self) -> int:
-        """Channels of the map."""
+        """Number of channels of the map."""
         return len(self.where)
 
     def to_json(self) -> dict:
@@ -59,7 +60,7 @@ class MapLayout:
         return {("kind" if k == "role" else k): v for k, v in {**asdict(self), "where": where}.items()}
 
     def encode(self, values):
-        """The numbers in [0, 1] that stand for ``values``; outside of the range of the map, the nearest."""
+        """Return the stored numbers in [0, 1] of ``values``; values beyond the range of the map become its ends."""
         if self.knee > 0:
             s = np.log1p(np.maximum(values, 0) / self.knee) / math.log1p(self.high / self.knee)
         else:
@@ -67,7 +68,7 @@ class MapLayout:
         return np.clip(s, 0, 1)
 
     def decode(self, s, exp2=np.exp2):
-        """The inverse of :meth:`encode`, of a NumPy array or, with Dr.Jit's ``exp2``, of one of its."""
+        """Return the values of stored numbers: the inverse of :meth:`encode`; ``exp2`` is NumPy's or Dr.Jit's."""
         if self.knee > 0:
             return self.knee * (exp2(s * math.log2(1 + self.high / self.knee)) - 1)
         return s if (self.low, self.high) == (0, 1) else self.low + (self.high - self.low) * s
@@ -76,8 +77,9 @@ class MapLayout:
 @dataclass(frozen=True)
 class Layout:
     """
-    Size and maps of a material, and which channels of it are stored: ``initial`` gives for each of them the value that
-    the paper's initialisation has, ``groups`` the map that it comes from.
+    Size, maps and stored channels of a material.
+
+    ``initial`` has the paper's initial value of each stored channel, ``groups`` the name of its map.
     """
 
     width: int
@@ -91,10 +93,13 @@ class Layout:
         source: Source, once: bool = True, two_channel_normals: bool | None = None, filtered: bool = False
     ) -> Layout:
         """
-        The layout of ``source``. ``once``: equal channels are stored once, constant ones as a number.
-        ``two_channel_normals``: leave out the third component of normal maps; ``None``: where it follows from the other
-        two to :data:`NORMAL_FLOOR_DB`. ``filtered``: channels have to be equal, or constant, at every level of detail
-        (:mod:`.pyramid`), so only those are stored once that are averaged alike.
+        Return the layout of ``source``.
+
+        - ``once``: store equal channels once, and constant channels as a number.
+        - ``two_channel_normals``: leave out the third component of normal maps (``None``: where it follows from the
+          other two to :data:`NORMAL_FLOOR_DB`).
+        - ``filtered``: channels have to be equal, or constant, at every level of detail (:mod:`.pyramid`); only
+          channels that are averaged alike are stored once.
         """
         maps, stored, initial, groups, averaged = [], [], [], [], []
         for m in source.maps:
@@ -139,52 +144,60 @@ class Layout:
         """Names of the maps."""
         return tuple(m.name for m in self.maps)
 
+    def channels_by_map(self) -> dict[str, list[int]]:
+        """Return the stored channels of each map, by :attr:`groups`."""
+        channels = {}
+        for i, name in enumerate(self.groups):
+            channels.setdefault(name, []).append(i)
+        return channels
+
     @property
     def source_nbytes(self) -> int:
         """Bytes of the source, uncompressed, at its own depth."""
         return self.width * self.height * sum(m.channels * m.depth for m in self.maps)
 
     def __getitem__(self, name: str) -> MapLayout:
-        """The map called ``name``. Raises ``KeyError`` with one sentence."""
+        """Return the map called ``name``. Raises ``KeyError``."""
         for m in self.maps:
             if m.name == name:
                 return m
         raise KeyError(f'found the map "{name}", the file holds {", ".join(self.names)}')
 
     def needed(self, name: str) -> tuple[int, ...]:
-        """The stored channels that a map is made of."""
+        """Return the stored channels of a map."""
         return tuple(dict.fromkeys(w for w in self[name].where if isinstance(w, int)))
 
     def encode(self, source: Source) -> np.ndarray:
-        """The stored channels of ``source``, float32 in [0, 1], shape ``(height, width, stored)``."""
-        found = np.zeros((self.height, self.width, self.stored), np.float32)
+        """Return the stored channels of ``source``, float32 in [0, 1], shape ``(height, width, stored)``."""
+        stored = np.zeros((self.height, self.width, self.stored), np.float32)
         for m, layout in zip(source.maps, self.maps, strict=True):
             for c, where in enumerate(layout.where):
                 if isinstance(where, int):
-                    found[..., where] = layout.encode(m.values[..., c])
-        return found
+                    stored[..., where] = layout.encode(m.values[..., c])
+        return stored
 
     def decode(self, name: str, stored: Sequence, exp2=np.exp2, root=None) -> list:
         """
-        The channels of a map, in the color space that it has, from the stored channels in [0, 1] (those that it does
-        not need may be ``None``). ``exp2`` and ``root``, a square root that makes 0 of what is negative, are NumPy's
-        unless given.
+        Return the channels of a map, in its color space, from the stored channels in [0, 1].
+
+        Stored channels that the map does not need may be ``None``. ``exp2`` and ``root``, a square root that is 0 for
+        negative numbers, are NumPy's unless given.
         """
         layout = self[name]
         root = root or (lambda v: np.sqrt(np.maximum(v, 0)))
-        found = []
+        channels = []
         for where in layout.where:
             if isinstance(where, int):
-                found.append(layout.decode(stored[where], exp2))
+                channels.append(layout.decode(stored[where], exp2))
             elif where == FROM_NORMAL:
-                x, y = 2 * found[0] - 1, 2 * found[1] - 1
-                found.append(0.5 + 0.5 * root(1 - x * x - y * y))
+                x, y = 2 * channels[0] - 1, 2 * channels[1] - 1
+                channels.append(0.5 + 0.5 * root(1 - x * x - y * y))
             else:
-                found.append(where[1])
-        return found
+                channels.append(where[1])
+        return channels
 
     def to_json(self) -> dict:
-        """For the settings of a table file."""
+        """Return the layout for the settings of a table file."""
         return {
             "width": self.width,
             "height": self.height,
@@ -194,29 +207,30 @@ class Layout:
         }
 
     @staticmethod
-    def from_json(found: dict) -> Layout:
+    def from_json(settings: dict) -> Layout:
         """
-        The inverse of :meth:`to_json`. Raises ``KeyError``, ``TypeError``, ``ValueError`` or ``OverflowError`` for
-        anything else.
+        Return the layout of :meth:`to_json`.
+
+        Raises ``KeyError``, ``TypeError``, ``ValueError`` or ``OverflowError`` for damaged settings.
         """
         maps = []
-        for entry in found["maps"]:
+        for entry in settings["maps"]:
             if not isinstance(entry["name"], str) or not entry["name"].isidentifier():
                 raise ValueError(f"a map is called {entry['name']!r:.40}")
-            where = tuple(_where(w, len(found["groups"])) for w in entry["where"])
+            where = tuple(_where(w, len(settings["groups"])) for w in entry["where"])
             role, color_space = str(entry["kind"]), str(entry["color_space"])
             low, high, knee = (float(entry[k]) for k in ("low", "high", "knee"))
             depth = int(entry["depth"])
             if not where or role not in ROLES or color_space not in ("srgb", "linear") or depth not in (1, 2, 4):
-                raise ValueError(f'the map "{entry["name"]}" is of no kind that is known')
+                raise ValueError(f'the map "{entry["name"]}" has an unknown role, color space or depth')
             if FROM_NORMAL in where and (where.index(FROM_NORMAL) != 2 or where.count(FROM_NORMAL) != 1):
-                raise ValueError(f'the map "{entry["name"]}" has its third component in another place')
+                raise ValueError(f'the map "{entry["name"]}" derives another channel than the third from a normal')
             finite = max(-low, high, knee) <= LARGEST
             if not (finite and low < high and knee >= 0) or (knee > 0 and not 0 < high <= 1e6 * knee):
                 raise ValueError(f'the map "{entry["name"]}" has no range of values')
             maps.append(MapLayout(str(entry["name"]), role, color_space, depth, where, low, high, knee))
-        width, height = int(found["width"]), int(found["height"])
-        initial, groups = tuple(map(float, found["initial"])), tuple(map(str, found["groups"]))
+        width, height = int(settings["width"]), int(settings["height"])
+        initial, groups = tuple(map(float, settings["initial"])), tuple(map(str, settings["groups"]))
         if min(width, height) < 1 or width * height >= 2**32 or not maps or len(initial) != len(groups):
             raise ValueError("the size or the channels of the image are damaged")
         if len({m.name for m in maps}) != len(maps):
@@ -225,21 +239,22 @@ class Layout:
 
 
 def _where(w, stored: int):
+    """Return the origin of a channel. Raises ``ValueError``."""
     if isinstance(w, int) and not isinstance(w, bool) and 0 <= w < stored:
         return w
     if w == FROM_NORMAL:
         return w
     if isinstance(w, (list, tuple)) and len(w) == 2 and w[0] == "constant" and math.isfinite(w[1]):
         return ("constant", float(w[1]))
-    raise ValueError(f"found {w!r} in place of a channel")
+    raise ValueError(f"a channel has the origin {w!r:.40}, allowed are stored channels, z and constants")
 
 
 def _range(m: Map) -> MapLayout:
-    """A layout without channels that says what range of values a map has."""
+    """Return a layout without channels that has the range of values of a map."""
     low, high, knee = 0.0, 1.0, 0.0
     smallest, largest = (min(max(float(v), -LARGEST), LARGEST) for v in (m.values.min(), m.values.max()))
     if smallest >= 0 and largest > 1:
-        # Logarithmic above the knee, linear below: relative precision for what is bright, and none wasted on the dark
+        # Logarithmic above the knee, linear below: constant relative precision for bright values only
         middle = float(np.median(np.minimum(m.values, largest)))
         knee, high = max(middle, 1e-3 * largest), largest
     elif smallest < 0 or (m.depth > 1 and m.color_space == "linear" and 0 < largest - smallest < NARROW):
@@ -248,7 +263,7 @@ def _range(m: Map) -> MapLayout:
 
 
 def _drops_z(m: Map, where: list, wanted: bool | None) -> bool:
-    """Is the third channel of this map left out? ``where``: what was said of the first two."""
+    """Return whether the third channel of a map is left out; ``where``: origins of the first two."""
     if m.role != "normal" or m.values.shape[-1] != 3 or wanted is False:
         return False
     if not all(isinstance(w, int) for w in where) or m.values.min() < 0 or m.values.max() > 1:
@@ -261,7 +276,7 @@ def _drops_z(m: Map, where: list, wanted: bool | None) -> bool:
 
 
 def _initial(role: str, channel: int) -> float:
-    """Initial value of the cascaded array (supplement 1.3): grey, white, light blue, grey; others 0."""
+    """Return the initial value of the cascaded array (supplement 1.3): grey, white, light blue, grey; others 0."""
     if role == "normal":
         return 1.0 if channel == 2 else 0.5
     return {"albedo": 0.5, "ao": 1.0, "roughness": 0.5}.get(role, 0.0)

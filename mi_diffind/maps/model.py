@@ -1,7 +1,8 @@
-"""What files of tasks that store maps stand for: maps that are read, measured against their source, decoded."""
+"""Table files of maps: their arrays, their pages, and the maps as a model that is measured and decoded."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,23 +10,61 @@ import numpy as np
 from .. import srgb
 from ..errors import UsageError
 from ..files import replacing
-from ..tables import TableError
+from ..indirection import DifferentiableArray
+from ..pages import SIDE_BITS, page_counts, page_shift
+from ..tables import PAGES, Table, TableError, allocate_pages, page_sides
 from ..task import Model
 from .compressed import CompressedMaps
 from .source import Source, load_source
 
 
+def allocate_maps(
+    table: Table, dtype, storage: str, size_of: Callable[[str], tuple[int, int]]
+) -> dict[str, DifferentiableArray]:
+    """
+    Return the arrays of a checked table for the tensor type ``dtype``, by name.
+
+    Arrays of bytes stay bytes, which can only be read; with the ``storage`` ``"float32"`` they become floats that pass
+    through the fold and can be optimised. ``size_of(name)`` returns rows and columns of the image that an array of
+    pages covers.
+    """
+    entry_type = "uint8" if storage != "float32" and table.storage == "uint8" else "float32"
+    arrays = {}
+    for name, array in table.arrays.items():
+        pages = table.arrays.get(name + PAGES)
+        if pages is not None:
+            arrays[name] = allocate_pages(array, pages, dtype, page_shift(size_of(name)), entry_type, fold=True)
+        elif not name.endswith(PAGES):
+            arrays[name] = array.allocate(dtype, entry_type, fold=True)
+    return arrays
+
+
+def page_entries(table: Table, name: str, size: tuple[int, int]) -> int:
+    """Return the number of entries of the pages of an array, on an image of ``size``. Raises :class:`TableError`."""
+    pages, counts, largest = table.arrays[name + PAGES], page_counts(size), 2 ** SIDE_BITS[1]
+    where = f'{table.path}: array "{name}{PAGES}"'
+    try:
+        sides = page_sides(pages)
+    except ValueError as e:
+        raise TableError(f"{where}: {e}") from None
+    if sides.shape != (*counts, 2):
+        raise TableError(f"{where} has the shape {sides.shape}, expected {(*counts, 2)}")
+    if sides.max() > largest:
+        raise TableError(f"{where} has a page of {sides.max()} entries along an axis, allowed are {largest}")
+    return int(sides.prod(axis=2).sum())
+
+
 class MapsModel(Model):
-    """The maps in a file: ``image`` (:class:`~mi_diffind.maps.compressed.CompressedMaps`)."""
+    """Maps in a table file; ``image`` reads them. Base class of the models of image and texture files."""
 
     image: CompressedMaps
 
     @property
     def source_path(self) -> Path:
-        """Where the source was when it was compressed. Raises :class:`TableError` if the file does not say."""
+        """Path of the source when it was compressed. Raises :class:`TableError` if the file has none."""
         recorded = self.table.settings.get("source_path")
         if recorded is None:
-            raise TableError(f"{self.table.path}: does not say which image it was made from, so it cannot be measured")
+            raise TableError(f"{self.table.path}: does not name the image that it was made from, so it has no errors")
         return Path(self.table.path or "").parent / str(recorded)
 
     def describe(self):
@@ -45,10 +84,10 @@ class MapsModel(Model):
         return {**figures, "memory_bytes": self.memory_nbytes, "compression": ratio, "maps": maps}, lines
 
     def measure(self, source: Source | None = None) -> dict[str, float]:
-        """See :meth:`.CompressedMaps.measure`; the source is looked for where it was, unless given."""
+        """Return the errors of :meth:`.CompressedMaps.measure` against ``source`` (default: the recorded file)."""
         if source is None:
             path = self.source_path
-            source = load_source(path, nonfinite="clean")  # if it was not cleaned before either, the digest tells
+            source = load_source(path, nonfinite="clean")  # cleaned values change the digest
             if source.digest != self.table.settings.get("source", source.digest):
                 raise TableError(f"{self.table.path}: its source {path} has changed since it was compressed")
         return self.image.measure(source)
@@ -62,9 +101,11 @@ class MapsModel(Model):
         **reading,
     ):
         """
-        Write the maps (``map``: only those named) in ``width`` × ``height`` texels, those of the source unless given:
-        ``.png``, 8 bits a channel, encoded as they are; ``.exr`` linear, in half precision unless numbers are beyond.
-        ``reading``: what the maps have to be told beside.
+        Write the maps (``map``: only those named) in ``width`` × ``height`` texels, by default the source's.
+
+        ``.png`` has 8 bits a channel in the color space of the map; ``.exr`` is linear, in half precision unless its
+        range is too small. ``reading`` is passed on to :meth:`.CompressedMaps.decode`. Returns each path with a line of
+        text. Raises :class:`UsageError`.
         """
         layout, file = self.image.layout, self.table.path
         if output.suffix.lower() not in (".png", ".exr"):
@@ -91,6 +132,7 @@ class MapsModel(Model):
 
 
 def _write(path: Path, values: np.ndarray, color_space: str) -> None:
+    """Write a map as PNG or EXR."""
     import mitsuba as mi
 
     with replacing(path) as temporary:
@@ -99,5 +141,5 @@ def _write(path: Path, values: np.ndarray, color_space: str) -> None:
             return
         if color_space == "srgb":
             values = srgb.to_linear(values)
-        form = np.float16 if np.abs(values).max() < 65520 else np.float32  # what rounds to a finite number
-        mi.Bitmap(np.ascontiguousarray(values, dtype=form)).write(str(temporary))
+        fits = np.abs(values).max() < 65520  # the limit of rounding to a finite half
+        mi.Bitmap(np.ascontiguousarray(values, dtype=np.float16 if fits else np.float32)).write(str(temporary))

@@ -1,16 +1,14 @@
 """
-The maps of a material at every level of detail, as graphics hardware filters them: a mip pyramid, read trilinearly.
+Mip pyramids of the maps of a material, read trilinearly as graphics hardware does.
 
-- **Levels.** Level 0 is the source; each further one has max(1, n // 2) of the n texels along each axis, down to one
-  texel. A texel is the mean of the rectangle that it covers: of two by two texels of the level below, and along an axis
-  with an odd number of them of three, of which the outer two count in part (the "polyphase" box).
-- **What is averaged.** Colours that are sRGB-encoded: their linear values, encoded again. High dynamic range: the
-  values, not the logarithms that stand for them. Normals: the mean of the vectors, brought to the length that the
-  vectors have on average, so that unit vectors stay unit vectors (a layout that leaves out the third component relies
-  on that) and others keep theirs; it is always the mean of all texels of level 0 that is brought to a length, not one
-  of vectors that were already. Everything else: plain means.
-- **Between texels and levels** what hardware interpolates is interpolated: linear values of what is sRGB, everything
-  else as it is stored; bilinearly in two levels, linearly between them. The result is encoded again.
+- **Levels.** Level 0 is the source. Each further level has max(1, n // 2) of the n texels along each axis, down to one
+  texel. A texel is the mean of the rectangle that it covers: two by two texels of the level below; along an axis with
+  an odd number of texels three, of which the outer two count in part (the "polyphase" box).
+- **Averages.** sRGB colours are averaged as linear values and encoded again; values of high dynamic range as values,
+  not as logarithms. Normals: the mean vector of all covered texels of level 0, rescaled to their mean length, so unit
+  vectors stay unit vectors (a layout that leaves out the third component relies on that). Other maps: plain means.
+- **Interpolation.** Linear values of sRGB colours, stored values of all other maps: bilinear in two levels, linear
+  between the levels. The result is encoded again.
 """
 
 from __future__ import annotations
@@ -30,13 +28,13 @@ from .source import Source
 
 
 def level_sizes(height: int, width: int) -> list[tuple[int, int]]:
-    """Rows and columns of all levels of an image, down to a single texel."""
+    """Return rows and columns of all levels of an image, down to a single texel."""
     count = max(height, width).bit_length()
     return [(max(1, height >> level), max(1, width >> level)) for level in range(count)]
 
 
 def halved(values: np.ndarray) -> np.ndarray:
-    """The next level of ``values``, ``(height, width, k)``: means of what its texels cover."""
+    """Return the next level of ``values``, ``(height, width, k)``: each texel is the mean of the area it covers."""
     for axis in (0, 1):
         n = values.shape[axis]
         if n == 1:
@@ -53,8 +51,11 @@ def halved(values: np.ndarray) -> np.ndarray:
 
 class Pyramid(FilteredMaps):
     """
-    The truth: all levels of the stored channels of a ``layout``, uncompressed. ``values`` are the levels, float32,
-    ``(height, width, stored)``, each channel in [0, 1] as :meth:`.Layout.encode` has it.
+    Mip pyramid of the stored channels of a ``layout``, uncompressed: the reference of all filtered textures.
+
+    ``values`` are the levels, float32, ``(height, width, stored)``, each channel in [0, 1] as :meth:`.Layout.encode`
+    returns it. Without ``types`` the pyramid cannot be read, only its ``values``. Raises ``ValueError`` for levels of
+    other shapes.
     """
 
     def __init__(self, layout: Layout, values: Sequence[np.ndarray], types: ModuleType | None, border):
@@ -81,16 +82,18 @@ class Pyramid(FilteredMaps):
     @staticmethod
     def of(source: Source, layout: Layout | None = None, types: ModuleType | None = None, border=None) -> Pyramid:
         """
-        The pyramid of a source. ``layout`` (default: ``Layout.of(source, filtered=True)``) may be any of this source;
-        where one stored channel serves two maps that are averaged differently, it is averaged as in the first.
-        ``border`` along v and u is found out unless given.
+        Return the pyramid of a source.
+
+        ``layout`` is any layout of this source (default: ``Layout.of(source, filtered=True)``); a stored channel of
+        several maps is averaged as in the first of them. ``border`` along v and u is by default
+        :func:`.components.borders`.
         """
         layout = layout or Layout.of(source, filtered=True)
         sizes = level_sizes(source.height, source.width)
         values = [np.zeros((*size, layout.stored), np.float32) for size in sizes]
         values[0] = layout.encode(source)
-        for m, own in zip(source.maps, layout.maps, strict=True):
-            channels = [(c, w) for c, w in enumerate(own.where) if isinstance(w, int) and _owner(layout, w) is own]
+        for m, entry in zip(source.maps, layout.maps, strict=True):
+            channels = [(c, w) for c, w in enumerate(entry.where) if isinstance(w, int) and _owner(layout, w) is entry]
             if not channels:
                 continue
             vectors = m.role == "normal" and m.channels == 3
@@ -101,7 +104,7 @@ class Pyramid(FilteredMaps):
             else:
                 level = srgb.to_linear(m.values) if m.color_space == "srgb" else m.values
                 level = level.astype(np.float32)
-            for found in values[1:]:
+            for stored in values[1:]:
                 level = halved(level)
                 if vectors:
                     length = np.linalg.norm(level[..., :3], axis=-1, keepdims=True)
@@ -111,17 +114,9 @@ class Pyramid(FilteredMaps):
                 else:
                     mean = srgb.from_linear(level) if m.color_space == "srgb" else level
                 for c, where in channels:
-                    found[..., where] = own.encode(mean[..., c])
+                    stored[..., where] = entry.encode(mean[..., c])
         border = border or components.borders(values[0])
         return Pyramid(layout, values, types, border)
-
-    @staticmethod
-    def from_levels(layout: Layout, levels: Sequence[np.ndarray], types, border) -> Pyramid:
-        """
-        The pyramid of levels that are given, such as those that a codec decoded: ``(height, width, stored)``, encoded
-        as :meth:`.Layout.encode` has them. Raises ``ValueError`` for other shapes.
-        """
-        return Pyramid(layout, levels, types, border)
 
     @property
     def levels(self) -> int:
@@ -135,7 +130,7 @@ class Pyramid(FilteredMaps):
 
     @property
     def arrays(self) -> dict:
-        """The Dr.Jit arrays that are read, by name."""
+        """Dr.Jit arrays of a read, by name."""
         return {} if self._texels is None else {"texels": self._texels, "offsets": self._offsets}
 
     @property
@@ -144,7 +139,7 @@ class Pyramid(FilteredMaps):
         return 4 * sum(map(dr.width, self.arrays.values()))
 
     def is_linear(self, name: str) -> bool:
-        """Is what is interpolated of a map, sRGB-encoded in its source, the linear values of its channels?"""
+        """Return whether :meth:`interpolated` returns linear values for a map that is sRGB-encoded in its source."""
         m = self.layout[name]
         channels = [self._owners[w] for w in m.where if isinstance(w, int)]
         return all((o.color_space, o.low, o.high, o.knee) == ("srgb", 0, 1, 0) for o in (m, *channels))
@@ -152,21 +147,23 @@ class Pyramid(FilteredMaps):
     # -- reading ----------------------------------------------------------------------------------------------------
 
     def stored(self, u, v, active=True) -> list:
-        """The stored channels at (u, v) in level 0, bilinear."""
+        """Return the stored channels at (u, v) in level 0, bilinear."""
         if not self.layout.stored:
             return []
         return self.encoded(self.interpolated(u, v, type(u)(0), active, whole=True))
 
     def filtered(self, u, v, level, active=True) -> list:
-        """The stored channels at (u, v) and a level of detail, trilinear."""
+        """Return the stored channels at (u, v) and a level of detail, trilinear."""
         if not self.layout.stored:
             return []
         return self.encoded(self.interpolated(u, v, level, active))
 
     def interpolated(self, u, v, level, active=True, whole: bool = False) -> list:
         """
-        What is interpolated in place of the stored channels, and can be averaged further: linear values of what is
-        sRGB or of high dynamic range. ``whole``: levels are whole numbers, which is half of the reads.
+        Return the interpolated values before they are encoded, which can be averaged further.
+
+        They are linear for sRGB colours and for high dynamic range. ``whole``: levels are whole numbers, which halves
+        the reads.
         """
         if not self.layout.stored:
             return []
@@ -180,14 +177,11 @@ class Pyramid(FilteredMaps):
         return [dr.fma(weight, b - a, a) for a, b in zip(below, above, strict=True)]
 
     def texels(self, index) -> list:
-        """
-        The stored channels of texels, at the ``index`` of each in a list of all, level by level and row by row; what
-        a bilinear read finds exactly there.
-        """
+        """Return the stored channels of texels, given their ``index`` in a list of all, level by level, row by row."""
         return self.encoded(self._fetch(index, True))
 
     def _bilinear(self, u, v, level, active) -> list:
-        """What is interpolated, in one level (a whole number) for each place."""
+        """Return the bilinear values in one level, a whole number, for each place."""
         UInt32 = dr.uint32_array_t(type(u))
         level = UInt32(level)
         corners = []
@@ -198,32 +192,18 @@ class Pyramid(FilteredMaps):
         total = None
         for row, a in corners[0]:
             for column, b in corners[1]:
-                found = self._fetch(offset + row * columns + column, active)
-                weight = a * b
-                total = (
-                    [weight * f for f in found]
-                    if total is None
-                    else [dr.fma(weight, f, t) for f, t in zip(found, total, strict=True)]
-                )
+                total = weighted_sum(a * b, self._fetch(offset + row * columns + column, active), total)
         return total
 
     def _fetch(self, index, active) -> list:
-        types, width = self.types, self._padded
-        if width <= 2:
-            found = [dr.gather(types.Float, self._texels, index * width + i, active) for i in range(width)]
-        else:
-            groups = width // 4
-            found = []
-            for group in range(groups):
-                found += list(dr.gather(types.Array4f, self._texels, index * groups + group, active))
-        return found[: self.layout.stored]
+        return padded_texels(self.types, self._texels, self._padded, index, active)[: self.layout.stored]
 
     def encoded(self, values: list) -> list:
-        """The stored channels in [0, 1], from what was interpolated (``None`` where a channel is not wanted)."""
-        found = []
+        """Return the stored channels in [0, 1] from interpolated values; ``None`` stays ``None``."""
+        stored = []
         for value, owner in zip(values, self._owners, strict=True):
             if value is None:
-                found.append(None)
+                stored.append(None)
                 continue
             if owner.color_space == "srgb":
                 value = srgb.from_linear(value)
@@ -232,24 +212,39 @@ class Pyramid(FilteredMaps):
                 value = dr.log2(1 + dr.maximum(value, 0) / owner.knee) * float(scale)
             elif owner.color_space == "srgb" and (owner.low, owner.high) != (0, 1):
                 value = (value - owner.low) / (owner.high - owner.low)
-            found.append(value)
-        return found
+            stored.append(value)
+        return stored
+
+
+def weighted_sum(weight, values: list, total: list | None) -> list:
+    """Return ``total + weight · values``, channel by channel; ``total`` is ``None`` at the start of a sum."""
+    if total is None:
+        return [weight * value for value in values]
+    return [dr.fma(weight, value, t) for value, t in zip(values, total, strict=True)]
+
+
+def padded_texels(types: ModuleType, texels, width: int, index, active=True) -> list:
+    """Return the ``width`` numbers (1, 2 or a multiple of 4) of each texel of a flat array, gathered four at a time."""
+    if width <= 2:
+        return [dr.gather(types.Float, texels, index * width + i, active) for i in range(width)]
+    groups = width // 4
+    return [v for i in range(groups) for v in dr.gather(types.Array4f, texels, index * groups + i, active)]
 
 
 def _owner(layout: Layout, channel: int) -> MapLayout:
-    """The first map that a stored channel serves."""
+    """Return the first map that contains a stored channel."""
     return next(m for m in layout.maps if channel in m.where)
 
 
 def _interpolated(stored: np.ndarray, owner: MapLayout) -> np.ndarray:
-    """What hardware would interpolate in place of a stored channel."""
+    """Return the values that are interpolated in place of a stored channel."""
     if owner.color_space == "srgb":
         return srgb.to_linear(owner.decode(stored))
     return owner.decode(stored) if owner.knee > 0 else stored
 
 
 def around(x, n, border: str) -> list:
-    """The two texels around ``x`` in [0, 1] of ``n`` along an axis, which may differ by lane, and their weights."""
+    """Return the two texels around ``x`` in [0, 1] of ``n`` along an axis (one number a lane), with their weights."""
     Float, Int32 = type(x), dr.int32_array_t(type(x))
     size = Float(n)
     x = lookup.clamp(x - dr.floor(x), 0.0, 1.0) if border == "repeat" else lookup.clamp(x, 0.0, 1.0)

@@ -1,16 +1,16 @@
 """
-What is to be compressed: one image, or the maps of a material that a JSON manifest lists.
+Sources of a compression: one image, or the maps of a material that a JSON manifest lists.
 
-A manifest names the maps and their files (relative to the manifest's folder)::
+A manifest gives the name and the file of each map, relative to the manifest's folder::
 
     {"maps": {"albedo": "base.png",
               "normal": {"file": "n.png", "color_space": "linear"},
               "roughness": {"file": "orm.png", "channels": "g"},
               "ao": {"file": "orm.png", "channels": "r"}}}
 
-or is the content of ``"maps"`` alone. ``channels`` selects, as letters among ``r``, ``g``, ``b`` and ``a`` or as a list
-of indices (the only way for a multi-channel EXR). Images are whatever ``mitsuba.Bitmap`` reads: PNG, JPEG, EXR, HDR,
-PFM, BMP, TGA; no variant needs to be set for it, and none is.
+or is the content of ``"maps"`` alone. ``channels`` are letters among ``r``, ``g``, ``b`` and ``a``, or a list of
+indices (needed for a multi-channel EXR). Images are read by ``mitsuba.Bitmap``: PNG, JPEG, EXR, HDR, PFM, BMP, TGA. No
+variant of Mitsuba has to be set.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 
 from ..errors import DiffindError, reason
 
-#: The largest number of channels of all maps together.
+#: Largest number of channels of all maps together.
 MAX_CHANNELS = 16
 
 COLOR_SPACES = ("srgb", "linear")
@@ -41,21 +41,22 @@ _SYNONYMS = {
     "metallic": ("metallic", "metalness", "metal"),
 }
 _DEPTHS = {"uint8": 1, "uint16": 2, "uint32": 4, "float16": 2, "float32": 4, "float64": 4}
-_ENCODED = ("uint8", "uint16")  # the types whose full range stands for 0 … 1
+_ENCODED = ("uint8", "uint16")  # types whose full range means 0 … 1
 
 
 class SourceError(DiffindError, ValueError):
-    """What is to be compressed cannot be used; the message is one sentence that names the file and the fault."""
+    """A source cannot be used; the message is one sentence that names the file and the fault."""
 
 
 @dataclass(frozen=True, eq=False)
 class Map:
     """
-    One map: ``values`` of shape ``(height, width, channels)``, float32, as they are stored in ``file`` (bytes over 255,
-    16-bit numbers over 65535, others as they are).
+    One map of a material.
 
-    ``color_space`` is ``"srgb"`` if they carry the sRGB transfer function, ``"linear"`` if they are data as they are;
-    ``role`` is one of :data:`ROLES`; ``depth`` the bytes of a channel in the source (1, 2 or 4).
+    - ``values``: ``(height, width, channels)``, float32, in the encoding of ``file`` (bytes divided by 255, 16-bit
+      numbers by 65535).
+    - ``color_space``: ``"srgb"`` if they carry the sRGB transfer function, else ``"linear"``.
+    - ``role``: one of :data:`ROLES`; ``depth``: bytes of a channel in the source (1, 2 or 4).
     """
 
     name: str
@@ -73,7 +74,7 @@ class Map:
 @dataclass(frozen=True, eq=False)
 class Source:
     """
-    The ``maps``, all of ``height`` × ``width`` texels and with at most :data:`MAX_CHANNELS` channels together.
+    The ``maps`` of an image or material, all of ``height`` × ``width`` texels, with at most 16 channels together.
 
     ``digest`` is a SHA-256 over their names, layout and values; ``cleaned`` counts the NaN and infinite values that
     were replaced.
@@ -96,40 +97,30 @@ class Source:
 
     @property
     def nbytes(self) -> int:
-        """Bytes without compression, each channel at its depth in the source."""
+        """Uncompressed bytes, each channel at its depth in the source."""
         return self.texels * sum(m.channels * m.depth for m in self.maps)
 
 
-def load_source(path: str | os.PathLike, name: str | None = None, nonfinite: str = "error") -> Source:
+def load_source(path: str | os.PathLike, nonfinite: str = "error") -> Source:
     """
     Read an image or a manifest (``.json``).
 
-    An image is one map, called ``name`` (default: ``"image"``); its alpha channel is another one, ``"alpha"``. It is
-    sRGB if it is grey or RGB of 8 or 16 bits (and ``name`` is not that of a map of another role), else linear. A map of
-    a manifest is sRGB by default if it is an albedo of 8 or 16 bits and 1 or 3 channels; its alpha channel is left out
-    if it is 1 everywhere, otherwise ``channels`` has to say what is meant. A roughness, AO or metallic map whose three
-    channels are equal keeps one.
+    An image is a map called ``"image"`` and, if it has an alpha channel, a map ``"alpha"``. It is sRGB if it is grey or
+    RGB of 8 or 16 bits, else linear. A map of a manifest is by default sRGB if it is an albedo of 8 or 16 bits and 1 or
+    3 channels. Its alpha channel is left out if it is 1 everywhere, else ``channels`` is needed. A roughness, AO or
+    metallic map with three equal channels keeps one.
 
-    NaN and infinite values are an error or, with ``nonfinite="clean"``, replaced: NaN by 0, infinity by the largest (if
-    negative, the smallest) finite value of the channel, 0 if there is none. Raises :class:`SourceError`.
+    NaN and infinite values are an error. With ``nonfinite="clean"`` NaN becomes 0 and infinity the largest (negative:
+    the smallest) finite value of the channel, 0 if there is none. Raises :class:`SourceError`.
     """
     path = Path(path)
     _check_nonfinite(nonfinite)
     if path.suffix.lower() == ".json":
-        if name is not None:
-            raise SourceError(f'{path}: is a manifest, which names its maps itself: found the name "{name}"')
         return _load_manifest(path, nonfinite)
-
-    name = "image" if name is None else name
-    _check_name(path, name)
     image = _read(path)
-    role = role_of(name)
-    if role == "other" and name != "alpha" and image.named:
-        role = "albedo"
-    maps = [_RawMap(name, image.values[:, :, : image.colors], role, str(path))]
+    role = "albedo" if image.named else "other"
+    maps = [_RawMap("image", image.values[:, :, : image.colors], role, str(path))]
     if image.has_alpha:
-        if name == "alpha":
-            raise SourceError(f'{path}: has an alpha channel, so the name "alpha" is taken')
         maps.append(_RawMap("alpha", image.values[:, :, image.colors :], "other", str(path)))
     return _assemble(maps, path, nonfinite)
 
@@ -138,12 +129,11 @@ def from_arrays(
     arrays: dict[str, np.ndarray], color_spaces: dict[str, str] | None = None, nonfinite: str = "error"
 ) -> Source:
     """
-    The same from arrays, name → ``(height, width)`` or ``(height, width, channels)`` of 8- or 16-bit unsigned integers
-    or floats.
+    Return a source of arrays by name, ``(height, width)`` or ``(height, width, channels)``.
 
-    ``color_spaces`` (name → ``"srgb"`` or ``"linear"``) replaces the defaults, which are a manifest's; the name
-    ``"image"`` stands for an albedo if it has 1 or 3 channels. Nothing is taken for alpha. Raises
-    :class:`SourceError`.
+    Types are 8- or 16-bit unsigned integers and floats. ``color_spaces`` (name → ``"srgb"`` or ``"linear"``) replaces
+    the defaults, which are a manifest's; ``"image"`` of 1 or 3 channels counts as an albedo. No channel counts as
+    alpha. ``nonfinite`` is that of :func:`load_source`. Raises :class:`SourceError`.
     """
     _check_nonfinite(nonfinite)
     color_spaces = dict(color_spaces or {})
@@ -174,7 +164,7 @@ def from_arrays(
 
 
 def role_of(name: str) -> str:
-    """The one of :data:`ROLES` that the name of a map stands for, such as ``"albedo"`` for ``"base_color"``."""
+    """Return the role (:data:`ROLES`) of a map by its name, such as ``"albedo"`` for ``"base_color"``."""
     plain = name.lower().replace("_", "").removesuffix("texture").removesuffix("map")
     return next((role for role, names in _SYNONYMS.items() if plain in names), "other")
 
@@ -183,6 +173,7 @@ def role_of(name: str) -> str:
 
 
 def _load_manifest(path: Path, nonfinite: str) -> Source:
+    """Read a manifest and its images. Raises :class:`SourceError`."""
     try:
         content = json.loads(_read_bytes(path).decode("utf-8-sig"), object_pairs_hook=_unique)
     except (ValueError, RecursionError) as e:
@@ -231,7 +222,7 @@ def _load_manifest(path: Path, nonfinite: str) -> Source:
 
 
 def _unique(pairs: list) -> dict:
-    """An object of a JSON file, in which no key may come twice."""
+    """Return an object of a JSON file. Raises ``ValueError`` if a key comes twice."""
     result = {}
     for key, value in pairs:
         if key in result:
@@ -245,7 +236,7 @@ def _unique(pairs: list) -> dict:
 
 @dataclass(frozen=True, eq=False)
 class _ImageFile:
-    """A file's content in its own type, ``(height, width, channels)``: ``colors`` channels, then perhaps alpha."""
+    """Content of an image file in its own type, ``(height, width, channels)``: ``colors`` channels, then any alpha."""
 
     values: np.ndarray
     colors: int
@@ -253,7 +244,7 @@ class _ImageFile:
     named: bool  # grey or RGB, not the channels of a multi-channel EXR
 
     def select(self, channels, where: str) -> np.ndarray:
-        """What ``channels`` of a manifest select; grey is its own red, green and blue."""
+        """Return the values of ``channels`` of a manifest; grey is red, green and blue at once."""
         count = self.values.shape[2]
         if isinstance(channels, str) and channels and self.named:
             letters = {"r": 0, "g": 1 % self.colors, "b": 2 % self.colors}
@@ -272,31 +263,30 @@ class _ImageFile:
         return self.values[:, :, indices]
 
     def opaque(self, where: str) -> np.ndarray:
-        """The colours, if there is no transparency that would be lost."""
+        """Return the colours. Raises :class:`SourceError` for transparency, which would be lost."""
         colors, alpha = self.values[:, :, : self.colors], self.values[:, :, self.colors :]
         one = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
         if self.has_alpha and (alpha != one).any():
             raise SourceError(
-                f"{where} is from a file with transparency, "
-                f'"channels" has to say which it means ("rgb", and "a" for a map of its own)'
+                f'{where} is from a file with transparency: "channels" is needed ("rgb", and "a" for a map of its own)'
             )
         return colors
 
 
 def _read(path: Path) -> _ImageFile:
-    """An image file. Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it or it is cut short."""
+    """Read an image file. Raises :class:`SourceError` if ``mitsuba.Bitmap`` cannot read it or it is cut short."""
     import mitsuba as mi
 
     _check_complete(path, _read_bytes(path))
-    # A TGA file has no signature, only newer ones have a footer that tells them.
-    form = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
+    # A TGA file has no signature
+    file_format = mi.Bitmap.FileFormat.TGA if path.suffix.lower() == ".tga" else mi.Bitmap.FileFormat.Auto
     try:
-        bitmap = mi.Bitmap(str(path), form)
+        bitmap = mi.Bitmap(str(path), file_format)
         values = np.array(bitmap)
         pixels = bitmap.pixel_format()
     except (RuntimeError, MemoryError, ValueError) as e:
         raise SourceError(
-            f"{path}: cannot be read as an image, it is damaged, cut short or of an unknown kind ({reason(e)})"
+            f"{path}: cannot be read as an image, it is damaged, cut short or of an unknown format ({reason(e)})"
         ) from None
     if values.size == 0 or values.dtype.name not in _DEPTHS:
         raise SourceError(f"{path}: has the shape {values.shape} and type {values.dtype}, which is not supported")
@@ -312,6 +302,7 @@ def _read(path: Path) -> _ImageFile:
 
 
 def _read_bytes(path: Path) -> bytes:
+    """Return the content of a file. Raises :class:`SourceError`."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -322,11 +313,11 @@ def _read_bytes(path: Path) -> bytes:
         raise SourceError(f"{path}: cannot be read ({reason(e)})") from None
 
 
-_JPEG_MARKER = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")  # none of those that are part of the compressed data
+_JPEG_MARKER = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")  # without the markers inside of compressed data
 
 
 def _check_complete(path: Path, data: bytes) -> None:
-    """Raise :class:`SourceError` for the faults that the decoders pass over: a missing end, colours from a palette."""
+    """Raise :class:`SourceError` for faults that Mitsuba's decoders accept: a missing end, colours of a palette."""
     if data.startswith(b"\x89PNG\r\n\x1a\n") and not _png_ends(data):
         raise SourceError(f"{path}: is cut short, a PNG file ends with an IEND chunk")
     if data.startswith(b"\xff\xd8\xff") and not _jpeg_ends(data):
@@ -339,6 +330,7 @@ def _check_complete(path: Path, data: bytes) -> None:
 
 
 def _png_ends(data: bytes) -> bool:
+    """Return whether a PNG file has its last chunk."""
     position = 8
     while position + 12 <= len(data):
         if data[position + 4 : position + 8] == b"IEND":
@@ -348,6 +340,7 @@ def _png_ends(data: bytes) -> bool:
 
 
 def _jpeg_ends(data: bytes) -> bool:
+    """Return whether a JPEG file has its last marker."""
     position = 0
     while match := _JPEG_MARKER.search(data, position):
         position, marker = match.end(), match[1][0]
@@ -363,7 +356,7 @@ def _jpeg_ends(data: bytes) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _RawMap:
-    """A map before its values are converted; without a color space it gets the default."""
+    """A map in the number type of its file; without a color space it gets the default."""
 
     name: str
     values: np.ndarray
@@ -373,7 +366,7 @@ class _RawMap:
 
 
 def _one_of_equal(values: np.ndarray, role: str) -> np.ndarray:
-    """One of three equal channels, if one is what a map of this role has."""
+    """Return ``values``, or one of three equal channels where the role has one channel."""
     if role not in ("roughness", "ao", "metallic") or values.shape[2] != 3:
         return values
     nan = values.dtype.kind == "f"
@@ -382,7 +375,7 @@ def _one_of_equal(values: np.ndarray, role: str) -> np.ndarray:
 
 
 def _assemble(raw: list[_RawMap], where, nonfinite: str) -> Source:
-    """The source with these maps, if they go together."""
+    """Return the source of some maps. Raises :class:`SourceError` if they do not go together."""
     if not raw:
         raise SourceError(f"{where}: has no maps")
     first = raw[0]
@@ -405,7 +398,7 @@ def _assemble(raw: list[_RawMap], where, nonfinite: str) -> Source:
         if color_space is None:
             srgb = m.role == "albedo" and number_type in _ENCODED and m.values.shape[2] in (1, 3)
             color_space = "srgb" if srgb else "linear"
-        with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, which is told below
+        with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite and is reported below
             values = m.values.astype("<f4", order="C")
         if number_type in _ENCODED:
             values /= np.iinfo(m.values.dtype).max
@@ -422,7 +415,7 @@ def _assemble(raw: list[_RawMap], where, nonfinite: str) -> Source:
 
 
 def _check_finite(values: np.ndarray, where: str, nonfinite: str) -> int:
-    """How many values are NaN or infinite, after they were replaced in place or, by default, refused."""
+    """Replace NaN and infinite values in place, or raise :class:`SourceError`; returns their number."""
     bad = ~np.isfinite(values)
     count = int(bad.sum())
     if count and nonfinite == "error":
@@ -440,6 +433,7 @@ def _check_finite(values: np.ndarray, where: str, nonfinite: str) -> int:
 
 
 def _check_name(where, name) -> None:
+    """Raise :class:`SourceError` for a name of a map that is no identifier."""
     if not isinstance(name, str) or not name.isidentifier():
         raise SourceError(
             f"{where}: a map is called {name!r:.40}, allowed are letters, digits and _ (not first a digit)"
@@ -447,5 +441,6 @@ def _check_name(where, name) -> None:
 
 
 def _check_nonfinite(nonfinite: str) -> None:
+    """Raise ``ValueError`` for an unknown way to treat NaN and infinity."""
     if nonfinite not in NONFINITE:
         raise ValueError(f'nonfinite: found "{nonfinite}", allowed are {NONFINITE}')

@@ -133,7 +133,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
             raise RuntimeError(f'parameter "pyramid": found "{name}", there are {known} (support.image_files.PYRAMIDS)')
         pyramid = PYRAMIDS[name]
         if pyramid.types is not types:
-            pyramid = Pyramid.from_levels(pyramid.layout, pyramid.values, types, pyramid.border)
+            pyramid = Pyramid(pyramid.layout, pyramid.values, types, pyramid.border)
         return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {}, "")), ""
 
     def load() -> SharedMaps:

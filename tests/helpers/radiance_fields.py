@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 
 from mi_diffind import plugins
-from mi_diffind.tasks.radiance.field import VolumeField
+from mi_diffind.tasks.radiance.volume_field import VolumeField
 
 
 class Fog(VolumeField):
@@ -18,19 +18,19 @@ class Fog(VolumeField):
         arrays = {name: types.TensorXf(values.astype(np.float32)) for name, values in arrays.items()}
         super().__init__(types, [-h for h in half], half, voxel, arrays)
 
-    def look(self, p, active=True):
+    def density_at(self, p, active=True):
         density = dr.gather(self.types.Float, self.arrays["density"].array, self.types.UInt32(0), active)
         return density, []
 
-    def colour(self, latent, p, d, active=True):
+    def radiance_at(self, point_data, p, d, active=True):
         array = self.arrays["colour"].array
         return [dr.gather(self.types.Float, array, self.types.UInt32(i), active) for i in range(3)]
 
 
 class Bumps(VolumeField):
     """
-    Smooth bumps in a box from −1 to 1: ``arrays`` hold the heights of the densities and, of four numbers, colours that
-    depend on the direction. ``empty``: half of the box (x > 0) holds nothing, which ``skip`` knows unless ``blind``.
+    Smooth bumps in a box from −1 to 1: ``arrays`` hold the heights of the densities and, in four numbers, colours that
+    depend on the direction. ``empty``: half of the box (x > 0) is empty, known to ``free_distance`` unless ``blind``.
     """
 
     CENTRES = np.array([[-0.5, -0.3, 0.1], [-0.2, 0.4, -0.3], [0.4, 0.1, 0.3]])
@@ -49,7 +49,7 @@ class Bumps(VolumeField):
     def _read(self, name, i, active):
         return dr.gather(self.types.Float, self.arrays[name].array, self.types.UInt32(i), active)
 
-    def look(self, p, active=True):
+    def density_at(self, p, active=True):
         active = self.types.Bool(active)
         if self.empty:
             active &= p.x < 0
@@ -57,11 +57,11 @@ class Bumps(VolumeField):
         density = sum(shape * self._read("density", i, active) for i, shape in enumerate(shapes))
         return dr.select(active, density, 0), shapes
 
-    def colour(self, latent, p, d, active=True):
-        numbers = [sum(s * self._read("colour", 4 * i + k, active) for i, s in enumerate(latent)) for k in range(4)]
+    def radiance_at(self, point_data, p, d, active=True):
+        numbers = [sum(s * self._read("colour", 4 * i + k, active) for i, s in enumerate(point_data)) for k in range(4)]
         return [numbers[c] * (1 + 0.5 * numbers[3] * d[c]) for c in range(3)]
 
-    def skip(self, p, d, active=True):
+    def free_distance(self, p, d, active=True):
         if not self.empty or self.blind:
             return self.types.Float(0)
         away = dr.select(d.x < 0, p.x / dr.maximum(-d.x, 1e-6), 10)
@@ -71,5 +71,5 @@ class Bumps(VolumeField):
 def register(mi, fields: dict, name: str = "test_field") -> None:
     """An integrator ``name``: ``neural_field``, of which ``field`` is the key of one in ``fields``."""
     # The module is another one in each variant
-    made = plugins.declared()["neural_field"].factory.__globals__["integrator"]()
-    mi.register_integrator(name, lambda props: made(props, fields[props["field"]]))
+    integrator = plugins.declared()["neural_field"].factory.__globals__["integrator"]()
+    mi.register_integrator(name, lambda props: integrator(props, fields[props["field"]]))

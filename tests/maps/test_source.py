@@ -158,22 +158,23 @@ def test_bmp_with_a_palette(tmp_path):
 
 @pytest.mark.parametrize(
     "name, expected",
-    [("image", ("albedo", "srgb")), ("photo", ("albedo", "srgb")), ("base_color", ("albedo", "srgb")),
-     ("normal", ("normal", "linear")), ("roughness", ("roughness", "linear"))],
+    [("image", ("albedo", "srgb")), ("base_color", ("albedo", "srgb")), ("normal", ("normal", "linear")),
+     ("roughness", ("roughness", "linear"))],
 )  # fmt: skip
-def test_name_of_an_image(tmp_path, name, expected):
-    m = load_source(write(tmp_path / "a.png", pattern(5, 7, 3)), name).maps[0]
+def test_roles_of_images_and_of_maps(tmp_path, name, expected):
+    path = write(tmp_path / "a.png", pattern(5, 7, 3))
+    m = load_source(path if name == "image" else manifest(tmp_path, {name: "a.png"})).maps[0]
     assert (m.name, m.role, m.color_space) == (name, *expected)
 
 
 @pytest.mark.parametrize(
-    "name, kind",
+    "name, role",
     [("albedo", "albedo"), ("baseColor", "albedo"), ("base_color_map", "albedo"), ("diffuse", "albedo"),
      ("Color", "albedo"), ("normalTexture", "normal"), ("occlusion", "ao"), ("AO", "ao"), ("metalness", "metallic"),
      ("roughness", "roughness"), ("alpha", "other"), ("height", "other"), ("map", "other")],
 )  # fmt: skip
-def test_kinds(name, kind):
-    assert role_of(name) == kind
+def test_roles(name, role):
+    assert role_of(name) == role
 
 
 def test_no_variant_is_set_or_changed(tmp_path, mi_rgb):
@@ -274,17 +275,9 @@ def test_too_many_channels(tmp_path):
 
 @pytest.mark.parametrize("name", ["", "a b", "1a", "a-b", "ä b"])
 def test_bad_names(tmp_path, name):
-    path = write(tmp_path / "a.png", pattern(5, 7, 3))
-    with pytest.raises(SourceError, match="a map is called"):
-        load_source(path, name)
+    write(tmp_path / "a.png", pattern(5, 7, 3))
     with pytest.raises(SourceError, match="a map is called"):
         load_source(manifest(tmp_path, {name: "a.png"}))
-
-
-def test_the_name_alpha(tmp_path):
-    assert load_source(write(tmp_path / "a.png", pattern(5, 7, 1)), "alpha").maps[0].color_space == "linear"
-    with pytest.raises(SourceError, match='the name "alpha" is taken'):
-        load_source(write(tmp_path / "b.png", pattern(5, 7, 4)), "alpha")
 
 
 # -- NaN and infinity -------------------------------------------------------------------------------------------------
@@ -386,7 +379,7 @@ def test_equal_channels(tmp_path):
 def test_alpha_in_a_manifest(tmp_path):
     array = pattern(5, 7, 4)
     write(tmp_path / "a.png", array)
-    with pytest.raises(SourceError, match='map "albedo" is from a file with transparency, "channels" has to say'):
+    with pytest.raises(SourceError, match='map "albedo" is from a file with transparency: "channels" is needed'):
         load_source(manifest(tmp_path, {"albedo": "a.png"}))
     maps = {"albedo": {"file": "a.png", "channels": "rgb"}, "alpha": {"file": "a.png", "channels": "a"}}
     source = load_source(manifest(tmp_path, maps))
@@ -463,8 +456,6 @@ def test_manifest_that_is_no_text(tmp_path):
     (tmp_path / "a.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SourceError, match="is not valid JSON"):
         load_source(tmp_path / "a.json")
-    with pytest.raises(SourceError, match="which names its maps itself"):
-        load_source(tmp_path / "a.json", "image")
 
 
 # -- arrays -----------------------------------------------------------------------------------------------------------

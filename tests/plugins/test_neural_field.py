@@ -534,7 +534,7 @@ def test_frozen(mi_rgb, fields, no_garbage_collection):
         ({"max_depth": 3, "c": {"type": "path"}}, 'parameter "max_depth": belongs to the nested integrator'),
         ({"c": {"type": "path"}, "d": {"type": "path"}}, "found 2 nested integrators"),
         ({"c": {"type": "ptracer"}}, "does not follow rays from a camera"),
-        ({"c": {"type": "test_field", "field": "fog"}}, "the boxes of two fields overlap"),
+        ({"c": {"type": "test_field", "field": "fog"}}, "the boxes of two nested fields overlap"),
         ({"c": {"type": "test_field", "field": "fog", "aovs": "depth"}}, "has AOVs of its own"),
         ({"c": {"type": "aov", "aovs": "dd:depth"}}, "has AOVs of its own"),
         ({"to_world": [1.0, 1.0, 2.0]}, 'parameter "to_world": found'),

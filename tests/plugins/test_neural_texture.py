@@ -154,7 +154,7 @@ def test_equals_a_mipmap_of_what_it_decodes_to(mi_rgb, files, rng, border, wrap_
         y, x = np.mgrid[0:rows, 0:columns]
         u, v, at = floats(mi, (x.ravel() + 0.5) / columns, (y.ravel() + 0.5) / rows, np.full(x.size, level))
         levels.append(np.stack([c.numpy() for c in image.filtered(u, v, at)], -1).reshape(rows, columns, -1))
-    image_files.PYRAMIDS["decoded"] = Pyramid.from_levels(layout, levels, module_of(mi.TensorXf), along)
+    image_files.PYRAMIDS["decoded"] = Pyramid(layout, levels, module_of(mi.TensorXf), along)
     try:
         ours = mi.load_dict(plugin(files[border], wrap_mode=wrap_mode))
         theirs = mi.load_dict({"type": "mipmap", "pyramid": "decoded", "channels": "albedo", "wrap_mode": wrap_mode})

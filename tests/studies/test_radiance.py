@@ -14,8 +14,9 @@ from mi_diffind.measure import benchmark
 from mi_diffind.studies.baselines import node_codes, radiance_factors, radiance_fits
 from mi_diffind.studies.radiance import conclusions
 from mi_diffind.studies.radiance import plan as plans
-from mi_diffind.tasks.radiance.field import FAINT
 from mi_diffind.tasks.radiance.nodes import Nodes, cells_of, corners_of
+from mi_diffind.tasks.radiance.training import FieldSession
+from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField
 
 LOWER, SPACING, SHAPE = (-0.5, -0.3, 0.1), 0.05, (11, 9, 14)
 
@@ -26,7 +27,7 @@ def grid(rng):
     count = np.count_nonzero(stored)
     density, colour = 3 * rng.normal(size=count), 0.7 * rng.normal(size=(count, 12))
     nodes = Nodes(T, LOWER, SPACING, SHAPE, stored)
-    return radiance_fits.Grid(nodes, np.float32(density), np.float32(colour), rng.random(count))
+    return radiance_fits.WeightedGrid(nodes, np.float32(density), np.float32(colour), rng.random(count))
 
 
 FITS = {
@@ -82,9 +83,9 @@ def test_bytes_are_read_as_they_are_meant(grid, name, rng):
         expected[:, 1 + 4 * c] + np.sum(expected[:, 2 + 4 * c : 5 + 4 * c] * directions, axis=1) for c in range(3)
     ]
     for field in (made.field_of(made.net), made.field(T, state)):
-        found, latent = field.look(p)
+        found, point_data = field.density_at(p)
         assert np.abs(found.numpy() - sigma).max() < 2e-3
-        colour = np.array(field.colour(latent, p, d, found > 0))
+        colour = np.array(field.radiance_at(point_data, p, d, found > 0))
         assert 0.1 < (sigma > 0).mean() < 0.9
         assert np.allclose(colour[:, sigma > 0], np.exp(exponents)[:, sigma > 0], rtol=2e-4)
 
@@ -148,7 +149,7 @@ def test_coarser_grids_are_read_from_finer_ones():
     nodes = Nodes(T, LOWER, SPACING, (16, 16, 16), corners_of(cells))
     place = nodes.positions()
     colour = np.stack([place @ [k, 1, 2] for k in range(12)], axis=1)
-    grid = radiance_fits.Grid(nodes, 0.3 * place[:, 0] - 0.1 * place[:, 2], colour, np.ones(len(place)))
+    grid = radiance_fits.WeightedGrid(nodes, 0.3 * place[:, 0] - 0.1 * place[:, 2], colour, np.ones(len(place)))
     found = grid.resampled(1.4)
     assert found.nodes.spacing == pytest.approx(1.4 * SPACING) and found.nodes.shape == (12, 12, 12)
     place = 1.4 * found.nodes.positions()
@@ -166,13 +167,13 @@ def test_derivatives_of_planes_and_networks(grid, kind, rng):
     """Of densities and colours with respect to each array, against finite differences."""
     made, step = radiance_factors.PlanesFit(grid, (4, 4), 0.07), 2e-3
     if kind == "hash":
-        made, step = radiance_factors.HashFit(grid, 2**9, 16.0), 1e-4
+        made, step = radiance_factors.HashVolumeFit(grid, 2**9, 16.0), 1e-4
     _, _, p, d = rays(rng, 2000, grid)
 
     def values(net):
         field = made.field_of(net)
-        sigma, latent = field.look(p)
-        return sigma / 50 + sum(field.colour(latent, p, d, sigma > 0))
+        sigma, point_data = field.density_at(p)
+        return sigma / 50 + sum(field.radiance_at(point_data, p, d, sigma > 0))
 
     net = {name: T.TensorXf(value) for name, value in made.net.items()}
     dr.enable_grad(net)
@@ -207,25 +208,23 @@ def test_planes_are_sums_of_products(grid, rng):
         line = table[lines + cell[:, c]] * (1 - f[:, c : c + 1]) + table[lines + cell[:, c] + 1] * f[:, c : c + 1]
         raw = raw + np.sum(flat * line, axis=1)
         start, lines = start + sides[a] * sides[b], lines + sides[c]
-    sigma, _ = field.look(p)
+    sigma, _ = field.density_at(p)
     occupied = made.occupancy(p).numpy()
     expected = np.maximum(np.logaddexp(0, raw) - FAINT, 0) / SPACING * occupied
     assert np.abs(sigma.numpy() - expected).max() < 1e-3 and 0.2 < occupied.mean() <= 1
-    trained, _ = made.field_of(made.net).look(p)
+    trained, _ = made.field_of(made.net).density_at(p)
     assert np.abs(trained.numpy() - sigma.numpy()).max() < 1e-3
     assert field.nbytes > state["density_planes"].size + state["colour_planes"].size
 
 
 def test_what_is_seen_is_where_rays_end(grid):
     """The shares of a ray that ends in one cell are those of its corners; a wall hides what is behind it."""
-    from mi_diffind.tasks.radiance.field import GridField
-
     nodes = Nodes(T, (0, 0, 0), 1.0, (4, 4, 4), np.ones((4, 4, 4), bool))
     density = np.full((4, 4, 4), -30.0)
     density[:, :, 2:] = 60.0
     arrays = [T.TensorXf(np.float32(np.append(0, density.ravel()))), T.TensorXf(np.zeros((65, 12), np.float32))]
 
-    class Images:
+    class ParallelRays:
         def __init__(self):
             self.views = type("Views", (), {"width": 4, "height": 4, "__len__": lambda self: 1})()
 
@@ -233,7 +232,7 @@ def test_what_is_seen_is_where_rays_end(grid):
             o = T.Array3f(0.5 + 0.5 * T.Float(x), 0.5 + 0.5 * T.Float(y), 9.0)
             return o, T.Array3f(T.Float(0), T.Float(0), T.Float(-1))
 
-    seen = radiance_fits.visibility(GridField(nodes, *arrays), Images(), 1)[1:].reshape(4, 4, 4)
+    seen = radiance_fits.visibility(NodeField(nodes, *arrays), ParallelRays(), 1)[1:].reshape(4, 4, 4)
     assert seen.sum() == pytest.approx(16, rel=1e-3)
     assert seen[:, :, 3].sum() > 15.9 * 0.5 and seen[:, :, :2].sum() < 1e-3
 
@@ -284,13 +283,10 @@ def test_what_is_written(folder):
 
 
 def test_what_was_made_is_known(folder):
-    from mi_diffind.tasks.radiance.views import load_views
-
     result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
     without = tuple(k for k in plans.KINDS if k not in MADE)
     source = str(folder / "balls")
-    request = plans.Request((60.0,), without)
-    plan = plans.plan(load_views(source, "train"), load_views(source, "test"), source, request)
+    plan = plans.plan(FieldSession.load(T, source), source, plans.RadianceStudySettings((60.0,), without))
     assert [job.name for job in plan.jobs] == list(result["jobs"])
     models = folder / "out" / "tradeoff_field_models"
     for job in plan.jobs:

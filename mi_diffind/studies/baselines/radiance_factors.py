@@ -1,6 +1,8 @@
 """
-Radiance fields that are no grids: planes and lines (the idea of TensoRF, Chen et al. 2022) and a hash grid with a
-network (``drjit.nn``; of Instant-NGP, Müller et al. 2022). Both know from an :class:`Occupancy` where nothing is.
+Baselines without nodes: planes and lines (TensoRF, Chen et al. 2022), and a hash grid with a network.
+
+The latter follows Instant-NGP (Müller et al. 2022) with the modules of ``drjit.nn``. Both skip empty space by an
+:class:`Occupancy`.
 """
 
 from __future__ import annotations
@@ -12,20 +14,21 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
-from ...tasks.radiance.field import VolumeField, colour_of, density_of
-from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, corners_of, distances
+from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, chessboard_distances, corners_of
+from ...tasks.radiance.volume_field import VolumeField, colour_of, density_of
 from .node_codes import QuantisationSteps, deflated, mask_bytes
-from .radiance_fits import HEADER, Grid, nodes_of, nodes_state
+from .radiance import transformed
+from .radiance_fits import HEADER, WeightedGrid, nodes_of, nodes_state
 
-#: Raw density of a field that is not trained yet.
+#: Raw density before training.
 BEGIN = -4.0
 
-#: Nodes of the grid that a field is made of along a side of a cell of its occupancy, divided by :data:`COARSE`.
+#: Cells of the grid along a side of a wide cell; a cell of an occupancy spans :data:`COARSE` wide cells.
 WIDER = 2
 
 
 def wide_cells(stored: np.ndarray | None, shape) -> np.ndarray:
-    """The cells :data:`WIDER` times as wide as those of a grid, of nodes ``stored`` of this shape, that have some."""
+    """Return the wide cells, bool, that hold occupied cells of a grid of this shape with ``stored`` nodes."""
     cells = cells_of(stored) if stored is not None else np.ones([n - 1 for n in shape], bool)
     padded = np.pad(cells, [(0, -n % WIDER) for n in cells.shape])
     x, y, z = (n // WIDER for n in padded.shape)
@@ -33,7 +36,7 @@ def wide_cells(stored: np.ndarray | None, shape) -> np.ndarray:
 
 
 class Occupancy:
-    """Where something may be: cells of the coarse grid of distances of nodes :data:`WIDER` times as far apart."""
+    """Occupied cells and empty distances of a grid whose nodes are :data:`WIDER` times as far apart."""
 
     def __init__(self, nodes: Nodes):
         stored = corners_of(wide_cells(nodes.stored, nodes.shape))
@@ -42,23 +45,31 @@ class Occupancy:
         self.types, self.nbytes = nodes.types, self.nodes.nbytes
 
     def __call__(self, p, active=True):
-        """Whether a cell is occupied."""
+        """Return whether the cell that holds ``p`` is occupied."""
         side = COARSE * self.nodes.spacing
         at = self.types.UInt32(0)
-        for x, a, n in zip(p, self.nodes.lower, self.nodes.far.shape, strict=True):
+        for x, a, n in zip(p, self.nodes.lower, self.nodes.coarse_distances.shape, strict=True):
             u = dr.clip(dr.floor(dr.fma(x, 1 / side, -a / side)), 0, n - 1)
             at = dr.fma(at, n, self.types.UInt32(u))
         word = dr.gather(self.types.UInt32, self.nodes.distances, at >> 3, active)
         return active & (((word >> ((at & 7) << 2)) & FARTHEST) == 0)
 
-    def skip(self, p, d, active=True):
-        return self.nodes.skip(p, d, active)
+
+class OccupancyField(VolumeField):
+    """Field that is empty outside of an :class:`Occupancy`: the base class."""
+
+    def __init__(self, nodes: Nodes, arrays: dict, occupancy: Occupancy):
+        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
+        self.occupancy = occupancy
+
+    def free_distance(self, p, d, active=True):
+        return self.occupancy.nodes.free_distance(p, d, active)
 
 
 def occupied_bytes(state: dict) -> int:
-    """Bytes on disk of an occupancy of the nodes of a state."""
+    """Return the bytes on disk of the occupancy of the nodes of a state."""
     cells = cells_of(corners_of(wide_cells(state.get("stored"), state["shape"])))
-    return len(mask_bytes(distances(cells) == 0))
+    return len(mask_bytes(chessboard_distances(cells) == 0))
 
 
 # -- planes and lines -------------------------------------------------------------------------------------------------
@@ -69,26 +80,27 @@ TABLES = ("density_planes", "colour_planes")
 PLANES = (((0, 1), 2), ((0, 2), 1), ((1, 2), 0))
 
 
-class PlanesField(VolumeField):
+class PlanesField(OccupancyField):
     """
-    Sums over three planes of products of ``R`` channels of a plane and a line: arrays ``density_planes`` and
-    ``colour_planes``, the texels of the three planes and then of the three lines, ``(n, R)`` each, R a multiple of
-    four, and ``matrix`` ``(3 R + 1, 12)``, which makes twelve numbers of the colours' products. With ``steps``, the
-    first two hold words of four bytes.
+    Field of sums over three planes of products of ``R`` channels of a plane and a line.
+
+    The arrays ``density_planes`` and ``colour_planes`` hold the texels of the three planes and then of the three lines,
+    ``(n, R)`` each, R a multiple of four. ``matrix`` ``(3 R + 1, 12)`` maps the products of the colours to twelve
+    coefficients. With ``steps``, ``words`` hold the texels instead, four bytes each.
     """
 
     def __init__(self, nodes: Nodes, shape, arrays: dict, ranks, occupancy: Occupancy, steps=None):
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
-        self.shape, self.ranks, self.occupancy, self.steps = tuple(shape), tuple(ranks), occupancy, steps
+        super().__init__(nodes, arrays, occupancy)
+        self.shape, self.ranks, self.steps = tuple(shape), tuple(ranks), steps
         self.starts = starts_of(self.shape)
 
     def _cell(self, p):
-        found = []
+        cell = []
         for x, a, b, n in zip(p, self.lower, self.upper, self.shape, strict=True):
             u = (x - a) * ((n - 1) / (b - a))
             i = dr.clip(dr.floor(u), 0, n - 2)
-            found.append((self.types.UInt32(i), dr.clip(u - i, 0, 1)))
-        return found
+            cell.append((self.types.UInt32(i), dr.clip(u - i, 0, 1)))
+        return cell
 
     def _four(self, which: int, row, packet: int, active):
         name, count = TABLES[which], self.ranks[which] // 4
@@ -101,7 +113,7 @@ class PlanesField(VolumeField):
         return [dr.fma(v, float(s.step[0]), float(s.low[0])) for v in bytes_]
 
     def _products(self, which: int, cell, active):
-        """The products of all planes, four at a time."""
+        """Yield the products of all planes, four at a time."""
         for (plane, line), start, along in zip(PLANES, self.starts[:3], self.starts[3:], strict=True):
             (i, u), (j, v), (k, w) = cell[plane[0]], cell[plane[1]], cell[line]
             width = self.shape[plane[1]]
@@ -114,55 +126,41 @@ class PlanesField(VolumeField):
                 ends = [self._four(which, k + (along + e), packet, active) for e in (0, 1)]
                 yield [x * dr.fma(w, b - a, a) for x, a, b in zip(flat, *ends, strict=True)]
 
-    def look(self, p, active=True):
+    def density_at(self, p, active=True):
         active = self.occupancy(p, active)
         raw = self.types.Float(BEGIN)
         for four in self._products(0, self._cell(p), active):
             raw += four[0] + four[1] + four[2] + four[3]
         return dr.select(active, density_of(raw, self.per_voxel), 0), []
 
-    def colour(self, latent, p, d, active=True):
-        matrix = self.arrays["matrix"].array
-
-        def line(i: int):
-            return [
-                v for j in range(3) for v in dr.gather(self.types.Array4f, matrix, self.types.UInt32(3 * i + j), active)
-            ]
-
-        found, count = line(3 * self.ranks[1]), 0
-        for four in self._products(1, self._cell(p), active):
-            for value in four:
-                found = [dr.fma(value, m, total) for m, total in zip(line(count), found, strict=True)]
-                count += 1
-        return colour_of(found, d)
-
-    def skip(self, p, d, active=True):
-        return self.occupancy.skip(p, d, active)
+    def radiance_at(self, point_data, p, d, active=True):
+        products = itertools.chain.from_iterable(self._products(1, self._cell(p), active))
+        return colour_of(transformed(self.types, self.arrays["matrix"].array, products, active), d)
 
 
 def starts_of(shape) -> list[int]:
-    """The first row of each plane and line, and the end."""
+    """Return the first row of each plane and line."""
     sizes = [shape[a] * shape[b] for (a, b), _ in PLANES] + [shape[c] for _, c in PLANES]
     return [0, *np.cumsum(sizes).tolist()][:6]
 
 
 def sides_of(nodes: Nodes, spacing: float) -> list[int]:
-    """Texels along the axes of the box of ``nodes`` that are ``spacing`` apart."""
+    """Return the texels along the axes of the box of ``nodes`` at a ``spacing``."""
     return [max(2, math.ceil((b - a) / spacing) + 1) for a, b in zip(nodes.lower, nodes.upper, strict=True)]
 
 
 def rows_of(shape) -> int:
-    """Texels of all planes and lines."""
+    """Return the number of texels of all planes and lines."""
     return int(sum(shape[a] * shape[b] for (a, b), _ in PLANES) + sum(shape))
 
 
 class PlanesFit:
-    """Planes and lines of ``shape`` texels along the axes of a ``grid`` (:class:`.radiance_fits.Grid`)."""
+    """Training of planes and lines in the box of a ``grid``, with texels at a ``spacing``."""
 
-    #: Of the numbers that are trained: a product of two of them is what counts.
+    #: Density numbers per unit of the trained parameter, since densities are products of two of them.
     SCALE = 3.0
 
-    def __init__(self, grid: Grid, ranks: tuple[int, int], spacing: float, seed: int = 1):
+    def __init__(self, grid: WeightedGrid, ranks: tuple[int, int], spacing: float, seed: int = 1):
         nodes = self.nodes = grid.nodes
         self.types, self.ranks = nodes.types, tuple(ranks)
         self.occupancy = Occupancy(nodes)
@@ -183,7 +181,7 @@ class PlanesFit:
         return value * self.SCALE if index == 0 else value
 
     def round(self) -> None:
-        """From here on, numbers are rounded to 8 bits of their range."""
+        """Round numbers to 8 bits of their current range from now on."""
         self.steps = []
         for k in (0, 1):
             low, high = (float(f(self._scaled(self.net, k).numpy())) for f in (np.min, np.max))
@@ -191,6 +189,7 @@ class PlanesFit:
             self.steps.append(QuantisationSteps(np.float32([low]), np.float32([step]), np.array([256])))
 
     def field_of(self, net) -> PlanesField:
+        """Return the field of the trained parameters, after :meth:`round` rounded as they are stored."""
         values = [self._scaled(net, k) for k in (0, 1)]
         if self.steps is not None:
             values = [s.rounded(self.types, v) for s, v in zip(self.steps, values, strict=True)]
@@ -198,50 +197,51 @@ class PlanesFit:
         return PlanesField(self.nodes, self.shape, arrays, self.ranks, self.occupancy)
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that a file has to hold, by name; after :meth:`round`."""
-        found = {**nodes_state(self.nodes), "ranks": np.array(self.ranks), "sides": np.array(self.shape)}
+        """Return the arrays of a file by name, after :meth:`round`."""
+        state = {**nodes_state(self.nodes), "ranks": np.array(self.ranks), "sides": np.array(self.shape)}
         for k, name in enumerate(TABLES):
-            found |= {name: self.steps[k].codes(self._scaled(self.net, k).numpy()), f"{name}_low": self.steps[k].low}
-            found[f"{name}_step"] = self.steps[k].step
-        return found | {"matrix": self.net["matrix"].numpy()}
+            state |= {name: self.steps[k].codes(self._scaled(self.net, k).numpy()), f"{name}_low": self.steps[k].low}
+            state[f"{name}_step"] = self.steps[k].step
+        return state | {"matrix": self.net["matrix"].numpy()}
 
     @staticmethod
     def field(types, state: dict) -> PlanesField:
-        """The field that reads what :meth:`state` returned."""
+        """Return the field that reads what :meth:`state` returned."""
         nodes = nodes_of(types, state)
         occupancy = Occupancy(nodes)
         matrix = types.TensorXf(np.ascontiguousarray(state["matrix"], np.float32))
         steps = [QuantisationSteps(state[f"{n}_low"], state[f"{n}_step"], np.array([256])) for n in TABLES]
         shape, ranks = map(tuple, (state["sides"].tolist(), state["ranks"].tolist()))
-        found = PlanesField(nodes, shape, {"matrix": matrix}, ranks, occupancy, steps)
-        found.words = [types.UInt32(np.ascontiguousarray(state[n]).view("<u4").reshape(-1)) for n in TABLES]
-        found.nbytes = 4 * (sum(map(dr.width, found.words)) + dr.width(matrix)) + occupancy.nbytes
-        return found
+        field = PlanesField(nodes, shape, {"matrix": matrix}, ranks, occupancy, steps)
+        field.words = [types.UInt32(np.ascontiguousarray(state[n]).view("<u4").reshape(-1)) for n in TABLES]
+        field.nbytes = 4 * (sum(map(dr.width, field.words)) + dr.width(matrix)) + occupancy.nbytes
+        return field
 
     @staticmethod
     def file_bytes(state: dict, predict: bool = True) -> int:
-        """Bytes on disk, after zlib."""
+        """Return the bytes on disk, after zlib."""
         packed = sum(len(deflated(np.ascontiguousarray(state[n].T).tobytes())) for n in TABLES)
         return HEADER + packed + state["matrix"].nbytes + occupied_bytes(state)
 
 
 # -- hash grid and network --------------------------------------------------------------------------------------------
 
-#: Levels of the hash grid, numbers a level, its coarsest resolution; units of the hidden layer.
+#: Hash grid: levels, numbers a level, and coarsest resolution; units of the hidden layer of the network.
 LEVELS, FEATURES, COARSEST, WIDTH = 8, 2, 16, 32
 
 
-class HashField(VolumeField):
+class HashVolumeField(OccupancyField):
     """
-    A hash grid and a network of one hidden layer, which tells a raw density and twelve numbers of colour: arrays
-    ``entries`` and ``weights``, flat.
+    Field of a hash grid and a network of one hidden layer, which returns a raw density and twelve coefficients.
+
+    The arrays ``entries`` and ``weights`` are flat.
     """
 
     def __init__(self, nodes: Nodes, arrays: dict, encoding, network, occupancy: Occupancy):
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
-        self.encoding, self.network, self.occupancy = encoding, network, occupancy
+        super().__init__(nodes, arrays, occupancy)
+        self.encoding, self.network = encoding, network
 
-    def look(self, p, active=True):
+    def density_at(self, p, active=True):
         active = self.occupancy(p, active)
         longest = max(b - a for a, b in zip(self.lower, self.upper, strict=True))
         self.encoding.data = self.arrays["entries"].array
@@ -252,56 +252,54 @@ class HashField(VolumeField):
         raw, *numbers = self.network(nn.CoopVec(*features))
         return dr.select(active, density_of(raw + BEGIN, self.per_voxel), 0), numbers
 
-    def colour(self, latent, p, d, active=True):
-        return colour_of(latent, d)
-
-    def skip(self, p, d, active=True):
-        return self.occupancy.skip(p, d, active)
+    def radiance_at(self, point_data, p, d, active=True):
+        return colour_of(point_data, d)
 
 
-class HashFit:
-    """A hash grid of at most ``entries`` a level, as fine as ``finest`` cells along the longest side."""
+class HashVolumeFit:
+    """Training of a hash grid of at most ``entries`` a level, with ``finest`` cells along the longest side."""
 
-    def __init__(self, grid: Grid, entries: int, finest: float, seed: int = 1):
+    def __init__(self, grid: WeightedGrid, entries: int, finest: float, seed: int = 1):
         self.nodes, self.sizes = grid.nodes, (entries, finest)
         types = self.types = grid.nodes.types
         self.occupancy = Occupancy(grid.nodes)
         self.encoding, self.network = modules(types, entries, finest, seed)
         weights = types.TensorXf(dr.detach(self.network["weights"]))
-        # What the last layer begins with: nothing, of the mean colour
+        # The last layer begins with an empty field of the mean colour
         bias = self.network.layers[-1].bias
         mean = np.average(grid.colour, axis=0, weights=grid.seen + 1e-9)
         begin = weights.numpy().copy()
         begin[bias.offset : bias.offset + 13 * bias.stride : bias.stride] = [0.0, *mean]
         self.net = {"entries": types.TensorXf(dr.detach(self.encoding.params)), "weights": types.TensorXf(begin)}
 
-    def field_of(self, net) -> HashField:
+    def field_of(self, net) -> HashVolumeField:
+        """Return the field of the trained parameters."""
         arrays = {"entries": net["entries"], "weights": net["weights"]}
-        return HashField(self.nodes, arrays, self.encoding, self.network, self.occupancy)
+        return HashVolumeField(self.nodes, arrays, self.encoding, self.network, self.occupancy)
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that a file has to hold, by name: numbers in half precision."""
+        """Return the arrays of a file by name; numbers are in half precision."""
         half = {name: self.net[name].numpy().astype(np.float16) for name in ("entries", "weights")}
         return {**nodes_state(self.nodes), "sizes": np.array(self.sizes), **half}
 
     @staticmethod
-    def field(types, state: dict) -> HashField:
-        """The field of what :meth:`state` returned, which computes in single precision."""
+    def field(types, state: dict) -> HashVolumeField:
+        """Return the field of what :meth:`state` returned, which computes in single precision."""
         nodes = nodes_of(types, state)
         arrays = {name: types.TensorXf(state[name].astype(np.float32)) for name in ("entries", "weights")}
         encoding, network = modules(types, int(state["sizes"][0]), float(state["sizes"][1]), 1)
-        found = HashField(nodes, arrays, encoding, network, Occupancy(nodes))
-        found.nbytes = state["entries"].nbytes + state["weights"].nbytes + found.occupancy.nbytes
-        return found
+        field = HashVolumeField(nodes, arrays, encoding, network, Occupancy(nodes))
+        field.nbytes = state["entries"].nbytes + state["weights"].nbytes + field.occupancy.nbytes
+        return field
 
     @staticmethod
     def file_bytes(state: dict, predict: bool = True) -> int:
-        """Bytes on disk, after zlib."""
+        """Return the bytes on disk, after zlib."""
         return HEADER + sum(len(deflated(state[n].tobytes())) for n in ("entries", "weights")) + occupied_bytes(state)
 
 
 def modules(types, entries: int, finest: float, seed: int) -> tuple:
-    """The hash grid and the network, untrained."""
+    """Return the untrained hash grid and network."""
     scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
     encoding = nn.HashGridEncoding(
         types.Float, 3, n_levels=LEVELS, n_features_per_level=FEATURES, hashmap_size=entries // 16 * 16,
@@ -313,7 +311,7 @@ def modules(types, entries: int, finest: float, seed: int) -> tuple:
 
 
 def parameters(entries: int, finest: float) -> int:
-    """Numbers of a hash grid and its network, about."""
+    """Return the approximate number of parameters of a hash grid and its network."""
     scale = (finest / COARSEST) ** (1 / (LEVELS - 1))
     levels = sum(min(entries, (math.ceil(COARSEST * scale**k) + 1) ** 3) for k in range(LEVELS))
     return FEATURES * levels + WIDTH * (LEVELS * FEATURES + 1) + 13 * (WIDTH + 1)

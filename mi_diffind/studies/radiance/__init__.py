@@ -1,6 +1,7 @@
 """
-``tradeoff field``: the radiance field of a capture in equal bytes, ours beside grids, codebooks, planes, the
-supplement's arrays and a hash grid with a network: views, reads and renders. :mod:`.candidates` says more.
+``tradeoff field``: the radiance field of a capture in equal bytes, ours against grids, codebooks, planes and others.
+
+The study measures errors in held-out views and the times of reads and renders (:mod:`.plan`).
 """
 
 from __future__ import annotations
@@ -10,16 +11,15 @@ import argparse
 from ...measure.study import Plan, Study
 from ..equal_memory import add_without_option, check_without
 
-#: What is asked for unless something else is: how many times smaller than a dense grid of float32. At the first one all
-#: kinds are made, and reads and renders are timed.
+#: Default budgets, as compression against a dense float32 grid. At the first one, all methods are trained and timed.
 RATIOS = (75.0, 50.0, 200.0)
 
-#: Where the capture is that is looked for, and how it is made.
+#: Default folder of the capture, and the scene that it is made from.
 DEFAULT, SCENE = "captures/group", "scenes/capture_group.xml"
 
 
-class FieldStudy(Study):
-    """A radiance field in equal bytes: how views look that it was not trained by, and the time of reads and renders."""
+class RadianceStudy(Study):
+    """Study of radiance fields in equal bytes: errors in held-out views, and the times of reads and renders."""
 
     name = "field"
     title = "the radiance field of a capture, in equal bytes, views, reads and renders"
@@ -27,24 +27,24 @@ class FieldStudy(Study):
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             "source", nargs="?", default=DEFAULT, metavar="FOLDER",
-            help=f"views, as mi-diffind capture writes them (default: {DEFAULT})",
+            help=f"folder of views, as mi-diffind capture writes it (default: {DEFAULT})",
         )  # fmt: skip
         parser.add_argument(
             "--compression", action="append", default=[], metavar="N",
-            help="how many times smaller than a dense grid of float32; may be repeated (default: "
-            f"{', '.join(f'{r:g}' for r in RATIOS)}; --quick: 75); all kinds are made and timed at the first one",
+            help="compression against a dense float32 grid; may be repeated (default: "
+            f"{', '.join(f'{r:g}' for r in RATIOS)}; --quick: 75); all methods are trained and timed at the first one",
         )  # fmt: skip
         add_without_option(parser)
         parser.add_argument(
             "--resolution", type=int, default=0, metavar="N",
-            help="nodes of the grid that all begin with, of a cube of the same volume (default: 128; --quick: 24)",
+            help="nodes along the side of a cube of the same volume, of the initial grid (default: 128; --quick: 24)",
         )  # fmt: skip
         parser.add_argument(
-            "--steps", type=int, default=0, metavar="N", help="of each training through the images (default: 500)"
+            "--steps", type=int, default=0, metavar="N", help="steps of each training through the images (default: 500)"
         )
 
     def check(self, arguments) -> None:
-        """Also reads the views; raises :class:`~mi_diffind.tasks.radiance.views.ViewsError`."""
+        """Check the options and read the views; raise :class:`~mi_diffind.tasks.radiance.views.ViewsError`."""
         from pathlib import Path
 
         from ...tasks.radiance.views import load_views
@@ -63,10 +63,14 @@ class FieldStudy(Study):
         arguments.views = tuple(load_views(arguments.source, split) for split in ("train", "test"))
 
     def plan(self, arguments) -> Plan:
-        from .plan import Request, plan
+        import mitsuba as mi
+
+        from ...runtime import array_module
+        from ...tasks.radiance.training import FieldSession
+        from .plan import RadianceStudySettings, plan
 
         quick = arguments.quick
-        request = Request(
+        settings = RadianceStudySettings(
             ratios=arguments.ratios,
             without=tuple(arguments.without),
             resolution=arguments.resolution or (24 if quick else 128),
@@ -75,7 +79,8 @@ class FieldStudy(Study):
             seconds=3.0 if quick else 90.0,
             film=48 if quick else 200,
         )
-        return plan(*arguments.views, arguments.source, request)
+        session = FieldSession(array_module(mi.variant()), *arguments.views)
+        return plan(session, arguments.source, settings)
 
 
-STUDY = FieldStudy()
+STUDY = RadianceStudy()

@@ -1,19 +1,19 @@
 """
-What the study of radiance fields compares, all made of one grid that was trained before, and then trained through the
-same images for as many steps as each other.
+Contenders, cases and budgets of the study of radiance fields.
 
-*Dense* and *sparse* grids have thirteen numbers of 8 bits at a node, or 6 bits for colours; *components* are principal
-ones of the colours, in steps that change a screen equally; a *codebook* holds colours found by k-means of what is seen
-(the idea of VQRF); *planes* are TensoRF's, the *hash grid* is that of ``drjit.nn`` with a network behind it. *Paper*
-and *ours* are presets of ``fit field``. Cells that no ray sees are left out of all by the same rule.
+All contenders begin with one trained grid and are trained through the same images for the same number of steps. *Dense*
+and *sparse* grids have thirteen numbers of 8 bits at a node, or 6 bits for colours. *Components* are principal
+components of the colours, in steps that change the display equally. A *codebook* holds colours found by k-means (the
+idea of VQRF). *Planes* are those of TensoRF, the *hash grid* is that of ``drjit.nn`` with a network. *Paper* and *ours*
+are presets of ``fit field``. Cells that no ray sees are removed from all by the same rule.
 
-Equal bytes: ours and dense grids have them in memory, index and all; all others on disk, the numbers of grids predicted
-from their neighbours and deflated. Grids are as fine as fits: a coarser one is trained by half of the steps, then loses
-what is not seen, and is trained, as it is stored, by the other half. Planes and networks, whose steps take longer, have
-:attr:`Request.seconds`.
+Equal bytes: ours and dense grids are counted in memory, index included; all others on disk, where the numbers of grids
+are predicted from their neighbours and deflated. Grids are as fine as the budget allows: a coarser grid is trained for
+half of the steps, loses the cells that no ray sees, and is trained in its stored form for the other half. Planes and
+networks, whose steps take longer, have :attr:`RadianceStudySettings.seconds`.
 
-Errors are PSNR of sRGB values before white in views that were not trained by: of pixels in which something is
-(``psnr_foreground_db``), and of all (``psnr_white_db``), which flatters.
+Errors are PSNR of sRGB values before white in held-out views: of the pixels of the foreground
+(``psnr_foreground_db``) and of all pixels (``psnr_white_db``), which flatters.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import functools
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import drjit as dr
@@ -33,22 +33,20 @@ from ...files import replacing
 from ...fitting import FitSettings, fit
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...runtime import array_module
 from ...tasks.radiance import grid as grids
-from ...tasks.radiance.field import VolumeField
 from ...tasks.radiance.files import load
 from ...tasks.radiance.fit import grid_of
 from ...tasks.radiance.march import march
 from ...tasks.radiance.presets import dense_bytes
-from ...tasks.radiance.training import Images, ImagesProblem, evaluate
-from ...tasks.radiance.views import Views
+from ...tasks.radiance.training import FieldSession, ImagesProblem
+from ...tasks.radiance.volume_field import NodeField, VolumeField
 from .. import equal_memory
 from ..baselines import radiance_factors as factors
 from ..baselines import radiance_fits as fits
 from . import pictures
 from .conclusions import conclusions, ratio_text, table
 
-#: Kind → its label. Those of :data:`ONCE` are made of the first size only.
+#: Method → its label. Those of :data:`ONCE` are trained at the first budget only.
 KINDS = {
     "dense": "dense grid, 8 bits",
     "sparse": "sparse grid, 8 bits",
@@ -62,56 +60,58 @@ KINDS = {
 }
 ONCE = ("dense", "planes", "hash")
 
-#: Kind → what it is a kind of, for pictures.
+#: Method → the group that it belongs to in pictures.
 FAMILIES = {
     "dense": "grid", "sparse": "grid", "sparse6": "grid", "components": "codes", "codebook": "codes",
     "planes": "planes", "hash": "network", "paper": "supplement's arrays", "ours": "ours",
 }  # fmt: skip
 
-#: Kind → preset, of those that ``fit field`` makes.
+#: Method → preset of ``fit field``.
 PRESETS = {"ours": "sparse", "paper": "paper"}
 
-#: Kinds whose bytes are those in memory; those of all others are on disk.
+#: Methods whose bytes are counted in memory; those of all others are counted on disk.
 IN_MEMORY = ("dense", "ours")
 
-#: Kinds that the times of ours are divided by.
+#: Methods by whose times ours is divided.
 AGAINST = ("sparse", "codebook", "paper")
 
-#: References: the grid that all begin with, and what becomes of it in as many steps as the others have.
+#: References: the grid that all begin with, and the same grid trained for as many steps as the contenders.
 GRID, LONGER = "grid", "grid, trained on"
 
-#: How a field is trained through images.
+#: Settings of the training through images.
 SETTINGS = FitSettings(seed=1, batch=8192, lr=2e-3, loss="mse", schedule="cosine", check_every=50, deterministic=False)
 
-#: Rates of what does not begin near its end. At them, a trained grid gets worse in test views.
+#: Learning rates of contenders that begin far from their optimum. At these, a trained grid gets worse in test views.
 RATES = {"coarser": 5e-3, "coarser, stored": 5e-3, "planes": 2e-2, "hash": 1e-2}
 
-#: What training is expected to leave room for: numbers that are trained deflate less.
+#: Share of a budget that untrained numbers may take, since trained numbers deflate less.
 ROOM, ROOM_COMPONENTS = 0.97, 0.84
 
-#: What a coarser grid is expected to lose of its bytes when cells that are not seen are left out.
+#: Expected share of its bytes that a coarser grid keeps when cells that no ray sees are removed.
 SHRINK = 0.8
 
-#: Weights in a ray, in units of the usual one, below which cells of a coarser grid are left out: the first that fits.
+#: Weights in a ray, in units of the default, below which cells of a coarser grid are removed: the first that fits.
 LADDER = (0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.5, 4.0, 6.0, 9.0)
 
-#: Entries of a codebook, and steps of components, in the order in which they are tried.
+#: Entries of a codebook and step widths of components, in the order in which they are tried.
 COUNTS, WIDTHS = (2**14, 2**12, 2**10), (0.03, 0.05, 0.08)
 
-#: A grid is never coarser than this.
+#: Largest ratio of node distances of a coarser grid.
 COARSEST = 6.0
 
-#: Channels of planes and lines, of density and of colour: more of them take minutes to compile.
+#: Channels of planes and lines for density and for colour: more of them take minutes to compile.
 RANKS = (8, 16)
 
 
 @dataclass(frozen=True)
-class Request:
+class RadianceStudySettings:
     """
-    ``ratios``, how many times smaller than a dense grid of float32, the first of which is shown most; kinds left out
-    (``without``); ``resolution`` of the grid that all begin with; ``grid_steps`` of its training (0: the preset's);
-    ``steps`` of each training from there, or ``seconds`` where those take longer; ``film``, pixels along the sides of
-    the picture that is timed.
+    Settings of the study.
+
+    ``ratios`` are the budgets, as compression against a dense float32 grid; the first is timed and shown. ``without``
+    names the methods left out. ``resolution`` is that of the grid, trained for ``grid_steps`` (0: as its preset says).
+    Each contender is trained for ``steps``, or for ``seconds`` if its steps take long. ``film`` is the side of the
+    timed picture in pixels.
     """
 
     ratios: tuple[float, ...]
@@ -124,92 +124,80 @@ class Request:
 
 
 @dataclass
-class Setting:
-    """What all candidates share: views, of the folder ``source``, and the grid that they begin with."""
+class RadianceStudyContext:
+    """State shared by all contenders: the session of the capture in the folder ``source``, and their grid."""
 
-    views: Views
-    held: Views
+    session: FieldSession
     source: str
-    request: Request
-    types: object
+    settings: RadianceStudySettings
     jobs: dict[str, RadianceContender] = field(default_factory=dict)
 
-    @functools.cached_property
-    def images(self) -> Images:
-        return Images(self.types, self.views)
+    @property
+    def types(self):
+        """The module of Dr.Jit types."""
+        return self.session.types
 
     @functools.cached_property
-    def tests(self) -> Images:
-        return Images(self.types, self.held)
-
-    @functools.cached_property
-    def target(self) -> grids.Grid:
+    def node_grid(self) -> grids.NodeGrid:
         """The trained grid."""
         return grid_of(load(self.jobs[GRID].file), self.types)
 
     @functools.cached_property
-    def grid(self) -> fits.Grid:
-        """What is seen of it."""
-        return self.seen(self.target.field())
+    def grid(self) -> fits.WeightedGrid:
+        """The visible part of the trained grid."""
+        return self.visible(self.node_grid.field())
 
-    def seen(self, found: VolumeField, least: float = 1.0) -> fits.Grid:
-        """
-        What is left of a grid without the cells that have less than so many times :data:`.target.VISIBLE` of any ray.
-        """
-        grid = fits.Grid.of(found, fits.visibility(found, self.images))
-        return grid.kept(grids.weights(found, self.images) >= least * grids.VISIBLE)
+    def visible(self, trained: NodeField, least: float = 1.0) -> fits.WeightedGrid:
+        """Return a grid without the cells whose largest weight in a ray is below ``least`` · :data:`.grid.VISIBLE`."""
+        grid = fits.WeightedGrid.of(trained, fits.visibility(trained, self.session.images))
+        return grid.kept(grids.weights(trained, self.session.images) >= least * grids.VISIBLE)
 
     @functools.cached_property
     def dense_bytes(self) -> int:
-        """What ratios refer to."""
-        return dense_bytes(self.target.nodes.shape)
+        """Bytes of the dense float32 grid, to which ratios refer."""
+        return dense_bytes(self.node_grid.nodes.shape)
 
-    def asked(self, ratio: float) -> int:
-        return round(self.dense_bytes / ratio)
-
-    def train(self, made, kind: str, steps: int, progress: bool, title: str, seconds: float | None = None):
-        """Train a fit in place. Returns the result, of as many steps as there were."""
-        problem = Unmeasured(self.types, made.net, made.field_of, self.views)
-        settings = FitSettings(**{
-            **asdict(SETTINGS), "lr": RATES.get(kind, SETTINGS.lr), "steps": steps, "measure_every": steps,
-        })  # fmt: skip
+    def train(self, trained_fit, rate: str, steps: int, progress: bool, title: str, seconds: float | None = None):
+        """Train a fit in place, at the learning rate of a name in :data:`RATES`, and return the result."""
+        problem = UnmeasuredProblem(self.session, trained_fit.net, trained_fit.field_of)
+        settings = replace(SETTINGS, lr=RATES.get(rate, SETTINGS.lr), steps=steps, measure_every=steps)
         result = fit(problem, settings, progress=progress, title=title, seconds=seconds)
-        made.net = problem.net
+        trained_fit.net = problem.net
         return result
 
-    def errors(self, found: VolumeField) -> dict[str, float]:
-        return evaluate(found, self.tests)
+    def errors(self, trained: VolumeField) -> dict[str, float]:
+        """Return the PSNR of a field in the held-out views."""
+        return self.session.held_out_images.evaluate(trained)
 
 
-class Unmeasured(ImagesProblem):
-    """Nothing is measured on the way: what counts is the end, of all alike."""
+class UnmeasuredProblem(ImagesProblem):
+    """Training that measures nothing before its end, so that the last step counts for all contenders."""
 
     def measure(self, net):
         return {"step": 0.0}
 
 
-def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
-    """What is measured of the views in the folder ``source``, in the variant that is set."""
-    setting = Setting(views, held, source, request, array_module(mi.variant()))
-    first = request.ratios[0]
-    jobs = setting.jobs
-    jobs[GRID] = Gridded("grid", 1.0, setting, GRID)
-    jobs[LONGER] = Longer("longer", 1.0, setting, LONGER)
-    for kind, ratio in equal_memory.combinations(KINDS, request.ratios, ONCE, request.without):
-        made = RadianceContender.of(kind, ratio, setting)
-        jobs[made.name] = made
+def plan(session: FieldSession, source: str, settings: RadianceStudySettings) -> Plan:
+    """Return the plan of the study for a session of the capture in the folder ``source``."""
+    context = RadianceStudyContext(session, source, settings)
+    views, held_out, first, jobs = session.views, session.held_out, settings.ratios[0], context.jobs
+    jobs[GRID] = GridReference("grid", 1.0, context, GRID)
+    jobs[LONGER] = TrainedOnReference("longer", 1.0, context, LONGER)
+    for method, ratio in equal_memory.combinations(KINDS, settings.ratios, ONCE, settings.without):
+        contender = RadianceContender.of(method, ratio, context)
+        jobs[contender.name] = contender
     candidates = [job.candidate() for job in jobs.values()]
     shown = [name for name, job in jobs.items() if job.budget == first and job.method in KINDS]
     ours = next((n for n in shown if jobs[n].method == "ours"), "")
     timed = tuple([GRID, *shown])
     cases = [
-        Case("reads", lambda lanes: _reads(setting, timed, lanes), lambda: _renders(setting, timed), candidates=timed,
+        Case("reads", lambda lanes: _reads(context, timed, lanes), lambda: _renders(context, timed), candidates=timed,
              query_names=("density", "both")),
     ]  # fmt: skip
     package = Path(__file__).resolve().parents[2]
-    made_by = [*(package / "tasks" / "field").glob("*.py"), package / "fitting.py", Path(__file__)]
-    made_by += (package / "studies" / "baselines").glob("radiance*.py")
-    made_by.append(package / "studies" / "baselines" / "node_codes.py")
+    sources = [*(package / "tasks" / "radiance").glob("*.py"), package / "fitting.py", Path(__file__)]
+    sources += (package / "studies" / "baselines").glob("radiance*.py")
+    sources.append(package / "studies" / "baselines" / "node_codes.py")
     return Plan(
         study="field",
         title=f"Radiance field: {Path(source).name}",
@@ -221,34 +209,35 @@ def plan(views: Views, held: Views, source: str, request: Request) -> Plan:
         accuracy_label="PSNR of the foreground in test views, dB",
         ratios=[(ours, n) for n in shown if jobs[n].method in AGAINST] if ours else [],
         details={
-            "source": source, "source_digest": views.digest + held.digest, "views": [len(views), len(held)],
-            "pixels": [views.width, views.height], "request": asdict(request), "first": first,
+            "source": source, "source_digest": views.digest + held_out.digest, "views": [len(views), len(held_out)],
+            "pixels": [views.width, views.height], "request": asdict(settings), "first": first,
         },
         notes=[
-            f"{Path(source).name}, {len(views)} views of {views.width} × {views.height} and {len(held)} to test. Equal "
-            "bytes: ours and dense grids in memory, the others on disk, deflated.",
+            f"{Path(source).name}, {len(views)} views of {views.width} × {views.height} and {len(held_out)} to test. "
+            "Equal bytes: ours and dense grids in memory, the others on disk, deflated.",
         ],
         jobs=list(jobs.values()),
-        jobs_fingerprint=fingerprint(made_by) + views.digest[:16],
-        pictures=pictures.of(setting),
+        jobs_fingerprint=fingerprint(sources) + views.digest[:16],
+        pictures=pictures.of(context),
         sampled=False,
         table=table,
         conclusions=conclusions,
     )  # fmt: skip
 
 
-# -- jobs -------------------------------------------------------------------------------------------------------------
+# -- contenders -------------------------------------------------------------------------------------------------------
 
 
 class RadianceContender(equal_memory.Contender):
-    """A field of a kind, so many times smaller than a dense grid."""
+    """Radiance field of a method, at a compression ratio against the dense float32 grid."""
 
     labels, families, budget_text = KINDS, FAMILIES, staticmethod(ratio_text)
 
     @staticmethod
-    def of(kind: str, ratio: float, setting: Setting) -> RadianceContender:
-        own = {"planes": Planes, "hash": Hashed}.get(kind, Preset if kind in PRESETS else OnNodes)
-        return own(kind, ratio, setting)
+    def of(method: str, ratio: float, context: RadianceStudyContext) -> RadianceContender:
+        """Return the contender of a method at a ratio."""
+        other = FieldPresetContender if method in PRESETS else NodesContender
+        return {"planes": PlanesContender, "hash": HashContender}.get(method, other)(method, ratio, context)
 
     def record(self, nbytes: int, file_bytes: int, seconds: float, **details) -> dict:
         details |= {"memory_bytes": nbytes, "file_bytes": file_bytes, "dense_bytes": self.context.dense_bytes}
@@ -256,12 +245,13 @@ class RadianceContender(equal_memory.Contender):
         return {"bytes": counted, "seconds": seconds, "errors": self.context.errors(self.model), "details": details}
 
     @property
-    def asked(self) -> int:
-        return self.context.asked(self.budget)
+    def budget_bytes(self) -> int:
+        """The budget in bytes."""
+        return round(self.context.dense_bytes / self.budget)
 
 
-class Preset(equal_memory.PresetContender, RadianceContender):
-    """By a preset of ``fit field``, from the grid."""
+class FieldPresetContender(equal_memory.PresetContender, RadianceContender):
+    """Contender trained from the grid by a preset of ``fit field``."""
 
     task_name = "field"
 
@@ -270,10 +260,10 @@ class Preset(equal_memory.PresetContender, RadianceContender):
         return PRESETS[self.method]
 
     def arguments(self) -> dict:
-        setting = self.context
+        context = self.context
         return {
-            "source": setting.source, "grid": str(setting.jobs[GRID].file), "bytes": str(self.asked),
-            "steps": setting.request.steps,
+            "source": context.source, "grid": str(context.jobs[GRID].file), "bytes": str(self.budget_bytes),
+            "steps": context.settings.steps,
         }  # fmt: skip
 
     def fit_record(self, task_model, fitted, seconds: float) -> dict:
@@ -281,8 +271,8 @@ class Preset(equal_memory.PresetContender, RadianceContender):
         return self.record(task_model.memory_nbytes, self.file.stat().st_size, seconds, **details)
 
 
-class Gridded(Preset):
-    """The grid that all begin with."""
+class GridReference(FieldPresetContender):
+    """Reference: the grid that all contenders begin with."""
 
     preset = "grid"
 
@@ -290,43 +280,42 @@ class Gridded(Preset):
         return Candidate(self.name, "reference", job=self.name, is_reference=True, details={"kind": self.method})
 
     def arguments(self) -> dict:
-        request = self.context.request
-        steps = {"steps": request.grid_steps} if request.grid_steps else {}
-        return {"source": self.context.source, "resolution": request.resolution, **steps}
+        settings = self.context.settings
+        steps = {"steps": settings.grid_steps} if settings.grid_steps else {}
+        return {"source": self.context.source, "resolution": settings.resolution, **steps}
 
 
-class Longer(Gridded):
-    """The grid after as many more steps as the others have."""
+class TrainedOnReference(GridReference):
+    """Reference: the grid after as many more steps as the contenders have."""
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        setting = self.context
-        start = time.perf_counter()
-        problem = grids.GridProblem(setting.target, setting.views)
+        start, steps = time.perf_counter(), self.context.settings.steps
+        problem = grids.GridProblem(self.context.node_grid, self.context.session)
         problem.measure = lambda net: {"step": 0.0}
-        steps = setting.request.steps
-        settings = FitSettings(**{**asdict(SETTINGS), "steps": steps, "measure_every": steps})
+        settings = replace(SETTINGS, steps=steps, measure_every=steps)
         if fit(problem, settings, progress=progress, title=self.name).interrupted:
             return None
-        found = problem.trained()
+        grid = problem.trained()
         if self.file:
             with replacing(self.file) as temporary, open(temporary, "wb") as stream:
-                np.savez(stream, density=found.density, colour=found.colour)
-        self.model = found.field()
-        nbytes = 52 * found.nodes.count
+                np.savez(stream, density=grid.density, colour=grid.colour)
+        self.model = grid.field()
+        nbytes = 52 * grid.nodes.count
         return self.record(nbytes, nbytes, time.perf_counter() - start, steps=steps)
 
     def load(self, path: Path) -> VolumeField:
         with np.load(path) as data:
-            return grids.Grid(self.context.target.nodes, data["density"], data["colour"]).field()
+            return grids.NodeGrid(self.context.node_grid.nodes, data["density"], data["colour"]).field()
 
 
-class Fitted(RadianceContender):
-    """What :mod:`..baselines` make; ``CLASS`` is that of the fits."""
+class BaselineContender(RadianceContender):
+    """Contender of :mod:`..baselines`; ``CLASS`` is the class of its fit."""
 
     CLASS: type
 
-    def finish(self, made, seconds: float, **details) -> dict:
-        state = made.state()
+    def finish(self, trained_fit, seconds: float, **details) -> dict:
+        """Store a trained fit, set the model and return the record."""
+        state = trained_fit.state()
         if self.file:
             with replacing(self.file) as temporary, open(temporary, "wb") as stream:
                 np.savez_compressed(stream, **state)
@@ -339,124 +328,125 @@ class Fitted(RadianceContender):
             return self.CLASS.field(self.context.types, {name: data[name] for name in data})
 
 
-class OnNodes(Fitted):
-    """A grid, components or a codebook."""
+class NodesContender(BaselineContender):
+    """Baseline on nodes: a grid, components or a codebook."""
 
     CLASS = fits.NodesFit
 
-    def makers(self) -> list[Callable[[fits.Grid], fits.NodesFit]]:
-        """What can be made of a grid, the best first."""
+    def makers(self) -> list[Callable[[fits.WeightedGrid], fits.NodesFit]]:
+        """Return functions that make a fit of a grid, in order of decreasing quality."""
         if self.method == "codebook":
             return [functools.partial(fits.codebook, count=n) for n in COUNTS]
         if self.method == "components":
             return [functools.partial(fits.components, width=w) for w in WIDTHS]
         return [functools.partial(fits.plain, levels=64 if self.method == "sparse6" else 256)]
 
-    def bytes_of(self, made: fits.NodesFit) -> int:
-        # What is everywhere has no need to be predicted, and no place for it
-        return made.file_bytes(made.state()) if self.method != "dense" else 13 * made.nodes.count
+    def bytes_of(self, nodes_fit: fits.NodesFit) -> int:
+        """Return the bytes of a fit that count against the budget."""
+        if self.method == "dense":
+            return 13 * nodes_fit.nodes.count
+        return nodes_fit.file_bytes(nodes_fit.state())
 
     @property
     def room(self) -> float:
-        return self.asked * {"dense": 1.0, "components": ROOM_COMPONENTS}.get(self.method, ROOM)
+        """Bytes that an untrained fit may take."""
+        return self.budget_bytes * {"dense": 1.0, "components": ROOM_COMPONENTS}.get(self.method, ROOM)
 
-    def beginning(self) -> tuple[fits.Grid, Callable, float]:
-        """The grid to begin with, what is made of it in the end, and how much coarser it is."""
-        whole, asked, makers = self.context.grid, self.room, self.makers()
+    def initial(self) -> tuple[fits.WeightedGrid, Callable, float]:
+        """Return the grid to begin with, the function that makes its fit, and the ratio of its node distances."""
+        whole, room, makers = self.context.grid, self.room, self.makers()
         if self.method == "dense":
             shape = np.array(whole.nodes.shape)
-            scale = (13 * shape.prod() / asked) ** (1 / 3)
-            while 13 * np.prod(np.ceil((shape - 1) / scale - 1e-6) + 1) > asked:
+            scale = (13 * shape.prod() / room) ** (1 / 3)
+            while 13 * np.prod(np.ceil((shape - 1) / scale - 1e-6) + 1) > room:
                 scale *= 1.01
             return whole.resampled(scale, sparse=False), makers[0], scale
         for make in makers:
             nbytes = self.bytes_of(make(whole))
-            if nbytes <= asked:
+            if nbytes <= room:
                 return whole, make, 1.0
         make = makers[min(1, len(makers) - 1)]
         nbytes = self.bytes_of(make(whole)) if len(makers) > 1 else nbytes
         rate, low, high = SHRINK * nbytes / whole.nodes.count, 1.0, COARSEST
         for _ in range(12):
             scale = math.sqrt(low * high)
-            fits_in = rate * np.count_nonzero(whole.coarser(scale)) <= asked
+            fits_in = rate * np.count_nonzero(whole.coarser(scale)) <= room
             low, high = (low, scale) if fits_in else (scale, high)
         return whole.resampled(high), make, high
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        start, setting = time.perf_counter(), self.context
-        grid, make, scale = self.beginning()
-        steps = rest = setting.request.steps
+        start, context = time.perf_counter(), self.context
+        grid, make, scale = self.initial()
+        steps = rest = context.settings.steps
         if scale > 1:
             first, rest = fits.plain(grid), steps - steps // 2
-            if setting.train(first, "coarser", steps - rest, progress, f"{self.name}, at first").interrupted:
+            if context.train(first, "coarser", steps - rest, progress, f"{self.name}, at first").interrupted:
                 return None
-            made = make(first.grid(grid.seen))
+            stored = make(first.grid(grid.seen))
             for least in LADDER if self.method != "dense" else ():
-                made = make(setting.seen(first.field_of(first.net), least))
-                if self.bytes_of(made) <= self.room:
+                stored = make(context.visible(first.field_of(first.net), least))
+                if self.bytes_of(stored) <= self.room:
                     break
         else:
-            made = make(grid)
-        if setting.train(made, "coarser, stored" if scale > 1 else "", rest, progress, self.name).interrupted:
+            stored = make(grid)
+        if context.train(stored, "coarser, stored" if scale > 1 else "", rest, progress, self.name).interrupted:
             return None
-        colours = len(made.state()["colour"]) if self.method == "codebook" else 0
+        colours = len(stored.state()["colour"]) if self.method == "codebook" else 0
         return self.finish(
-            made, time.perf_counter() - start, steps=steps, coarser=scale, nodes=made.nodes.count, entries=colours
+            stored, time.perf_counter() - start, steps=steps, coarser=scale, nodes=stored.nodes.count, entries=colours
         )
 
 
-class Planes(Fitted):
-    """Planes and lines."""
+class PlanesContender(BaselineContender):
+    """Baseline of planes and lines."""
 
     CLASS = factors.PlanesFit
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        start, setting = time.perf_counter(), self.context
-        grid = setting.grid
+        start, grid = time.perf_counter(), self.context.grid
         longest = max(b - a for a, b in zip(grid.nodes.lower, grid.nodes.upper, strict=True))
         low, high = longest / 2000, longest / 4
         for _ in range(30):
             spacing = math.sqrt(low * high)
             rows = factors.rows_of(factors.sides_of(grid.nodes, spacing))
-            low, high = (low, spacing) if sum(RANKS) * rows <= 0.97 * self.asked else (spacing, high)
-        made = factors.PlanesFit(grid, RANKS, high)
-        steps = 0
+            low, high = (low, spacing) if sum(RANKS) * rows <= 0.97 * self.budget_bytes else (spacing, high)
+        planes, steps = factors.PlanesFit(grid, RANKS, high), 0
         for share, title in ((0.7, f"{self.name}, at first"), (0.3, self.name)):
-            seconds = share * setting.request.seconds
-            result = setting.train(made, self.method, 10**6, progress, title, seconds)
+            seconds = share * self.context.settings.seconds
+            result = self.context.train(planes, self.method, 10**6, progress, title, seconds)
             if result.interrupted:
                 return None
             steps += result.steps
-            if made.steps is None:
-                made.round()
-        return self.finish(made, time.perf_counter() - start, steps=steps)
+            if planes.steps is None:
+                planes.round()
+        return self.finish(planes, time.perf_counter() - start, steps=steps)
 
 
-class Hashed(Fitted):
-    """A hash grid and a network."""
+class HashContender(BaselineContender):
+    """Baseline of a hash grid and a network."""
 
-    CLASS = factors.HashFit
+    CLASS = factors.HashVolumeFit
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        start, setting = time.perf_counter(), self.context
-        finest = float(max(setting.grid.nodes.shape))
-        powers = np.arange(8, 24, 0.1)
-        fitting = [2**p for p in powers if 2 * factors.parameters(int(2**p) // 16 * 16, finest) <= 0.97 * self.asked]
-        made = factors.HashFit(setting.grid, int(max(fitting, default=256)) // 16 * 16, finest)
-        result = setting.train(made, self.method, 10**6, progress, self.name, setting.request.seconds)
+        start, context, room = time.perf_counter(), self.context, 0.97 * self.budget_bytes
+        finest = float(max(context.grid.nodes.shape))
+        sizes = (int(2**power) // 16 * 16 for power in np.arange(8, 24, 0.1))
+        entries = max((size for size in sizes if 2 * factors.parameters(size, finest) <= room), default=256)
+        hash_fit = factors.HashVolumeFit(context.grid, entries, finest)
+        result = context.train(hash_fit, self.method, 10**6, progress, self.name, context.settings.seconds)
         if result.interrupted:
             return None
-        return self.finish(made, time.perf_counter() - start, steps=result.steps)
+        return self.finish(hash_fit, time.perf_counter() - start, steps=result.steps)
 
 
-# -- time -------------------------------------------------------------------------------------------------------------
+# -- times ------------------------------------------------------------------------------------------------------------
 
 
-def _reads(setting: Setting, names, lanes: int) -> dict:
-    """Densities, and densities with colours, at random points of the cells that are seen, in random directions."""
-    types, nodes = setting.types, setting.grid.nodes
+def _reads(context: RadianceStudyContext, names, lanes: int) -> dict:
+    """Return queries of density, and of density and colour, at random points of the visible cells."""
+    types, nodes = context.types, context.grid.nodes
     rng = np.random.default_rng(1)
-    cells = np.argwhere(setting.grid.cells())
+    cells = np.argwhere(context.grid.cells())
     places = cells[rng.integers(len(cells), size=lanes)] + rng.random((lanes, 3))
     points = np.float32(np.array(nodes.lower) + places * nodes.spacing)
     p = types.Array3f(*(types.Float(np.ascontiguousarray(v)) for v in points.T))
@@ -467,21 +457,21 @@ def _reads(setting: Setting, names, lanes: int) -> dict:
     density = {FLOOR: lambda: [*p, *d]}
     both = {FLOOR: lambda: [*p, *d]}
     for name in names:
-        own = setting.jobs[name].model
-        density[name] = lambda f=own: [f.look(p)[0]]
-        both[name] = lambda f=own: _both(f, p, d)
+        model = context.jobs[name].model
+        density[name] = lambda f=model: [f.density_at(p)[0]]
+        both[name] = lambda f=model: _density_and_colour(f, p, d)
     return {"density": density, "both": both}
 
 
-def _both(found: VolumeField, p, d) -> list:
-    density, latent = found.look(p)
-    return [density, *found.colour(latent, p, d)]
+def _density_and_colour(model: VolumeField, p, d) -> list:
+    density, point_data = model.density_at(p)
+    return [density, *model.radiance_at(point_data, p, d)]
 
 
-def _renders(setting: Setting, names) -> dict:
-    """A picture of one of the test views, one ray a pixel."""
-    types, side = setting.types, setting.request.film
-    images = setting.tests
+def _renders(context: RadianceStudyContext, names) -> dict:
+    """Return renders of the first held-out view, one ray a pixel."""
+    types, side = context.types, context.settings.film
+    images = context.session.held_out_images
     lane = dr.arange(types.UInt32, side * side)
     tile, pixel = lane // 16, lane % 16
     across = side // 4
@@ -492,8 +482,8 @@ def _renders(setting: Setting, names) -> dict:
     )
     dr.make_opaque(o, d)
 
-    def render(own):
-        seen = march(own, o, d, 0, dr.inf)
+    def render(model):
+        seen = march(model, o, d, 0, dr.inf)
         return [*seen.colour, seen.transmittance]
 
-    return {name: lambda k, f=setting.jobs[name].model: render(f) for name in names}
+    return {name: lambda k, f=context.jobs[name].model: render(f) for name in names}

@@ -27,7 +27,7 @@ def pyramid_of(maps: dict[str, list[np.ndarray]], like: Pyramid) -> Pyramid:
             if isinstance(channel, int):
                 for values, decoded_level in zip(levels, maps[m.name], strict=True):
                     values[..., channel] = m.encode(decoded_level[..., c])
-    return Pyramid.from_levels(like.layout, levels, like.types, like.border)
+    return Pyramid(like.layout, levels, like.types, like.border)
 
 
 def errors(truth: dict[str, list[np.ndarray]], maps: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:

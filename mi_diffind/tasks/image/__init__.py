@@ -1,11 +1,11 @@
 """
-Task 3: images and materials as one primary and one cascaded array.
+Task 3: images and materials as a primary array that points into a cascaded one.
 
-Sources, and which of their channels are stored: :mod:`mi_diffind.maps`.
+Sources and stored channels are in :mod:`mi_diffind.maps`.
 
-- :mod:`.arrays`: initial values; :mod:`.memory_budget`, :mod:`.search`: how large they are;
-- :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and what ``fit image`` does;
-- :mod:`.compressed`, :mod:`.model`: the result, as an image and as a file.
+- :mod:`.arrays`: initial arrays; :mod:`.memory_budget`, :mod:`.search`: resolutions.
+- :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the training problem, the command ``fit image``.
+- :mod:`.compressed`: the result as an image, as a table file and as a model.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, without
 
 
 class Image(Task):
-    """The task. Its presets are the recipes of :mod:`.presets`; files are always stored as bytes, or fewer bits."""
+    """Task of images; presets are the recipes of :mod:`.presets`, entries have 8 bits or fewer."""
 
     name = "image"
     title = "an image or the maps of a material"
@@ -32,7 +32,7 @@ class Image(Task):
         *SIZES,
         Argument(
             "--ratio-search", action="store_true",
-            help="find sides, bits and dimensions of the arrays by short trainings",
+            help="choose sides, bits and dimensions of the arrays by short trainings",
         ),
         Argument(
             "--without", action="append", default=[], choices=list(IMPROVEMENTS),
@@ -40,7 +40,7 @@ class Image(Task):
         ),
         Argument(
             "--structure", choices=["auto", *STRUCTURES],
-            help="bits of an entry of the primary array, or of two (default: auto for ours, 8 bits for paper)",
+            help="bits of an entry of one or two primary arrays, or pages (default: auto for ours, 8 bits for paper)",
         ),
         Argument("--dims", type=positive, choices=range(1, 5), help="dimensions of the cascaded array"),
         Argument(
@@ -51,9 +51,9 @@ class Image(Task):
     decode_arguments = DECODED
 
     def settings(self, preset, given, options):
-        own = without(PRESETS[preset], options["without"]).settings
-        steps = given.get("steps", own.steps)
-        return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
+        defaults = without(PRESETS[preset], options["without"]).settings
+        steps = given.get("steps", defaults.steps)
+        return dataclasses.replace(defaults, measure_every=max(1, steps // 10), **given)
 
 
 TASK = Image()

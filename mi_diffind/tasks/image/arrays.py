@@ -1,10 +1,10 @@
 """
-The arrays of task 3, untrained: a primary array of 1 to 4 channels, read at uv, that points into a cascaded one.
+Initial arrays of task 3: a primary array of 1 to 4 channels, read at uv, that points into a cascaded array.
 
-Two ways to start. The supplement's: the primary is the uv ramp, repeated for each further channel, the cascaded array
-constant for each kind of map. Or from the data: the image's principal components, scaled down to the primary's
-size, are its entries, and the cascaded array is the linear map back from components to channels. At step 0 this is a
-smaller picture of fewer channels, and what is left to learn is what a smaller linear picture cannot show.
+- The supplement's: the primary is the uv ramp, repeated for each further channel; the cascaded array is constant for
+  each role of a map.
+- Ours: the primary holds the image's principal components, scaled down to its size; the cascaded array is the linear
+  map back from components to channels. At step 0 this is a smaller picture of fewer channels.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from ...maps.layout import Layout
 from ...pages import PagedArray, page_counts, page_entries, page_gain, page_positions, page_shift, page_sizes
 from .memory_budget import ImageBudget
 
-#: Room between the components' range and the ends of [0, 1], and the share of texels beyond the range at either end.
+#: Room between the components' range and the ends of [0, 1]; share of texels beyond the range at either end.
 MARGIN, OUTSIDE = 0.02, 1e-3
 
 
 def from_ramp(layout: Layout, size: ImageBudget, border: tuple[str, str]) -> Indirection:
-    """The supplement's initial values; not allocated."""
+    """Return the supplement's initial arrays, not allocated."""
     primaries = [
         DifferentiableArray((rows, columns), dims, "ramp", fold=True, border=border)
         for rows, columns, dims, _ in size.primaries
@@ -35,40 +35,43 @@ def from_ramp(layout: Layout, size: ImageBudget, border: tuple[str, str]) -> Ind
 
 
 def joined(primaries: Sequence[DifferentiableArray], cascaded: DifferentiableArray) -> Indirection:
-    """The indirection of primaries that are all read at (v, u)."""
+    """Return the indirection of primaries that are all read at (v, u)."""
     return Indirection(primaries, cascaded, [(0, 1)] * len(primaries))
 
 
 def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> Indirection:
     """
-    Initial values from the principal components of ``values``, ``(height, width, k)`` in [0, 1]; not allocated. Of two
-    primaries, the first takes the components of the differences of neighbours, which need its resolution most, the
-    second those of what is left. What channels a primary has beyond the image's ``k`` become a ramp along u or v, as in
-    the supplement.
+    Return initial arrays from the principal components of ``values``, ``(height, width, k)`` in [0, 1]; not allocated.
+
+    Of two primaries, the first takes the components of the differences of neighbours, which need its resolution most;
+    the second takes components of the rest. Channels beyond the image's ``k`` start as ramps along u or v.
     """
     k = values.shape[-1]
     mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
-    left, back = np.eye(k), mean  # what is not in a component yet, what the cascaded array says at its entries
+    left, back = (
+        np.eye(k),
+        mean,
+    )  # projection onto remaining components; channels of the cascaded entries
     primaries, axis = [], 0
     for i, (rows, columns, dims, _) in enumerate(size.primaries):
         last = i + 1 == len(size.primaries)
         covariance = components.covariance(values, mean) if last else components.differences(values)
         used = max(0, min(dims, k - axis))
-        # Of what does not vary, any direction is as good, but none that an earlier array has already
+        # The small multiple of ``left`` keeps flat directions apart from those of an earlier array
         directions = components.strongest(left @ covariance @ left + 1e-9 * left, used)
         left = left - directions.T @ directions
         paged = size.paged and i == 0
         if paged:
             exact = ((values - mean) @ directions.T).astype(np.float32)
             sizes, shift = page_sizes(exact, border, page_budget(size, values.shape)), page_shift(values.shape[:2])
-            found = page_entries(exact, border, sizes)
+            projected = page_entries(exact, border, sizes)
         else:
-            found = (components.downscale(values, rows, columns, border) - mean) @ directions.T
-        unit = np.zeros((*found.shape[:-1], 0))
+            projected = (components.downscale(values, rows, columns, border) - mean) @ directions.T
+        unit = np.zeros((*projected.shape[:-1], 0))
         if used:
-            low, high = np.quantile(found.reshape(-1, used), [OUTSIDE, 1 - OUTSIDE], axis=0)
+            low, high = np.quantile(projected.reshape(-1, used), [OUTSIDE, 1 - OUTSIDE], axis=0)
             high = np.maximum(high, low + 1e-3)
-            unit = MARGIN + (1 - 2 * MARGIN) * np.clip((found - low) / (high - low), 0, 1)
+            unit = MARGIN + (1 - 2 * MARGIN) * np.clip((projected - low) / (high - low), 0, 1)
             grid = (np.linspace(0, 1, size.cascaded) - MARGIN) / (1 - 2 * MARGIN)
         for j in range(used):
             along = np.reshape(
@@ -94,7 +97,7 @@ def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, st
 
 
 def gain_of_pages(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> tuple[float, float]:
-    """:func:`~mi_diffind.pages.page_gain` of the components of an image at a size of one primary."""
+    """Return :func:`~mi_diffind.pages.page_gain` of the components of an image, for one primary."""
     k = values.shape[-1]
     mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
     covariance = components.covariance(values, mean)
@@ -106,7 +109,7 @@ def gain_of_pages(values: np.ndarray, size: ImageBudget, border: tuple[str, str]
 
 
 def page_budget(size: ImageBudget, shape: Sequence[int]) -> float:
-    """Entries of all pages of the first primary together, for an image of ``shape``: less what the index takes."""
+    """Return the entries of all pages of the first primary beside their index, for an image of ``shape``."""
     rows, columns, dims, bits = size.primaries[0]
     index = PagedArray(np.ones((*page_counts(shape[:2]), 2), int)).index_nbytes
     return rows * columns - 8 * index / (dims * bits)

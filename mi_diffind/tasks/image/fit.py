@@ -1,13 +1,11 @@
-"""``fit image``: from what was asked for to sizes, searches and trainings."""
+"""``fit image``: checks of options, the choice of a memory budget, searches and trainings."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
-from pathlib import Path
 
 from ...errors import UsageError
-from ...maps.arguments import asked_bytes
+from ...maps.arguments import record_source, requested_border, requested_bytes, size_figures
 from ...maps.source import Source, load_source
 from ...pages import most_entries
 from ...settings import FittingError
@@ -18,14 +16,14 @@ from .presets import PAGED, PRESETS, STRUCTURES, ImageRecipe, without
 
 
 def recipe_of(preset: str, settings, options) -> ImageRecipe:
-    """The recipe of a preset with what the options change. Raises :class:`UsageError`."""
+    """Return the recipe of a preset, changed by the options. Raises :class:`UsageError`."""
     recipe = without(PRESETS[preset], options["without"])
     given = {k: options[k] for k in ("structure", "dims") if options[k] is not None}
     recipe = dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
     if STRUCTURES.get(recipe.structure, (8, None))[1] and recipe.dims < 3:
-        raise UsageError(f'--structure "{recipe.structure}" has two primary arrays and needs --dims 3 or 4')
+        raise UsageError(f'--structure "{recipe.structure}" has two primary arrays, allowed are --dims 3 and 4')
     if recipe.structure in PAGED and not recipe.components:
-        raise UsageError(f'--structure "{recipe.structure}" starts from components: leave out what switches them off')
+        raise UsageError(f'--structure "{recipe.structure}" starts from components: leave out --without components')
     return recipe
 
 
@@ -35,14 +33,14 @@ def check(request: FitRequest) -> None:
     several = options["ratio_search"] or options["psnr"]
     if request.checkpoint is not None and several:
         raise UsageError(
-            "--checkpoint keeps one training, --ratio-search and --psnr make several: give only one of them"
+            "--checkpoint: for one training, but --ratio-search and --psnr make several: give only one of them"
         )
     if options["ratio_search"] and (options["psnr"] or options["cascaded"]):
-        raise UsageError("--ratio-search finds the sides of arrays of a given size: leave out --psnr and --cascaded")
+        raise UsageError("--ratio-search: chooses the sides of arrays of a given size: leave out --psnr and --cascaded")
     if options["psnr"] and options["cascaded"]:
-        raise UsageError("--psnr chooses the sides of the arrays: leave out --cascaded")
+        raise UsageError("--psnr: chooses the sides of the arrays: leave out --cascaded")
     if request.preset == "paper" and options["without"]:
-        raise UsageError("--without switches off what the paper's recipe does not have: leave it out")
+        raise UsageError("--without: the preset paper has none of our improvements: leave it out")
     if options["source"] is None:
         raise UsageError("source: not given, an image or a manifest of the maps of a material is needed")
     recipe_of(request.preset, request.settings, options)
@@ -50,74 +48,66 @@ def check(request: FitRequest) -> None:
 
 def fit(request: FitRequest) -> Fitted:
     """
-    Choose sizes, train, and measure. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
+    Choose sizes, train, and measure.
+
+    Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
     :class:`~mi_diffind.fitting.FittingError`.
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
-    fitted, asked = _train(request, source, recipe)
-    table, folder = fitted.table, (request.output or Path("x")).resolve().parent
-    table.settings["source_path"] = os.path.relpath(Path(options["source"]).resolve(), folder)
-    achieved = source.nbytes / table.nbytes if table.nbytes else None
-    wanted = f" ({source.nbytes / asked:.2f}x asked for)" if asked else ""
-    fitted.lines.append((f"{achieved:.2f}x" if achieved else "of one colour") + wanted)
-    fitted.figures = {
-        "source_bytes": source.nbytes,
-        "compression": achieved,
-        "compression_asked": source.nbytes / asked if asked else None,
-        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
-        "bits": {name: a.bits for name, a in table.arrays.items()},
-        **fitted.figures,
-    }
+    fitted, requested = _train(request, source, recipe)
+    record_source(request, fitted.table)
+    figures, line = size_figures(source, fitted.table, requested)
+    fitted.lines.append(line)
+    fitted.figures = {**figures, **fitted.figures}
     return fitted
 
 
 def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:
-    """What was trained, and the bytes that were asked for."""
+    """Return the result of the training or search, and the requested bytes."""
     options = request.options
-    border = None if options["border"] == "auto" else (options["border"],) * 2
-    if not training.layout_of(source, recipe).stored:  # of one colour: nothing to choose
+    border = requested_border(options)
+    if not training.layout_of(source, recipe).stored:  # all channels are constant
         return Fitted(*training.fit_image(source, None, recipe, request, border), figures={"tried": []}), None
     if options["psnr"] is not None:
         return _for_psnr(request, source, recipe, border), None
-    asked = asked_bytes(options, source)
+    requested = requested_bytes(options, source)
     tried, lines = [], []
     if options["ratio_search"]:
         short = dataclasses.replace(request, checkpoint=None)
-        found = search.ratio_search(source, asked, recipe, short, request.preset != "paper", border)
-        tried, recipe, size = found.tried, found.recipe, found.size
+        ratio = search.ratio_search(source, requested, recipe, short, request.preset != "paper", border)
+        tried, recipe, size = ratio.tried, ratio.recipe, ratio.size
         lines += [
             f"tried {t['columns']} x {t['rows']} x {t['dims']} of {t['structure']} → {t['cascaded']}: "
             f"{t['psnr_db']:.2f} dB at texels, {t['psnr_between_db']:.2f} between"
             for t in tried
         ]
-        if found.interrupted:
-            return Fitted(*found.best, lines, {"tried": tried}), asked
+        if ratio.interrupted:
+            return Fitted(*ratio.best, lines, {"tried": tried}), requested
     elif options["cascaded"]:
-        size = search.sized(source, asked, recipe, options["cascaded"])
+        size = search.sized(source, requested, recipe, options["cascaded"])
         if size.nbytes > MAX_BYTES:
             raise UsageError(
-                f"--cascaded: found {options['cascaded']}, which makes {size.nbytes:,} bytes of {size.dims} "
+                f"--cascaded: found {options['cascaded']}, which is {size.nbytes:,} bytes in {size.dims} "
                 f"dimensions, allowed are {MAX_BYTES:,}"
             )
     else:
-        size = search.default_size(source, asked, recipe)
+        size = search.default_size(source, requested, recipe)
     if size.paged and size.primaries[0][0] * size.primaries[0][1] > most_entries(2):
         raise UsageError(
-            f'--structure "{recipe.structure}": {round(asked):,} bytes are more than {most_entries(2):,} entries, '
-            f"which is what pages can hold: ask for fewer or take another one"
+            f'--structure "{recipe.structure}": {round(requested):,} bytes are too many, pages hold at most '
+            f"{most_entries(2):,} entries: request fewer bytes or another structure"
         )
     table, result = training.fit_image(source, size, recipe, request, border)
-    _, sentence = memory_budget.explain(size, source.nbytes, asked)
-    if sentence is None and size.paged and table.nbytes < (1 - memory_budget.TOLERANCE) * asked:
-        sentence = (
-            f"{round(asked):,} bytes were asked for, but at {table.nbytes:,} bytes the pages are as fine as the image"
-        )
-    return Fitted(table, result, [*lines, *([sentence] if sentence else [])], {"tried": tried}), asked
+    sentence = memory_budget.explain(size, source.nbytes, requested)
+    if sentence is None and size.paged and table.nbytes < (1 - memory_budget.TOLERANCE) * requested:
+        sentence = f"{round(requested):,} bytes were requested, at {table.nbytes:,} the pages are as fine as the image"
+    return Fitted(table, result, [*lines, *([sentence] if sentence else [])], {"tried": tried}), requested
 
 
 def _for_psnr(request: FitRequest, source: Source, recipe: ImageRecipe, border) -> Fitted:
+    """Return the smallest file of a wanted quality. Raises :class:`FittingError`."""
     goal = float(request.options["psnr"])
     table, result, tried = search.psnr_search(source, goal, recipe, request, border)
     if table is None:

@@ -1,5 +1,5 @@
 """
-Bytes and resolutions: how large the arrays of task 3 are for a wanted size (the paper's supplement, section 1.3).
+Memory budgets of task 3: resolutions of the arrays for a number of bytes (the paper's supplement, section 1.3).
 
 Equation 1, ``bytes = 4 N_p² + k N_c⁴``, is for square images, a four-dimensional cascaded array and one byte an entry.
 Here the primary has ``rows × columns`` entries in place of ``N_p²`` (in the proportions of the image), ``dims``
@@ -21,55 +21,40 @@ RATIOS = {3: 128, 6: 128, 12: 80, 24: 72}
 #: Resolution ratio that is safe at 12x, for the side of the image in texels (the supplement's section 1.3).
 SAFE_RATIOS = {1024: 64, 2048: 64, 4096: 96}
 
-#: Largest side of a cascaded array that is chosen by itself, of 1 to 4 dimensions.
+#: Largest side of a cascaded array of 1 to 4 dimensions that is chosen by default.
 CASCADED_LIMITS = (256, 64, 32, 16)
 
 #: Useful range of the resolution ratio (the supplement's section 1.3).
 RATIO_RANGE = (40, 128)
 
-#: Both sides of a primary that the paper's search finds are multiples of the first, the cascaded array's of the second.
+#: Steps of the paper's search: sides of a primary are multiples of the first, of a cascaded array of the second.
 PRIMARY_STEP, CASCADED_STEP = 8, 4
 
-#: How far the bytes may be from what was asked for before :func:`explain` says why.
+#: Largest relative difference between wanted and actual bytes that needs no explanation.
 TOLERANCE = 0.05
 
 
-def image_bytes(primary_entries: int, cascaded: int, channels: int, dims: int = 4, bits: int = 8) -> int:
+def resolution_ratio(compression: float, resolution: float) -> float:
     """
-    Bytes of a primary array of ``primary_entries`` texels (``dims`` channels of ``bits`` bits, without gaps) and a
-    cascaded array of side ``cascaded`` (``dims`` dimensions, one byte a channel).
+    Return the default of ``ρ = N_p / N_c`` for a compression ratio and the side of the image in texels.
 
-    With ``primary_entries = N_p²`` and the defaults this is the supplement's equation 1: ``4 N_p² + k N_c⁴``.
+    The side of a non-square image is the square root of its texels. :data:`RATIOS`, interpolated linearly in
+    ``log2(compression)`` and constant outside of 3 … 24, times a factor for the resolution: 1 at 4096; up to 2048 the
+    factor that makes the ratio at 12x the safe default, 64 (:data:`SAFE_RATIOS`); between them linear in
+    ``log2(resolution)``. At 4K the best measured ratio, 80, is taken and not the safe one, 96. The product is limited
+    to :data:`RATIO_RANGE`.
     """
-    return (dims * bits * primary_entries + 7) // 8 + channels * cascaded**dims
-
-
-def ratio(compression: float, resolution: float) -> float:
-    """
-    Default of the resolution ratio ``ρ = N_p / N_c`` for a compression ratio and the side of the image in texels
-    (non-square: the square root of its texels).
-
-    :data:`RATIOS`, interpolated linearly in ``log2(compression)`` and constant outside of 3 … 24, times a factor for
-    the resolution: 1 at 4096, and from 2048 downwards what makes it the safe default at 12x, 64 (:data:`SAFE_RATIOS`;
-    at 4K the 80 that was measured best is taken, not the safe 96), interpolated linearly in ``log2(resolution)``. The
-    product is limited to :data:`RATIO_RANGE`.
-    """
-    for name, value in (("compression", compression), ("resolution", resolution)):
-        if not (value > 0 and math.isfinite(value)):
-            raise ValueError(f"{name}: found {value}, allowed are finite numbers > 0")
     at_4k = np.interp(math.log2(compression), np.log2(list(RATIOS)), list(RATIOS.values()))
     factor = np.interp(math.log2(resolution), [11, 12], [SAFE_RATIOS[2048] / RATIOS[12], 1])
     return float(np.clip(at_4k * factor, *RATIO_RANGE))
 
 
-_default_ratio = ratio  # where "ratio" is the argument that replaces it
-
-
 @dataclass(frozen=True)
 class CoarsePrimary:
     """
-    A second primary array, of lower resolution: how many ``dims`` of the pointer it holds, their ``bits``, and its
-    sides in units of those of the first, ``scale``.
+    A second primary array, of lower resolution.
+
+    It holds ``dims`` coordinates of the pointer in ``bits`` bits; ``scale`` is its side as a multiple of the first's.
     """
 
     dims: int = 2
@@ -84,14 +69,14 @@ class CoarsePrimary:
 @dataclass(frozen=True)
 class ImageBudget:
     """
-    Resolutions of a pair of arrays: the primary's ``rows`` and ``columns``, the side of the ``cascaded`` array, its
-    ``channels``, the ``dims`` of the pointer and the ``bits`` of each of its coordinates. With ``coarse``, so many of
-    the ``dims`` are in a second primary.
+    Resolutions of the arrays of an image.
 
-    ``paged``: the first primary consists of pages, whose entries and index together take the bytes of so many rows and
-    columns; where they are, the image decides.
-
-    ``full`` says that the primary is as large as the image, or as the search lets it be; sizes compare without it.
+    - ``rows``, ``columns``: sides of the primary; ``dims``, ``bits``: coordinates of a pointer, bits of each.
+    - ``cascaded``: side of the cascaded array of ``channels`` channels.
+    - ``full``: the primary is as large as the image, or as the search allows; comparisons ignore it.
+    - ``coarse``: a second primary, which holds some of the ``dims``.
+    - ``paged``: the first primary consists of pages, whose entries and index together take the bytes of ``rows`` ×
+      ``columns`` entries.
     """
 
     rows: int
@@ -113,9 +98,9 @@ class ImageBudget:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays, :func:`image_bytes`."""
-        found = self.channels * self.cascaded**self.dims
-        return found + sum((dims * bits * rows * columns + 7) // 8 for rows, columns, dims, bits in self.primaries)
+        """Bytes of all arrays, primaries without gaps between entries."""
+        cascaded = self.channels * self.cascaded**self.dims
+        return cascaded + sum((dims * bits * rows * columns + 7) // 8 for rows, columns, dims, bits in self.primaries)
 
     @property
     def primaries(self) -> list[tuple[int, int, int, int]]:
@@ -128,12 +113,8 @@ class ImageBudget:
 
     @property
     def ratio(self) -> float:
-        """``ρ``, the primary's side (non-square: the square root of its entries) over the cascaded array's."""
+        """``ρ``: the primary's side (non-square: the square root of its entries) over the cascaded array's."""
         return math.sqrt(self.rows * self.columns) / self.cascaded
-
-    def compression(self, uncompressed_bytes: int) -> float:
-        """How many times smaller than ``uncompressed_bytes`` this is."""
-        return uncompressed_bytes / self.nbytes
 
 
 # -- resolutions from bytes -------------------------------------------------------------------------------------------
@@ -150,28 +131,23 @@ def paper_search(
     bits: int = 8,
 ) -> ImageBudget:
     """
-    The paper's linear search: of all sides ``N_c`` = 4, 8, 12, … of the cascaded array, the one that minimises
-    ``|compression − uncompressed_bytes / bytes|``, with ``N_p = ratio · N_c`` rounded to a multiple of 8.
+    Return the result of the paper's linear search over the sides ``N_c`` = 4, 8, 12, … of the cascaded array.
 
-    Where equation 1 has squares only, a non-square image spreads the ``N_p²`` entries in its own proportions, in whole
-    rows and columns. The primary is never larger than the image (a square one: than the largest multiple of 8 in it,
-    as long as there is one).
+    The search minimises ``|compression − uncompressed_bytes / bytes|``, with ``N_p = ratio · N_c`` in multiples
+    of 8. Equation 1 has squares only: for a non-square image the ``N_p²`` entries are spread in its proportions, in
+    whole rows and columns. The primary is never larger than the image (square: than the largest multiple of 8 in it, if
+    there is one).
     """
-    _check_image(uncompressed_bytes, channels, height, width)
-    if not (compression > 0 and math.isfinite(compression)):
-        raise ValueError(f"compression: found {compression}, allowed are finite numbers > 0")
-    if not (ratio > 0 and math.isfinite(ratio)):
-        raise ValueError(f"ratio: found {ratio}, allowed are finite numbers > 0")
     best, distance = None, math.inf
     cascaded = 0
     while True:
         cascaded += CASCADED_STEP
         side = PRIMARY_STEP * max(1, round(ratio * cascaded / PRIMARY_STEP))
         size = ImageBudget(*_spread(side, height, width), cascaded, channels, dims, bits)
-        achieved = size.compression(uncompressed_bytes)
+        achieved = uncompressed_bytes / size.nbytes
         if abs(compression - achieved) < distance:
             best, distance = size, abs(compression - achieved)
-        if achieved <= compression:  # more bytes only lead away
+        if achieved <= compression:  # larger arrays only increase the difference
             largest = _spread(PRIMARY_STEP * max(height, width), height, width)
             return replace(best, full=(best.rows, best.columns) == largest)
 
@@ -184,19 +160,15 @@ def search(
     width: int,
     dims: int = 4,
     bits: int = 8,
-    ratio: float | None = None,
 ) -> ImageBudget:
     """
-    The resolutions for a compression ratio: :func:`paper_search` with ``ratio``, by default that of :func:`ratio`.
+    Return :func:`paper_search` with the ratio of :func:`resolution_ratio`, corrected if it is more than 5% off.
 
-    Sides in such steps may miss ``compression`` by far (4K RGB asked for 12x gets 13.4x at ρ = 80). If it is by more
-    than 5%, the cascaded array is kept, unless it alone is more than half of what was asked for, and the primary
-    becomes what fits, :func:`fit_bytes`: down to 1×1 for images so small that even the smallest cascaded array (``N_c``
-    = 4) is more than was asked for.
+    Sides in steps can miss ``compression`` by far (4K RGB at 12x becomes 13.4x at ρ = 80). Then the cascaded array is
+    kept, or reduced until it takes at most half of the bytes, and the primary becomes the largest that fits
+    (:func:`fit_bytes`): 1×1 for images so small that the smallest cascaded array (``N_c`` = 4) is too large.
     """
-    _check_image(uncompressed_bytes, channels, height, width)
-    if ratio is None:
-        ratio = _default_ratio(compression, math.sqrt(height * width))
+    ratio = resolution_ratio(compression, math.sqrt(height * width))
     size = paper_search(uncompressed_bytes, compression, channels, height, width, ratio, dims, bits)
     budget = uncompressed_bytes / compression
     if abs(size.nbytes / budget - 1) <= TOLERANCE:
@@ -209,8 +181,9 @@ def search(
 
 def cascaded_side(budget: float, channels: int, dims: int = 4, share: float = 0.08) -> int:
     """
-    The side of a cascaded array that takes about ``share`` of ``budget`` bytes: a multiple of 4 from 4 to
-    :data:`CASCADED_LIMITS`, no larger than that unless it is the smallest.
+    Return the side of a cascaded array that takes at most ``share`` of ``budget`` bytes.
+
+    A multiple of 4, at least 4 and at most :data:`CASCADED_LIMITS`.
     """
     side = int((max(budget * share, 1) / channels) ** (1 / dims) + 1e-9)
     return min(max(CASCADED_STEP, side // CASCADED_STEP * CASCADED_STEP), CASCADED_LIMITS[dims - 1])
@@ -227,13 +200,11 @@ def fit_bytes(
     coarse: CoarsePrimary | None = None,
 ) -> ImageBudget:
     """
-    The largest primary that fits into ``budget`` bytes beside a cascaded array of side ``cascaded``, in the proportions
-    of the image (a square one exactly, others to 2% or one texel) and no larger than it. At least 1×1: only then can
-    the bytes exceed ``budget``.
+    Return the largest primary that fits into ``budget`` bytes beside a cascaded array of side ``cascaded``.
+
+    It has the proportions of the image (a square one exactly, others to 2% or one texel) and is no larger than it. Its
+    least size is 1×1: only then can the bytes exceed ``budget``.
     """
-    _check_image(1, channels, height, width)
-    if not math.isfinite(budget):
-        raise ValueError(f"budget: found {budget}, allowed are finite numbers of bytes")
     if coarse is not None:
         return _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse)
     entries = int((budget - channels * cascaded**dims) * 8) // (dims * bits)
@@ -244,27 +215,23 @@ def fit_bytes(
     short, long = sorted((height, width))
     wanted = short * math.sqrt(entries / (height * width))
     margin = max(1.0, 0.02 * wanted)
-    best = None
-    for one in range(max(1, math.ceil(wanted - margin)), min(short, math.floor(wanted + margin)) + 1):
-        other = min(entries // one, long)
-        if other >= 1:
-            rank = (one * other, -abs(one - wanted))
-            best = max(best, (rank, one, other)) if best else (rank, one, other)
-    _, one, other = best
+    sides = range(max(1, math.ceil(wanted - margin)), min(short, math.floor(wanted + margin)) + 1)
+    pairs = ((one, min(entries // one, long)) for one in sides if one <= entries)
+    one, other = max(pairs, key=lambda pair: (pair[0] * pair[1], -abs(pair[0] - wanted), pair))
     rows, columns = (one, other) if height <= width else (other, one)
     return ImageBudget(rows, columns, cascaded, channels, dims, bits, full=(rows, columns) == (height, width))
 
 
 def _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse: CoarsePrimary) -> ImageBudget:
-    """:func:`fit_bytes` of two primaries: the sides in proportion, then the longer one alone, both by bisection."""
+    """Return :func:`fit_bytes` of two primaries: both sides in proportion, then the longer side alone."""
     short, long = sorted((height, width))
 
     def sized(one: int, other: int) -> ImageBudget:
         rows, columns = (one, other) if height <= width else (other, one)
         return ImageBudget(rows, columns, cascaded, channels, dims, bits, (rows, columns) == (height, width), coarse)
 
-    def largest(at) -> ImageBudget:
-        return at(largest_fitting(lambda n: at(n).nbytes <= budget, 1, long + 1))
+    def largest(candidate) -> ImageBudget:
+        return candidate(largest_fitting(lambda n: candidate(n).nbytes <= budget, 1, long + 1))
 
     best = largest(lambda n: sized(min(max(1, round(n * short / long)), short), n))
     if short < long:
@@ -275,7 +242,7 @@ def _fit_two(budget, channels, height, width, cascaded, dims, bits, coarse: Coar
 
 
 def _spread(side: int, height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of about ``side²`` entries in the proportions of an image, and no larger than it."""
+    """Return rows and columns of about ``side²`` entries in the proportions of an image, and no larger than it."""
     if height == width:
         side = min(side, height // PRIMARY_STEP * PRIMARY_STEP or height)
         return side, side
@@ -285,36 +252,14 @@ def _spread(side: int, height: int, width: int) -> tuple[int, int]:
     return (one, other) if height < width else (other, one)
 
 
-def _check_image(uncompressed_bytes: int, channels: int, height: int, width: int) -> None:
-    for name, value in (
-        ("uncompressed_bytes", uncompressed_bytes),
-        ("channels", channels),
-        ("height", height),
-        ("width", width),
-    ):
-        if not value >= 1:
-            raise ValueError(f"{name}: found {value}, allowed are numbers ≥ 1")
-
-
-# -- what was asked for ------------------------------------------------------------------------------------------------
-
-
-def explain(size: ImageBudget, uncompressed_bytes: int, asked_bytes: float) -> tuple[float, str | None]:
-    """The compression ratio that ``size`` reaches and, unless its bytes are within 5% of ``asked_bytes``, why not."""
-    achieved = size.compression(uncompressed_bytes)
-    if abs(size.nbytes / asked_bytes - 1) <= TOLERANCE:
-        return achieved, None
-    asked = f"{round(asked_bytes):,} bytes ({uncompressed_bytes / asked_bytes:.4g}x) were asked for"
-    found = f"{size.nbytes:,} bytes ({achieved:.4g}x)"
-    if size.nbytes > asked_bytes and size.rows * size.columns == 1:
-        return achieved, f"{asked}, but the smallest table with a cascaded side of {size.cascaded} has {found}"
-    if size.nbytes > asked_bytes and size.cascaded <= CASCADED_STEP:
-        return achieved, f"{asked}, but the smallest table with a resolution ratio of {size.ratio:.3g} has {found}"
-    if size.nbytes < asked_bytes and size.full:
-        return achieved, (
-            f"{asked}, but at {found} the primary is as large as the image and more of it would be of no use"
-        )
-    return achieved, (
-        f"{asked}, but {found} are the nearest that whole sides of the primary allow beside a cascaded side of "
-        f"{size.cascaded}"
-    )
+def explain(size: ImageBudget, uncompressed_bytes: int, requested_bytes: float) -> str | None:
+    """Return a sentence about a size that differs by more than 5% from the requested bytes, else ``None``."""
+    if abs(size.nbytes / requested_bytes - 1) <= TOLERANCE:
+        return None
+    requested = f"{round(requested_bytes):,} bytes ({uncompressed_bytes / requested_bytes:.4g}x) were requested"
+    result = f"{size.nbytes:,} bytes ({uncompressed_bytes / size.nbytes:.4g}x)"
+    if size.nbytes > requested_bytes and size.rows * size.columns == 1:
+        return f"{requested}, but the smallest table with a cascaded side of {size.cascaded} has {result}"
+    if size.nbytes < requested_bytes and size.full:
+        return f"{requested}, but the primary is as large as the image at {result}"
+    return f"{requested}, but {result} are the nearest with whole sides and a cascaded side of {size.cascaded}"

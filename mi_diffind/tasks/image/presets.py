@@ -1,4 +1,4 @@
-"""How an image is stored and trained: the recipe of the supplement and ours, whose differences can be switched off."""
+"""Recipes of images: the supplement's and ours, whose improvements can be switched off one by one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from ...settings import FitSettings
 from .memory_budget import CoarsePrimary
 
-#: How the primary is stored: bits of an entry, and a second primary or none. The fewer bits, the more entries fit.
-#: The resolution of pages follows the image.
+#: Structures of the primary: bits of an entry, and a second primary or ``None``. Fewer bits: more entries.
 STRUCTURES: dict[str, tuple[int, CoarsePrimary | None]] = {
     **{f"{bits} bits": (bits, None) for bits in (8, 7, 6, 5, 4, 3)},
     "4 + 8 bits": (4, CoarsePrimary(2, 8, 0.5)),
@@ -20,20 +19,22 @@ STRUCTURES: dict[str, tuple[int, CoarsePrimary | None]] = {
     "pages of 2 + 6 bits": (2, CoarsePrimary(2, 6, 0.35)),
 }
 
-#: Structures whose first primary consists of pages (:class:`mi_diffind.pages.PagedArray`).
+#: Structures whose first primary consists of pages, whose resolution follows the image (:mod:`mi_diffind.pages`).
 PAGED = ("pages of 5 bits", "pages of 6 bits", "pages of 2 + 6 bits")
 
 
 @dataclass(frozen=True)
 class ImageRecipe:
     """
-    How an image is stored and trained.
+    Storage and training of an image.
 
-    ``once``: equal and constant channels are stored once (:meth:`.Layout.of`). ``normals``: leave out the third
-    component of normals where it follows from the others. ``components``: start from principal components, not from
-    the ramp. ``jitter``: share of the steps whose samples are jittered. ``rounded``: share of the steps, the last ones,
-    that see entries as they will be stored. ``structure``: one of :data:`STRUCTURES`, or ``"auto"``. ``dims``: channels
-    of the primary arrays. ``settings``: the rest.
+    - ``once``: store equal channels once, and constant channels as numbers (:meth:`.Layout.of`).
+    - ``normals``: leave out the third component of normals where it follows from the others.
+    - ``components``: start from principal components, not from the ramp.
+    - ``jitter``: share of the steps whose samples are jittered.
+    - ``rounded``: share of the steps, the last ones, that read entries rounded to their stored values.
+    - ``structure``: one of :data:`STRUCTURES`, or ``"auto"``; ``dims``: coordinates of a pointer.
+    - ``settings``: steps, batch, rate and loss.
     """
 
     once: bool = True
@@ -46,19 +47,19 @@ class ImageRecipe:
     settings: FitSettings = dataclasses.field(default_factory=FitSettings)
 
 
-#: Steps of 262,144 samples of a training that is not told how long it may take.
+#: Steps of 262,144 samples of a training without a time limit.
 STEPS = 1500
 
 _OURS = FitSettings(steps=STEPS, batch=2**18, lr=3e-2, schedule="cosine", loss="mse", measure_every=STEPS // 10)
 _PAPER = dataclasses.replace(_OURS, batch=2**20, steps=STEPS // 4, lr=1e-3, schedule="constant", loss="mae")
 
-#: The first is the default.
+#: Recipes by name; the first is the default.
 PRESETS = {
     "ours": ImageRecipe(settings=_OURS),
     "paper": ImageRecipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
 }
 
-#: What of ours can be switched off: to what the supplement does.
+#: Improvements over the supplement's recipe that can be switched off.
 IMPROVEMENTS = {
     "once": "equal and constant channels are stored once",
     "normals": "normals as two channels where the third follows",
@@ -73,7 +74,7 @@ IMPROVEMENTS = {
 
 
 def without(recipe: ImageRecipe, names) -> ImageRecipe:
-    """``recipe`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown one."""
+    """Return ``recipe`` with some of :data:`IMPROVEMENTS` switched off. Raises ``ValueError`` for an unknown name."""
     paper = PRESETS["paper"]
     for name in names:
         if name not in IMPROVEMENTS:
@@ -91,5 +92,5 @@ def without(recipe: ImageRecipe, names) -> ImageRecipe:
 
 
 def replaced(recipe: ImageRecipe, **settings) -> ImageRecipe:
-    """``recipe`` with other settings of the training."""
+    """Return ``recipe`` with other settings of the training."""
     return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **settings))

@@ -1,7 +1,4 @@
-"""
-How large the arrays are: by rule, or by short trainings of several sizes (``--ratio-search``), or as small as a wanted
-quality allows (``--psnr``).
-"""
+"""Choice of a memory budget: by rule, by short trainings (``--ratio-search``), or by a wanted quality (``--psnr``)."""
 
 from __future__ import annotations
 
@@ -19,24 +16,26 @@ from .memory_budget import CoarsePrimary, ImageBudget
 from .presets import PAGED, STRUCTURES, ImageRecipe, replaced
 from .training import dims_of, fit_image, layout_of, structure_of
 
-#: A candidate of a search is trained for this share of the steps.
+#: Share of the steps that a candidate of a search is trained for.
 SHORT = 1 / 8
 
-#: Sides of the cascaded array to try, by its dimensions.
+#: Sides of the cascaded array that a search tries, by its dimensions.
 SIDES = {1: (64, 256), 2: (16, 32, 64), 3: (8, 16, 32), 4: (4, 8, 12, 16)}
 
-#: Structures of the primary to try.
+#: Structures of the primary that a search tries.
 TRIED = ("8 bits", "6 bits", "4 bits", "4 + 8 bits", "3 + 6 bits", "2 + 6 bits", *PAGED)
 
-#: A search by quality ends when the file is at most this much larger than one that is known to be too small.
+#: Largest ratio of the smallest sufficient and the largest insufficient file at which a search by quality ends.
 NEAR = 1.06
 
 
 @dataclass
 class RatioSearch:
     """
-    What a search has tried (one dictionary a training: sizes, ``bytes``, ``psnr_db``) and chosen; ``best`` is the table
-    of the best short training and its record, for a search that was interrupted.
+    Result of :func:`ratio_search`.
+
+    ``tried`` has one dictionary a training (sizes, ``bytes``, ``psnr_db``). ``best`` is the table and the record of the
+    best short training, which an interrupted search returns.
     """
 
     size: ImageBudget
@@ -48,8 +47,10 @@ class RatioSearch:
 
 def default_size(source: Source, nbytes: float, recipe: ImageRecipe) -> ImageBudget:
     """
-    The size of a recipe for so many bytes: the supplement's search, or with ``components`` a cascaded array of
-    :func:`.memory_budget.cascaded_side` and whatever primary fits beside it.
+    Return the default budget of a recipe for ``nbytes`` bytes.
+
+    The supplement's search, or, with ``components`` or two primaries, a cascaded array of
+    :func:`.memory_budget.cascaded_side` and the largest primary that fits beside it.
     """
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
     bits, coarse = STRUCTURES[structure]
@@ -61,10 +62,7 @@ def default_size(source: Source, nbytes: float, recipe: ImageRecipe) -> ImageBud
 
 
 def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> ImageBudget:
-    """
-    The size for so many bytes, with a cascaded array of a given side. A single primary of pages may have fewer
-    channels than the recipe says (:func:`.dims_of`).
-    """
+    """Return the budget for ``nbytes`` bytes with a cascaded array of a given side; its dims are :func:`.dims_of`."""
     stored, structure = max(1, layout_of(source, recipe).stored), structure_of(source, recipe, nbytes)
     (bits, coarse), paged = STRUCTURES[structure], structure in PAGED
     dims = dims_of(recipe, structure, stored)
@@ -72,32 +70,31 @@ def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> 
     return dataclasses.replace(size, paged=paged)
 
 
-def _steps(recipe: ImageRecipe, share: float) -> ImageRecipe:
-    steps = max(20, round(recipe.settings.steps * share))
-    return replaced(recipe, steps=steps, measure_every=steps)
-
-
 def ratio_search(
     source: Source, nbytes: float, recipe: ImageRecipe, request: FitRequest, free: bool = True, border=None
 ) -> RatioSearch:
     """
-    The best of several sizes of ``nbytes``, each trained for :data:`SHORT` of the steps: the side of the cascaded
-    array, and so the ratio ρ; with ``free`` then the structure of the primary and dimensions (with sides of their
-    own). One is varied after the other, the best kept. ``request`` and ``border`` are those of :func:`.fit_image`.
+    Return the best of several budgets of ``nbytes`` bytes, each trained for :data:`SHORT` of the steps.
+
+    The side of the cascaded array (and so the ratio ρ) is varied first; with ``free`` then the structure of the primary
+    and the dimensions. The best so far is kept after each. ``request`` and ``border`` are those of :func:`.fit_image`.
     """
+    steps = max(20, round(recipe.settings.steps * SHORT))
     tried, tables = [], []
 
     def attempt(recipe: ImageRecipe, side: int) -> bool:
-        """Train a candidate; was that interrupted?"""
+        """Train a candidate, unless it is known or too large; returns whether the training was interrupted."""
         size = sized(source, nbytes, recipe, side)
         structure, recipe = structure_of(source, recipe, nbytes), dataclasses.replace(recipe, dims=size.dims)
-        known = [t for t in tried if (t["dims"], t["structure"], t["cascaded"]) == (recipe.dims, structure, side)]
+        known = any((t["dims"], t["structure"], t["cascaded"]) == (recipe.dims, structure, side) for t in tried)
         if known or size.nbytes > nbytes * (1 + memory_budget.TOLERANCE):
             return False
-        table, result = fit_image(source, size, _steps(recipe, SHORT), request, border, _title(size, structure))
+        title = f"try {size.columns}×{size.rows}×{size.dims} of {structure} → {size.cascaded}"
+        shortened = replaced(recipe, steps=steps, measure_every=steps)
+        table, result = fit_image(source, size, shortened, request, border, title)
         tried.append({
             "dims": size.dims, "structure": structure, "cascaded": side, "rows": size.rows, "columns": size.columns,
-            "ratio": size.ratio, "bytes": size.nbytes, "psnr_db": table.measured["psnr_db"],
+            "ratio": size.ratio, "bytes": table.nbytes, "psnr_db": table.measured["psnr_db"],
             "psnr_between_db": table.measured["psnr_between_db"],
         })  # fmt: skip
         if best() is tried[-1]:
@@ -105,12 +102,13 @@ def ratio_search(
         return result.interrupted
 
     def best() -> dict | None:
+        """Return the best training so far."""
         return max(tried, key=_merit, default=None)
 
     start, interrupted = default_size(source, nbytes, recipe), False
     structure, recipe = structure_of(source, recipe, nbytes), dataclasses.replace(recipe, dims=start.dims)
-    for stage in _stages(recipe, structure, start.cascaded, free, best):
-        interrupted = any(attempt(candidate, side) for candidate, side in stage)
+    for candidates in _candidates(recipe, structure, start.cascaded, free, best):
+        interrupted = any(attempt(candidate, side) for candidate, side in candidates)
         if interrupted:
             break
     if not tried:
@@ -122,32 +120,27 @@ def ratio_search(
 
 
 def _merit(tried: dict) -> float:
-    """What is compared: the quality at texels and between them."""
+    """Return the mean of the quality at texels and between them, which the search compares."""
     return 0.5 * (tried["psnr_db"] + tried["psnr_between_db"])
 
 
-def _title(size: ImageBudget, structure: str) -> str:
-    return f"try {size.columns}×{size.rows}×{size.dims} of {structure} → {size.cascaded}"
-
-
-def _stages(recipe: ImageRecipe, structure: str, side: int, free: bool, best: Callable) -> Iterator[list]:
-    """Lists of (recipe, side) to try, each made when the results of those before are there."""
+def _candidates(recipe: ImageRecipe, structure: str, side: int, free: bool, best: Callable) -> Iterator[list]:
+    """Yield lists of (recipe, side) to try; each depends on the results of the lists before."""
     yield [(recipe, s) for s in sorted(SIDES[recipe.dims], key=lambda s: abs(math.log(s / side)))]
-    if not free or best() is None:  # not even the smallest cascaded array fits
+    leader = best()
+    if not free or leader is None:  # not even the smallest cascaded array fits
         return
-    found = best()
     several = recipe.dims > CoarsePrimary().dims
     tried = [s for s, (_, coarse) in STRUCTURES.items() if s in TRIED and s != structure and (several or not coarse)]
-    yield [(dataclasses.replace(recipe, structure=s), found["cascaded"]) for s in tried]
-    found = best()
-    recipe = dataclasses.replace(recipe, structure=found["structure"], dims=found["dims"])
-    yield [(recipe, s) for s in SIDES[recipe.dims] if abs(math.log2(s / found["cascaded"])) <= 1]
-    if STRUCTURES[found["structure"]][1] is None:
+    yield [(dataclasses.replace(recipe, structure=s), leader["cascaded"]) for s in tried]
+    leader = best()
+    recipe = dataclasses.replace(recipe, structure=leader["structure"], dims=leader["dims"])
+    yield [(recipe, s) for s in SIDES[recipe.dims] if abs(math.log2(s / leader["cascaded"])) <= 1]
+    if STRUCTURES[leader["structure"]][1] is None:
         other = [d for d in (2, 3, 4) if d != recipe.dims]
         yield [(dataclasses.replace(recipe, dims=d), SIDES[d][1]) for d in other]
-        found = best()
-        recipe = dataclasses.replace(recipe, dims=found["dims"])
-        yield [(recipe, s) for s in SIDES[found["dims"]]]
+        recipe = dataclasses.replace(recipe, dims=best()["dims"])
+        yield [(recipe, s) for s in SIDES[recipe.dims]]
 
 
 def psnr_search(
@@ -160,11 +153,13 @@ def psnr_search(
     log: Callable[[str], None] = print,
 ) -> tuple[Table | None, FitResult | None, list[dict]]:
     """
-    The smallest file whose ``psnr_db`` is at least ``goal``: trainings of full length, sizes by the secant of quality
-    over the logarithm of bytes, until one that is large enough is within :data:`NEAR` of one that is not, or ``most``
-    were tried. Returns the table (``None``: not even the largest primary reaches it), the record of its training and
-    what was tried. ``log`` is told of each. After Ctrl-C, the record says ``interrupted``; ``KeyboardInterrupt`` is
-    raised if nothing reached ``goal`` before.
+    Search the smallest file whose ``psnr_db`` is at least ``goal``, by trainings of full length.
+
+    Sizes follow the secant of quality over the logarithm of bytes. The search ends when a sufficient size is within
+    :data:`NEAR` of an insufficient one, or after ``most`` trainings. Returns the table (``None`` if not even the
+    largest primary reaches the goal), the record of its training, and the list of trainings. ``log`` gets a line for
+    each. After Ctrl-C the record is marked ``interrupted``; ``KeyboardInterrupt`` is raised if no training had reached
+    the goal.
     """
     tried, kept = [], None
     nbytes = middle = source.nbytes / 12
@@ -191,21 +186,19 @@ def psnr_search(
         if short and size.full and not enough:
             break
         nbytes = middle = _next(tried, goal, enough, short)
-        if (
-            enough and short
-        ):  # where sizes come in steps, the one before may be all that fits into the bytes of the secant
+        if enough and short:  # sizes come in steps: the secant may lead to one that was tried
             middle = math.sqrt(enough * short)
     return (*(kept or (None, None)), tried)
 
 
 def _next(tried: list[dict], goal: float, enough: int | None, short: int | None) -> float:
-    """Bytes to try next."""
+    """Return the bytes to try next."""
     if enough and short:
         a, b = (next(t for t in tried if t["bytes"] == n) for n in (short, enough))
         share = (goal - a["psnr_db"]) / max(b["psnr_db"] - a["psnr_db"], 1e-6)
         share = min(max(share, 0.15), 0.85)
         return short * (enough / short) ** share
     last = tried[-1]
-    octaves = (goal - last["psnr_db"]) / 2.5  # dB an octave of bytes, about
+    octaves = (goal - last["psnr_db"]) / 2.5  # about 2.5 dB for twice the bytes
     octaves = math.copysign(min(max(abs(octaves) * 1.2, 0.25), 3), octaves)
     return last["bytes"] * 2**octaves

@@ -1,10 +1,9 @@
 """
-Training of task 3: its samples, its targets and its steps (what they are made of: :mod:`.presets`).
+Training of task 3: samples, targets and the stored result.
 
-A step draws a texel of the source for each sample, stratified, and reads the target there: at the texel's centre, or at
-a place that is jittered within the texel, where it is the bilinear value. The supplement's recipe jitters all samples.
-Then a table becomes the picture that bilinear interpolation makes, smoother than the one that is stored; half of the
-steps at centres, half jittered, is better at both.
+A step draws a texel of the source for each sample, stratified. The target is the texel at its centre, or the bilinear
+value at a jittered place within it. The supplement's recipe jitters all samples, which trains a bilinearly smoothed
+picture. Half of the steps at centres and half jittered is better both at texels and between them.
 """
 
 from __future__ import annotations
@@ -19,7 +18,9 @@ from ... import lookup
 from ...fitting import FitResult, Problem
 from ...indirection import rounded, stored_form
 from ...maps import components
+from ...maps.compressed import decibel
 from ...maps.layout import Layout
+from ...maps.pyramid import padded_texels, weighted_sum
 from ...maps.source import Source
 from ...pages import most_entries, page_counts
 from ...tables import Table
@@ -29,21 +30,20 @@ from .compressed import CompressedImage, to_table
 from .memory_budget import ImageBudget
 from .presets import PAGED, STRUCTURES, ImageRecipe
 
-#: dB of :func:`~mi_diffind.maps.components.smoothness` from which on an image is smooth enough for one primary.
+#: Least smoothness, in dB, of an image for one primary (:func:`~mi_diffind.maps.components.smoothness`).
 SMOOTH_DB = 28.0
 
-#: dB that pages have to gain, before training, and that a single primary of them has to have, before training, where an
-#: image is not smooth.
+#: Least gain of pages, and least PSNR of one primary of pages for a rough image, both in dB before training.
 GAIN_DB, FINE_DB = 0.5, 29.0
 
-#: Entries for each page that there have to be.
+#: Least entries a page.
 ENTRIES = 3
 
-_structures: dict[tuple, str] = {}  # what was found for a source, by its digest: looking takes a second
+_structures: dict[tuple, str] = {}  # structures of "auto" by source and recipe: the choice takes a second
 
 
 def structure_of(source: Source, recipe: ImageRecipe, nbytes: float | None = None) -> str:
-    """The structure of a recipe; for ``"auto"`` what suits the image in so many bytes (default: at 12x)."""
+    """Return the structure of a recipe; ``"auto"`` is chosen by the image and ``nbytes`` (default: a twelfth)."""
     if recipe.structure != "auto":
         return recipe.structure
     nbytes = source.nbytes / 12 if nbytes is None else nbytes
@@ -55,19 +55,20 @@ def structure_of(source: Source, recipe: ImageRecipe, nbytes: float | None = Non
 
 def dims_of(recipe: ImageRecipe, structure: str, stored: int) -> int:
     """
-    Dimensions of the cascaded array. Those of a single primary of pages are no more than there are channels ``stored``,
-    but 2: more entries are of more use to it, and read better between texels.
+    Return the dimensions of the cascaded array for ``stored`` channels.
+
+    A single primary of pages has at most ``stored`` (at least 2): more entries gain more than more coordinates.
     """
     single = structure in PAGED and STRUCTURES[structure][1] is None
     return min(recipe.dims, max(stored, 2)) if single else recipe.dims
 
 
 def _suitable(values: np.ndarray, recipe: ImageRecipe, nbytes: float) -> str:
-    """The structure that suits an image, ``(height, width, k)``, in so many bytes."""
+    """Return the structure for an image, ``(height, width, k)``, in ``nbytes`` bytes."""
     height, width, k = values.shape
     smooth = recipe.dims < 3 or components.smoothness(values) >= SMOOTH_DB
     if recipe.components and k:
-        # What the cascaded array adds to more channels than it has dimensions needs more precise pointers
+        # More channels than dimensions need more precise pointers
         pages = "pages of 6 bits" if k > recipe.dims else "pages of 5 bits"
         dims = dims_of(recipe, pages, k)
         side = memory_budget.cascaded_side(nbytes, k, dims)
@@ -81,15 +82,16 @@ def _suitable(values: np.ndarray, recipe: ImageRecipe, nbytes: float) -> str:
 
 
 def layout_of(source: Source, recipe: ImageRecipe) -> Layout:
-    """What of ``source`` is stored by a recipe."""
+    """Return the layout of ``source`` by a recipe."""
     return Layout.of(source, recipe.once, None if recipe.normals else False)
 
 
 class ImageProblem(Problem):
     """
-    The training problem of :mod:`mi_diffind.fitting`. ``net`` maps (v, u) to the stored channels, ``bits`` are
-    those of the entries of each primary, ``values`` the stored channels, ``(height, width, stored)``; ``border`` is
-    that of the image along v and u.
+    Training problem of an image.
+
+    ``net`` maps (v, u) to the stored channels; ``bits`` are those of the entries of each primary; ``values`` are the
+    stored channels, ``(height, width, stored)``; ``border`` is that of the image along v and u.
     """
 
     def __init__(
@@ -103,23 +105,21 @@ class ImageProblem(Problem):
         padded = np.zeros((self.height, self.width, stored), np.float32)
         padded[..., : self.channels] = values
         self.values = types.TensorXf(padded)
-        self.groups = {}
-        for i, name in enumerate(layout.groups):
-            self.groups.setdefault(name, []).append(i)
-        self.weights = {name: len(found) / self.channels for name, found in self.groups.items()}
+        self.groups = layout.channels_by_map()
+        self.weights = {name: len(channels) / self.channels for name, channels in self.groups.items()}
         self.identity = {"source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}}
         self.rounded = self.jittered = False
         self._stretches = {}  # size of a batch → first texel and number of texels of each stretch
 
     def begin(self, step: int, share: float) -> str:
-        """Called before each step: does it see rounded entries, are its samples jittered? Says so."""
+        """Start a step: decide whether entries are rounded and samples jittered. Returns a text that names both."""
         self.rounded = share >= 1 - self.recipe.rounded
         jitter = self.recipe.jitter
         self.jittered = int((step + 1) * jitter) > int(step * jitter)
         return f"rounded: {self.rounded}, jittered: {self.jittered}"
 
     def _texel(self, rng, size: int):
-        """Index of a texel for each sample: one of each of ``size`` equal stretches of the image."""
+        """Return the index of a texel for each sample: one in each of ``size`` equal stretches of the image."""
         UInt32, Float = self.types.UInt32, self.types.Float
         if size % self.texels == 0:
             return dr.arange(UInt32, size) % self.texels
@@ -140,21 +140,16 @@ class ImageProblem(Problem):
         else:
             target = self._texels(index)
         return [y / self.height, x / self.width], {
-            name: [target[i] for i in found] for name, found in self.groups.items()
+            name: [target[i] for i in channels] for name, channels in self.groups.items()
         }
 
     def _texels(self, index) -> list:
-        """The stored channels of texels."""
+        """Return the stored channels of texels, given their index row by row."""
         stored = self.values.shape[-1]
-        if stored <= 2:
-            return [dr.gather(self.types.Float, self.values.array, index * stored + i) for i in range(self.channels)]
-        found = []
-        for group in range(stored // 4):
-            found += list(dr.gather(self.types.Array4f, self.values.array, index * (stored // 4) + group))
-        return found[: self.channels]
+        return padded_texels(self.types, self.values.array, stored, index)[: self.channels]
 
     def target(self, y, x) -> list:
-        """The stored channels at a place in texels, (0, 0) a corner of the image: bilinear, as ``bitmap`` has them."""
+        """Return the stored channels at a place in texels from the corner of the image, bilinear as in ``bitmap``."""
         UInt32, Int32, Float = self.types.UInt32, self.types.Int32, self.types.Float
         corners = []
         for position, n, border in ((y, self.height, self.border[0]), (x, self.width, self.border[1])):
@@ -169,36 +164,35 @@ class ImageProblem(Problem):
         total = [Float(0)] * self.channels
         for row, a in corners[0]:
             for column, b in corners[1]:
-                found = self._texels(row * self.width + column)
-                total = [dr.fma(a * b, v, t) for v, t in zip(found, total, strict=True)]
+                total = weighted_sum(a * b, self._texels(row * self.width + column), total)
         return total
 
     def predict(self, net, inputs) -> dict[str, list]:
-        found = (rounded(net, self.bits) if self.rounded else net)(inputs)
-        return {name: [found[i] for i in channels] for name, channels in self.groups.items()}
+        outputs = (rounded(net, self.bits) if self.rounded else net)(inputs)
+        return {name: [outputs[i] for i in channels] for name, channels in self.groups.items()}
 
     def measure(self, net) -> dict[str, float]:
-        """PSNR of the stored channels, with rounded entries, at the centres of 2¹⁸ texels at most."""
+        """Return the PSNR of the stored channels, with rounded entries, at the centres of at most 2¹⁸ texels."""
         rng = dr.rng(seed=dr.opaque(self.types.UInt64, 2023))
         size = min(self.texels, 2**18)
         with dr.suspend_grad():
             index = self._texel(rng, size)
             x, y = self.types.Float(index % self.width) + 0.5, self.types.Float(index // self.width) + 0.5
-            found = rounded(net, self.bits)([y / self.height, x / self.width])
-            errors = [dr.mean(dr.square(a - b)) for a, b in zip(found, self._texels(index), strict=True)]
-            total = sum(float(e[0]) for e in errors) / self.channels
-        return {"psnr_db": -10 * math.log10(max(total, 1e-12))}
+            outputs = rounded(net, self.bits)([y / self.height, x / self.width])
+            errors = [dr.mean(dr.square(a - b)) for a, b in zip(outputs, self._texels(index), strict=True)]
+        return {"psnr_db": decibel(sum(float(e[0]) for e in errors) / self.channels)}
 
 
 def problem_of(
     source: Source, size: ImageBudget, recipe: ImageRecipe, types, layout: Layout | None = None, border=None
 ) -> ImageProblem:
     """
-    The problem of training ``source`` at a size by a recipe, its arrays at their initial values. Raises ``ValueError``
-    for pages without components, by which they are chosen.
+    Return the problem of training ``source`` at a size by a recipe, with initial arrays.
+
+    Raises ``ValueError`` for pages without components, which their resolution follows.
     """
     if size.paged and not recipe.components:
-        raise ValueError("size: found one of pages, which needs a recipe with components")
+        raise ValueError("size: found pages, which need a recipe with components")
     layout = layout or layout_of(source, recipe)
     values = layout.encode(source)
     border = border or components.borders(values)
@@ -216,10 +210,11 @@ def fit_image(
     title: str | None = None,
 ) -> tuple[Table, FitResult]:
     """
-    Train the arrays of ``source`` and return them as they are stored, with their errors
-    (:meth:`.CompressedImage.measure`), and the run's record. ``size`` may be ``None`` for an image of one colour, which
-    needs no arrays. ``border`` is that along v and u, found out unless given; ``request`` says where to train, for how
-    long and with which checkpoint; its settings are those of the ``recipe``.
+    Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
+
+    ``size`` is ``None`` for an image of one colour, which needs no arrays. ``border`` along v and u is by default
+    :func:`.components.borders`. ``request`` holds the Dr.Jit types, the time and the checkpoint; its settings are
+    replaced by those of the ``recipe``. Errors are those of :meth:`.CompressedImage.measure`.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
     layout, types = layout_of(source, recipe), request.types
@@ -235,12 +230,12 @@ def fit_image(
         settings["structure"] = recipe.structure if recipe.structure != "auto" else _name_of(size)
         table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
-    found = CompressedImage.of(table, types.TensorXf).measure(source)
-    table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
+    errors = CompressedImage.of(table, types.TensorXf).measure(source)
+    table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
     return table, result
 
 
 def _name_of(size: ImageBudget) -> str:
-    """The structure of a size, "" if it is none of those that are known."""
+    """Return the name of the structure of a size, "" for one that is not in :data:`.presets.STRUCTURES`."""
     known = (name for name, s in STRUCTURES.items() if s == (size.bits, size.coarse) and size.paged == (name in PAGED))
     return next(known, "")

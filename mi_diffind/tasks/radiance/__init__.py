@@ -1,11 +1,11 @@
 """
-Task 7: radiance fields, from images of a scene.
+Task 7: radiance fields from images of a scene.
 
-- :mod:`.views`: images and cameras; :mod:`.hull`: where something may be;
-- :mod:`.field`, :mod:`.nodes`, :mod:`.march`: what fields offer, where their numbers lie, what rays see of them;
-- :mod:`.target`, :mod:`.training`: the grid that is compressed, and training through images;
-- :mod:`.coded`, :mod:`.palette`, :mod:`.compression`: ours; :mod:`.pairs`: the supplement's;
-- :mod:`.presets`, :mod:`.fit`, :mod:`.files`, :mod:`.model`, :mod:`.decode`: how it is asked for, and the result.
+- :mod:`.views`, :mod:`.visual_hull`: captured images with cameras, and the space that they may occupy;
+- :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
+- :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
+- :mod:`.compression`, :mod:`.paper`: our compressed layout, and that of the supplement;
+- :mod:`.presets`, :mod:`.fit`, :mod:`.files`, :mod:`.model`, :mod:`.decode`: the steps of ``fit field`` and its result.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .presets import PRESETS
 
 
 class RadianceField(Task):
-    """The task. Its presets are the recipes of :mod:`.presets`; files are always stored as bytes, but of ``grid``."""
+    """Task 7, ``fit field``. The layout fixes the storage: bytes, or half precision for the preset ``grid``."""
 
     name = "field"
     title = "a radiance field, from images of a scene"
@@ -28,34 +28,40 @@ class RadianceField(Task):
     storages = ()
     arguments = (
         Argument(
-            "source", metavar="FOLDER", help="views (transforms_*.json): of mi-diffind capture, Blender or nerfstudio"
+            "source", metavar="FOLDER",
+            help="folder of views (transforms_*.json) of mi-diffind capture, Blender or nerfstudio"
         ),
         Argument(
             "--bytes", group="size", type=checked(units.parse_bytes), metavar="N",
-            help="size in memory, as in 512k or 1.5M",
+            help="size in memory, such as 512k or 1.5M",
         ),
         Argument(
             "--compression", group="size", type=checked(units.parse_compression), metavar="N",
-            help="how many times smaller than the dense grid of float32 (default of paper: 50)",
+            help="ratio of the bytes of a dense float32 grid to those of the field (default of paper: 50)",
         ),
         Argument(
             "--psnr", group="size", type=checked(decibels), metavar="N",
-            help="the smallest of several sizes that reaches so many dB over white (several trainings)",
+            help="PSNR over white, in dB: the smallest of several sizes that reaches it is taken (several trainings)",
         ),
         Argument(
             "--resolution", type=positive, metavar="N",
-            help="of the grid: nodes along the side of a cube of the same volume (default: 128)",
+            help="resolution of the grid: nodes along the side of a cube of the same volume (default: 128)",
         ),
-        Argument("--grid", metavar="FILE", help="the grid to compress; if there is no such file, it is written"),
+        Argument("--grid", metavar="FILE", help="grid to compress; if the file does not exist, it is made"),
     )  # fmt: skip
     decode_arguments = (
-        Argument("--resolution", type=positive, metavar="N", help="nodes along the longest side (default: its own)"),
+        Argument(
+            "--resolution",
+            type=positive,
+            metavar="N",
+            help="nodes along the longest side (default: as the field)",
+        ),
     )
 
     def settings(self, preset, given, options):
-        own = self.presets[preset]
-        steps = given.get("steps", own.steps)
-        return dataclasses.replace(own, measure_every=max(1, steps // 2), **given)
+        settings = self.presets[preset]
+        steps = given.get("steps", settings.steps)
+        return dataclasses.replace(settings, measure_every=max(1, steps // 2), **given)
 
     def allocate(self, table, dtype, storage=""):
         return {}

@@ -1,4 +1,9 @@
-"""From a grid to a palette: what is kept, how it begins, how it is trained through the images, how it is stored."""
+"""
+Compression of a grid to density levels and a palette: initial clusters, training through the images, and sizes.
+
+Each node stores a density level, a step on a straight line of raw densities, and an index into a palette of colours
+that all nodes share.
+"""
 
 from __future__ import annotations
 
@@ -6,111 +11,134 @@ from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ...indirection import fold
 from . import grid as grids
-from .coded import CodedField, PackedField
-from .grid import Grid
+from .grid import NodeGrid
 from .nodes import Nodes
-from .palette import clusters, importance
-from .training import Images, ImagesProblem
-from .views import Views
+from .training import FieldSession, ImagesProblem, ViewImages
+from .volume_field import NodeField, PackedPaletteField
 
-#: Raw numbers of density at the ends of a curve as it begins: nothing, and opaque.
+#: Raw densities of the first and the last density level: empty, and opaque.
 EMPTIEST, DENSEST = -7.0, 12.0
 
-#: Bits of a node's coordinate in the curve, and entries of the curve while it is trained.
-SHARE_BITS, CURVE = 6, 16
+#: Bits of a density level, the number of the last level, and the raw density from one level to the next.
+DENSITY_BITS = 6
+LAST_LEVEL = 2**DENSITY_BITS - 1
+LEVEL_STEP = (DENSEST - EMPTIEST) / LAST_LEVEL
 
-#: Of the numbers of the curve and of the palette, per unit of what is trained.
-CURVE_SCALE = 20.0
+#: Allowed bits of a palette index, and the default.
+INDEX_BITS, DEFAULT_BITS = (6, 8, 10, 12, 14), 12
 
-#: Bits of an index that may be asked for, and the default.
-CODE_BITS, DEFAULT_BITS = (6, 8, 10, 12, 14), 12
+#: Training steps between updates of the range of the palette's bytes.
+RANGE_INTERVAL = 50
 
-#: Steps after which the range of the palette's bytes is looked at again.
-RANGED = 50
-
-#: The smallest grid, of its full resolution.
+#: Resolution of the smallest grid, as a share of the full resolution.
 SMALLEST = 0.2
+
+#: Weight of the coefficients of direction against those of the mean colour, since |x|, |y|, |z| ≤ 1 in a direction.
+DIRECTION = 0.5
+
+#: Nodes per cluster that clusters are computed from, and rounds of Lloyd's algorithm.
+SAMPLES, ROUNDS = 60, 10
 
 
 @dataclass
-class Coding:
-    """A grid's ``nodes``, their ``shares`` in [0, 1] and ``codes``, ``(n,)``, and the ``palette`` ``(P, 12)``."""
+class PaletteCoding:
+    """
+    Palette coding of a grid's ``nodes``.
+
+    ``levels`` ``(n,)`` are densities in [0, 1] between :data:`EMPTIEST` and :data:`DENSEST`; ``index`` ``(n,)``
+    (uint32) names a row of ``palette`` ``(P, 12)`` in ``index_bits`` bits.
+    """
 
     nodes: Nodes
-    shares: np.ndarray
-    codes: np.ndarray
+    levels: np.ndarray
+    index: np.ndarray
     palette: np.ndarray
-    code_bits: int
+    index_bits: int
 
 
-def coded(grid: Grid, images: Images, code_bits: int, seed: int) -> Coding:
-    """The coding of a grid of visible nodes, as it begins."""
-    largest = grids.weights(grid.field(), images)
-    weights = importance(largest, grid.nodes.stored, grid.colour[1:])
-    palette, codes = clusters(grid.colour[1:], weights, 2**code_bits, seed)
-    # Neighbours in the palette look alike, so that the upper bits of an index vary little: they deflate
+def palette_coding(grid: NodeGrid, index_bits: int, seed: int) -> PaletteCoding:
+    """Return the initial coding of a grid of visible nodes."""
+    palette, index = clusters(grid.colour[1:], 2**index_bits, seed)
+    # Neighbours in the palette look alike, so that the upper bits of an index vary little and deflate
     centred = palette - palette.mean(axis=0)
-    first = np.linalg.eigh(centred.T @ centred)[1][:, -1]
-    order = np.argsort(centred @ first, kind="stable")
+    principal = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    order = np.argsort(centred @ principal, kind="stable")
     rank = np.empty(len(order), np.uint32)
     rank[order] = np.arange(len(order))
-    shares = np.clip((grid.density - EMPTIEST) / (DENSEST - EMPTIEST), 0, 1).astype(np.float32)
-    return Coding(grid.nodes, shares, np.concatenate([[0], rank[codes]]).astype(np.uint32), palette[order], code_bits)
+    levels = np.clip((grid.density - EMPTIEST) / (DENSEST - EMPTIEST), 0, 1).astype(np.float32)
+    index = np.concatenate([[0], rank[index]]).astype(np.uint32)
+    return PaletteCoding(grid.nodes, levels, index, palette[order], index_bits)
+
+
+def clusters(colour: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return ``count`` cluster centres of ``colour`` ``(n, 12)`` and the index of the nearest one for each row.
+
+    The centres, ``(count, 12)``, are found by Lloyd's algorithm on random rows.
+    """
+    rng = np.random.default_rng(seed)
+    metric = np.tile([1.0, DIRECTION, DIRECTION, DIRECTION], 3)
+    points = colour * metric
+    count = min(count, len(points))
+    centres = points[rng.choice(len(points), count, replace=False)]
+    sample = rng.choice(len(points), min(len(points), SAMPLES * count), replace=False)
+    for _ in range(ROUNDS):
+        nearest = cKDTree(centres).query(points[sample])[1]
+        used = np.bincount(nearest, minlength=count)
+        sums = np.stack([np.bincount(nearest, points[sample, c], count) for c in range(12)], axis=1)
+        # A centre without points restarts at a random one
+        spare = points[rng.choice(sample, count)]
+        centres = np.where(used[:, None] > 0, sums / np.maximum(used, 1)[:, None], spare)
+    return centres / metric, cKDTree(centres).query(points)[1].astype(np.uint32)
 
 
 class PaletteProblem(ImagesProblem):
     """
-    The training of a :class:`Coding` through the images: coordinates in the curve, rounded as they will be stored; the
-    curve; the palette, of bytes. Indices stay as they are.
+    Training of a :class:`PaletteCoding` through the images of a session.
+
+    Density levels and palette are rounded as they are stored, with straight-through gradients. Indices are constant.
     """
 
-    def __init__(self, coding: Coding, views: Views, held: Views | None = None):
-        self.coding, types = coding, coding.nodes.types
-        self.codes = types.UInt32(coding.codes)
-        line = np.linspace(EMPTIEST, DENSEST, CURVE, dtype=np.float32) / CURVE_SCALE
-        tensor = types.TensorXf
-        net = {"share": tensor(coding.shares), "curve": tensor(line), "palette": tensor(np.float32(coding.palette))}
-        super().__init__(types, net, self.field_of, views, held)
+    def __init__(self, coding: PaletteCoding, session: FieldSession):
+        types = coding.nodes.types
+        self.coding, self.index = coding, types.UInt32(coding.index)
+        net = {"density": types.TensorXf(coding.levels), "palette": types.TensorXf(np.float32(coding.palette))}
+        super().__init__(session, net, self.field_of)
         self._set_range()
 
-    def field_of(self, net) -> CodedField:
-        steps = 2**SHARE_BITS - 1
-        share = fold(net["share"].array)
-        exact = dr.detach(share)
-        share += dr.detach(dr.round(exact * steps) / steps - exact)
+    def field_of(self, net) -> NodeField:
+        """Return the field of the trained parameters, rounded as it is stored."""
+        types, tensor = self.session.types, self.session.types.TensorXf
+        level = fold(net["density"].array) * LAST_LEVEL
+        level += dr.detach(dr.round(level) - level)
         palette = net["palette"]
-        lane = dr.arange(self.types.UInt32, len(self.coding.palette) * 12) % 12
-        a, b = (dr.gather(self.types.Float, v, lane) for v in self.range)
+        lane = dr.arange(types.UInt32, len(self.coding.palette) * 12) % 12
+        scale, offset = (dr.gather(types.Float, v, lane) for v in self.range)
         exact = dr.detach(palette.array)
-        entries = palette.array + dr.detach(dr.fma(dr.round((exact - b) / a), a, b) - exact)
-        tensor = self.types.TensorXf
-        curve = tensor(net["curve"].array * CURVE_SCALE)
-        return CodedField(self.coding.nodes, tensor(share), curve, self.codes, tensor(entries, palette.shape))
+        colour = palette.array + dr.detach(dr.fma(dr.round((exact - offset) / scale), scale, offset) - exact)
+        density = dr.fma(level, LEVEL_STEP, EMPTIEST)
+        return NodeField(self.coding.nodes, tensor(density), tensor(colour, palette.shape), self.index)
 
     def begin(self, step, share):
-        # Numbers that leave the range of the bytes are rounded to steps beyond it until then
-        if step % RANGED == 0:
+        # Until the next update, numbers beyond the range are rounded to steps outside of it
+        if step % RANGE_INTERVAL == 0:
             self._set_range()
         return ""
 
     def _set_range(self) -> None:
-        self.range = [self.types.Float(np.float32(v)) for v in byte_range(self.net["palette"].numpy())]
+        self.range = [self.session.types.Float(np.float32(v)) for v in byte_range(self.net["palette"].numpy())]
 
     def stored(self) -> dict[str, np.ndarray]:
-        """What is stored: ``shares``, ``curve``, ``codes``, ``palette`` (bytes), its ``scale`` and ``offset``."""
-        steps, net = 2**SHARE_BITS - 1, self.net
-        shares = fold(net["share"].array).numpy()
-        line = net["curve"].numpy().astype(np.float64) * CURVE_SCALE
-        curve = np.interp(np.linspace(0, 1, steps + 1), np.linspace(0, 1, len(line)), line)
-        palette = net["palette"].numpy()
+        """Return the stored arrays: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``."""
+        palette = self.net["palette"].numpy()
         scale, offset = byte_range(palette)
         return {
-            "shares": np.rint(shares.astype(np.float64) * steps).astype(np.uint8),
-            "curve": curve.astype(np.float32),
-            "codes": self.coding.codes,
+            "levels": np.rint(fold(self.net["density"].array).numpy().astype(np.float64) * LAST_LEVEL).astype(np.uint8),
+            "index": self.coding.index,
             "palette": np.clip(np.rint((palette - offset) / scale), 0, 255).astype(np.uint8),
             "scale": scale,
             "offset": offset,
@@ -118,49 +146,50 @@ class PaletteProblem(ImagesProblem):
 
 
 def byte_range(palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The step and the least of each of twelve numbers, as bytes hold them."""
+    """Return the quantisation step and the minimum of each column of a palette, as bytes store it."""
     low, high = palette.min(axis=0).astype(np.float64), palette.max(axis=0).astype(np.float64)
     return np.maximum((high - low) / 255, 1e-6), low
 
 
-def packed_bytes(grid: Grid, code_bits: int) -> int:
-    """Bytes in memory of the packed field of such a grid."""
-    nodes = grid.nodes
-    index = Nodes(nodes.types, nodes.lower, nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
-    words = nodes.entries * (SHARE_BITS + code_bits) // 8 + 8
-    return index + words + 4 * 2**SHARE_BITS + 16 * min(2**code_bits, nodes.count)
-
-
-def sized(grid: Grid, images: Images, nbytes: int | None) -> tuple[Grid, int]:
-    """
-    The visible part of a grid, as fine as fits in ``nbytes`` (``None``: as it is), and the bits of its indices: the
-    most that fit at the full resolution, 10 at a lower one. Raises ``ValueError`` if nothing fits.
-    """
-    cells = grids.visible(grid, images)
-    whole = grids.divided(grid, cells, 1, 0)
-    if nbytes is None:
-        return whole, DEFAULT_BITS
-    for bits in sorted(CODE_BITS, reverse=True):
-        if bits >= 8 and packed_bytes(whole, bits) <= nbytes:
-            return whole, bits
-    low, high, found = SMALLEST, 1.0, None
-    for _ in range(7):
-        middle = (low + high) / 2
-        smaller = grids.divided(grid, cells, middle, 0)
-        bits = 10 if packed_bytes(smaller, 10) <= nbytes else 8
-        if packed_bytes(smaller, bits) <= nbytes:
-            low, found = middle, (smaller, bits)
-        else:
-            high = middle
-    if found is None:
-        smallest = packed_bytes(grids.divided(grid, cells, SMALLEST, 0), 6)
-        raise ValueError(f"{nbytes:,} bytes are fewer than the smallest field needs, about {smallest:,}")
-    return found
-
-
-def packed_field(nodes: Nodes, stored: dict, code_bits: int) -> PackedField:
-    """The field of what :meth:`PaletteProblem.stored` returned; ``nodes`` with a packed index."""
-    return PackedField(
-        nodes, stored["shares"], SHARE_BITS, stored["curve"], stored["codes"], code_bits, stored["palette"],
+def packed_field(nodes: Nodes, stored: dict, index_bits: int) -> PackedPaletteField:
+    """Return the field of what :meth:`PaletteProblem.stored` returned, on ``nodes`` with a packed index."""
+    return PackedPaletteField(
+        nodes, stored["levels"], DENSITY_BITS, (EMPTIEST, LEVEL_STEP), stored["index"], index_bits, stored["palette"],
         stored["scale"], stored["offset"],
     )  # fmt: skip
+
+
+def packed_bytes(grid: NodeGrid, index_bits: int) -> int:
+    """Return the bytes in memory of the packed field of a grid."""
+    nodes = grid.nodes
+    index = Nodes(nodes.types, nodes.lower, nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
+    return index + nodes.entries * (DENSITY_BITS + index_bits) // 8 + 8 + 16 * min(2**index_bits, nodes.count)
+
+
+def sized(grid: NodeGrid, images: ViewImages, nbytes: int | None) -> tuple[NodeGrid, int]:
+    """
+    Return the visible part of a grid at the highest resolution that fits in ``nbytes``, and its bits of an index.
+
+    At the full resolution, an index has as many bits as fit; at a lower one, 10, or 8 if these do not fit. With
+    ``None``, the resolution and the bits are the default. Raises ``ValueError`` if no grid fits.
+    """
+    cells = grids.visible(grid, images)
+    whole = grids.divided(grid, cells)
+    if nbytes is None:
+        return whole, DEFAULT_BITS
+    for bits in sorted(INDEX_BITS, reverse=True):
+        if bits >= 8 and packed_bytes(whole, bits) <= nbytes:
+            return whole, bits
+    low, high, largest = SMALLEST, 1.0, None
+    for _ in range(7):
+        middle = (low + high) / 2
+        smaller = grids.divided(grid, cells, middle)
+        bits = 10 if packed_bytes(smaller, 10) <= nbytes else 8
+        if packed_bytes(smaller, bits) <= nbytes:
+            low, largest = middle, (smaller, bits)
+        else:
+            high = middle
+    if largest is None:
+        smallest = packed_bytes(grids.divided(grid, cells, SMALLEST), 6)
+        raise ValueError(f"{nbytes:,} bytes are fewer than the smallest field needs, about {smallest:,}")
+    return largest

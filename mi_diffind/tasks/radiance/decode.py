@@ -1,8 +1,8 @@
 """
-Fields back to dense grids, as NumPy's archives or OpenVDB files that Blender and others read.
+Radiance fields decoded to dense grids: NumPy archives, or OpenVDB files that Blender and others read.
 
-No package of OpenVDB is on the index (``openvdb`` is part of conda's, Debian's ``python3-openvdb`` and Blender's own
-Python), so it is used where it is there and not required.
+The Python package index has no OpenVDB (``openvdb`` comes with conda-forge, Debian's ``python3-openvdb`` and Blender's
+Python), so the module is used where it is installed and is not required.
 """
 
 from __future__ import annotations
@@ -16,38 +16,40 @@ from scipy.ndimage import distance_transform_edt
 
 from ...errors import UsageError
 from ...files import replacing
-from .field import DenseField, VolumeField, raw_of
+from .volume_field import DenseVolumeField, VolumeField, raw_of
 
-#: Points that a field is asked at once.
+#: Points at which a field is evaluated at once.
 CHUNK = 2**20
 
-#: The finest grid that is decoded, nodes along the longest side.
+#: Most nodes along the longest side of a decoded grid.
 MAX_RESOLUTION = 512
 
-#: Of a voxel: a node belongs to all cells around it, and is looked at from within each.
+#: Offset, in voxels, at which a node is sampled from inside each adjacent cell.
 WITHIN = 1e-3
 
-#: Densities below this, per voxel, are nothing.
+#: Density per voxel below which a node counts as empty.
 NOTHING = 1e-3
 
-#: The least radiance whose logarithm is taken.
+#: Lower limit of a radiance before its logarithm is taken.
 DARK = 1e-6
 
-#: Names of OpenVDB's module, newest first.
+#: Names of the OpenVDB module, newest first.
 MODULES = ("openvdb", "pyopenvdb")
 
 
 def grid(field: VolumeField, resolution: int | None = None) -> dict[str, np.ndarray]:
     """
-    A field at the nodes of a grid, ``lower + voxel · (i, j, k)``: ``density`` ``(X, Y, Z)``, per unit of length,
-    ``colour`` ``(X, Y, Z, 12)``, of which the radiance in direction d is exp(a + b·d), four numbers a, b for each of
-    red, green and blue (:func:`.field.colour_of`), ``lower`` ``(3,)`` and ``voxel`` ``()``; float32.
+    Return a field sampled at the nodes ``lower + voxel · (i, j, k)`` of a dense grid, as float32 arrays by name.
 
-    With ``resolution`` nodes along the longest side, by default the field's own voxels. Where the radiance is no such
-    exponential, it is right in the mean of the logarithms of opposite directions, along the axes. Where there is
-    nothing, the colour is the nearest one. A cell that a sparse field does not look at, beside one that it does, fades
-    out in a dense grid: one that is twice as fine is nearer to the field. Raises
-    :class:`~mi_diffind.errors.UsageError` for a resolution out of 2 … 512.
+    ``density`` ``(X, Y, Z)`` is per unit of length. ``colour`` ``(X, Y, Z, 12)`` holds numbers a and b for each of red,
+    green and blue: the radiance in direction d is exp(a + b·d) (:func:`.volume_field.colour_of`). ``lower`` is
+    ``(3,)``, ``voxel`` ``()``. The grid has ``resolution`` nodes along the longest side; by
+    default, its voxels are those of the field.
+
+    If the radiance of a field is not such an exponential, the mean of the logarithms of opposite directions is kept
+    along the axes. Empty nodes get the colour of the nearest node that is not empty. A sparse field ends at the faces
+    of its occupied cells, a dense grid fades out over the next cell: a grid twice as fine is closer to the field.
+    Raises :class:`~mi_diffind.errors.UsageError` for a resolution outside of 2 … 512.
     """
     lower, extent = np.array(field.lower), np.array(field.upper) - np.array(field.lower)
     if resolution is None:
@@ -75,7 +77,7 @@ def grid(field: VolumeField, resolution: int | None = None) -> dict[str, np.ndar
 
 
 def _nodes(field: VolumeField, lower, voxel: float, shape, start: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Density and twelve numbers of colour of the nodes of these numbers, in lexicographic order."""
+    """Return density and colour coefficients of the nodes from ``start`` to ``last``, in lexicographic order."""
     t = field.types
     n = dr.arange(t.UInt32, start, last)
     index = (n // (shape[1] * shape[2]), n // shape[2] % shape[1], n % shape[2])
@@ -87,37 +89,37 @@ def _nodes(field: VolumeField, lower, voxel: float, shape, start: int, last: int
             for x, c, a, b in zip(nodes, corner, field.lower, field.upper, strict=True)
         ]
         p = t.Array3f(*place)
-        sigma, latent = field.look(p, t.Bool(True))
+        sigma, point_data = field.density_at(p, t.Bool(True))
         more = sigma > largest
-        found = _exponential(field, latent, p, more)
+        coefficients = _exponential(field, point_data, p, more)
         largest = dr.select(more, sigma, largest)
-        numbers = [dr.select(more, new, old) for new, old in zip(found, numbers, strict=True)]
+        numbers = [dr.select(more, new, old) for new, old in zip(coefficients, numbers, strict=True)]
         dr.eval(largest, numbers)
     return largest.numpy(), np.stack([x.numpy() for x in numbers], axis=-1)
 
 
-def _exponential(field: VolumeField, latent: list, p, active) -> list:
-    """The numbers a, b of each channel, from the radiance in six directions."""
+def _exponential(field: VolumeField, point_data: list, p, active) -> list:
+    """Return the numbers a, b of each channel, from the radiance in six directions."""
     t = field.types
     a, slopes = [t.Float(0)] * 3, []
     for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
         ends = [
-            [dr.log(dr.maximum(c, DARK)) for c in field.colour(latent, p, t.Array3f(*(s * x for x in axis)), active)]
-            for s in (1.0, -1.0)
+            [dr.log(dr.maximum(c, DARK)) for c in field.radiance_at(point_data, p, d, active)]
+            for d in (t.Array3f(*(sign * x for x in axis)) for sign in (1.0, -1.0))
         ]
         a = [x + (plus + minus) / 6 for x, plus, minus in zip(a, *ends, strict=True)]
         slopes.append([(plus - minus) / 2 for plus, minus in zip(*ends, strict=True)])
     return [x for c in range(3) for x in (a[c], *(b[c] for b in slopes))]
 
 
-def dense(types, content: dict[str, np.ndarray]) -> DenseField:
-    """The field that :func:`grid` made, or its archive holds, as one that can be rendered."""
+def dense(types, content: dict[str, np.ndarray]) -> DenseVolumeField:
+    """Return the field of the arrays that :func:`grid` returned, or that its archive holds."""
     voxel = float(content["voxel"])
-    return DenseField(types, raw_of(content["density"], voxel), content["colour"], content["lower"], voxel)
+    return DenseVolumeField(types, raw_of(content["density"], voxel), content["colour"], content["lower"], voxel)
 
 
 def mean_colour(numbers: np.ndarray) -> np.ndarray:
-    """The mean over all directions of exp(a + b·d), ``(…, 3)`` of ``(…, 12)``: exp(a) · sinh|b| / |b|."""
+    """Return the mean of exp(a + b·d) over all directions, exp(a) · sinh|b| / |b|: ``(…, 3)`` from ``(…, 12)``."""
     four = numbers.reshape(*numbers.shape[:-1], 3, 4).astype(np.float64)
     slope = np.maximum(np.linalg.norm(four[..., 1:], axis=-1), 1e-6)
     return (np.exp(four[..., 0]) * np.sinh(slope) / slope).astype(np.float32)
@@ -125,9 +127,11 @@ def mean_colour(numbers: np.ndarray) -> np.ndarray:
 
 def decode(field: VolumeField, output: Path, resolution: int | None = None) -> list[tuple[Path, str]]:
     """
-    Write a field as a grid, and return the file with a line about it: ``.npz`` with what :func:`grid` returns, or
-    ``.vdb`` with grids ``density`` and ``color``, the mean over all directions. Raises
-    :class:`~mi_diffind.errors.UsageError`, also where OpenVDB is not installed.
+    Write a field as a dense grid and return the file with a line about its content.
+
+    A ``.npz`` file holds the arrays of :func:`grid`; a ``.vdb`` file holds grids ``density`` and ``color``, the mean
+    radiance over all directions. Raises :class:`~mi_diffind.errors.UsageError` for another extension, a bad resolution,
+    or if OpenVDB is not installed.
     """
     suffix = output.suffix.lower()
     if suffix not in (".npz", ".vdb"):
@@ -142,8 +146,8 @@ def decode(field: VolumeField, output: Path, resolution: int | None = None) -> l
                 np.savez_compressed(stream, **content)
         else:
             _write_vdb(module, temporary, content)
-    what = "density and 12 numbers of colour" if module is None else "density and mean colour"
-    return [(output, f"{shape} nodes (x, y, z), {100 * filled:.1f}% of them not empty: {what}")]
+    summary = "density and 12 numbers of colour" if module is None else "density and mean colour"
+    return [(output, f"{shape} nodes (x, y, z), {100 * filled:.1f}% of them not empty: {summary}")]
 
 
 def _openvdb(output: Path):
@@ -154,25 +158,25 @@ def _openvdb(output: Path):
             continue
     raise UsageError(
         f'output "{output}": a VDB file needs the Python module openvdb, which is not installed (it is in conda-forge, '
-        f"in Debian's python3-openvdb and in Blender); .npz needs nothing"
+        f"in Debian's python3-openvdb and in Blender); a .npz file needs no other module"
     )
 
 
 def _write_vdb(module, path: Path, content: dict[str, np.ndarray]) -> None:
-    """Grids whose voxels are the nodes; those with nothing are not active."""
-    voxel, found = float(content["voxel"]), []
-    # Rows are multiplied from the left
+    """Write VDB grids whose voxels are the nodes; empty nodes are not active."""
+    voxel, grids = float(content["voxel"]), []
+    # OpenVDB multiplies row vectors from the left
     matrix = np.diag([voxel, voxel, voxel, 1.0])
     matrix[3, :3] = content["lower"]
     transform = module.createLinearTransform(matrix.tolist())
     something = content["density"][..., None] > 0
-    for name, kind, array in (
+    for name, grid_type, array in (
         ("density", module.FloatGrid, content["density"]),
         ("color", module.Vec3SGrid, mean_colour(content["colour"]) * something),
     ):
-        vdb = kind()
+        vdb = grid_type()
         vdb.copyFromArray(np.ascontiguousarray(array, np.float64))
         vdb.name, vdb.transform = name, transform
-        found.append(vdb)
-    found[0].gridClass = module.GridClass.FOG_VOLUME
-    module.write(str(path), grids=found)
+        grids.append(vdb)
+    grids[0].gridClass = module.GridClass.FOG_VOLUME
+    module.write(str(path), grids=grids)

@@ -1,22 +1,22 @@
-"""What a table file of task 7 holds, and the field that it becomes."""
+"""Table files of radiance fields: arrays of each layout, checks, and the field of a table."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 
 from ...indirection import Indirection
 from ...tables import StoredArray, Table, TableError, load_table
-from .coded import CodedField
-from .compression import CODE_BITS, SHARE_BITS, packed_field
-from .field import GridField, VolumeField
+from .compression import EMPTIEST, INDEX_BITS, LAST_LEVEL, LEVEL_STEP, packed_field
 from .nodes import Nodes
 from .paper import PairsField
+from .volume_field import NodeField, VolumeField
 
 #: Layout → name of an array → number of its dimensions, and channels.
 LAYOUTS = {
-    "sparse": {"cells": (1, 1), "shares": (1, 1), "codes": (1, 2), "curve": (1, 1), "palette": (1, 12)},
+    "sparse": {"cells": (1, 1), "density": (1, 1), "index": (1, 2), "palette": (1, 12)},
     "grid": {"cells": (1, 1), "density": (1, 1), "colour": (1, 12)},
     "pairs": {
         "cells": (1, 1), "density_primary": (3, 3), "density_cascaded": (3, 1), "colour_primary": (3, 3),
@@ -24,36 +24,35 @@ LAYOUTS = {
     },
 }  # fmt: skip
 
-#: Most nodes of a grid, stored or not.
+#: Most nodes of a grid, counting those that are not stored.
 MOST_NODES = 2**28
 
 
-def raw(codes: np.ndarray) -> StoredArray:
-    """Bytes that stand for themselves, ``(n, c)``."""
-    channels = codes.shape[-1]
-    return StoredArray(np.ascontiguousarray(codes, np.uint8), (), (1.0,) * channels, (0.0,) * channels)
+def byte_array(values: np.ndarray, scale: float = 1.0, offset: float = 0.0) -> StoredArray:
+    """Return bytes ``(n, c)`` that stand for ``offset`` + ``scale`` · byte as an array of a file."""
+    channels = values.shape[-1]
+    return StoredArray(np.ascontiguousarray(values, np.uint8), (), (scale,) * channels, (offset,) * channels)
 
 
 def stored_nodes(nodes: Nodes) -> tuple[dict[str, StoredArray], dict]:
-    """The array of a file that says which nodes are stored, and its settings."""
+    """Return the array that marks the stored nodes, one bit each, and the settings of the grid."""
     bits = np.packbits(nodes.stored.reshape(-1))
     settings = {"lower": list(nodes.lower), "spacing": nodes.spacing, "shape": list(nodes.shape)}
-    return {"cells": raw(bits[:, None])}, settings
+    return {"cells": byte_array(bits[:, None])}, settings
 
 
-def palette_table(nodes: Nodes, stored: dict, code_bits: int) -> Table:
-    """The table of :meth:`.compression.PaletteProblem.stored`."""
+def palette_table(nodes: Nodes, stored: dict, index_bits: int) -> Table:
+    """Return the table of what :meth:`.compression.PaletteProblem.stored` returned."""
     arrays, settings = stored_nodes(nodes)
-    codes = stored["codes"].astype(np.uint32)
-    arrays["shares"] = raw(stored["shares"][:, None])
-    arrays["codes"] = raw(np.stack([codes & 255, codes >> 8], axis=1))
-    arrays["curve"] = StoredArray(np.ascontiguousarray(stored["curve"][:, None], np.float32))
+    index = stored["index"].astype(np.uint32)
+    arrays["density"] = byte_array(stored["levels"][:, None], LEVEL_STEP, EMPTIEST)
+    arrays["index"] = byte_array(np.stack([index & 255, index >> 8], axis=1))
     arrays["palette"] = StoredArray(stored["palette"], (), tuple(stored["scale"]), tuple(stored["offset"]))
-    return Table("field", arrays, settings={"layout": "sparse", "code_bits": code_bits, **settings})
+    return Table("field", arrays, settings={"layout": "sparse", "index_bits": index_bits, **settings})
 
 
 def grid_table(nodes: Nodes, density: np.ndarray, colour: np.ndarray, dtype=np.float16) -> Table:
-    """The table of a grid, in half precision by default; the first entry stands for no node."""
+    """Return the table of a grid, in half precision by default; the first entry stands for no node."""
     arrays, settings = stored_nodes(nodes)
     arrays["density"] = StoredArray(np.clip(density, -1e4, 1e4)[:, None].astype(dtype))
     arrays["colour"] = StoredArray(np.clip(colour, -1e3, 1e3).astype(dtype))
@@ -61,102 +60,109 @@ def grid_table(nodes: Nodes, density: np.ndarray, colour: np.ndarray, dtype=np.f
 
 
 def pairs_table(nodes: Nodes, arrays: dict, low, high) -> Table:
-    """The table of the supplement's pairs: :class:`~mi_diffind.tables.StoredArray` by name."""
+    """Return the table of the pairs of the supplement; ``arrays`` maps names to arrays of a file."""
     masks, settings = stored_nodes(nodes)
     ranges = {"low": [float(v) for v in low], "high": [float(v) for v in high]}
     return Table("field", {**masks, **arrays}, settings={"layout": "pairs", **ranges, **settings})
 
 
 def load(path) -> Table:
-    """Read and check a file. Raises :class:`~mi_diffind.tables.TableError`."""
+    """Read and check a table file of a radiance field. Raises :class:`~mi_diffind.tables.TableError`."""
     table = load_table(path, "field")
     layout = table.settings.get("layout")
     if not isinstance(layout, str) or layout not in LAYOUTS:
         raise TableError(f"{path}: has the layout {layout!r}, allowed are {', '.join(LAYOUTS)}")
+    if "curve" in table.arrays:
+        raise TableError(
+            f"{path}: has a density curve, which this package no longer reads: make the file again with "
+            f'"mi-diffind fit field FOLDER -o {Path(path).name}"'
+        )
     for name, (dims, channels) in LAYOUTS[layout].items():
         array = table.arrays.get(name)
         if array is None or len(array.shape) != dims + 1 or array.shape[-1] != channels:
-            found = "is missing" if array is None else f"has the shape {array.shape}"
+            fault = "is missing" if array is None else f"has the shape {array.shape}"
             raise TableError(
-                f'{path}: the array "{name}" {found}, expected {dims} dimension(s) and {channels} channel(s)'
+                f'{path}: the array "{name}" {fault}, expected {dims} dimension(s) and {channels} channel(s)'
             )
     for name, count, whole in (("lower", 3, False), ("spacing", 1, False), ("shape", 3, True)):
         _numbers(table, name, count, whole, positive=name != "lower")
     shape = table.settings["shape"]
     if min(shape) < 2 or math.prod(shape) > MOST_NODES:
-        raise TableError(f"{path}: is damaged: found a grid of {shape}, allowed are 2 to {MOST_NODES:,} nodes in all")
+        raise TableError(f"{path}: is damaged: found a grid of {shape}, allowed are at most {MOST_NODES:,} nodes")
     if len(table.arrays["cells"].entries) != -(-math.prod(shape) // 8):
-        raise TableError(f"{path}: is damaged: its masks are not those of a grid of {shape}")
+        raise TableError(f'{path}: is damaged: the array "cells" is not that of a grid of {shape}')
     if layout == "pairs":
         for name in ("low", "high"):
             _numbers(table, name, 13, False, False)
         return table
     entries = int(np.count_nonzero(stored_of(table))) + 1
-    names = ("shares", "codes") if layout == "sparse" else ("density", "colour")
+    names = ("density", "index") if layout == "sparse" else ("density", "colour")
     for name in names:
-        if len(table.arrays[name].entries) != entries:
-            found = len(table.arrays[name].entries) - 1
-            raise TableError(f'{path}: is damaged: its masks say {entries - 1} nodes, the array "{name}" has {found}')
+        stored = len(table.arrays[name].entries)
+        if stored != entries:
+            raise TableError(f'{path}: is damaged: the array "{name}" has {stored} entries, expected {entries}')
     if layout == "sparse":
-        bits = table.settings.get("code_bits")
-        if bits not in CODE_BITS:
-            raise TableError(f"{path}: is damaged: found indices of {bits!r} bits, allowed are {CODE_BITS}")
-        codes, palette = codes_of(table), len(table.arrays["palette"].entries)
-        if codes.max() >= min(palette, 2**bits):
-            raise TableError(f"{path}: is damaged: an index names colour {codes.max()} of {palette}")
-        if len(table.arrays["curve"].entries) != 2**SHARE_BITS or table.arrays["shares"].entries.max() >= 2**SHARE_BITS:
-            raise TableError(f"{path}: is damaged: its curve or coordinates in it are not of {SHARE_BITS} bits")
+        bits = table.settings.get("index_bits")
+        if bits not in INDEX_BITS:
+            raise TableError(f"{path}: is damaged: found indices of {bits!r} bits, allowed are {INDEX_BITS}")
+        last, palette = index_of(table).max(), len(table.arrays["palette"].entries)
+        if last >= min(palette, 2**bits):
+            raise TableError(f"{path}: is damaged: found the index {last} in a palette of {palette} colours")
+        density = table.arrays["density"]
+        if density.storage != "uint8" or density.entries.max() > LAST_LEVEL:
+            raise TableError(f"{path}: is damaged: found a density level that is not a number from 0 to {LAST_LEVEL}")
     return table
 
 
 def _numbers(table: Table, name: str, count: int, whole: bool, positive: bool) -> None:
+    """Check that a setting is ``count`` finite numbers."""
     value = table.settings.get(name)
     values = [value] if count == 1 else value
-    kinds = (int,) if whole else (int, float)
+    types = (int,) if whole else (int, float)
     good = isinstance(values, list) and len(values) == count
-    good = good and all(isinstance(v, kinds) and math.isfinite(v) and (v > 0 or not positive) for v in values)
+    good = good and all(isinstance(v, types) and math.isfinite(v) and (v > 0 or not positive) for v in values)
     if not good:
-        kind = "whole number" if whole else "number"
-        allowed = f"{count} {'positive ' if positive else 'finite '}{kind}{'s' if count > 1 else ''}"
+        number = "whole number" if whole else "number"
+        allowed = f"{count} {'positive ' if positive else 'finite '}{number}{'s' if count > 1 else ''}"
         raise TableError(f'{table.path}: its setting "{name}" is {value!r}, expected {allowed}')
 
 
 def stored_of(table: Table) -> np.ndarray:
-    """Which nodes are stored, ``shape`` bool."""
+    """Return the mask of stored nodes: bool of the ``shape`` of the grid."""
     shape = table.settings["shape"]
     bits = np.unpackbits(np.ascontiguousarray(table.arrays["cells"].entries[:, 0]), count=math.prod(shape))
     return bits.reshape(shape).astype(bool)
 
 
-def codes_of(table: Table) -> np.ndarray:
-    """Indices in the palette, uint32."""
-    low, high = table.arrays["codes"].entries.astype(np.uint32).T
+def index_of(table: Table) -> np.ndarray:
+    """Return the palette index of each node, uint32 ``(n,)``."""
+    low, high = table.arrays["index"].entries.astype(np.uint32).T
     return low | (high << 8)
 
 
 def field_of(table: Table, types, storage: str = "") -> VolumeField:
     """
-    The field of a checked table: packed for rendering, or, with the ``storage`` ``"float32"``, with ``arrays`` that can
-    be trained.
+    Return the field of a checked table.
+
+    It is packed for rendering; with the ``storage`` ``"float32"``, its ``arrays`` can be trained instead.
     """
     settings, layout, arrays = table.settings, table.settings["layout"], table.arrays
     floats = storage == "float32"
     nodes = Nodes(types, settings["lower"], settings["spacing"], settings["shape"], stored_of(table), packed=not floats)
     tensor = types.TensorXf
     if layout == "grid":
-        return GridField(nodes, tensor(arrays["density"].values[:, 0]), tensor(arrays["colour"].values))
+        return NodeField(nodes, tensor(arrays["density"].values[:, 0]), tensor(arrays["colour"].values))
     if layout == "pairs":
-        made = {name: arrays[name].allocate(tensor, storage) for name in PairsField.NAMES}
+        allocated = {name: arrays[name].allocate(tensor, storage) for name in PairsField.NAMES}
         density, colour = (
-            Indirection([made[f"{kind}_primary"]], made[f"{kind}_cascaded"]) for kind in ("density", "colour")
+            Indirection([allocated[f"{name}_primary"]], allocated[f"{name}_cascaded"]) for name in ("density", "colour")
         )
         return PairsField(nodes, density, colour, settings["low"], settings["high"])
-    palette, shares, curve = arrays["palette"], arrays["shares"].entries[:, 0], arrays["curve"].entries[:, 0]
+    palette, density, index = arrays["palette"], arrays["density"], index_of(table)
     if floats:
-        share = tensor(shares.astype(np.float32) / (2**SHARE_BITS - 1))
-        return CodedField(nodes, share, tensor(curve), types.UInt32(codes_of(table)), tensor(palette.values))
+        return NodeField(nodes, tensor(density.values[:, 0]), tensor(palette.values), types.UInt32(index))
     stored = {
-        "shares": shares, "curve": curve, "codes": codes_of(table), "palette": palette.entries, "scale": palette.scale,
+        "levels": density.entries[:, 0], "index": index, "palette": palette.entries, "scale": palette.scale,
         "offset": palette.offset,
     }  # fmt: skip
-    return packed_field(nodes, stored, settings["code_bits"])
+    return packed_field(nodes, stored, settings["index_bits"])

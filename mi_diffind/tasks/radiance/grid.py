@@ -1,8 +1,8 @@
 """
-The field that is compressed: a sparse grid of plain numbers, from coarse to fine.
+Sparse grid of plain numbers, trained from coarse to fine: the field that is compressed.
 
-Training begins in the visual hull at a quarter of the nodes along each side, goes on at half of them and ends with
-all: each time, cells that no ray sees are left out (:func:`weights`), and the others are divided.
+Training begins in the visual hull at a quarter of the nodes along each side, continues at half of them and ends with
+all of them. Between these stages, cells that no ray sees (:func:`weights`) are removed and the others are divided.
 """
 
 from __future__ import annotations
@@ -13,60 +13,62 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import binary_dilation, map_coordinates
 
-from .field import GridField, VolumeField
-from .hull import box_of, hull
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
-from .training import Images, ImagesProblem
-from .views import Views
+from .training import FieldSession, ImagesProblem, ViewImages
+from .views import CapturedViews
+from .visual_hull import box_of, hull
+from .volume_field import NodeField, NodeVolume
 
-#: Of a raw number of density, per unit of what is trained: so that one rate suits density and colour.
+#: Raw density per unit of the trained parameter, so that one learning rate suits density and colour.
 DENSITY_SCALE = 10.0
 
-#: What training begins with: nearly empty, and dark.
+#: Initial raw density and logarithm of the radiance: nearly empty, and dark.
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 
-#: The weight of the total variation of raw densities, the square below which a step counts less, and nodes a step.
+#: Total variation of raw densities: its weight, the square that rounds its kink at 0, and nodes a step.
 SMOOTH, ROUND, VARIED = 2e-4, 1e-2, 2**15
 
-#: The largest weight in a ray below which a cell is left out.
+#: Largest weight in a ray below which a cell is removed.
 VISIBLE = 0.02
 
 
 @dataclasses.dataclass
-class Grid:
-    """``density`` ``(n,)``, raw numbers, and ``colour`` ``(n, 12)`` of the ``nodes``' entries, arrays of NumPy."""
+class NodeGrid:
+    """Raw ``density`` ``(n,)`` and ``colour`` ``(n, 12)`` of the entries of sparse ``nodes``, as NumPy arrays."""
 
     nodes: Nodes
     density: np.ndarray
     colour: np.ndarray
 
-    def field(self) -> GridField:
+    def field(self) -> NodeField:
+        """Return the grid as a field."""
         tensor = self.nodes.types.TensorXf
-        return GridField(self.nodes, tensor(np.float32(self.density)), tensor(np.float32(self.colour)))
+        return NodeField(self.nodes, tensor(np.float32(self.density)), tensor(np.float32(self.colour)))
 
 
 class GridProblem(ImagesProblem):
     """
-    The training of a :class:`Grid` through images, with a little total variation of its densities (:data:`SMOOTH`):
-    neighbours that no image tells apart agree. That is worth half a decibel in views that were not trained by.
+    Training of a :class:`NodeGrid` through images, with a little total variation of its densities (:data:`SMOOTH`).
+
+    The variation makes neighbours agree that no image distinguishes, which is worth half a decibel in held-out views.
     """
 
-    def __init__(self, grid: Grid, views: Views, held: Views | None = None):
+    def __init__(self, grid: NodeGrid, session: FieldSession):
         self.nodes, types = grid.nodes, grid.nodes.types
         tensor = types.TensorXf
         net = {"density": tensor(np.float32(grid.density / DENSITY_SCALE)), "colour": tensor(np.float32(grid.colour))}
         self.count = dr.opaque(types.UInt32, grid.nodes.count)
         self.neighbours = types.UInt32(neighbours(grid.nodes).reshape(-1))
-        super().__init__(types, net, self.field_of, views, held)
+        super().__init__(session, net, self.field_of)
 
-    def field_of(self, net) -> GridField:
-        """The field of what is trained."""
+    def field_of(self, net) -> NodeField:
+        """Return the field of the trained parameters."""
         density = net["density"]
-        return GridField(self.nodes, type(density)(density.array * DENSITY_SCALE), net["colour"])
+        return NodeField(self.nodes, type(density)(density.array * DENSITY_SCALE), net["colour"])
 
     def loss(self, net, rng, size: int):
-        types = self.types
+        types = self.nodes.types
         density = net["density"].array
         node = types.UInt32(rng.random(types.TensorXf, (VARIED,)).array * types.Float(self.count))
         node = dr.minimum(node, self.count - 1)
@@ -77,39 +79,36 @@ class GridProblem(ImagesProblem):
             variation += dr.select(other != 0, dr.sqrt(dr.square(step) + ROUND), 0)
         return [super().loss(net, rng, size), variation * (SMOOTH / VARIED)]
 
-    def trained(self) -> Grid:
-        """The grid with what was trained."""
-        return Grid(self.nodes, self.net["density"].numpy() * DENSITY_SCALE, self.net["colour"].numpy())
+    def trained(self) -> NodeGrid:
+        """Return the grid with the trained numbers."""
+        return NodeGrid(self.nodes, self.net["density"].numpy() * DENSITY_SCALE, self.net["colour"].numpy())
 
 
 def neighbours(nodes: Nodes) -> np.ndarray:
-    """The numbers of the next nodes along x, y and z of each stored one, 0 of those that are not: ``(n, 3)``."""
+    """Return the numbers of the next nodes along x, y and z of each stored node, ``(n, 3)``; 0 if not stored."""
     places = nodes.positions()
     numbers = np.zeros(np.array(nodes.shape) + 1, np.uint32)
     numbers[tuple(places.T)] = np.arange(1, len(places) + 1)
     return np.stack([numbers[tuple((places + axis).T)] for axis in np.eye(3, dtype=int)], axis=1)
 
 
-def begin(types, views: Views, nodes: int, box=None) -> Grid:
-    """An empty grid of the views' hull: as fine as a cube of ``nodes``³ of the box's volume."""
-    lower, upper = box if box is not None else box_of(views)
+def begin(types, views: CapturedViews, nodes: int) -> NodeGrid:
+    """Return an empty grid of the visual hull, as fine as a cube of ``nodes``³ nodes with the volume of its box."""
+    lower, upper = box_of(views)
     spacing = float((np.prod(upper - lower) / nodes**3) ** (1 / 3))
     shape = np.maximum(2, np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1)
     inside = hull(views, lower, spacing, shape) if views.has_alpha else np.ones(shape, bool)
-    # All cells that have a corner in the hull
+    # Occupied: all cells that have a corner in the hull
     near = np.zeros(tuple(shape - 1), bool)
     for corner in np.ndindex(2, 2, 2):
         near |= inside[tuple(slice(c, n - 1 + c) for c, n in zip(corner, shape, strict=True))]
     grid = Nodes(types, lower, spacing, shape, corners_of(near))
     colour = np.tile(np.float32([BEGIN_COLOUR, 0, 0, 0] * 3), (grid.entries, 1))
-    return Grid(grid, np.full(grid.entries, BEGIN_DENSITY, np.float32), colour)
+    return NodeGrid(grid, np.full(grid.entries, BEGIN_DENSITY, np.float32), colour)
 
 
-def weights(field: VolumeField, images: Images) -> np.ndarray:
-    """
-    The largest weight, transmittance times opacity, that each cell has in a ray of the views:
-    ``(X − 1, Y − 1, Z − 1)``.
-    """
+def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
+    """Return the largest weight (transmittance × opacity) of each cell in a ray: ``(X − 1, Y − 1, Z − 1)``."""
     nodes, types, views = field.nodes, field.types, images.views
     largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
     lane = dr.arange(types.UInt32, views.height * views.width)
@@ -120,15 +119,16 @@ def weights(field: VolumeField, images: Images) -> np.ndarray:
     return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]
 
 
-def visible(grid: Grid, images: Images) -> np.ndarray:
-    """The cells that some ray of the views sees, ``(X − 1, Y − 1, Z − 1)`` bool."""
+def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
+    """Return the cells that some ray of the views sees, bool ``(X − 1, Y − 1, Z − 1)``."""
     return weights(grid.field(), images) >= VISIBLE
 
 
-def divided(grid: Grid, cells: np.ndarray, factor: float, wide: int = 1) -> Grid:
+def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 0) -> NodeGrid:
     """
-    The grid at ``factor`` times as many nodes along each side, of these ``cells`` (:func:`visible`) and ``wide`` more,
-    of the coarser ones, around them.
+    Return the grid reduced to ``cells`` (:func:`visible`), at ``factor`` times as many nodes along each side.
+
+    ``wide`` cells of the given grid around them are kept, too.
     """
     nodes = grid.nodes
     if wide:
@@ -147,8 +147,8 @@ def divided(grid: Grid, cells: np.ndarray, factor: float, wide: int = 1) -> Grid
     def sampled(values, begin: float):
         dense = np.full(nodes.shape, begin, np.float32)
         dense[nodes.stored] = values[1:]
-        found = map_coordinates(dense, at, order=1, mode="nearest", prefilter=False)
-        return np.concatenate([[begin], found]).astype(np.float32)
+        interpolated = map_coordinates(dense, at, order=1, mode="nearest", prefilter=False)
+        return np.concatenate([[begin], interpolated]).astype(np.float32)
 
     colour = [sampled(grid.colour[:, c], 0 if c % 4 else BEGIN_COLOUR) for c in range(12)]
-    return Grid(fine, sampled(grid.density, BEGIN_DENSITY), np.stack(colour, axis=1))
+    return NodeGrid(fine, sampled(grid.density, BEGIN_DENSITY), np.stack(colour, axis=1))

@@ -1,35 +1,40 @@
 """
-Rays through a field: emission and absorption, from front to back, and the derivatives of what they see.
+Ray marching: emission and absorption from front to back, the derivatives of both, and counts of the reads.
 
-A ray is divided into steps of a fixed length from where it enters the box, from where distances are counted (from
-afar, a step might be too short to change them at all), the last one cut where it ends. Each is of one density and
-radiance, so that a medium that is the same everywhere is Beer–Lambert, exactly. Steps in which there is certainly
-nothing are skipped, which changes nothing; no radiance is read where density is nothing; and the ray ends when it is
-opaque (:data:`OPAQUE`).
+A ray is divided into steps of a fixed length from the point where it enters the box; the last step is cut where the ray
+leaves. Distances count from the point of entry, since a step might be too short to change a distance from afar. Each
+step has one density and one radiance, so a homogeneous medium is Beer–Lambert exactly. Steps that are certainly empty
+are skipped, which changes nothing. No radiance is read where the density is zero. The ray ends when it is opaque
+(:data:`OPAQUE`).
 
-Derivatives replay the ray (Vicini et al., *Path Replay Backpropagation*, SIGGRAPH 2021): with what is seen from a step
-on, R, and the transmittance T behind it, ∂L/∂σ = δ (T c − R). Nothing is divided by.
+Derivatives replay the ray (Vicini et al., *Path Replay Backpropagation*, SIGGRAPH 2021): with the light R that is seen
+from a step on and the transmittance T behind the step, ∂L/∂σ = δ (T c − R). There is no division.
 """
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
+
 import drjit as dr
 
 from ...rays import box_interval
+from .volume_field import VolumeField
 
-#: The transmittance at which a ray ends.
+#: Transmittance at which a ray ends.
 OPAQUE = 1e-4
 
-#: The weight of a step below which its radiance is not read.
+#: Weight of a step below which its radiance is not read.
 NOTHING = 2e-7
 
-#: Not all arrays have to be differentiated.
+#: Flags of derivatives: not all arrays have to be differentiated.
 ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 class Marched:
     """
-    What a ray saw: ``colour`` (premultiplied), ``transmittance``, and ``depth``, Σ w t: by the opacity, a mean.
+    Result of a marched ray: ``colour`` (premultiplied), ``transmittance`` and ``depth``.
+
+    ``depth`` is Σ w t over the steps; divided by the opacity, it is the mean distance.
     """
 
     def __init__(self, colour=None, transmittance=None, depth=None):
@@ -42,8 +47,9 @@ class Marched:
 
 def box(field, o, d, near, far, active):
     """
-    The part of each ray that lies in the field's box: the place where it begins, the distance to there, its length, and
-    where there is one. NaN is nowhere.
+    Return the part of each ray in the field's box: its origin, the distance to it, its length, and whether it exists.
+
+    A ray with NaN has no part in the box.
     """
     types = field.types
     near, far = types.Float(near), types.Float(far)
@@ -56,8 +62,9 @@ def box(field, o, d, near, far, active):
 @dr.syntax
 def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     """
-    What rays ``o + t d``, t from ``near`` to ``far``, see of a field; ``d`` has unit length. ``offset`` in [0, 1) says
-    where within a step it is looked at.
+    March the rays ``o + t d`` through a field, for t from ``near`` to ``far``.
+
+    ``d`` has unit length; ``offset`` in [0, 1) is the position within a step at which the field is read.
     """
     types = field.types
     with dr.suspend_grad():
@@ -70,13 +77,13 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
             end = dr.minimum(t + step, far)
             at = dr.fma(offset, end - t, t)
             p = dr.fma(d, at, o)
-            density, latent = field.look(p, here)
+            density, point_data = field.density_at(p, here)
             passed = through * dr.exp(-density * (end - t))
             weight = dr.select(here, through - passed, 0)
             shown = here & (weight > NOTHING)
             colour = types.Array3f(0)
             if shown:
-                colour = types.Array3f(*field.colour(latent, p, d, shown))
+                colour = types.Array3f(*field.radiance_at(point_data, p, d, shown))
             seen += dr.select(shown, weight * colour, 0)
             depth += weight * (near + at)
             through = dr.select(here, passed, through)
@@ -87,31 +94,32 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
 
 @dr.syntax
 def _next(field, o, d, t, far, step, offset, active):
-    """The next step, from the one at ``t`` on, in which something may be: where it begins, and whether there is one."""
+    """Return the start of the next step, from ``t`` on, that may not be empty, and whether there is one."""
     types = field.types
     t = types.Float(t)
-    looking = types.Bool(active)
-    found = types.Bool(False)
-    while looking:
+    searching = types.Bool(active)
+    occupied = types.Bool(False)
+    while searching:
         at = dr.fma(offset, dr.minimum(t + step, far) - t, t)
-        free = field.skip(dr.fma(d, at, o), d, looking)
-        nothing = free > 0
-        found |= looking & ~nothing
-        t = dr.select(looking & nothing, dr.fma(dr.floor(free / step) + 1, step, t), t)
-        looking &= nothing & (t < far)
-    return t, found
+        free = field.free_distance(dr.fma(d, at, o), d, searching)
+        empty = free > 0
+        occupied |= searching & ~empty
+        t = dr.select(searching & empty, dr.fma(dr.floor(free / step) + 1, step, t), t)
+        searching &= empty & (t < far)
+    return t, occupied
 
 
 def replay(field, o, d, near, far, active, offset, marched: Marched, d_colour, d_transmittance=0, d_depth=0) -> None:
     """
-    Add to the gradients of ``field.arrays`` what those of :class:`Marched` make of them. ``marched`` is what
-    :func:`march` returned for these arguments.
+    Add to the gradients of ``field.arrays``, given those with respect to colour, transmittance and depth.
+
+    ``marched`` is what :func:`march` returned for these arguments.
     """
     _follow(field, o, d, near, far, active, offset, marched, (d_colour, d_transmittance, d_depth), None)
 
 
 def tangent(field, o, d, near, far, active, offset, marched: Marched) -> tuple:
-    """The derivatives of colour, transmittance and depth along those that are set for ``field.arrays``."""
+    """Return the derivatives of colour, transmittance and depth along the tangents set for ``field.arrays``."""
     return _follow(field, o, d, near, far, active, offset, marched, None, field)
 
 
@@ -135,7 +143,7 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
             at = dr.fma(offset, length, t)
             p = dr.fma(d, at, o)
             with dr.resume_grad():
-                density, latent = field.look(p, here)
+                density, point_data = field.density_at(p, here)
             passed = through * dr.exp(-dr.detach(density) * length)
             weight = dr.select(here, through - passed, 0)
             shown = here & (weight > NOTHING)
@@ -143,12 +151,12 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
             if shown:
                 # Nothing that is differentiated leaves this branch
                 with dr.resume_grad():
-                    found = types.Array3f(*field.colour(latent, p, d, shown))
+                    radiance = types.Array3f(*field.radiance_at(point_data, p, d, shown))
                     if dr.hint(adjoint is not None, mode="scalar"):
-                        dr.backward_from(dr.dot(found, d_colour * weight), ANY)
+                        dr.backward_from(dr.dot(radiance, d_colour * weight), ANY)
                     else:
-                        d_colour += weight * dr.forward_to(found, flags=ANY)
-                colour = dr.detach(found)
+                        d_colour += weight * dr.forward_to(radiance, flags=ANY)
+                colour = dr.detach(radiance)
             rest -= weight * dr.select(shown, colour, 0)
             rest_depth -= weight * (near + at)
             step_colour = passed * dr.select(shown, colour, 0) - rest
@@ -172,8 +180,10 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
 @dr.syntax
 def visibility(field, o, d, near, far, active, target) -> None:
     """
-    The largest weight, transmittance times opacity of a step, that each cell of ``field.nodes`` has in one of these
-    rays: raises the numbers of ``target``, one for each node, at the first of its corners.
+    Raise ``target`` to the largest weight that each cell of ``field.nodes`` has in one of these rays.
+
+    The weight of a step is its transmittance times its opacity. ``target`` has an entry for each node of the grid; that
+    of a cell is at its first corner.
     """
     types = field.types
     with dr.suspend_grad():
@@ -184,7 +194,7 @@ def visibility(field, o, d, near, far, active, target) -> None:
             t, here = _next(field, o, d, t, far, step, types.Float(0.5), active)
             end = dr.minimum(t + step, far)
             p = dr.fma(d, dr.fma(0.5, end - t, t), o)
-            density, _ = field.look(p, here)
+            density, _ = field.density_at(p, here)
             passed = through * dr.exp(-density * (end - t))
             dr.scatter_reduce(dr.ReduceOp.Max, target, through - passed, field.nodes.cell(p), here)
             through = dr.select(here, passed, through)
@@ -196,9 +206,8 @@ class _March(dr.CustomOp):
     def eval(self, arrays, field, o, d, near, far, active, offset):
         self.field, self.arguments = field, (o, d, near, far, active, offset)
         self.arrays = arrays
-        found = march(field.with_arrays(arrays), *self.arguments)
-        self.found = found
-        return found.colour, found.transmittance, found.depth
+        self.marched = march(field.with_arrays(arrays), *self.arguments)
+        return self.marched.colour, self.marched.transmittance, self.marched.depth
 
     def _attached(self):
         arrays = {name: type(value)(dr.detach(value)) for name, value in self.arrays.items()}
@@ -207,15 +216,89 @@ class _March(dr.CustomOp):
 
     def backward(self):
         arrays, field = self._attached()
-        replay(field, *self.arguments, self.found, *self.grad_out())
+        replay(field, *self.arguments, self.marched, *self.grad_out())
         self.set_grad_in("arrays", dr.grad(arrays))
 
     def forward(self):
         arrays, field = self._attached()
         dr.set_grad(arrays, self.grad_in("arrays"))
-        self.set_grad_out(tangent(field, *self.arguments, self.found))
+        self.set_grad_out(tangent(field, *self.arguments, self.marched))
 
 
 def differentiable(field, o, d, near, far, active=True, offset=0.5) -> Marched:
-    """As :func:`march`, with derivatives with respect to ``field.arrays`` (rays are constants to them)."""
+    """March rays as :func:`march` does, with derivatives with respect to ``field.arrays``; rays are constants."""
     return Marched(*dr.custom(_March, field.arrays, field.with_arrays({}), o, d, near, far, active, offset))
+
+
+# -- counts of reads --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RayCounts:
+    """
+    Number of ``rays``, of those that cross the field's box (``crossing``), and of those that end opaque (``opaque``).
+
+    ``steps`` is the number of steps in the box. Of these, ``hidden`` lie behind an opaque part, ``skipped`` in space
+    known to be empty, ``looks`` read the density, and ``colours`` read the radiance, too.
+    """
+
+    rays: int
+    crossing: int
+    opaque: int
+    steps: int
+    hidden: int
+    skipped: int
+    looks: int
+    colours: int
+
+    def asdict(self) -> dict:
+        return asdict(self)
+
+
+class CountingField(VolumeField):
+    """
+    Field that counts the reads of density and radiance of another ``field``.
+
+    ``reads_all``: no space is known to be empty, so every step up to an opaque part reads the density.
+    """
+
+    def __init__(self, field: VolumeField, reads_all: bool = False):
+        super().__init__(field.types, field.lower, field.upper, field.voxel, field.arrays)
+        self.field, self.reads_all = field, reads_all
+        self.counts = dr.zeros(field.types.UInt32, 2)
+
+    def _count(self, which: int, active) -> None:
+        UInt32 = self.types.UInt32
+        dr.scatter_add(self.counts, UInt32(1), UInt32(which), self.types.Bool(active))
+
+    def density_at(self, p, active=True):
+        self._count(0, active)
+        return self.field.density_at(p, active)
+
+    def radiance_at(self, point_data, p, d, active=True):
+        self._count(1, active)
+        return self.field.radiance_at(point_data, p, d, active)
+
+    def free_distance(self, p, d, active=True):
+        return self.types.Float(0) if self.reads_all else self.field.free_distance(p, d, active)
+
+
+def count(field: VolumeField, o, d, near, far, active=True) -> RayCounts:
+    """Return the counts of :func:`march` for these rays; two marches are needed."""
+    types = field.types
+    with dr.suspend_grad():
+        o, active = types.Array3f(o), types.Bool(active)
+        rays = dr.max(dr.width(o, d, near, far, active))
+        *_, length, crossing = box(field, o, d, near, far, active)
+        steps = dr.select(crossing, dr.ceil(length / field.step), 0)
+        skipping, all_steps = CountingField(field), CountingField(field, reads_all=True)
+        marched = march(skipping, o, d, near, far, crossing)
+        opaque = crossing & (marched.transmittance <= OPAQUE)
+        dr.eval(march(all_steps, o, d, near, far, crossing).transmittance, opaque, steps)
+        looks, colours = (int(n) for n in skipping.counts.numpy())
+        reached = int(all_steps.counts[0])
+        total = round(float(dr.sum(types.Float64(steps))[0]))
+        return RayCounts(
+            rays, int(dr.count(crossing)[0]), int(dr.count(opaque)[0]), total, max(0, total - reached),
+            max(0, reached - looks), looks, colours,
+        )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a table file of task 7 stands for."""
+"""Model of a radiance-field file: its field, what is measured of it, and its dense grid."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ...task import Model
 from .files import field_of
 from .presets import dense_bytes
 
-#: Rays along each side of the box in which what they leave out is counted.
+#: Rays along each side of the box in counts of steps.
 PIXELS = 96
 
 
-class FieldModel(Model):
-    """The radiance field in a file: ``field`` (:class:`.field.VolumeField`), in the coordinates of its capture."""
+class RadianceFieldModel(Model):
+    """Radiance field of a file: ``field`` (:class:`.volume_field.VolumeField`), in the coordinates of its capture."""
 
-    #: The storage form that was asked for, "" for the file's own.
+    #: Requested storage form; "" means that of the file.
     form = ""
 
     def __init__(self, table, arrays, dtype, form: str = ""):
@@ -37,19 +37,19 @@ class FieldModel(Model):
 
     @property
     def nbytes(self):
-        """Bytes in memory, with the index of the nodes."""
+        """Bytes in memory, including the index of the nodes."""
         return self.memory_nbytes
 
     @property
     def memory_nbytes(self):
-        own = getattr(self.field, "nbytes", None)
-        if own is not None:
-            return own
+        nbytes = getattr(self.field, "nbytes", None)
+        if nbytes is not None:
+            return nbytes
         return self.field.nodes.nbytes + sum(4 * math.prod(a.shape) for a in self.field.arrays.values())
 
     @property
     def dense_nbytes(self) -> int:
-        """Bytes of a grid of thirteen float32 numbers at every node of the box: what ratios refer to."""
+        """Bytes of a grid of 13 float32 numbers at every node of the box, to which ratios refer."""
         return dense_bytes(self.table.settings["shape"])
 
     def describe(self):
@@ -80,14 +80,14 @@ class FieldModel(Model):
         skipped, hidden = (100 * counts[name] / steps for name in ("skipped", "hidden"))
         lines.append(
             f"of {steps / counts['crossing']:.0f} steps of a ray through the box, {skipped:.1f}% are skipped as empty "
-            f"and {hidden:.1f}% lie behind what is opaque; of {looks / counts['crossing']:.1f} that are looked at, "
+            f"and {hidden:.1f}% lie behind an opaque part; of {looks / counts['crossing']:.1f} that read the density, "
             f"{100 * (1 - counts['colours'] / looks):.0f}% read no colour"
         )
         return figures, lines
 
     def counts(self) -> dict[str, int]:
-        """What rays leave out (:class:`.counting.Counts`): parallel ones, along the axes, in both directions."""
-        from .counting import count
+        """Return the counts (:class:`.march.RayCounts`) of parallel rays along the axes, in both directions."""
+        from .march import count
 
         lower, upper = np.array(self.field.lower), np.array(self.field.upper)
         u = (np.arange(PIXELS) + 0.5) / PIXELS
@@ -103,23 +103,23 @@ class FieldModel(Model):
 
     def measure(self, capture=None):
         """
-        PSNR of the test views of the capture in the folder ``capture`` (default: the one that was fitted, if it is
-        where it was).
+        Return the PSNR of the test views of a capture.
+
+        ``capture`` is its folder; by default, that of the capture that was fitted, if it still exists.
         """
-        from .fit import held_views
-        from .training import Images, evaluate
+        from .training import ViewImages, load_held_out
 
         folder = (self.table.path or Path("x")).resolve().parent
         path = Path(capture) if capture is not None else folder / self.table.settings.get("capture_path", "")
         if (capture is None and not self.table.settings.get("capture_path")) or not path.is_dir():
             self._refuse(f"was fitted to the capture {path}, which is not there")
-        return evaluate(self.field, Images(self.types, held_views(path)[0]))
+        return ViewImages(self.types, load_held_out(path)[0]).evaluate(self.field)
 
     def decode(self, output: Path, resolution: int | None = None):
-        """Density and colour on a dense grid (:mod:`.decode`)."""
+        """Write density and colour on a dense grid (:mod:`.decode`)."""
         from .decode import decode
 
         return decode(self.field, output, resolution)
 
 
-MODEL = FieldModel
+MODEL = RadianceFieldModel

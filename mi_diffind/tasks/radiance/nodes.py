@@ -1,9 +1,9 @@
 """
-Where the numbers of a field lie: the nodes of a grid, all of them, or those of some of its cells.
+Nodes of a dense or sparse grid: their numbers, their memory index, and the empty distances between them.
 
-Of a sparse grid, the corners of all cells that matter are stored. A cell is looked at if all its corners are stored,
-and is nothing otherwise. Rays cross what is nothing by the distances of a coarser grid, of cells of
-:data:`COARSE` × :data:`COARSE` × :data:`COARSE`.
+A sparse grid stores the corners of all occupied cells. A cell is occupied if all its corners are stored, and empty
+otherwise. Rays cross empty space by the distances of a coarser grid, whose cells span :data:`COARSE` cells along each
+axis.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from scipy.ndimage import distance_transform_cdt
 
 from ...bits import mask_words
 
-#: Cells along a side of a cell of the grid of distances.
+#: Cells along a side of a cell of the coarser grid of distances.
 COARSE = 2
 
-#: The largest distance that is told, in cells of that grid: 4 bits.
+#: Largest stored distance, in cells of the coarser grid: 4 bits.
 FARTHEST = 15
 
-#: Cells along z of a column: its 32 nodes have a bit each, the last one also in the next column.
+#: Cells of a column, along z. Each of its 32 nodes has a bit; the last node is also the first of the next column.
 COLUMN = 31
 
 
 class Nodes:
     """
-    Nodes at ``lower + spacing · (i, j, k)``, ``(i, j, k)`` below ``shape``. With ``stored`` (bool, of this shape),
-    those that are true are numbered from 1 on in lexicographic order, and 0 stands for none; without, all are, from 0.
+    Nodes at ``lower + spacing · (i, j, k)``, with ``(i, j, k)`` below ``shape``.
 
-    Numbers are found in an index with a word for each node of the grid or, if ``packed``, by bit masks and ranks, which
-    take a tenth of that memory.
+    ``stored``, bool of this shape, marks the nodes of a sparse grid. They are numbered from 1 in lexicographic order,
+    and 0 stands for no node. Without ``stored``, all nodes are numbered from 0. The index that maps positions to
+    numbers has a word for each node of the grid or, if ``packed``, bit masks and ranks in a tenth of that memory.
     """
 
     def __init__(self, types, lower, spacing: float, shape, stored: np.ndarray | None = None, packed: bool = False):
@@ -38,16 +38,16 @@ class Nodes:
         self.lower, self.spacing = tuple(map(float, lower)), float(spacing)
         self.shape = tuple(int(n) for n in shape)
         self.stored = stored
-        # Not part of kernels, so that those of one grid serve another
+        # Opaque: grids of another size use the same kernels
         self._inverse = dr.opaque(types.Float, 1 / self.spacing)
         self._offset = dr.opaque(types.Array3f, [-a / self.spacing for a in self.lower])
         self._last = dr.opaque(types.Array3f, [float(n - 2) for n in self.shape])
         self._sides = dr.opaque(types.Array3u, self.shape)
         self.index = self.columns = self.filled = self.distances = None
         if stored is not None:
-            self.far = distances(cells_of(stored))
-            self.distances = types.UInt32(nibbles(self.far))
-            self._coarse = dr.opaque(types.Array3u, self.far.shape)
+            self.coarse_distances = chessboard_distances(cells_of(stored))
+            self.distances = types.UInt32(nibbles(self.coarse_distances))
+            self._coarse = dr.opaque(types.Array3u, self.coarse_distances.shape)
             if packed:
                 filled, columns = column_words(stored)
                 self._columns = dr.opaque(types.UInt32, columns_of(self.shape[2]))
@@ -57,54 +57,55 @@ class Nodes:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the index and of the distances, in memory."""
+        """Bytes of the index and of the distances in memory."""
         words = [self.index, self.columns, self.filled, self.distances]
         return sum(4 * dr.width(w) for w in words if w is not None)
 
     @property
     def count(self) -> int:
-        """Nodes that are stored."""
+        """Number of stored nodes."""
         return int(np.count_nonzero(self.stored)) if self.stored is not None else int(np.prod(self.shape))
 
     @property
     def entries(self) -> int:
-        """Entries of an array with a number for each node, and for none."""
+        """Entries of an array indexed by node numbers: one for each node and, in a sparse grid, one for no node."""
         return self.count + (self.stored is not None)
 
     @property
     def upper(self) -> tuple[float, float, float]:
-        """The position of the last node."""
+        """Position of the last node."""
         return tuple(a + self.spacing * (n - 1) for a, n in zip(self.lower, self.shape, strict=True))
 
     def positions(self) -> np.ndarray:
-        """The place of each stored node in the grid, ``(n, 3)``."""
+        """Return the integer coordinates of each stored node, ``(n, 3)``."""
         stored = self.stored if self.stored is not None else np.ones(self.shape, bool)
         return np.argwhere(stored)
 
     def _place(self, p) -> tuple:
-        """The first corner of the cell that holds ``p``, along each axis, and the place in that cell."""
+        """Return the first corner of the cell that holds ``p`` and the position within the cell, along each axis."""
         cell, fraction = [], []
         for x, offset, last in zip(p, self._offset, self._last, strict=True):
             u = dr.fma(x, self._inverse, offset)
             i = dr.clip(dr.floor(u), 0, last)
-            # A point that rounding has put out of the box, or NaN, stays within its cell
+            # A point that rounding has moved out of the box, or NaN, stays within its cell
             fraction.append(dr.clip(u - i, 0, 1))
             cell.append(self.types.UInt32(i))
         return cell, fraction
 
     def cell(self, p):
-        """The cell that holds ``p``: the place of its first corner in the grid, in lexicographic order."""
+        """Return the cell that holds ``p``: the lexicographic index of its first corner in the grid."""
         (x, y, z), _ = self._place(p)
         return dr.fma(dr.fma(x, self._sides.y, y), self._sides.z, z)
 
     def corners(self, p, active=True) -> tuple[list, object]:
         """
-        The eight (weight, number) of the cell that holds ``p``, and where that cell is looked at. Numbers of a cell
-        that is not may be 0.
+        Return eight pairs (weight, node number) of the cell that holds ``p``, and whether that cell is occupied.
+
+        Numbers of an empty cell may be 0.
         """
         cell, fraction = self._place(p)
         active = self.types.Bool(active)
-        found = []
+        weighted = []
         for x in (0, 1):
             for y in (0, 1):
                 line = dr.fma(cell[0] + x, self._sides.y, cell[1] + y)
@@ -113,16 +114,16 @@ class Nodes:
                 else:
                     at = dr.fma(line, self._sides.z, cell[2])
                 if self.index is not None:
-                    # A word for both: of nodes that are neighbours along z, and stored, one number follows the other
+                    # One word for two nodes: stored neighbours along z have consecutive numbers
                     at = dr.gather(self.types.UInt32, self.index, at, active)
                     active &= at != 0
                 across = (fraction[0] if x else 1 - fraction[0]) * (fraction[1] if y else 1 - fraction[1])
                 upper = across * fraction[2]
-                found += [(across - upper, at), (upper, at + 1)]
-        return found, active
+                weighted += [(across - upper, at), (upper, at + 1)]
+        return weighted, active
 
     def _ranked(self, line, z, active) -> tuple:
-        """The number of the node ``z`` of a line, and whether it and the next one are stored, by masks."""
+        """Return the number of node ``z`` of a line and, from the masks, whether it and the next one are stored."""
         Array2u, UInt32 = self.types.Array2u, self.types.UInt32
         part = z // COLUMN
         bit = z - part * COLUMN
@@ -131,12 +132,12 @@ class Nodes:
         here = column & 31
         active = active & (((filled[0] >> here) & 1) != 0)
         rank = filled[1] + dr.popcnt(filled[0] & ((UInt32(1) << here) - 1))
-        found = dr.gather(Array2u, self.columns, rank, active)
-        active &= ((found[0] >> bit) & 3) == 3
-        return found[1] + dr.popcnt(found[0] & ((UInt32(1) << bit) - 1)), active
+        mask, number = dr.gather(Array2u, self.columns, rank, active)
+        active &= ((mask >> bit) & 3) == 3
+        return number + dr.popcnt(mask & ((UInt32(1) << bit) - 1)), active
 
-    def skip(self, p, d, active=True):
-        """A length from ``p`` along ``d`` without a cell that is looked at, or 0."""
+    def free_distance(self, p, d, active=True):
+        """Return a length from ``p`` along ``d`` that crosses no occupied cell, or 0."""
         if self.distances is None:
             return self.types.Float(0)
         (x, y, z), _ = self._place(p)
@@ -144,31 +145,32 @@ class Nodes:
         word = dr.gather(self.types.UInt32, self.distances, at >> 3, active)
         steps = (word >> ((at & 7) << 2)) & FARTHEST
         fastest = dr.maximum(dr.maximum(dr.abs(d.x), dr.abs(d.y)), dr.abs(d.z))
-        # From anywhere in this cell, one less; a neighbour (1) is still worth not looking
+        # One cell less, since ``p`` may be anywhere in its own; beside an occupied cell the length stays positive
         length = dr.maximum(self.types.Float(steps) - 1, 1e-6) * COARSE / (self._inverse * fastest)
         return dr.select(active & (steps > 0), length, 0)
 
 
 def cells_of(stored: np.ndarray) -> np.ndarray:
-    """The cells of which all corners are stored, ``(X − 1, Y − 1, Z − 1)``."""
-    found = np.ones(tuple(n - 1 for n in stored.shape), bool)
+    """Return the occupied cells, bool ``(X − 1, Y − 1, Z − 1)``, of ``stored`` nodes: all their corners are stored."""
+    cells = np.ones(tuple(n - 1 for n in stored.shape), bool)
     for corner in np.ndindex(2, 2, 2):
-        found &= stored[tuple(slice(c, n - 1 + c) for c, n in zip(corner, stored.shape, strict=True))]
-    return found
+        cells &= stored[tuple(slice(c, n - 1 + c) for c, n in zip(corner, stored.shape, strict=True))]
+    return cells
 
 
 def corners_of(cells: np.ndarray) -> np.ndarray:
-    """The nodes that are corners of one of these cells, of one more along each axis."""
-    found = np.zeros(tuple(n + 1 for n in cells.shape), bool)
+    """Return the nodes, bool ``(X + 1, Y + 1, Z + 1)``, that are corners of one of the ``cells``."""
+    nodes = np.zeros(tuple(n + 1 for n in cells.shape), bool)
     for corner in np.ndindex(2, 2, 2):
-        found[tuple(slice(c, n + c) for c, n in zip(corner, cells.shape, strict=True))] |= cells
-    return found
+        nodes[tuple(slice(c, n + c) for c, n in zip(corner, cells.shape, strict=True))] |= cells
+    return nodes
 
 
-def distances(cells: np.ndarray) -> np.ndarray:
+def chessboard_distances(cells: np.ndarray) -> np.ndarray:
     """
-    For each cell of the coarser grid, how many of its cells away, in the maximum norm, the nearest with a cell that is
-    looked at is; at most :data:`FARTHEST`. uint8.
+    Return the distance of each cell of the coarser grid to the nearest one that holds an occupied cell.
+
+    Distances are in cells of the coarser grid, in the maximum norm, at most :data:`FARTHEST`; uint8.
     """
     padded = np.pad(cells, [(0, -n % COARSE) for n in cells.shape])
     x, y, z = (n // COARSE for n in padded.shape)
@@ -179,14 +181,14 @@ def distances(cells: np.ndarray) -> np.ndarray:
 
 
 def nibbles(values: np.ndarray) -> np.ndarray:
-    """Numbers of 4 bits, eight to a word of 32, the lowest first."""
+    """Return 4-bit numbers packed into 32-bit words, eight to a word, the lowest bits first."""
     flat = values.reshape(-1)
     pairs = np.pad(flat, (0, -len(flat) % 8)).reshape(-1, 2)
     return (pairs[:, 0] | (pairs[:, 1] << 4)).astype(np.uint8).view("<u4")
 
 
 def numbered(stored: np.ndarray) -> np.ndarray:
-    """The number of each node that is stored, as its neighbour along z is, 0 of the others. uint32."""
+    """Return the number of each node, uint32; 0 where the node or its next neighbour along z is not stored."""
     numbers = np.zeros(stored.shape, np.uint32)
     numbers[stored] = np.arange(1, np.count_nonzero(stored) + 1)
     numbers[:, :, :-1][~stored[:, :, 1:]] = 0
@@ -196,16 +198,18 @@ def numbered(stored: np.ndarray) -> np.ndarray:
 
 def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    The same as masks and ranks: ``(w, 2)``, a bit for each column that has nodes, 32 to a word, and how many came
-    before; ``(c, 2)``, for each of these the bits of its nodes, and the number of the first. uint32.
+    Return the numbers of nodes as masks and ranks: two uint32 arrays.
+
+    The first, ``(w, 2)``, holds a bit for each column, set if the column has stored nodes, 32 to a word, and the number
+    of set bits before. The second, ``(c, 2)``, holds the mask of each such column and the number of its first node.
     """
     x, y, z = stored.shape
     count = columns_of(z)
     padded = np.pad(stored, [(0, 0), (0, 0), (0, count * COLUMN + 1 - z)])
     bits = np.stack([padded[:, :, c * COLUMN : c * COLUMN + 32] for c in range(count)], axis=2).reshape(-1, 32)
-    own = bits[:, :COLUMN].sum(axis=1)  # the last node is the next column's first
-    own.reshape(x * y, count)[:, -1] += bits.reshape(x * y, count, 32)[:, -1, -1]
-    first = 1 + np.cumsum(own) - own
+    counts = bits[:, :COLUMN].sum(axis=1)  # the last node is the next column's first
+    counts.reshape(x * y, count)[:, -1] += bits.reshape(x * y, count, 32)[:, -1, -1]
+    first = 1 + np.cumsum(counts) - counts
     filled = bits.any(axis=1)
     columns = np.stack([mask_words(bits[filled])[:, 0], first[filled].astype(np.uint32)], axis=1)
     masks = np.pad(filled, (0, -len(filled) % 32)).reshape(-1, 32)
@@ -214,5 +218,5 @@ def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def columns_of(nodes: int) -> int:
-    """Columns along a line of so many nodes."""
+    """Return the number of columns along a line of ``nodes`` nodes."""
     return -(-(nodes - 1) // COLUMN)

@@ -1,8 +1,8 @@
 """
-The supplement's layout (§ 1.7): two pairs of dense 3D arrays, one for density, one for the twelve numbers of colour.
-The primary arrays begin as ramps, the cascaded ones as the grid resampled to their size.
+Layout of the supplement (§ 1.7): two pairs of dense 3D arrays, one for density and one for twelve numbers of colour.
 
-Cells that nothing shows in are left out, as in all fields here; the supplement keeps them.
+The primary arrays begin as ramps, the cascaded arrays as the grid resampled to their size. Cells that no ray sees are
+empty, as in all fields here; the supplement keeps them.
 """
 
 from __future__ import annotations
@@ -10,37 +10,39 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 from drjit import nn
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from ...fitting import Problem
 from ...indirection import DifferentiableArray, Indirection, ramp, rounded
-from .field import VolumeField, blended, colour_of, density_of
-from .grid import Grid
+from .grid import NodeGrid
 from .nodes import Nodes
-from .training import ImagesProblem
+from .training import FieldSession, ImagesProblem
+from .volume_field import NodeVolume, blended, colour_of, density_of
 
-#: The largest raw number of density: beyond, all is opaque.
-DENSEST = 16.0
-
-#: The least, and what empty space has.
-EMPTIEST = -8.0
+#: Range of raw densities: empty space has the smallest, the largest is opaque.
+EMPTIEST, DENSEST = -8.0, 16.0
 
 
-class PairsField(VolumeField):
-    """``density`` and ``colour`` map coordinates of the box, [0, 1]³, to numbers in [0, 1], which ``ranges`` scales."""
+class PairsField(NodeVolume):
+    """
+    Radiance field of two indirections, ``density`` and ``colour``.
+
+    Both map coordinates of the box, [0, 1]³, to numbers in [0, 1] that stand for the range from ``low`` to ``high``,
+    13 numbers each, density first. Cells of ``nodes`` that are not stored are empty.
+    """
 
     NAMES = ("density_primary", "density_cascaded", "colour_primary", "colour_cascaded")
 
-    def __init__(self, nodes: Nodes, density: Indirection, colour: Indirection, low, high, step=None):
-        self.nodes, self.low, self.high = nodes, [float(v) for v in low], [float(v) for v in high]
+    def __init__(self, nodes: Nodes, density: Indirection, colour: Indirection, low, high):
+        self.low, self.high = [float(v) for v in low], [float(v) for v in high]
         modules = density.primary[0], density.cascaded, colour.primary[0], colour.cascaded
         self.modules = dict(zip(self.NAMES, modules, strict=True))
         arrays = {name: module.data for name, module in self.modules.items()}
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays, step)
+        super().__init__(nodes, arrays)
 
     @property
     def nbytes(self) -> int:
-        """Bytes in memory, with the index of the nodes."""
+        """Bytes in memory, including the index of the nodes."""
         return sum(module.memory_nbytes for module in self.modules.values()) + self.nodes.nbytes
 
     def with_arrays(self, arrays):
@@ -51,29 +53,27 @@ class PairsField(VolumeField):
             result.modules[name].data = arrays.get(name)
         return result
 
-    def _read(self, kind: str, p, active) -> list:
+    def _read(self, quantity: str, p, active) -> list:
         u = [dr.clip((x - a) / (b - a), 0, 1) for x, a, b in zip(p, *self.box, strict=True)]
-        return self.modules[f"{kind}_cascaded"](self.modules[f"{kind}_primary"](u, active), active)
+        return self.modules[f"{quantity}_cascaded"](self.modules[f"{quantity}_primary"](u, active), active)
 
-    def look(self, p, active=True):
+    def density_at(self, p, active=True):
         _, active = self.nodes.corners(p, active)
-        (found,) = self._read("density", p, active)
-        raw = dr.fma(found, self.high[0] - self.low[0], self.low[0])
+        (share,) = self._read("density", p, active)
+        raw = dr.fma(share, self.high[0] - self.low[0], self.low[0])
         return dr.select(active, density_of(raw, self.per_voxel), 0), []
 
-    def colour(self, latent, p, d, active=True):
-        found = self._read("colour", p, active)
-        numbers = [dr.fma(v, b - a, a) for v, a, b in zip(found, self.low[1:], self.high[1:], strict=True)]
-        return colour_of(numbers, d)
-
-    def skip(self, p, d, active=True):
-        return self.nodes.skip(p, d, active)
+    def radiance_at(self, point_data, p, d, active=True):
+        shares = self._read("colour", p, active)
+        return colour_of([dr.fma(v, b - a, a) for v, a, b in zip(shares, self.low[1:], self.high[1:], strict=True)], d)
 
 
 def sides(nbytes: float, ratio: float, channels: int, extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """
-    Entries of the primary (3 bytes each) and the cascaded array (``channels`` bytes each) along the sides of a box of
-    this ``extent``, as many as ``nbytes`` hold in this ratio.
+    Return the shapes of a primary and a cascaded array that together fill ``nbytes``, in the ratio ``ratio``.
+
+    An entry of the primary array has 3 bytes, one of the cascaded array ``channels``. The sides are proportional to
+    the ``extent`` of the box.
     """
     shape = np.asarray(extent, np.float64) / np.max(extent)
 
@@ -87,10 +87,8 @@ def sides(nbytes: float, ratio: float, channels: int, extent) -> tuple[tuple[int
     return tuple(primary.tolist()), tuple(cascaded.tolist())
 
 
-def dense(grid: Grid) -> np.ndarray:
-    """The grid's thirteen numbers at every node, ``(X, Y, Z, 13)``; of those that are not stored, nearest ones."""
-    from scipy.ndimage import distance_transform_edt
-
+def dense(grid: NodeGrid) -> np.ndarray:
+    """Return the 13 numbers of every node, ``(X, Y, Z, 13)``; a node that is not stored has those of the nearest."""
     values = np.concatenate([np.clip(grid.density, EMPTIEST, DENSEST)[:, None], grid.colour], axis=1)[1:]
     result = np.zeros((*grid.nodes.shape, 13), np.float32)
     stored = grid.nodes.stored
@@ -102,14 +100,14 @@ def dense(grid: Grid) -> np.ndarray:
 
 
 def initial(values: np.ndarray, shapes: dict, types) -> tuple[Indirection, Indirection, np.ndarray, np.ndarray]:
-    """The two pairs as they begin, of :func:`dense`, and the ranges of its numbers."""
+    """Return the two initial pairs for the ``values`` of :func:`dense`, and the lower and upper ends of their range."""
     flat = values.reshape(-1, 13)
     low, high = np.quantile(flat, 0.0005, axis=0), np.quantile(flat, 0.9995, axis=0)
     low[0], high[0] = EMPTIEST, DENSEST
     high = np.maximum(high, low + 1e-3)
 
-    def pair(kind: str, part: slice):
-        primary, cascaded = shapes[kind]
+    def pair(quantity: str, part: slice):
+        primary, cascaded = shapes[quantity]
         at = [np.linspace(0, n - 1, m) for n, m in zip(values.shape, cascaded, strict=False)]
         at = np.stack(np.meshgrid(*at, indexing="ij"))
         channels = [map_coordinates(values[..., c], at, order=1) for c in range(13)[part]]
@@ -124,7 +122,7 @@ def initial(values: np.ndarray, shapes: dict, types) -> tuple[Indirection, Indir
 
 
 class PairsNet(nn.Module):
-    """Both pairs, to be trained."""
+    """Both pairs as one trainable module."""
 
     DRJIT_STRUCT = {"density": object, "colour": object}  # noqa: RUF012
 
@@ -133,9 +131,9 @@ class PairsNet(nn.Module):
 
 
 class ValuesProblem(Problem):
-    """The pairs against the grid's own numbers, at uniform places in the visible cells: absolute differences."""
+    """Training of the pairs by the mean absolute error of the grid's numbers, at random points of occupied cells."""
 
-    def __init__(self, net: PairsNet, field: PairsField, grid: Grid):
+    def __init__(self, net: PairsNet, field: PairsField, grid: NodeGrid):
         self.net, self.grid, self.box = net, grid.field(), field
         self.positions = grid.nodes.types.Float(grid.nodes.positions().astype(np.float32).reshape(-1))
         self.types, self.count = grid.nodes.types, grid.nodes.count
@@ -151,14 +149,14 @@ class ValuesProblem(Problem):
             *(dr.fma(f + i, nodes.spacing, a) for f, i, a in zip(first, inside, nodes.lower, strict=True))
         )
         corners, active = nodes.corners(p)
-        raw = sum(w * dr.gather(types.Float, self.grid.arrays["density"].array, s, active) for w, s in corners)
-        flat = self.grid.arrays["colour"].array
-        truth = [raw, *blended(types, flat, 3, [w for w, _ in corners], [s for _, s in corners], active)]
+        weights, numbers = zip(*corners, strict=True)
+        raw = sum(w * dr.gather(types.Float, self.grid.arrays["density"].array, n, active) for w, n in corners)
+        truth = [raw, *blended(types, self.grid.arrays["colour"].array, 3, weights, numbers, active)]
         u = [dr.clip((x - a) / (b - a), 0, 1) for x, a, b in zip(p, box.lower, box.upper, strict=True)]
         density, colour = rounded(net.density), rounded(net.colour)
-        found = [*density(u), *colour(u)]
+        predicted = [*density(u), *colour(u)]
         total = types.Float(0)
-        for f, t, a, b in zip(found, truth, box.low, box.high, strict=True):
+        for f, t, a, b in zip(predicted, truth, box.low, box.high, strict=True):
             total += dr.select(active, dr.abs(f - (dr.clip(t, a, b) - a) / (b - a)), 0)
         return total * (1 / (13 * size))
 
@@ -167,11 +165,12 @@ class ValuesProblem(Problem):
 
 
 class PairsProblem(ImagesProblem):
-    """The pairs through the images."""
+    """Training of the pairs through the images of a session."""
 
-    def __init__(self, net: PairsNet, nodes: Nodes, low, high, views, held=None):
+    def __init__(self, net: PairsNet, nodes: Nodes, low, high, session: FieldSession):
         self.nodes, self.low, self.high = nodes, low, high
-        super().__init__(nodes.types, net, self.field_of, views, held)
+        super().__init__(session, net, self.field_of)
 
     def field_of(self, net) -> PairsField:
+        """Return the field of the trained arrays, rounded as they are stored."""
         return PairsField(self.nodes, rounded(net.density), rounded(net.colour), self.low, self.high)

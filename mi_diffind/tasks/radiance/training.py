@@ -1,37 +1,40 @@
 """
-Training a field through images: rays of random patches of the views, before random greys.
+Training of a radiance field through images: rays of random patches of the views, in front of random greys.
 
-A patch of 4 × 4 neighbouring pixels shares most of what its rays read; that is 2.5 times as fast as single pixels.
+A patch of 4 × 4 neighbouring pixels shares most of what its rays read, which is 2.5 times as fast as single pixels.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
 
 import drjit as dr
 import numpy as np
 
 from ... import srgb
 from ...fitting import Problem
-from .field import VolumeField
 from .march import differentiable, march
-from .views import Views
+from .views import CapturedViews, ViewsError, load_views
+from .volume_field import VolumeField
 
 #: Pixels along a side of a patch.
 PATCH = 4
 
 
-class Images:
-    """Views as Dr.Jit arrays, and the rays of their pixels."""
+class ViewImages:
+    """Captured ``views`` as Dr.Jit arrays, and the rays of their pixels."""
 
-    def __init__(self, types, views: Views):
+    def __init__(self, types, views: CapturedViews):
         self.types, self.views = types, views
         self.pixels = types.Float(np.ascontiguousarray(views.images, np.float32).reshape(-1))
         cameras = np.concatenate([views.poses[:, :3, :].reshape(-1, 12), views.focal, views.centre], axis=1)
         self.cameras = types.Float(np.ascontiguousarray(cameras, np.float32).reshape(-1))
 
     def rays(self, view, x, y) -> tuple:
-        """Origins and unit directions of the rays through the middles of pixels (:meth:`.Views.rays`)."""
+        """Return origins and unit directions of the rays through the centres of pixels."""
         c = [value for j in range(4) for value in dr.gather(self.types.Array4f, self.cameras, view * 4 + j)]
         fx, fy, cx, cy = c[12:]
         u = (self.types.Float(x) + 0.5 - cx) / fx
@@ -40,12 +43,12 @@ class Images:
         return self.types.Array3f(c[3], c[7], c[11]), dr.normalize(d)
 
     def colours(self, view, x, y):
-        """Linear red, green and blue, multiplied by alpha, and alpha."""
+        """Return linear red, green and blue, multiplied by alpha, and alpha."""
         height, width = self.views.height, self.views.width
         return dr.gather(self.types.Array4f, self.pixels, dr.fma(dr.fma(view, height, y), width, x))
 
-    def drawn(self, rng, size: int) -> tuple:
-        """The view, column and row of ``size`` pixels, in patches."""
+    def random_pixels(self, rng, size: int) -> tuple:
+        """Return view, column and row of ``size`` random pixels, in patches."""
         types, views = self.types, self.views
         patches = max(1, size // PATCH**2)
 
@@ -61,75 +64,110 @@ class Images:
         x, y = x + pixel % PATCH, y + pixel // PATCH
         return view, dr.minimum(x, views.width - 1), dr.minimum(y, views.height - 1)
 
+    def render(self, field: VolumeField, view: int) -> np.ndarray:
+        """Return the picture of a view, ``(height, width, 4)``: linear colours multiplied by alpha, and alpha."""
+        types, views, side = self.types, self.views, PATCH
+        rows, columns = -(-views.height // side), -(-views.width // side)
+        # Neighbouring pixels, which read the same nodes, lie in tiles
+        lane = dr.arange(types.UInt32, rows * columns * side * side)
+        tile, pixel = lane // (side * side), lane % (side * side)
+        x, y = (tile % columns) * side + pixel % side, (tile // columns) * side + pixel // side
+        o, d = self.rays(dr.opaque(types.UInt32, view), x, y)
+        seen = march(field, o, d, 0, dr.inf)
+        values = np.stack([*seen.colour.numpy(), 1 - seen.transmittance.numpy()], axis=-1)
+        values = values.reshape(rows, columns, side, side, 4).swapaxes(1, 2).reshape(rows * side, columns * side, 4)
+        return values[: views.height, : views.width]
+
+    def evaluate(self, field: VolumeField) -> dict[str, float]:
+        """
+        Return the PSNR of sRGB values before white in decibels, as means over the views.
+
+        ``psnr_white_db`` is that of all pixels. ``psnr_foreground_db``, of the pixels with an alpha above 0, is the
+        first figure, since white flatters.
+        """
+        return scores([self.render(field, v) for v in range(len(self.views))], self.views)
+
+
+@dataclass
+class FieldSession:
+    """Views of one capture: those that fields are trained by, and the ``held_out`` ones that they are measured by."""
+
+    types: ModuleType
+    views: CapturedViews
+    held_out: CapturedViews
+    #: False if the capture has no test views, so that ``held_out`` are the training views.
+    has_test_views: bool = True
+
+    @staticmethod
+    def load(types: ModuleType, folder) -> FieldSession:
+        """Read the capture in a folder. Raises :class:`.views.ViewsError`."""
+        return FieldSession(types, load_views(folder, "train"), *load_held_out(folder))
+
+    @functools.cached_property
+    def images(self) -> ViewImages:
+        """Training views as Dr.Jit arrays."""
+        return ViewImages(self.types, self.views)
+
+    @functools.cached_property
+    def held_out_images(self) -> ViewImages:
+        """Held-out views as Dr.Jit arrays."""
+        return ViewImages(self.types, self.held_out)
+
+
+def load_held_out(folder) -> tuple[CapturedViews, bool]:
+    """Return the test views of a capture and True or, if there are none, its training views and False."""
+    try:
+        return load_views(folder, "test"), True
+    except ViewsError as e:
+        try:
+            return load_views(folder, "train"), False
+        except ViewsError:
+            raise e from None
+
 
 class ImagesProblem(Problem):
     """
-    Fields through the images that they are to show. ``net`` maps names to tensors (a dictionary or a module);
-    ``field_of`` makes a :class:`.VolumeField` of it, differentiably. The loss is the mean squared difference of sRGB
-    values, before random greys, which teaches the opacity, too. ``held`` are views to measure by.
+    Training of a field through the images of a session.
+
+    ``net`` maps names to tensors (a dictionary or a module); ``field_of`` makes a :class:`.VolumeField` of them,
+    differentiably. The loss is the mean squared difference of sRGB values in front of random greys, which trains the
+    opacity, too.
     """
 
-    def __init__(self, types, net, field_of: Callable[..., VolumeField], views: Views, held: Views | None = None):
-        self.types, self.net, self.field_of = types, net, field_of
-        self.images = Images(types, views)
-        self.held = Images(types, held if held is not None else views)
-        self.identity = {"source": views.digest}
+    def __init__(self, session: FieldSession, net, field_of: Callable[..., VolumeField]):
+        self.session, self.net, self.field_of = session, net, field_of
+        self.identity = {"source": session.views.digest}
 
     def loss(self, net, rng, size: int):
-        types = self.types
-        view, x, y = self.images.drawn(rng, size)
+        types, images = self.session.types, self.session.images
+        view, x, y = images.random_pixels(rng, size)
         count = dr.width(view)
         offset = rng.random(types.TensorXf, (count,)).array
         grey = rng.random(types.TensorXf, (count,)).array
-        o, d = self.images.rays(view, x, y)
-        truth = self.images.colours(view, x, y)
+        o, d = images.rays(view, x, y)
+        truth = images.colours(view, x, y)
         seen = differentiable(self.field_of(net), o, d, 0, dr.inf, True, offset)
         total = types.Float(0)
         for c in range(3):
-            wanted = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1))
-            found = seen.colour[c] + seen.transmittance * grey
-            # Beyond white, all is white; the slope goes on, so that it comes back
-            total += dr.square(srgb.from_linear(found) - wanted)
+            reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1))
+            # The prediction is not clamped at white: its slope leads back into the range
+            total += dr.square(srgb.from_linear(seen.colour[c] + seen.transmittance * grey) - reference)
         return total * (1 / (3 * count))
 
     def measure(self, net):
-        return evaluate(self.field_of(net), self.held)
+        return self.session.held_out_images.evaluate(self.field_of(net))
 
 
-def rendered(field: VolumeField, images: Images, view: int):
-    """What a view shows: ``(height, width, 4)``, linear colours multiplied by alpha, and alpha."""
-    types, views = images.types, images.views
-    # Tiles of neighbouring pixels share what they read
-    side = PATCH
-    rows, columns = -(-views.height // side), -(-views.width // side)
-    lane = dr.arange(types.UInt32, rows * columns * side * side)
-    tile, pixel = lane // (side * side), lane % (side * side)
-    x, y = (tile % columns) * side + pixel % side, (tile // columns) * side + pixel // side
-    o, d = images.rays(dr.opaque(types.UInt32, view), x, y)
-    seen = march(field, o, d, 0, dr.inf)
-    values = np.stack([*seen.colour.numpy(), 1 - seen.transmittance.numpy()], axis=-1)
-    values = values.reshape(rows, columns, side, side, 4).swapaxes(1, 2).reshape(rows * side, columns * side, 4)
-    return values[: views.height, : views.width]
+def displayed(image: np.ndarray) -> np.ndarray:
+    """Return an image ``(…, 4)`` in front of white as sRGB ``(…, 3)`` in [0, 1]."""
+    return srgb.for_display(image[..., :3] + (1 - image[..., 3:]))
 
 
-def shown(image: np.ndarray, grey: float = 1.0) -> np.ndarray:
-    """An image before a grey, white by default, as sRGB in [0, 1]."""
-    return srgb.from_linear(np.clip(image[..., :3] + (1 - image[..., 3:]) * grey, 0, 1))
-
-
-def evaluate(field: VolumeField, images: Images) -> dict[str, float]:
-    """
-    PSNR of sRGB values before white, means over the views: of all pixels (``psnr_white_db``), and of those in which
-    there is something (``psnr_foreground_db``: alpha above 0), which is the first figure, since white flatters.
-    """
-    return scores([rendered(field, images, v) for v in range(len(images.views))], images.views)
-
-
-def scores(pictures: list[np.ndarray], views: Views) -> dict[str, float]:
-    """The figures of :func:`evaluate` of pictures that a field made of the views."""
+def scores(pictures: list[np.ndarray], views: CapturedViews) -> dict[str, float]:
+    """Return the figures of :meth:`ViewImages.evaluate` for pictures ``(height, width, 4)`` of the views."""
     white, foreground = [], []
     for picture, truth in zip(pictures, views.images, strict=True):
-        squared = np.square(shown(picture) - shown(truth))
+        squared = np.square(displayed(picture) - displayed(truth))
         covered = truth[..., 3] > 0
         white.append(squared.mean())
         foreground.append(squared[covered].mean() if covered.any() else squared.mean())

@@ -1,13 +1,13 @@
 """
-Images of a scene with the poses of their cameras: a folder as ``mi-diffind capture``, Blender or nerfstudio write it.
+Captured views: images of a scene with the poses of their cameras, read from a folder.
 
-Two layouts are read: ``transforms_train.json``, ``transforms_test.json`` and ``transforms_val.json``, as of NeRF's
-Blender data (Mildenhall et al. 2020), and nerfstudio's ``transforms.json``. Poses are taken as they stand: camera to
-world, a camera that looks along −z with y up, in the world that the matrices are in. What nerfstudio has already
-applied to them (``applied_transform``, ``applied_scale``) is not undone.
+``mi-diffind capture``, Blender and nerfstudio write such folders. Two layouts are read: ``transforms_train.json``,
+``transforms_test.json`` and ``transforms_val.json`` of NeRF's Blender data (Mildenhall et al. 2020), and the
+``transforms.json`` of nerfstudio. Poses map camera to world; a camera looks along −z with y up. Transforms that
+nerfstudio has already applied to the poses (``applied_transform``, ``applied_scale``) are not undone.
 
 PNG and JPEG hold sRGB, not multiplied by alpha; EXR holds linear values multiplied by alpha. An image without alpha is
-opaque everywhere: whatever its background shows is then part of the field.
+opaque everywhere, so that its background becomes part of the field.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from ...srgb import to_linear
 
 SPLITS = ("train", "test", "val")
 
-#: Tried in turn where the name of an image is given without one.
+#: Extensions tried in turn for an image name without one.
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
 
-#: How far the columns of a rotation may be from unit vectors at right angles.
+#: Tolerance of the columns of a rotation: lengths against 1, and dot products against 0.
 RIGID = 1e-3
 
-#: Every so many views of a list that says nothing about it are test views, the first among them (as of LLFF's data).
+#: Interval of the test views in a list without splits, beginning with the first view (as in LLFF's data).
 EVERY = 8
 
 #: Camera models that are pinholes if their distortion is zero.
@@ -41,19 +41,21 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 class ViewsError(DiffindError, ValueError):
-    """Images or poses that cannot be used; the message is one sentence that names the file and the fault."""
+    """Error for unusable images or poses; the message is one sentence that names the file and the fault."""
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class CapturedViews:
     """
-    ``images`` ``(V, height, width, 4)``, float32: linear colours, multiplied by alpha, and alpha in [0, 1]; ``poses``
-    ``(V, 4, 4)``, float64, camera to world; ``focal`` and ``centre`` ``(V, 2)`` in pixels, the latter from the upper
-    left corner; ``names`` of the image files.
+    Images of one split of a capture, with their cameras.
 
-    ``has_alpha``: no image was taken as opaque for want of alpha. ``box`` is ``(2, 3)``, the lower and the upper
-    corner of what the views show, if the file has an ``aabb`` (as of instant-ngp), else ``None``. ``digest`` is a
-    SHA-256 over all of it.
+    ``images`` ``(V, height, width, 4)``, float32, holds linear colours multiplied by alpha, and alpha in [0, 1].
+    ``poses`` ``(V, 4, 4)``, float64, map camera to world. ``focal`` and ``centre``, ``(V, 2)``, are in pixels, the
+    centre from the upper left corner. ``names`` are those of the image files.
+
+    ``has_alpha`` is false if an image without alpha counts as opaque. ``box`` ``(2, 3)`` holds the lower and the upper
+    corner of the captured objects if the file has an ``aabb`` (as of instant-ngp), else it is ``None``. ``digest`` is a
+    SHA-256 of everything.
     """
 
     images: np.ndarray
@@ -79,13 +81,15 @@ class Views:
 
     @property
     def origins(self) -> np.ndarray:
-        """Where the cameras are, ``(V, 3)``."""
+        """Positions of the cameras, ``(V, 3)``."""
         return self.poses[:, :3, 3]
 
     def rays(self, view, x, y) -> tuple[np.ndarray, np.ndarray]:
         """
-        Origins and unit directions ``(…, 3)``, float64, of the rays through the middles of the pixels in the columns
-        ``x`` and rows ``y``, counted from 0 at the upper left (fractions are allowed), of the images ``view``.
+        Return origins and unit directions ``(…, 3)``, float64, of the rays through the centres of pixels.
+
+        ``view`` names the images, ``x`` and ``y`` the columns and rows, counted from 0 at the upper left; fractions are
+        allowed.
         """
         view = np.asarray(view)
         fx, fy = np.moveaxis(self.focal[view], -1, 0)
@@ -98,14 +102,13 @@ class Views:
         return np.broadcast_to(pose[..., :3, 3], directions.shape), directions
 
 
-def load_views(folder: str | os.PathLike, split: str = "train", reduce: int = 1) -> Views:
+def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews:
     """
     Read the views of a ``split``: "train", "test" or "val".
 
-    From ``transforms_SPLIT.json``; from ``transforms.json`` those that its ``train_filenames``, ``test_filenames`` or
-    ``val_filenames`` list. Where nothing says which are for testing, every eighth is, and the others are for training.
-    With ``reduce``, pixels are averages of so many by so many. Raises :class:`ViewsError`; a training that has less
-    than two views is refused, since one says nothing about depth.
+    The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``,
+    ``test_filenames`` and ``val_filenames``. If no file or list names the test views, every eighth view is one.
+    Raises :class:`ViewsError`, also for fewer than two training views, since one view does not show depth.
     """
     folder = Path(folder)
     if split not in SPLITS:
@@ -121,7 +124,6 @@ def load_views(folder: str | os.PathLike, split: str = "train", reduce: int = 1)
         path = _image_file(file, frame["file_path"])
         image, alpha = _read(path)
         camera.check_size(path, image.shape[1], image.shape[0])
-        image = _reduced(path, image, reduce)
         if images is None:
             images = np.empty((len(frames), *image.shape), np.float32)
         elif image.shape != images.shape[1:]:
@@ -130,34 +132,34 @@ def load_views(folder: str | os.PathLike, split: str = "train", reduce: int = 1)
         images[i] = image
         names.append(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
         has_alpha &= alpha
-    height, width = (reduce * n for n in images.shape[1:3])
-    focal = np.array([c.focal(width, height) for c in cameras]) / reduce
-    centre = np.array([c.centre(width, height) for c in cameras]) / reduce
+    height, width = images.shape[1:3]
+    focal = np.array([c.focal(width, height) for c in cameras])
+    centre = np.array([c.centre(width, height) for c in cameras])
     poses, box = np.stack([c.pose for c in cameras]), _box(file, content)
     digest = hashlib.sha256(json.dumps([split, images.shape, names, has_alpha]).encode())
     for array in (images, poses, focal, centre, *([] if box is None else [box])):
         digest.update(np.ascontiguousarray(array))
-    return Views(images, poses, focal, centre, tuple(names), folder, has_alpha, box, digest.hexdigest())
+    return CapturedViews(images, poses, focal, centre, tuple(names), folder, has_alpha, box, digest.hexdigest())
 
 
 # -- lists of views ---------------------------------------------------------------------------------------------------
 
 
 def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
-    """The file that lists the views of a split, its content, and these views."""
+    """Return the file that lists the views of a split, its content, and the entries of these views."""
     if not folder.is_dir():
         raise ViewsError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
-    own, train, single = (folder / f"transforms{s}.json" for s in (f"_{split}", "_train", ""))
-    if own.is_file():
-        content, frames = _parse(own)
+    listed_split, train, single = (folder / f"transforms{s}.json" for s in (f"_{split}", "_train", ""))
+    if listed_split.is_file():
+        content, frames = _parse(listed_split)
         if split == "train" and not (folder / "transforms_test.json").is_file():
             frames = [f for i, f in enumerate(frames) if i % EVERY or len(frames) == 1]
-        return own, content, frames
+        return listed_split, content, frames
     if train.is_file():
         if split == "test":
             content, frames = _parse(train)
             return train, content, frames[::EVERY]
-        raise ViewsError(f"{own}: no such file")
+        raise ViewsError(f"{listed_split}: no such file")
     if not single.is_file():
         raise ViewsError(f"{folder}: holds no views: neither transforms_train.json nor transforms.json is there")
     content, frames = _parse(single)
@@ -168,7 +170,7 @@ def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
         wanted = [f for i, f in enumerate(frames) if (i % EVERY == 0) == (split == "test")]
         return single, content, frames if len(frames) == 1 else wanted
     if split not in lists:
-        raise ViewsError(f'{single}: has no list "{split}_filenames", and others ({", ".join(lists)})')
+        raise ViewsError(f'{single}: has no list "{split}_filenames", only those of {", ".join(lists)}')
     listed = {frame["file_path"]: frame for frame in frames}
     if not isinstance(lists[split], list):
         raise ViewsError(f'{single}: "{split}_filenames" is {lists[split]!r:.40}, expected a list')
@@ -215,24 +217,24 @@ def _box(file: Path, content: dict) -> np.ndarray | None:
 
 
 @dataclass(frozen=True)
-class _Camera:
-    """A pinhole: ``pose`` ``(4, 4)``; ``get(name)`` is what the frame, or the file for all, says, ``None``: nothing."""
+class _PinholeCamera:
+    """Pinhole camera of a frame: its ``pose`` ``(4, 4)``, camera to world, and the ``numbers`` that the file gives."""
 
-    where: str
+    file: str
     pose: np.ndarray
     numbers: dict[str, float]
 
     def check_size(self, path: Path, width: int, height: int) -> None:
         """Raise :class:`ViewsError` if the image is not of the size that the camera was described for."""
-        said = self.numbers.get("w", width), self.numbers.get("h", height)
-        if said != (width, height):
+        size = self.numbers.get("w", width), self.numbers.get("h", height)
+        if size != (width, height):
             raise ViewsError(
-                f"{path}: has {width} × {height} pixels, {self.where} says {said[0]:g} × {said[1]:g}: "
-                f"focal lengths are those of that size"
+                f"{path}: has {width} × {height} pixels, {self.file} says {size[0]:g} × {size[1]:g}, "
+                f"to which its focal lengths refer"
             )
 
     def focal(self, width: int, height: int) -> tuple[float, float]:
-        """In pixels of an image of that size."""
+        """Return the focal lengths along x and y in pixels of an image of this size."""
         n = self.numbers
         fx = n["fl_x"] if "fl_x" in n else width / 2 / np.tan(n["camera_angle_x"] / 2)
         if "fl_y" in n:
@@ -240,14 +242,16 @@ class _Camera:
         return fx, height / 2 / np.tan(n["camera_angle_y"] / 2) if "camera_angle_y" in n and "fl_x" not in n else fx
 
     def centre(self, width: int, height: int) -> tuple[float, float]:
+        """Return the principal point in pixels of an image of this size."""
         return self.numbers.get("cx", width / 2), self.numbers.get("cy", height / 2)
 
 
-def _camera(file: Path, content: dict, frame: dict) -> _Camera:
+def _camera(file: Path, content: dict, frame: dict) -> _PinholeCamera:
+    """Return the camera of a frame, from its entries and those of the file."""
     where = f'{file}: frame "{frame["file_path"]}"'
-    said = {**{k: v for k, v in content.items() if k != "frames"}, **frame}
-    model = said.get("camera_model", "PINHOLE")
-    if model not in PINHOLES or said.get("is_fisheye"):
+    entries = {**{k: v for k, v in content.items() if k != "frames"}, **frame}
+    model = entries.get("camera_model", "PINHOLE")
+    if model not in PINHOLES or entries.get("is_fisheye"):
         model = model if model not in PINHOLES else "fisheye"
         raise ViewsError(
             f"{where} has the camera model {model!r:.40}, allowed are pinholes without distortion "
@@ -255,7 +259,7 @@ def _camera(file: Path, content: dict, frame: dict) -> _Camera:
         )
     numbers = {}
     for name in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", *DISTORTION):
-        value = said.get(name)
+        value = entries.get(name)
         if value is None:
             continue
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
@@ -272,17 +276,17 @@ def _camera(file: Path, content: dict, frame: dict) -> _Camera:
     for name in ("camera_angle_x", "camera_angle_y"):
         if name in numbers and not 0 < numbers[name] < np.pi:
             raise ViewsError(f'{where} has the "{name}" {numbers[name]:g}, expected radians between 0 and π')
-    return _Camera(str(file), _pose(where, frame.get("transform_matrix")), numbers)
+    return _PinholeCamera(str(file), _pose(where, frame.get("transform_matrix")), numbers)
 
 
 def _pose(where: str, matrix) -> np.ndarray:
-    """A rigid motion, ``(4, 4)``."""
+    """Return a ``transform_matrix`` as a rigid motion, ``(4, 4)``."""
     if matrix is None:
         raise ViewsError(f'{where} has no "transform_matrix"')
     try:
         pose = np.array(matrix, np.float64)
     except (TypeError, ValueError):
-        raise ViewsError(f"{where} has a transform_matrix that is no matrix of numbers") from None
+        raise ViewsError(f"{where} has a transform_matrix that is not a matrix of numbers") from None
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
     if pose.shape != (4, 4):
@@ -291,14 +295,14 @@ def _pose(where: str, matrix) -> np.ndarray:
         raise ViewsError(f"{where} has a transform_matrix with NaN or infinite numbers")
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID:
         raise ViewsError(f"{where} has a transform_matrix whose last row is not 0, 0, 0, 1")
-    turn = pose[:3, :3]
-    lengths = np.linalg.norm(turn, axis=0)
+    rotation = pose[:3, :3]
+    lengths = np.linalg.norm(rotation, axis=0)
     if np.abs(lengths - 1).max() > RIGID:
         text = ", ".join(f"{x:.4g}" for x in lengths)
         raise ViewsError(f"{where} has a transform_matrix that scales (columns of length {text}), a rotation is needed")
-    if np.abs(turn.T @ turn - np.eye(3)).max() > RIGID:
-        raise ViewsError(f"{where} has a transform_matrix that shears, its columns have to be at right angles")
-    if np.linalg.det(turn) < 0:
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID:
+        raise ViewsError(f"{where} has a transform_matrix that shears, a rotation is needed")
+    if np.linalg.det(rotation) < 0:
         raise ViewsError(f"{where} has a transform_matrix that mirrors, a rotation is needed")
     return pose
 
@@ -307,17 +311,17 @@ def _pose(where: str, matrix) -> np.ndarray:
 
 
 def _image_file(file: Path, name: str) -> Path:
+    """Return the path of the image ``name`` in a list of views."""
     path = file.parent / name
-    tried = [path, *(path.with_name(path.name + e) for e in EXTENSIONS)]
-    found = next((p for p in tried if p.is_file()), None)
-    if found is None:
-        more = "" if path.suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
-        raise ViewsError(f"{path}: no such image{more}, {file.name} names it")
-    return found
+    for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
+        if candidate.is_file():
+            return candidate
+    more = "" if path.suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
+    raise ViewsError(f"{path}: no such image{more}, {file.name} names it")
 
 
 def _read(path: Path) -> tuple[np.ndarray, bool]:
-    """An image ``(height, width, 4)``, linear, multiplied by alpha; and if it has alpha."""
+    """Return an image ``(height, width, 4)``, linear and multiplied by alpha, and whether the file has alpha."""
     values, encoded = (_read_exr(path), False) if path.suffix.lower() == ".exr" else (_read_bytes(path), True)
     has_alpha = values.shape[2] in (2, 4)
     colour, alpha = (values[..., :-1], values[..., -1:]) if has_alpha else (values, None)
@@ -340,49 +344,39 @@ _LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
 
 
 def _read_bytes(path: Path) -> np.ndarray:
-    """``(height, width, 1 to 4)``, uint8."""
+    """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
     from PIL import Image
 
     try:
         with Image.open(path) as image:
             if image.mode not in ("RGB", "RGBA", "L", "LA"):
                 if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
-                    raise ViewsError(f"{path}: has pixels of the kind {image.mode}, allowed are 8 bits of grey or RGB")
+                    raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
                 image = image.convert("RGBA" if image.has_transparency_data else "RGB")
             elif image.mode in ("RGB", "L") and image.has_transparency_data:
                 image = image.convert("RGBA")
             values = np.array(image)
     except ViewsError:
         raise
-    except Exception as e:  # the decoders have many kinds of their own for a damaged file
+    except Exception as e:  # each decoder raises errors of its own for a damaged file
         raise ViewsError(
-            f"{path}: cannot be read as an image, it is damaged or of an unknown kind ({reason(e)})"
+            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
         ) from None
     return values.reshape(*values.shape[:2], -1)
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    """``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
+    """Return an EXR image, ``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
     import OpenEXR
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except Exception as e:  # OpenEXR has many kinds of its own for a damaged file
+    except Exception as e:  # OpenEXR raises errors of its own for a damaged file
         raise ViewsError(
-            f"{path}: cannot be read as an image, it is damaged or of an unknown kind ({reason(e)})"
+            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
         ) from None
     colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(planes)), None)
     if colours is None:
         raise ViewsError(f"{path}: has the channels {', '.join(sorted(planes))}, expected R, G, B or Y, and A")
     return np.stack([planes[name] for name in (*colours, *(("A",) if "A" in planes else ()))], axis=-1)
-
-
-def _reduced(path: Path, image: np.ndarray, reduce: int) -> np.ndarray:
-    """Averages of ``reduce`` × ``reduce`` pixels."""
-    if reduce == 1:
-        return image
-    height, width = image.shape[:2]
-    if reduce < 1 or height % reduce or width % reduce:
-        raise ViewsError(f"{path}: has {width} × {height} pixels, which cannot be taken {reduce} by {reduce}")
-    return image.reshape(height // reduce, reduce, width // reduce, reduce, -1).mean(axis=(1, 3))

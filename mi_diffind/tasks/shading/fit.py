@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from pathlib import Path
 
 from ...errors import UsageError
-from ...maps.arguments import asked_bytes, preview_path
+from ...maps.arguments import preview_path, record_source, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
-from ...tables import MAX_BYTES, Table
+from ...tables import Table
 from ...task import FitRequest, Fitted
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
@@ -53,12 +52,11 @@ def fit(request: FitRequest) -> Fitted:
     to each. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
     :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.fitting.FittingError`.
     """
-    options, folder = request.options, (request.output or Path("x")).resolve().parent
+    options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
     texture = TEXTURES[recipe.texture]
-    border = None if options["border"] == "auto" else (options["border"],) * 2
-    pyramid = Pyramid.of(source, textures.layout_of(source, texture), request.types, border)
+    pyramid = Pyramid.of(source, textures.layout_of(source, texture), request.types, requested_border(options))
     effects, reasons = material.effects_of(pyramid.layout)
     if not pyramid.layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
@@ -80,7 +78,7 @@ def fit(request: FitRequest) -> Fitted:
         table, result = training.fit_shading(source, net, recipe, own, pyramid, evaluation, preview)
     else:
         table = start
-    table.settings["source_path"] = os.path.relpath(Path(options["source"]).resolve(), folder)
+    record_source(request, table)
     lines = [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
@@ -112,10 +110,7 @@ def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequ
     settings = dataclasses.replace(own.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic)
     own = dataclasses.replace(own, settings=settings)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(request.options)
-    asked = asked_bytes(options, source)
-    size = texture_fit.size_of(source, pyramid, asked, own, options)
-    if size.nbytes > MAX_BYTES:
-        raise UsageError(f"the arrays would take {size.nbytes:,} bytes, allowed are {MAX_BYTES:,}")
+    size = texture_fit.size_of(source, pyramid, requested_bytes(options, source), own, options)
     checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
     first = dataclasses.replace(
         request, preset=recipe.texture, checkpoint=checkpoint, options=options,

@@ -1,12 +1,12 @@
 """
-Task 4: textures and materials that are compressed and filtered in one, read at a place and a level of detail.
+Task 4: compressed textures and materials that are filtered as they are read, at a place and a level of detail.
 
-Sources, which of their channels are stored, and the truth, a mip pyramid: :mod:`mi_diffind.maps`.
+Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`.
 
-- :mod:`.nets`: how arrays are read, the paper's layout and ours; :mod:`.arrays`: their initial values;
-- :mod:`.memory_budget`: how large they are; :mod:`.sampling`: footprints, equations 3 to 9;
-- :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and what ``fit texture`` does;
-- :mod:`.compressed`, :mod:`.model`: the result, as a texture and as a file.
+- :mod:`.nets`: reads of the arrays, the paper's structure and ours; :mod:`.arrays`: initial arrays.
+- :mod:`.memory_budget`: resolutions; :mod:`.sampling`: footprints, equations 3 to 9.
+- :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the training problem, the command ``fit texture``.
+- :mod:`.compressed`: the result as a texture, as a table file and as a model.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from ...arguments import Argument, positive
+from ...arguments import Argument, natural, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
 from ...task import Task
 from .presets import PRESETS
 
 
 def _structure(text: str) -> str:
+    """Return a structure of arrays. Raises ``ArgumentTypeError``."""
     from .memory_budget import parse_structure
 
     try:
@@ -31,14 +32,8 @@ def _structure(text: str) -> str:
     return text
 
 
-def _whole(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or len(text) > 3:
-        raise argparse.ArgumentTypeError(f"found {text!r}, allowed are whole numbers from 0 on")
-    return int(text)
-
-
 class Texture(Task):
-    """The task. Its presets are the recipes of :mod:`.presets`; files are always stored as bytes, or fewer bits."""
+    """Task of filtered textures; presets are the recipes of :mod:`.presets`, entries have 8 bits or fewer."""
 
     name = "texture"
     title = "a texture or the maps of a material at every level of detail"
@@ -54,31 +49,27 @@ class Texture(Task):
             help="pages, or level, channels and bits of each fine array, as in 0:1:2,1:2:4 (default: auto)",
         ),
         Argument(
-            "--skip", type=_whole, metavar="LEVEL",
-            help="the level of detail from which on all have pointers of their own (default: chosen)",
+            "--skip", type=natural, metavar="LEVEL",
+            help="first level of detail of the coarse array (default: chosen)",
         ),
         Argument(
             "--cascaded", type=positive, metavar="N", help="entries along each side of the cascaded array"
         ),
         Argument(
             "--footprint-samples", choices=["levels", "power", "exponential"],
-            help="how levels of detail are drawn in training (default: levels for ours, power for paper)",
-        ),
-        Argument(
-            "--axis", choices=["side", "area", "level"],
-            help="what footprints of the preset paper measure (default: side)",
+            help="distribution of levels of detail in training (default: levels for ours, power for paper)",
         ),
         *SOURCES,
     )  # fmt: skip
     decode_arguments = (
         *DECODED,
-        Argument("--level", type=_whole, metavar="N", help="level of detail of a texture (default: 0, the source's)"),
+        Argument("--level", type=natural, metavar="N", help="level of detail (default: 0, the source's)"),
     )
 
     def settings(self, preset, given, options):
-        own = PRESETS[preset].settings
-        steps = given.get("steps", own.steps)
-        return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
+        defaults = PRESETS[preset].settings
+        steps = given.get("steps", defaults.steps)
+        return dataclasses.replace(defaults, measure_every=max(1, steps // 10), **given)
 
 
 TASK = Texture()

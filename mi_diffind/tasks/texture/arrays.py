@@ -1,6 +1,8 @@
 """
-The arrays of task 4, untrained: the paper's start from ramps and a constant for each kind of map, ours from the
-principal components of the texture's levels, so that at step 0 they are smaller pictures of fewer channels.
+Initial arrays of task 4.
+
+The paper's arrays start from ramps and a constant for each role of a map. Ours start from the principal components of
+the texture's levels, so at step 0 they are smaller pictures of fewer channels.
 """
 
 from __future__ import annotations
@@ -18,28 +20,29 @@ from ...pages import PagedArray, page_entries, page_gain, page_positions, page_s
 from .memory_budget import PaperBudget, TextureBudget
 from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
-#: Of the differences of two levels, by bits of an entry (8: and more): the share that lies within its range.
+#: Share of the differences between two levels that lies within the range of an entry, by its bits.
 WITHIN = {1: 0.7, 2: 0.97, 3: 0.99, 4: 0.998, 5: 0.998, 6: 0.998, 7: 0.998, 8: 0.998}
 
-#: The smallest range, lest a flat component be held for good.
+#: Least range of a difference, so that a flat component can still be trained.
 SMALLEST = 0.02
 
 
-def from_ramps(layout: Layout, size: PaperBudget, border: tuple[str, str], levels: int, axis: str) -> PaperNet:
-    """The supplement's initial values; not allocated."""
+def from_ramps(layout: Layout, size: PaperBudget, border: tuple[str, str], levels: int) -> PaperNet:
+    """Return the supplement's initial arrays, not allocated."""
     primary0 = DifferentiableArray((size.rows, size.columns), 3, "ramp", fold=True, border=border)
     primary1 = DifferentiableArray((4 * size.lods,), 1, "ramp", fold=True)
     shape = (size.lods, *[size.cascaded] * 3)
     cascaded = DifferentiableArray(shape, layout.stored, "constant", layout.initial, fold=True)
-    return PaperNet(primary0, primary1, cascaded, PaperStructure(levels, axis))
+    return PaperNet(primary0, primary1, cascaded, PaperStructure(levels))
 
 
 @dataclass(frozen=True)
 class PrincipalComponents:
     """
-    The principal components of a texture, as pointers of its texels: ``mean`` (``(k,)``) and ``directions`` (``(dims,
-    k)``) of the channels, those with the most differences between neighbours first, and ``low`` and ``high``, the range
-    of each component, of which a little room at the ends of [0, 1] is left.
+    Principal components of a texture, scaled to [0, 1] as pointers of its texels.
+
+    ``mean``, ``(k,)``; ``directions``, ``(dims, k)``, those with the largest differences between neighbours first;
+    ``low`` and ``high``, ``(dims,)``, the range of each component.
     """
 
     mean: np.ndarray
@@ -52,16 +55,16 @@ class PrincipalComponents:
 
     @staticmethod
     def of(values: np.ndarray, dims: int) -> PrincipalComponents:
-        """Of level 0, ``(height, width, k)``: ``dims`` of them, if there are so many."""
+        """Return the first ``dims`` components of level 0, ``(height, width, k)``, at most ``k``."""
         k = values.shape[-1]
         mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
         covariance = components.covariance(values, mean)
         directions = components.strongest(covariance, min(dims, k))
-        # Axes of the same space, those with the most detail first: fine arrays have the first ones only
+        # Rotated within the same space so that the first axes have the most detail: fine arrays hold only these
         detail = directions @ components.differences(values) @ directions.T
         directions = components.strongest(detail, len(directions)) @ directions
-        found = (values.reshape(-1, k) - mean) @ directions.T
-        low, high = np.quantile(found, [PrincipalComponents.OUTSIDE, 1 - PrincipalComponents.OUTSIDE], axis=0)
+        projected = (values.reshape(-1, k) - mean) @ directions.T
+        low, high = np.quantile(projected, [PrincipalComponents.OUTSIDE, 1 - PrincipalComponents.OUTSIDE], axis=0)
         return PrincipalComponents(mean, directions, low, np.maximum(high, low + 1e-3))
 
     @property
@@ -69,23 +72,23 @@ class PrincipalComponents:
         return len(self.directions)
 
     def pointers(self, values: np.ndarray) -> np.ndarray:
-        """The pointers of texels, ``(height, width, dims)`` in [0, 1], float32."""
-        found = ((values - self.mean) @ self.directions.T - self.low) / (self.high - self.low)
-        return np.clip(self.MARGIN + (1 - 2 * self.MARGIN) * found, 0, 1).astype(np.float32)
+        """Return the pointers of texels, ``(height, width, dims)`` in [0, 1], float32."""
+        unit = ((values - self.mean) @ self.directions.T - self.low) / (self.high - self.low)
+        return np.clip(self.MARGIN + (1 - 2 * self.MARGIN) * unit, 0, 1).astype(np.float32)
 
     def back(self, side: int) -> np.ndarray:
-        """The channels at the entries of a cascaded array, ``(side, …, k)``: the linear map back from pointers."""
+        """Return the channels at the entries of a cascaded array, ``(side, …, k)``: linear in the pointer."""
         grid = (np.linspace(0, 1, side) - self.MARGIN) / (1 - 2 * self.MARGIN) if side > 1 else np.array([0.5])
-        found = self.mean
+        channels = self.mean
         for d in range(self.dims):
             shape = [-1 if axis == d else 1 for axis in range(self.dims)] + [1]
             along = np.reshape(self.low[d] + grid * (self.high[d] - self.low[d]), shape)
-            found = found + along * self.directions[d]
-        return np.clip(found, 1e-3, 1 - 1e-3).astype(np.float32)
+            channels = channels + along * self.directions[d]
+        return np.clip(channels, 1e-3, 1 - 1e-3).astype(np.float32)
 
 
 def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str]) -> np.ndarray:
-    """A level, ``(height, width, k)``, read bilinearly at the texel centres of ``rows`` × ``columns``. float32."""
+    """Return a level, ``(height, width, k)``, read bilinearly at the texel centres of ``rows`` × ``columns``."""
     for axis, (n, along) in enumerate(zip((rows, columns), border, strict=True)):
         places = (np.arange(n) + 0.5) / n
         total = 0
@@ -98,56 +101,56 @@ def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str])
 
 def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> LayeredNet:
     """
-    Initial values from the levels ``values`` of a texture, each ``(height, width, k)`` in [0, 1]; not allocated. From
-    the coarsest fine array on each holds the difference between the components of its level and what the coarser ones
-    say of them.
+    Return initial arrays from the levels ``values`` of a texture, each ``(height, width, k)`` in [0, 1]; not allocated.
+
+    Each fine array holds the difference between the pointers of its level and the sum of the coarser arrays.
     """
-    found = PrincipalComponents.of(values[0], size.dims)
-    # A texture has no more components than channels: further coordinates start as ramps along u or v
+    basis = PrincipalComponents.of(values[0], size.dims)
+    # A texture has at most as many components as channels: further coordinates start as ramps along u or v
     pointers = [
-        np.concatenate([found.pointers(level), _ramps(*level.shape[:2], size.dims - found.dims)], axis=-1)
+        np.concatenate([basis.pointers(level), _ramps(*level.shape[:2], size.dims - basis.dims)], axis=-1)
         for level in values
     ]
     reached, level = pointers[size.skip], size.skip
-    layers, fine = _pages(pointers, found, size, border)
+    layers, fine = _pages(pointers, basis, size, border)
     for i in reversed(range(len(size.fine))):
-        wanted = size.fine[i]
-        rows, columns = values[wanted.level].shape[:2]
-        while level > wanted.level:
+        spec = size.fine[i]
+        rows, columns = values[spec.level].shape[:2]
+        while level > spec.level:
             level -= 1
             reached = enlarged(reached, *values[level].shape[:2], border)
         until = (size.fine[i + 1].level if i + 1 < len(size.fine) else size.skip) - 1
         if size.base and i + 1 == len(size.fine):
             reached = np.clip(pointers[level], 1e-3, 1 - 1e-3)
-            layers.insert(0, FineLayer(level, until, wanted.bits, (1.0,) * wanted.channels))
+            layers.insert(0, FineLayer(level, until, spec.bits, (1.0,) * spec.channels))
             fine.insert(0, DifferentiableArray((rows, columns), size.dims, reached, fold=True, border=border))
             continue
-        rest = (pointers[level] - reached)[..., : wanted.channels]
-        within = np.quantile(np.abs(rest).reshape(-1, wanted.channels), WITHIN[wanted.bits], axis=0)
+        rest = (pointers[level] - reached)[..., : spec.channels]
+        within = np.quantile(np.abs(rest).reshape(-1, spec.channels), WITHIN[spec.bits], axis=0)
         scale = np.maximum(2 * within, SMALLEST)
-        layer = FineLayer(level, until, wanted.bits, tuple(float(f"{s:.6g}") for s in scale))
+        layer = FineLayer(level, until, spec.bits, tuple(float(f"{s:.6g}") for s in scale))
         entries = np.clip(rest / np.array(layer.scale) + layer.zero, 0, 1).astype(np.float32)
         layers.insert(0, layer)
-        fine.insert(0, DifferentiableArray((rows, columns), wanted.channels, entries, fold=True, border=border))
+        fine.insert(0, DifferentiableArray((rows, columns), spec.channels, entries, fold=True, border=border))
         reached = reached.copy()
-        reached[..., : wanted.channels] += ((entries - layer.zero) * layer.scale).astype(np.float32)
+        reached[..., : spec.channels] += ((entries - layer.zero) * layer.scale).astype(np.float32)
     coarse = np.concatenate([p.reshape(-1, size.dims) for p in pointers[size.skip :]])
     coarse = DifferentiableArray((len(coarse),), size.dims, np.clip(coarse, 1e-3, 1 - 1e-3), fold=True)
     shape = (size.knots,) * (size.knots > 1) + (size.cascaded,) * size.dims
-    back = found.back(size.cascaded)
-    back = back.reshape(*back.shape[:-1], *[1] * (size.dims - found.dims), back.shape[-1])
+    back = basis.back(size.cascaded)
+    back = back.reshape(*back.shape[:-1], *[1] * (size.dims - basis.dims), back.shape[-1])
     cascaded = np.broadcast_to(back, (*shape, size.channels)).astype(np.float32)
     cascaded = DifferentiableArray(shape, size.channels, cascaded, fold=True)
     structure = LayeredStructure(size.height, size.width, tuple(layers), size.skip, size.bits, size.base)
     return LayeredNet(fine, coarse, cascaded, structure, border)
 
 
-def _pages(pointers: list, found: PrincipalComponents, size: TextureBudget, border) -> tuple[list, list]:
-    """The layers of pages, and their arrays."""
+def _pages(pointers: list, basis: PrincipalComponents, size: TextureBudget, border) -> tuple[list, list]:
+    """Return the layers of pages and their arrays."""
     if not size.pages:
         return [], []
-    used = found.dims
-    weighted = [(pointers[level][..., :used] * (found.high - found.low)).astype(np.float32) for level in size.pages]
+    used = basis.dims
+    weighted = [(pointers[level][..., :used] * (basis.high - basis.low)).astype(np.float32) for level in size.pages]
     layers, fine = [], []
     ends = [*size.pages[1:], size.skip]
     sides = page_sizes_of(weighted, border, size.page_entries)
@@ -163,16 +166,16 @@ def _pages(pointers: list, found: PrincipalComponents, size: TextureBudget, bord
 
 
 def gain_of_pages(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> float:
-    """What pages gain over one grid of as many bytes at level 0, in dB: :func:`~mi_diffind.pages.page_gain`."""
-    found = PrincipalComponents.of(values[0], size.dims)
-    flat = values[0].reshape(-1, values[0].shape[-1]) - found.mean
-    exact = flat @ found.directions.T
+    """Return the gain of pages over one grid of equal bytes at level 0, in dB (:func:`~mi_diffind.pages.page_gain`)."""
+    basis = PrincipalComponents.of(values[0], size.dims)
+    flat = values[0].reshape(-1, values[0].shape[-1]) - basis.mean
+    exact = flat @ basis.directions.T
     rest = float(np.mean(flat**2, axis=0).sum() - np.mean(exact**2, axis=0).sum())
     exact = exact.reshape(*values[0].shape[:2], -1).astype(np.float32)
     return page_gain(exact, border, size.page_entries, max(rest, 0.0))[0]
 
 
 def _ramps(rows: int, columns: int, count: int) -> np.ndarray:
-    """The positions of texel centres, ``(rows, columns, count)``: along u and v in turn."""
+    """Return the positions of texel centres, ``(rows, columns, count)``: along u and v in turn."""
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
     return np.concatenate([np.zeros((rows, columns, 0)), *[(u, v)[i % 2][..., None] for i in range(count)]], axis=-1)

@@ -1,36 +1,41 @@
-"""
-A texture as a table file holds it: a layout of its maps, and the arrays of its channels at every level of detail.
-"""
+"""Compressed textures: reading at any level of detail, errors by level, and their table files."""
 
 from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
 
+from ...compat import module_of
+from ...errors import UsageError
 from ...indirection import DifferentiableArray
 from ...lookup import BORDERS
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
+from ...maps.model import MapsModel, allocate_maps, page_entries
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
-from ...pages import page_counts, page_shift
-from ...tables import PAGES, Table, TableError, allocate_pages, load_table, page_sides, stored_arrays
-from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure, coarse_texels, types_of
-from .sampling import AXES
+from ...tables import PAGES, Table, TableError, load_table, stored_arrays
+from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure, coarse_texels
+
+#: Names of the paper's arrays.
+PAPER = ("primary0", "primary1", "cascaded")
 
 
 class CompressedTexture(FilteredMaps):
     """
-    A compressed texture or material that is read at any level of detail: ``layout`` says which maps there are, ``net``
-    reads the arrays (:mod:`.nets`). ``net`` is ``None`` if no channel is stored, since all are constant.
+    A compressed texture or material, read at any level of detail.
+
+    ``layout`` lists the maps, ``net`` reads the arrays (:mod:`.nets`). ``net`` is ``None`` if all channels are
+    constant.
     """
 
     def __init__(self, layout: Layout, net: PaperNet | LayeredNet | None):
         self.layout, self.net = layout, net
-        self.types = None if net is None else types_of(net)
+        self.types = None if net is None else module_of(net.cascaded.data)
         self.border = ("clamp", "clamp") if net is None else net.border
         self.levels = len(level_sizes(layout.height, layout.width))
 
@@ -41,26 +46,30 @@ class CompressedTexture(FilteredMaps):
 
     @staticmethod
     def of(table: Table, dtype, storage: str = "") -> CompressedTexture:
-        """The texture of a checked table, see :func:`allocate`."""
+        """Return the texture of a checked table, in a storage form (:func:`allocate`)."""
         return assembled(table, allocate(table, dtype, storage))
 
     def stored(self, u, v, active=True) -> list:
-        """The stored channels at (u, v) in level 0; of arrays for coarser levels no more is read than that needs."""
+        """Return the stored channels at (u, v) in level 0, with as few reads as that takes."""
         return [] if self.net is None else self.net.stored(u, v, active)
 
     def filtered(self, u, v, level, active=True) -> list:
-        """The stored channels at (u, v) and a level of detail."""
+        """Return the stored channels at (u, v) and a level of detail."""
         return [] if self.net is None else self.net.filtered(u, v, self.clamped(level, type(u)), active)
 
     # -- how good it is -----------------------------------------------------------------------------------------------
 
     def measure(self, source: Source) -> dict[str, float]:
         """
-        Errors against the pyramid of ``source``: ``psnr_db``, of all channels together at the texel centres of level 0,
-        ``psnr_MAP_db`` of each map there, ``psnr_l0_db``, ``psnr_l1_db``, … of all channels at those of each level,
-        ``psnr_worst_db``, the least of these, ``psnr_between_db`` at 2¹⁸ random places and levels of detail, half of
-        them magnified, and ``mean_error``, the largest difference of the mean of a channel at level 0. Values are
-        compared as they are in the file, those of high dynamic range as logarithms.
+        Return the errors against the mip pyramid of ``source``.
+
+        - ``psnr_db``, ``psnr_MAP_db``: all channels, and each map, at the texel centres of level 0.
+        - ``psnr_l0_db``, ``psnr_l1_db``, …: all channels at the texel centres of each level; ``psnr_worst_db``: the
+          least of these.
+        - ``psnr_between_db``: all channels at 2¹⁸ random places and levels of detail, half of them magnified.
+        - ``mean_error``: the largest difference of the mean of a channel at level 0.
+
+        Values are compared in the encoding of the file, values of high dynamic range as logarithms.
         """
         pyramid = Pyramid.of(source, self.layout, self.types, self.border)
         by_level, by_map, worst_mean = [], {}, 0.0
@@ -86,54 +95,34 @@ class CompressedTexture(FilteredMaps):
         }
 
     def _truth(self, name: str, values: np.ndarray) -> list:
-        """The channels of a map from the stored ones of a level."""
-        found = self.layout.decode(name, np.moveaxis(values, -1, 0))
-        return [np.broadcast_to(np.asarray(v, np.float32), values.shape[:2]) for v in found]
+        """Return the channels of a map from the stored channels of a level."""
+        channels = self.layout.decode(name, np.moveaxis(values, -1, 0))
+        return [np.broadcast_to(np.asarray(v, np.float32), values.shape[:2]) for v in channels]
 
     def _between(self, pyramid: Pyramid, count: int = 2**18) -> float:
-        """Mean squared error of the stored channels at random places and levels of detail."""
-        types = self.types
-        if types is None:
+        """Return the mean squared error of the stored channels at random places and levels of detail."""
+        if self.types is None:
             return 0.0
-        rng = np.random.default_rng(2023)
-        u, v = (types.Float(x) for x in rng.random((2, count), dtype=np.float32))
-        level = types.Float(np.maximum(0, rng.random(count, dtype=np.float32) * 2 - 1) * (self.levels - 1))
+        Float, rng = self.types.Float, np.random.default_rng(2023)
+        u, v = (Float(x) for x in rng.random((2, count), dtype=np.float32))
+        level = Float(np.maximum(0, rng.random(count, dtype=np.float32) * 2 - 1) * (self.levels - 1))
         with dr.suspend_grad():
-            got, expected = self.filtered(u, v, level), pyramid.filtered(u, v, level)
-            return float(
-                np.mean(
-                    [
-                        np.mean((a.numpy() - b.numpy()) ** 2, dtype=np.float64)
-                        for a, b in zip(got, expected, strict=True)
-                    ]
-                )
-            )
+            pairs = zip(self.filtered(u, v, level), pyramid.filtered(u, v, level), strict=True)
+            return float(np.mean([np.mean((a.numpy() - b.numpy()) ** 2, dtype=np.float64) for a, b in pairs]))
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
 def allocate(table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
-    """
-    The arrays of a checked table for the tensor type ``dtype``: as bytes, if it has them as bytes, which can be read
-    only; with the ``storage`` ``"float32"``, as floats that pass through the fold, which can be optimised.
-    """
-    entry_type = "uint8" if storage != "float32" and table.storage == "uint8" else "float32"
-    found = {}
-    for name, array in table.arrays.items():
-        pages = table.arrays.get(name + PAGES)
-        if pages is not None:
-            layout = Layout.from_json(table.settings["layout"])
-            sizes = level_sizes(layout.height, layout.width)
-            shift = page_shift(sizes[int(name.removeprefix("level"))])
-            found[name] = allocate_pages(array, pages, dtype, shift, entry_type, fold=True)
-        elif not name.endswith(PAGES):
-            found[name] = array.allocate(dtype, entry_type, fold=True)
-    return found
+    """Return the arrays of a checked table: :func:`~mi_diffind.maps.model.allocate_maps` of this task."""
+    layout = Layout.from_json(table.settings["layout"])
+    sizes = level_sizes(layout.height, layout.width)
+    return allocate_maps(table, dtype, storage, lambda name: sizes[int(name.removeprefix("level"))])
 
 
 def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedTexture:
-    """The texture that the allocated arrays of a checked table make."""
+    """Return the texture of a checked table from its allocated arrays."""
     layout = Layout.from_json(table.settings["layout"])
     if not arrays:
         return CompressedTexture(layout, None)
@@ -144,12 +133,8 @@ def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> Compresse
     return CompressedTexture(layout, LayeredNet(fine, arrays["coarse"], arrays["cascaded"], structure, border))
 
 
-#: Names of the paper's arrays.
-PAPER = ("primary0", "primary1", "cascaded")
-
-
 def to_table(texture: CompressedTexture, settings: dict) -> Table:
-    """The table file of a texture."""
+    """Return the table file of a texture, with ``settings``."""
     stored = {}
     for name, array in texture.arrays.items():
         stored |= stored_arrays(name, array)
@@ -157,7 +142,7 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
     if texture.net is not None:
         structure = texture.net.structure
         if isinstance(structure, PaperStructure):
-            settings["arrays"] = {"kind": "paper", "axis": structure.axis}
+            settings["arrays"] = {"kind": "paper", "axis": "side"}
         else:
             layers = [
                 {"level": x.level, "until": x.until, "bits": x.bits, "scale": list(x.scale), "paged": x.paged}
@@ -172,32 +157,33 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
 
 def structure_of(settings: dict, layout: Layout):
     """
-    What the settings of a file say about its arrays, and the border along v and u. Raises ``KeyError``, ``TypeError``
-    or ``ValueError`` for anything else.
+    Return the structure of the arrays of a file and the border along v and u (``None`` for the paper's arrays).
+
+    Raises ``KeyError``, ``TypeError`` or ``ValueError`` for damaged settings.
     """
-    found, levels = settings["arrays"], len(level_sizes(layout.height, layout.width))
-    if found["kind"] == "paper":
-        if found["axis"] not in AXES:
-            raise ValueError(f"footprints measure {found['axis']!r}")
-        return PaperStructure(levels, found["axis"]), None
-    if found["kind"] != "layers":
-        raise ValueError(f"arrays of the kind {found['kind']!r:.40}")
-    skip, bits, border = int(found["skip"]), int(found["bits"]), tuple(found["border"])
+    entry, levels = settings["arrays"], len(level_sizes(layout.height, layout.width))
+    if entry["kind"] == "paper":
+        if entry["axis"] != "side":
+            raise ValueError(f"its footprints measure {entry['axis']!r:.40}, allowed is 'side': train it again")
+        return PaperStructure(levels), None
+    if entry["kind"] != "layers":
+        raise ValueError(f"arrays of the kind {entry['kind']!r:.40}")
+    skip, bits, border = int(entry["skip"]), int(entry["bits"]), tuple(entry["border"])
     if not 0 <= skip < levels or not 1 <= bits <= 8 or len(border) != 2 or any(b not in BORDERS for b in border):
-        raise ValueError("the level that is skipped to, the bits or the borders are damaged")
+        raise ValueError("the first level of the coarse array, its bits or the borders are damaged")
     layers, last = [], -1
-    for entry in found["layers"]:
-        scale, paged = tuple(map(float, entry["scale"])), bool(entry["paged"])
-        layer = FineLayer(int(entry["level"]), int(entry["until"]), int(entry["bits"]), scale, paged)
+    for item in entry["layers"]:
+        scale, paged = tuple(map(float, item["scale"])), bool(item["paged"])
+        layer = FineLayer(int(item["level"]), int(item["until"]), int(item["bits"]), scale, paged)
         if not last < layer.level <= layer.until < skip or not 1 <= layer.bits <= 8:
-            raise ValueError("the fine arrays are of no levels that there are")
+            raise ValueError("the levels or bits of the fine arrays are damaged")
         if not layer.scale or not all(math.isfinite(s) and 0 < s <= 4 for s in layer.scale):
             raise ValueError("the scales of the fine arrays are damaged")
         last = layer.level
         layers.append(layer)
-    base = bool(found["base"])
+    base = bool(entry["base"])
     if base and not layers:
-        raise ValueError("there is no fine array that could hold pointers")
+        raise ValueError("no fine array could hold pointers")
     return LayeredStructure(layout.height, layout.width, tuple(layers), skip, bits, base), border
 
 
@@ -211,70 +197,75 @@ def load(path: str | os.PathLike) -> Table:
             structure, border = structure_of(table.settings, layout)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
         raise TableError(f"{path}: its settings describe no texture ({e})") from None
-    pages = (
-        []
-        if not isinstance(structure, LayeredStructure)
-        else [f"level{x.level}{PAGES}" for x in structure.layers if x.paged]
-    )
-    shapes = {name: array.shape for name, array in table.arrays.items() if name not in pages}
-    fine = (
-        []
-        if structure is None or isinstance(structure, PaperStructure)
-        else [f"level{layer.level}" for layer in structure.layers]
-    )
-    expected = (
-        [] if structure is None else PAPER if isinstance(structure, PaperStructure) else [*fine, "coarse", "cascaded"]
-    )
-    if set(table.arrays) != {*expected, *pages}:
-        found, wanted = (", ".join(sorted(names)) or "none" for names in (table.arrays, {*expected, *pages}))
-        raise TableError(f"{path}: holds the arrays {found}, expected {wanted}")
+    layers = {f"level{x.level}": x for x in structure.layers} if isinstance(structure, LayeredStructure) else {}
+    pages = [name + PAGES for name, x in layers.items() if x.paged]
+    expected = PAPER if isinstance(structure, PaperStructure) else [*layers, *pages, "coarse", "cascaded"]
+    if set(table.arrays) != set(expected if structure else ()):
+        names, wanted = (", ".join(sorted(n)) or "none" for n in (table.arrays, expected if structure else ()))
+        raise TableError(f"{path}: holds the arrays {names}, expected {wanted}")
     if structure is None:
         return table
     if isinstance(structure, PaperStructure):
         wanted = {"primary0": (None, None, 3), "primary1": (None, 1), "cascaded": (None,) * 4 + (layout.stored,)}
     else:
-        dims = shapes["coarse"][-1]
-        axes = len(shapes["cascaded"]) - 1
-        wanted = {
-            **{
-                n: (_entries(table, n, structure.sizes[x.level], border), x.channels)
-                if x.paged
-                else (*structure.sizes[x.level], x.channels)
-                for n, x in zip(fine, structure.layers, strict=True)
-            },
-            "coarse": (coarse_texels(structure), dims),
-            "cascaded": (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,),
-        }
-        for x in structure.layers:
-            if x.channels != dims and structure.is_pointer(x):
-                raise TableError(f"{path}: has a fine array that holds pointers of {x.channels} of {dims} coordinates")
-            if x.channels > dims:
-                raise TableError(f"{path}: has a fine array with more channels than the {dims} of its pointers")
+        wanted = _layered_shapes(table, layout, structure, layers)
     for name, shape in wanted.items():
-        found = shapes[name]
-        if len(found) != len(shape) or any(w not in (None, f) for f, w in zip(found, shape, strict=True)):
-            text = " x ".join("N" if n is None else str(n) for n in shape)
-            raise TableError(f'{path}: array "{name}" has the shape {found}, expected {text}')
         array = table.arrays[name]
+        actual = array.shape
+        if len(actual) != len(shape) or any(w not in (None, n) for n, w in zip(actual, shape, strict=True)):
+            text = " x ".join("N" if n is None else str(n) for n in shape)
+            raise TableError(f'{path}: array "{name}" has the shape {actual}, expected {text}')
         if not array.is_pointer:
             raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
-        if name in fine and name + PAGES not in pages and array.border != border:
-            raise TableError(f'{path}: array "{name}" has the borders {array.border}, expected {border}')
-        if name in fine and array.storage == "uint8" and array.bits != structure.layers[fine.index(name)].bits:
-            raise TableError(f'{path}: array "{name}" has {array.bits} bits an entry, which its settings deny')
+        if name not in layers:
+            continue
+        spread = table.arrays[name + PAGES] if layers[name].paged else array
+        if spread.border != border:
+            raise TableError(f'{path}: array "{name}" has the borders {spread.border}, expected {border}')
+        if array.storage == "uint8" and array.bits != layers[name].bits:
+            raise TableError(
+                f'{path}: array "{name}" has {array.bits} bits an entry, expected {layers[name].bits} by its settings'
+            )
     return table
 
 
-def _entries(table: Table, name: str, size: tuple[int, int], border) -> int:
-    """The number of entries of an array of pages on a level of ``size``. Raises :class:`TableError`."""
-    pages, counts = table.arrays[name + PAGES], page_counts(size)
-    try:
-        sides = page_sides(pages)
-    except ValueError as e:
-        raise TableError(f'{table.path}: array "{name}{PAGES}": {e}') from None
-    if sides.shape != (*counts, 2) or pages.border != border:
-        raise TableError(
-            f'{table.path}: array "{name}{PAGES}" has the shape {sides.shape} and the borders {pages.border}, expected '
-            f"{(*counts, 2)} and {border}"
-        )
-    return int(sides.prod(axis=2).sum())
+def _layered_shapes(table: Table, layout: Layout, structure: LayeredStructure, layers: dict[str, FineLayer]) -> dict:
+    """Return the shapes of our arrays by name; ``None`` stands for any number. Raises :class:`TableError`."""
+    dims, axes = table.arrays["coarse"].shape[-1], len(table.arrays["cascaded"].shape) - 1
+    shapes = {}
+    for name, layer in layers.items():
+        if layer.channels > dims or (layer.channels < dims and structure.is_pointer(layer)):
+            raise TableError(f'{table.path}: array "{name}" has {layer.channels} channels, its pointers have {dims}')
+        size = structure.sizes[layer.level]
+        shapes[name] = (*((page_entries(table, name, size),) if layer.paged else size), layer.channels)
+    shapes["coarse"] = (coarse_texels(structure), dims)
+    shapes["cascaded"] = (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,)
+    return shapes
+
+
+class TextureModel(MapsModel):
+    """Model of a texture file; ``image`` is a :class:`CompressedTexture`."""
+
+    def build(self):
+        self.image = assembled(self.table, self.arrays)
+
+    def describe(self):
+        figures, lines = super().describe()
+        image, measured = self.image, self.table.measured
+        by_level = [measured.get(f"psnr_l{i}_db") for i in range(image.levels)]
+        figures = {**figures, "levels": image.levels, "psnr_by_level_db": by_level}
+        if all(value is not None for value in by_level):
+            listed = ", ".join(f"{value:.1f}" for value in by_level)
+            lines.append(f"  {image.levels} levels of detail: {listed} dB")
+        return figures, lines
+
+    def decode(self, output: Path, map=None, width=None, height=None, level: int = 0):
+        """Write the maps at a level of detail, by default in its own size (:meth:`.MapsModel.decode`)."""
+        image = self.image
+        if not 0 <= level < image.levels:
+            raise UsageError(f"{self.table.path}: --level: found {level}, the file has levels 0 to {image.levels - 1}")
+        rows, columns = image.level_size(level)
+        return super().decode(output, map, width or columns, height or rows, level=level)
+
+
+MODEL = TextureModel

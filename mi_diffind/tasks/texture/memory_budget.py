@@ -1,9 +1,9 @@
 """
-Bytes and resolutions: how large the arrays of task 4 are for a wanted size.
+Memory budgets of task 4: resolutions of the arrays for a number of bytes.
 
-The paper's are equation 2 of the supplement, ``bytes = 3 N_p0² + N_p1 + k N_c³ N_lod``, a table of ratios
-``ρ = N_p0 / N_c`` and a linear search (:func:`paper_size`). Ours are all on the grids of levels of detail, so only
-channels and bits of the fine arrays are to be chosen (:func:`choose`).
+The paper's arrays follow equation 2 of the supplement, ``bytes = 3 N_p0² + N_p1 + k N_c³ N_lod``, a table of ratios
+``ρ = N_p0 / N_c`` and a linear search (:func:`paper_size`). Our arrays lie on the grids of levels of detail, so only
+the channels and bits of the fine arrays are chosen (:func:`choose`).
 """
 
 from __future__ import annotations
@@ -21,35 +21,38 @@ from ...pages import SIDE_BITS, most_entries, page_counts
 RATIOS = {3: 80, 6: 64, 12: 64, 24: 48}
 MATERIAL_RATIOS = {3: 128, 6: 96, 12: 96, 24: 72}
 
-#: Entries of the cascaded array along the footprint for the side of a texture in texels, from which on it holds.
+#: Entries of the cascaded array along the footprint, by the smallest side of a texture in texels.
 LODS = {1024: 8, 2048: 12}
 
-#: Sides that the paper's search finds are multiples of these (the supplement's section 1.3).
+#: Steps of the paper's search: sides are multiples of these (supplement 1.3).
 PRIMARY_STEP, CASCADED_STEP = 8, 4
 
-#: How far the bytes may be from what was asked for before somebody is told.
+#: Largest relative difference between wanted and actual bytes that needs no explanation.
 TOLERANCE = 0.05
 
 
 def paper_bytes(primary: int, lods: int, cascaded: int, channels: int) -> int:
     """
-    Equation 2: bytes of a primary of ``primary = N_p0²`` entries, ``N_p1 = 4 N_lod`` of the footprint's, and a cascaded
-    array of ``N_lod × N_c³`` entries of ``channels``.
+    Return the bytes of the paper's arrays (equation 2).
+
+    ``primary`` is N_p0², ``lods`` is N_lod (N_p1 is four times that), ``cascaded`` is N_c and ``channels`` is k.
     """
     return 3 * primary + 4 * lods + channels * cascaded**3 * lods
 
 
 def lods_of(height: int, width: int) -> int:
-    """``N_lod`` of a texture: :data:`LODS`, for smaller ones at most as many as they have doublings (at least 2)."""
+    """Return ``N_lod`` of a texture: :data:`LODS`; below 1024 texels ``log2`` of the side, within 2 … 8."""
     side = max(height, width)
-    found = [n for base, n in LODS.items() if side >= base]
-    return found[-1] if found else min(8, max(2, round(math.log2(side)) if side > 1 else 2))
+    if side < min(LODS):
+        return min(8, max(2, round(math.log2(side))))
+    return next(n for base, n in reversed(LODS.items()) if side >= base)
 
 
 def ratio(compression: float, channels: int) -> float:
     """
-    Default of ``ρ``: :data:`RATIOS` for up to three channels, else :data:`MATERIAL_RATIOS`, interpolated linearly in
-    ``log2(compression)`` and constant outside of 3 … 24. (The supplement gives them for 4K only.)
+    Return the default of ``ρ``: :data:`RATIOS` for up to three channels, else :data:`MATERIAL_RATIOS`.
+
+    Interpolated linearly in ``log2(compression)``, constant outside of 3 … 24. The supplement gives values for 4K only.
     """
     table = RATIOS if channels <= 3 else MATERIAL_RATIOS
     return float(np.interp(math.log2(compression), np.log2(list(table)), list(table.values())))
@@ -57,7 +60,7 @@ def ratio(compression: float, channels: int) -> float:
 
 @dataclass(frozen=True)
 class PaperBudget:
-    """Resolutions of the paper's arrays: ``rows`` × ``columns`` of primary 0, and the sides of the cascaded array."""
+    """Resolutions of the paper's arrays: ``rows`` × ``columns`` of primary 0, ``lods`` × ``cascaded``³ entries."""
 
     rows: int
     columns: int
@@ -72,9 +75,11 @@ class PaperBudget:
 
 def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, width: int) -> PaperBudget:
     """
-    The paper's linear search: of all sides ``N_c`` = 4, 8, … the one whose bytes are nearest to what is wanted, as a
-    ratio to ``source_bytes``, with ``N_p0 = ρ N_c`` in multiples of 8 and no larger than the image. If that is more
-    than 5% off, ``N_c`` is kept, unless its array alone is more than half, and primary 0 becomes what fits.
+    Return the result of the paper's linear search over the sides ``N_c`` = 4, 8, ….
+
+    The search minimises the difference of compression ratios, with ``N_p0 = ρ N_c`` in multiples of 8 and no larger
+    than the image. If the best is more than 5% off, primary 0 is resized to fit beside the same ``N_c``, or beside a
+    smaller one if the cascaded array alone takes more than half of the bytes.
     """
     lods, wanted = lods_of(height, width), source_bytes / nbytes
     rho = ratio(max(wanted, 1e-6), channels)
@@ -85,7 +90,7 @@ def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, wid
         size = PaperBudget(*_spread(side**2, height, width), lods, cascaded, channels)
         if abs(source_bytes / size.nbytes - wanted) < distance:
             best, distance = size, abs(source_bytes / size.nbytes - wanted)
-        if size.nbytes >= nbytes:  # more only lead away
+        if size.nbytes >= nbytes:  # larger arrays only increase the difference
             break
     if abs(best.nbytes / nbytes - 1) <= TOLERANCE:
         return best
@@ -97,7 +102,7 @@ def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, wid
 
 
 def _spread(entries: float, height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of at most so many entries in the proportions of an image, no larger than it."""
+    """Return rows and columns of at most ``entries`` entries, in the proportions of an image and within it."""
     short, long = sorted((height, width))
     one = min(max(1, int(math.sqrt(entries * short / long) + 1e-9)), short)
     other = min(max(1, int(entries / one + 1e-9)), long)
@@ -110,7 +115,7 @@ def _spread(entries: float, height: int, width: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class FineArray:
-    """A fine array: the ``level`` whose grid it is on, and how many ``channels`` of how many ``bits``."""
+    """A fine array on the grid of a ``level`` of detail, with so many ``channels`` of ``bits`` bits."""
 
     level: int
     channels: int
@@ -124,10 +129,13 @@ class FineArray:
 @dataclass(frozen=True)
 class TextureBudget:
     """
-    Resolutions of our arrays: the ``fine`` ones, the finest first; the level ``skip`` from which on all levels have
-    pointers of their own, with ``dims`` coordinates of ``bits``; and the side of the ``cascaded`` array, of
-    ``channels`` and with ``knots`` entries along the level of detail (1: none). With ``pages``, the levels that have
-    arrays of pages, these share ``page_bytes``.
+    Resolutions of our arrays.
+
+    - ``fine``: the fine arrays, the finest first.
+    - ``skip``: first level of detail of the coarse array, whose pointers have ``dims`` coordinates of ``bits`` bits.
+    - ``cascaded``: side of the cascaded array, which has ``channels`` channels and ``knots`` entries along the level of
+      detail (1: no such axis).
+    - ``pages``: levels with arrays of pages, which share ``page_bytes``, entries of ``page_bits`` bits.
     """
 
     height: int
@@ -146,22 +154,22 @@ class TextureBudget:
     def __post_init__(self):
         levels = [f.level for f in self.fine]
         if levels != sorted(set(levels)) or (levels and levels[-1] >= self.skip):
-            raise ValueError(f"fine arrays on the levels {levels} do not lie below level {self.skip}, one each")
+            raise ValueError(f"fine arrays: found the levels {levels}, allowed are different ones below {self.skip}")
         if not 0 <= self.skip < len(level_sizes(self.height, self.width)):
             raise ValueError(
                 f"skip: found {self.skip}, the texture has {len(level_sizes(self.height, self.width))} levels"
             )
         if any(f.channels > self.dims for f in self.fine):
-            raise ValueError(f"fine arrays have at most as many channels as pointers have coordinates, {self.dims}")
+            raise ValueError(f"fine arrays: allowed are at most {self.dims} channels, the coordinates of a pointer")
 
     @property
     def base(self) -> bool:
-        """Does the coarsest fine array hold pointers? It does if it has all coordinates, in bits enough."""
+        """Whether the coarsest fine array holds pointers: it has all coordinates in :data:`BASE_BITS` bits or more."""
         return bool(self.fine) and self.fine[-1].channels == self.dims and self.fine[-1].bits >= BASE_BITS
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays, each a whole number of them."""
+        """Bytes of all arrays, each rounded up."""
         sizes = level_sizes(self.height, self.width)
         fine = sum(math.ceil(math.prod(sizes[f.level]) * f.channels * f.bits / 8) for f in self.fine)
         coarse = math.ceil(sum(map(math.prod, sizes[self.skip :])) * self.dims * self.bits / 8)
@@ -169,31 +177,27 @@ class TextureBudget:
 
     @property
     def page_entries(self) -> int:
-        """Entries that the pages have room for, beside their indices."""
+        """Entries of all pages together, which share ``page_bytes`` with their indices."""
         sizes = level_sizes(self.height, self.width)
         index = sum(math.ceil(2 * SIDE_BITS[1] * math.prod(page_counts(sizes[level])) / 8) for level in self.pages)
         return int((self.page_bytes - index) * 8 / (self.page_bits * self.dims))
 
 
 def parse_structure(text: str) -> tuple[FineArray, ...]:
-    """
-    Fine arrays from ``LEVEL:CHANNELS:BITS`` of each, separated by commas, such as ``0:1:2,1:2:4``. Raises
-    ``ValueError``.
-    """
+    """Return the fine arrays of a text such as ``0:1:2,1:2:4`` (level, channels, bits). Raises ``ValueError``."""
     if not re.fullmatch(r"\d+:\d+:\d+(,\d+:\d+:\d+)*", text, re.ASCII):
-        raise ValueError(f'{text!r} is no structure, expected LEVEL:CHANNELS:BITS,… such as "0:1:2,1:2:4", or "auto"')
+        raise ValueError(f'structure: found {text!r}, allowed are LEVEL:CHANNELS:BITS,… as in 0:1:2,1:2:4, and "auto"')
     fine = tuple(FineArray(*map(int, part.split(":"))) for part in text.split(","))
     if [f.level for f in fine] != sorted({f.level for f in fine}):
-        raise ValueError(f"{text!r}: levels have to grow, one array each")
+        raise ValueError(f"structure: found {text!r}, levels have to grow from array to array")
     return fine
 
 
-#: Bits from which on the coarsest fine array holds pointers, if it has all their coordinates.
+#: Least bits of a fine array that holds pointers in place of differences.
 BASE_BITS = 5
 
-#: Structures for more and more bytes: the fine arrays and the level that all have pointers of their own from. Found by
-#: trainings: from one to the next level a quarter of the entries has room for four times the bits, and a channel or two
-#: are enough for the finest.
+#: Structures in the order of their bytes: fine arrays, and the first level of the coarse array. Found by trainings: a
+#: level has a quarter of the entries of the one below it and room for more bits; the finest needs one or two channels.
 LADDER: tuple[tuple[str, int], ...] = (
     ("0:1:2,2:2:4", 3),
     ("0:1:2,1:1:4,2:3:6", 3),
@@ -209,7 +213,7 @@ LADDER: tuple[tuple[str, int], ...] = (
     ("0:3:8,1:3:8", 2),
 )
 
-#: The same for smooth textures, whose finest level is not worth an array of its own before bytes are plenty.
+#: Structures of smooth textures, whose finest level needs an array only where bytes are plenty.
 SMOOTH_LADDER: tuple[tuple[str, int], ...] = (
     ("1:2:4,2:3:6", 3),
     ("1:3:4,2:3:6", 3),
@@ -218,10 +222,10 @@ SMOOTH_LADDER: tuple[tuple[str, int], ...] = (
     *LADDER[5:],
 )
 
-#: Largest sides of a cascaded array of 1 to 4 dimensions that are chosen.
-CASCADED_LIMITS = (128, 32, 16, 8)
+#: Largest sides of a cascaded array of 1 to 3 dimensions that are chosen.
+CASCADED_LIMITS = (128, 32, 16)
 
-#: A cascaded array takes at least this share of the bytes, unless its side is this already.
+#: Least share of the bytes that a cascaded array takes until its side reaches the second number.
 CASCADED_SHARE, CASCADED_SIDE = 0.05, 12
 
 
@@ -236,37 +240,35 @@ def choose(
     smooth: bool = False,
 ) -> TextureBudget:
     """
-    Our size for a texture of so many stored channels and so many bytes, some of it given unless ``None``: the structure
-    of :data:`LADDER` (for a ``smooth`` texture of :data:`SMOOTH_LADDER`) with the most bytes that fit, on coarser
-    levels if none does; what is left goes to the cascaded array. Pointers have three coordinates, and fewer where even
-    the smallest arrays of three are too large.
+    Return our arrays for a texture of ``channels`` stored channels and at most ``nbytes`` bytes.
+
+    The structure is that of :data:`LADDER` (:data:`SMOOTH_LADDER` for a ``smooth`` texture) with the most bytes that
+    fits, moved to coarser levels if none does; the cascaded array takes the rest. ``skip``, ``fine`` and ``cascaded``
+    replace what is chosen. Pointers have three coordinates, fewer where the smallest arrays of three do not fit. If
+    nothing fits, the result is the smallest budget. Raises ``ValueError`` for fine arrays that do not go together.
     """
     for dims in (3, 2, 1):
-        found = []
+        too_large = []
         for group in _structures(height, width, dims, skip, fine, SMOOTH_LADDER if smooth else LADDER):
             sizes = [_sized(nbytes, height, width, channels, *where, dims, cascaded) for where in group]
             fitting = [size for size in sizes if size.nbytes <= nbytes]
             if fitting:
-                return max(fitting, key=lambda size: _without(size, channels))
-            found += sizes
+                return max(fitting, key=lambda size: size.nbytes - size.knots * size.cascaded**size.dims * channels)
+            too_large += sizes
         if fine is not None and dims <= max(f.channels for f in fine):
             break
-    return min(found, key=lambda size: size.nbytes)
+    return min(too_large, key=lambda size: size.nbytes)
 
 
-#: Levels that have pages, the level from which on all have pointers of their own, and entries for each page that there
-#: have to be.
+#: Levels with pages, first level of the coarse array behind them, and least entries a page.
 PAGES, PAGES_SKIP, FEWEST = (0, 2), 4, 3
 
-#: Share of the bytes of a cascaded array behind pages, and its largest side.
+#: Share of the bytes of the cascaded array behind pages, and its largest side.
 PAGES_CASCADED, PAGES_SIDE = 0.06, 12
 
 
 def paged(height: int, width: int, channels: int, nbytes: float, cascaded: int | None = None) -> TextureBudget | None:
-    """
-    A size whose fine arrays consist of pages, for so many bytes; ``None`` if the texture is too small, or the bytes are
-    too few or too many for that.
-    """
+    """Return arrays of pages for ``nbytes`` bytes; ``None`` if the texture or the bytes are too small or too large."""
     sizes = level_sizes(height, width)
     if len(sizes) <= PAGES_SKIP:
         return None
@@ -281,10 +283,7 @@ def paged(height: int, width: int, channels: int, nbytes: float, cascaded: int |
 
 
 def _structures(height: int, width: int, dims: int, skip: int | None, fine: tuple[FineArray, ...] | None, ladder):
-    """
-    What is tried, the first choice first: groups of structures, each the fine arrays and the level from which on the
-    others are. The ladder on the levels themselves, then on coarser ones.
-    """
+    """Yield groups of (fine arrays, skip) to try: the ladder on the levels themselves, then on coarser ones."""
     last = len(level_sizes(height, width)) - 1
     if fine is not None:
         yield [(fine, skip)]
@@ -300,13 +299,8 @@ def _structures(height: int, width: int, dims: int, skip: int | None, fine: tupl
     yield [((), last if skip is None else skip)]
 
 
-def _without(size: TextureBudget, channels: int) -> int:
-    """Bytes of all but the cascaded array."""
-    return size.nbytes - channels * size.knots * size.cascaded**size.dims
-
-
 def _sized(nbytes, height, width, channels, fine, skip, dims, cascaded) -> TextureBudget:
-    """With the largest cascaded array that is left room for, and no small one, unless its side is given."""
+    """Return the budget with the largest cascaded array that fits, at least :data:`CASCADED_SHARE` of the bytes."""
 
     def sized(side: int) -> TextureBudget:
         return TextureBudget(height, width, channels, fine, skip, dims, side, skip + 1)

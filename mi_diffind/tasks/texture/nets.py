@@ -1,8 +1,8 @@
 """
-How arrays are read at a place and a level of detail: the paper's layout, and ours.
+Reads of the arrays at a place and a level of detail: the paper's structure, and ours.
 
-Both answer ``filtered(u, v, level)`` and ``stored(u, v)``, which is level 0 and reads no more than that needs. Levels
-are those of a mip pyramid: 0 is the source, each further one half as large.
+Both have the methods ``filtered(u, v, level)`` and ``stored(u, v)``, which reads level 0 with fewer gathers. Levels are
+those of a mip pyramid: 0 is the source, each further level is half as large.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ import drjit as dr
 from drjit import nn
 
 from ... import lookup
-from ...compat import module_of
 from ...indirection import DifferentiableArray
-from ...maps.pyramid import around, level_sizes
+from ...maps.pyramid import around, level_sizes, weighted_sum
 from ...pages import PagedArray
 from .sampling import footprint_of
 
 
 @dataclass(frozen=True)
 class PaperStructure:
-    """What the paper's arrays do not say themselves: the ``levels`` of the texture, and what footprints measure."""
+    """Structure of the paper's arrays: the number of ``levels`` of the texture."""
 
     levels: int
-    axis: str
 
 
 class PaperNet(nn.Module):
     """
-    The paper's arrays (the supplement's table 3): ``primary0``, read at (v, u), 3 channels, and ``primary1``, read at
-    the footprint, 1 channel, point into ``cascaded``, ``N_lod × N_c³``.
+    The paper's arrays (supplement, table 3).
+
+    ``primary0`` has 3 channels and is read at (v, u); ``primary1`` has 1 channel and is read at the footprint. Together
+    they point into ``cascaded``, ``N_lod × N_c³``.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -56,21 +56,21 @@ class PaperNet(nn.Module):
         return self.primary0.border
 
     def changed(self, change) -> PaperNet:
-        """A copy with ``change(array, bits)`` in place of each array."""
+        """Return a copy with ``change(array, bits)`` in place of each array."""
         return PaperNet(*(change(a, 8) for a in self.arrays.values()), self.structure)
 
     def at_footprint(self, u, v, x, active=True) -> list:
-        """The channels at (u, v) for a footprint in [0, 1]."""
+        """Return the channels at (u, v) for a footprint in [0, 1]."""
         inside = self.primary0.is_pointer and self.primary1.is_pointer
         return self.cascaded([*self.primary1([x], active), *self.primary0([v, u], active)], active, inside)
 
     def filtered(self, u, v, level, active=True) -> list:
-        """The channels at (u, v) and a level of detail within those that there are."""
-        return self.at_footprint(u, v, footprint_of(level, self.structure.axis, self.structure.levels), active)
+        """Return the channels at (u, v) and a level of detail from 0 to ``levels − 1``."""
+        return self.at_footprint(u, v, footprint_of(level, self.structure.levels), active)
 
     def stored(self, u, v, active=True) -> list:
-        """The same at level 0. The footprint's array is not read: it says one number, known when bytes are stored."""
-        array, x = self.primary1, float(footprint_of(0.0, self.structure.axis, self.structure.levels))
+        """Return the channels at level 0; with bytes, the footprint's array is one constant and is not read."""
+        array, x = self.primary1, float(footprint_of(0.0, self.structure.levels))
         if array.storage == "uint8":
             entries, at = array.numpy()[:, 0], x * (array.resolution[0] - 1)
             lower = min(int(at), len(entries) - 2)
@@ -83,11 +83,12 @@ class PaperNet(nn.Module):
 @dataclass(frozen=True)
 class FineLayer:
     """
-    A fine array of ours: it has the size of the level of detail ``level``, and what is read of it, less
-    :attr:`zero`, times the ``scale`` of each channel, is added to the pointer from the levels below ``until``, and less
-    and less from there to ``until + 1``. ``bits`` are those of an entry. One that is ``paged`` consists of pages, whose
-    resolution follows the content, and holds pointers themselves. (Of these, see also :class:`LayeredStructure`,
-    ``scale`` is 1 and there is no zero.)
+    A fine array, on the grid of the level of detail ``level``.
+
+    Its value, less :attr:`zero` and times the ``scale`` of each channel, is added to the pointer in full up to the
+    level ``until`` and fades out from there to ``until + 1``. ``bits`` are those of an entry. A ``paged`` layer
+    consists of pages, whose resolution follows the content. Layers that hold pointers
+    (:meth:`LayeredStructure.is_pointer`) replace the pointer instead; their ``scale`` is 1 and they have no zero.
     """
 
     level: int
@@ -102,16 +103,19 @@ class FineLayer:
 
     @property
     def zero(self) -> float:
-        """The entry, a multiple of 1 / (2^bits − 1) if there are several bits, that stands for no difference."""
+        """Entry that stands for no difference: a multiple of 1 / (2^bits − 1), or 0.5 for a single bit."""
         return 0.5 if self.bits == 1 else 2 ** (self.bits - 1) / (2**self.bits - 1)
 
 
 @dataclass(frozen=True)
 class LayeredStructure:
     """
-    What our arrays do not say themselves: the size of the texture, the fine ``layers``, the finest first, the level of
-    detail ``skip`` from which on each has its own pointers, and the ``bits`` of these. ``base``: the coarsest of the
-    layers holds pointers, not differences, so that finer levels need not read those from ``skip`` on.
+    Structure of our arrays.
+
+    - ``height``, ``width``: size of the texture in texels.
+    - ``layers``: the fine arrays, the finest first.
+    - ``skip``: first level of the coarse array, whose pointers have ``bits`` bits.
+    - ``base``: the coarsest layer holds pointers, so finer levels do not read the coarse array.
     """
 
     height: int
@@ -127,17 +131,19 @@ class LayeredStructure:
         return level_sizes(self.height, self.width)
 
     def is_pointer(self, layer: FineLayer) -> bool:
-        """Does a layer hold pointers, not differences?"""
+        """Return whether a layer holds pointers in place of differences."""
         return layer.paged or (self.base and layer == self.layers[-1])
 
 
 class LayeredNet(nn.Module):
     """
-    Our arrays. ``coarse`` holds pointers for all texels of the levels from ``structure.skip`` on, level by level,
-    read trilinearly; ``fine`` what the pointers of finer levels differ by, each array on the grid of its level, in few
-    bits and not of all channels, or, where it consists of pages, pointers; ``cascaded`` is read at what that makes. Its
-    first axis is the level of detail, one entry a level up to ``structure.skip``, if it has one dimension more than
-    ``coarse`` has channels.
+    Our arrays.
+
+    - ``coarse``: pointers of all texels of the levels from ``structure.skip`` on, level by level, read trilinearly.
+    - ``fine``: differences of the pointers of finer levels, each array on the grid of its level, in few bits and not of
+      all channels; or pointers, where arrays consist of pages.
+    - ``cascaded``: the colours, read at the sum. If it has one dimension more than ``coarse`` has channels, its first
+      axis is the level of detail, one entry a level up to ``structure.skip``.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -166,13 +172,13 @@ class LayeredNet(nn.Module):
         return self.along
 
     def changed(self, change) -> LayeredNet:
-        """A copy with ``change(array, bits)`` in place of each array."""
+        """Return a copy with ``change(array, bits)`` in place of each array."""
         structure = self.structure
         fine = [change(a, x.bits) for a, x in zip(self.fine, structure.layers, strict=True)]
         return LayeredNet(fine, change(self.coarse, structure.bits), change(self.cascaded, 8), structure, self.along)
 
     def filtered(self, u, v, level, active=True) -> list:
-        """The channels at (u, v) and a level of detail within those that there are."""
+        """Return the channels at (u, v) and a level of detail from 0 to the last level."""
         structure, Float = self.structure, type(u)
         UInt32 = dr.uint32_array_t(Float)
         above = dr.maximum(level - structure.skip, 0)
@@ -188,9 +194,8 @@ class LayeredNet(nn.Module):
         return self._answer(pointer, level, active)
 
     def stored(self, u, v, active=True) -> list:
-        """The same at level 0."""
+        """Return the channels at level 0: from the finest layer that holds pointers and the finer ones alone."""
         layers = [*zip(self.structure.layers, self.fine, strict=True)]
-        # What is finer than the finest array that holds pointers, and this one
         last = next((i for i, (x, _) in enumerate(layers) if self.structure.is_pointer(x)), None)
         if last is None:
             pointer = self._coarse(u, v, None, active)
@@ -203,23 +208,24 @@ class LayeredNet(nn.Module):
         return self._answer(pointer, type(u)(0), active)
 
     def _answer(self, pointer: list, level, active) -> list:
+        """Return the cascaded array at a pointer, with the level as its first coordinate if it has such an axis."""
         if self.cascaded.dims > len(pointer):
             pointer = [lookup.clamp(level * (1 / max(1, self.structure.skip)), 0.0, 1.0), *pointer]
         return self.cascaded(pointer, active)
 
     def _add(self, pointer: list, layer: FineLayer, array: DifferentiableArray, u, v, share, active) -> None:
-        """Add what a layer says to a pointer, times ``share`` (``None``: 1); pointers take its place."""
-        found = array(self._place(array, u, v), active)
+        """Add a layer to ``pointer``, or replace it by a layer that holds pointers, times ``share`` (``None``: 1)."""
+        values = array(self._place(array, u, v), active)
         if self.structure.is_pointer(layer):
-            for k, value in enumerate(found):
+            for k, value in enumerate(values):
                 pointer[k] = value if share is None else dr.fma(share, value - pointer[k], pointer[k])
             return
-        for k, value in enumerate(found):
+        for k, value in enumerate(values):
             value = (value - layer.zero) * layer.scale[k]
             pointer[k] = pointer[k] + value if share is None else dr.fma(share, value, pointer[k])
 
     def _place(self, array: DifferentiableArray, u, v) -> list:
-        """Where a fine array is read for (u, v): its entries sit at texel centres, and pages are where they are."""
+        """Return the coordinates (v, u) of a read of a fine array, whose entries lie at texel centres."""
         if isinstance(array, PagedArray):
             return [v, u]
         place = []
@@ -228,7 +234,7 @@ class LayeredNet(nn.Module):
         return place
 
     def _coarse(self, u, v, level, active) -> list:
-        """The pointer that ``coarse`` has at (u, v) of a level, a whole number for each place; ``None``: the finest."""
+        """Return the pointer of ``coarse`` at (u, v) in a whole level for each place (``None``: its finest level)."""
         structure, UInt32 = self.structure, dr.uint32_array_t(type(u))
         sizes = structure.sizes[structure.skip :]
         if level is None or len(sizes) == 1:
@@ -242,20 +248,11 @@ class LayeredNet(nn.Module):
         total = None
         for row, a in around(v, rows, self.along[0]):
             for column, b in around(u, columns, self.along[1]):
-                found, weight = self.coarse.entry(offset + row * columns + column, active), a * b
-                total = (
-                    [weight * f for f in found]
-                    if total is None
-                    else [dr.fma(weight, f, t) for f, t in zip(found, total, strict=True)]
-                )
+                entry, weight = self.coarse.entry(offset + row * columns + column, active), a * b
+                total = weighted_sum(weight, entry, total)
         return total
 
 
 def coarse_texels(structure: LayeredStructure) -> int:
-    """Texels of all levels from ``structure.skip`` on."""
+    """Return the number of texels of all levels from ``structure.skip`` on."""
     return sum(math.prod(size) for size in structure.sizes[structure.skip :])
-
-
-def types_of(net) -> object:
-    """The module of the Dr.Jit types that a net is read with."""
-    return module_of(net.cascaded.data)

@@ -1,16 +1,14 @@
 """
-Training of task 4: its samples, its targets and its steps (what they are made of: :mod:`.presets`).
+Training of task 4: samples, targets and the stored result.
 
-The truth is a mip pyramid that is read trilinearly (:mod:`mi_diffind.maps.pyramid`). Our recipe draws a texel of a
-level for each sample, stratified; half of the steps read it at its centre, where the truth is the texel itself, half at
-a place and a level of detail that are jittered. The supplement's draws a place for each texel of the source and a
-footprint, all jittered.
+The reference is a mip pyramid, read trilinearly (:mod:`mi_diffind.maps.pyramid`). Our recipe draws a texel of a level
+for each sample, stratified; half of the steps read the texel's centre, half a jittered place and level of detail. The
+supplement's recipe draws a jittered place in each texel of the source and a footprint.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import drjit as dr
 import numpy as np
@@ -18,6 +16,7 @@ import numpy as np
 from ... import lookup
 from ...fitting import FitResult, Problem
 from ...indirection import unfolded
+from ...maps.compressed import decibel
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
@@ -30,36 +29,31 @@ from .nets import PaperNet
 from .presets import TextureRecipe
 from .sampling import footprints, level_of
 
-#: dB that pages have to gain, before training, over one grid of as many bytes. (0.7 on bricks, where they lose 0.4.)
+#: Least gain of pages, in dB before training, over one grid of equal bytes. (0.7 on bricks, where pages lose 0.4.)
 GAIN_DB = 1.0
 
 
 def layout_of(source: Source, recipe: TextureRecipe) -> Layout:
-    """What of ``source`` is stored by a recipe."""
+    """Return the layout of ``source`` by a recipe."""
     return Layout.of(source, recipe.once, None if recipe.normals else False, filtered=True)
 
 
 def shares(levels: int) -> np.ndarray:
-    """Shares of the samples on each level: one half, one quarter, …; of the coarsest together at least a fiftieth."""
-    found = 0.5 ** np.arange(1, levels + 1)
-    return np.maximum(found, 0.02 / levels) / np.maximum(found, 0.02 / levels).sum()
+    """Return the share of samples on each level: one half, one quarter, …, but at least 0.02 / ``levels``."""
+    halves = np.maximum(0.5 ** np.arange(1, levels + 1), 0.02 / levels)
+    return halves / halves.sum()
 
 
 class TextureProblem(Problem):
-    """
-    The training problem of :mod:`mi_diffind.fitting`. ``net`` reads the stored channels (:mod:`.nets`), ``pyramid`` is
-    the truth.
-    """
+    """Training problem of a texture: ``net`` (:mod:`.nets`) against the reference ``pyramid``."""
 
     tolerance = 0.02
 
     def __init__(self, net, pyramid: Pyramid, recipe: TextureRecipe, digest: str = ""):
         self.net, self.pyramid, self.recipe, self.types = net, pyramid, recipe, pyramid.types
         layout = pyramid.layout
-        self.groups = {}
-        for i, name in enumerate(layout.groups):
-            self.groups.setdefault(name, []).append(i)
-        self.weights = {name: len(found) / layout.stored for name, found in self.groups.items()}
+        self.groups = layout.channels_by_map()
+        self.weights = {name: len(channels) / layout.stored for name, channels in self.groups.items()}
         self.sizes = [level.shape[:2] for level in pyramid.values]
         self.starts = np.cumsum([0] + [rows * columns for rows, columns in self.sizes])
         structure = dataclasses.asdict(net.structure)
@@ -68,38 +62,35 @@ class TextureProblem(Problem):
             "structure": structure, "border": list(net.border),
         }  # fmt: skip
         self.jittered = False
-        self._stretches = {}  # size of a batch → of each sample: level, first texel and number of texels, …
+        self._stretches = {}  # size of a batch → level, first texel, number of texels, … of each sample
 
     def begin(self, step: int, share: float) -> str:
-        """Called before each step: are its samples jittered? Says so."""
+        """Start a step: decide whether its samples are jittered. Returns a text that names the decision."""
         jitter = self.recipe.jitter
         self.jittered = int((step + 1) * jitter) > int(step * jitter)
         return f"jittered: {self.jittered}"
 
     def _stretch(self, size: int) -> tuple:
         """
-        For each of ``size`` samples its level, the first of the texels of that level that it may be in, how many these
-        are, the columns and rows of the level and where it starts.
+        Return the stratum of each of ``size`` samples, as arrays of whole numbers.
+
+        Level of detail; first texel, and number of texels, that the sample may be in; columns and rows of the level;
+        index of the level's first texel among those of all levels.
         """
         if size not in self._stretches:
             share = shares(len(self.sizes)) if self.recipe.samples == "levels" else np.array([1.0])
             counts = np.floor(share * size).astype(np.int64)
             counts[0] += size - counts.sum()
-            found = [[] for _ in range(6)]
+            parts = []
             for level, count in enumerate(counts):
                 rows, columns = self.sizes[level]
                 edges = np.arange(count + 1, dtype=np.uint64) * np.uint64(rows * columns) // np.uint64(max(1, count))
-                ones = np.ones(count, np.uint32)
-                for part, values in zip(
-                    found,
-                    (
-                        level * ones, edges[:-1], np.maximum(np.diff(edges), 1), columns * ones, rows * ones,
-                        int(self.starts[level]) * ones,
-                    ),
-                    strict=True,
-                ):  # fmt: skip
-                    part.append(values.astype(np.uint32))
-            self._stretches = {size: tuple(self.types.UInt32(np.concatenate(part)) for part in found)}
+                ones = np.ones(count, np.int64)
+                widths = np.maximum(np.diff(edges), 1)
+                start = int(self.starts[level])
+                parts.append((level * ones, edges[:-1], widths, columns * ones, rows * ones, start * ones))
+            merged = (np.concatenate(part).astype(np.uint32) for part in zip(*parts, strict=True))
+            self._stretches = {size: tuple(map(self.types.UInt32, merged))}
             dr.eval(self._stretches)
         return self._stretches[size]
 
@@ -113,10 +104,9 @@ class TextureProblem(Problem):
         if self.recipe.samples != "levels":
             x, y = x + rng.random(Float, size) - 0.5, y + rng.random(Float, size) - 0.5
             layout = self.pyramid.layout
-            # Uniform numbers are in [0, 1), the powers want (0, 1]
             base, samples = max(layout.height, layout.width), self.recipe.samples
-            footprint = footprints(1 - rng.random(Float, size), samples, base)
-            level = level_of(footprint, self.recipe.axis, len(self.sizes))
+            footprint = footprints(1 - rng.random(Float, size), samples, base)  # uniform in (0, 1]
+            level = level_of(footprint, len(self.sizes))
             u, v = x / layout.width, y / layout.height
             return [u, v, level, footprint], self._grouped(self.pyramid.filtered(u, v, level))
         level = Float(level)
@@ -135,19 +125,19 @@ class TextureProblem(Problem):
         return self.read(self.seen(net), inputs)
 
     def seen(self, net):
-        """The folded arrays as training sees them."""
+        """Return the folded arrays as training reads them, rounded if the recipe says so."""
         return rounded(net) if self.recipe.rounded else net
 
     def read(self, net, inputs) -> dict[str, list]:
-        """What arrays that are as training sees them have for the inputs of a batch."""
+        """Return the outputs of arrays (:meth:`seen`) for the inputs of a batch, by map."""
         u, v, level, footprint = inputs
         if isinstance(net, PaperNet) and footprint is not None:
             return self._grouped(net.at_footprint(u, v, footprint))
         return self._grouped(net.filtered(u, v, level))
 
     def measure(self, net) -> dict[str, float]:
-        """PSNR of the stored channels at the centres of at most 2¹⁶ texels of each level, entries rounded."""
-        types, found = self.types, []
+        """Return the PSNR of the stored channels at the centres of at most 2¹⁶ texels a level, entries rounded."""
+        types, errors_by_level = self.types, []
         net = rounded(unfolded(net))
         with dr.suspend_grad():
             for level, (rows, columns) in enumerate(self.sizes):
@@ -155,24 +145,24 @@ class TextureProblem(Problem):
                 count = min(texels, 2**16)
                 index = np.random.default_rng(level).choice(texels, count, replace=False) if count < texels else None
                 index = types.UInt32(np.arange(texels, dtype=np.uint32) if index is None else index.astype(np.uint32))
-                # Opaque, so that all levels are read by one kernel
+                # Opaque, so that one kernel reads all levels
                 start, rows, columns = (dr.opaque(types.UInt32, int(n)) for n in (self.starts[level], rows, columns))
                 u = (types.Float(index % columns) + 0.5) / types.Float(columns)
                 v = (types.Float(index // columns) + 0.5) / types.Float(rows)
-                got = net.filtered(u, v, dr.opaque(types.Float, level, count))
+                actual = net.filtered(u, v, dr.opaque(types.Float, level, count))
                 expected = self.pyramid.texels(index + start)
-                errors = [dr.mean(dr.square(a - b)) for a, b in zip(got, expected, strict=True)]
-                found.append(sum(float(e[0]) for e in errors) / len(errors))
-        decibels = [-10 * math.log10(max(e, 1e-12)) for e in found]
+                errors = [dr.mean(dr.square(a - b)) for a, b in zip(actual, expected, strict=True)]
+                errors_by_level.append(sum(float(e[0]) for e in errors) / len(errors))
+        decibels = list(map(decibel, errors_by_level))
         return {"psnr_db": decibels[0], "psnr_worst_db": min(decibels)}
 
 
 def problem_of(
     source: Source, size: TextureBudget | PaperBudget, recipe: TextureRecipe, pyramid: Pyramid
 ) -> TextureProblem:
-    """The problem of training ``source`` at a size by a recipe, its arrays at their initial values."""
+    """Return the problem of training ``source`` at a size by a recipe, with initial arrays."""
     if isinstance(size, PaperBudget):
-        net = arrays.from_ramps(pyramid.layout, size, pyramid.border, pyramid.levels, recipe.axis)
+        net = arrays.from_ramps(pyramid.layout, size, pyramid.border, pyramid.levels)
     else:
         net = arrays.from_components(pyramid.values, size, pyramid.border)
     net = net.changed(lambda array, bits: array.alloc(pyramid.types.TensorXf))
@@ -187,10 +177,11 @@ def fit_texture(
     pyramid: Pyramid,
 ) -> tuple[Table, FitResult]:
     """
-    Train the arrays of ``source`` and return them as they are stored, with their errors
-    (:meth:`.CompressedTexture.measure`), and the run's record. ``size`` may be ``None`` for a texture of one colour,
-    which needs no arrays. ``request`` says where to train, for how long and with which checkpoint; its settings are
-    those of the ``recipe``.
+    Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
+
+    ``size`` is ``None`` for a texture of one colour, which needs no arrays. ``request`` holds the Dr.Jit types, the
+    time and the checkpoint; its settings are replaced by those of the ``recipe``. Errors are those of
+    :meth:`.CompressedTexture.measure`.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
     if size is None:
@@ -205,16 +196,16 @@ def fit_texture(
             settings["steps"] = result.steps
         table = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net)), settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
-    found = CompressedTexture.of(table, request.types.TensorXf).measure(source)
-    table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
+    errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)
+    table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
     return table, result
 
 
 def stored_form(net):
-    """The arrays as they are stored, each entry rounded to its bits."""
+    """Return the arrays as they are stored, each entry rounded to its bits."""
     return net.changed(lambda array, bits: array.quantised(bits))
 
 
 def rounded(net):
-    """A copy of ``net`` as training sees it that takes rounding into account (:meth:`.DifferentiableArray.rounded`)."""
+    """Return a copy of ``net`` whose reads round each entry (:meth:`.DifferentiableArray.rounded`)."""
     return net.changed(lambda array, bits: array.rounded(bits))

@@ -8,8 +8,8 @@ import pytest
 
 from mi_diffind.errors import UsageError
 from mi_diffind.tasks.radiance import decode
-from mi_diffind.tasks.radiance.field import DenseField, GridField, VolumeField
 from mi_diffind.tasks.radiance.nodes import Nodes, cells_of
+from mi_diffind.tasks.radiance.volume_field import DenseVolumeField, NodeField, VolumeField
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def softplus(raw):
 
 def test_a_grid_comes_back(t, rng):
     raw, colour = numbers(rng)
-    field = DenseField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    field = DenseVolumeField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
     found = decode.grid(field)
     assert found["density"].shape == SHAPE and found["colour"].shape == (*SHAPE, 12)
     assert found["lower"] == pytest.approx(LOWER) and found["voxel"] == pytest.approx(VOXEL)
@@ -54,15 +54,15 @@ def test_what_was_decoded_is_the_same_field(t, rng):
     smooth = np.stack(np.meshgrid(*(np.linspace(0, 2, n) for n in SHAPE), indexing="ij"))
     raw = 2 * np.sin(smooth.sum(axis=0))
     colour = 0.3 * np.sin(np.multiply.outer(smooth[0] + 2 * smooth[1], np.arange(12)) + np.arange(12))
-    field = DenseField(t, raw, colour, LOWER, VOXEL)
+    field = DenseVolumeField(t, raw, colour, LOWER, VOXEL)
     places = rng.uniform(np.array(LOWER) + 0.01, np.array(field.upper) - 0.01, (500, 3))
     ways = rng.normal(size=(500, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
 
     def seen(f):
         p, d = (t.Array3f(*(t.Float(np.float32(x)) for x in v.T)) for v in (places, ways))
-        sigma, latent = f.look(p, t.Bool(True))
-        return sigma.numpy(), np.array([c.numpy() for c in f.colour(latent, p, d, t.Bool(True))])
+        sigma, point_data = f.density_at(p, t.Bool(True))
+        return sigma.numpy(), np.array([c.numpy() for c in f.radiance_at(point_data, p, d, t.Bool(True))])
 
     sigma, radiance = seen(field)
     again = decode.grid(field)
@@ -81,7 +81,7 @@ def test_nodes_at_the_rim_of_what_is_stored_count(t, rng):
     nodes = Nodes(t, LOWER, VOXEL, SHAPE, stored)
     raw, colour = numbers(rng, nodes.entries)
     raw = np.abs(raw)
-    field = GridField(nodes, t.TensorXf(raw), t.TensorXf(colour))
+    field = NodeField(nodes, t.TensorXf(raw), t.TensorXf(colour))
     found = decode.grid(field)
     assert cells_of(stored).sum() == 4 and np.array_equal(found["density"] > 0, stored)
     assert found["density"][stored] == pytest.approx(softplus(raw[1:]) / VOXEL, rel=0.02)
@@ -100,7 +100,7 @@ def test_mean_colour():
 
 def test_an_archive_holds_the_grid(t, rng, tmp_path):
     raw, colour = numbers(rng)
-    field = DenseField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    field = DenseVolumeField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
     ((path, line),) = decode.decode(field, tmp_path / "grid.npz")
     assert path == tmp_path / "grid.npz" and line.startswith("6 x 5 x 4 nodes (x, y, z), 6")
     with np.load(path) as content:
@@ -132,7 +132,7 @@ class Written:
 
 def test_vdb_where_openvdb_is_there(t, rng, tmp_path, monkeypatch):
     raw, colour = numbers(rng)
-    field = DenseField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
+    field = DenseVolumeField(t, raw.reshape(SHAPE), colour.reshape(*SHAPE, 12), LOWER, VOXEL)
     for name in decode.MODULES:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(UsageError, match=r"a VDB file needs the Python module openvdb, which is not installed"):
@@ -162,6 +162,6 @@ def test_what_is_refused(t, tmp_path):
 
 
 def test_an_empty_field_is_empty(t):
-    field = DenseField(t, np.full(SHAPE, -20.0), np.zeros((*SHAPE, 12)), LOWER, VOXEL)
+    field = DenseVolumeField(t, np.full(SHAPE, -20.0), np.zeros((*SHAPE, 12)), LOWER, VOXEL)
     found = decode.grid(field)
     assert not found["density"].any() and np.isfinite(found["colour"]).all()

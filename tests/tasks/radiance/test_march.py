@@ -6,7 +6,6 @@ import pytest
 from radiance_fields import Bumps, Fog
 
 from mi_diffind import compat
-from mi_diffind.tasks.radiance import counting
 from mi_diffind.tasks.radiance import march as marching
 
 
@@ -95,7 +94,7 @@ def test_nothing_is_read_that_does_not_count(mi_rgb):
     across = [[-3, 0.01 * i, 0.02] for i in range(20)], [[1, 0, 0]] * 20
 
     def counted(o, d, **more):
-        return counting.count(Bumps(types, **more), *rays(mi, o, d), 0, np.inf)
+        return marching.count(Bumps(types, **more), *rays(mi, o, d), 0, np.inf)
 
     whole = counted(*across, empty=True, blind=True, height=0.1)
     assert (whole.rays, whole.crossing, whole.opaque, whole.hidden, whole.skipped) == (20, 20, 0, 0, 0)

@@ -15,12 +15,12 @@ from mi_diffind.cli import main
 from mi_diffind.fitting import FitSettings
 from mi_diffind.fitting import fit as train
 from mi_diffind.runtime import array_module
-from mi_diffind.tables import TableError, load_table, save_table
+from mi_diffind.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.task import fit, tasks
-from mi_diffind.tasks.radiance import compression, files, hull, nodes, palette
+from mi_diffind.tasks.radiance import compression, files, nodes, visual_hull
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
-from mi_diffind.tasks.radiance.training import Images, evaluate, scores, shown
+from mi_diffind.tasks.radiance.training import FieldSession, ViewImages, displayed, scores
 from mi_diffind.tasks.radiance.views import load_views
 
 SIZE, FOV = 40, 0.9
@@ -105,22 +105,22 @@ def test_fit_meets_views_it_has_not_seen(folder):
 
 def test_the_stored_field_is_what_was_measured(folder, ad):
     model = tasks()["field"].open(ad.TensorXf, folder / "ball.npz")
-    held = Images(ad, load_views(folder, "test"))
+    held_out = ViewImages(ad, load_views(folder, "test"))
     measured = load_table(folder / "ball.npz").measured
-    assert evaluate(model.field, held)["psnr_white_db"] == pytest.approx(measured["psnr_white_db"], abs=1e-3)
+    assert held_out.evaluate(model.field)["psnr_white_db"] == pytest.approx(measured["psnr_white_db"], abs=1e-3)
     assert model.measure()["psnr_white_db"] == pytest.approx(measured["psnr_white_db"], abs=1e-3)
 
 
 def test_packed_and_trainable_fields_agree(folder, ad, rng):
     task = tasks()["field"]
     packed, floats = (task.open(ad.TensorXf, folder / "ball.npz", storage=s).field for s in ("", "float32"))
-    assert not packed.arrays and set(floats.arrays) == {"share", "curve", "palette"}
+    assert not packed.arrays and set(floats.arrays) == {"density", "colour"}
     p = ad.Array3f(rng.uniform(packed.lower, packed.upper, (32768, 3)).T.astype(np.float32))
     d = ad.Array3f(*np.float32([0.6, 0.0, -0.8]).tolist())
     read = []
     for field in (packed, floats):
-        density, latent = field.look(p)
-        colour = field.colour(latent, p, d, density > 0)
+        density, point_data = field.density_at(p)
+        colour = field.radiance_at(point_data, p, d, density > 0)
         read.append(np.array([density, *(dr.select(density > 0, c, 0) for c in colour)]))
     assert (read[0][0] > 0).sum() > 200
     np.testing.assert_allclose(read[0], read[1], rtol=2e-3, atol=2e-3 * read[1][0].max() * 1e-2)
@@ -143,7 +143,8 @@ def test_paper_preset(folder, tmp_path, ad):
     arrays = sum(a.nbytes for n, a in table.arrays.items() if n != "cells")
     dense = 52 * np.prod(table.settings["shape"])
     assert 0.7 * dense / 20 < arrays <= dense / 20
-    again = evaluate(tasks()["field"].open(ad.TensorXf, out).field, Images(ad, load_views(folder, "test")))
+    field = tasks()["field"].open(ad.TensorXf, out).field
+    again = FieldSession.load(ad, folder).held_out_images.evaluate(field)
     assert again["psnr_white_db"] == pytest.approx(table.measured["psnr_white_db"], abs=0.05)
 
 
@@ -217,8 +218,11 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--preset", "grid", "--bytes", "1M"], "--bytes is of the presets sparse and paper, found grid"),
-        (["--preset", "paper", "--psnr", "30"], "--psnr is of the preset sparse, found paper"),
+        (
+            ["--preset", "grid", "--bytes", "1M"],
+            "--bytes is an option of the presets sparse and paper, found the preset grid",
+        ),
+        (["--preset", "paper", "--psnr", "30"], "--psnr is an option of the preset sparse, found the preset paper"),
         (["--bytes", "100"], "--bytes: 100 bytes are fewer than the smallest field needs"),
         (["--compression", "1e5"], "--compression: "),
         (["--bytes", "many"], "many"),
@@ -244,7 +248,7 @@ def test_a_grid_of_other_views_is_refused(folder, tmp_path, capsys):
     assert 'has the layout "sparse", a grid is needed' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("fault", ["layout", "shape", "cells", "codes", "bits", "nan", "truncated"])
+@pytest.mark.parametrize("fault", ["layout", "shape", "cells", "index", "bits", "nan", "truncated"])
 def test_damaged_files_are_refused(folder, tmp_path, fault):
     table, path = load_table(folder / "ball.npz"), tmp_path / "damaged.npz"
     arrays = table.arrays
@@ -253,11 +257,11 @@ def test_damaged_files_are_refused(folder, tmp_path, fault):
     elif fault == "shape":
         table.settings["shape"] = [1, 2, 3]
     elif fault == "cells":
-        arrays["cells"] = files.raw(np.full_like(arrays["cells"].entries, 255))
-    elif fault == "codes":
-        arrays["codes"] = files.raw(np.full_like(arrays["codes"].entries, 255))
+        arrays["cells"] = files.byte_array(np.full_like(arrays["cells"].entries, 255))
+    elif fault == "index":
+        arrays["index"] = files.byte_array(np.full_like(arrays["index"].entries, 255))
     elif fault == "bits":
-        table.settings["code_bits"] = 11
+        table.settings["index_bits"] = 11
     elif fault == "nan":
         table.settings["spacing"] = -1.0
     save_table(path, table)
@@ -267,17 +271,26 @@ def test_damaged_files_are_refused(folder, tmp_path, fault):
         files.load(path)
 
 
+def test_files_with_a_density_curve_are_refused(folder, tmp_path):
+    """Files of the version with a learned density curve; the message says how to make them again."""
+    table, path = load_table(folder / "ball.npz"), tmp_path / "old.npz"
+    table.arrays["curve"] = StoredArray(np.linspace(-7, 12, 64, dtype=np.float32)[:, None])
+    save_table(path, table)
+    with pytest.raises(TableError, match=r'has a density curve, .* "mi-diffind fit field FOLDER -o old\.npz"$'):
+        files.load(path)
+
+
 # -- the parts --------------------------------------------------------------------------------------------------------
 
 
 def test_hull_and_box(folder):
     views = load_views(folder, "train")
-    lower, upper = hull.box_of(views)
+    lower, upper = visual_hull.box_of(views)
     assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])
     assert np.all(upper - lower < 1.8)
     spacing = 0.05
     shape = np.ceil((upper - lower) / spacing).astype(int) + 1
-    inside = hull.hull(views, lower, spacing, shape)
+    inside = visual_hull.hull(views, lower, spacing, shape)
     at = np.stack(np.meshgrid(*[a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)], indexing="ij"))
     distance = np.linalg.norm(at - np.array([0.2, 0, 0])[:, None, None, None], axis=0)
     assert inside[distance < 0.5].all() and inside[distance > 0.75].mean() < 0.01
@@ -305,7 +318,7 @@ def test_clusters(rng):
     centres = rng.normal(size=(8, 12))
     which = rng.integers(0, 8, 4000)
     points = centres[which] + 0.01 * rng.normal(size=(4000, 12))
-    entries, codes = palette.clusters(points, np.ones(4000), 64, 0)
+    entries, codes = compression.clusters(points, 64, 0)
     assert np.abs(entries[codes] - points).max() < 0.2
 
 
@@ -318,15 +331,15 @@ def test_scores_of_a_known_error(folder):
     for image, where in zip(pictures, covered, strict=True):
         image[where] = [0, 0, 0, 1]
     found = scores(pictures, views)
-    black = [np.square(shown(v))[c].mean() for v, c in zip(views.images, covered, strict=True)]
+    black = [np.square(displayed(v))[c].mean() for v, c in zip(views.images, covered, strict=True)]
     assert found["psnr_foreground_db"] == pytest.approx(np.mean(-10 * np.log10(black)), abs=1e-3)
     assert found["psnr_white_db"] == pytest.approx(np.mean(-10 * np.log10(black * share)), abs=1e-3)
 
 
 def test_divided_grids_are_what_they_were(folder, ad, rng):
     grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
-    images = Images(ad, load_views(folder, "train"))
-    finer = grids.divided(grid, grids.visible(grid, images), 2, 1)
+    images = ViewImages(ad, load_views(folder, "train"))
+    finer = grids.divided(grid, grids.visible(grid, images), 2, wide=1)
     cells = nodes.cells_of(finer.nodes.stored)
     places = np.argwhere(cells)[rng.choice(cells.sum(), 500)] + 0.5
     p = ad.Array3f((np.array(finer.nodes.lower) + finer.nodes.spacing * places).T.astype(np.float32))
@@ -363,9 +376,9 @@ def test_views_without_alpha(tmp_path, capsys):
 
 def test_sizes(folder, ad):
     grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    session = FieldSession.load(ad, folder)
     for bits in (8, 10):
-        coding = compression.coded(grid, Images(ad, load_views(folder, "train")), bits, 0)
-        problem = compression.PaletteProblem(coding, load_views(folder, "train"))
+        problem = compression.PaletteProblem(compression.palette_coding(grid, bits, 0), session)
         table = files.palette_table(grid.nodes, problem.stored(), bits)
         assert files.field_of(table, ad).nbytes == pytest.approx(compression.packed_bytes(grid, bits), rel=0.01)
 
@@ -377,7 +390,7 @@ def test_ten_thousand_steps_take_no_more_memory(folder, ad):
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
 
     grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
-    problem = grids.GridProblem(grid, load_views(folder, "train"))
+    problem = grids.GridProblem(grid, FieldSession.load(ad, folder))
     settings = FitSettings(steps=1000, batch=256, lr=1e-3, measure_every=1000, check_every=100)
     train(problem, settings, progress=False)
     before = resident()
@@ -396,5 +409,5 @@ def test_a_view_that_sees_nothing(folder):
         poses=np.concatenate([views.poses, away[None]]), focal=np.concatenate([views.focal, views.focal[:1]]),
         centre=np.concatenate([views.centre, views.centre[:1]]), names=(*views.names, "away.png"),
     )  # fmt: skip
-    made = [hull.hull(v, (-0.5, -0.7, -0.7), 0.07, (18, 20, 20)) for v in (views, more)]
+    made = [visual_hull.hull(v, (-0.5, -0.7, -0.7), 0.07, (18, 20, 20)) for v in (views, more)]
     assert made[0].sum() > 500 and (made[0] & ~made[1]).sum() < 0.02 * made[0].sum()

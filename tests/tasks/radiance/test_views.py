@@ -126,15 +126,6 @@ def test_rays_go_through_the_middles_of_pixels(blender):
     assert np.allclose(2.5 - 7 * local[..., 1] / -local[..., 2], y + 0.5)  # y is up, rows go down
 
 
-def test_pixels_can_be_averaged(blender):
-    whole, half = load_views(blender), load_views(blender, reduce=2)
-    assert half.images.shape == (4, 3, 4, 4)
-    assert half.images[1, 2, 3] == pytest.approx(whole.images[1, 4:6, 6:8].mean(axis=(0, 1)), abs=1e-6)
-    assert np.allclose(half.rays(0, 1, 1)[1], whole.rays(0, 2.5, 2.5)[1])
-    with pytest.raises(ViewsError, match=r"has 8 × 6 pixels, which cannot be taken 4 by 4$"):
-        load_views(blender, reduce=4)
-
-
 def test_without_test_views_every_eighth_is_one(blender):
     (blender / "transforms_test.json").unlink()
     assert load_views(blender).names == tuple(f"train/r_{i}.png" for i in (1, 2, 3))
@@ -232,7 +223,7 @@ def mirror():
         (shear(), "that shears"),
         (mirror(), "that mirrors"),
         (np.eye(3).tolist(), r"of the shape \(3, 3\), expected \(4, 4\)"),
-        ([[1, 2], [3]], "that is no matrix of numbers"),
+        ([[1, 2], [3]], "that is not a matrix of numbers"),
         (np.ones((4, 4)).tolist(), "whose last row is not 0, 0, 0, 1"),
     ],
 )
@@ -259,7 +250,7 @@ def test_images_that_are_refused(blender):
     with pytest.raises(ViewsError, match=r"r_1\.png: has another size than train/r_0\.png \(8 × 6 and 6 × 6 pixels\)"):
         load_views(blender)
     Image.fromarray(np.zeros(SIZE, np.uint16)).save(path)
-    with pytest.raises(ViewsError, match=r"r_1\.png: has pixels of the kind I"):
+    with pytest.raises(ViewsError, match=r"r_1\.png: has pixels of the mode I"):
         load_views(blender)
     path.unlink()
     with pytest.raises(ViewsError, match=r"train/r_1: no such image, nor with \.png, .*, transforms_train\.json names"):

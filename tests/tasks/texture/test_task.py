@@ -1,5 +1,6 @@
 """``fit texture``: equations, sizes, arrays that are read at levels of detail, training, files."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -55,8 +56,6 @@ def material(height=32, width=24, seed=0):
 
 
 def quick(recipe=OURS, **settings):
-    import dataclasses
-
     given = {"steps": 4, "batch": 2048, "measure_every": 4, **settings}
     return dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **given))
 
@@ -95,57 +94,57 @@ def read(texture, u, v, level) -> np.ndarray:
 
 
 @pytest.mark.parametrize("base, n", [(1024, 10), (2048, 11), (4096, 12)])
-def test_powers_of_uniform_numbers(rng, base, n):
+def test_powers_of_uniform_numbers(ad, rng, base, n):
     """Equations 3 to 6: half of the samples below a texel's side, and the whole distribution."""
     t = sampling.threshold(base)
     assert t == 1 / base and sampling.exponent(t) == pytest.approx(n)
-    assert sampling.power_fraction(t, n) == pytest.approx(0.5)
-    x = np.sort(sampling.footprints(rng.random(200_000), "power", base))
+    assert sampling.share_below(t, "power", base) == pytest.approx(0.5)
+    u = rng.random(200_000)
+    x = np.sort(sampling.footprints(ad.Float(u), "power", base).numpy())
+    np.testing.assert_allclose(x, np.sort(u) ** n, rtol=2e-4, atol=1e-7)
     for fraction in (0.1, 0.25, 0.5, 0.9):
-        drawn = x[int(fraction * len(x))]
-        assert sampling.power_fraction(drawn, n) == pytest.approx(fraction, abs=0.01)
-    assert sampling.exponent(t, 0.25) == pytest.approx(n / 2) and x.max() < 1
+        assert sampling.share_below(x[int(fraction * len(x))], "power", base) == pytest.approx(fraction, abs=0.01)
+    assert x.max() < 1
 
 
-def test_exponential_samples(rng):
+def test_exponential_samples(ad, rng):
     """Equations 7 to 9."""
     t = 1 / 1024
     rate = sampling.exponential_rate(t)
-    assert rate == pytest.approx(1024 * math.log(2)) and sampling.exponential_fraction(t, rate) == pytest.approx(0.5)
-    x = sampling.footprints(1 - rng.random(200_000), "exponential", 1024)
+    assert rate == pytest.approx(1024 * math.log(2))
+    assert sampling.share_below(t, "exponential", 1024) == pytest.approx(0.5)
+    u = 1 - rng.random(200_000)
+    u[0] = 0
+    x = sampling.footprints(ad.Float(u), "exponential", 1024).numpy()
+    np.testing.assert_allclose(x[1:], np.minimum(-np.log(u[1:]) / rate, 1), rtol=2e-3, atol=1e-7)
     for below in (0.5 * t, t, 3 * t):
-        assert np.mean(x < below) == pytest.approx(sampling.exponential_fraction(below, rate), abs=0.01)
-    assert np.isfinite(x).all() and sampling.exponential(0.0, rate) <= 1
-
-
-def test_equations_of_drjit_are_those_of_numpy(ad, rng):
-    u = rng.random(100, dtype=np.float32)
-    for kind in sampling.FOOTPRINTS:
-        np.testing.assert_allclose(
-            sampling.footprints(ad.Float(u), kind, 512).numpy(), sampling.footprints(u, kind, 512), rtol=2e-4, atol=1e-7
-        )
-    for axis in sampling.AXES:
-        x = np.float32([1e-9, 0.001, 0.3, 1])
-        found = sampling.level_of(ad.Float(x), axis, 10).numpy()
-        np.testing.assert_allclose(found, sampling.level_of(x, axis, 10), atol=1e-4)
-        levels = np.float32([0, 0.5, 3, 9])
-        back = sampling.footprint_of(ad.Float(levels), axis, 10)
-        np.testing.assert_allclose(sampling.level_of(back, axis, 10).numpy(), levels, atol=1e-4)
-        assert back.numpy()[-1] == pytest.approx(1) and found[0] < 1e-6
+        share = sampling.share_below(below, "exponential", 1024)
+        assert share == pytest.approx(1 - math.exp(-rate * below)) == pytest.approx(np.mean(x < below), abs=0.01)
+    assert np.isfinite(x).all() and x.max() <= 1
     with pytest.raises(ValueError, match='footprint samples: found "uniform", allowed are'):
-        sampling.footprints(u, "uniform", 512)
-    with pytest.raises(ValueError, match="p: found 1, allowed are numbers between 0 and 1"):
-        sampling.exponent(0.1, 1)
+        sampling.footprints(ad.Float(u), "uniform", 512)
 
 
-def test_which_levels_the_footprints_are_on():
+def test_levels_of_footprints(ad):
+    """A side of 1 is the coarsest level; half the side is one level less; what is below a texel is level 0."""
+    x = ad.Float([1e-9, 2**-9, 2**-4, 0.5, 1])
+    np.testing.assert_allclose(sampling.level_of(x, 10).numpy(), [0, 0, 5, 8, 9], atol=1e-4)
+    levels = np.float32([0, 0.5, 3, 9])
+    back = sampling.footprint_of(ad.Float(levels), 10)
+    np.testing.assert_allclose(sampling.level_of(back, 10).numpy(), levels, atol=1e-4)
+    assert back.numpy()[-1] == pytest.approx(1) and sampling.footprint_of(0.0, 10) == pytest.approx(2**-9)
+
+
+def test_which_levels_the_footprints_are_on(rng):
     """The supplement rejects the exponential distribution since coarse levels get too few samples."""
-    power, exponential = (sampling.footprint_histogram(kind, 11) for kind in sampling.FOOTPRINTS)
+    power, exponential = (sampling.footprint_histogram(name, 11) for name in sampling.FOOTPRINTS)
     assert power.sum() == pytest.approx(1) and exponential.sum() == pytest.approx(1)
     # Level of u^10 is 10 + 10 log2 u: below ½ with probability 2^-0.95, each further level has 2^(0.1 · level) more
-    expected = np.diff([0, *2 ** ((np.arange(10) + 0.5 - 10) / 10), 1])
-    np.testing.assert_allclose(power, expected, atol=0.005)
+    np.testing.assert_allclose(power, np.diff([0, *2 ** ((np.arange(10) + 0.5 - 10) / 10), 1]), atol=1e-6)
     assert power[0] > 0.5 and power[5:].sum() > 0.2 and exponential[5:].sum() < 1e-3
+    drawn = np.log2(np.minimum(-np.log(1 - rng.random(200_000)) / sampling.exponential_rate(2**-10), 1)) + 10
+    counted = np.bincount(np.clip(np.floor(drawn + 0.5).astype(int), 0, 10), minlength=11) / 200_000
+    np.testing.assert_allclose(exponential, counted, atol=0.005)
 
 
 # -- sizes ------------------------------------------------------------------------------------------------------------
@@ -192,7 +191,7 @@ def test_structures():
     for wrong in ("", "0:1", "1:1:1,0:1:1", "0:5:1", "0:1:9", "a", "0:1:2,"):
         with pytest.raises(ValueError, match=r"structure|allowed are levels|have to grow"):
             parse_structure(wrong)
-    with pytest.raises(ValueError, match="do not lie below level 1"):
+    with pytest.raises(ValueError, match="allowed are different ones below 1"):
         TextureBudget(8, 8, 3, (FineArray(1, 1, 1),), 1, 3, 4, 2)
 
 
@@ -381,25 +380,21 @@ def test_training_improves_every_level():
 
 def test_better_than_the_paper():
     """At no more bytes and samples: level 0 by 5 dB, the worst by 10."""
-    source = from_arrays(material(64, 48))
+    source, steps = from_arrays(material(64, 48)), 60
     nbytes = source.nbytes / 4
     paper = paper_size(nbytes, source.nbytes, training.layout_of(source, PAPER).stored, 64, 48)
-    theirs = trained(source, paper, quick(PAPER, steps=120))[0]
-    ours = trained(source, choose(64, 48, training.layout_of(source, OURS).stored, nbytes), quick(steps=120))[0]
+    theirs = trained(source, paper, quick(PAPER, steps=steps))[0]
+    ours = trained(source, choose(64, 48, training.layout_of(source, OURS).stored, nbytes), quick(steps=steps))[0]
     assert theirs.nbytes == pytest.approx(nbytes, rel=0.1) and ours.nbytes <= nbytes
     assert ours.measured["psnr_db"] > theirs.measured["psnr_db"] + 5
     assert ours.measured["psnr_worst_db"] > theirs.measured["psnr_worst_db"] + 10
 
 
-@pytest.mark.parametrize("axis", ["side", "level"])
-def test_the_papers_arrays(axis, tmp_path, ad, rng):
-    import dataclasses
-
+@pytest.mark.parametrize("samples", sampling.FOOTPRINTS)
+def test_the_papers_arrays(samples, tmp_path, ad, rng):
     source = from_arrays(material(64, 48))
     size = paper_size(source.nbytes / 4, source.nbytes, 5, 64, 48)
-    samples = "exponential" if axis == "level" else "power"
-    recipe = dataclasses.replace(quick(PAPER, steps=3), axis=axis, samples=samples)
-    table, _ = trained(source, size, recipe)
+    table, _ = trained(source, size, dataclasses.replace(quick(PAPER, steps=3), samples=samples))
     assert table.arrays["primary0"].shape[-1] == 3 and table.arrays["primary1"].shape == (4 * size.lods, 1)
     assert table.arrays["cascaded"].shape == (size.lods, *[size.cascaded] * 3, 5) and table.nbytes == size.nbytes
     save_table(tmp_path / "t.npz", table)
@@ -536,12 +531,15 @@ def no_pointer(table):
     [
         (without_array, "holds the arrays cascaded, coarse, level0, expected cascaded, coarse, level0, level1"),
         (other_shape, r'array "coarse" has the shape \(\d+, 3\), expected \d+ x 3'),
-        (other_bits, 'array "level0" has 3 bits an entry, which its settings deny'),
+        (other_bits, 'array "level0" has 3 bits an entry, expected 2 by its settings'),
         (other_border, r'array "level0" has the borders \(\'repeat\', \'clamp\'\), expected'),
         (no_pointer, 'array "cascaded" has entries outside of'),
-        (lambda t: t.settings["arrays"].update(skip=99), "describe no texture .the level that is skipped to"),
+        (lambda t: t.settings["arrays"].update(skip=99), "describe no texture .the first level of the coarse array"),
         (lambda t: t.settings["arrays"].update(kind="x"), "describe no texture .arrays of the kind 'x'"),
-        (lambda t: t.settings["arrays"]["layers"][0].update(level=1), "describe no texture .the fine arrays"),
+        (
+            lambda t: t.settings["arrays"]["layers"][0].update(level=1),
+            "describe no texture .the levels or bits",
+        ),
         (lambda t: t.settings["arrays"]["layers"][0].update(scale=[-1]), "describe no texture .the scales"),
         (lambda t: t.settings.pop("arrays"), "describe no texture .'arrays'"),
         (lambda t: t.settings.update(layout=3), "describe no texture"),
@@ -591,10 +589,12 @@ def test_options_that_do_not_go_together(tmp_path):
     source = str(tmp_path / "no.png")
     for given, message in (
         ({}, "source: not given"),
-        ({"preset": "paper", "skip": 2}, "--skip is for our arrays"),
-        ({"preset": "paper", "structure": "0:1:1"}, "--structure is for our arrays"),
-        ({"axis": "area"}, "--axis is for the preset paper"),
-        ({"preset": "paper", "footprint_samples": "levels"}, "draws footprints, power or exponential"),
+        ({"preset": "paper", "skip": 2}, "--skip: not for the preset paper"),
+        ({"preset": "paper", "structure": "0:1:1"}, "--structure: not for the preset paper"),
+        (
+            {"preset": "paper", "footprint_samples": "levels"},
+            "--footprint-samples: found levels, allowed",
+        ),
     ):
         with pytest.raises(UsageError, match=re.escape(message)):
             fit("texture", **({"source": source} if given else {}), **given)
@@ -603,7 +603,7 @@ def test_options_that_do_not_go_together(tmp_path):
         ({"skip": 4}, "--skip: found 4, the texture has levels 0 to 3"),
         ({"structure": "0:1:2,2:1:4", "skip": 2}, "--skip: found 2, the structure has a fine array on level 2"),
         ({"structure": "5:1:2"}, "--skip: found 6, the texture has levels 0 to 3"),
-        ({"structure": "0:4:2"}, "--structure: fine arrays have at most as many channels"),
+        ({"structure": "0:4:2"}, "--structure: fine arrays: allowed are at most"),
     ):
         with pytest.raises(UsageError, match=re.escape(message)):
             fit("texture", source=source, variant="llvm_ad_rgb", progress=False, **given)

@@ -1,32 +1,34 @@
-"""Where something may be, before any training: the box of a capture, and the visual hull of its silhouettes."""
+"""Occupied space known before any training: the box of a capture and the visual hull of its silhouettes."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from .views import Views, ViewsError
+from .views import CapturedViews, ViewsError
 
-#: Nodes along the sides of the grid in which the box is looked for.
+#: Nodes along the longest side of the grid in which the box is searched.
 SEARCH = 64
 
-#: The share of the views that have to see a place, lest what lies out of sight counts as full.
+#: Share of the views that must have a node in sight, so that space out of sight does not count as occupied.
 SIGHTED = 0.34
 
-#: By how many voxels a box that silhouettes were found in is larger.
+#: Voxels by which the box is larger than the visual hull.
 MARGIN = 2
 
 
-def box_of(views: Views) -> tuple[np.ndarray, np.ndarray]:
+def box_of(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
     """
-    The box of what the views show: the capture's own (``aabb``), cut to the visual hull if there is alpha. Without an
-    ``aabb``, one looks around the point that the cameras look at, as far as the nearest of them. Raises
-    :class:`.ViewsError` if nothing is in sight.
+    Return the lower and upper corner of the box of the captured objects.
+
+    The box is the ``aabb`` of the capture, cut to the visual hull if the images have alpha. Without an ``aabb``, the
+    search covers a cube around the point that the cameras look at, up to the nearest camera. Raises
+    :class:`.ViewsError` if the visual hull is empty.
     """
     if views.box is not None:
         lower, upper = np.asarray(views.box, np.float64)
     else:
-        middle, reach = _looked_at(views)
+        middle, reach = _focus(views)
         lower, upper = middle - reach, middle + reach
     if not views.has_alpha:
         return lower, upper
@@ -35,15 +37,15 @@ def box_of(views: Views) -> tuple[np.ndarray, np.ndarray]:
         shape = np.ceil((upper - lower) / spacing).astype(int) + 1
         inside = hull(views, lower, spacing, shape)
         if not inside.any():
-            raise ViewsError(f"{views.path}: the views show nothing that all of them could see: the alphas do not meet")
-        found = np.argwhere(inside)
-        first, last = found.min(axis=0) - MARGIN, found.max(axis=0) + MARGIN
+            raise ViewsError(f"{views.path}: the views show nothing: no point has an alpha above 0 in all of them")
+        occupied = np.argwhere(inside)
+        first, last = occupied.min(axis=0) - MARGIN, occupied.max(axis=0) + MARGIN
         lower, upper = np.maximum(lower, lower + first * spacing), np.minimum(upper, lower + last * spacing)
     return lower, upper
 
 
-def _looked_at(views: Views) -> tuple[np.ndarray, float]:
-    """The point nearest to all axes of view, and the distance from there to the nearest camera."""
+def _focus(views: CapturedViews) -> tuple[np.ndarray, float]:
+    """Return the point nearest to the optical axes of all cameras and its distance to the nearest camera."""
     axes = -views.poses[:, :3, 2]
     # Σ (I − a aᵀ) (x − o) = 0; a little weight on the cameras' mean if all look the same way
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -56,10 +58,12 @@ def _looked_at(views: Views) -> tuple[np.ndarray, float]:
     return point, float(max(reach, 1e-3))
 
 
-def hull(views: Views, lower, spacing: float, shape) -> np.ndarray:
+def hull(views: CapturedViews, lower, spacing: float, shape) -> np.ndarray:
     """
-    The nodes, ``lower + spacing · (i, j, k)`` below ``shape``, that no view sees empty and :data:`SIGHTED` of them see:
-    which lie, with a voxel around them, on something with alpha or out of each image. bool of this shape.
+    Return the nodes ``lower + spacing · (i, j, k)`` of the visual hull: bool of this ``shape``.
+
+    A node belongs to it if a share :data:`SIGHTED` of the views have it in sight and none of these shows it empty: a
+    pixel within a voxel of its projection has an alpha above 0.
     """
     lower = np.asarray(lower, np.float64)
     axes = [a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)]
@@ -73,7 +77,7 @@ def hull(views: Views, lower, spacing: float, shape) -> np.ndarray:
         scale = views.focal[v] / np.where(front, ahead, 1)[:, None]
         x = views.centre[v, 0] + scale[:, 0] * local[:, 0] - 0.5
         y = views.centre[v, 1] - scale[:, 1] * local[:, 1] - 0.5
-        # As wide as a voxel seems; what is so near that it would cover the image is left to other views
+        # The filter is as wide as a voxel appears. Nodes so near that it would cover the image are left to other views
         near = 0.5 * np.median(ahead[front]) if front.any() else np.inf
         front &= ahead >= near
         reach = int(np.ceil(0.87 * spacing * views.focal[v].max() / near))

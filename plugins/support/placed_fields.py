@@ -1,8 +1,9 @@
-"""Radiance fields in a scene: where they are put, what rays see of them in the world, and as which light."""
+"""Radiance fields in a scene: their placement, their light in each variant, and the grid of their counterpart."""
 
 from __future__ import annotations
 
 from itertools import product
+from pathlib import Path
 from types import ModuleType
 
 import drjit as dr
@@ -10,20 +11,23 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import compat
-from mi_diffind.tasks.radiance import counting
+from mi_diffind.tables import TableError
 from mi_diffind.tasks.radiance import march as marching
+from mi_diffind.tasks.radiance.files import load
 
-from . import upsampling
+from . import properties, upsampling
 from .solids import Placement
 
-#: Luminance of linear sRGB, as Mitsuba has it.
+#: Luminance of linear sRGB, the same as in Mitsuba.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 class PlacedField:
     """
-    A radiance field (:class:`mi_diffind.tasks.radiance.field.VolumeField`) that ``to_world``, a similarity, puts into
-    the world. It looks the same from everywhere, whatever its size: densities are per length of its own frame.
+    Radiance field (:class:`mi_diffind.tasks.radiance.volume_field.VolumeField`) in a scene, placed by ``to_world``.
+
+    The transform is a similarity. Densities are per unit of length in the field's frame, so that a scaled field keeps
+    its appearance.
     """
 
     def __init__(self, field, to_world):
@@ -35,33 +39,35 @@ class PlacedField:
 
     def held(self) -> list:
         """
-        All arrays that rays read. An instance of a plugin that has them as an attribute of its own can be part of a
-        frozen function (``dr.freeze``), which does not look into other objects.
+        Return all arrays that rays read.
+
+        A plugin keeps them as an attribute of its instance, since a frozen function (``dr.freeze``) does not traverse
+        other objects.
         """
         return [self.axes, self.origin, self.size, *_arrays_of(self.field, set())]
 
     @property
     def exposed(self) -> dict:
-        """Those of the field's arrays that can be optimised: name → tensor."""
+        """Arrays of the field that can be optimised: name → tensor."""
         return {name: values for name, values in self.field.arrays.items() if dr.is_float_v(values)}
 
     def optimised(self) -> bool:
-        """Is a derivative with respect to the field's arrays asked for?"""
+        """Return whether a derivative with respect to the field's arrays is requested."""
         return any(compat.has_gradient(values) for values in self.exposed.values())
 
     def _local(self, ray, far, active) -> tuple:
-        """What the functions of :mod:`.march` take, after the field."""
+        """Return the arguments of the functions of :mod:`.march` after the field."""
         o = mi.Point3f(self.axes.to_local(mi.Vector3f(ray.o - self.origin)) / self.size)
         return o, self.axes.to_local(ray.d), mi.Float(0), far / self.size, active
 
     def enters(self, ray, far, active=True) -> tuple:
-        """The distance at which rays enter the field's box, and whether they do, before the distance ``far``."""
+        """Return the distance at which rays enter the field's box, and whether they do so before ``far``."""
         with dr.suspend_grad():
             _, near, _, crossing = marching.box(self.field, *self._local(ray, far, active))
             return near * self.size, crossing
 
     def overlaps(self, other: PlacedField) -> bool:
-        """Do the boxes of two fields have a volume in common? By the theorem of separating axes."""
+        """Return whether the boxes of two fields have a volume in common, by the separating axis theorem."""
         corners = [np.array(list(product(*zip(f.field.lower, f.field.upper, strict=True)))) for f in (self, other)]
         points = [f.placement.world(c) for f, c in zip((self, other), corners, strict=True)]
         axes = [self.placement.rotation.T, other.placement.rotation.T]
@@ -73,29 +79,29 @@ class PlacedField:
         return True
 
     def march(self, ray, far, active=True) -> marching.Marched:
-        """What rays see of the field before the distance ``far``; ``depth`` in units of the field's own frame."""
+        """March rays up to the distance ``far``; the resulting ``depth`` is in units of the field's frame."""
         return marching.march(self.field, *self._local(ray, far, active))
 
-    def count(self, ray, far, active=True) -> counting.Counts:
-        """What :meth:`march` reads."""
-        return counting.count(self.field, *self._local(ray, far, active))
+    def count(self, ray, far, active=True) -> marching.RayCounts:
+        """Return the counts of the reads of :meth:`march`."""
+        return marching.count(self.field, *self._local(ray, far, active))
 
     def replay(self, ray, far, active, marched, d_colour, d_transmittance, d_depth) -> None:
-        """See :func:`.march.replay`; ``depth`` is that of the world."""
+        """Call :func:`.march.replay`; ``depth`` is in units of the world."""
         local = self._local(ray, far, active)
         marching.replay(self.field, *local, 0.5, marched, d_colour, d_transmittance, d_depth * self.size)
 
     def tangent(self, ray, far, active, marched) -> tuple:
-        """See :func:`.march.tangent`; ``depth`` is that of the world."""
+        """Call :func:`.march.tangent`; ``depth`` is in units of the world."""
         colour, transmittance, depth = marching.tangent(self.field, *self._local(ray, far, active), 0.5, marched)
         return colour, transmittance, depth * self.size
 
 
-def _arrays_of(value, known: set) -> list:
-    """The Dr.Jit arrays in an object of ours and in what it refers to."""
-    if id(value) in known:
+def _arrays_of(value, visited: set) -> list:
+    """Return the Dr.Jit arrays of an object and of all objects that it refers to."""
+    if id(value) in visited:
         return []
-    known.add(id(value))
+    visited.add(id(value))
     if isinstance(value, dr.ArrayBase):
         return [value] if dr.is_jit_v(value) else []
     if isinstance(value, dict):
@@ -106,20 +112,21 @@ def _arrays_of(value, known: set) -> list:
         inside = (
             vars(value).values() if hasattr(value, "__dict__") and not isinstance(value, (type, ModuleType)) else ()
         )
-    return [array for one in inside for array in _arrays_of(one, known)]
+    return [array for one in inside for array in _arrays_of(one, visited)]
 
 
-class Light:
+class VariantLight:
     """
-    Linear RGB radiance as light of the variant that is set: itself, its luminance, or a spectrum, which is that of
-    Mitsuba's emitters, the upsampled colour of at most ½ times that of the illuminant D65.
+    Conversion of linear RGB radiance to the light of the current variant: RGB, luminance or a spectrum.
+
+    The spectrum is that of Mitsuba's emitters: the upsampled colour, of at most ½, times that of the illuminant D65.
     """
 
     def __init__(self):
         self.illuminant = mi.load_dict({"type": "d65"}, parallel=False) if mi.is_spectral else None
 
     def of(self, colour, wavelengths, active=True):
-        """The light of RGB ``colour`` (three floats)."""
+        """Return the light of RGB ``colour`` (three floats)."""
         if mi.is_monochromatic:
             return mi.Spectrum(sum(w * c for w, c in zip(LUMINANCE, colour, strict=True)))
         if not mi.is_spectral:
@@ -131,7 +138,7 @@ class Light:
         return mi.Spectrum(spectrum * scale * self.illuminant.eval(at, active))
 
     def adjoint(self, colour, wavelengths, weight, active=True):
-        """The derivative of ``dot(weight, of(colour))`` with respect to ``colour``: three floats."""
+        """Return the derivative of ``dot(weight, of(colour))`` with respect to ``colour``: three floats."""
         if mi.is_monochromatic:
             return mi.Array3f(*(w * weight.x for w in LUMINANCE))
         if not mi.is_spectral:
@@ -143,7 +150,7 @@ class Light:
             return dr.select(active & _coloured(colour), dr.grad(free), 0)
 
     def tangent(self, colour, change, wavelengths, active=True):
-        """How the light of ``colour`` changes with its ``change``."""
+        """Return the derivative of the light of ``colour`` along ``change``."""
         if not mi.is_spectral:
             return self.of(change, wavelengths, active)
         with dr.resume_grad():
@@ -154,5 +161,34 @@ class Light:
 
 
 def _coloured(colour):
-    """Black has no derivative, since the spectrum of a colour depends on its hue alone."""
+    """Return whether a colour is not black; black has no derivative, since its spectrum depends on its hue."""
     return dr.max(mi.Array3f(dr.detach(colour))) > 0
+
+
+def to_grid(props: mi.Properties) -> None:
+    """
+    Replace the compressed field in ``filename`` by the grid that it was made from, its exact counterpart.
+
+    Raises ``RuntimeError`` if the grid was not kept or its file does not exist.
+    """
+    path = Path(properties.filename(props))
+    try:
+        table = load(path)
+    except TableError as e:
+        raise RuntimeError(str(e)) from None
+    if table.settings["layout"] == "grid":
+        return
+    grid_path = table.settings.get("grid_path")
+    if not grid_path:
+        raise RuntimeError(
+            f'parameter "filename": {path} was fitted without "--grid FILE": the grid to compare it with was not kept'
+        )
+    grid = path.resolve().parent / grid_path
+    if not grid.is_file():
+        raise RuntimeError(
+            f'parameter "filename": {path} was made from the grid {grid}, which does not exist: "mi-diffind fit field '
+            f'FOLDER --preset grid -o {grid.name}" makes it again'
+        )
+    props["filename"] = str(grid)
+    if "storage" in props:
+        del props["storage"]

@@ -1,0 +1,243 @@
+"""
+Radiance fields: the interface of all of them, and those whose numbers lie on the nodes of a grid.
+
+A field fills a box. Each point has a density σ per unit of length and, in each direction, a radiance (linear RGB, never
+negative), so that a ray sees ``Σ T_i (1 − exp(−σ_i δ_i)) c_i`` (:mod:`.march`).
+"""
+
+from __future__ import annotations
+
+import copy
+
+import drjit as dr
+import numpy as np
+
+from ...bits import as_words, pack_bits
+from .nodes import Nodes
+
+#: Optical depth of a voxel below which its density counts as zero.
+FAINT = 2e-3
+
+#: Upper limit of the logarithm of a radiance.
+BRIGHTEST = 12.0
+
+
+class VolumeField:
+    """
+    Radiance field in the box from ``lower`` to ``upper``: the base class.
+
+    ``voxel`` is the side of a voxel. Rays take steps of length ``step``, half a voxel. ``arrays`` maps names to the
+    tensors that can be differentiated.
+    """
+
+    def __init__(self, types, lower, upper, voxel: float, arrays: dict):
+        self.types = types
+        self.lower, self.upper = tuple(map(float, lower)), tuple(map(float, upper))
+        self.voxel, self.step = float(voxel), 0.5 * float(voxel)
+        self.arrays = dict(arrays)
+        # Opaque: fields of another size use the same kernels
+        self.box = tuple(dr.opaque(types.Array3f, corner) for corner in (self.lower, self.upper))
+        self.per_voxel = dr.opaque(types.Float, 1 / self.voxel)
+
+    def with_arrays(self, arrays: dict) -> VolumeField:
+        """Return a copy of the field with other tensors in ``arrays``."""
+        result = copy.copy(self)
+        result.arrays = dict(arrays)
+        return result
+
+    def density_at(self, p, active=True) -> tuple:
+        """
+        Return the density at the points ``p`` of the box, at least 0, and the data that :meth:`radiance_at` needs.
+
+        The data are a list of arrays that carry no derivatives, such as the weights and numbers of nearby nodes.
+        """
+        raise NotImplementedError
+
+    def radiance_at(self, point_data: list, p, d, active=True) -> list:
+        """
+        Return the radiance [r, g, b] that leaves the points ``p`` towards −``d``.
+
+        ``d`` has unit length; ``point_data`` is what :meth:`density_at` returned for the same points.
+        """
+        raise NotImplementedError
+
+    def free_distance(self, p, d, active=True):
+        """Return a length from ``p`` along ``d`` that is certainly empty; 0 where the density has to be read."""
+        return self.types.Float(0)
+
+
+class NodeVolume(VolumeField):
+    """Radiance field whose numbers lie on :class:`.nodes.Nodes`: the base class."""
+
+    def __init__(self, nodes: Nodes, arrays: dict):
+        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
+        self.nodes = nodes
+
+    def free_distance(self, p, d, active=True):
+        return self.nodes.free_distance(p, d, active)
+
+    def interpolated_density(self, node_density, p, active) -> tuple:
+        """
+        Return what :meth:`density_at` does, from ``node_density(number, active)``, the raw density of a node.
+
+        The data of a point are its eight weights and then its eight node numbers.
+        """
+        corners, active = self.nodes.corners(p, active)
+        raw = self.types.Float(0)
+        for weight, number in corners:
+            raw = dr.fma(weight, node_density(number, active), raw)
+        density = dr.select(active, density_of(self.raw_density(raw), self.per_voxel), 0)
+        return density, [w for w, _ in corners] + [n for _, n in corners]
+
+    def raw_density(self, interpolated):
+        """Return the raw density that an interpolated number stands for: the number itself by default."""
+        return interpolated
+
+
+def density_of(raw, per_voxel):
+    """
+    Return the density σ of a raw number: softplus(raw) − :data:`FAINT` per voxel, never negative.
+
+    ``per_voxel`` is one over the side of a voxel. A raw number below about −6 is exactly empty, 10 is opaque.
+    """
+    soft = dr.maximum(raw, 0) + dr.log(1 + dr.exp(-dr.abs(raw)))
+    return dr.maximum(soft - FAINT, 0) * per_voxel
+
+
+def raw_of(density: np.ndarray, voxel: float) -> np.ndarray:
+    """Return the raw numbers of NumPy densities, the inverse of :func:`density_of`."""
+    y = np.asarray(density, np.float64) * voxel + FAINT
+    return y + np.log(-np.expm1(-y))
+
+
+def colour_of(coefficients: list, d) -> list:
+    """
+    Return the radiance [r, g, b] in direction ``d``: exp(a + b·d), clamped at exp(:data:`BRIGHTEST`).
+
+    ``coefficients`` are twelve numbers, a and b for each of red, green and blue. The exponent is linear in them.
+    """
+    radiance = []
+    for c in range(3):
+        a, x, y, z = coefficients[4 * c : 4 * c + 4]
+        radiance.append(dr.exp(dr.minimum(dr.fma(x, d.x, dr.fma(y, d.y, dr.fma(z, d.z, a))), BRIGHTEST)))
+    return radiance
+
+
+class NodeField(NodeVolume):
+    """
+    Radiance field of numbers at nodes, interpolated trilinearly.
+
+    ``density`` ``(n,)`` holds raw densities (:func:`density_of`), ``colour`` ``(m, 12)`` the coefficients of
+    :func:`colour_of`; both are float tensors. ``palette_index`` ``(n,)``, uint32, names the row of ``colour`` of each
+    node; without it, node i has row i. A pointer that is an index cannot be interpolated, so rows are read at the eight
+    corners of a cell and blended there.
+    """
+
+    def __init__(self, nodes: Nodes, density, colour, palette_index=None):
+        super().__init__(nodes, {"density": density, "colour": colour})
+        self.palette_index = palette_index
+
+    def density_at(self, p, active=True):
+        Float, density = self.types.Float, self.arrays["density"].array
+        return self.interpolated_density(lambda number, seen: dr.gather(Float, density, number, seen), p, active)
+
+    def radiance_at(self, point_data, p, d, active=True):
+        return colour_of(self.coefficients(point_data, active), d)
+
+    def coefficients(self, point_data, active) -> list:
+        """Return the blended columns of ``colour`` at points."""
+        rows, table = point_data[8:], self.arrays["colour"]
+        if self.palette_index is not None:
+            rows = [dr.gather(self.types.UInt32, self.palette_index, number, active) for number in rows]
+        return blended(self.types, table.array, table.shape[1] // 4, point_data[:8], rows, active)
+
+
+def blended(types, flat, packets: int, weights: list, rows: list, active) -> list:
+    """Return the weighted sum of rows of ``flat``, ``(m, 4 · packets)``; four columns are read at once."""
+    sums = [types.Float(0)] * (4 * packets)
+    for weight, row in zip(weights, rows, strict=True):
+        for j in range(packets):
+            four = dr.gather(types.Array4f, flat, dr.fma(row, packets, j), active)
+            for k in range(4):
+                sums[4 * j + k] = dr.fma(weight, four[k], sums[4 * j + k])
+    return sums
+
+
+class DenseVolumeField(NodeField):
+    """
+    :class:`NodeField` with a number at every node of a box, from NumPy arrays.
+
+    ``density`` ``(X, Y, Z)`` holds raw densities and ``colour`` is ``(X, Y, Z, 12)``; nodes begin at ``lower`` and are
+    ``voxel`` apart.
+    """
+
+    def __init__(self, types, density, colour, lower, voxel: float):
+        density = np.ascontiguousarray(density, np.float32)
+        colour = np.ascontiguousarray(colour, np.float32)
+        nodes = Nodes(types, lower, voxel, density.shape)
+        tensor = types.TensorXf
+        super().__init__(nodes, tensor(density.reshape(-1)), tensor(colour.reshape(-1, 12)))
+
+
+class PackedPaletteField(NodeVolume):
+    """
+    Compressed field in its form for rendering: a word of ``density_bits`` + ``index_bits`` bits at each node.
+
+    The low bits of a node are a density level, which stands for the raw density ``density_range[0]`` + level ·
+    ``density_range[1]``. The high bits are an index into ``palette`` ``(P, 12)``, uint8, whose bytes stand for
+    ``offset`` + ``scale`` · byte. ``levels`` and ``index`` are NumPy arrays ``(n,)``. Entries of the palette take 16
+    bytes in memory.
+    """
+
+    def __init__(self, nodes, levels, density_bits, density_range, index, index_bits, palette, scale, offset):
+        super().__init__(nodes, {})
+        types = nodes.types
+        self.density_bits, self.index_bits, self.density_range = density_bits, index_bits, density_range
+        self.words = types.UInt32(node_words(levels, density_bits, index, index_bits))
+        entries = np.zeros((len(palette), 16), np.uint8)
+        entries[:, :12] = palette
+        self.palette = types.UInt32(entries.view("<u4").reshape(-1))
+        self.scale, self.offset = [float(v) for v in scale], [float(v) for v in offset]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory, including the index of the nodes."""
+        return 4 * sum(map(dr.width, (self.words, self.palette))) + self.nodes.nbytes
+
+    def density_at(self, p, active=True):
+        UInt32, width, indices = self.types.UInt32, self.density_bits + self.index_bits, []
+
+        def level(number, seen):
+            start = number * width
+            first, shift = start >> 5, start & 31
+            word = dr.gather(UInt32, self.words, first, seen) >> shift
+            if 32 % width:  # the bits of a node may begin in one word and end in the next
+                following = dr.gather(UInt32, self.words, first + 1, seen)
+                word |= (following << (31 - shift)) << 1
+            indices.append((word >> self.density_bits) & (2**self.index_bits - 1))
+            return self.types.Float(word & (2**self.density_bits - 1))
+
+        density, point_data = self.interpolated_density(level, p, active)
+        return density, point_data[:8] + indices
+
+    def raw_density(self, interpolated):
+        low, step = self.density_range
+        return dr.fma(interpolated, step, low)
+
+    def radiance_at(self, point_data, p, d, active=True):
+        types = self.types
+        sums = [types.Float(0)] * 12
+        for weight, index in zip(point_data[:8], point_data[8:], strict=True):
+            words = dr.gather(types.Array4u, self.palette, index, active)
+            for k in range(12):
+                # The byte as the mantissa of a number in [1, 2): no conversion, and the weights sum to 1
+                byte = (words[k // 4] << 15 - 8 * (k % 4)) if k % 4 < 2 else (words[k // 4] >> 8 * (k % 4) - 15)
+                number = dr.reinterpret_array(types.Float, (byte & 0x7F8000) | 0x3F800000)
+                sums[k] = dr.fma(weight, number, sums[k])
+        return colour_of([dr.fma(s - 1, 256 * a, b) for s, a, b in zip(sums, self.scale, self.offset, strict=True)], d)
+
+
+def node_words(levels: np.ndarray, density_bits: int, index: np.ndarray, index_bits: int) -> np.ndarray:
+    """Return 32-bit words that hold the level and the index of each node without gaps, and one more word."""
+    joined = levels.astype(np.uint32) | (index.astype(np.uint32) << density_bits)
+    return as_words(pack_bits(joined, density_bits + index_bits), spare=1)
