@@ -67,18 +67,22 @@ def page_of_tasks() -> str:
 def disney_forms() -> str:
     """Return accuracy, bytes and time of each form of the Disney BRDF."""
     study = measured("tradeoff_disney")
-    timings = {name: case["queries"]["eval"] for name, case in study["cases"].items()}
-    cases = [name for name in ("constant, all lobes", "constant, diffuse + specular") if name in timings]
-    reference = {case: timings[case]["principled"]["time"] for case in cases}
+    columns = {
+        "constant, all lobes": ("eval",),
+        "constant, diffuse + specular": ("eval",),
+        "textured, diffuse + specular": ("eval", "pdf"),
+    }
+    cases = study["cases"]
+    timings = {f"{q}: {case}": cases[case]["queries"][q] for case, queries in columns.items() for q in queries}
     rows = []
     for name, candidate in study["candidates"].items():
-        if candidate["representation"] == "one table" or not all(name in timings[case] for case in cases):
+        if candidate["representation"] == "one table":
             continue
         errors = candidate["errors"]
         accuracy = " / ".join(f"{errors[k]:.1f}" for k in ("psnr_db_training", "psnr_db_uniform") if k in errors)
-        times = [f"{timings[case][name]['time'] / reference[case]:.2f}" for case in cases]
+        times = [f"{t[name]['time'] / t['principled']['time']:.2f}" if name in t else "–" for t in timings.values()]
         rows.append([f"`{name}`", f"{candidate['bytes']:,}", accuracy or "–", *times])
-    return table(["form", "bytes", "PSNR, dB: training / uniform", *(f"eval, {c.split(', ')[1]}" for c in cases)], rows)
+    return table(["form", "bytes", "PSNR, dB: training / uniform", *timings], rows)
 
 
 def comparisons() -> str:

@@ -1,10 +1,10 @@
 """
 Mitsuba plugins, one a file. ``import mi_diffind`` registers them; nothing here needs to be imported by hand.
 
-A plugin's module says in ``PLUGIN`` what it is (:class:`Plugin`). The modules of this package are found, and those that
-other packages name as entry points of the group ``mi_diffind.plugins``. Mitsuba's classes differ from variant to
-variant (``mi.BSDF`` is another class in each), so a module is executed afresh for each (:func:`register`), now or when
-the variant is set (:func:`install`): its classes keep the globals of their own variant.
+A plugin's module declares it as ``PLUGIN`` (:class:`Plugin`). Modules are discovered: those of this package, and those
+that other packages name as entry points of the group ``mi_diffind.plugins``. Mitsuba's classes differ from variant to
+variant (``mi.BSDF`` is another class in each), so a module is executed afresh for each variant (:func:`register`), now
+or when the variant is set (:func:`install`): its classes keep the globals of their own variant.
 """
 
 from __future__ import annotations
@@ -16,19 +16,21 @@ from typing import Any
 
 from mi_diffind import compat, discovery
 
-#: What lies beside the plugins and is none.
+#: Modules of this package that are no plugins.
 IGNORED = ("support",)
 
-#: What a plugin may be → the class in ``mitsuba`` whose instances its factory returns.
-KINDS = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
+#: Type of a plugin → the class in ``mitsuba`` whose instances its factory returns.
+OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume": "Volume", "integrator": "Integrator"}
 
 
 @dataclass(frozen=True)
 class Counterpart:
     """
-    Another plugin that may stand in the place of one: the ``name`` of one that takes the same parameters but those of
-    ``learned_only``, and needs those of ``given`` in addition. ``convert(props)``, if that is not all there is to it,
-    turns the properties (``mi.Properties``) of the one into those of the other, or raises ``RuntimeError``.
+    Plugin that may replace another one in a scene.
+
+    The plugin called ``name`` takes the same parameters except ``learned_only``, and needs those of ``given`` in
+    addition. If more has to change, ``convert(props)`` changes the properties (``mi.Properties``), or raises
+    ``RuntimeError``.
     """
 
     name: str
@@ -37,7 +39,7 @@ class Counterpart:
     convert: Callable[[Any], None] | None = None
 
     def replace(self, props) -> None:
-        """Turn the properties of the plugin into those of the counterpart, in place."""
+        """Change the properties of the plugin, in place, to those of the counterpart."""
         if self.convert:
             self.convert(props)
         props.set_plugin_name(self.name)
@@ -51,18 +53,21 @@ class Counterpart:
 @dataclass(frozen=True)
 class Plugin:
     """
-    A plugin: its ``name`` in a scene; its ``kind`` (:data:`KINDS`); ``factory(props)``, a class or a function, which
-    may return an object of Mitsuba's own; the ``task`` whose tables it reads, and their storage form by default ("":
-    the file's). One that has an ``exact`` counterpart is *learned*; ``others`` may stand in its place, too. Of a shape
-    that only some integrators see, these (``seen_by``), and the parameter and its value by which all others see it
-    (``otherwise``).
+    Declaration of a plugin.
 
-    Instances with a method ``report()`` say what they do (:func:`mi_diffind.scenes.reports`); for an object of
-    Mitsuba's own, its factory says so with :func:`reports_as`.
+    - ``name``: its ``type`` in a scene; ``object_type``: one of :data:`OBJECT_TYPES`;
+    - ``factory(props)``: a class, or a function, which may return an object of one of Mitsuba's own classes;
+    - ``task``: the task whose tables it reads; ``storage``: their default storage form ("": that of the file);
+    - ``exact``: the exact counterpart, which makes the plugin a *learned* one; ``others``: further counterparts;
+    - ``seen_by``: for a shape that only some integrators see, these; ``otherwise``: the parameter and the value with
+      which all others see it, too.
+
+    Instances with a method ``report()`` describe what they do (:func:`mi_diffind.scenes.reports`); for an object of one
+    of Mitsuba's own classes, the factory calls :func:`reports_as`.
     """
 
     name: str
-    kind: str
+    object_type: str
     factory: Callable[[Any], Any]
     task: str = ""
     storage: str = ""
@@ -72,28 +77,31 @@ class Plugin:
     otherwise: tuple[str, str] | None = None
 
     def __post_init__(self):
-        if self.kind not in KINDS:
-            raise ValueError(f'the kind of "{self.name}" is "{self.kind}", allowed are {", ".join(KINDS)}')
+        if self.object_type not in OBJECT_TYPES:
+            allowed = ", ".join(OBJECT_TYPES)
+            raise ValueError(f'plugin "{self.name}": found the object type "{self.object_type}", allowed are {allowed}')
 
     def counterpart(self, against: str = "exact") -> Counterpart | None:
-        """The exact counterpart, or another one by its name; ``None`` if there is none."""
+        """Return the exact counterpart, or another one by its name; ``None`` if there is none."""
         return self.exact if against == "exact" else next((c for c in self.others if c.name == against), None)
 
     def described(self, props) -> dict:
         """
-        What properties (``mi.Properties``) say: ``plugin``, ``kind``, ``id``, ``parameters`` (numbers, text, colours
-        and matrices as lists, ``"texture"`` for any object with a name), and by themselves those that only the learned
-        plugin has, and the file that it reads.
+        Return a plain description of the properties (``mi.Properties``) of an instance.
+
+        It has the keys ``plugin``, ``kind`` (the object type), ``id`` and ``parameters`` (numbers, text, colours and
+        matrices as lists, ``"texture"`` for any named object). Parameters that only the learned plugin has, and the
+        file that it reads, are keys of their own.
         """
         learned_only = self.exact.learned_only if self.exact else ()
         if self.task and "filename" not in learned_only:
             learned_only = (*learned_only, "filename")
         return {
             "plugin": self.name,
-            "kind": self.kind,
+            "kind": self.object_type,
             "id": props.id(),
             "parameters": {
-                key: _plain(props, key, self.kind)
+                key: _plain(props, key, self.object_type)
                 for key in props
                 if key not in learned_only and not key.startswith("_arg_")
             },
@@ -101,23 +109,23 @@ class Plugin:
         }
 
 
-#: For each variant that was set: the plugins by name.
+#: Variant that was set → its plugins by name.
 _declared: dict[str, dict[str, Plugin]] = {}
 
-#: Objects of Mitsuba's own that factories returned: id → the object, what its properties said, what it does.
+#: Objects of Mitsuba's own classes that factories returned: id → the object, its description, its report function.
 _native: dict[int, list] = {}
 
-#: What factories are about to return, if a scene takes it apart: id → the part of it that is looked for.
+#: Id of an object that a factory is about to return and that a scene takes apart → the part that stays in the scene.
 _parts: dict[int, object] = {}
 
 
 def supported(variant: str) -> bool:
-    """Can the plugins run in this variant? Python plugins need a vectorised (JIT) one with derivatives."""
+    """Return whether the plugins run in a variant: in vectorised (JIT) ones with derivatives."""
     return "_ad_" in variant and not variant.endswith("_double")
 
 
 def install() -> None:
-    """Register the plugins with the variant that is set, if any, and with every one that will be set."""
+    """Register the plugins with the variant that is set, if any, and with every variant that will be set."""
     import mitsuba as mi
 
     compat.on_variant_change(_on_variant_change)
@@ -126,14 +134,14 @@ def install() -> None:
 
 
 def declared() -> dict[str, Plugin]:
-    """The plugins of the variant that is set, by name."""
+    """Return the plugins of the variant that is set, by name."""
     import mitsuba as mi
 
     return _declared.get(mi.variant(), {})
 
 
 def with_counterpart(against: str = "exact") -> tuple[str, ...]:
-    """The names of the plugins that have this counterpart; of the learned ones by default."""
+    """Return the names of the plugins that have a counterpart: by default, those of the learned plugins."""
     return tuple(plugin.name for plugin in declared().values() if plugin.counterpart(against))
 
 
@@ -142,27 +150,28 @@ def _on_variant_change(old: str | None, new: str) -> None:
 
 
 def register(variant: str) -> None:
-    """Register every plugin with ``variant``, which must be the one that is set. Does nothing the second time."""
+    """Register every plugin with ``variant``, which must be the one that is set; only the first call does anything."""
     import mitsuba as mi
 
     if variant in _declared:
         return
-    _declared[variant] = known = {}
+    _declared[variant] = declarations = {}
     for plugin in _load():
-        known[plugin.name] = plugin
+        declarations[plugin.name] = plugin
         if supported(variant):
-            make = _checked(plugin)
-        elif plugin.kind != "volume":  # for scalar variants, Mitsuba cannot do without the type of what it loads
-            make = _refusal(plugin.name, variant)
+            factory = _checked(plugin)
+        elif plugin.object_type != "volume":  # in scalar variants, Mitsuba needs the type of every object it loads
+            factory = _refusal(plugin.name, variant)
         else:
             continue
-        # Of volumes, Mitsuba's Python interface knows nothing; in a scene, they are looked up among textures
-        getattr(mi, f"register_{'texture' if plugin.kind == 'volume' else plugin.kind}")(plugin.name, make)
+        # Mitsuba has no `register_volume`; in a scene, volumes are looked up among textures
+        register_as = "texture" if plugin.object_type == "volume" else plugin.object_type
+        getattr(mi, f"register_{register_as}")(plugin.name, factory)
 
 
 def _load() -> list[Plugin]:
-    """Execute the modules of plugins afresh, and return what they declare."""
-    for name in discovery.modules(__name__, IGNORED).values():  # all of them first, since one may build upon another
+    """Execute the modules of plugins afresh and return their declarations."""
+    for name in discovery.modules(__name__, IGNORED).values():  # all of them first, since modules import each other
         sys.modules.pop(name, None)
     return list(discovery.load(__name__, "PLUGIN", IGNORED, kind=Plugin).values())
 
@@ -178,40 +187,41 @@ def _refusal(name: str, variant: str):
 
 
 def _checked(plugin: Plugin):
-    """The factory as Mitsuba gets it: it returns what it should, and it is known what that was made from."""
+    """Return the factory to register: it checks the type of the instance and records the properties it came from."""
 
     def make(props):
         import mitsuba as mi
 
-        made = plugin.factory(props)
-        kind = getattr(mi, KINDS[plugin.kind])
-        if not isinstance(made, kind):  # Mitsuba would crash, or speak of a bad cast
-            found = "nothing" if made is None else f"a {type(made).__name__}"
-            raise RuntimeError(f'the factory of the plugin "{plugin.name}" returned {found}, a {plugin.kind} is needed')
+        instance = plugin.factory(props)
+        if not isinstance(instance, getattr(mi, OBJECT_TYPES[plugin.object_type])):  # Mitsuba would crash
+            returned = "nothing" if instance is None else f"a {type(instance).__name__}"
+            raise RuntimeError(
+                f'plugin "{plugin.name}": the factory returned {returned}, a {plugin.object_type} is needed'
+            )
         unknown = [key for key in props if not props.was_queried(key)]  # Mitsuba refuses these, if they stay so
-        said = plugin.described(props)
+        description = plugin.described(props)
         for key in unknown:
             props.mark_queried(key, False)
-        shown = _parts.pop(id(made), made)
-        if hasattr(shown, "__dict__"):
-            shown._made_from = _Origin(said)
+        part = _parts.pop(id(instance), instance)
+        if hasattr(part, "__dict__"):
+            part._origin = _Origin(description)
         else:
             _forget_dead()
-            _native.setdefault(id(shown), [shown, said, None])[1] = said
-        return made
+            _native.setdefault(id(part), [part, description, None])[1] = description
+        return instance
 
     return make
 
 
 class _Origin:
-    """What an instance was made from: not a dictionary, in whose entries ``dr.freeze`` would look for arrays."""
+    """Description of an instance; no dictionary, in whose entries ``dr.freeze`` would look for arrays."""
 
-    def __init__(self, said: dict):
-        self.said = said
+    def __init__(self, description: dict):
+        self.description = description
 
 
 def warn(text: str) -> None:
-    """Warn by Mitsuba's log; on stderr where that is told to be quiet, as commands tell it."""
+    """Warn through Mitsuba's log, or on stderr if the log hides warnings, as in the commands."""
     import mitsuba as mi
 
     if mi.log_level() <= mi.LogLevel.Warn:
@@ -220,21 +230,23 @@ def warn(text: str) -> None:
         print(f"warning: {text}", file=sys.stderr)
 
 
-def reports_as(made, report: Callable[[], dict]) -> None:
+def reports_as(instance, report: Callable[[], dict]) -> None:
     """
-    For a factory that is about to return ``made``, an object of Mitsuba's own: ``report()`` says what it does, as the
-    method of that name of a plugin written in Python does. It must not hold the object.
+    Attach ``report()`` to ``instance``, an object of one of Mitsuba's own classes that a factory is about to return.
+
+    ``report`` replaces the method of that name of plugins written in Python. It must not hold the object.
     """
     _forget_dead()
-    _native[id(made)] = [made, None, report]
+    _native[id(instance)] = [instance, None, report]
 
 
-def shown_as(made, part) -> None:
+def shown_as(instance, part) -> None:
     """
-    For a factory that is about to return ``made``, an object of Mitsuba's own that a scene takes apart and drops, as a
-    ``merge`` of shapes: what is left of it in the scene is ``part``.
+    Declare that only ``part`` of ``instance`` stays in the scene.
+
+    A factory calls this before it returns an object that scenes take apart and drop, such as a ``merge`` of shapes.
     """
-    _parts[id(made)] = part
+    _parts[id(instance)] = part
 
 
 def _forget_dead() -> None:
@@ -244,34 +256,34 @@ def _forget_dead() -> None:
             del _native[key]
 
 
-def origin(made) -> dict | None:
-    """What the properties of an instance of a plugin said (:meth:`Plugin.described`); ``None`` for any other object."""
-    found = getattr(made, "_made_from", None)
-    if found is not None:
-        return found.said
-    entry = _native.get(id(made))
+def origin(instance) -> dict | None:
+    """Return the description of an instance of a plugin (:meth:`Plugin.described`); ``None`` for any other object."""
+    recorded = getattr(instance, "_origin", None)
+    if recorded is not None:
+        return recorded.description
+    entry = _native.get(id(instance))
     return None if entry is None else entry[1]
 
 
-def report(made) -> dict | None:
-    """What an instance of a plugin says that it does; ``None`` if it says nothing."""
-    if hasattr(made, "report"):
-        return made.report()
-    entry = _native.get(id(made))
+def report(instance) -> dict | None:
+    """Return the report of an instance of a plugin; ``None`` if it has none."""
+    if hasattr(instance, "report"):
+        return instance.report()
+    entry = _native.get(id(instance))
     return None if entry is None or entry[2] is None else entry[2]()
 
 
-def _plain(props, key: str, owner: str):
-    kind, types = props.type(key), type(props).Type
-    if kind in (types.Float, types.Integer):
+def _plain(props, key: str, object_type: str):
+    value_type, types = props.type(key), type(props).Type
+    if value_type in (types.Float, types.Integer):
         return float(props[key])
-    if kind == types.Color:
+    if value_type == types.Color:
         return [float(v) for v in props[key]]
-    if kind in (types.Reference, types.ResolvedReference, types.Object):
-        return "nested" if owner == "integrator" else "texture"
-    if kind == types.Transform:
+    if value_type in (types.Reference, types.ResolvedReference, types.Object):
+        return "nested" if object_type == "integrator" else "texture"
+    if value_type == types.Transform:
         m = props[key].matrix
         return [[float(m[i, j]) for j in range(4)] for i in range(4)]
-    if kind == types.Any:
+    if value_type == types.Any:
         return type(props[key]).__name__
     return str(props[key])

@@ -1,3 +1,5 @@
+"""The Disney BRDF by arithmetic."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import drjit as dr
@@ -60,7 +62,7 @@ class Disney(mi.BSDF):
 
      * - eta
        - |float| or |texture|
-       - The same as a relative index of refraction in [1, 3], instead of ``specular``: reflectance
+       - Relative index of refraction in [1, 3], in place of ``specular``: reflectance
          :math:`((\eta - 1)/(\eta + 1))^2`.
        - |exposed|, |differentiable|, |discontinuous|
 
@@ -92,12 +94,12 @@ class Disney(mi.BSDF):
 
      * - clearcoat_gloss
        - |float| or |texture|
-       - Its glossiness, from satin to gloss. (Default: 0.0)
+       - Gloss of the clearcoat, from satin (0) to gloss (1). (Default: 0.0)
        - |exposed|, |differentiable|
 
      * - spec_trans
        - |float|
-       - Accepted if 0, for the sake of scenes written for :monosp:`principled`: the model has no transmission.
+       - Accepted if 0, so that scenes for :monosp:`principled` can be kept: the model has no transmission.
          (Default: 0.0)
        - --
 
@@ -112,24 +114,25 @@ class Disney(mi.BSDF):
        - Factors on the share of samples that each lobe gets. (Default: 1.0)
        - |exposed|
 
-    The reflection model of *Physically Based Shading at Disney* (Burley 2012) by arithmetic, rearranged for speed:
-    equal to the formulas up to rounding (158 dB). It is the exact counterpart of
-    :ref:`neural_disney <bsdf-neural_disney>` and has the same parameters, whose names and meaning follow Mitsuba's
-    :monosp:`principled`: changing ``type`` is all it takes. All are in [0, 1]: numbers outside are refused, textures
-    are clamped.
+    The reflection model of *Physically Based Shading at Disney* (Burley 2012), rearranged for speed: equal to the
+    published formulas up to rounding (158 dB). It is the exact counterpart of
+    :ref:`neural_disney <bsdf-neural_disney>`. Names and meaning of the parameters follow Mitsuba's
+    :monosp:`principled`: to switch, change ``type``. All parameters but ``eta`` are in [0, 1]: numbers outside are
+    refused, textures are clamped.
 
-    **It is another model than** :monosp:`principled`: Schlick's Fresnel term in place of the dielectric one, with which
-    images are 0.1% to 1% darker, up to 4% in places; no transmission; and ``eta`` between 1 and 3. ``mi-diffind compare
-    --against principled`` shows a scene with both.
+    **The model differs from** :monosp:`principled`: it has Schlick's Fresnel term in place of the dielectric one, which
+    makes images 0.1% to 1% darker, up to 4% in places; it has no transmission; and ``eta`` is limited to 1 to 3.
+    ``mi-diffind compare --against principled`` shows a scene with both.
 
-    **Only the effects in use.** A part of the model that the parameters make zero (``clearcoat`` 0, ``metallic`` 1, a
-    black texture, the tint of a grey albedo, …) is neither traced nor sampled. What is in use is found when the scene
-    is loaded and again when parameters change; parameters with gradients enabled always count as in use, and so does a
-    texture whose bounds are not known (constants and bitmaps are). ``mi-diffind inspect SCENE.xml`` lists what was left
-    out, and why. Whatever depends on constant parameters alone is evaluated once, not for each sample.
+    **Only the effects in use are computed.** A part of the model that the parameters make zero (``clearcoat`` 0,
+    ``metallic`` 1, a black texture, the tint of a grey albedo, …) is neither traced nor sampled. The effects in use are
+    determined when the scene is loaded and whenever parameters change. A parameter with gradients enabled always counts
+    as in use, and so does a texture whose bounds are unknown (those of constants and bitmaps are known).
+    ``mi-diffind inspect SCENE.xml`` lists the other effects and the reasons. Terms that depend on constant parameters
+    alone are evaluated once, not for each sample.
 
-    It reflects on the front side only; put it into a :monosp:`twosided` for both. Components: 0 diffuse and sheen,
-    1 specular, 2 clearcoat.
+    The material reflects on the front side only; nest it in :monosp:`twosided` for both sides. Components: 0 diffuse
+    and sheen, 1 specular, 2 clearcoat.
 
     Values and gradients are finite for every input: grazing directions, roughness 0, black albedo. Sampling is
     detached: gradients flow through the value of a sample, not through its position or density, which keeps them
@@ -182,7 +185,7 @@ class Disney(mi.BSDF):
 
         if "subsurface" in props:
             if "flatness" in props:
-                raise RuntimeError('"flatness" and "subsurface" are two names of one parameter, give only one')
+                raise RuntimeError('parameter "subsurface": is another name of "flatness", give only one of the two')
             aliases = {"flatness": "subsurface"}
         else:
             aliases = {}
@@ -197,7 +200,7 @@ class Disney(mi.BSDF):
 
         # As in `principled`, a constant is exposed under its own name and not as a texture's value
         if "eta" in props and "specular" in props:
-            raise RuntimeError('"eta" and "specular" are two ways to say one thing, give only one')
+            raise RuntimeError('parameter "eta": sets the same reflectance as "specular", give only one of the two')
         self.reflectance_name = "eta" if "eta" in props else "specular"
         low, high = (1, ETA_MAX) if self.reflectance_name == "eta" else (0, 1)
         name = self.reflectance_name
@@ -209,11 +212,11 @@ class Disney(mi.BSDF):
             self.reflectance = props.get_texture(name)
 
         if "spec_trans" in props:
-            found = f"{float(props['spec_trans']):g}" if properties.is_number(props, "spec_trans") else "a texture"
+            given = f"{float(props['spec_trans']):g}" if properties.is_number(props, "spec_trans") else "a texture"
             props.get_texture("spec_trans", 0.0)
-            if found != "0":
+            if given != "0":
                 raise RuntimeError(
-                    f'parameter "spec_trans": found {found}, but this model has no transmission, only 0 is allowed; '
+                    f'parameter "spec_trans": found {given}, but this model has no transmission, only 0 is allowed; '
                     'use Mitsuba\'s "principled" for it'
                 )
 
@@ -230,10 +233,10 @@ class Disney(mi.BSDF):
         self._set_flags(any(t.is_spatially_varying() for t in self._textures().values()), self._is_anisotropic)
 
         self.effects = properties.one_of(props, "effects", ("used", "all"))
-        #: What computes coefficients and values, from arithmetic or from tables.
+        #: The form of the model that computes coefficients and values, by arithmetic or from tables.
         self.decoder, self.preset = Decoder(), ""
-        #: What is known about the parameters of the model.
-        self._watched = {
+        #: Name of a parameter of the model → its bounds and changes.
+        self._tracked = {
             "base_color": TrackedParameter(self.base_color, colour=True),
             **{name: TrackedParameter(texture) for name, texture in self.scalars.items()},
             "specular": TrackedParameter(self.reflectance, is_eta=self.reflectance_name == "eta"),
@@ -245,7 +248,7 @@ class Disney(mi.BSDF):
         when_outermost(self._prepare_constants)
 
     def _set_up(self, props: mi.Properties) -> None:
-        """What another form of the model adds, before anything is evaluated."""
+        """Read the properties of a learned form, before anything is evaluated."""
 
     def _set_flags(self, varies: bool, is_anisotropic: bool) -> None:
         front = mi.BSDFFlags.FrontSide
@@ -283,31 +286,31 @@ class Disney(mi.BSDF):
         dr.make_opaque(self.rates)
         self._prepare_constants()
 
-    # -- effects in use, and what is evaluated once -------------------------------------------------------------------
+    # -- effects in use, and coefficients that are evaluated once ------------------------------------------------------
 
     def _find_effects(self) -> tuple[Effects, dict[str, str]]:
-        """The parts of the model in use, and for the others the reason why not; parameters as they were looked at."""
+        """Return the parts of the model in use, and the reasons for the others, from the bounds last determined."""
         if self.effects == "all":
             return Effects(), {}
-        return find_effects({name: watched.known() for name, watched in self._watched.items()})
+        return find_effects({name: parameter.bounds() for name, parameter in self._tracked.items()})
 
     def _effects(self) -> Effects:
-        """The parts of the model in use at present."""
-        watched = self._watched.values()
+        """Return the parts of the model in use at present."""
+        parameters = self._tracked.values()
         stale = self.effects == "used" and not dr.flag(dr.JitFlag.SymbolicScope)
-        if stale and any(w.changed() and not w.optimised() for w in watched):
-            self._prepare_constants()  # a texture was updated, and we were not told
+        if stale and any(p.changed() and not p.optimised() for p in parameters):
+            self._prepare_constants()  # a texture was updated without a notification
         return self._find_effects()[0]
 
     def _is_constant(self, group: str) -> bool:
-        """Does a group of coefficients depend on constants alone, none of which is being optimised or has changed?"""
-        watched = [self._watched[name] for name in self.decoder.groups[group]]
-        return all(w.constant and not w.optimised() and not w.changed() for w in watched)
+        """Return whether a group of coefficients depends on constants alone, neither optimised nor changed."""
+        parameters = [self._tracked[name] for name in self.decoder.groups[group]]
+        return all(p.constant and not p.optimised() and not p.changed() for p in parameters)
 
     def _prepare_constants(self) -> None:
-        """Look at the parameters, and evaluate every group of coefficients that depends on constants alone."""
-        for watched in self._watched.values():
-            watched.look()
+        """Determine the parameters' bounds, and evaluate the groups of coefficients that depend on constants alone."""
+        for parameter in self._tracked.values():
+            parameter.update()
         effects, _ = self._find_effects()
         groups = sorted({*self.decoder.required(effects), *sampling.required(effects)})
         parameters = Parameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
@@ -317,19 +320,21 @@ class Disney(mi.BSDF):
                 for group in groups
                 if self._is_constant(group)
             }
-        # A frozen function is recorded anew when the arrays that it finds here are others
+        # A frozen function is recorded anew when it sees other arrays here
         self._constant["effects"] = {name: mi.Float(0) for name in effects.names}
         dr.make_opaque(self._constant)
         self._constant_for = effects
 
     def _arrays(self) -> dict:
-        """The tables that are read, by name."""
+        """Return the tables that are read, by name."""
         return {}
 
     def report(self) -> dict:
         """
-        What this instance does: ``preset`` of its tables ("": it reads none), ``effects_in_use``, ``effects_left_out``
-        (effect → reason), ``evaluated_once`` (groups of coefficients), ``storage`` and ``table_bytes``.
+        Return a description of this instance, for ``mi-diffind inspect``.
+
+        Keys: ``preset`` of its tables ("" without tables), ``effects_in_use``, ``effects_left_out`` (effect → reason),
+        ``evaluated_once`` (groups of coefficients), ``storage`` and ``table_bytes``.
         """
         effects, reasons = self._find_effects()
         return {
@@ -341,11 +346,8 @@ class Disney(mi.BSDF):
 
     # -- evaluation -------------------------------------------------------------------------------------------------
 
-    def _read(self, name: str, parameters: Parameters, si: mi.SurfaceInteraction3f, active: mi.Bool):
-        """
-        A parameter at ``si``, limited to its range (NaN → 0): textures and optimisers overshoot. ``parameters`` asks,
-        and may be asked for others.
-        """
+    def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool):
+        """Return a parameter at ``si``, clamped to its range (NaN → 0), since textures and optimisers overshoot."""
         if name == "base_color":
             return mi.UnpolarizedSpectrum(model.clamp(self.base_color.eval(si, active), 0.0, 1.0))
         if name != "specular":
@@ -357,7 +359,7 @@ class Disney(mi.BSDF):
         return model.clamp(value, 0.0, model.specular_from_eta(ETA_MAX))
 
     def _rates(self, ctx: mi.BSDFContext, effects: Effects) -> dict[str, mi.Float]:
-        """The sampling rates of the lobes that are in use and that the context asks for; the others are missing."""
+        """Return the sampling rates of the lobes that are in use and enabled in the context."""
         flags = (mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.GlossyReflection)
         return {
             lobe: model.clamp(self.rates[lobe], 0.0, 1e6)
@@ -366,15 +368,16 @@ class Disney(mi.BSDF):
         }
 
     def _prepare(self, si, wo, active):
-        """Directions that are safe to compute with in every lane, and the lanes whose result counts."""
+        """Return directions that are safe to compute with in every lane, and the mask of lanes whose result counts."""
         active = active & (si.wi.z > 0) & (wo.z > 0)
         up = mi.Vector3f(0, 0, 1)
         return dr.select(active, si.wi, up), dr.select(active, wo, up), active
 
     def _surface(self, si, active, effects: Effects, value: bool = True, density: bool = True):
         """
-        The material at ``si``: its parameters, and the coefficients that values and densities need. All of these are
-        evaluated here, not when they are first used, which may be where derivatives are suspended.
+        Return the parameters at ``si`` and the coefficients that values and densities need.
+
+        All coefficients are computed here: at their first use, derivatives may be suspended.
         """
         parameters = Parameters(self, si, active)
         groups = (*(self.decoder.required(effects) if value else ()), *(sampling.required(effects) if density else ()))
@@ -481,14 +484,15 @@ class Disney(mi.BSDF):
 
 
 def _are_directions(wi, wo):
-    """Are these no NaN, and not far longer than directions are? From what values are computed from anyway."""
+    """Return the lanes in which neither direction is NaN or much longer than 1."""
     return model.geometry(wi, wo).h2 < 100
 
 
 class Parameters:
     """
-    A material's parameters at a surface interaction: ``roughness``, …, ``specular``, and ``albedo``, ``luminance``.
-    Each is read when it is first asked for, so one that nobody asks for is not read.
+    Parameters of a material at a surface interaction: ``roughness``, …, ``specular``, ``albedo``, ``luminance``.
+
+    Each is read at its first use, so unused parameters are not read.
     """
 
     def __init__(self, bsdf: Disney, si: mi.SurfaceInteraction3f, active: mi.Bool):
@@ -500,34 +504,34 @@ class Parameters:
         if name == "luminance":
             value = luminance(self.albedo, self._si)
         else:
-            value = self._bsdf._read("base_color" if name == "albedo" else name, self, self._si, self._active)
+            value = self._bsdf._read("base_color" if name == "albedo" else name, self._si, self._active)
         setattr(self, name, value)
         return value
 
 
 def luminance(albedo, si: mi.SurfaceInteraction3f):
-    """The luminance of an albedo, 1 for a white one."""
+    """Return the luminance of an albedo, 1 for white."""
     if mi.is_monochromatic:
         return albedo[0]
     if mi.is_rgb:
         return mi.luminance(albedo)
-    # A mean over the sampled wavelengths, weighted by the luminous efficiency: 1 for a white albedo whatever they
-    # are (Mitsuba's `luminance` alone varies with them)
+    # Mean over the sampled wavelengths, weighted by the luminous efficiency: 1 for a white albedo at any wavelengths
+    # (Mitsuba's `luminance` alone varies with them)
     weight = mi.luminance(mi.UnpolarizedSpectrum(1), si.wavelengths) + 1e-6
     return (mi.luminance(albedo, si.wavelengths) + 1e-6 * dr.mean(albedo)) / weight
 
 
 def to_principled(props: mi.Properties) -> None:
-    """Turn properties into those of ``principled``, which takes the same ones, but no textures for two of them."""
+    """Change properties to those of ``principled``, which takes no textures for ``specular`` and ``eta``."""
     for name in ("specular", "eta"):
         if name in props and not properties.is_number(props, name):
-            raise RuntimeError(f'parameter "{name}": is a texture, and "principled" takes a number only')
+            raise RuntimeError(f'parameter "{name}": is a texture, but "principled" takes only a number')
     if "subsurface" in props:
         props["flatness"] = props["subsurface"]
         del props["subsurface"]
 
 
-#: For this form of the model and any other: Mitsuba's own model of the same parameters.
+#: Mitsuba's own model with the same parameters.
 PRINCIPLED = Counterpart("principled", ("effects", "preset", "filename", "storage"), convert=to_principled)
 
 PLUGIN = Plugin("disney", "bsdf", Disney, others=(PRINCIPLED,))

@@ -1,4 +1,4 @@
-"""Textures that filter themselves over the footprint of a pixel: no plugin, their base class."""
+"""Base class of the textures that filter themselves over the footprint of a pixel; no plugin."""
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
@@ -16,23 +16,23 @@ from .support.textures import luminance
 
 class FilteredTexture(MapTexture):
     """
-    One map of a :class:`~mi_diffind.maps.compressed.FilteredMaps`, read at the level of detail of the footprint at a
-    hit (:func:`.footprint.footprint`); no gradient passes through that. ``cone`` is the sensor that sees it
-    (:class:`.footprint.Cone`), ``None`` if it is not known. A sample that is the only one of its pixel is read at the
-    pixel's centre (:func:`.footprint.to_centre`).
+    Texture of one map of a :class:`~mi_diffind.maps.compressed.FilteredMaps`, read at the footprint's level of detail.
 
-    Places are averaged as they are used, after sRGB has been decoded, and data as they are stored.
+    No gradient passes through the footprint at a hit (:func:`.footprint.footprint`). ``cone`` describes the sensor that
+    sees the texture (:class:`.footprint.Cone`; ``None``: unknown). A sample that is the only one of its pixel is read
+    at the pixel's centre (:func:`.footprint.to_centre`). Several places are averaged in linear colours; maps of data
+    are averaged as stored.
     """
 
     def __init__(self, props: mi.Properties):
         self.filter = Filter.from_properties(props)
-        self._given = cone_of(props)
-        self.cone = self._given
+        self._cone_of_parameters = cone_of(props)
+        self.cone = self._cone_of_parameters
         super().__init__(props)
 
     def set_cone(self, cone: Cone | None) -> None:
-        """Which sensor sees it; ``None``: the one that the parameters describe, if any."""
-        self.cone = cone or self._given
+        """Set the sensor that sees the texture; ``None``: the one that the parameters describe, if any."""
+        self.cone = cone or self._cone_of_parameters
 
     # -- reading ----------------------------------------------------------------------------------------------------
 
@@ -46,9 +46,9 @@ class FilteredTexture(MapTexture):
         level, axis = anisotropic(ddx, ddy, self.filter.taps)
         axis = axis / mi.Vector2f(*self._size)
         if self.filter.name == "anisotropic":
-            found = [self._filtered(dr.fma(axis, x, uv), level) for x in offsets(self.filter.taps)]
-            scale = 1 / len(found)
-            return self._used_of([sum(channel[1:], channel[0]) * scale for channel in zip(*found, strict=True)])
+            taps = [self._filtered(dr.fma(axis, x, uv), level) for x in offsets(self.filter.taps)]
+            scale = 1 / len(taps)
+            return self._used_of([sum(channel[1:], channel[0]) * scale for channel in zip(*taps, strict=True)])
         choice, rounding = random(si)
         taps = self.filter.taps
         if taps > 1:
@@ -56,7 +56,7 @@ class FilteredTexture(MapTexture):
         return self._used_of(self._rounded(uv, level, rounding))
 
     def _footprint(self, si) -> tuple:
-        """The footprint in texels of the image, ``to_uv`` applied."""
+        """Return the footprint in texels of the image, with ``to_uv`` applied."""
         with dr.suspend_grad():
             ddx, ddy = footprint.footprint(si, self.cone)
             if self._transform is not None:
@@ -65,16 +65,16 @@ class FilteredTexture(MapTexture):
             return in_texels(ddx, ddy, self._size)
 
     def _filtered(self, uv, level) -> list:
-        """What can be averaged, of one place at a level of detail: see :meth:`_used_of`."""
+        """Return the values of one place at a level of detail, in a form that can be averaged (:meth:`_used_of`)."""
         stored = self.image.filtered(*self._wrapped_at(uv, level), level)
         return self._used(stored) if self._is_encoded() else [stored[i] for i in self._needed()]
 
     def _rounded(self, uv, level, sample) -> list:
-        """:meth:`_filtered`, at a level that may be rounded at random by a number in [0, 1)."""
+        """Return :meth:`_filtered`; a derived class may round the level at random by ``sample`` in [0, 1)."""
         return self._filtered(uv, level)
 
     def _used_of(self, values: list) -> list[mi.Float]:
-        """The channels of the map as they are used, of what was averaged."""
+        """Return the channels of the map, converted from averaged values of :meth:`_filtered`."""
         if self._is_encoded():
             return values
         stored = [None] * self.image.layout.stored
@@ -86,12 +86,13 @@ class FilteredTexture(MapTexture):
         return self.image.layout.needed(self.map.name)
 
     def _wrapped_at(self, uv, level) -> list:
-        """The coordinates to read a level of detail at; ``mirror`` and ``clamp`` keep within its outermost texels."""
-        found, repeats = self._wrapped(uv), self._repeats()
+        """Return the coordinates of a read on a level; ``mirror`` and ``clamp`` keep within its outermost texels."""
+        coordinates, repeats = self._wrapped(uv), self._repeats()
         if self.wrap_mode == "repeat" or not any(repeats):
-            return found
+            return coordinates
         half = [dr.minimum(0.5 * dr.exp2(dr.ceil(level)) / n, 0.5) for n in self._size]
-        return [clamp(x, h, 1 - h) if own else x for x, h, own in zip(found, half, repeats, strict=True)]
+        limits = zip(coordinates, half, repeats, strict=True)
+        return [clamp(x, h, 1 - h) if repeat else x for x, h, repeat in limits]
 
     def eval_1_grad(self, si, active=True):
         if self.filter.name == "off":
@@ -100,36 +101,38 @@ class FilteredTexture(MapTexture):
             self._refuse("eval_1_grad", "a gradient")
         uv = self._uv(si)
         level = self.image.clamped(isotropic(*self._footprint(si)), mi.Float)
-        found = []
+        gradient = []
         for axis, n in enumerate(self._size):
             width = dr.minimum(dr.exp2(level) * (1 / n), 1)
             step = mi.Vector2f(*(0.5 * width if i == axis else 0 for i in range(2)))
             ahead, behind = (luminance(self._used_of(self._filtered(p, level))) for p in (uv + step, uv - step))
-            found.append((ahead - behind) / width)
-        return self._before(*found)
+            gradient.append((ahead - behind) / width)
+        return self._before(*gradient)
 
-    # -- what it does -------------------------------------------------------------------------------------------------
+    # -- description -------------------------------------------------------------------------------------------------
 
     def report(self) -> dict:
         """
-        As of every texture of maps; also ``filter``, ``taps``, the places that are read for one footprint, and
-        ``footprint``, where it comes from: names of sources in their order, none if nothing is filtered.
+        Return the description of :meth:`.MapTexture.report` and three more keys.
+
+        ``filter``; ``taps``, the number of places read for one footprint; ``footprint``, the names of the footprint's
+        sources in their order, none if nothing is filtered.
         """
-        found = super().report()
-        left_out = found["effects_left_out"]
+        description = super().report()
+        left_out = description["effects_left_out"]
         sources = []
         if self.filter.name == "off" or not self.is_spatially_varying():
             left_out["footprint"] = "the filter is off" if self.filter.name == "off" else "the map is constant"
         else:
             sources = [*(["interaction"] if hasattr(mi.SurfaceInteraction3f, "footprint") else []), "uv partials"]
             if self.cone is not None:
-                sources.append("sensor" if self.cone is not self._given else "parameters")
+                sources.append("sensor" if self.cone is not self._cone_of_parameters else "parameters")
             else:
-                left_out["sensor"] = "is not known: level 0, where an integrator gives no uv partials"
-        return {**found, "filter": self.filter.name, "taps": self.filter.reads, "footprint": sources}
+                left_out["sensor"] = "is not known: level 0 is read if the integrator gives no uv partials"
+        return {**description, "filter": self.filter.name, "taps": self.filter.reads, "footprint": sources}
 
     def _description(self):
         name = self.filter.name
         taps = f", at most {self.filter.taps} taps" if name in ("anisotropic", "stochastic") else ""
-        seen = "" if name == "off" else f", {'no' if self.cone is None else 'a ' + self.cone.kind} sensor"
+        seen = "" if name == "off" else f", {'no' if self.cone is None else 'a ' + self.cone.projection} sensor"
         return [*super()._description(), f"filter = {name}{taps}{seen}"]

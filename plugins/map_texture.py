@@ -1,4 +1,4 @@
-"""What textures of images and materials have in common, however these are stored: no plugin, their base class."""
+"""Base class of the textures of images and materials, for any storage; no plugin."""
 
 from __future__ import annotations  # Delayed parsing of type annotations
 
@@ -13,30 +13,30 @@ from mi_diffind.lookup import clamp
 
 from .support import properties, tables, textures, upsampling
 from .support.image_files import SharedMaps, is_data, map_of
-from .support.textures import WRAP_MODES, Positions, luminance
+from .support.textures import WRAP_MODES, PositionDistribution, luminance
 
-#: Texels, at most, that are decoded for the mean, the maximum and the sampling of positions; larger images are reduced.
+#: Most texels that are decoded for the mean, the maximum and the sampling of positions; larger images are reduced.
 DECODED = 2**22
 
 
 class MapTexture(mi.Texture):
     """
-    One map of a :class:`~mi_diffind.maps.compressed.CompressedMaps` as a texture: colours and data, wrapping,
-    transformation, spectra, sampling of positions. A class of its own says in :meth:`_open` where the maps come from,
-    and may read them in another way in :meth:`_values`.
+    Texture of one map of a :class:`~mi_diffind.maps.compressed.CompressedMaps`.
 
-    Like every module of a plugin, this one is executed afresh for each variant, whose ``mi.Texture`` it is made of.
+    The class implements colours and data, wrapping, transformation, spectra and the sampling of positions. A derived
+    class opens the maps in :meth:`_open`, and may override the read in :meth:`_values`. Like the modules of plugins,
+    this one is executed afresh for each variant, since ``mi.Texture`` differs.
     """
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         self.wrap_mode = properties.one_of(props, "wrap_mode", WRAP_MODES)
-        props.get("accel", True)  # of no use here
-        #: The file, as a description names it.
+        props.get("accel", True)  # has no effect
+        #: Path of the file, for :meth:`to_string`.
         self._path = ""
         self._shared = self._open(props)
         self.image = self._shared.image
-        #: For functions that are frozen, which look for the arrays that they read in here.
+        #: The arrays, where frozen functions (``dr.freeze``) look for them.
         self.net = getattr(self.image, "net", None)
         self.map = map_of(self.image.layout, str(props.get("channels", "")))
         raw = props.get("raw", is_data(self.map))
@@ -44,11 +44,11 @@ class MapTexture(mi.Texture):
             raise RuntimeError(f'parameter "raw": found {raw}, allowed are true and false')
         self.raw = raw
         self.to_uv = textures.transformation(props)
-        self._look_at_transformation()
-        self._forget()
+        self._update_transformation()
+        self._clear_cache()
 
     def _open(self, props: mi.Properties) -> SharedMaps:
-        """The maps that properties name; also what else only this kind of texture has. Raises ``RuntimeError``."""
+        """Open the maps that the properties name, and read further properties of the class. Raises ``RuntimeError``."""
         raise NotImplementedError
 
     # -- parameters -------------------------------------------------------------------------------------------------
@@ -59,24 +59,24 @@ class MapTexture(mi.Texture):
 
     def parameters_changed(self, keys: list[str] = ()):
         tables.check_shapes(self._shared.tables)
-        self._look_at_transformation()
-        self._forget()
+        self._update_transformation()
+        self._clear_cache()
 
-    def _look_at_transformation(self) -> None:
+    def _update_transformation(self) -> None:
         m = self.to_uv.matrix
         matrix = [[float(m[i, j]) for j in range(3)] for i in range(3)]
         identity = matrix == [[float(i == j) for j in range(3)] for i in range(3)]
         self._transform = None if identity else self._shared.transform(matrix)
         self._permutes = textures.permutes_corners(matrix)
 
-    def _forget(self) -> None:
-        """Of what was found out by decoding."""
+    def _clear_cache(self) -> None:
+        """Discard the mean, the maximum and the distribution of positions."""
         self._state, self._mean, self._max, self._positions = self._shared.state(), None, None, None
 
-    def _remember(self) -> None:
-        """What was found out is still true, or forgotten: another texture may have changed the arrays."""
+    def _check_cache(self) -> None:
+        """Discard cached values if the arrays changed, possibly through another texture."""
         if not self._shared.unchanged(self._state):
-            self._forget()
+            self._clear_cache()
 
     # -- reading ----------------------------------------------------------------------------------------------------
 
@@ -89,26 +89,27 @@ class MapTexture(mi.Texture):
         return si.uv if self._transform is None else self._transform @ si.uv
 
     def _wrapped(self, uv) -> list:
-        """The coordinates u and v to read at."""
+        """Return the coordinates u and v to read at."""
         return textures.wrapped(uv, self.wrap_mode, self._size, self._repeats())
 
     def _repeats(self) -> list[bool]:
-        """Do the arrays repeat by themselves, along u and along v?"""
+        """Return whether the arrays repeat by themselves, along u and along v."""
         return [border == "repeat" for border in reversed(self.image.border)]
 
     def _values(self, si) -> list[mi.Float]:
-        """What a surface has: the channels of the map at a hit, as they are used."""
+        """Return the channels of the map at a hit, converted."""
         return self._read(self._uv(si))
 
     def _read(self, uv) -> list[mi.Float]:
         """
-        The channels of the map at ``uv``, as they are used. In lanes that are not active, too: no place is out of
-        bounds, and what is masked differently is not recognised as the same read.
+        Return the channels of the map at ``uv``, converted, in inactive lanes, too.
+
+        No place is out of bounds, and Dr.Jit merges equal reads only if their masks are equal.
         """
         return self._used(self.image.stored(*self._wrapped(uv)))
 
     def _used(self, stored: list) -> list[mi.Float]:
-        """The channels of the map, as they are used, from the stored ones of all maps."""
+        """Return the channels of the map, converted from the stored channels of all maps."""
         values = self.image.maps(stored, [self.map.name])[self.map.name]
         values = [mi.Float(v) for v in values]
         if not self._is_encoded():
@@ -118,11 +119,11 @@ class MapTexture(mi.Texture):
         return [decode(v) for v in values]
 
     def _is_encoded(self) -> bool:
-        """Are values in the file sRGB, and to be converted?"""
+        """Return whether stored values are sRGB and have to be converted."""
         return not self.raw and self.map.color_space == "srgb"
 
     def _is_upsampled(self) -> bool:
-        """Is this a colour that stands for a spectrum?"""
+        """Return whether the values are colours that are upsampled to spectra."""
         return mi.is_spectral and not self.raw and self.map.channels == 3
 
     def _refuse(self, method: str, wanted: str):
@@ -167,7 +168,7 @@ class MapTexture(mi.Texture):
         return self._before(du, dv)
 
     def _before(self, du, dv) -> mi.Vector2f:
-        """A gradient as it is before ``to_uv``."""
+        """Return a gradient with respect to uv before ``to_uv``."""
         if self._transform is not None:
             m = self._transform.matrix
             du, dv = m[0, 0] * du + m[1, 0] * dv, m[0, 1] * du + m[1, 1] * dv
@@ -181,7 +182,7 @@ class MapTexture(mi.Texture):
         si.wavelengths = mi.MI_CIE_MIN + extent * sample
         return si.wavelengths, self.eval(si, active) * extent
 
-    # -- what is known of the whole -----------------------------------------------------------------------------------
+    # -- properties of the whole image ---------------------------------------------------------------------------------
 
     def is_spatially_varying(self):
         return any(not isinstance(where, tuple) for where in self.map.where)
@@ -190,21 +191,21 @@ class MapTexture(mi.Texture):
         return mi.ScalarVector2i(*self._size)
 
     def _decoded_size(self) -> tuple[int, int]:
-        """Width and height of what is decoded."""
+        """Return width and height of the decoded image."""
         width, height = self._size
         while width * height > DECODED:
             width, height = (width + 1) // 2, (height + 1) // 2
         return width, height
 
     def mean(self):
-        self._remember()
+        self._check_cache()
         if self._mean is None:
             with dr.suspend_grad():
                 self._mean = self._compute_mean()
         return self._mean
 
     def _compute_mean(self):
-        """Nothing here waits for a kernel: materials ask for it while they are constructed."""
+        """Compute the mean without waiting for a kernel, since constructors of materials need it."""
         width, height = self._decoded_size() if self.is_spatially_varying() else (1, 1)
         index = dr.arange(mi.UInt32, width * height)
         uv = mi.Point2f((mi.Float(index % width) + 0.5) / width, (mi.Float(index // width) + 0.5) / height)
@@ -213,15 +214,16 @@ class MapTexture(mi.Texture):
         return dr.mean(value)
 
     def max(self):
-        self._remember()
+        self._check_cache()
         if self._max is None:
             self._max = float(self._decoded().max())
         return self._max
 
     def _decoded(self) -> np.ndarray:
         """
-        The image as its values are used, float32, ``(height, width, channels)``. From another thread: this one may be
-        recording a loop or a call, in which nothing can be evaluated.
+        Return the converted image, float32, ``(height, width, channels)``.
+
+        It is decoded in another thread: this one may be recording a loop or a call, where nothing can be evaluated.
         """
 
         def decode():
@@ -234,10 +236,10 @@ class MapTexture(mi.Texture):
 
     # -- sampling of positions ----------------------------------------------------------------------------------------
 
-    def _sampled(self) -> Positions:
-        self._remember()
+    def _sampled(self) -> PositionDistribution:
+        self._check_cache()
         if self._positions is None:
-            self._positions = Positions.of(self._decoded(), self.wrap_mode)
+            self._positions = PositionDistribution.of(self._decoded(), self.wrap_mode)
         return self._positions
 
     def sample_position(self, sample, active=True):
@@ -251,13 +253,15 @@ class MapTexture(mi.Texture):
             return mi.Float(1)
         return self._sampled().density(pos if self._transform is None else self._transform @ pos, active)
 
-    # -- what it does -------------------------------------------------------------------------------------------------
+    # -- description -------------------------------------------------------------------------------------------------
 
     def report(self) -> dict:
         """
-        What this instance does: ``preset``, ``map``; ``channels_read`` and ``channels_left_out``, numbers of the
-        channels that the file stores; ``effects_in_use`` and ``effects_left_out`` (→ reason), the maps of the file
-        among them; ``evaluated_once``, ``storage`` and ``table_bytes``.
+        Return a description of this instance, for ``mi-diffind inspect``.
+
+        Keys: ``preset``, ``map``; ``channels_read`` and ``channels_left_out``, numbers of stored channels;
+        ``effects_in_use`` and ``effects_left_out`` (→ reason), which include the maps of the file; ``evaluated_once``,
+        ``storage`` and ``table_bytes``.
         """
         left_out = {name: "is another map of the file" for name in self.image.layout.names if name != self.map.name}
         if not self._is_encoded():
@@ -279,11 +283,11 @@ class MapTexture(mi.Texture):
         }
 
     def _storage(self) -> dict:
-        """What a report says of the arrays."""
+        """Return the part of :meth:`report` on the arrays."""
         return tables.described(self._shared.preset, self._shared.arrays)
 
     def _description(self) -> list[str]:
-        """Lines for a description."""
+        """Return the lines of :meth:`to_string`."""
         layout = self.image.layout
         lines = [
             f'filename = "{self._path}"',

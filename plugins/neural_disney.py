@@ -1,3 +1,5 @@
+"""The Disney BRDF from tables."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import mitsuba as mi
@@ -9,7 +11,7 @@ from . import Counterpart, Plugin
 from .disney import PRINCIPLED, Disney
 from .support import tables
 
-#: The fastest form to read; 82 dB or more from the formulas.
+#: Default storage form: the fastest to read, and within 82 dB of the formulas.
 STORAGE = "uint8"
 
 
@@ -24,27 +26,27 @@ class NeuralDisney(Disney):
 
      * - preset
        - |string|
-       - ``tables``: tables of together 384 bytes, in a factorisation that stays accurate at the horizon (85 dB from the
+       - ``tables``: 384 bytes of tables, in a factorisation that stays accurate at the horizon (85 dB against the
          formulas); ``paper``: the layout of the paper's Table 1, for comparison (39 dB). (Default: that of the file, if
          ``filename`` is given, else ``tables``)
        - --
 
      * - filename
        - |string|
-       - Tables of one's own, as written by ``mi-diffind fit disney``. (Default: those that ship with the package)
+       - A table file, written by ``mi-diffind fit disney``. (Default: the file that ships with the package)
        - --
 
      * - storage
        - |string|
-       - Storage form of the tables: ``float32``, ``float16`` or ``uint8``. The tables are exposed as parameters, and
-         can be optimised, only in the first. (Default: ``uint8``, the fastest, whatever that of the file)
+       - Storage form of the tables: ``float32``, ``float16`` or ``uint8``. Only ``float32`` tables are exposed as
+         parameters and can be optimised. (Default: ``uint8``, the fastest, for any file)
        - --
 
      * - tables.alpha, tables.aspect, tables.masking, tables.coat, tables.encoder_roughness,
          tables.encoder_anisotropic; or tables.ggx, tables.masking, tables.diffuse, tables.fresnel, … (``paper``)
        - |tensor|
-       - With ``storage`` ``float32``: the entries of the tables, in the file's shapes, or with channels padded to 1, 2
-         or a multiple of 4, as they are to begin with.
+       - The entries of the tables, exposed if ``storage`` is ``float32``; channels are padded to 1, 2 or a multiple of
+         4, and may be assigned without the padding.
        - |exposed|, |differentiable|
 
      * - base_color, roughness, anisotropic, metallic, specular, eta, spec_tint, sheen, sheen_tint, flatness,
@@ -56,12 +58,12 @@ class NeuralDisney(Disney):
     The Disney BRDF by *differentiable indirection* (Datta et al., *Efficient Graphics Representation with
     Differentiable Indirection*, SIGGRAPH Asia 2023): a small encoder turns the material into coordinates, and learned
     tables replace the arithmetic of its lobes. The exact counterpart is :ref:`disney <bsdf-disney>`, which computes the
-    same without any table, and on the CPUs that we measured in less time. This plugin differs from it in nothing but
-    the value: sampling and densities are analytic, so they stay normalised although tables are approximate, and only
-    the effects in use are traced, read and sampled.
+    same model without tables, in less time on the CPUs that we measured. Only values differ from it: sampling and
+    densities are analytic, so they stay normalised although tables are approximate. Only the effects in use are traced,
+    read and sampled.
 
-    **``paper`` gains energy** at the horizon, where its masking is off: at roughness 0.2, ``anisotropic`` 1 and an
-    angle of 89° the mean weight of a sample reaches 2.44, where the exact one stays below 1. ``tables`` does not.
+    **``paper`` gains energy** at the horizon, where its masking is inaccurate: at roughness 0.2, ``anisotropic`` 1 and
+    an angle of 89° the mean weight of a sample reaches 2.44, where the exact one stays below 1. ``tables`` does not.
 
     .. tabs::
         .. code-tab:: xml
@@ -96,7 +98,7 @@ class NeuralDisney(Disney):
         return {name: getattr(self.decoder.arrays, name) for name in self.decoder.arrays.SHAPES}
 
     def _tables(self) -> dict:
-        """The tables that are exposed."""
+        """Return the tables that are exposed."""
         return tables.exposed(self._arrays())
 
     def _is_constant(self, group):

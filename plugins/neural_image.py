@@ -1,3 +1,5 @@
+"""Compressed image or material."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import functools
@@ -10,8 +12,10 @@ from . import Counterpart, Plugin
 from .map_texture import MapTexture
 from .support import properties
 from .support.image_files import SharedMaps, open_compressed, to_bitmap
+from .support.manual import shared_parts
 
 
+@shared_parts
 class NeuralImage(MapTexture):
     r"""
     .. _texture-neural_image:
@@ -23,79 +27,56 @@ class NeuralImage(MapTexture):
 
      * - filename
        - |string|
-       - A compressed image or material, as written by ``mi-diffind fit image``.
+       - A compressed image or material, written by ``mi-diffind fit image``.
        - --
 
-     * - channels
-       - |string|
-       - Name of the map that is meant, such as ``albedo``, of 1 or 3 channels. (Default: the only map of the file, or
-         its only albedo)
-       - --
+     {channels}
 
-     * - raw
-       - |bool|
-       - Leave values as they are in the image, which is what data want: no conversion from sRGB, no spectral
-         upsampling. (Default: false for colours; true for maps that hold data: ``normal``, ``roughness``, ``ao``,
-         ``metallic``)
-       - --
+     {raw}
 
-     * - wrap_mode
-       - |string|
-       - Outside of [0, 1] as for :monosp:`bitmap`: ``repeat``, ``mirror`` or ``clamp``. (Default: ``repeat``)
-       - --
+     {wrap_mode}
 
-     * - to_uv
-       - |transform|
-       - Transformation of the texture coordinates, as for :monosp:`bitmap`. (Default: none)
-       - |exposed|
+     {to_uv}
 
-     * - storage
-       - |string|
-       - ``uint8``, which is the fastest to read, or ``float32``, which can be optimised. (Default: ``uint8``)
-       - --
-
-     * - source
-       - |string|
-       - The image or the manifest that the file was made from; only the exact counterpart reads it. (Default: what the
-         file says)
-       - --
+     {compressed}
 
      * - filter_type, accel
        - |string|, |bool|
-       - Accepted for the sake of exchange with :monosp:`bitmap`: of filters only ``bilinear`` is allowed, ``accel`` has
-         no effect. (Default: these)
+       - Accepted so that the parameters of :monosp:`bitmap` can be kept: the only filter is ``bilinear``; ``accel``
+         has no effect. (Default: these)
        - --
 
      * - tables.primary, tables.coarse, tables.cascaded
        - |tensor|
-       - The entries of the arrays, with ``storage`` ``float32``: of the primary, of its pages one after the other if it
-         has pages; of the second, coarser primary, if there is one.
+       - The entries of the primary array (or of its pages, one after the other), of the second, coarser primary if
+         there is one, and of the cascaded array; exposed if ``storage`` is ``float32``.
        - |exposed|, |differentiable|
 
     An image that is stored as a pair of small arrays and read by *differentiable indirection* (Datta et al., *Efficient
     Graphics Representation with Differentiable Indirection*, SIGGRAPH Asia 2023, task 3): a primary array, read at uv,
-    points into a cascaded one, whose entries are the channels of all maps of a material. The exact counterpart is
-    :monosp:`bitmap` with the image that was compressed. Any BSDF and emitter can use it.
+    points into a cascaded array, whose entries are the channels of all maps of a material. Any BSDF and emitter can use
+    the texture. Its exact counterpart is :monosp:`bitmap` with the original image.
 
-    **Several textures of one file are decoded once**, if their ``to_uv``, ``wrap_mode`` and ``storage`` are equal: they
-    read the same arrays at the same place, which Dr.Jit recognises. The arrays of ``float32`` storage are parameters
-    that such textures share, across scenes, too: what an optimiser does to one of them it does to all. A texture that
-    is loaded after such a change starts from the file.
+    **Several textures of one file are decoded once** if their ``to_uv``, ``wrap_mode`` and ``storage`` are equal: they
+    read the same arrays at the same place, and Dr.Jit merges equal reads. With ``storage`` ``float32`` such textures
+    share their parameters, across scenes, too: an optimiser that changes one of them changes all. A texture that is
+    loaded after such a change starts from the file.
 
-    **Between texels** values are interpolated as the image has them, sRGB-encoded where it is, and converted
-    afterwards, which :monosp:`bitmap` does first; at texel centres this makes no difference. ``mirror`` and ``clamp``
-    read nothing beyond the outermost texel centres. Where the image was found not to wrap around, ``repeat`` jumps at
-    the seam, where :monosp:`bitmap` blends over the width of a texel.
+    **Between texels**, values are interpolated in the encoding of the image (sRGB, if it is sRGB) and converted
+    afterwards; :monosp:`bitmap` converts first. At texel centres the two agree. ``mirror`` and ``clamp`` read nothing
+    beyond the outermost texel centres. If the fit found that the image does not wrap around, ``repeat`` jumps at the
+    seam, where :monosp:`bitmap` blends over the width of a texel.
 
-    **Spectral variants** upsample the colour that was read to a spectrum by Jakob and Hanika's model, from the table of
-    coefficients that :monosp:`bitmap` uses when it is loaded: the same spectra at texel centres (114 dB), and 52 dB
-    between those of smooth colours, 48 × 64 texels, at 400 to 700 nm. As in :monosp:`bitmap`, colours are clamped to
-    [0, 1] for that, also those of emitters, and a map of three channels answers for spectra only if it is not ``raw``,
-    for numbers only if it is.
+    **Spectral variants** upsample each colour to a spectrum by Jakob and Hanika's model, from the table of coefficients
+    that :monosp:`bitmap` uses at load time. The spectra agree at texel centres (114 dB), and to 52 dB between the
+    texels of smooth colours (48 × 64 texels, 400 to 700 nm). As in :monosp:`bitmap`, colours are clamped to [0, 1]
+    before upsampling, also those of emitters; and a map of three channels gives spectra only without ``raw``, and
+    numbers only with ``raw``.
 
-    The gradient that :monosp:`bumpmap` asks for is that of the image at its own resolution, from the four texels around
-    the place, each decoded. Positions on an emitter are sampled by the decoded image, or uniformly if ``to_uv`` does
-    not map the unit square to itself. This, ``mean`` and ``max`` reduce images of more than 2²² texels.
+    The gradient that :monosp:`bumpmap` reads is that of the image at its own resolution, from the four decoded texels
+    around the place. Positions on an emitter are sampled in proportion to the decoded image, or uniformly if ``to_uv``
+    does not map the unit square to itself. For this, for ``mean`` and for ``max``, images of more than 2²² texels are
+    reduced.
 
     .. tabs::
         .. code-tab:: xml
@@ -115,8 +96,8 @@ class NeuralImage(MapTexture):
 
     def _open(self, props: mi.Properties) -> SharedMaps:
         properties.one_of(props, "filter_type", ("bilinear",))
-        found, self._path = open_compressed(TASK, props)
-        return found
+        maps, self._path = open_compressed(TASK, props)
+        return maps
 
     def _repeats(self):
         borders = [] if self.net is None else [reversed(array.border) for array in self.net.primary]

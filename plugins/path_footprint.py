@@ -1,3 +1,5 @@
+"""Path tracer that carries ray differentials, for textures that filter themselves."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 from functools import cache
@@ -24,12 +26,12 @@ Path tracer with footprints (:monosp:`path_footprint`)
 
  * - max_depth
    - |int|
-   - Longest path: 1 shows emitters only, 2 direct light, and so on; -1 is infinite. (Default: -1)
+   - Maximum path depth: 1 shows emitters only, 2 adds direct light, and so on; -1 is unlimited. (Default: -1)
    - --
 
  * - rr_depth
    - |int|
-   - Depth from which on Russian roulette may end a path. (Default: 5)
+   - Depth from which Russian roulette may end a path. (Default: 5)
    - --
 
  * - hide_emitters
@@ -39,30 +41,31 @@ Path tracer with footprints (:monosp:`path_footprint`)
 
  * - jitter
    - |bool|
-   - Spread samples over the pixel. If false, all go through its centre, which is for one sample a pixel and
+   - Spread samples over the pixel. If false, all samples go through its centre, which suits one sample per pixel with
      textures that filter themselves. (Default: true)
    - --
 
-The estimator of :monosp:`path`: emitters and BSDFs are sampled, and both are weighted by the power heuristic.
-Along each path it carries *ray differentials* (Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999), from which
-textures that filter themselves learn how large the pixel is where they are read: in the fields ``si.duv_dx`` and
-``si.duv_dy``, two conjugate diameters of its footprint in uv. Mirrors and smooth boundaries, plane and curved,
-bend them as they bend the ray, with both curvatures of the surface. For :math:`n` samples a pixel they are
-:math:`\max(1/8, 1/\sqrt n)` of the pixel's, as in pbrt-v4.
+A path tracer with the estimator of :monosp:`path`: emitters and BSDFs are sampled, and both are weighted by the power
+heuristic. Along each path it carries *ray differentials* (Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999). They
+tell textures that filter themselves the size of the pixel at each hit, in the fields ``si.duv_dx`` and ``si.duv_dy``:
+two conjugate diameters of its footprint in uv. Mirrors and smooth boundaries, plane and curved, bend the differentials
+as they bend the ray, with both curvatures of the surface. For :math:`n` samples per pixel, differentials are scaled by
+:math:`\max(1/8, 1/\sqrt n)`, as in pbrt-v4.
 
-**At rough bounces** a cone is opened around the ray, whose angle is the root of the solid angle of a share of the
-lobe, that scale divided by the root of the density of the sampled direction, at most 0.5 rad. It grows
-linearly, other surfaces leave its angle as it is, and its disc and the parallelogram of the differentials add up
-as their second moments do. The direction itself is taken as that of a mirror whose normal is half-way.
+**Rough bounces** add a cone around the ray. Its angle is the scale above, divided by the square root of the density of
+the sampled direction, and at most 0.5 rad: the square root of the solid angle of one sample's share of the lobe. The
+cone's width grows linearly with distance, and later smooth surfaces do not change its angle. The second moments of the
+cone's disc and of the differentials' parallelogram are added. The differentials are reflected by the mirror whose
+normal lies half-way between the two directions.
 
-**Only if a texture of the scene asks for footprints** is any of this computed, that is, has a method
-``set_cone(cone)``, which is not called here. Shapes that do not tell how their normals change, :monosp:`sdfgrid`
-among them, count as flat, and so do the details of normal and bump maps.
+**Differentials are carried only if a texture of the scene uses footprints**, that is, has a method ``set_cone(cone)``,
+which is not called here. Shapes that do not provide the derivatives of their normals, such as :monosp:`sdfgrid`, count
+as flat, and so do the details of normal and bump maps.
 
-**Derivatives** are computed by path replay (Vicini et al., *Path Replay Backpropagation*, SIGGRAPH 2021) with
-respect to materials, textures and emitters; those that are smooth mirrors, too, as far as they do not decide what
-is sampled. Footprints are constants to them, and the geometry is: for shapes there is :monosp:`prb_projective`. Not
-for polarised variants.
+**Derivatives** with respect to materials, textures and emitters are computed by path replay (Vicini et al., *Path
+Replay Backpropagation*, SIGGRAPH 2021). This includes smooth mirrors, except for parameters that decide which direction
+is sampled. Footprints and geometry are constants: for derivatives of shapes, use :monosp:`prb_projective`. Polarised
+variants are not supported.
 
 .. tabs::
     .. code-tab:: xml
@@ -80,7 +83,7 @@ for polarised variants.
 
 
 class Centred:
-    """A sampler of which the first pair of numbers, the place in a pixel, is the centre; the others are as they are."""
+    """Sampler whose first pair of numbers, the place in a pixel, is the centre; all others are unchanged."""
 
     def __init__(self, sampler: mi.Sampler):
         self._sampler, self._first = sampler, True
@@ -95,20 +98,20 @@ class Centred:
 
 
 def power_heuristic(a, b):
-    """The weight of a sample whose density is ``a``, where another technique would have had ``b``."""
+    """Return the weight of a sample of density ``a``, where another technique has the density ``b``."""
     return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)
 
 
 def relative(value):
-    """1 with the derivative of the logarithm of ``value``; 0 where it is 0."""
-    found = dr.detach(value)
-    nonzero = found != 0
-    return dr.select(nonzero, value / dr.select(nonzero, found, 1), 0)
+    """Return 1 with the derivative of the logarithm of ``value``; 0 where ``value`` is 0."""
+    detached = dr.detach(value)
+    nonzero = detached != 0
+    return dr.select(nonzero, value / dr.select(nonzero, detached, 1), 0)
 
 
 @cache
 def integrator() -> type:
-    """The class, in the variant that is set: of what Mitsuba's integrators build upon it knows only after this file."""
+    """Return the class for the variant that is set; its base class exists only after Mitsuba loaded this file."""
 
     class PathFootprint(compat.replay_integrator()):
         __doc__ = MANUAL
@@ -136,7 +139,7 @@ def integrator() -> type:
             )
 
         def sample_rays(self, scene, sensor, sampler):
-            """As in Mitsuba, but with differentials of samples, not of pixels."""
+            """Sample rays as Mitsuba does, but with differentials of samples in place of pixels."""
             ray, weight, place = super().sample_rays(scene, sensor, sampler if self.jitter else Centred(sampler))
             ray.has_differentials = len(footprint.textures(scene)) > 0
             if not ray.has_differentials:
@@ -154,8 +157,10 @@ def integrator() -> type:
         @dr.syntax
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
             """
-            See ``ADIntegrator.sample``. In the differential phases ``L`` is what is still to come at the current
-            vertex, which starts as the whole (``state_in``).
+            Trace paths; see ``ADIntegrator.sample``.
+
+            In the differential phases, ``L`` is the radiance that is still to come at the current vertex; it starts as
+            the radiance of the whole path (``state_in``).
             """
             primal = mode == dr.ADMode.Primal
             carried = bool(getattr(ray, "has_differentials", False))
@@ -213,7 +218,7 @@ def integrator() -> type:
                     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
                     direct = dr.select(lit, throughput * weight * bsdf_value * emitter_weight, 0)
 
-                # Where to go on
+                # Next direction
                 with dr.resume_grad(when=not primal):
                     bs, bsdf_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), going)
                 bs = dr.detach(bs)
@@ -243,7 +248,7 @@ def integrator() -> type:
                 density = bs.pdf
                 delta = delta_next
 
-                # Whether to go on: radiance changes by η² at a boundary, which is undone for this
+                # Russian roulette, without the factor η² of radiance at boundaries
                 largest = dr.max(throughput)
                 survival = dr.minimum(largest * dr.square(eta), 0.95)
                 roulette = depth >= self.rr_depth
@@ -253,8 +258,8 @@ def integrator() -> type:
                 depth[going] += 1
                 pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
-            shown = dr.select(valid, L, 0) if primal else δL
-            return shown, valid, [], L
+            result = dr.select(valid, L, 0) if primal else δL
+            return result, valid, [], L
 
     return PathFootprint
 

@@ -1,7 +1,8 @@
 """
-Ray differentials: how the ray of a sample moves with a step of the sample's width in x and in y on the film, along a
-whole path. After Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999, with one formula for reflection and refraction;
-what rough bounces do to them is a rule of ours (:meth:`Differentials.bounced`). Everything is detached.
+Ray differentials along a path: the shift of a ray for a step of one sample's width in x and in y on the film.
+
+After Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999, with one formula for reflection and refraction; the rule for
+rough bounces is our own (:meth:`Differentials.bounced`). All values are detached.
 """
 
 from __future__ import annotations
@@ -13,20 +14,22 @@ import mitsuba as mi
 
 from . import footprint
 
-#: What a rough bounce adds, at most, to the angle of a sample's cone, rad. A diffuse lobe would be 1.8 wide, and what
-#: is seen through it so blurred that colour would bleed from where no light comes.
+#: Largest angle that a rough bounce adds to a sample's cone, in rad. The full angle of a diffuse lobe would be 1.8, and
+#: would blur textures so much that colour bleeds from places that send no light.
 WIDEST = 0.5
 
-#: Cosines that something is divided by are at least so far from 0.
+#: Smallest absolute value of cosines in denominators.
 GRAZING = 1e-4
 
 
-@dataclass  # which is what loops of Dr.Jit take for state
+@dataclass  # a type that loops of Dr.Jit accept as state
 class Differentials:
     """
-    Of the rays of a wavefront: what a step in x and y adds to their origins ``ox``, ``oy``, and to their directions
-    ``dx``, ``dy``, all ``mi.Vector3f``; and a cone around them, of ``width`` at the origin, that grows by ``spread``
-    per unit of length: what rough bounces did.
+    Differentials of the rays of a wavefront.
+
+    A step in x or y adds ``ox`` or ``oy`` to the origin and ``dx`` or ``dy`` to the direction, all ``mi.Vector3f``.
+    Rough bounces add a cone around the ray, which is ``width`` wide at the origin and grows by ``spread`` per unit of
+    length.
     """
 
     ox: mi.Vector3f
@@ -38,7 +41,7 @@ class Differentials:
 
     @classmethod
     def of(cls, ray) -> Differentials:
-        """Of rays of a sensor (``mi.RayDifferential3f``, scaled as the samples are); zero of any others."""
+        """Return those of a sensor's rays (``mi.RayDifferential3f``, scaled for samples); zero for other rays."""
         if not (hasattr(ray, "d_x") and ray.has_differentials):
             return cls(*(mi.Vector3f(0) for _ in range(4)), mi.Float(0), mi.Float(0))
         ray = dr.detach(ray)
@@ -47,8 +50,10 @@ class Differentials:
 
     def at(self, ray, si) -> Differentials:
         """
-        At a hit: what the steps add to the place on the tangent plane is now in ``ox``, ``oy``, and ``width`` is that
-        of the cone there, across the ray.
+        Return the differentials at a hit.
+
+        ``ox`` and ``oy`` are the shifts of the place on the tangent plane, ``width`` is the width of the cone there,
+        perpendicular to the ray.
         """
         n, d, t = mi.Vector3f(dr.detach(si.n)), dr.detach(ray.d), dr.select(si.is_valid(), dr.detach(si.t), 0)
         cosine = _away_from_zero(dr.dot(n, d))
@@ -63,8 +68,9 @@ class Differentials:
 
     def footprint(self, ray, si) -> tuple[mi.Vector2f, mi.Vector2f]:
         """
-        At a hit (:meth:`at`): ``ddx, ddy`` in uv (:func:`.footprint.footprint`). The steps' parallelogram and the
-        cone's disc add up as their second moments do.
+        Return the footprint ``ddx, ddy`` in uv at a hit (:meth:`at`).
+
+        The second moments of the steps' parallelogram and of the cone's disc are added.
         """
         du, dv = dr.detach(si.dp_du), dr.detach(si.dp_dv)
         ddx, ddy = footprint.in_uv(self.ox, self.oy, ray.d, du, dv)
@@ -76,18 +82,20 @@ class Differentials:
 
     def bounced(self, ray, si, wo, eta, pdf, delta, scale, edges) -> Differentials:
         """
-        From a hit (:meth:`at`) on, in the direction ``wo`` (world), which was sampled with the density ``pdf`` (per
-        solid angle) or is the only one (``delta``); ``eta``, the relative index of refraction of what lies there.
+        Return the differentials after a bounce at a hit (:meth:`at`) into the direction ``wo`` (world space).
 
-        The bounce is taken as one at a mirror, or a smooth boundary, whose normal leads from the one direction to the
-        other: a shading normal, a mapped one, or that of a microfacet. It curves as the surface does: ``dn_du`` and
-        ``dn_dv`` belong to the ``edges`` (:func:`mi_diffind.compat.normal_edges`). If not ``delta``, the cone's
-        ``spread`` s grows to √(s² + a²) with a² = scale² / pdf, the solid angle of a share of the lobe, limited to
-        :data:`WIDEST`; ``scale`` as that of the samples.
+        ``pdf`` is the density of the direction per solid angle, unless it is the only one (``delta``); ``eta`` is the
+        relative index of refraction in that direction; ``scale`` is the scale of a sample's footprint.
+
+        The bounce is treated as that of a mirror, or of a smooth boundary, with the normal that maps one direction to
+        the other: a shading normal, a mapped normal or the normal of a microfacet. Its curvature is that of the
+        surface: ``dn_du`` and ``dn_dv`` belong to the ``edges`` (:func:`mi_diffind.compat.normal_edges`). Without
+        ``delta``, the ``spread`` s of the cone grows to √(s² + a²) with a² = scale² / pdf, the solid angle of one
+        sample's share of the lobe; a is at most :data:`WIDEST`.
         """
         d, wo, outward = dr.detach(ray.d), dr.detach(wo), mi.Vector3f(dr.detach(si.sh_frame.n))
         ratio = dr.select(eta > 0, dr.rcp(eta), 1)
-        # ratio · d − wo is parallel to the normal; zero where the ray just goes on, and any normal will do
+        # ratio · d − wo is parallel to the normal; it is zero for an undeflected ray, where any normal is valid
         normal = ratio * d - wo
         length2 = dr.squared_norm(normal)
         normal = dr.select(length2 > 1e-8, normal * dr.rsqrt(length2), outward)

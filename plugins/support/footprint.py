@@ -1,13 +1,14 @@
 """
-The footprint of a pixel where a ray hits a surface: two full conjugate diameters of an ellipse in the surface's uv,
-``ddx`` and ``ddy`` (``mi.Vector2f``), the columns of what the next Mitsuba calls ``si.footprint``. :func:`area`,
-|det|, is |ddx(uv) × ddy(uv)| of Datta et al., *Efficient Graphics Representation with Differentiable Indirection*,
-SIGGRAPH Asia 2023, task 4.
+Footprint of a pixel at a surface hit: two full conjugate diameters of an ellipse in uv, ``ddx`` and ``ddy``.
 
-A texture gets to see the hit alone. Where no integrator says how large the pixel is there, a :class:`Cone` of the
-sensor does, which :func:`attach` hands to all textures of a scene that have a method ``set_cone(cone)``.
+Both are ``mi.Vector2f``, the columns of ``si.footprint`` in Mitsuba 3.10. Their |det| (:func:`area`) is
+|ddx(uv) × ddy(uv)| of Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH Asia
+2023, task 4.
 
-Functions here neither evaluate nor differentiate: footprints are detached.
+A texture sees only the hit. If the integrator does not provide the footprint, a :class:`Cone` of the sensor does;
+:func:`attach` passes it to all textures of a scene that have a method ``set_cone(cone)``.
+
+The functions of this module neither evaluate nor differentiate: footprints are detached.
 """
 
 from __future__ import annotations
@@ -21,33 +22,36 @@ import numpy as np
 
 from mi_diffind import compat
 
-#: Components of a footprint are limited to ± this, in uv: beyond any texture, and its fourth power is finite.
+#: Limit of the components of a footprint in uv: larger than any texture, and its fourth power is finite.
 LARGEST = 2.0**20
 
-#: Of a surface whose dp_du and dp_dv enclose an angle with a sine below this, uv says nothing.
+#: Sine of the angle between dp_du and dp_dv below which uv is degenerate.
 PARALLEL = 1e-6
 
-#: Sensors whose pixels are known, by what their rays do.
-KINDS = ("perspective", "thinlens", "orthographic")
+#: Supported sensors.
+PROJECTIONS = ("perspective", "thinlens", "orthographic")
 
-#: A ray deviates by less from the line to the sensor if it comes from there, rad: a normal map's frame is not exact.
+#: Largest deviation, in rad, of a direct ray from the line to the sensor; a normal map's frame is not exact.
 STRAIGHT = 2e-2
 
 
-@dataclass(eq=False)  # which is where functions that are frozen look for arrays
+@dataclass(eq=False)  # a type in which frozen functions (``dr.freeze``) look for arrays
 class Cone:
     """
-    What a texture has to know of a sensor, in world space, as opaque arrays: another sensor compiles nothing anew.
+    Geometry of a sensor's pixels in world space, as opaque arrays, so that another sensor needs no new kernel.
 
-    ``origin``, of a perspective its centre, of a thin lens the centre of the lens. ``axis``, the unit vector of
-    viewing. ``dx``, ``dy``: what a step of one pixel to the right, or down, adds to the place that is seen: at depth
-    1 along the axis, or of an orthographic sensor at any. ``scale``, by which the footprint of a sample is smaller than
-    that of a pixel (:func:`scale_of`). ``reach``: of all pixels the least √(cos³) of the angle to the axis, 1 if
-    orthographic. ``lens``, the radius of the lens, 0 without. ``kind``, one of :data:`KINDS`. ``corner``: what is seen
-    at the film's corner, from ``origin``, as ``dx``; ``None`` with a lens or more than one sample a pixel.
+    - ``projection``: one of :data:`PROJECTIONS`;
+    - ``origin``: the centre of projection, or of the lens; ``axis``: the unit vector of the viewing direction;
+    - ``dx``, ``dy``: the shift of the visible place for a step of one pixel to the right, or down, at depth 1 along the
+      axis (for an orthographic sensor, at any depth);
+    - ``scale``: the width of a sample's footprint relative to a pixel's (:func:`scale_of`);
+    - ``reach``: the least √(cos³) of the angle between a pixel and the axis, 1 if orthographic;
+    - ``lens``: the radius of the lens, 0 without one;
+    - ``corner``: the visible place at the film's corner, relative to ``origin`` and at the depth of ``dx``; ``None``
+      with a lens or more than one sample per pixel.
     """
 
-    kind: str
+    projection: str
     origin: mi.Point3f
     axis: mi.Vector3f
     dx: mi.Vector3f
@@ -60,9 +64,11 @@ class Cone:
     @classmethod
     def of(cls, sensor: mi.Sensor, spp: int | None = None) -> Cone:
         """
-        Of a loaded sensor, at ``spp`` samples a pixel (default: its sampler's). It is told by its rays: all through one
-        point or one lens, or all parallel, and pixels that are parallelograms. Raises ``RuntimeError`` for others
-        (``distant``, ``irradiancemeter``, ``radiancemeter``, ``batch``, …).
+        Return the cone of a loaded sensor, at ``spp`` samples per pixel (default: that of its sampler).
+
+        The projection is derived from the sensor's rays: all go through one point or one lens, or all are parallel, and
+        pixels are parallelograms. Raises ``RuntimeError`` for other sensors (``distant``, ``irradiancemeter``,
+        ``radiancemeter``, ``batch``, …).
         """
         film, to_world = sensor.film(), np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
         places = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0.5], [0.5, 0.5]])
@@ -78,41 +84,43 @@ class Cone:
 
         radius = 0.0
         if np.abs(d - d[0]).max() < 1e-6:
-            kind, seen, origin = "orthographic", o, o[4]
+            projection, seen, origin = "orthographic", o, o[4]
         elif (cosine > 0).all():
-            kind, seen = "perspective", d / np.maximum(cosine, 1e-9)[:, None]
+            projection, seen = "perspective", d / np.maximum(cosine, 1e-9)[:, None]
             if sensor.needs_aperture_sample():
-                kind = "thinlens"
+                projection = "thinlens"
                 on_lens = o[5] - seen[5] * ((o[5] - origin) @ axis)  # rays start at the near clipping plane
                 radius = float(np.linalg.norm(on_lens - origin))
             away = np.cross(o[:5] - origin, d[:5])
             if np.abs(away).max() > 1e-4 * (1 + np.abs(origin).max()):
-                kind = ""
+                projection = ""
         else:
-            kind = ""
-        if kind:
+            projection = ""
+        if projection:
             dx, dy = seen[1] - seen[0], seen[2] - seen[0]
             error = max(np.abs(seen[0] + dx + dy - seen[3]).max(), np.abs(seen[0] + (dx + dy) / 2 - seen[4]).max())
             span = max(np.abs(dx).max(), np.abs(dy).max())
-        if not kind or span == 0 or error > 1e-2 * span:
+        if not projection or span == 0 or error > 1e-2 * span:
             raise RuntimeError(
                 f'the sensor "{sensor.id()}" ({sensor.class_name()}) has no pixels whose footprint is known, supported '
-                f"are {', '.join(KINDS)}"
+                f"are {', '.join(PROJECTIONS)}"
             )
         spp = sensor.sampler().sample_count() if spp is None else spp
-        reach = 1.0 if kind == "orthographic" else float((cosine[:4] ** 1.5).min())
-        found = cls._opaque(kind, origin, axis, dx / size[0], dy / size[1], spp, reach, radius)
-        if kind != "thinlens" and spp == 1:
-            corner = seen[0] - (origin if kind == "orthographic" else 0)
-            found.corner = dr.opaque(mi.Vector3f, [float(x) for x in corner])
-        return found
+        reach = 1.0 if projection == "orthographic" else float((cosine[:4] ** 1.5).min())
+        cone = cls._opaque(projection, origin, axis, dx / size[0], dy / size[1], spp, reach, radius)
+        if projection != "thinlens" and spp == 1:
+            corner = seen[0] - (origin if projection == "orthographic" else 0)
+            cone.corner = dr.opaque(mi.Vector3f, [float(x) for x in corner])
+        return cone
 
     @classmethod
     def from_properties(cls, props: mi.Properties) -> Cone | None:
         """
-        Of a perspective, from a texture's properties ``sensor_to_world`` (a transformation without scale), ``fov`` (in
-        degrees, along x), ``resolution`` (pixels along x, which are square) and ``spp`` (default 1): for plain Mitsuba,
-        where nobody calls :func:`attach`. ``None`` if none of them is given. Raises ``RuntimeError``.
+        Return the cone of a perspective sensor that a texture's properties describe; ``None`` without such properties.
+
+        They are ``sensor_to_world`` (a transformation without scale), ``fov`` (in degrees, along x), ``resolution``
+        (number of square pixels along x) and ``spp`` (default 1), for plain Mitsuba, which does not call
+        :func:`attach`. Raises ``RuntimeError``.
         """
         names = ("sensor_to_world", "fov", "resolution", "spp")
         given = [name for name in names if name in props]
@@ -137,22 +145,19 @@ class Cone:
         return cls._opaque("perspective", origin, axis, -step * right, -step * down, spp, reach, 0.0)
 
     @classmethod
-    def _opaque(cls, kind, origin, axis, dx, dy, spp, reach, lens) -> Cone:
+    def _opaque(cls, projection, origin, axis, dx, dy, spp, reach, lens) -> Cone:
         vectors = (dr.opaque(mi.Vector3f, [float(x) for x in v]) for v in (axis, dx, dy))
         numbers = (dr.opaque(mi.Float, float(x)) for x in (scale_of(spp), reach, lens))
-        return cls(kind, dr.opaque(mi.Point3f, [float(x) for x in origin]), *vectors, *numbers)
+        return cls(projection, dr.opaque(mi.Point3f, [float(x) for x in origin]), *vectors, *numbers)
 
     @property
     def spread(self) -> mi.Float:
-        """
-        How wide a pixel is, along x: at depth 1, which is 2·tan(fov/2)/pixels, or anywhere if orthographic. Of a pixel,
-        not a sample.
-        """
+        """Width of a pixel along x, at depth 1 (2·tan(fov/2)/pixels), or at any depth if orthographic."""
         return dr.norm(self.dx)
 
 
 def scale_of(spp: float) -> float:
-    """The width of a sample's footprint relative to the pixel's: max(1/8, 1/√spp), as in pbrt-v4; 1 for one sample."""
+    """Return the width of a sample's footprint relative to the pixel's: max(1/8, 1/√spp), as in pbrt-v4."""
     return float(max(1 / 8, 1 / np.sqrt(max(spp, 1))))
 
 
@@ -168,12 +173,12 @@ def _number(props: mi.Properties, name: str, default: float) -> float:
 
 def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi.Vector2f, mi.Vector2f]:
     """
-    The footprint at a hit: ``ddx, ddy`` in the surface's uv, before any ``to_uv``.
+    Return the footprint at a hit: ``ddx, ddy`` in the surface's uv, before any ``to_uv``. It is always finite.
 
-    It is taken from the first of these that knows: ``si.footprint``, which the next Mitsuba has; the partials
-    ``si.duv_dx`` and ``si.duv_dy``, if an integrator filled them; the ``cone`` (:func:`seen_by`). Lane by lane, one
-    that is zero or not finite hands over to the next. If none knows, what is infinite is limited to :data:`LARGEST`,
-    NaN is 0, and no source at all is 0: the sharpest. What is returned is finite, always.
+    In each lane, the first of these sources counts that is neither zero nor infinite nor NaN: ``si.footprint``, which
+    Mitsuba 3.10 has; the partial derivatives ``si.duv_dx`` and ``si.duv_dy``, if an integrator filled them; the
+    ``cone`` (:func:`seen_by`). Without any, infinite values of the last source are limited to :data:`LARGEST`, and NaN
+    or no source at all is 0, the sharpest footprint.
     """
     sources = []
     if hasattr(si, "footprint"):
@@ -184,28 +189,30 @@ def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi
     for x, y in reversed(sources):
         x, y = dr.detach(x), dr.detach(y)
         size = _size(x, y)
-        known = (size > 0) & (size < dr.inf)  # NaN: false
-        known |= _size(ddx, ddy) == 0
-        ddx, ddy = dr.select(known, _finite(x), ddx), dr.select(known, _finite(y), ddy)
+        valid = (size > 0) & (size < dr.inf)  # NaN: false
+        valid |= _size(ddx, ddy) == 0
+        ddx, ddy = dr.select(valid, _finite(x), ddx), dr.select(valid, _finite(y), ddy)
     return ddx, ddy
 
 
 def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Vector2f]:
     """
-    The footprint of a sample of a sensor, from its place alone: the steps of a pixel, projected along the line of sight
-    onto the plane of dp_du and dp_dv. With t the distance, z the cosine of the line to the sensor's axis, θ its angle
-    to the normal, the area is (spread · t)² z³ / (|dp_du × dp_dv| cos θ), exactly.
+    Return the footprint of a sensor's sample, from the position of the hit alone.
 
-    A hit that is not seen directly, since ``si.wi`` points elsewhere than to the sensor, is taken for what it is at
-    least: the larger one of two, both as wide as the pixel at the film's corner. One comes along ``si.wi`` from as far
-    as ``si.t``, the last segment of the way; the other from as far as the sensor, onto a surface that faces it, which
-    is pbrt-v4's ``Camera::Approximate_dp_dxy`` but never oblique. The way by flat mirrors is longer than either, and
-    round mirrors and rough bounces widen: never blurrier than the truth but after hollow mirrors and lenses. Where
-    dp_du and dp_dv are parallel or zero: zero.
+    A direct hit: the steps of a pixel are projected along the line of sight onto the plane of dp_du and dp_dv. With the
+    distance t, the cosine z between the line and the sensor's axis, and the angle θ between the line and the normal,
+    the area is exactly (spread · t)² z³ / (|dp_du × dp_dv| cos θ).
+
+    An indirect hit, where ``si.wi`` does not point to the sensor, gets a lower estimate: the larger of two footprints,
+    both as wide as the pixel at the film's corner. The first comes along ``si.wi`` over the distance ``si.t``, the last
+    segment of the path; the second comes over the distance of the sensor onto a surface that faces it, which is
+    pbrt-v4's ``Camera::Approximate_dp_dxy`` but never oblique. Paths over flat mirrors are longer than either, and
+    curved mirrors and rough bounces widen the footprint; only after concave mirrors and lenses may the true footprint
+    be smaller. If dp_du and dp_dv are parallel or zero, the footprint is zero.
     """
     p, du, dv = dr.detach(si.p), dr.detach(si.dp_du), dr.detach(si.dp_dv)
     unit = dr.normalize(dr.cross(du, dv))
-    if cone.kind == "orthographic":
+    if cone.projection == "orthographic":
         to, distance, depth = cone.axis, mi.Float(1), mi.Float(1)
         tolerance = mi.Float(STRAIGHT)
     else:
@@ -213,7 +220,7 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
         distance, depth = dr.norm(to), dr.dot(to, cone.axis)
         to = to * dr.rcp(distance)
         tolerance = STRAIGHT + cone.lens * dr.rcp(distance)
-    # A material with two sides may have reflected si.wi at the surface: the sign of z says nothing
+    # A two-sided material may have flipped si.wi, so that the sign of z has no meaning
     local, wi = dr.detach(si.sh_frame).to_local(to), dr.detach(si.wi)
     away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
     direct = (dr.squared_norm(away) < dr.square(tolerance)) & (depth > 0)
@@ -221,7 +228,7 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
     last, incident = dr.detach(si.t), dr.detach(si.sh_frame).to_world(wi)
     oblique = dr.abs(dr.dot(incident, unit))
     by_last = dr.square(last) > dr.square(distance) * oblique
-    if cone.kind == "orthographic":  # a pixel is as wide at any distance
+    if cone.projection == "orthographic":  # a pixel is as wide at any distance
         by_last, last = mi.Bool(True), distance
     along = dr.select(direct, to, dr.select(by_last, incident, unit))
     frame = mi.Frame3f(along)
@@ -233,14 +240,16 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
 
 def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Vector2f:
     """
-    From a hit to what is seen at the centre of its pixel, in uv: undoes the jitter of a sample that is the only one of
-    its pixel. Zero where the sensor does not see the hit directly, or takes more samples, or has a lens.
+    Return the offset in uv from a hit to the place seen at the centre of its pixel.
+
+    It removes the jitter of a sample that is the only one of its pixel. It is zero for indirect hits, for several
+    samples per pixel, and for sensors with a lens.
     """
     if cone is None or cone.corner is None:
         return mi.Vector2f(0)
     to = dr.detach(si.p) - cone.origin
-    depth = mi.Float(1) if cone.kind == "orthographic" else dr.dot(to, cone.axis)
-    way = cone.axis if cone.kind == "orthographic" else dr.normalize(to)
+    depth = mi.Float(1) if cone.projection == "orthographic" else dr.dot(to, cone.axis)
+    way = cone.axis if cone.projection == "orthographic" else dr.normalize(to)
     local, wi = dr.detach(si.sh_frame).to_local(way), dr.detach(si.wi)
     away = mi.Vector3f(local.x + wi.x, local.y + wi.y, dr.abs(local.z) - dr.abs(wi.z))
     direct = (dr.squared_norm(away) < STRAIGHT**2) & (depth > 0)
@@ -252,8 +261,9 @@ def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Ve
 
 def in_uv(x, y, along, du, dv) -> tuple[mi.Vector2f, mi.Vector2f]:
     """
-    Vectors in space, ``x`` and ``y``, projected along a direction onto the plane of ``du`` and ``dv``, and expressed in
-    these. Limited to ± :data:`LARGEST`; zero where du and dv are parallel or zero, or something is NaN.
+    Project the vectors ``x`` and ``y`` along a direction onto the plane of ``du`` and ``dv``, and return them in uv.
+
+    Components are limited to ± :data:`LARGEST`; they are zero where du and dv are parallel or zero, or a value is NaN.
     """
     normal = dr.cross(du, dv)
     defined = dr.squared_norm(normal) > PARALLEL**2 * dr.squared_norm(du) * dr.squared_norm(dv)  # NaN, underflow: false
@@ -261,39 +271,40 @@ def in_uv(x, y, along, du, dv) -> tuple[mi.Vector2f, mi.Vector2f]:
     volume = dr.dot(normal, along)
     inverse = dr.rcp(dr.select(dr.abs(volume) < 1e-30, 1e-30, volume))
     to_u, to_v = dr.cross(dv, along), dr.cross(along, du)
-    found = (mi.Vector2f(dr.dot(v, to_u), dr.dot(v, to_v)) * inverse for v in (x, y))
-    return tuple(dr.select(defined, _finite(v), 0) for v in found)
+    projected = (mi.Vector2f(dr.dot(v, to_u), dr.dot(v, to_v)) * inverse for v in (x, y))
+    return tuple(dr.select(defined, _finite(v), 0) for v in projected)
 
 
 def _size(ddx, ddy):
-    """The largest component of both, infinite or NaN if one is."""
+    """Return the largest absolute component of both, infinite or NaN if one is."""
     return dr.maximum(dr.maximum(dr.abs(ddx.x), dr.abs(ddx.y)), dr.maximum(dr.abs(ddy.x), dr.abs(ddy.y)))
 
 
 def _finite(v: mi.Vector2f) -> mi.Vector2f:
-    """Limited to ± :data:`LARGEST`; NaN is 0."""
+    """Clamp a vector to ± :data:`LARGEST`, NaN to 0."""
     return dr.select(dr.isnan(v), 0, dr.clip(v, -LARGEST, LARGEST))
 
 
-# -- what it means -----------------------------------------------------------------------------------------------------
+# -- geometry of a footprint -------------------------------------------------------------------------------------------
 
 
 def transformed(ddx: mi.Vector2f, ddy: mi.Vector2f, matrix) -> tuple[mi.Vector2f, mi.Vector2f]:
-    """A footprint in uv that went through ``to_uv``, whose ``matrix``, 3 × 3, is given as a list of its rows."""
+    """Apply ``to_uv`` to a footprint in uv; ``matrix``, 3 × 3, is a list of its rows."""
     (a, b), (c, d) = (tuple(row)[:2] for row in tuple(matrix)[:2])
     return tuple(mi.Vector2f(dr.fma(a, v.x, b * v.y), dr.fma(c, v.x, d * v.y)) for v in (ddx, ddy))
 
 
 def area(ddx: mi.Vector2f, ddy: mi.Vector2f) -> mi.Float:
-    """|det|, in uv²: of the parallelogram, 4/π times that of the ellipse. Its root is the side of a square pixel."""
+    """Return |det| in uv², the area of the parallelogram (4/π of the ellipse); its root is a square pixel's side."""
     ddx, ddy = _finite(ddx), _finite(ddy)
     return dr.abs(ddx.x * ddy.y - ddx.y * ddy.x)
 
 
 def axes(ddx: mi.Vector2f, ddy: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Vector2f]:
     """
-    Of the ellipse with these conjugate diameters: the length of its major and of its minor axis in uv, both full and
-    ≥ 0, and the unit vector of the major one, (1, 0) for a circle. Finite, always; major · minor is :func:`area`.
+    Return the full lengths ≥ 0 in uv of the ellipse's major and minor axis, and the unit vector of the major axis.
+
+    For a circle, the vector is (1, 0). All are finite; major · minor is :func:`area`.
     """
     ddx, ddy = _finite(ddx), _finite(ddy)
     major, direction = _major(*_moments(ddx, ddy))
@@ -301,7 +312,7 @@ def axes(ddx: mi.Vector2f, ddy: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Vec
 
 
 def joined(ddx: mi.Vector2f, ddy: mi.Vector2f, s: mi.Vector2f, t: mi.Vector2f) -> tuple[mi.Vector2f, mi.Vector2f]:
-    """Two footprints, one blurred by the other: the moments add up. Its axes, the major one first."""
+    """Return the axes, major first, of two footprints blurred by each other: the second moments are added."""
     ddx, ddy, s, t = (_finite(v) for v in (ddx, ddy, s, t))
     p, q, r = (a + b for a, b in zip(_moments(ddx, ddy), _moments(s, t), strict=True))
     major, direction = _major(p, q, r)
@@ -312,21 +323,21 @@ def joined(ddx: mi.Vector2f, ddy: mi.Vector2f, s: mi.Vector2f, t: mi.Vector2f) -
 
 
 def _moments(ddx, ddy) -> tuple:
-    """The second moments uu, uv and vv of both diameters."""
+    """Return the sums over both diameters of the second moments uu, uv and vv."""
     uu, vv = dr.fma(ddx.x, ddx.x, dr.square(ddy.x)), dr.fma(ddx.y, ddx.y, dr.square(ddy.y))
     return uu, dr.fma(ddx.x, ddx.y, ddy.x * ddy.y), vv
 
 
 def _major(p, q, r) -> tuple:
-    """The length of the major axis of the ellipse with these moments, and its unit vector, (1, 0) for a circle."""
+    """Return length and unit vector of the major axis of the ellipse with these moments; (1, 0) for a circle."""
     half = 0.5 * (p - r)
     root = dr.sqrt(dr.fma(half, half, q * q))
     wide = half >= 0
     x, y = dr.select(wide, half + root, q), dr.select(wide, q, root - half)
     length2 = dr.fma(x, x, y * y)
-    found = length2 > 0
-    inverse = dr.rsqrt(dr.select(found, length2, 1))
-    direction = mi.Vector2f(dr.select(found, x * inverse, 1), dr.select(found, y * inverse, 0))
+    elongated = length2 > 0
+    inverse = dr.rsqrt(dr.select(elongated, length2, 1))
+    direction = mi.Vector2f(dr.select(elongated, x * inverse, 1), dr.select(elongated, y * inverse, 0))
     return dr.sqrt(0.5 * (p + r) + root), direction
 
 
@@ -334,19 +345,20 @@ def _major(p, q, r) -> tuple:
 
 
 def textures(scene: mi.Scene) -> list:
-    """The textures of a loaded scene that ask for a sensor: they have a method ``set_cone(cone)``; each once."""
+    """Return the textures of a loaded scene that have a method ``set_cone(cone)``, each once."""
     return [node for node in compat.objects_of(scene) if hasattr(node, "set_cone")]
 
 
 def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None) -> int:
     """
-    Tell the textures of a loaded scene that ask for it (:func:`textures`) which sensor sees them, at ``spp`` samples a
-    pixel (default: its sampler's); returns how many there are. To be called again after the sensor moved, for another
-    one, or for other samples. A scene without sensors, or one whose pixels are not known (:meth:`Cone.of`), which is
-    warned of, tells them that there is none.
+    Set the cone of all textures of a loaded scene that use one (:func:`textures`), and return their number.
+
+    ``spp`` is the number of samples per pixel (default: that of the sampler). Call again after a change of the sensor
+    or of the samples. Without a supported sensor (:meth:`Cone.of`) the cone is ``None``, with a warning if there is an
+    unsupported one.
     """
-    found = textures(scene)
-    if not found:
+    filtering = textures(scene)
+    if not filtering:
         return 0
     cone = None
     try:
@@ -356,6 +368,6 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
             cone = Cone.of(scene.sensors()[sensor], spp)
     except RuntimeError as e:
         mi.Log(mi.LogLevel.Warn, f"textures are not filtered: {e}")
-    for texture in found:
+    for texture in filtering:
         texture.set_cone(cone)
-    return len(found)
+    return len(filtering)

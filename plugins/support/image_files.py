@@ -1,4 +1,4 @@
-"""Files of maps as textures share them, and the originals that compressed ones were made from."""
+"""Files of maps, shared between textures, and the original images of compressed files."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ STORAGES = ("uint8", "float32")
 #: Kinds of maps that hold data, not colours.
 DATA_ROLES = ("normal", "roughness", "ao", "metallic")
 
-#: Pyramids that a texture may name: name → :class:`~mi_diffind.maps.pyramid.Pyramid`. (No property can hold one.)
+#: Name → :class:`~mi_diffind.maps.pyramid.Pyramid`, for textures that name one (no property can hold a pyramid).
 PYRAMIDS: dict[str, Pyramid] = {}
 
 _cache: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
-_lock = threading.RLock()  # a thread that waits for a kernel may go on with another constructor
+_lock = threading.RLock()  # a thread that waits for a kernel may enter another constructor
 
 
 class SharedMaps:
     """
-    Maps and the arrays that hold them (name → ``DifferentiableArray``), the same Dr.Jit variables for all textures that
-    read them, and what else these share.
+    Maps and their arrays (name → ``DifferentiableArray``), shared by all textures that read them.
+
+    Equal reads are merged by Dr.Jit only if textures share their variables.
     """
 
     def __init__(self, image: CompressedMaps, arrays: dict, preset: str):
@@ -49,39 +50,37 @@ class SharedMaps:
 
     @property
     def tables(self) -> dict:
-        """The arrays that can be optimised, by name."""
+        """Arrays that can be optimised, by name."""
         return exposed(self.arrays)
 
     def state(self) -> list:
-        """What the arrays hold at present; keeps it alive, so that nothing else gets its index."""
+        """Return the present variables of the arrays; a reference keeps their indices from being used again."""
         return [dr.detach(array.data.array) for array in self.tables.values()]
 
     def unchanged(self, state: list) -> bool:
-        """Do the arrays hold what they held then?"""
+        """Return whether the arrays are still those of ``state``."""
         return [*map(compat.identity, state)] == [*map(compat.identity, self.state())]
 
     def as_loaded(self) -> bool:
-        """Do the arrays hold what the file holds, and is nobody about to change that?"""
+        """Return whether the arrays are those of the file, and no gradient of them is enabled."""
         return self.unchanged(self._loaded) and not any(compat.has_gradient(a.data) for a in self.tables.values())
 
     def transform(self, matrix: list):
-        """
-        The transformation by a 3×3 ``matrix``: one and the same variable for equal ones, so that the reads of several
-        textures are recognised as one.
-        """
+        """Return the transformation by a 3×3 ``matrix``, the same variable for equal matrices."""
         key = (mi.variant(), tuple(map(tuple, matrix)))
         with _lock:
             if key not in self._transforms:
-                found = mi.AffineTransform3f(mi.ScalarAffineTransform3f(matrix))
-                dr.make_opaque(found)
-                self._transforms[key] = found
+                transform = mi.AffineTransform3f(mi.ScalarAffineTransform3f(matrix))
+                dr.make_opaque(transform)
+                self._transforms[key] = transform
             return self._transforms[key]
 
 
 def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
     """
-    The maps in a file of a task whose models have an ``image``, shared with everybody who has them open, unless they
-    have been changed since. Raises ``TableError``.
+    Return the maps in a file of a task whose models have an ``image``. Raises ``TableError``.
+
+    They are shared by all textures that have the file open, unless their arrays have been changed since.
     """
     path = Path(path)
 
@@ -93,21 +92,21 @@ def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
 
 
 def shared(key: tuple, load: Callable[[], SharedMaps]) -> SharedMaps:
-    """What ``load()`` made for this ``key``, as long as somebody has it and has not changed it."""
+    """Return ``load()``, or its earlier result for this ``key`` if that is still in use and unchanged."""
     with _lock:
-        found = _cache.get(key)
-        if found is None or not found.as_loaded():
-            found = _cache[key] = load()
-        return found
+        maps = _cache.get(key)
+        if maps is None or not maps.as_loaded():
+            maps = _cache[key] = load()
+        return maps
 
 
 def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
-    """The maps that the properties ``filename`` and ``storage`` of a texture name, and the path of the file."""
+    """Return the maps that the properties ``filename`` and ``storage`` name, and the path of the file."""
     path = properties.filename(props)
     if not path:
         raise RuntimeError('parameter "filename": not given, a compressed image (.npz) is needed')
     storage = properties.one_of(props, "storage", STORAGES)
-    props.get("source", "")  # of use to the exact counterpart only
+    props.get("source", "")  # only the exact counterpart needs it
     try:
         return open_file(task, path, storage), path
     except TableError as e:
@@ -116,21 +115,22 @@ def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
 
 def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps, str]:
     """
-    The mip pyramid of what the property ``filename`` names, an image or a manifest, of the object ``bitmap``, or that
-    one of :data:`PYRAMIDS` that ``pyramid`` names; and the path of the file, "" without. With ``raw``, nothing is taken
-    for sRGB.
+    Return the mip pyramid that the properties name, and the path of its file ("" without a file).
+
+    ``filename`` names an image or a manifest, ``bitmap`` is an object, ``pyramid`` names one of :data:`PYRAMIDS`. With
+    ``raw``, sRGB values are not converted.
     """
     given = [name for name in ("filename", "bitmap", "pyramid") if name in props]
     if len(given) != 1:
-        found = " and ".join(f'"{name}"' for name in given) or "none"
-        raise RuntimeError(f'parameters "filename", "bitmap" and "pyramid": found {found}, one of them is needed')
+        names = " and ".join(f'"{name}"' for name in given) or "none"
+        raise RuntimeError(f'parameters "filename", "bitmap" and "pyramid": found {names}, exactly one is needed')
     raw = props.get("raw", False) is True
     types, border = module_of(mi.TensorXf), ("repeat" if wrap_mode == "repeat" else "clamp",) * 2
     if given == ["pyramid"]:
         name = str(props["pyramid"])
         if name not in PYRAMIDS:
-            known = ", ".join(f'"{n}"' for n in PYRAMIDS) or "none"
-            raise RuntimeError(f'parameter "pyramid": found "{name}", there are {known} (support.image_files.PYRAMIDS)')
+            names = ", ".join(f'"{n}"' for n in PYRAMIDS) or "none"
+            raise RuntimeError(f'parameter "pyramid": found "{name}", allowed are the keys of PYRAMIDS: {names}')
         pyramid = PYRAMIDS[name]
         if pyramid.types is not types:
             pyramid = Pyramid(pyramid.layout, pyramid.values, types, pyramid.border)
@@ -153,7 +153,7 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
 
 
 def _source_of(bitmap) -> Source:
-    """A ``mi.Bitmap`` as a source of one map, ``image``."""
+    """Return a ``mi.Bitmap`` as a source of one map, ``image``."""
     if not isinstance(bitmap, mi.Bitmap):
         raise RuntimeError(f'parameter "bitmap": found a {type(bitmap).__name__}, a Bitmap is needed')
     values = np.array(bitmap)
@@ -163,26 +163,26 @@ def _source_of(bitmap) -> Source:
 
 
 def map_of(layout: Layout, channels: str) -> MapLayout:
-    """The map called ``channels``; if that is empty, the only one, or the only one that holds colours."""
+    """Return the map called ``channels``; if that is empty, the only map, or the only albedo."""
     if channels and channels not in layout.names:
         raise RuntimeError(f'parameter "channels": found "{channels}", the file holds {", ".join(layout.names)}')
     if channels:
-        found = layout[channels]
+        chosen = layout[channels]
     else:
         candidates = layout.maps if len(layout.maps) == 1 else [m for m in layout.maps if m.role == "albedo"]
         if len(candidates) != 1:
             names = ", ".join(layout.names)
             raise RuntimeError(f'parameter "channels": not given, and the file holds several maps: {names}')
-        found = candidates[0]
-    if found.channels not in (1, 3):
+        chosen = candidates[0]
+    if chosen.channels not in (1, 3):
         raise RuntimeError(
-            f'parameter "channels": the map "{found.name}" has {found.channels} channels, a texture has 1 or 3'
+            f'parameter "channels": the map "{chosen.name}" has {chosen.channels} channels, a texture has 1 or 3'
         )
-    return found
+    return chosen
 
 
 def is_data(layout: MapLayout) -> bool:
-    """Does a map hold data that are never converted, so that ``raw`` is its default?"""
+    """Return whether a map holds data, which are never converted; ``raw`` is then true by default."""
     return layout.role in DATA_ROLES and layout.color_space == "linear"
 
 
@@ -190,58 +190,58 @@ def is_data(layout: MapLayout) -> bool:
 
 
 def to_bitmap(task: Task, props: mi.Properties) -> None:
-    """Give the properties of a texture of a task's file what a ``bitmap`` needs to show the original of its map."""
-    original, found = original_of(task, props)
+    """Add the properties that a ``bitmap`` needs to show the original of the map."""
+    original, layout = original_of(task, props)
     try:
-        values = _values(original, found)
+        values = _values(original, layout)
     except SourceError as e:
         raise RuntimeError(str(e)) from None
-    # A byte is what it was; of half precision, which "bitmap" would make of 16 bits, the texture knows nothing
-    bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if found.depth == 1 else np.ascontiguousarray(values))
-    bitmap.set_srgb_gamma(found.color_space == "srgb")
+    # Bytes stay bytes; 16 bits become float32, since "bitmap" would reduce them to half precision
+    bitmap = mi.Bitmap(np.rint(values * 255).astype(np.uint8) if layout.depth == 1 else np.ascontiguousarray(values))
+    bitmap.set_srgb_gamma(layout.color_space == "srgb")
     props["bitmap"] = bitmap
-    props["raw"] = bool(props.get("raw", is_data(found)))
+    props["raw"] = bool(props.get("raw", is_data(layout)))
 
 
 def to_mipmap(task: Task, props: mi.Properties) -> None:
-    """Give the properties of a texture of a task's file what a ``mipmap`` of the original of its map needs."""
-    original, found = original_of(task, props)
+    """Add the properties that a ``mipmap`` needs to show the original of the map."""
+    original, layout = original_of(task, props)
     props["filename"] = str(original)
     if original.suffix.lower() == ".json":
-        props["channels"] = found.name
+        props["channels"] = layout.name
     elif "channels" in props:
         del props["channels"]
-    if "raw" not in props and is_data(found):
+    if "raw" not in props and is_data(layout):
         props["raw"] = True
 
 
 def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
-    """The image or manifest that a task's file was made from, and the map of it that the properties mean."""
+    """Return the path of the image or manifest that a task's file was made from, and the map that is shown."""
     path = Path(properties.filename(props))
     try:
         table = task.load(path)
     except TableError as e:
         raise RuntimeError(str(e)) from None
-    found = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
-    return _original(props, path, table.settings), found
+    chosen = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
+    return _original(props, path, table.settings), chosen
 
 
 def _original(props, path: Path, settings: dict) -> Path:
     given, recorded = str(props.get("source", "")), str(settings.get("source_path", ""))
     if given:
-        found = Path(str(mi.file_resolver().resolve(given)))
+        original = Path(str(mi.file_resolver().resolve(given)))
     elif recorded:
-        found = path.parent / recorded
+        original = path.parent / recorded
     else:
-        raise RuntimeError(f'{path}: does not say what it was made from, which is what the parameter "source" is for')
-    if not found.is_file():
-        advice = "" if given else '; the parameter "source" may say where it is now'
-        raise RuntimeError(f"{found}: no such file, {path.name} was made from it{advice}")
-    return found
+        raise RuntimeError(f'{path}: does not record its original image, give it as the parameter "source"')
+    if not original.is_file():
+        advice = "" if given else '; if it was moved, give its path as the parameter "source"'
+        raise RuntimeError(f"{original}: no such file, {path.name} was made from it{advice}")
+    return original
 
 
 def _values(original: Path, layout: MapLayout) -> np.ndarray:
-    """The map as it is in its source, ``(height, width, channels)``."""
+    """Return the values of the map in its source, ``(height, width, channels)``."""
     maps = load_source(original, nonfinite="clean").maps
     named = [m for m in maps if m.name == layout.name]
     if original.suffix.lower() == ".json" and not named:

@@ -1,4 +1,4 @@
-"""What plugins that read tables have in common: how they open them, and the entries as parameters."""
+"""Tables of plugins: opening their file, and exposing their entries as parameters."""
 
 from __future__ import annotations
 
@@ -12,32 +12,34 @@ from . import properties
 
 def open_tables(props: mi.Properties, task: Task, storage: str = "") -> Model:
     """
-    The model of a task's file that the properties ``filename``, ``storage`` (by default ``storage``; "": the file's own
-    form) and ``preset`` (default: that of the file, or of the task) name (:meth:`.Task.open`).
+    Open the file that the properties ``filename``, ``storage`` and ``preset`` name (:meth:`.Task.open`).
+
+    ``storage`` is the default of the property of that name ("": the form of the file); ``preset`` defaults to that of
+    the file, or of the task.
     """
     given, preset = (str(props.get(name, "")) for name in ("storage", "preset"))
     return task.open(mi.TensorXf, properties.filename(props), preset, given or storage)
 
 
 def described(preset: str, arrays: dict) -> dict:
-    """What a report says of tables: ``preset``, ``storage`` (None: there are none) and ``table_bytes``."""
+    """Return the part of a report on tables: ``preset``, ``storage`` (None without tables) and ``table_bytes``."""
     storage = "/".join(dict.fromkeys(array.storage for array in arrays.values())) or None
     return {"preset": preset, "storage": storage, "table_bytes": sum(array.nbytes for array in arrays.values())}
 
 
 def exposed(arrays: dict) -> dict:
-    """Those of the arrays (name → ``DifferentiableArray``) that can be optimised."""
+    """Return those of the arrays (name → ``DifferentiableArray``) that can be optimised."""
     return {name: array for name, array in arrays.items() if array.storage == "float32"}
 
 
 def traverse(cb: mi.TraversalCallback, arrays: dict) -> None:
-    """Name the entries of exposed arrays as parameters, ``tables.NAME``."""
+    """Expose the entries of arrays as parameters ``tables.NAME``."""
     for name, array in arrays.items():
         cb.put(f"tables.{name}", array.data, mi.ParamFlags.Differentiable)
 
 
 def check_shapes(arrays: dict) -> None:
-    """Refuse entries of another shape, after parameters have changed."""
+    """Raise ``RuntimeError`` if a changed parameter has another shape."""
     for name, array in arrays.items():
         try:
             array.check_shape()
@@ -46,5 +48,5 @@ def check_shapes(arrays: dict) -> None:
 
 
 def optimised(arrays: dict) -> bool:
-    """Is a derivative with respect to any entry asked for?"""
+    """Return whether gradients of any entry are enabled."""
     return any(compat.has_gradient(array.data) for array in arrays.values())

@@ -1,6 +1,4 @@
-"""
-What textures of images need: colours from their sRGB encoding, coordinates beyond [0, 1], sampling of positions.
-"""
+"""Parts of textures of images: colours, coordinates outside of [0, 1], sampling of positions."""
 
 from __future__ import annotations
 
@@ -17,17 +15,17 @@ from . import upsampling
 
 WRAP_MODES = ("repeat", "mirror", "clamp")
 
-#: Density of positions that are black, relative to the mean.
+#: Density of black positions, relative to the mean.
 FLOOR = 0.01
 
 
 def luminance(values: list):
-    """Of one channel or three, linear."""
+    """Return the luminance of one channel or three, linear."""
     return values[0] if len(values) == 1 else mi.luminance(mi.Color3f(*values))
 
 
 def spectrum(values: list, wavelengths, upsampled: bool):
-    """What a texture's ``eval`` returns for one channel or three, linear; ``upsampled``: as a spectrum."""
+    """Return the result of a texture's ``eval`` for one linear channel or three; ``upsampled``: as a spectrum."""
     if len(values) == 1 or mi.is_monochromatic:
         return mi.UnpolarizedSpectrum(luminance(values))
     return upsampling.spectrum(values, wavelengths) if upsampled else mi.UnpolarizedSpectrum(*values)
@@ -35,17 +33,19 @@ def spectrum(values: list, wavelengths, upsampled: bool):
 
 def wrapped(uv, wrap_mode: str, size: tuple[int, int], repeats: list[bool]) -> list:
     """
-    The coordinates u and v to read an image of ``size`` (width, height) at; ``repeats`` says along which of them the
-    arrays do so by themselves. ``mirror`` and ``clamp`` lead to nothing beyond the outermost texel centres.
+    Return the coordinates u and v at which an image of ``size`` (width, height) is read.
+
+    ``repeats`` tells for each coordinate whether the arrays repeat by themselves. With ``mirror`` and ``clamp``, no
+    coordinate lies beyond the outermost texel centres.
     """
     if wrap_mode == "repeat":
-        return [x if own else x - dr.floor(x) for x, own in zip((uv.x, uv.y), repeats, strict=True)]
+        return [x if repeat else x - dr.floor(x) for x, repeat in zip((uv.x, uv.y), repeats, strict=True)]
     folded = (fold(x) if wrap_mode == "mirror" else x for x in (uv.x, uv.y))
     return [clamp(x, 0.5 / n, 1 - 0.5 / n) for x, n in zip(folded, size, strict=True)]
 
 
 def transformation(props: mi.Properties):
-    """The property ``to_uv``."""
+    """Return the property ``to_uv``, the identity by default."""
     if "to_uv" not in props:
         return mi.ScalarAffineTransform3f()
     given = props["to_uv"]
@@ -56,7 +56,7 @@ def transformation(props: mi.Properties):
 
 
 def permutes_corners(matrix: list) -> bool:
-    """Does an affine map take the unit square to itself, by a flip, a transposition, or quarters of a turn?"""
+    """Return whether an affine map takes the unit square to itself: flips, a transposition, quarter turns."""
     m = np.array(matrix)
     corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
     images = (corners @ m.T)[:, :2]
@@ -64,19 +64,20 @@ def permutes_corners(matrix: list) -> bool:
     return bool((distance.min(axis=0) < 1e-4).all())
 
 
-@dataclass  # which is where functions that are frozen look for arrays
-class Positions:
-    """Positions in the unit square by a distribution of the texels of an image of ``size`` (width, height)."""
+@dataclass  # a type in which frozen functions (``dr.freeze``) look for arrays
+class PositionDistribution:
+    """Distribution of positions in the unit square, by the texels of an image of ``size`` (width, height)."""
 
     distribution: object
     size: tuple[int, int]
     repeats: bool
 
     @classmethod
-    def of(cls, image: np.ndarray, wrap_mode: str) -> Positions:
+    def of(cls, image: np.ndarray, wrap_mode: str) -> PositionDistribution:
         """
-        With the density of the luminance of an image, ``(height, width, channels)``, interpolated as a texture of that
-        ``wrap_mode`` does.
+        Return the distribution proportional to the luminance of an image, ``(height, width, channels)``.
+
+        It is interpolated as a texture of that ``wrap_mode`` is.
         """
         weights = image[..., 0] if image.shape[-1] == 1 else image @ np.float32([0.212671, 0.715160, 0.072169])
         weights = np.maximum(weights, 0)
@@ -86,7 +87,7 @@ class Positions:
         return cls(distribution, weights.shape[::-1], wrap_mode == "repeat")
 
     def sample(self, sample, active):
-        """A position, and its density; samples are limited to [0, 1), NaN is 0."""
+        """Return a position and its density; samples are clamped to [0, 1), NaN to 0."""
         sample = mi.Point2f(*(clamp(x, 0.0, 1 - 2**-24) for x in sample))
         texel, _, sample = self.distribution.sample(sample, active)
         uv = (mi.Point2f(texel) + 0.5 + mi.warp.square_to_tent(sample)) / mi.Point2f(*self.size)
@@ -98,7 +99,7 @@ class Positions:
         return uv, self.density(uv, active)
 
     def density(self, uv, active):
-        """The bilinear interpolation of the texels' probabilities, with respect to area, at ``uv``."""
+        """Return the density at ``uv``: the bilinear interpolation of the texels' probabilities per area."""
         corners = []
         for x, n in zip((uv.x, uv.y), self.size, strict=True):
             position = dr.fma(clamp(x, 0.0, 1.0), n, -0.5)

@@ -1,4 +1,4 @@
-"""What can be said about a texture before anything is rendered: bounds of its values, whether it is being optimised."""
+"""Bounds of a texture's values, changes of its arrays and requested derivatives, before anything is rendered."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _waiting = threading.local()
 
 def when_outermost(work) -> None:
     """
-    Do ``work``, which may wait for a kernel, now; or, if this thread is waiting in other such work already, after that.
+    Do ``work``, which may wait for a kernel, now, or after the work that this thread is already waiting in.
 
-    Mitsuba loads scenes in several threads, and one that waits for a kernel takes up the next task, which may construct
-    the next material: without this, constructors would nest without bounds.
+    Mitsuba loads scenes in several threads, and a thread that waits for a kernel takes up the next task, which may
+    construct the next material: without this queue, constructors would nest without bounds.
     """
     queue = getattr(_waiting, "queue", None)
     if queue is not None:
@@ -28,7 +28,7 @@ def when_outermost(work) -> None:
     _waiting.queue = [work]
     try:
         while _waiting.queue:
-            # What was computed for other materials in the meantime came before, as far as Dr.Jit is concerned
+            # For Dr.Jit, computations for other materials in the meantime came before
             compat.new_scope(mi.Float)
             _waiting.queue.pop(0)()
     finally:
@@ -37,9 +37,10 @@ def when_outermost(work) -> None:
 
 class TrackedParameter:
     """
-    A parameter of a BSDF, a texture or a number, and what is known about it. ``constant``: it is the same everywhere (a
-    colour in spectral variants is not: it varies with the wavelengths). ``is_eta``: it stands for the reflectance that
-    belongs to it.
+    Parameter of a BSDF, a texture or a number, with bounds of its values.
+
+    ``constant``: the value is the same everywhere (a colour in spectral variants is not, since it varies with the
+    wavelengths). ``is_eta``: bounds are those of the reflectance of this index of refraction.
     """
 
     def __init__(self, texture, colour: bool = False, is_eta: bool = False):
@@ -49,50 +50,51 @@ class TrackedParameter:
         else:
             self.constant = compat.is_constant_texture(texture) and not (colour and mi.is_spectral)
             self._parameters = mi.traverse(texture)
-        self._arrays, self._found = None, ValueBounds()
+        self._arrays, self._bounds = None, ValueBounds()
 
     def _values(self) -> list:
-        """The arrays that the texture consists of at present, children included."""
+        """Return the arrays of the texture at present, children included."""
         if self._parameters is None:
             return [self.texture]
         values = (self._parameters[key] for key in self._parameters.keys())
         return [v for v in values if isinstance(v, dr.ArrayBase)]
 
     def optimised(self) -> bool:
-        """Is a derivative with respect to it asked for? Also where derivatives are suspended at the moment."""
+        """Return whether gradients of the parameter are enabled, also while derivatives are suspended."""
         return any(map(compat.has_gradient, self._values()))
 
     def changed(self) -> bool:
-        """Is it not what it was when it was last looked at? A texture may be updated without anybody being told."""
+        """Return whether the arrays changed since :meth:`update`: a texture may change without a notification."""
         if self._arrays is None:
             return True
         return [*map(compat.identity, self._arrays)] != [*map(compat.identity, self._values())]
 
-    def look(self) -> None:
-        """Find out its bounds, if they are not known or it is not what it was."""
+    def update(self) -> None:
+        """Determine the bounds, unless the arrays are unchanged."""
         if dr.flag(dr.JitFlag.FreezingScope) or self.optimised():
-            self._arrays, self._found = None, ValueBounds()  # values cannot be looked at, or need not
+            self._arrays, self._bounds = None, ValueBounds()  # values cannot be evaluated, or need not be
         elif self.changed():
             # The copies keep the arrays alive, so that no other one gets their index
-            self._arrays, self._found = [dr.detach(v) for v in self._values()], self._bounds()
+            self._arrays, self._bounds = [dr.detach(v) for v in self._values()], self._compute_bounds()
 
-    def _bounds(self) -> ValueBounds:
-        found = bounds(self.texture, self.colour)
-        if self.is_eta:  # 1 reflects nothing
-            return ValueBounds(0, 0) if found.is_always(1) else ValueBounds(0, math.inf)
-        return found
+    def _compute_bounds(self) -> ValueBounds:
+        values = value_bounds(self.texture, self.colour)
+        if self.is_eta:  # an index of 1 reflects nothing
+            return ValueBounds(0, 0) if values.is_always(1) else ValueBounds(0, math.inf)
+        return values
 
-    def known(self) -> ValueBounds:
-        """What was found when it was last looked at; anything is possible if it has changed, or is being optimised."""
+    def bounds(self) -> ValueBounds:
+        """Return the bounds of the last :meth:`update`; unknown if the arrays changed or are being optimised."""
         if self.optimised():
             return ValueBounds(optimised=True)
-        return ValueBounds() if self.changed() else self._found
+        return ValueBounds() if self.changed() else self._bounds
 
 
-def bounds(texture, colour: bool = False) -> ValueBounds:
+def value_bounds(texture, colour: bool = False) -> ValueBounds:
     """
-    Bounds of what ``texture`` (or a number) gives: of its ``eval`` if ``colour``, else of its ``eval_1``. Constants and
-    bitmaps are known, whatever their filter; anything else may have any value.
+    Return bounds of the values of ``texture`` (or a number): of its ``eval`` if ``colour``, else of its ``eval_1``.
+
+    Bounds of constants and bitmaps are known, for any filter; those of any other texture are unknown.
     """
     if isinstance(texture, dr.ArrayBase):
         return _of([texture])
@@ -116,13 +118,13 @@ def bounds(texture, colour: bool = False) -> ValueBounds:
 
 
 def _of(channels: list) -> ValueBounds:
-    """From the values of each channel; unknown if there is a NaN among them."""
+    """Return the bounds of the values of all channels; unknown if one is NaN."""
     arrays = [dr.detach(mi.Float(c)) for c in channels]
     arrays = [dr.select(dr.isnan(a), dr.inf, a) for a in arrays]
     spread = [dr.max(dr.abs(a - arrays[0])) for a in arrays[1:]]
-    found = [*(dr.min(a) for a in arrays), *(dr.max(a) for a in arrays), *spread]
-    found = dr.concat(found).numpy().tolist()
+    extrema = [*(dr.min(a) for a in arrays), *(dr.max(a) for a in arrays), *spread]
+    extrema = dr.concat(extrema).numpy().tolist()
     n = len(arrays)
-    if not all(math.isfinite(v) for v in found):
+    if not all(math.isfinite(v) for v in extrema):
         return ValueBounds()
-    return ValueBounds(min(found[:n]), max(found[n : 2 * n]), grey=max(found[2 * n :], default=0) == 0)
+    return ValueBounds(min(extrema[:n]), max(extrema[n : 2 * n]), grey=max(extrema[2 * n :], default=0) == 0)

@@ -1,9 +1,9 @@
 """
-Spectra from colours at render time: Jakob and Hanika, *A Low-Dimensional Function Space for Efficient Spectral
-Upsampling*, Computer Graphics Forum 38(2), 2019, from the coefficients that come with Mitsuba.
+Spectra from colours at render time, by Jakob and Hanika's model with the coefficients that come with Mitsuba.
 
-Mitsuba's textures are converted when they are loaded. This is the same read of the same table, 3 × 64³ × 3 numbers, of
-colours that are known only when they are needed, differentiable with respect to them.
+Jakob and Hanika, *A Low-Dimensional Function Space for Efficient Spectral Upsampling*, Computer Graphics Forum 38(2),
+2019. Mitsuba's textures are converted when they are loaded; this module reads the same table, 3 × 64³ × 3 numbers,
+while rendering, differentiably with respect to the colours.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _lock = threading.RLock()
 
 
 def model():
-    """The table for the variant's backend: side, positions along the brightness, coefficients padded to four."""
+    """Return the table for the variant's backend: side, positions along the brightness, coefficients padded to four."""
     key = mi.Float
     with _lock:
         if key not in _models:
@@ -39,8 +39,9 @@ def _load():
 
 def coefficients(rgb):
     """
-    Coefficients of the model for linear sRGB colours, clamped to [0, 1] as Mitsuba does; meaningless for greys, whose
-    spectra are constant.
+    Return the coefficients of the model for linear sRGB colours, clamped to [0, 1] as in Mitsuba.
+
+    They are meaningless for greys, whose spectra are constant.
     """
     side, positions, table = model()
     r, g, b = (clamp(mi.Float(c), 0.0, 1.0) for c in rgb)
@@ -67,23 +68,23 @@ def coefficients(rgb):
                 for (i, w), up in zip(axes, (a, b_, c), strict=True):
                     index = dr.fma(index, side, i + up)
                     weight = weight * (w if up else 1 - w)
-                found = dr.gather(mi.Vector4f, table, index)
-                total = [dr.fma(weight, found[n], total[n]) for n in range(3)]
+                entry = dr.gather(mi.Vector4f, table, index)
+                total = [dr.fma(weight, entry[n], total[n]) for n in range(3)]
     return total
 
 
 def spectrum(rgb, wavelengths):
-    """The reflectance at ``wavelengths`` (nm), for linear sRGB colours in [0, 1]."""
+    """Return the reflectance at ``wavelengths`` (nm), for linear sRGB colours in [0, 1]."""
     r, g, b = (clamp(mi.Float(c), 0.0, 1.0) for c in rgb)
     c0, c1, c2 = coefficients(rgb)
     v = dr.fma(dr.fma(c0, wavelengths, c1), wavelengths, c2)
-    found = dr.fma(0.5 * v, dr.rsqrt(dr.fma(v, v, 1)), 0.5)
+    reflectance = dr.fma(0.5 * v, dr.rsqrt(dr.fma(v, v, 1)), 0.5)
     grey = (r == g) & (g == b)
-    return mi.UnpolarizedSpectrum(dr.select(grey, r, found))
+    return mi.UnpolarizedSpectrum(dr.select(grey, r, reflectance))
 
 
 def mean(rgb):
-    """Mean of the spectrum over the wavelengths, as Mitsuba has it: of 16 of them."""
+    """Return the mean of the spectrum over 16 wavelengths, as Mitsuba computes it."""
     wavelengths = np.linspace(mi.MI_CIE_MIN, mi.MI_CIE_MAX, 16)
     c0, c1, c2 = coefficients(rgb)
     total = 0

@@ -3,6 +3,7 @@
 import disney_formulas
 import drjit as dr
 import numpy as np
+from arrays import aligned
 
 PRESETS = ("tables", "paper")
 
@@ -58,7 +59,7 @@ def plugin(mi, form, material, **more):
 def bitmap(mi, values, **more):
     """A texture of ``values``, (height, width[, channels]), read as they are."""
     values = np.asarray(values, np.float32)
-    data = mi.TensorXf(np.ascontiguousarray(values.reshape(*values.shape[:2], -1)))
+    data = mi.TensorXf(aligned(values.reshape(*values.shape[:2], -1)))
     return {"type": "bitmap", "data": data, "raw": True, "filter_type": "nearest", "format": "variant", **more}
 
 
@@ -75,7 +76,7 @@ def interactions(mi, wi, material=None, count=1):
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
     si.wi = wi
     if material is not None:
-        si.uv = mi.Point2f(mi.Float(((np.asarray(material) + 0.5) / count).astype("f4")), 0.5)
+        si.uv = mi.Point2f(mi.Float(aligned((np.asarray(material) + 0.5) / count)), 0.5)
     if mi.is_spectral:
         si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 580, 650)
     return si
@@ -89,11 +90,11 @@ def random_directions(rng, n, low=0.0, high=1.0):
 
 
 def vectors(mi, w):
-    return mi.Vector3f(np.ascontiguousarray(w.T, dtype=np.float32))
+    return mi.Vector3f(aligned(w.T))
 
 
 def uniform(mi, rng, n):
-    u = [mi.Float(rng.random(n).astype("f4")) for _ in range(3)]
+    u = [mi.Float(aligned(rng.random(n))) for _ in range(3)]
     return u[0], mi.Point2f(u[1], u[2])
 
 

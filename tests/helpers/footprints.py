@@ -73,10 +73,22 @@ def look_at(origin, target, up=(0, 1, 0)):
 
 
 def rays(sensor, dx: float, dy: float):
-    """Of all pixels, through their centres moved by that many pixels."""
+    """The rays of all pixels, through their centres moved by that many pixels; any move is the same kernel."""
     x, y = dr.meshgrid(dr.arange(mi.Float, WIDTH), dr.arange(mi.Float, HEIGHT))
+    dx, dy = dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy)
     place = mi.Point2f((x + 0.5 + dx) / WIDTH, (y + 0.5 + dy) / HEIGHT)
     return sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))[0]
+
+
+def hits(scene, chain=(), dx: float = 0, dy: float = 0) -> list:
+    """The hits of the rays through all pixels, followed along ``chain``; each evaluated, which compiles one kernel."""
+    ray, found = rays(scene.sensors()[0], dx, dy), []
+    for follow in (*chain, None):
+        found.append(scene.ray_intersect(ray))
+        dr.eval(found[-1])
+        if follow is not None:
+            ray = follow(found[-1])
+    return found
 
 
 def mirrored(si):
@@ -102,13 +114,9 @@ def truth(scene, chain=(), step: float = 0.5) -> tuple:
     """
 
     def hit(dx, dy):
-        ray, shapes = rays(scene.sensors()[0], dx, dy), []
-        for follow in (*chain, None):
-            si = scene.ray_intersect(ray)
-            shapes.append(np.array(dr.reinterpret_array(mi.UInt32, si.shape)))
-            if follow is not None:
-                ray = follow(si)
-        return si, np.array(si.is_valid()), np.array(si.uv).T, shapes
+        met = hits(scene, chain, dx, dy)
+        shapes = [np.array(dr.reinterpret_array(mi.UInt32, si.shape)) for si in met]
+        return met[-1], np.isfinite(np.array(met[-1].t)), np.array(met[-1].uv).T, shapes
 
     centre, valid, _, shapes = hit(0, 0)
     uv = []

@@ -4,6 +4,7 @@ import math
 
 import drjit as dr
 import numpy as np
+from arrays import aligned
 
 #: Components of a footprint that no render should produce, and some that are merely extreme.
 WRONG = (0.0, 1.0, -1.0, 1e-20, -0.0, 1e20, 3e38, -3e38, math.nan, math.inf, -math.inf)
@@ -20,7 +21,7 @@ def hits(mi, uv, ddx=(0, 0), ddy=(0, 0), p=None):
     si = dr.zeros(mi.SurfaceInteraction3f, n)
 
     def vector(kind, x):
-        return kind(*[mi.Float(np.ascontiguousarray(np.broadcast_to(row, n))) for row in x])
+        return kind(*[mi.Float(aligned(np.broadcast_to(row, n))) for row in x])
 
     si.uv, si.duv_dx, si.duv_dy = vector(mi.Point2f, uv), vector(mi.Vector2f, ddx), vector(mi.Vector2f, ddy)
     if p is not None:

@@ -4,6 +4,7 @@ import disney_formulas
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 
 from mi_diffind import StoredArray
 from mi_diffind.tables import save_table
@@ -52,7 +53,7 @@ def directions(mi, rng, n, low_cosine=0.0):
     z = low_cosine + (1 - low_cosine) * rng.random(n)
     phi = 2 * np.pi * rng.random(n)
     r = np.sqrt(1 - z * z)
-    return mi.Vector3f(*(v.astype(np.float32) for v in (r * np.cos(phi), r * np.sin(phi), z)))
+    return mi.Vector3f(*(aligned(v) for v in (r * np.cos(phi), r * np.sin(phi), z)))
 
 
 def sphere_scene(mi, bsdf, integrator="path", size=16, **extra):
@@ -79,7 +80,7 @@ def textured(mi, name, color, m, **more):
     n = int(np.sqrt(len(color)))
 
     def texture(values):
-        data = mi.TensorXf(np.asarray(values, np.float32).reshape(n, n, -1))
+        data = mi.TensorXf(aligned(np.asarray(values, np.float32).reshape(n, n, -1)))
         return {"type": "bitmap", "data": data, "raw": True, "filter_type": "nearest", "format": "variant"}
 
     return mi.load_dict(
@@ -168,7 +169,7 @@ def test_finite_and_non_negative_over_many_inputs(mi_rgb, rng, name, n, rounds):
         wi, wo = (mi.Vector3f(v.astype(np.float32)) for v in w)
         si, ctx = interactions(mi, wi), mi.BSDFContext()
         f, pdf = bsdf.eval_pdf(ctx, si, wo)
-        u = [mi.Float(rng.random(n).astype("f4")) for _ in range(3)]
+        u = [mi.Float(aligned(rng.random(n))) for _ in range(3)]
         if i % 2:
             u = [mi.Float(rng.choice(np.array([0, 1 - 2**-24, 0.5], "f4"), n)) for _ in range(3)]
         bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
@@ -225,7 +226,7 @@ def test_nan_textures_do_not_spread(mi_rgb, rng):
     mi = mi_rgb
     nan = {
         "type": "bitmap",
-        "data": mi.TensorXf(np.full((4, 4, 1), np.nan, np.float32)),
+        "data": mi.TensorXf(aligned(np.full((4, 4, 1), np.nan, np.float32))),
         "raw": True,
         "format": "variant",
     }
@@ -327,7 +328,7 @@ def test_tables_of_the_file_can_be_assigned(mi_rgb, rng):
     params["tables.ggx"] = mi.TensorXf(table.arrays["ggx"].values + 0.1)  # once more: the parameter is still the table
     params.update()
     assert not np.allclose(bsdf.eval(mi.BSDFContext(), si, wo).numpy(), before)
-    params["tables.ggx"] = mi.TensorXf(np.zeros((4, 4, 3), np.float32))
+    params["tables.ggx"] = mi.TensorXf(aligned(np.zeros((4, 4, 3), np.float32)))
     with pytest.raises(RuntimeError, match=r'"tables.ggx": "data" has the shape \(4, 4, 3\), expected \(16, 16, 3\)'):
         params.update()
     params["tables.ggx"] = mi.TensorXf(table.arrays["ggx"].values)
@@ -404,8 +405,8 @@ def test_parameters_may_be_colours(mi_any, rng):
         ({"sheen": float("nan")}, 'parameter "sheen": found nan'),
         ({"specular": 2.0}, 'parameter "specular": found 2, allowed is [0, 1]'),
         ({"eta": 0.5}, 'parameter "eta": found 0.5, allowed is [1, 3.0]'),
-        ({"eta": 1.5, "specular": 0.5}, "two ways to say one thing"),
-        ({"flatness": 0.5, "subsurface": 0.5}, "two names of one parameter"),
+        ({"eta": 1.5, "specular": 0.5}, 'parameter "eta": sets the same reflectance as "specular"'),
+        ({"flatness": 0.5, "subsurface": 0.5}, 'parameter "subsurface": is another name of "flatness"'),
         ({"spec_trans": 0.5}, 'parameter "spec_trans": found 0.5'),
         ({"clearcoat_sampling_rate": -1.0}, 'parameter "clearcoat_sampling_rate": found -1'),
         ({"roughnes": 0.5}, '"roughnes"'),
@@ -518,7 +519,7 @@ def test_white_is_white_in_every_colour_mode(kind):
 def test_wrappers(mi_rgb):
     mi, name = mi_rgb, "disney"
     inner = {**PLUGINS[name], **RICH}
-    flat = mi.TensorXf(np.tile(np.array([0.5, 0.5, 1.0], "f4"), (4, 4, 1)))
+    flat = mi.TensorXf(aligned(np.tile(np.array([0.5, 0.5, 1.0], "f4"), (4, 4, 1))))
     plain = mi.render(sphere_scene(mi, inner), spp=32).numpy()
     wrapped = {
         "twosided": {"type": "twosided", "bsdf": inner},
@@ -530,7 +531,7 @@ def test_wrappers(mi_rgb):
         },
         "bumpmap": {
             "type": "bumpmap", "bsdf": inner,
-            "arbitrary": {"type": "bitmap", "data": mi.TensorXf(np.zeros((4, 4, 1), "f4")), "raw": True},
+            "arbitrary": {"type": "bitmap", "data": mi.TensorXf(aligned(np.zeros((4, 4, 1), "f4"))), "raw": True},
         },
     }  # fmt: skip
     for kind, bsdf in wrapped.items():

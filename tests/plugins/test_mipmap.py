@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 import pytest
 import texture_scenes
+from arrays import aligned
 from texture_scenes import WRONG, linear
 from variants import set_variant
 
@@ -53,7 +54,7 @@ def pyramid(mi, image, border="repeat", color_space="srgb"):
 
 def expected(mi, truth, uv, level):
     """Linear values of the truth."""
-    u, v, level = (mi.Float(np.ascontiguousarray(x, np.float32)) for x in (*uv, level))
+    u, v, level = (mi.Float(aligned(x)) for x in (*uv, level))
     return linear(np.stack([x.numpy() for x in truth.filtered(u, v, level)]))
 
 
@@ -116,7 +117,7 @@ def test_trilinear_is_the_pyramid_at_the_level_of_the_area(mi_any, file, image, 
         assert np.isfinite(texture.eval(si).numpy()).all()
         texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode, raw=True))
         truth = [x.numpy() for x in pyramid(mi, image, wrap_mode, "linear").filtered(
-            *map(mi.Float, uv.astype("f4")), mi.Float(texture_scenes.isotropic(ddx, ddy, SIZE).astype("f4"))
+            *map(mi.Float, uv.astype("f4")), mi.Float(aligned(texture_scenes.isotropic(ddx, ddy, SIZE)))
         )]  # fmt: skip
     np.testing.assert_allclose(texture.eval_3(si).numpy(), truth, atol=2e-4)
 
@@ -458,11 +459,11 @@ def test_sources(mi_rgb, tmp_path, image, rng):
     for x in found[1:]:
         np.testing.assert_allclose(x, found[0], atol=1e-5)
     level = texture_scenes.isotropic(ddx, ddy, SIZE)
-    u, v, level = (mi.Float(x.astype("f4")) for x in (*uv, level))
+    u, v, level = (mi.Float(aligned(x)) for x in (*uv, level))
     (truth,) = pyramid(mi, image[..., 1:2], color_space="linear").filtered(u, v, level)
     rough = {"filename": str(tmp_path / "wall.json"), "channels": "roughness"}
     np.testing.assert_allclose(mi.load_dict({"type": "mipmap", **rough}).eval_1(si), truth, atol=1e-5)
-    grey = {"bitmap": mi.Bitmap(np.ascontiguousarray(image[..., 1])), "raw": True}
+    grey = {"bitmap": mi.Bitmap(aligned(image[..., 1])), "raw": True}
     np.testing.assert_allclose(mi.load_dict({"type": "mipmap", **grey}).eval_1(si), truth, atol=1e-5)
 
 
@@ -493,13 +494,13 @@ def test_words_of_bitmap(mi_rgb, file):
 
 
 BAD = {
-    "no source": ({}, 'found none, one of them is needed'),
-    "two sources": ({"filename": "a.png", "pyramid": "b"}, 'found "filename" and "pyramid", one of them is needed'),
+    "no source": ({}, 'found none, exactly one is needed'),
+    "two sources": ({"filename": "a.png", "pyramid": "b"}, 'found "filename" and "pyramid", exactly one is needed'),
     "missing": ({"filename": "/nowhere/a.png"}, 'parameter "filename": /nowhere/a.png: no such file'),
-    "no such levels": ({"pyramid": "x"}, 'parameter "pyramid": found "x", there are none'),
+    "no such levels": ({"pyramid": "x"}, 'parameter "pyramid": found "x", allowed are the keys of PYRAMIDS: none'),
     "filter": ({"filter": "nearest"}, 'parameter "filter": found "nearest", allowed are trilinear, off, anisotropic'),
     "type": ({"filter_type": "nearest"}, 'parameter "filter_type": found "nearest", allowed are bilinear, trilinear'),
-    "both": ({"filter": "off", "filter_type": "trilinear"}, 'found "trilinear" beside the filter "off", which is anot'),
+    "both": ({"filter": "off", "filter_type": "trilinear"}, 'found "trilinear", which contradicts the filter "off"'),
     "no taps": ({"max_anisotropy": 0}, 'parameter "max_anisotropy": found 0, allowed are whole numbers 1 to 16'),
     "half a tap": ({"max_anisotropy": 2.5}, 'parameter "max_anisotropy": found 2.5, allowed are whole numbers'),
     "many taps": ({"max_anisotropy": 17}, 'parameter "max_anisotropy": found 17, allowed are whole numbers 1 to 16'),

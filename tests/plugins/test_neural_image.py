@@ -19,6 +19,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 from scipy.ndimage import map_coordinates
 from variants import VARIANTS, set_variant
 
@@ -128,7 +129,7 @@ def decoded(dtype, file, stamp):
 def counterpart(mi, file, channels="albedo", **more):
     """``bitmap`` with the image that the file decodes to."""
     layout = layout_of(file)
-    bitmap = mi.Bitmap(np.ascontiguousarray(decoded(mi.TensorXf, file, os.stat(file).st_mtime_ns)[channels]))
+    bitmap = mi.Bitmap(aligned(decoded(mi.TensorXf, file, os.stat(file).st_mtime_ns)[channels]))
     bitmap.set_srgb_gamma(layout[channels].color_space == "srgb")
     raw = {"raw": True} if channels in ("normal", "roughness", "metallic") else {}
     return {"type": "bitmap", "bitmap": bitmap, "format": "variant", **raw, **more}
@@ -140,7 +141,7 @@ def interactions(mi, u, v):
     si.uv = mi.Point2f(mi.Float(u), mi.Float(v))
     if mi.is_spectral:
         wavelengths = np.random.default_rng(5).uniform(360, 830, (4, dr.width(si.uv)))
-        si.wavelengths = type(si.wavelengths)(*[mi.Float(w.astype("f4")) for w in wavelengths])
+        si.wavelengths = type(si.wavelengths)(*[mi.Float(aligned(w)) for w in wavelengths])
     return si
 
 
@@ -353,7 +354,7 @@ def test_tables_of_anything(mi_rgb, file, rng):
     for key in ("tables.primary", "tables.cascaded"):
         before = params[key].numpy()
         for wrong, share in [(math.nan, 1), *((wrong, 0.3) for wrong in WRONG)]:
-            params[key] = mi.TensorXf(np.where(rng.random(before.shape) < share, np.float32(wrong), before))
+            params[key] = mi.TensorXf(aligned(np.where(rng.random(before.shape) < share, np.float32(wrong), before)))
             params.update()
             for name, texture in textures.items():
                 found = [texture.eval(si), texture.eval_1(si), texture.eval_1_grad(si), texture.mean()]
@@ -379,7 +380,7 @@ def test_gradients_of_wrong_tables_are_finite(mi_rgb, file, rng, wrong):
         keys = ("tables.primary", "tables.cascaded")
         for key in keys:
             entries = params[key].numpy()
-            params[key] = mi.TensorXf(np.where(rng.random(entries.shape) < 0.1, np.float32(wrong), entries))
+            params[key] = mi.TensorXf(aligned(np.where(rng.random(entries.shape) < 0.1, np.float32(wrong), entries)))
             dr.enable_grad(params[key])
         params.update()
         dr.backward(sum(dr.sum(channel) for channel in texture.eval_3(si)))
@@ -394,7 +395,7 @@ def test_positions_of_samples_that_are_none(mi_rgb, file, wrap_mode, transformed
     mi = mi_rgb
     more = {"to_uv": TRANSFORMS["turn"](mi.ScalarTransform4f())} if transformed else {}
     bad = [math.nan, math.inf, -math.inf, -1, -1e-9, 0, 1, 1 + 1e-6, 2, 1e30, 3e38, 1 - 2**-24]
-    u, v = (mi.Float(x.ravel().astype("f4")) for x in np.meshgrid(bad, bad))
+    u, v = (mi.Float(aligned(x.ravel())) for x in np.meshgrid(bad, bad))
     for name in ("albedo", "roughness", "glow", "flat"):
         texture = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode, **more))
         uv, pdf = texture.sample_position(mi.Point2f(u, v))
@@ -450,7 +451,7 @@ def test_spectra_between_texels(smooth):
     path, image = smooth
     rng = np.random.default_rng(2)
     si = interactions(mi, *rng.random((2, 20000)))
-    si.wavelengths = type(si.wavelengths)(*[mi.Float(w.astype("f4")) for w in rng.uniform(400, 700, (4, 20000))])
+    si.wavelengths = type(si.wavelengths)(*[mi.Float(aligned(w)) for w in rng.uniform(400, 700, (4, 20000))])
     more = {"wrap_mode": "clamp"}
     ours = mi.load_dict(plugin(path, "image", **more)).eval(si).numpy()
     for bitmap, floor in ((mi.load_dict(counterpart(mi, path, "image", **more)), 48), (None, 45)):
@@ -506,10 +507,10 @@ def test_sampled_positions_have_their_density(mi_rgb, file, rng, name, wrap_mode
     mi, n, bins = mi_rgb, 100_000, 10
     more = {} if name == "none" else {"to_uv": TRANSFORMS[name](mi.ScalarTransform4f())}
     texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode, **more))
-    uv, pdf = texture.sample_position(mi.Point2f(*[mi.Float(x.astype("f4")) for x in rng.random((2, n))]))
+    uv, pdf = texture.sample_position(mi.Point2f(*[mi.Float(aligned(x)) for x in rng.random((2, n))]))
     side = 20 * bins
     grid = (np.mgrid[0:side, 0:side].reshape(2, -1) + 0.5) / side
-    grid = mi.Point2f(*[mi.Float(x.astype("f4")) for x in grid])
+    grid = mi.Point2f(*[mi.Float(aligned(x)) for x in grid])
     density = np.broadcast_to(texture.pdf_position(grid).numpy(), side * side).reshape(bins, 20, bins, 20)
     assert density.mean() == pytest.approx(1, abs=2e-3) and density.min() > 0
     expected = density.mean(axis=(1, 3)) / bins**2 * n
@@ -677,7 +678,7 @@ def test_gradients_against_finite_differences(mi_any, file, rng, method):
     assert sorted(params.keys()) == ["tables.cascaded", "tables.primary", "to_uv"]
     assert mi.ParamFlags.Differentiable == params.flags("tables.primary")
     si = interactions(mi, *rng.random((2, 64)))
-    weights = [mi.Float(w.astype("f4")) for w in rng.normal(size=(4, 64))]
+    weights = [mi.Float(aligned(w)) for w in rng.normal(size=(4, 64))]
 
     def total():
         value = getattr(texture, method)(si)
@@ -757,14 +758,14 @@ def test_textures_of_one_file_share_their_parameters(mi_rgb, file, rng):
     density = float(b.pdf_position(point)[0])
     params = mi.traverse(a)
     entries = params["tables.cascaded"].numpy()
-    params["tables.cascaded"] = mi.TensorXf(entries * np.linspace(0.2, 0.9, 4)[:, None, None].astype("f4"))
+    params["tables.cascaded"] = mi.TensorXf(aligned(entries * np.linspace(0.2, 0.9, 4)[:, None, None]))
     params.update()
     assert (np.abs(b.eval(si).numpy() - before) > 1e-3).any()
     assert float(b.mean()[0]) < 0.8 * mean and b.max() < largest
     assert float(b.pdf_position(point)[0]) != density
     fresh = mi.load_dict(plugin(file, "glow", storage="float32"))
     np.testing.assert_array_equal(fresh.eval(si).numpy(), before)
-    params["tables.cascaded"] = mi.TensorXf(np.zeros((2, 2, 7), "f4"))
+    params["tables.cascaded"] = mi.TensorXf(aligned(np.zeros((2, 2, 7), "f4")))
     with pytest.raises(RuntimeError, match=re.escape('parameter "tables.cascaded": "data" has the shape (2, 2, 7)')):
         params.update()
 
@@ -942,7 +943,7 @@ def test_exact_counterpart(mi_any, material):
     mi = mi_any
     folder, _, orm = material
     exact = scenes.load(folder / "scene.xml", exact=True)
-    mi.Bitmap(np.ascontiguousarray(orm[..., 1:2])).write(str(folder / "roughness.png"))
+    mi.Bitmap(aligned(orm[..., 1:2])).write(str(folder / "roughness.png"))
     textures = (
         '<texture type="bitmap" name="base_color"><string name="filename" value="albedo.png"/></texture>'
         '<texture type="bitmap" name="roughness"><string name="filename" value="roughness.png"/>'
@@ -978,7 +979,7 @@ def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
     table = load_table(folder / "wall.npz")
     cases = []
     for recorded, given, expected in (
-        (None, None, 'does not say what it was made from, which is what the parameter "source" is for'),
+        (None, None, 'does not record its original image, give it as the parameter "source"'),
         ("gone.png", None, "gone.png: no such file"),
         ("wall.json", "gone.png", "gone.png: no such file"),
         (None, str(folder / "orm.png"), 'has 3 channel(s), the map "roughness" has 1'),

@@ -16,6 +16,7 @@ import drjit as dr
 import numpy as np
 import pytest
 import texture_scenes
+from arrays import aligned
 from texture_scenes import WRONG, linear
 
 from mi_diffind import compat, scenes
@@ -87,7 +88,7 @@ def opened(mi, file, storage=""):
 
 
 def floats(mi, *arrays):
-    return [mi.Float(np.ascontiguousarray(x, np.float32)) for x in arrays]
+    return [mi.Float(aligned(x)) for x in arrays]
 
 
 def expected(mi, image, name, uv, level):
@@ -255,7 +256,7 @@ def test_gradients_against_finite_differences(mi_rgb, files, rng, preset):
     assert sorted(params.keys()) == sorted([*keys, "to_uv"])
     uv, (ddx, ddy) = rng.random((2, 64)), texture_scenes.footprints(rng, 64, SIZE, 4)
     si = texture_scenes.hits(mi, uv, ddx, ddy)
-    weights = mi.Float(rng.normal(size=64).astype("f4"))
+    weights = mi.Float(aligned(rng.normal(size=64)))
 
     def total():
         return dr.sum(weights * texture.eval_1(si))
@@ -323,7 +324,7 @@ def test_parameters_are_shared_and_checked(mi_rgb, file, rng):
     assert float(b.mean()[0]) == pytest.approx(mean / 2, abs=1e-3) and b.max() < 0.6 * largest
     fresh = mi.load_dict(plugin(file, channels="roughness", storage="float32"))
     np.testing.assert_array_equal(fresh.eval_1(si).numpy(), before)
-    params["tables.cascaded"] = mi.TensorXf(np.zeros((2, 2, 7), "f4"))
+    params["tables.cascaded"] = mi.TensorXf(aligned(np.zeros((2, 2, 7), "f4")))
     with pytest.raises(RuntimeError, match=re.escape('parameter "tables.cascaded": "data" has the shape (2, 2, 7)')):
         params.update()
     assert list(mi.traverse(mi.load_dict(plugin(file))).keys()) == ["to_uv"]
@@ -545,7 +546,7 @@ BAD = {
     "unknown map": ({"channels": "depth"}, 'parameter "channels": found "depth", the file holds albedo, normal, roug'),
     "storage": ({"storage": "float16"}, 'parameter "storage": found "float16", allowed are uint8, float32'),
     "filter": ({"filter": "cubic"}, 'parameter "filter": found "cubic", allowed are trilinear, off, anisotropic, stoc'),
-    "contradiction": ({"filter_type": "bilinear"}, 'found "bilinear" beside the filter "trilinear", which is another'),
+    "contradiction": ({"filter_type": "bilinear"}, 'found "bilinear", which contradicts the filter "trilinear"'),
     "taps": ({"max_anisotropy": 0}, 'parameter "max_anisotropy": found 0, allowed are whole numbers 1 to 16'),
     "unknown": ({"level": 3}, "level"),
 }

@@ -138,7 +138,7 @@ SCENE = """
 
 def test_plugins_of_this_package_say_what_they_are(mi_rgb):
     declared = plugins.declared()
-    assert {name: p.kind for name, p in declared.items()} == {
+    assert {name: p.object_type for name, p in declared.items()} == {
         "disney": "bsdf", "mipmap": "texture", "neural_disney": "bsdf", "neural_ggx": "bsdf",
         "neural_field": "integrator", "neural_image": "texture",
         "neural_sdf": "shape", "neural_texture": "texture", "path_footprint": "integrator",
@@ -227,7 +227,7 @@ def test_volumes(mi_toys):
 def test_factories_that_return_something_else(mi_toys, name, found):
     """Mitsuba would crash, or speak of a bad cast."""
     if plugins.supported(mi_toys.variant()):
-        with pytest.raises(RuntimeError, match=f'"{name}" returned {found}, a bsdf is needed'):
+        with pytest.raises(RuntimeError, match=f'"{name}": the factory returned {found}, a bsdf is needed'):
             mi_toys.load_dict({"type": name})
 
 

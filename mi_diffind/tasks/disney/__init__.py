@@ -1,13 +1,13 @@
 """
 Task 2: the Disney BRDF (Burley 2012), exact and as tables.
 
-- :mod:`.model`: the reference model and what both forms share: parameters, factors, how factors make a colour;
-- :mod:`.effects`: which parts of the model a material makes use of;
-- :mod:`.decoder`: the model in two steps, per material and per direction; what tables can replace;
-- :mod:`.arrays`, :mod:`.paper`, :mod:`.factored`: the tables, in the paper's layout and in a better one;
-- :mod:`.library`: table files;
-- :mod:`.sampling`: importance sampling, and the density that goes with it;
-- :mod:`.training`: training distributions, errors.
+- :mod:`.model`: the reference model, and parameters, factors and colours that all forms share;
+- :mod:`.effects`: the parts of the model that a material uses;
+- :mod:`.decoder`: the model in two steps, per material and per direction, with methods that tables can replace;
+- :mod:`.arrays`, :mod:`.factored`, :mod:`.paper`: the tables, their base class and both layouts;
+- :mod:`.files`: table files;
+- :mod:`.sampling`: importance sampling and its density;
+- :mod:`.training`: training distributions and errors.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from ...settings import FitSettings
 from ...task import FitRequest, Task
 
 
-class Disney(Task):
-    """The task. Its presets are layouts: ``tables``, one coordinate a table; ``paper``, the paper's Table 1."""
+class DisneyTask(Task):
+    """The task. Its presets are layouts: ``tables``, one coordinate per table; ``paper``, the paper's Table 1."""
 
     name = "disney"
     title = "the Disney BRDF"
-    files = "library"
     section = "supplemental 1.2"
-    #: Tables of one coordinate start close to their optimum: a large rate would only shake them (75 instead of 90 dB).
+    #: Tables of one coordinate start close to their optimum: ten times the rate costs 15 dB (75 in place of 90 dB).
     presets = {  # noqa: RUF012
         "tables": FitSettings(steps=2000, batch=65536, lr=3e-4, schedule="cosine", seed=1),
         "paper": FitSettings(steps=2000, batch=65536, lr=3e-3, schedule="cosine", seed=1),
@@ -31,7 +30,7 @@ class Disney(Task):
     shipped = {"tables": "disney_tables.npz", "paper": "disney_paper.npz"}  # noqa: RUF012
 
     def problem(self, request: FitRequest):
-        from .library import LAYOUTS
+        from .files import LAYOUTS
         from .training import DisneyProblem
 
         layout, decoder = LAYOUTS[request.preset]
@@ -41,4 +40,4 @@ class Disney(Task):
         return problem.net.to_table()
 
 
-TASK = Disney()
+TASK = DisneyTask()

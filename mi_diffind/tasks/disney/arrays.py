@@ -1,9 +1,9 @@
 """
-The tables of the Disney BRDF: what both layouts have in common.
+Base class of the tables of the Disney BRDF.
 
 A layout (:class:`.paper.PaperArrays`, :class:`.factored.FactoredArrays`) is a ``drjit.nn`` module of named
-:class:`~mi_diffind.indirection.DifferentiableArray` s. It says which sizes they have and which values may be in them,
-and knows its training: targets, predictions, and where to start from. Its decoder reads it.
+:class:`~mi_diffind.indirection.DifferentiableArray` s. It declares their sizes and the range of their entries, and
+defines their training: initial values, targets and predictions. Its decoder reads it.
 """
 
 from __future__ import annotations
@@ -17,19 +17,21 @@ from ...tables import StoredArray, Table
 from .decoder import warp_roughness
 
 
-class Arrays(nn.Module):
+class DisneyArrays(nn.Module):
     """
-    Base class of the layouts. ``Layout().alloc(TensorXf)`` starts from ramps and coarse samples of what the tables are
-    to hold, :meth:`from_table` from trained ones. Parameters are called ``NAME.data``.
+    Base class of the layouts.
+
+    ``Layout().alloc(TensorXf)`` starts from ramps and coarse samples of the target functions. Parameters are called
+    ``NAME.data``.
     """
 
-    #: The preset that the layout stands for.
+    #: The preset of this layout.
     PRESET = ""
 
-    #: Sizes: name → shape with channels last.
+    #: Name of a table → its shape, channels last.
     SHAPES: dict[str, tuple] = {}  # noqa: RUF012
 
-    #: Values that entries may have; outside of them the BRDF could become negative or infinite.
+    #: Name of a table → the range of its entries; outside of it the BRDF could become negative or infinite.
     RANGES: dict[str, tuple] = {}  # noqa: RUF012
 
     def __init_subclass__(cls):
@@ -50,22 +52,22 @@ class Arrays(nn.Module):
 
     @classmethod
     def initial(cls, name: str) -> np.ndarray:
-        """Coarse samples of the truth at the entries' own positions: the approximate solution to start from."""
+        """Return the initial entries: coarse samples of the target function at the positions of the entries."""
         raise NotImplementedError
 
     @classmethod
     def axes(cls, name: str) -> list[np.ndarray]:
-        """The positions of a table's entries, one array of the table's size for each axis."""
+        """Return the positions of a table's entries in [0, 1], one array of the table's size for each axis."""
         return np.meshgrid(*(np.linspace(0, 1, n) for n in cls.SHAPES[name][:-1]), indexing="ij")
 
     def to_table(self) -> Table:
-        """The entries, limited to their ranges, in single precision."""
+        """Return the table to store: the entries, clamped to their ranges, in single precision."""
         arrays = {name: np.clip(getattr(self, name).numpy(), *self.RANGES[name]) for name in self.SHAPES}
         stored = {name: StoredArray(values.astype(np.float32)) for name, values in arrays.items()}
         return Table("disney", stored, self.PRESET)
 
     def bounded(self, name: str, values: list) -> list:
-        """What was read from an array, limited to its range, NaN too: floats may have left it, bytes cannot."""
+        """Clamp values read from a table to its range, NaN included; bytes cannot leave the range."""
         if getattr(self, name).storage == "uint8":
             return values
         return [clamp(v, *self.RANGES[name]) for v in values]
@@ -82,11 +84,12 @@ class Arrays(nn.Module):
     @classmethod
     def targets(cls, m, wi, wo, uniform) -> dict[str, list]:
         """
-        What the tables should give for these materials and directions, and two uniform numbers, straight from the
-        formulas: name of a table → its channels.
+        Return the exact values, name of a table → its channels.
+
+        ``m`` are materials, ``wi`` and ``wo`` directions, ``uniform`` two arrays of uniform random numbers.
         """
         raise NotImplementedError
 
     def predict(self, m, wi, wo, uniform) -> dict[str, list]:
-        """What they give, in the form of the targets."""
+        """Return the values that the tables yield, in the form of :meth:`targets`."""
         raise NotImplementedError

@@ -1,5 +1,5 @@
 """
-The Disney BRDF evaluated in two steps: coefficients that depend on the material alone, and what depends on directions.
+The Disney BRDF in two steps: coefficients of the material, then values for pairs of directions.
 
 :class:`Decoder` is the model of :mod:`.model` rearranged for speed, with the same values up to rounding. Only the parts
 in use (:class:`.effects.Effects`) are computed. Coefficients come in groups (:data:`GROUPS`), each of which depends on
@@ -20,7 +20,7 @@ from . import model
 from .effects import Effects
 from .model import COAT_F0, COAT_STRENGTH, SPECULAR_SCALE, TINY, diffuse_factors, geometry, schlick
 
-#: Groups of coefficients → the parameters that they are computed from.
+#: Group of coefficients → the parameters from which it is computed.
 GROUPS = {
     "ggx": ("roughness", "anisotropic"),
     "diffuse": ("base_color", "metallic"),
@@ -35,20 +35,21 @@ GROUPS = {
 
 class Decoder:
     """
-    The analytic form.
+    Analytic form of the model.
 
-    ``p`` in what follows is any object with the parameters as attributes, sanitised (:func:`.model.sanitize`), and with
-    ``albedo`` (a colour) and ``luminance``. ``c`` maps the names of groups to coefficients.
+    In all methods, ``p`` is an object with the sanitised parameters (:func:`.model.sanitize`), ``albedo`` (a colour)
+    and ``luminance`` as attributes; ``c`` maps groups to coefficients; ``e`` are the effects in use; ``g`` is the
+    geometry of a pair of directions (:func:`.model.geometry`).
     """
 
-    #: Groups → parameters. A learned form may have more.
+    #: Group → parameters; a learned form may have more groups.
     groups = GROUPS
 
-    #: The tables that are read.
+    #: The tables, of a learned form.
     arrays = None
 
     def required(self, e: Effects) -> tuple[str, ...]:
-        """The groups that values need when the effects ``e`` are in use."""
+        """Return the groups that values need when the effects ``e`` are in use."""
         needed = {
             "ggx": True,
             "diffuse": e.diffuse or e.subsurface,
@@ -61,13 +62,13 @@ class Decoder:
         return tuple(name for name, applies in needed.items() if applies)
 
     def coefficients(self, group: str, p: Any, e: Effects) -> dict:
-        """The coefficients of one group."""
+        """Return the coefficients of one group."""
         return getattr(self, f"_{group}")(p, e)
 
     # -- the material -----------------------------------------------------------------------------------------------
 
     def _ggx(self, p, e: Effects) -> dict:
-        """See :func:`ggx_coefficients`."""
+        """Return the coefficients of the specular lobe (:func:`ggx_coefficients`)."""
         if not e.anisotropic:
             return ggx_coefficients(dr.maximum(dr.square(p.roughness), model.ALPHA_MIN))
         return ggx_coefficients(*model.roughness_to_alpha(p.roughness, p.anisotropic))
@@ -97,14 +98,18 @@ class Decoder:
         return {"f0": f0}
 
     def _coat(self, p, e: Effects) -> dict:
-        """``GTR1 = scale |h|² / (sin² + α² cos²)``, the scale with the lobe's strength; ``log`` is for sampling."""
+        """
+        Return the coefficients of the clearcoat: ``GTR1 = scale |h|² / (sin² + α² cos²)``.
+
+        ``scale`` contains the lobe's strength; ``log`` is for sampling.
+        """
         a2 = dr.square(model.coat_alpha(p.clearcoat_gloss))
         log = dr.log(a2)
         norm = (a2 - 1) / (dr.pi * log)
         return {"a2": a2, "log": log, "norm": norm, "scale": COAT_STRENGTH * p.clearcoat * norm}
 
     def _shares(self, p, e: Effects) -> dict:
-        """What :func:`.sampling.lobe_probabilities` needs: how much energy a lobe has, for any direction."""
+        """Return the estimated energy of each lobe, for :func:`.sampling.lobe_probabilities`."""
         shares = {}
         dielectric = (1 - p.metallic) if e.metal else 1
         if "diffuse" in e.lobes:
@@ -125,8 +130,9 @@ class Decoder:
 
     def value(self, c: dict, e: Effects, lobes, p, wi, wo, active=True):
         """
-        BRDF · ``wo.z`` of the lobes named in ``lobes``: a colour, or a number where it has no hue. ``p`` is not used
-        here, but by forms that read tables at parameters.
+        Return BRDF · ``wo.z`` of the lobes named in ``lobes``: a colour, or a number if all of them are colourless.
+
+        Only forms that read tables at parameters use ``p``.
         """
         g = geometry(wi, wo)
         total = 0
@@ -145,7 +151,7 @@ class Decoder:
         return total
 
     def diffuse(self, c, e: Effects, g, wi, wo, active):
-        """Base diffuse and subsurface approximation, mixed by flatness, times ``π wo.z``."""
+        """Return base diffuse and subsurface approximation, mixed by flatness, times ``π wo.z``."""
         fl, fv = self.fresnel(wo.z, active), self.fresnel(wi.z, active)
         # (l·h)² = |h|²/4 without a root; the ratio is only needed for subsurface scattering
         ratio = wo.z / (wi.z + wo.z + TINY) if e.subsurface else 0
@@ -155,7 +161,7 @@ class Decoder:
         return dr.lerp(base, flat, c["flatness"]["flatness"]) if e.diffuse else flat
 
     def specular(self, c, e: Effects, g, wi, wo, active):
-        """``D G wo.z / (4 (n·l)(n·v))``."""
+        """Return ``D G wo.z / (4 (n·l)(n·v))``."""
         return (
             dr.square(g.h2 / (quadric(self.ggx(c)["q"], g) + TINY))
             * wo.z
@@ -163,39 +169,41 @@ class Decoder:
         )
 
     def clearcoat(self, c, e: Effects, g, s, wi, wo, active):
-        """The clearcoat lobe with its strength, times ``wo.z``."""
+        """Return the clearcoat lobe with its strength, times ``wo.z``."""
         masked, denominator = self.coat_masking(wi.z, wo.z, active)
         fresnel = dr.fma(1 - COAT_F0, s, COAT_F0)
         coat = self.coat(c)
         return coat["scale"] * g.h2 * fresnel * wo.z * masked / (coat_quadric(coat["a2"], g) * denominator)
 
-    # -- what tables may replace ------------------------------------------------------------------------------------
+    # -- factors that tables may replace -------------------------------------------------------------------------------
 
     def ggx(self, c):
-        """The specular lobe's coefficients, see :func:`ggx_coefficients`."""
+        """Return the specular lobe's coefficients (:func:`ggx_coefficients`)."""
         return c["ggx"]
 
     def coat(self, c):
-        """``a2`` and ``scale`` of the clearcoat's GTR1."""
+        """Return ``a2`` and ``scale`` of the clearcoat's GTR1."""
         return c["coat"]
 
     def fresnel(self, cosine, active=True):
-        """Schlick's ``(1 − cosine)^5``."""
+        """Return Schlick's ``(1 − cosine)^5``."""
         return schlick(cosine)
 
     def masking(self, c, w, active=True):
-        """:func:`.model.masking_denominator` of one direction."""
+        """Return :func:`.model.masking_denominator` of one direction."""
         return masking(self.ggx(c)["alpha2"], w)
 
     def coat_masking(self, cos_i, cos_o, active=True):
-        """Numerator and denominator of Smith's masking of the clearcoat for both directions."""
+        """Return numerator and denominator of Smith's masking of the clearcoat for both directions."""
         return 4 * cos_i * cos_o, coat_masking_denominator(cos_i) * coat_masking_denominator(cos_o)
 
 
 def ggx_coefficients(ax, ay=None) -> dict:
     """
-    α, its square for masking, and ``q`` with ``D = (|h|² / Σ q_k h_k²)²``: a sum of positive terms, in which nothing
-    cancels at the peak and nothing overflows at roughness 0. Without ``ay``, those of an isotropic distribution.
+    Return the coefficients of GGX: α, its square for masking, and ``q`` with ``D = (|h|² / Σ q_k h_k²)²``.
+
+    The sum has positive terms only: nothing cancels at the peak, and nothing overflows at roughness 0. Without ``ay``,
+    the distribution is isotropic, and ``q`` has two coefficients.
     """
     if ay is None:
         root = math.sqrt(math.pi)
@@ -206,38 +214,38 @@ def ggx_coefficients(ax, ay=None) -> dict:
 
 
 def quadric(q, g):
-    """``Σ q_k h_k²``, with two coefficients for the isotropic form."""
+    """Return ``Σ q_k h_k²``, with two coefficients for the isotropic form."""
     if len(q) == 2:
         return dr.fma(q[0], dr.square(g.h.x) + dr.square(g.h.y), q[1] * dr.square(g.h.z))
     return dr.fma(q[0], dr.square(g.h.x), dr.fma(q[1], dr.square(g.h.y), q[2] * dr.square(g.h.z)))
 
 
 def stretched(alpha2, w):
-    """``α_x² x² + α_y² y²`` of a direction, from α² once or for each axis."""
+    """Return ``α_x² x² + α_y² y²`` of a direction, from one α² or one for each axis."""
     if len(alpha2) == 1:
         return alpha2[0] * (dr.square(w.x) + dr.square(w.y))
     return dr.fma(alpha2[0], dr.square(w.x), alpha2[1] * dr.square(w.y))
 
 
 def masking(alpha2, w):
-    """:func:`.model.masking_denominator` from α², once or for each axis."""
+    """Return :func:`.model.masking_denominator` from one α² or one for each axis."""
     return w.z + dr.sqrt(dr.fma(w.z, w.z, stretched(alpha2, w)))
 
 
 def coat_quadric(a2, g):
-    """``sin² + α² cos²`` of the half vector, times its squared length."""
+    """Return ``sin² + α² cos²`` of the half vector, times its squared length."""
     return dr.fma(a2, dr.square(g.h.z), dr.square(g.h.x) + dr.square(g.h.y)) + TINY
 
 
 def coat_masking_denominator(cosine):
-    """``c + √(α² + (1 − α²) c²)``: the clearcoat's G₁ is ``2c`` over it."""
+    """Return ``c + √(α² + (1 − α²) c²)``; the clearcoat's G₁ is ``2c`` divided by it."""
     a2 = model.COAT_MASKING_ALPHA**2
     return cosine + dr.sqrt(dr.fma(1 - a2, dr.square(cosine), a2))
 
 
 def warp_roughness(roughness):
     """
-    The coordinate of a roughness in the encoder: ``√(r + c)``, brought to [0, 1].
+    Return the coordinate of a roughness in the encoder: ``√(r + c)``, mapped to [0, 1].
 
     GGX coefficients span decades where roughness is low; the eight entries of the encoder lie closer together there
     (0, 0.04, 0.12, 0.23, …). With ``c = 0.01`` the slope at roughness 0 stays finite.
@@ -246,7 +254,7 @@ def warp_roughness(roughness):
 
 
 def unwarp_roughness(u):
-    """The inverse of :func:`warp_roughness`, up to a rounding that may leave it below 0."""
+    """Invert :func:`warp_roughness`; rounding may leave the result slightly below 0."""
     root = u * (math.sqrt(1 + _WARP) - math.sqrt(_WARP)) + math.sqrt(_WARP)
     return root * root - _WARP
 

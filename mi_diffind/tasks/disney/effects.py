@@ -1,7 +1,8 @@
 """
-Which parts of the Disney BRDF a material makes use of, found from what is known about its parameters before anything
-is rendered. What is not in use need not be traced, read or sampled; that this changes nothing is a property of the
-model: each part below has a factor that is exactly 0 for every value the parameter can take.
+Parts of the Disney BRDF that a material uses, derived from the bounds of its parameters before rendering.
+
+Parts that are not in use are neither traced nor read nor sampled. This changes no value: each part has a factor that is
+exactly 0 for every value that the parameter can take.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from .model import PARAMETERS
 @dataclass(frozen=True)
 class Effects:
     """
-    The parts of the model in use.
+    Parts of the model in use.
 
     ``diffuse``: Burley's base diffuse; ``subsurface``: its Hanrahan–Krueger-like alternative; ``sheen``, and
     ``sheen_tint``, its tint; ``metal``: reflection coloured by the albedo; ``dielectric``: colourless reflection at
@@ -36,24 +37,24 @@ class Effects:
 
     @property
     def lobes(self) -> tuple[str, ...]:
-        """The lobes (components of the BSDF) in use, in the order of :data:`.model.LOBES`."""
+        """Lobes (components of the BSDF) in use, in the order of :data:`.model.LOBES`."""
         diffuse = ("diffuse",) if self.diffuse or self.subsurface or self.sheen else ()
         return (*diffuse, "specular", *(("clearcoat",) if self.clearcoat else ()))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the parts in use."""
+        """Names of the parts in use."""
         return tuple(f.name for f in fields(self) if getattr(self, f.name))
 
 
-def find_effects(known: dict[str, ValueBounds]) -> tuple[Effects, dict[str, str]]:
+def find_effects(bounds: dict[str, ValueBounds]) -> tuple[Effects, dict[str, str]]:
     """
-    The effects in use, and for each of the others the reason why it is not, in words.
+    Return the effects in use, and for each of the others the reason, in words, why it is not in use.
 
-    ``known`` maps ``base_color`` and the names of :data:`.model.PARAMETERS` to what is known; a missing one may be
-    anything. Parameters that are being optimised keep their effect, and its derivative, whatever their value.
+    ``bounds`` maps ``base_color`` and the names of :data:`.model.PARAMETERS` to their bounds; a missing parameter may
+    have any value. Parameters that are being optimised keep their effect, and its derivative, whatever their value.
     """
-    k = {name: known.get(name, ValueBounds()) for name in ("base_color", *PARAMETERS)}
+    k = {name: bounds.get(name, ValueBounds()) for name in ("base_color", *PARAMETERS)}
     reasons: dict[str, str] = {}
 
     def unless(effect: str, *causes: tuple[bool, str]) -> None:

@@ -1,5 +1,5 @@
 """
-``preset="tables"``: a better factorisation than the paper's, in tables of one coordinate where one suffices.
+Layout of the preset ``tables``: a better factorisation than the paper's, in tables of one coordinate.
 
 =============== ========= ======== =============================== ===================================================
 array           size      channels read at                         holds
@@ -11,18 +11,18 @@ array           size      channels read at                         holds
 ``coat``        32        4        clearcoat gloss                 α and normalisation of GTR1, and their rests
 =============== ========= ======== =============================== ===================================================
 
-The *rest* is what rounding to bytes has left of a value whose exponential or small square is taken: both together are
-as good as 16 bits. The floor on α is applied after reading, since its kink would not fit into a table; both logarithms
-then depend on one parameter each, and an isotropic material need not read the second.
+The *rest* is the error of rounding the first channel to bytes: the sum of both is as accurate as 16 bits, which values
+need if their exponential or square is taken. The floor on α is applied after reading, since its kink would not fit into
+a table; both logarithms then depend on one parameter each, and an isotropic material need not read the second.
 
 Masking is tabulated for each direction, with the cosine already divided out: ``d = c + √(c² + t²)``, where ``c`` is the
 direction's cosine and ``t = √(α_x² x² + α_y² y²)`` its tangent, stretched by the roughness. ``d`` is homogeneous, so
 ``d / (c + t)`` is a function of the ratio ``c / (c + t)`` alone: one axis instead of three (roughness, anisotropy,
-cosine), between 1 and 2, and of the same relative accuracy at the horizon as anywhere else. That is what the paper's
-layout lacks.
+cosine), between 1 and 2, and of the same relative accuracy at the horizon as anywhere else. The paper's layout is
+inaccurate there.
 
-What depends on one cosine alone, Schlick's (1 − c)^5 and the clearcoat's masking, is computed: four multiplications and
-a root take less time than any read, and with a table of them the whole was slower than Mitsuba's ``principled``.
+Terms of one cosine, Schlick's (1 − c)^5 and the clearcoat's masking, are computed: four multiplications and a root take
+less time than any read. With a table for them, the whole model was slower than Mitsuba's ``principled``.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ import numpy as np
 from ...lookup import clamp, quantize
 from ...tables import StoredArray, Table
 from . import decoder, model
-from .arrays import Arrays
+from .arrays import DisneyArrays
 from .model import ALPHA_MIN, TINY
 
-#: Where the tabulated α ends: below the floor that is applied to it, so that the kink is not in the table.
+#: Smallest tabulated α: below the floor that is applied after reading, so that the kink is not in the table.
 LOWEST_ALPHA = 0.2 * ALPHA_MIN
 
 
-#: Limits of what is read, whatever is in the tables: roughness and anisotropy between 0 and 1, and a little more.
+#: Limits of the values that are read: those of roughness and anisotropy between 0 and 1, with a margin.
 LOG_ALPHA, LOG_ASPECT = (-12.0, 0.1), (-1.2, 0.0)
 
 
-class FactoredArrays(Arrays):
-    """Encoder and decoder as one trainable module."""
+class FactoredArrays(DisneyArrays):
+    """Encoder and decoder tables of the preset ``tables`` as one trainable module."""
 
     PRESET = "tables"
 
@@ -67,12 +67,12 @@ class FactoredArrays(Arrays):
         "coat": (-0.05, 0.2),
     }
 
-    #: Tables whose second half of channels is what rounding the first half to bytes has left, to be added to it: an
+    #: Tables whose second half of channels is added to the first: it holds the error of rounding that to bytes. An
     #: exponential follows, and 8 bits for 8 units of a logarithm are errors of 1.6%.
     SPLIT = ("encoder_roughness", "encoder_anisotropic", "alpha", "aspect", "coat")
 
     def coat_values(self, gloss, active=True) -> list:
-        """α of the clearcoat's GTR1, and its normalisation. Depends on the material only."""
+        """Return α of the clearcoat's GTR1 and its normalisation, which depend on the material only."""
         alpha, norm, rest_alpha, rest_norm = self.coat([gloss], active)
         return [alpha + rest_alpha, norm + rest_norm]
 
@@ -83,7 +83,7 @@ class FactoredArrays(Arrays):
             half = values.shape[-1] // 2
             total = values[..., :half] + values[..., half:]
             if name in ("encoder_anisotropic", "aspect"):
-                total[0] = 0  # an anisotropy of 0 is none, to the last bit: it may be left out
+                total[0] = 0  # anisotropic 0 has to be isotropic to the last bit, since it may be left out
             codes, scale, offset = quantize(total, half)
             coarse = np.asarray(offset) + np.asarray(scale) * codes.astype(np.float64)
             entries = np.concatenate([coarse, total - coarse], axis=-1).astype(np.float32)
@@ -95,8 +95,10 @@ class FactoredArrays(Arrays):
     @classmethod
     def targets(cls, m, wi, wo, uniform) -> dict[str, list]:
         """
-        Tables of one coordinate are trained at uniform ones: those of random directions would hardly ever lie near the
-        horizon, where errors matter as much.
+        Return the exact values, see :meth:`.DisneyArrays.targets`.
+
+        Tables of one coordinate are trained at uniform coordinates: those of random directions would hardly ever lie
+        near the horizon, where errors matter as much.
         """
         u, _ = uniform
         alpha = model.coat_alpha(m.clearcoat_gloss)
@@ -137,8 +139,10 @@ class FactoredArrays(Arrays):
 
 class FactoredDecoder(decoder.Decoder):
     """
-    Reads :class:`FactoredArrays` in place of the arithmetic of the factors named in ``read``: any of ``alpha``,
-    ``masking`` and ``coat`` (fewer than all for measuring what a table gains).
+    Form of the model that reads :class:`FactoredArrays` in place of some arithmetic.
+
+    ``read`` names the factors that are read: any of ``alpha``, ``masking`` and ``coat``. A study leaves some of them
+    out, to measure the cost of one table.
     """
 
     FACTORS = ("alpha", "masking", "coat")
@@ -152,12 +156,12 @@ class FactoredDecoder(decoder.Decoder):
     def __init__(self, arrays: FactoredArrays, read=FACTORS):
         self.arrays, self.read = arrays, tuple(read)
 
-    def _alpha(self, latent, anisotropic: bool, active=True) -> list:
-        """α_x and α_y of the encoded roughness and anisotropy, or one number for an isotropic material."""
-        mean = clamp(sum(self.arrays.alpha([latent[0]], active)), *LOG_ALPHA)
+    def _alpha(self, encoded, anisotropic: bool) -> list:
+        """Return α_x and α_y of the encoded roughness and anisotropy, or one α for an isotropic material."""
+        mean = clamp(sum(self.arrays.alpha([encoded[0]])), *LOG_ALPHA)
         if not anisotropic:
             return [dr.maximum(dr.exp(mean), ALPHA_MIN)]
-        aspect = clamp(sum(self.arrays.aspect([latent[1]], active)), *LOG_ASPECT)
+        aspect = clamp(sum(self.arrays.aspect([encoded[1]])), *LOG_ASPECT)
         return [dr.maximum(dr.exp(v), ALPHA_MIN) for v in (mean - aspect, mean + aspect)]
 
     def required(self, e):
@@ -186,5 +190,5 @@ class FactoredDecoder(decoder.Decoder):
         if "masking" not in self.read:
             return super().masking(c, w, active)
         total = w.z + dr.sqrt(decoder.stretched(self.ggx(c)["alpha2"], w) + TINY)
-        found = self.arrays.masking([w.z / total], active, inside=True)
-        return total * self.arrays.bounded("masking", found)[0]
+        ratio = self.arrays.masking([w.z / total], active, inside=True)
+        return total * self.arrays.bounded("masking", ratio)[0]

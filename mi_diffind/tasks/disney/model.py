@@ -1,9 +1,9 @@
 """
-The reference: Burley, *Physically Based Shading at Disney*, 2012.
+Reference model: Burley, *Physically Based Shading at Disney*, 2012.
 
 All functions work on Dr.Jit arrays of one width, in the local frame with the normal (0, 0, 1), for unit directions
-``wi`` (towards the viewer) and ``wo`` (towards the light) with positive cosines ``wi.z`` and ``wo.z``; what a caller
-does with other directions is up to him, nothing becomes NaN. Values include the cosine ``wo.z``, as in Mitsuba.
+``wi`` (towards the viewer) and ``wo`` (towards the light) with positive cosines ``wi.z`` and ``wo.z``. Values for other
+directions have no meaning, but none is NaN. Values include the cosine ``wo.z``, as in Mitsuba.
 
 The colour is affine in the albedo and in its tint, ``albedo / luminance(albedo)``: ``f = albedo · a + tint · x + y``.
 (The paper writes ``tint · x + y`` with ``a · luminance`` inside ``x``; apart, the derivative with respect to a black
@@ -36,8 +36,8 @@ COAT_STRENGTH, COAT_F0, COAT_MASKING_ALPHA = 0.25, 0.04, 0.25
 #: The lobes, in the order of a BSDF's components.
 LOBES = ("diffuse", "specular", "clearcoat")
 
-#: Added to squared lengths before dividing: below what directions 1e-6 rad from opposite produce, yet large enough for
-#: its inverse square, which derivatives contain, to be a float.
+#: Added to squared lengths before dividing. It is smaller than the squared half vector of directions 1e-6 rad from
+#: opposite, and its inverse square, which derivatives contain, is still a finite float.
 TINY = 1e-18
 
 
@@ -63,8 +63,9 @@ PARAMETERS = tuple(f.name for f in fields(Material))
 @dataclass
 class Factors:
     """
-    What depends on the directions, each a scalar array. ``c = wo.z``, ``s = (1 − l·h)^5``, ``m`` = metallic.
+    Factors that depend on the directions, each a scalar array.
 
+    With ``c = wo.z``, ``s = (1 − l·h)^5`` and ``m`` = metallic:
     ``specular``: D · G · c / (4 (n·l)(n·v)); ``metal_base``: m (1 − s); ``base``: (1 − m)(1 − s);
     ``sheen``: (1 − m) s c; ``grazing``: s; ``diffuse``: base diffuse · c; ``flat``: subsurface approximation · c;
     ``clearcoat``: GTR1 · G · F · c without its strength.
@@ -90,26 +91,34 @@ class Geometry:
 
 
 def geometry(wi, wo) -> Geometry:
-    """For unit vectors, ``l·h = |wi + wo| / 2``: no normalisation, and no 0/0 where the directions are opposite."""
+    """
+    Return the geometry of two unit vectors.
+
+    ``l·h = |wi + wo| / 2`` needs no normalisation, and is no 0/0 where the directions are opposite.
+    """
     h = wi + wo
     h2 = dr.squared_norm(h)
     return Geometry(h, h2, dr.minimum(0.5 * dr.sqrt(h2 + TINY), 1))
 
 
 def positive(x):
-    """``max(x, 0)``, and 0 for NaN."""
+    """Return ``max(x, 0)``, and 0 for NaN."""
     return dr.select(x > 0, x, 0)
 
 
 def schlick(cosine):
-    """(1 − cos)^5, and 0 for a cosine that rounding has made larger than 1."""
+    """Return (1 − cos)^5, and 0 for a cosine that rounding has made larger than 1."""
     m = dr.maximum(1 - cosine, 0)
     m2 = m * m
     return m2 * m2 * m
 
 
 def roughness_to_alpha(roughness, anisotropic):
-    """``(α_x, α_y)``: roughness² over and times the aspect √(1 − 0.9 anisotropic), at least :data:`ALPHA_MIN`."""
+    """
+    Return ``(α_x, α_y)``, each at least :data:`ALPHA_MIN`.
+
+    They are roughness² divided by and multiplied with the aspect √(1 − 0.9 anisotropic).
+    """
     aspect = dr.sqrt(1 - 0.9 * anisotropic)
     alpha = dr.square(roughness)
     return dr.maximum(alpha / aspect, ALPHA_MIN), dr.maximum(alpha * aspect, ALPHA_MIN)
@@ -117,27 +126,30 @@ def roughness_to_alpha(roughness, anisotropic):
 
 def masking_denominator(w, ax, ay):
     """
-    ``d(w) = c + √(c² + α_x² x² + α_y² y²)`` with ``c = w.z``: Smith's masking is ``G₁ = 2c / d``, and
-    ``G / (4 (n·l)(n·v)) = 1 / (d(wi) d(wo))`` is finite at the horizon, where ``d ≥ min(α_x, α_y)``.
+    Return ``d(w) = c + √(c² + α_x² x² + α_y² y²)`` with ``c = w.z``.
+
+    Smith's masking is ``G₁ = 2c / d``, and ``G / (4 (n·l)(n·v)) = 1 / (d(wi) d(wo))`` is finite at the horizon, where
+    ``d ≥ min(α_x, α_y)``.
     """
     return w.z + dr.sqrt(dr.square(w.z) + dr.square(ax * w.x) + dr.square(ay * w.y))
 
 
 def ggx(g: Geometry, ax, ay):
-    """Anisotropic GTR2 (GGX) for a half vector that need not be normalised."""
+    """Return anisotropic GTR2 (GGX) for a half vector that need not be normalised."""
     stretched = dr.square(g.h.x / ax) + dr.square(g.h.y / ay) + dr.square(g.h.z)
     return dr.square(g.h2 / (stretched + TINY)) / (dr.pi * ax * ay)
 
 
 def coat_alpha(gloss):
-    """α of the clearcoat: mix(0.1, 0.001, gloss)."""
+    """Return α of the clearcoat: mix(0.1, 0.001, gloss)."""
     return 0.1 + (0.001 - 0.1) * gloss
 
 
 def gtr1(g: Geometry, alpha):
     """
-    GTR1 with the denominator written as ``sin² + α² cos²``: the published form ``1 + (α² − 1) cos²`` cancels near the
-    peak, to zero or below it.
+    Return GTR1, with the denominator written as ``sin² + α² cos²``.
+
+    The published form ``1 + (α² − 1) cos²`` cancels near the peak, to zero or below it.
     """
     a2 = dr.square(alpha)
     denominator = dr.square(g.h.x) + dr.square(g.h.y) + a2 * dr.square(g.h.z)
@@ -145,15 +157,16 @@ def gtr1(g: Geometry, alpha):
 
 
 def coat_masking(cosine):
-    """Smith's G₁ for the clearcoat's fixed α."""
+    """Return Smith's G₁ for the clearcoat's fixed α."""
     a2 = COAT_MASKING_ALPHA**2
     return 2 * cosine / (cosine + dr.sqrt(a2 + (1 - a2) * dr.square(cosine)))
 
 
 def diffuse_factors(roughness, cos_d2, fresnel_sum, fresnel_product, cos_ratio, cos_o):
     """
-    Burley's base diffuse and the Hanrahan–Krueger-inspired subsurface approximation, times ``cos_o``, from
-    ``(l·h)²``, ``F_L + F_V``, ``F_L F_V`` and ``cos_o / (cos_i + cos_o)``.
+    Return Burley's base diffuse and the Hanrahan–Krueger-inspired subsurface approximation, times ``cos_o``.
+
+    The other arguments are ``(l·h)²``, ``F_L + F_V``, ``F_L F_V`` and ``cos_o / (cos_i + cos_o)``.
     """
     f90 = 2 * roughness * cos_d2
     k = f90 - 0.5
@@ -165,7 +178,7 @@ def diffuse_factors(roughness, cos_d2, fresnel_sum, fresnel_product, cos_ratio, 
 
 
 def exact_factors(material: Material, wi, wo) -> Factors:
-    """The factors, straight from the formulas."""
+    """Return the factors by the published formulas."""
     g = geometry(wi, wo)
     ax, ay = roughness_to_alpha(material.roughness, material.anisotropic)
     s = schlick(g.cos_d)
@@ -188,9 +201,7 @@ def exact_factors(material: Material, wi, wo) -> Factors:
 
 
 def compose(material: Material, f: Factors, lobes=LOBES) -> dict[str, tuple]:
-    """
-    For each lobe the scalars ``(a, x, y)`` of ``f = albedo · a + tint · x + y``, non-negative if the factors are.
-    """
+    """Return the scalars ``(a, x, y)`` of ``f = albedo · a + tint · x + y`` for each lobe, ≥ 0 if the factors are."""
     m = material
     parts = {}
     if "diffuse" in lobes:
@@ -213,7 +224,7 @@ def compose(material: Material, f: Factors, lobes=LOBES) -> dict[str, tuple]:
 
 
 def colour(lobes, albedo, luminance):
-    """``albedo · a + tint · x + y``, summed over ``lobes``, an iterable of such triples."""
+    """Return ``albedo · a + tint · x + y``, summed over ``lobes``, an iterable of triples ``(a, x, y)``."""
     total = [0, 0, 0]
     for lobe in lobes:
         total = [a + b for a, b in zip(total, lobe, strict=True)]
@@ -222,17 +233,17 @@ def colour(lobes, albedo, luminance):
 
 
 def tint(albedo, luminance):
-    """``albedo / luminance``, turning into 1 for black, which has no hue; its slope stays below 10⁵."""
+    """Return ``albedo / luminance``, which tends to 1 for black; its slope stays below 10⁵."""
     return (albedo + 1e-5) / (luminance + 1e-5)
 
 
 def specular_from_eta(eta):
-    """``specular`` of a relative index of refraction: reflectance ((η − 1)/(η + 1))² in units of 0.08."""
+    """Return ``specular`` of a relative index of refraction: reflectance ((η − 1)/(η + 1))² in units of 0.08."""
     return dr.square((eta - 1) / (eta + 1)) / SPECULAR_SCALE
 
 
 def sanitize(material: Material, specular_max: float = 1.0) -> Material:
-    """Every parameter limited to its range, NaN to 0: textures and optimisers overshoot."""
+    """Clamp every parameter to its range, NaN to 0, since textures and optimisers overshoot."""
     return Material(
         **{n: clamp(getattr(material, n), 0.0, specular_max if n == "specular" else 1.0) for n in PARAMETERS}
     )

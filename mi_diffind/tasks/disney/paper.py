@@ -1,5 +1,5 @@
 """
-``preset="paper"``: the layout of the paper's Table 1, with a small encoder before it.
+Layout of the preset ``paper``: the paper's Table 1, with a small encoder before it.
 
 The *encoder* is two 1D primary arrays, which map roughness (warped, see :func:`.decoder.warp_roughness`) and anisotropy
 to coordinates; it depends on the material only. The *decoder* is five cascaded arrays, the same for every material:
@@ -27,12 +27,12 @@ import numpy as np
 
 from ...lookup import clamp
 from . import decoder, model
-from .arrays import Arrays
-from .model import ALPHA_MIN, COAT_F0, LOBES, TINY, Factors, compose, diffuse_factors, geometry, positive
+from .arrays import DisneyArrays
+from .model import ALPHA_MIN, COAT_F0, TINY, Factors, compose, diffuse_factors, geometry, positive
 
 
-class PaperArrays(Arrays):
-    """Encoder and decoder as one trainable module."""
+class PaperArrays(DisneyArrays):
+    """Encoder and decoder tables of the preset ``paper`` as one trainable module."""
 
     PRESET = "paper"
 
@@ -56,40 +56,38 @@ class PaperArrays(Arrays):
         "coat": (-16.0, 8.0),
     }
 
-    def ggx_coefficients(self, latent, active=True) -> list:
-        """``q`` with ``D = 1 / (q_x h_x² + q_y h_y² + q_z h_z²)²`` for a unit half vector. Material only."""
-        return [dr.exp(v) for v in self.bounded("ggx", self.ggx(latent, active))]
+    def ggx_coefficients(self, encoded, active=True) -> list:
+        """Return ``q`` of ``D = 1 / (q_x h_x² + q_y h_y² + q_z h_z²)²``, with a unit half vector, of a material."""
+        return [dr.exp(v) for v in self.bounded("ggx", self.ggx(encoded, active))]
 
     def coat_coefficients(self, gloss, active=True) -> list:
-        """``k`` with ``GTR1 = 1 / (k_0 sin² + k_1 cos²)``. Material only."""
+        """Return ``k`` of ``GTR1 = 1 / (k_0 sin² + k_1 cos²)``, of the material only."""
         return [dr.exp(v) for v in self.bounded("coat", self.coat([gloss], active))]
 
-    def masking_root(self, latent_roughness, cos_product, active=True):
-        """``√(d(wi) d(wo))`` from the encoded roughness and ``(n·l)(n·v)``; the specular term divides by its square."""
-        return self.bounded("masking", self.masking([latent_roughness, dr.sqrt(cos_product + TINY)], active))[0]
+    def masking_root(self, encoded_roughness, cos_product, active=True):
+        """Return ``√(d(wi) d(wo))``, the root of the specular term's denominator, from the roughness and (n·l)(n·v)."""
+        return self.bounded("masking", self.masking([encoded_roughness, dr.sqrt(cos_product + TINY)], active))[0]
 
-    def factors(self, material, wi, wo, active=True, encoded=None, lobes=LOBES) -> Factors:
+    def factors(self, material, wi, wo, encoded: dict, lobes, active=True) -> Factors:
         """
-        The factors of :func:`.model.compose` for ``lobes`` (0 for what the others need), from five reads.
+        Return the factors of :func:`.model.compose` for ``lobes``, from five reads; those of other lobes are 0.
 
-        ``encoded``, if given, are the coefficients of the material: ``latent_roughness``, ``q`` and, for the
-        clearcoat, ``k``.
+        ``encoded`` holds the coefficients of the material: ``roughness`` (encoded), ``q`` and, for the clearcoat,
+        ``k``.
         """
         g = geometry(wi, wo)
-        if encoded is None:
-            encoded = self.encoded(material, active, "clearcoat" in lobes)
         specular = diffuse = flat = clearcoat = 0
         if "specular" in lobes:
             qx, qy, qz = encoded["q"]
-            root = self.masking_root(encoded["latent_roughness"], clamp(wi.z * wo.z, 0.0, 1.0), active)
+            root = self.masking_root(encoded["roughness"], clamp(wi.z * wo.z, 0.0, 1.0), active)
             quadric = qx * dr.square(g.h.x) + qy * dr.square(g.h.y) + qz * dr.square(g.h.z)
             specular = dr.square(g.h2 / (quadric * root + TINY)) * wo.z
 
-        found = self.bounded("fresnel", self.fresnel([g.cos_d, material.metallic], active))
-        metal_base, base, coat_fresnel, sheen = found
+        read = self.bounded("fresnel", self.fresnel([g.cos_d, material.metallic], active))
+        metal_base, base, coat_fresnel, sheen = read
         if "diffuse" in lobes or "clearcoat" in lobes:
-            found = self.bounded("diffuse", self.diffuse([wo.z, wi.z], active))
-            fresnel_sum, fresnel_product, cos_ratio, coat_masking = found
+            read = self.bounded("diffuse", self.diffuse([wo.z, wi.z], active))
+            fresnel_sum, fresnel_product, cos_ratio, coat_masking = read
         if "diffuse" in lobes:
             diffuse, flat = diffuse_factors(
                 material.roughness, dr.square(g.cos_d), fresnel_sum, fresnel_product, cos_ratio, wo.z
@@ -109,14 +107,6 @@ class PaperArrays(Arrays):
             flat=flat,
             clearcoat=clearcoat,
         )
-
-    def encoded(self, material, active=True, coat: bool = True) -> dict:
-        """What reads of the directions need of the material (see :meth:`factors`)."""
-        latent = self.encode(material, active)
-        found = {"latent_roughness": latent[0], "q": tuple(self.ggx_coefficients(latent, active))}
-        if coat:
-            found["k"] = tuple(self.coat_coefficients(material.clearcoat_gloss, active))
-        return found
 
     # -- training ---------------------------------------------------------------------------------------------------
 
@@ -148,10 +138,10 @@ class PaperArrays(Arrays):
         }
 
     def predict(self, m, wi, wo, uniform) -> dict[str, list]:
-        latent = self.encode(m)
-        root = self.masking_root(latent[0], wi.z * wo.z)
+        encoded = self.encode(m)
+        root = self.masking_root(encoded[0], wi.z * wo.z)
         return {
-            "ggx": self.ggx(latent),
+            "ggx": self.ggx(encoded),
             "masking": [dr.log(root)],
             "diffuse": self.diffuse([wo.z, wi.z]),
             "fresnel": self.fresnel([geometry(wi, wo).cos_d, m.metallic]),
@@ -192,7 +182,7 @@ class PaperArrays(Arrays):
 
 
 class PaperDecoder(decoder.Decoder):
-    """Reads :class:`PaperArrays`. A material's encoding and its coefficients of GGX and GTR1 are read once."""
+    """Form of the model that reads :class:`PaperArrays`; coefficients of GGX and GTR1 are read once per material."""
 
     groups = {**decoder.GROUPS, "encoded": ("roughness", "anisotropic"), "encoded_coat": ("clearcoat_gloss",)}  # noqa: RUF012
 
@@ -203,7 +193,8 @@ class PaperDecoder(decoder.Decoder):
         return ("encoded", "encoded_coat") if e.clearcoat else ("encoded",)
 
     def _encoded(self, p, e):
-        return self.arrays.encoded(p, coat=False)
+        coordinates = self.arrays.encode(p)
+        return {"roughness": coordinates[0], "q": tuple(self.arrays.ggx_coefficients(coordinates))}
 
     def _encoded_coat(self, p, e):
         return {"k": tuple(self.arrays.coat_coefficients(p.clearcoat_gloss))}
@@ -211,5 +202,5 @@ class PaperDecoder(decoder.Decoder):
     def value(self, c, e, lobes, p, wi, wo, active=True):
         lobes = tuple(lobe for lobe in lobes if lobe in e.lobes)
         encoded = {**c["encoded"], **c.get("encoded_coat", {})}
-        factors = self.arrays.factors(p, wi, wo, active, encoded, lobes)
+        factors = self.arrays.factors(p, wi, wo, encoded, lobes, active)
         return model.colour(compose(p, factors, lobes).values(), p.albedo, p.luminance)

@@ -1,5 +1,5 @@
 """
-Importance sampling of the Disney BRDF: which lobe, and with which density.
+Importance sampling of the Disney BRDF: choice of a lobe, directions and their density.
 
 The density has to be normalised exactly even where tables are approximate, so it is always computed from the analytic
 distributions: a cosine for diffuse and sheen, visible normals (Heitz 2018) for the specular lobe, GTR1 half vectors for
@@ -18,24 +18,24 @@ from .decoder import coat_quadric, masking, quadric
 from .effects import Effects
 from .model import COAT_F0, TINY, geometry, schlick
 
-#: Groups of coefficients that densities need, and whether they do with the effects ``e``.
+#: Group of coefficients → whether densities need it with the effects ``e``.
 REQUIRED = {"ggx": lambda e: True, "coat": lambda e: e.clearcoat, "shares": lambda e: len(e.lobes) > 1}
 
-#: Share that a lobe gets however little energy is estimated for it, so that no lobe is left to another's sampling.
+#: Least share of a lobe, however low its estimated energy: without it, only other lobes would sample its directions.
 FLOOR = 0.02
 
 
 def required(e: Effects) -> tuple[str, ...]:
-    """The groups of coefficients that densities need when the effects ``e`` are in use."""
+    """Return the groups of coefficients that densities need when the effects ``e`` are in use."""
     return tuple(name for name, applies in REQUIRED.items() if applies(e))
 
 
 def lobe_probabilities(c: dict, e: Effects, cos_i, rates: dict) -> dict:
     """
-    The probability of sampling each lobe, proportional to an estimate of its albedo for the direction ``wi``.
+    Return the probability of sampling each lobe, proportional to an estimate of its albedo for the direction ``wi``.
 
-    ``rates`` maps lobes to factors on their shares; a lobe that it lacks is turned off. The specular lobe is never
-    without a chance unless it is turned off; if all are, there is none.
+    ``rates`` maps lobes to factors on their shares; a lobe that it lacks is turned off. The specular lobe has a
+    positive probability unless it is turned off.
     """
     lobes = [lobe for lobe in e.lobes if lobe in rates]
     if len(e.lobes) == 1:
@@ -57,7 +57,7 @@ def lobe_probabilities(c: dict, e: Effects, cos_i, rates: dict) -> dict:
 
 
 def density(c: dict, e: Effects, probabilities: dict, wi, wo):
-    """Density of ``wo`` per solid angle when lobes are chosen with ``probabilities``."""
+    """Return the density of ``wo`` per solid angle when lobes are chosen with ``probabilities``."""
     g = geometry(wi, wo)
     pdf = 0
     if "diffuse" in probabilities:
@@ -73,8 +73,9 @@ def density(c: dict, e: Effects, probabilities: dict, wi, wo):
 
 def sample_gtr1(a2, log_a2, sample):
     """
-    A half vector with density ``GTR1(h) · h.z`` (Burley 2012, appendix B.2), from α² and its logarithm; ``sample``
-    uniform in [0, 1)².
+    Return a half vector with density ``GTR1(h) · h.z`` (Burley 2012, appendix B.2).
+
+    ``a2`` and ``log_a2`` are α² and its logarithm, ``sample`` is uniform in [0, 1)².
     """
     # The published form gives cos², from which sin² = 1 − cos² would cancel next to the peak
     sin2 = dr.clip(a2 * (dr.exp(-sample.y * log_a2) - 1) / (1 - a2), 0, 1)

@@ -2,7 +2,7 @@
 Training of the Disney tables: distributions, per-factor targets, errors.
 
 Each factor is learned against its own analytic target, because the product of all of them is unbounded and dominated
-by the specular peak (METHOD task 2, supplemental 1.2). View and light directions are uniform over the hemisphere,
+by the specular peak (supplemental 1.2). View and light directions are uniform over the hemisphere,
 metallic and roughness exponential-like (many low values), the rest uniform.
 """
 
@@ -16,7 +16,7 @@ import drjit as dr
 
 from ...fitting import Problem, exponential_like
 from . import model
-from .arrays import Arrays
+from .arrays import DisneyArrays
 from .decoder import Decoder
 from .effects import Effects
 from .model import PARAMETERS, Material, compose, exact_factors
@@ -26,14 +26,18 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 def uniform_hemisphere(types, u, v):
-    """A unit vector (``Array3f``) uniform over the upper hemisphere from two uniform numbers."""
+    """Return a unit vector (``Array3f``) uniform over the upper hemisphere, from two uniform numbers."""
     r = dr.sqrt(dr.maximum(1 - u * u, 0))
     sin, cos = dr.sincos(2 * dr.pi * v)
     return types.Array3f(r * cos, r * sin, u)
 
 
 def random_materials(rng, types, size: int, distribution: str = "training") -> Material:
-    """``distribution``: ``"training"`` (metallic and roughness exponential-like) or ``"uniform"``."""
+    """
+    Draw ``size`` materials.
+
+    ``distribution``: ``"training"`` (metallic and roughness exponential-like, others uniform) or ``"uniform"``.
+    """
     drawn = {name: rng.random(types.Float, size) for name in PARAMETERS}
     if distribution == "training":
         for name in ("metallic", "roughness"):
@@ -42,7 +46,7 @@ def random_materials(rng, types, size: int, distribution: str = "training") -> M
 
 
 def random_directions(rng, types, size: int):
-    """``(wi, wo)``, both uniform over the hemisphere."""
+    """Draw ``size`` pairs ``(wi, wo)``, both uniform over the hemisphere."""
     u = [rng.random(types.Float, size) for _ in range(4)]
     return uniform_hemisphere(types, u[0], u[1]), uniform_hemisphere(types, u[2], u[3])
 
@@ -62,8 +66,9 @@ class Shaded(Material):
 
 def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects = Effects(), lobes=None):  # noqa: B008
     """
-    BRDF · cosine in RGB: from ``decoder``, or straight from the formulas if it is ``None``; of some ``lobes``, all that
-    are in use unless given.
+    Return BRDF · cosine in RGB, from ``decoder``, or by the published formulas if it is ``None``.
+
+    ``lobes`` names the lobes to sum; by default, all that are in use.
     """
     p, lobes = Shaded.of(m, albedo), lobes or effects.lobes
     if decoder is None:
@@ -74,15 +79,16 @@ def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects
 
 class DisneyProblem(Problem):
     """
-    The training problem of a layout ``net``, which ``decoder`` (its class) reads. ``samples`` random directions and
-    materials, seeded and held out, measure ``psnr_db``: PSNR of BRDF · cosine, clipped to [0, 1], against the analytic
-    model.
+    Training problem of a layout ``net``, which is read by ``decoder``, a class.
+
+    ``psnr_db`` is measured at ``samples`` random directions and materials, seeded and held out: PSNR of BRDF · cosine,
+    clipped to [0, 1], against the analytic model.
     """
 
-    #: dB. The peak of a smooth surface gains long after the mean over random directions has settled.
+    #: In dB. The peak of a smooth surface still improves when the mean over random directions has settled.
     tolerance = 0.2
 
-    def __init__(self, net: Arrays, decoder: type[Decoder], types, samples: int = 2**18):
+    def __init__(self, net: DisneyArrays, decoder: type[Decoder], types, samples: int = 2**18):
         self.net, self.decoder, self.types, self.samples = net, decoder, types, samples
 
     def batch(self, rng, size: int):
@@ -90,10 +96,10 @@ class DisneyProblem(Problem):
         uniform = [rng.random(self.types.Float, size) for _ in range(2)]
         return (m, wi, wo, uniform), self.net.targets(m, wi, wo, uniform)
 
-    def predict(self, net: Arrays, inputs) -> dict[str, list]:
+    def predict(self, net: DisneyArrays, inputs) -> dict[str, list]:
         return net.predict(*inputs)
 
-    def measure(self, net: Arrays) -> dict[str, float]:
+    def measure(self, net: DisneyArrays) -> dict[str, float]:
         return measure(self.decoder(net), self.types, self.samples)
 
 
@@ -101,22 +107,24 @@ def measure(
     decoder: Decoder, types, samples: int = 10**6, distribution: str = "training", seed: int = 2023
 ) -> dict[str, float]:
     """
-    Accuracy of the tables over random directions (uniform over the hemisphere) and materials: ``psnr_db`` of values
-    (BRDF · cosine) clipped to [0, 1], ``psnr_brdf_db`` of the BRDF without the cosine, clipped likewise, and ``mae``.
+    Measure the accuracy of a decoder over random materials and directions (uniform over the hemisphere).
+
+    Returns ``psnr_db`` of BRDF · cosine clipped to [0, 1], ``psnr_brdf_db`` of the BRDF without the cosine, clipped
+    likewise, and ``mae``.
     """
     rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
     m, (wi, wo) = random_materials(rng, types, samples, distribution), random_directions(rng, types, samples)
     albedo = types.Array3f([rng.random(types.Float, samples) for _ in range(3)])
-    truth, found = shade(None, m, albedo, wi, wo), shade(decoder, m, albedo, wi, wo)
+    truth, decoded = shade(None, m, albedo, wi, wo), shade(decoder, m, albedo, wi, wo)
 
     def clipped_mse(a, b):
         difference = dr.clip(a, 0, 1) - dr.clip(b, 0, 1)
         return sum(dr.mean(dr.square(d))[0] for d in difference) / 3
 
     cosine = dr.maximum(wo.z, 1e-6)
-    error = dr.clip(truth, 0, 1) - dr.clip(found, 0, 1)
+    error = dr.clip(truth, 0, 1) - dr.clip(decoded, 0, 1)
     return {
-        "psnr_db": -10 * math.log10(clipped_mse(truth, found)),
-        "psnr_brdf_db": -10 * math.log10(clipped_mse(truth / cosine, found / cosine)),
+        "psnr_db": -10 * math.log10(clipped_mse(truth, decoded)),
+        "psnr_brdf_db": -10 * math.log10(clipped_mse(truth / cosine, decoded / cosine)),
         "mae": float(sum(dr.mean(dr.abs(e))[0] for e in error) / 3),
     }

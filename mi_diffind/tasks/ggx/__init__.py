@@ -20,7 +20,7 @@ def _side(text: str) -> int:
 
 
 class GGX(Task):
-    """The task; see :mod:`.model` for what its presets are."""
+    """The task; :mod:`.model` explains its presets."""
 
     name = "ggx"
     title = "the GGX distribution of normals"

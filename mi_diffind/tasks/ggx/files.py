@@ -1,4 +1,4 @@
-"""Table files of task 1, and what they stand for."""
+"""Table files of task 1."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .model import Encoding, LearnedGGX
 
 
 class GGXModel(Model):
-    """The ``distribution`` as a file has it (:class:`.model.LearnedGGX`)."""
+    """A table file as a ``distribution`` (:class:`.model.LearnedGGX`)."""
 
     forms = STORAGES
 
@@ -22,16 +22,16 @@ class GGXModel(Model):
         self.distribution = LearnedGGX(net, encoding_of(self.table))
 
     def measure(self, samples: int = 10**6) -> dict[str, float]:
-        """See :func:`.training.measure`."""
+        """Measure errors (:func:`.training.measure`)."""
         return training.measure(self.distribution, self.types, samples)
 
 
 def encoding_of(table: Table) -> Encoding:
-    """What stands between the entries of a table and the distribution. Raises :class:`TableError`."""
+    """Return the encoding that a table's settings name. Raises :class:`TableError`."""
     try:
         return Encoding(table.settings["inputs"], table.settings["output"])
     except (KeyError, TypeError, ValueError) as e:
-        raise TableError(f"{table.path}: its settings name no encoding that is known ({e})") from None
+        raise TableError(f"{table.path}: the settings name no known encoding ({e})") from None
 
 
 def load(path: str | os.PathLike) -> Table:

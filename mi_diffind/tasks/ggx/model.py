@@ -1,12 +1,12 @@
 """
-Task 1: the isotropic GGX distribution of normals, read from arrays (METHOD task 1, supplemental 1.1).
+Task 1: the isotropic GGX distribution of normals, read from arrays (supplemental 1.1).
 
-The truth is Trowbridge and Reitz's distribution (Walter et al. 2007, equation 33) with the normal (0, 0, 1),
+The reference is Trowbridge and Reitz's distribution (Walter et al. 2007, equation 33) with the normal (0, 0, 1),
 
     D(h) = α² / (π q²),   q = sin²θ_h + α² cos²θ_h,
 
-whose peak 1/(π α²) is unbounded: 0.3 at α = 1, 318,310 at α = 0.001. Between entries and D stands therefore an
-:class:`Encoding`, and which one it is matters more than how the arrays are made:
+whose peak 1/(π α²) is unbounded: 0.3 at α = 1, 318,310 at α = 0.001. An :class:`Encoding` therefore maps entries to D.
+Its choice matters more than the sizes and the training of the arrays:
 
 ``"tables"`` (default)
     *Inputs* on logarithmic axes: v = 1 + log α / log(1/α_min) and u = 1 + log(sin²θ_h (1 − ε) + ε) / log(1/ε) with ε =
@@ -41,23 +41,23 @@ import drjit as dr
 from ...indirection import DifferentiableArray, Indirection
 from ...lookup import clamp
 
-#: Least roughness that is learned. Below it, the distribution is read there, at an angle that is scaled accordingly.
+#: Smallest roughness that is learned. A smaller one is read here, at an angle that is scaled accordingly.
 ALPHA_MIN = 1e-3
 
-#: Least roughness of all: that of Mitsuba's ``MicrofacetDistribution``.
+#: Smallest roughness that is accepted, as in Mitsuba's ``MicrofacetDistribution``.
 ALPHA_FLOOR = 1e-4
 
-#: Where sin²θ_h is more than so many times α², the distribution is not read but continued: it falls like 1/q².
+#: Multiple of α² beyond which, in sin²θ_h, the distribution is not read but continued: it falls like 1/q².
 TAIL = 8
 
-#: So many times the peak is the most that a table can say, whatever its entries are.
+#: Largest value that a table can yield, as a multiple of the peak, whatever its entries.
 PEAKS = 16
 
 INPUTS, OUTPUTS = ("logarithmic", "plain"), ("root", "raw")
 
 
 def ggx(sin2, alpha):
-    """D per solid angle of normals, from sin²θ_h and α (both in [0, 1], α > 0); exact also next to the peak."""
+    """Return D per solid angle of normals, from sin²θ_h and α in [0, 1] (α > 0); exact also next to the peak."""
     a2 = dr.square(alpha)
     q = dr.fma(1 - sin2, a2, sin2)
     return a2 / (dr.pi * dr.square(q))
@@ -66,8 +66,9 @@ def ggx(sin2, alpha):
 @dataclass(frozen=True)
 class Encoding:
     """
-    What stands between (θ_h, α) and the coordinates at which arrays are read (``inputs``: ``"logarithmic"`` or
-    ``"plain"``), and between what is read and D (``output``: ``"root"`` or ``"raw"``). See the module.
+    Mapping of (θ_h, α) to the coordinates of a read, and of the value that is read to D; see the module.
+
+    ``inputs`` is ``"logarithmic"`` or ``"plain"``, ``output`` is ``"root"`` or ``"raw"``.
     """
 
     inputs: str = "logarithmic"
@@ -78,21 +79,22 @@ class Encoding:
             raise ValueError(f"found the encoding {self}, allowed are inputs {INPUTS} and outputs {OUTPUTS}")
 
     def coordinate_alpha(self, alpha):
-        """The coordinate in [0, 1] that belongs to α ≥ :data:`ALPHA_FLOOR`."""
+        """Return the coordinate in [0, 1] of α ≥ :data:`ALPHA_FLOOR`."""
         if self.inputs == "plain":
             return alpha
         return dr.fma(dr.log2(dr.maximum(alpha, ALPHA_MIN)), -1 / math.log2(ALPHA_MIN), 1)
 
     def stretch(self, alpha):
-        """By how much sin²θ_h is stretched, since nothing below :data:`ALPHA_MIN` is learned; at least 1."""
+        """Return the factor ≥ 1 by which sin²θ_h is stretched, since nothing below :data:`ALPHA_MIN` is learned."""
         if self.inputs == "plain":
             return 1
         return dr.square(dr.maximum(ALPHA_MIN * dr.rcp(alpha), 1))
 
     def coordinate_normal(self, cos, sin2, stretch=1, limit=1):
         """
-        The coordinate in [0, 1] that belongs to the angle of the half vector (cos θ_h ≥ 0 and sin²θ_h); the stretched
-        sine counts up to ``limit``.
+        Return the coordinate in [0, 1] of the half vector's angle, from cos θ_h ≥ 0 and sin²θ_h.
+
+        The stretched squared sine is limited to ``limit``.
         """
         if self.inputs == "plain":
             return cos
@@ -100,21 +102,22 @@ class Encoding:
         return dr.fma(dr.log2(dr.fma(dr.minimum(sin2 * stretch, limit), 1 - ε, ε)), -1 / math.log2(ε), 1)
 
     def coordinates(self, cos, sin2, alpha) -> list:
-        """Both coordinates: of the normal and of α."""
+        """Return both coordinates: of the normal and of α."""
         return [self.coordinate_normal(cos, sin2, self.stretch(alpha)), self.coordinate_alpha(alpha)]
 
     def encode(self, d, alpha):
-        """What arrays are to hold where the distribution is ``d``."""
+        """Return the value that arrays should hold for the distribution ``d``."""
         return d if self.output == "raw" else dr.sqrt(dr.sqrt(d * self.peak_inverse(alpha)))
 
     def peak_inverse(self, alpha):
-        """1/D_peak = π α²."""
+        """Return 1/D_peak = π α²."""
         return dr.pi * dr.square(alpha)
 
     def decode(self, y, peak):
         """
-        D from what was read, and from ``peak`` = 1/(π α²), which depends on α alone. Limited to 0 to :data:`PEAKS`
-        times ``peak``; NaN becomes 0.
+        Return D for the value ``y`` that was read and ``peak`` = 1/(π α²).
+
+        D is limited to 0 to :data:`PEAKS` times ``peak``; NaN becomes 0.
         """
         if self.output == "raw":
             return clamp(y, 0, PEAKS * peak)
@@ -128,9 +131,11 @@ ENCODINGS = {"tables": Encoding(), "paper": Encoding("plain", "raw")}
 @dataclass
 class Roughness:
     """
-    What a read of the distribution needs to know about α: ``alpha2`` = α², ``peak`` = 1/(π α²), by how much sin²θ_h is
-    to be stretched and what it is then limited to, where the tail begins (``tail``, a q; None: nowhere), and the
-    coordinate of α, or the function of the other coordinate that remains once it is known (``net``).
+    Terms of a read of the distribution that depend on α alone.
+
+    ``alpha2`` = α²; ``peak`` = 1/(π α²); ``stretch`` and ``limit`` of sin²θ_h; ``tail``, the q at which the tail begins
+    (``None``: no tail); and either ``coordinate``, that of α, or ``net``, the function of the other coordinate that
+    remains for a constant α.
     """
 
     alpha2: Any
@@ -144,9 +149,10 @@ class Roughness:
 
 class LearnedGGX:
     """
-    The distribution as ``net`` has it, any function from a list of two coordinates in [0, 1] to a list of one array:
-    an :class:`~mi_diffind.indirection.Indirection`, a single array, a network. Without ``tail``, it is also read where
-    it would be continued, as training does.
+    Distribution read from ``net``, any function from a list of two coordinates in [0, 1] to a list of one array.
+
+    ``net`` may be an :class:`~mi_diffind.indirection.Indirection`, a single array or a network. Without ``tail``, all
+    of the distribution is read, as in training.
     """
 
     def __init__(self, net: Callable, encoding: Encoding, tail: bool = True):
@@ -154,28 +160,29 @@ class LearnedGGX:
         self.tail = tail and encoding.inputs != "plain"
 
     def roughness(self, alpha) -> Roughness:
-        """Whatever depends on α alone; α is limited to [:data:`ALPHA_FLOOR`, 1], NaN becomes the former."""
+        """Return the terms that depend on α alone; α is clamped to [:data:`ALPHA_FLOOR`, 1], NaN to the lower end."""
         alpha = clamp(alpha, ALPHA_FLOOR, 1)
         alpha2, e = dr.square(alpha), self.encoding
-        found = Roughness(alpha2, dr.rcp(dr.pi * alpha2), e.stretch(alpha), coordinate=e.coordinate_alpha(alpha))
+        terms = Roughness(alpha2, dr.rcp(dr.pi * alpha2), e.stretch(alpha), coordinate=e.coordinate_alpha(alpha))
         if self.tail:
             reach = dr.minimum(TAIL * alpha2, 1)
-            found.limit, found.tail = reach * found.stretch, dr.fma(reach, 1 - alpha2, alpha2)
-        return found
+            terms.limit, terms.tail = reach * terms.stretch, dr.fma(reach, 1 - alpha2, alpha2)
+        return terms
 
     def constant_roughness(self, alpha) -> Roughness:
         """
-        The same for an α that is one number: what remains of an indirection's primary array is a row of it, two
-        entries to read instead of four.
+        Return :meth:`roughness` of an α that is one number.
+
+        An indirection's primary array is reduced to one row: two entries to read instead of four.
         """
-        found = self.roughness(alpha)
+        terms = self.roughness(alpha)
         if isinstance(self.net, Indirection):
-            row = self.net.primary[0].at(found.coordinate)
-            found.net, found.coordinate = Indirection(row, self.net.cascaded), None
-        return found
+            row = self.net.primary[0].at(terms.coordinate)
+            terms.net, terms.coordinate = Indirection(row, self.net.cascaded), None
+        return terms
 
     def read(self, r: Roughness, cos, sin2, active=True):
-        """D per solid angle of normals, from cos θ_h ≥ 0 and sin²θ_h."""
+        """Return D per solid angle of normals, from cos θ_h ≥ 0 and sin²θ_h."""
         x = [self.encoding.coordinate_normal(cos, sin2, r.stretch, r.limit)]
         y = self.net([*x, r.coordinate], active) if r.net is None else r.net(x, active)
         d = self.encoding.decode(y[0], r.peak)
@@ -185,14 +192,16 @@ class LearnedGGX:
         return d * dr.select(q > r.tail, dr.square(r.tail * dr.rcp(q)), 1)
 
     def __call__(self, cos, sin2, alpha):
-        """D per solid angle of normals, from cos θ_h, sin²θ_h and α."""
+        """Return D per solid angle of normals, from cos θ_h, sin²θ_h and α."""
         return self.read(self.roughness(alpha), cos, sin2)
 
 
 def indirection(primary: int = 16, cascaded: int = 8) -> Indirection:
     """
-    The arrays of task 1, not yet allocated: a primary of ``primary``² × 2 entries, the undistorted uv ramp, and a
-    cascaded one of ``cascaded``² × 1, constant 0.5, with no non-linearity on its output. Raises ``ValueError``.
+    Return the arrays of task 1, not yet allocated. Raises ``ValueError``.
+
+    The primary array has ``primary``² × 2 entries and starts as the undistorted uv ramp; the cascaded array has
+    ``cascaded``² × 1 entries, starts at 0.5 and has no non-linearity on its output.
     """
     for name, n in (("primary", primary), ("cascaded", cascaded)):
         if not 2 <= n <= 4096:

@@ -1,4 +1,4 @@
-"""Training of task 1: samples, errors, the problem."""
+"""Training of task 1: samples, errors and the training problem."""
 
 from __future__ import annotations
 
@@ -12,28 +12,29 @@ import numpy as np
 from ...fitting import Problem, exponential_like
 from .model import ALPHA_MIN, ENCODINGS, Encoding, LearnedGGX, ggx
 
-#: Bands of roughness for which errors are reported.
+#: Ranges of roughness for which errors are reported.
 BANDS = ((0.001, 0.01), (0.01, 0.1), (0.1, 0.5), (0.5, 1.0))
 
 
 def draw(rng, types, size: int, preset: str = "paper"):
     """
-    ``(cos θ_h, sin²θ_h, α)``, each ``size`` long: cosine-weighted normals and exponential-like roughness (``"paper"``),
-    or with half of the normals from the peak (``"tables"``), see the module.
+    Draw ``size`` samples ``(cos θ_h, sin²θ_h, α)``: cosine-weighted normals and exponential-like roughness.
+
+    For the preset ``"tables"``, half of the normals are drawn from the peak (:mod:`.model`).
     """
     u, v = (rng.random(types.Float, size) for _ in range(2))
     alpha = dr.maximum(exponential_like(v), ALPHA_MIN)
     sin2 = u
     if preset == "tables":
-        which, a2 = rng.random(types.Float, size), dr.square(alpha)
-        peak = dr.select(which < 0.125, 0, u * a2 / (dr.fma(u, a2, 1 - u)))  # of density D cos θ_h
-        sin2 = dr.select(which < 0.5, peak, sin2)
+        choice, a2 = rng.random(types.Float, size), dr.square(alpha)
+        peak = dr.select(choice < 0.125, 0, u * a2 / (dr.fma(u, a2, 1 - u)))  # of density D cos θ_h
+        sin2 = dr.select(choice < 0.5, peak, sin2)
     return dr.sqrt(1 - sin2), sin2, alpha
 
 
 def measure(distribution: Callable, types, samples: int = 10**6, seed: int = 2023) -> dict[str, float]:
     """
-    Errors of ``distribution(cos, sin2, alpha)`` against :func:`ggx`.
+    Measure the errors of ``distribution(cos, sin2, alpha)`` against :func:`ggx`.
 
     On the bounded range: ``psnr_db`` and ``mae`` of D clipped to [0, 1], over ``samples`` of :func:`draw`. On the peak,
     for each of :data:`BANDS`: ``peak_error_LOW_HIGH``, the largest of |D̂/D − 1| at the normal itself over 64
@@ -43,7 +44,7 @@ def measure(distribution: Callable, types, samples: int = 10**6, seed: int = 202
     rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
     cos, sin2, alpha = draw(rng, types, samples)
     error = dr.clip(distribution(cos, sin2, alpha), 0, 1) - dr.clip(ggx(sin2, alpha), 0, 1)
-    found = {
+    errors = {
         "psnr_db": -10 * math.log10(max(dr.mean(dr.square(error))[0], 1e-20)),
         "mae": float(dr.mean(dr.abs(error))[0]),
     }
@@ -59,18 +60,19 @@ def measure(distribution: Callable, types, samples: int = 10**6, seed: int = 202
         sin2 = limit * j
         relative = dr.abs(distribution(dr.sqrt(1 - sin2), sin2, alpha) / ggx(sin2, alpha) - 1).numpy().reshape(n, m)
         name = f"{low:g}_{high:g}"
-        found[f"peak_error_{name}"] = float(relative[:, 0].max())
-        found[f"lobe_error_{name}"] = float(np.partition(relative.ravel(), rank)[rank])
-    return found
+        errors[f"peak_error_{name}"] = float(relative[:, 0].max())
+        errors[f"lobe_error_{name}"] = float(np.partition(relative.ravel(), rank)[rank])
+    return errors
 
 
 class GGXProblem(Problem):
     """
-    The training problem of :mod:`mi_diffind.fitting` for any representation: ``net`` maps two coordinates to one
-    output. ``preset`` names the samples to draw, ``encoding`` (default: that of the preset) what they become.
+    Training problem of the distribution for any representation ``net``, which maps two coordinates to one output.
+
+    ``preset`` selects the samples (:func:`draw`); ``encoding`` defaults to that of the preset.
     """
 
-    #: dB. The peak gains after the mean has settled.
+    #: In dB. The peak still improves when the mean has settled.
     tolerance = 0.1
 
     def __init__(self, net, types, preset: str = "tables", encoding: Encoding | None = None):

@@ -254,7 +254,7 @@ def test_parameters_say_the_same_as_the_sensor(mi_rgb):
     for name in ("origin", "axis", "dx", "dy", "scale", "spread", "lens"):
         a, b = np.array(getattr(found, name)), np.array(getattr(expected, name))
         np.testing.assert_allclose(a, b, atol=2e-5, err_msg=name)
-    assert found.kind == expected.kind == "perspective"
+    assert found.projection == expected.projection == "perspective"
     assert [footprint.scale_of(n) for n in (0, 1, 4, 64, 4096)] == [1, 1, 0.5, 0.125, 0.125]
 
     assert Cone.from_properties(mi.Properties()) is None

@@ -9,6 +9,7 @@ import disney_formulas
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 from disney_materials import (
     FORMS,
     MATERIALS,
@@ -78,16 +79,16 @@ def test_extreme_inputs(mi_rgb, rng, form):
         wi, wo = (w[pair] for w in extreme_directions(rng, N_PAIRS))
         parameters = drawn(rng, SPECIAL_VALUES, (len(SCALARS) + 3, N_MATERIALS)).astype(np.float32)
         u = drawn(rng, SPECIAL_UNIFORM, (3, N_PAIRS), 0, 1 - 2**-20).astype(np.float32)[:, pair]
-        params["base_color.data"] = mi.TensorXf(np.ascontiguousarray(np.stack([parameters[:3].T] * 2)))
+        params["base_color.data"] = mi.TensorXf(aligned(np.stack([parameters[:3].T] * 2)))
         for name, row in zip(SCALARS, parameters[3:], strict=True):
-            params[f"{name}.data"] = mi.TensorXf(np.ascontiguousarray(np.stack([row[:, None]] * 2)))
+            params[f"{name}.data"] = mi.TensorXf(aligned(np.stack([row[:, None]] * 2)))
         for key in tables:
             params[key] = dr.detach(params[key])  # or gradients would add up
         for key in keys + tables:
             dr.enable_grad(params[key])
         params.update()
         si, wo_ = interactions(mi, vectors(mi, wi), material, N_MATERIALS), vectors(mi, wo)
-        u_ = [mi.Float(np.ascontiguousarray(row)) for row in u]
+        u_ = [mi.Float(aligned(row)) for row in u]
 
         value, pdf = bsdf.eval_pdf(ctx, si, wo_)
         bs, weight = bsdf.sample(ctx, si, u_[0], mi.Point2f(u_[1], u_[2]))
@@ -253,7 +254,7 @@ def test_directional_albedo(mi_rgb, rng, form):
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     u = [(v.ravel() + rng.random((k * a, n))) / side for v in (x, y)]
     lobe = (np.array([rng.permutation(n) for _ in range(k * a)]) + rng.random((k * a, n))) / n
-    u1, u2, u3 = (mi.Float(np.minimum(v.ravel(), 1 - 2**-24).astype("f4")) for v in (lobe, *u))
+    u1, u2, u3 = (mi.Float(aligned(np.minimum(v.ravel(), 1 - 2**-24))) for v in (lobe, *u))
 
     bsdf, si, ctx = textured(mi, form, materials), interactions(mi, vectors(mi, wi), index, k), mi.BSDFContext()
     bs, weight = bsdf.sample(ctx, si, u1, mi.Point2f(u2, u3))
@@ -288,7 +289,7 @@ def test_directional_albedo_by_quadrature(mi_rgb, rng):
             expected = burley_of(materials, index, wi, wo) * wo[:, 2:3]
             albedos = [2 * np.pi * v.mean(axis=0, dtype=np.float64) for v in (found, expected)]
             assert np.abs(albedos[0] - albedos[1]).max() <= (1e-6 if form == "disney" else 2e-5), (form, angle)
-            u = [mi.Float(rng.random(2**17).astype("f4")) for _ in range(3)]
+            u = [mi.Float(aligned(rng.random(2**17))) for _ in range(3)]
             si = interactions(mi, vectors(mi, wi[: 2**17]))
             weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))[1].numpy()
             assert np.allclose(weight.mean(axis=1, dtype=np.float64), albedos[0], atol=0.004), (form, angle)
@@ -306,7 +307,7 @@ def random_population(rng, n, distribution):
 def shaded(types, decoder, case):
     color, m, wi, wo = case
     material = Material(**{name: types.Float(m[name]) for name in SCALARS})
-    vectors = [types.Array3f(np.ascontiguousarray(v.T)) for v in (color, wi, wo)]
+    vectors = [types.Array3f(aligned(v.T)) for v in (color, wi, wo)]
     return training.shade(decoder, material, *vectors).numpy().T.astype(np.float64)
 
 

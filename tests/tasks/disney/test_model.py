@@ -7,6 +7,7 @@ import drjit as dr
 import drjit.llvm.ad as ad
 import numpy as np
 import pytest
+from arrays import aligned
 
 from mi_diffind import StoredArray, load_model
 from mi_diffind import fit as fit_task
@@ -16,7 +17,7 @@ from mi_diffind.tables import Table, TableError, save_table
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import Effects, ValueBounds, find_effects
-from mi_diffind.tasks.disney.library import LAYOUTS
+from mi_diffind.tasks.disney.files import LAYOUTS
 from mi_diffind.tasks.disney.model import ALPHA_MIN, PARAMETERS, Material, exact_factors
 from mi_diffind.tasks.disney.paper import PaperArrays
 from mi_diffind.tasks.disney.training import measure, shade, uniform_hemisphere
@@ -31,7 +32,7 @@ def decoder_of(preset, storage=""):
 
 def to_drjit(case):
     color, m, wi, wo = case
-    material = Material(**{k: ad.Float(m[k].astype(np.float32)) for k in PARAMETERS})
+    material = Material(**{k: ad.Float(aligned(m[k])) for k in PARAMETERS})
     return material, *(ad.Array3f(v.T.astype(np.float32)) for v in (color, wi, wo))
 
 
@@ -51,7 +52,7 @@ def test_exact_model_is_burley(rng, decoder):
     case = (
         case[0].astype("f4"),
         {k: v.astype("f4") for k, v in case[1].items()},
-        *(v.astype("f4") for v in case[2:]),
+        *(aligned(v) for v in case[2:]),
     )
     reference = disney_formulas.brdf(*case) * case[3][:, 2:3]
     found = shaded(decoder, case)
@@ -199,13 +200,13 @@ def test_values_are_finite_and_non_negative_everywhere(rng, preset):
 
 
 def test_training_distributions(rng):
-    u = ad.Float(rng.random(N).astype("f4"))
+    u = ad.Float(aligned(rng.random(N)))
     x = exponential_like(u).numpy()
     assert x.min() >= 0 and x.max() <= 1
     for t in (0.1, 0.5, 0.9):
         cdf = (1 - np.exp(-EXPONENTIAL_RATE * t)) / (1 - np.exp(-EXPONENTIAL_RATE))
         assert abs(np.mean(x < t) - cdf) < 0.01
-    w = uniform_hemisphere(ad, ad.Float(rng.random(N).astype("f4")), ad.Float(rng.random(N).astype("f4"))).numpy()
+    w = uniform_hemisphere(ad, ad.Float(aligned(rng.random(N))), ad.Float(aligned(rng.random(N)))).numpy()
     assert np.allclose(np.linalg.norm(w, axis=0), 1, atol=1e-5)
     for t in (0.25, 0.5, 0.75):
         assert abs(np.mean(w[2] < t) - t) < 0.01

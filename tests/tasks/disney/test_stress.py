@@ -9,6 +9,7 @@ import math
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 from disney_materials import (
     FORMS,
     MATERIALS,
@@ -341,7 +342,7 @@ def switch(mi, params, kind, on):
     for i, (name, (value, _)) in enumerate(SWITCHES.items()):
         value, key = value if on else 0.0, f"shape{i}.bsdf.{name}"
         if kind == "bitmap":
-            params[f"{key}.data"] = mi.TensorXf(np.full((4, 4, 1), value, np.float32))
+            params[f"{key}.data"] = mi.TensorXf(aligned(np.full((4, 4, 1), value, np.float32)))
         else:
             params[key if name == "specular" else f"{key}.value"] = mi.Float(value)
     params.update()
@@ -452,7 +453,7 @@ def test_a_texture_of_ones_own_is_not_taken_for_a_bitmap(mi_rgb):
     class Inverted(mi.Texture):
         def __init__(self, props):
             super().__init__(props)
-            self.data = mi.TensorXf(np.zeros((2, 2, 1), np.float32))
+            self.data = mi.TensorXf(aligned(np.zeros((2, 2, 1), np.float32)))
 
         def traverse(self, cb):
             cb.put("data", self.data, mi.ParamFlags.Differentiable)

@@ -8,6 +8,7 @@ import drjit as dr
 import ggx_formulas
 import numpy as np
 import pytest
+from arrays import aligned
 from variants import BACKENDS
 
 from mi_diffind import DifferentiableArray, StoredArray, load_model, lookup
@@ -81,7 +82,7 @@ def test_ggx_is_mitsubas(mi_rgb, rng):
     sin2, alpha = random_case(rng, 10_000)
     phi = 2 * np.pi * rng.random(len(sin2))
     r = np.sqrt(sin2.astype(np.float64))
-    m = mi.Vector3f(*(v.astype(np.float32) for v in (r * np.cos(phi), r * np.sin(phi), np.sqrt(1 - r * r))))
+    m = mi.Vector3f(*(aligned(v) for v in (r * np.cos(phi), r * np.sin(phi), np.sqrt(1 - r * r))))
     found = ggx(dr.square(m.x) + dr.square(m.y), mi.Float(alpha)).numpy()
     expected = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, mi.Float(alpha), True).eval(m).numpy()
     np.testing.assert_allclose(found, expected, rtol=2e-5)
@@ -114,7 +115,7 @@ def test_projected_area_is_one(ad, shipped, name, alpha):
 def test_what_is_encoded_is_decoded(ad, rng, preset):
     encoding = ENCODINGS[preset]
     sin2, alpha = random_case(rng, 10_000)
-    d, alpha = ad.Float(ggx_formulas.distribution(sin2, alpha).astype(np.float32)), ad.Float(alpha)
+    d, alpha = ad.Float(aligned(ggx_formulas.distribution(sin2, alpha))), ad.Float(alpha)
     y = encoding.encode(d, alpha)
     if preset == "tables":
         assert y.numpy().min() > 0 and y.numpy().max() <= 1 + 1e-6
@@ -152,7 +153,7 @@ def test_below_the_learned_roughness_peaks_are_scaled(ad, rng):
         sin2 = np.maximum((least ** (1 - u) - least) / (1 - least), 0)
         alpha = ALPHA_MIN ** (1 - v)
         y = alpha / np.sqrt(sin2 + alpha**2 * (1 - sin2))
-        return [ad.Float(y.astype(np.float32))]
+        return [ad.Float(aligned(y))]
 
     read = LearnedGGX(lambda x, active=True: perfect(x), encoding)
     sin2, alpha = random_case(rng, 20_000)
@@ -379,7 +380,7 @@ def test_constant_roughness_reads_the_same(ad, shipped, preset, storage):
     for alpha in (0.0, 1e-4, 0.001, 0.0123, 0.1, 0.437, 1.0, 2.0, float("nan")):
         known = np.clip(np.nan_to_num(alpha), ALPHA_FLOOR, 1)
         sin2 = np.concatenate([np.linspace(0, 1, 200), 10 * known**2 * np.linspace(0, 1, 200)]).clip(0, 1)
-        sin2 = ad.Float(sin2.astype(np.float32))
+        sin2 = ad.Float(aligned(sin2))
         cos = dr.sqrt(1 - sin2)
         row = read.constant_roughness(ad.Float(alpha))
         assert row.net is not None and row.net.primary[0].dims == 1
@@ -565,8 +566,8 @@ def zeros(name, *shape):
 
 BROKEN = {
     "another task": (lambda t: setattr(t, "task", "disney"), 'holds tables for the task "disney", expected "ggx"'),
-    "no encoding": (lambda t: t.settings.pop("inputs"), "its settings name no encoding that is known"),
-    "an unknown encoding": (lambda t: t.settings.update(output="cube"), "its settings name no encoding that is known"),
+    "no encoding": (lambda t: t.settings.pop("inputs"), "the settings name no known encoding"),
+    "an unknown encoding": (lambda t: t.settings.update(output="cube"), "the settings name no known encoding"),
     "a pointer out of the table": (set_entry("primary", 1.5), r'entries of "primary" lie in \[.*, 1.5\], allowed is'),
     "a pointer below 0": (set_entry("primary", -0.1), r'entries of "primary" lie in \[-0.1, .*\], allowed is \[0, 1\]'),
     "an answer out of range": (set_entry("cascaded", 3), r'entries of "cascaded" lie in \[.*, 3\], allowed is'),

@@ -1,4 +1,4 @@
-"""Table files of task 2, and what they stand for."""
+"""Table files of task 2."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from ...lookup import STORAGES
 from ...tables import Table, TableError, check_ranges, load_table
 from ...task import Model
 from . import training
-from .arrays import Arrays
+from .arrays import DisneyArrays
 from .decoder import Decoder
 from .factored import FactoredArrays, FactoredDecoder
 from .paper import PaperArrays, PaperDecoder
 
 #: Preset → the layout of its tables, and the decoder that reads them.
-LAYOUTS: dict[str, tuple[type[Arrays], type[Decoder]]] = {
+LAYOUTS: dict[str, tuple[type[DisneyArrays], type[Decoder]]] = {
     "tables": (FactoredArrays, FactoredDecoder),
     "paper": (PaperArrays, PaperDecoder),
 }
 
 
 class DisneyModel(Model):
-    """The ``layout`` of the arrays as a module, and the ``decoder`` that reads it."""
+    """A table file as a module ``layout`` of its arrays, and the ``decoder`` that reads it."""
 
     forms = STORAGES
 
@@ -31,14 +31,14 @@ class DisneyModel(Model):
         self.decoder = decoder(self.layout)
 
     def measure(self, samples: int = 10**6) -> dict[str, float]:
-        """See :func:`.training.measure`: of materials distributed as in training, and (``…_uniform_db``) uniformly."""
-        found = training.measure(self.decoder, self.types, samples)
+        """Measure errors (:func:`.training.measure`): for training materials, and (``…_uniform_db``) uniform ones."""
+        trained = training.measure(self.decoder, self.types, samples)
         uniform = training.measure(self.decoder, self.types, samples, "uniform")
-        return {**found, **{f"{k[:-3]}_uniform_db": v for k, v in uniform.items() if k.endswith("_db")}}
+        return {**trained, **{f"{k[:-3]}_uniform_db": v for k, v in uniform.items() if k.endswith("_db")}}
 
 
 def load(path: str | os.PathLike) -> Table:
-    """Read a table file of this task, check its layout, sizes and ranges. Raises :class:`TableError`."""
+    """Read a table file of this task and check its layout, sizes and ranges. Raises :class:`TableError`."""
     table = load_table(path, task="disney")
     if table.preset not in LAYOUTS:
         raise TableError(f'{path}: holds tables of the preset "{table.preset}", allowed are {", ".join(LAYOUTS)}')

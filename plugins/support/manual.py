@@ -1,0 +1,95 @@
+"""Parts of manual pages (the docstrings of plugins) that several plugins share."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+
+#: Name of a placeholder → the text that stands for it: rows of the parameter table, and paragraphs.
+PARTS = {
+    "channels": """\
+        * - channels
+          - |string|
+          - Name of the map to show, such as ``albedo``; it has 1 or 3 channels. (Default: the only map, or the only
+            albedo)
+          - --""",
+    "raw": """\
+        * - raw
+          - |bool|
+          - Leave values as they are in the image, as data need it: no conversion from sRGB, no spectral upsampling.
+            (Default: false for colours; true for maps of data: ``normal``, ``roughness``, ``ao``, ``metallic``)
+          - --""",
+    "wrap_mode": """\
+        * - wrap_mode
+          - |string|
+          - Behaviour outside of [0, 1], as for :monosp:`bitmap`: ``repeat``, ``mirror`` or ``clamp``.
+            (Default: ``repeat``)
+          - --""",
+    "to_uv": """\
+        * - to_uv
+          - |transform|
+          - Transformation of the texture coordinates, as for :monosp:`bitmap`. (Default: none)
+          - |exposed|""",
+    "filtering": """\
+        * - filter
+          - |string|
+          - ``trilinear``: read the level of detail whose texels have the area of the footprint; ``anisotropic``: read
+            several places along the footprint's major axis, on a finer level; ``stochastic``: read one of these places,
+            chosen at random; ``off``: read level 0, whatever the footprint. (Default: ``trilinear``)
+          - --
+
+        * - max_anisotropy
+          - |int|
+          - Places along the major axis for ``anisotropic`` and ``stochastic``, 1 to 16. (Default: 4)
+          - --
+
+        * - sensor_to_world, fov, resolution, spp
+          - |transform|, |float|, |int|, |int|
+          - The perspective sensor that sees the texture: its ``to_world``, its field of view along x, its number of
+            pixels along x, and the samples of each (default: 1). Plain Mitsuba needs them; ``mi-diffind`` and
+            ``mi_diffind.load_file`` take the sensor of the scene instead.
+          - --
+
+        * - filter_type, accel
+          - |string|, |bool|
+          - Accepted so that the parameters of :monosp:`bitmap` can be kept: ``bilinear`` is the filter ``off``,
+            ``trilinear`` and ``anisotropic`` are the filters of these names; ``accel`` has no effect. (Default: none)
+          - --""",
+    "compressed": """\
+        * - storage
+          - |string|
+          - ``uint8``, the fastest to read, or ``float32``, which can be optimised. (Default: ``uint8``)
+          - --
+
+        * - source
+          - |string|
+          - The image or the manifest that the file was made from; only the exact counterpart reads it. (Default: the
+            path that the file records)
+          - --""",
+    "footprint": """\
+        **The footprint** is that of one sample: that of a pixel, reduced by the square root of the number of samples.
+        It comes from the first of these sources that has it: Mitsuba itself (from version 3.10); an integrator that
+        fills the partial derivatives of uv, such as :monosp:`path_footprint`; the sensor, if the ray comes straight
+        from it; otherwise an estimate that is rather too sharp than too blurred. Without any source, for instance
+        without a sensor, the footprint is zero and the texture is not filtered. No derivative passes through the
+        footprint.
+
+        ``anisotropic`` always reads ``max_anisotropy`` places, evenly spaced over the major axis, on a level half a
+        step finer than the width of one place. This is 1.4 to 3.6 dB nearer to the mean over the footprint than a full
+        level is. ``stochastic`` chooses one of these places by a hash of the hit's position and uv. Its expectation is
+        the result of ``anisotropic``, with the noise of one sample; every read on a path makes the same choice, and so
+        do all samples through one point of a pixel.""",
+    "gradient": """\
+        With ``off``, the gradient that :monosp:`bumpmap` reads is that of :monosp:`bitmap`. Any other filter takes the
+        difference over the width of one texel of the trilinear level.""",
+}
+
+
+def shared_parts(plugin: type) -> type:
+    """Fill the placeholders ``{NAME}`` (:data:`PARTS`) of a plugin's docstring: a class decorator."""
+
+    def filled(line: re.Match) -> str:
+        return textwrap.indent(textwrap.dedent(PARTS[line[2]]), line[1])
+
+    plugin.__doc__ = re.sub(r"^( *)\{(\w+)\}$", filled, plugin.__doc__, flags=re.MULTILINE)
+    return plugin
