@@ -1,4 +1,4 @@
-"""``mi-diffind capture``: a scene from all sides, as images with poses that radiance fields are made from."""
+"""``mi-diffind capture``: views of a scene from all sides with their poses, the input of a radiance field."""
 
 from __future__ import annotations
 
@@ -44,9 +44,10 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Render what is missing of the views. Returns what is printed; after Ctrl-C, of the views that there are. Raises
-    :class:`UsageError`, and as :mod:`mi_diffind.capture` does.
+    """Render the views that are missing and return what is printed.
+
+    After Ctrl-C, the result lists the views that exist. Raises :class:`UsageError`, and as :mod:`mi_diffind.capture`
+    does.
     """
     require_scene(arguments.scene)
     writable_folder(Path(arguments.output).parent)
@@ -64,17 +65,17 @@ def run(arguments) -> dict:
         settings.check()
     except ValueError as e:
         raise UsageError(f"--{e}") from None
-    found = capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
-    print("\n".join(capture.lines(found)))
+    captured = capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
+    print("\n".join(capture.lines(captured)))
     return {
-        "interrupted": len(found.files) < found.total,
+        "interrupted": len(captured.files) < captured.total,
         "scene": arguments.scene,
-        "output": str(found.folder),
-        "files": found.files,
-        "views": found.total,
-        "rendered": found.rendered,
-        "seconds": found.seconds,
-        "radius": found.radius,
-        "centre": found.centre.tolist(),
-        "box": found.box.tolist(),
+        "output": str(captured.folder),
+        "files": captured.files,
+        "views": captured.total,
+        "rendered": captured.rendered,
+        "seconds": captured.seconds,
+        "radius": captured.radius,
+        "centre": captured.centre.tolist(),
+        "box": captured.box.tolist(),
     }

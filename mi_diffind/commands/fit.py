@@ -43,8 +43,8 @@ def _add(sub, task: Task) -> None:
     length = sub.add_mutually_exclusive_group()
     length.add_argument("--steps", type=positive, help=f"optimisation steps (default: {_default(task, 'steps')})")
     length.add_argument("--seconds", type=positive, help="time of the training, in place of steps")
-    for name, text, kind in SETTINGS:
-        sub.add_argument(f"--{name}", **kind, help=f"{text} (default: {_default(task, name)})")
+    for name, text, options in SETTINGS:
+        sub.add_argument(f"--{name}", **options, help=f"{text} (default: {_default(task, name)})")
     sub.add_argument("--all-cores", action="store_true", help="faster, but not the same bytes each time")
     sub.add_argument("--checkpoint", metavar="FILE", help="keep the state of the training in FILE")
     sub.add_argument("--resume", action="store_true", help="go on from --checkpoint, with the same settings")
@@ -59,9 +59,10 @@ def _default(task: Task, name: str) -> str:
 
 
 def run(arguments) -> dict:
-    """
-    Train and write the table file. Returns its size, accuracy and how the training went; after Ctrl-C, of the best so
-    far. Raises :class:`~mi_diffind.errors.DiffindError`.
+    """Train, write the table file, and return its size, its accuracy and the history of the training.
+
+    After Ctrl-C, these are of the best state so far. Raises :class:`UsageError`,
+    :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.
     """
     output = Path(arguments.output)
     if output.suffix.lower() != ".npz":

@@ -1,4 +1,4 @@
-"""``mi-diffind regress``: do scenes still render as their stored references do?"""
+"""``mi-diffind regress``: a check that scenes still render like their stored references."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Check each scene, or store its reference again. Returns the result of each in ``scenes`` and how many ``failed``.
-    Raises :class:`UsageError`, and as :mod:`mi_diffind.regress` does.
+    """Check each scene, or store its reference again.
+
+    Returns the result of each in ``scenes`` and the number that ``failed``. Raises :class:`UsageError`, and as
+    :mod:`mi_diffind.regress` does.
     """
     for path in arguments.scenes:
         require_scene(path)
