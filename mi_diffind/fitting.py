@@ -85,13 +85,6 @@ class Problem:
         """
         return ""
 
-    def kept(self) -> dict[str, np.ndarray]:
-        """Return decisions of the problem (:meth:`begin`) for a checkpoint: arrays by name."""
-        return {}
-
-    def restore(self, kept: dict[str, np.ndarray]) -> None:
-        """Take up the result of :meth:`kept` when a training is resumed."""
-
     def batch(self, rng, size: int):
         """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
         raise NotImplementedError(f"{type(self).__name__} has neither batch() and predict() nor a loss() of its own")
@@ -198,7 +191,6 @@ def fit(
             raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
         state, extra = _load_checkpoint(checkpoint, _all_settings(problem, settings), trainer)
         trainer.restore(state)
-        problem.restore(extra["kept"])
         best, best_measured, best_step = extra["best"], extra["best_measured"], extra["best_step"]
         history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
         trainer.restarts = restarts
@@ -208,7 +200,7 @@ def fit(
     start = time.perf_counter() - spent
 
     def share() -> float:
-        """How much of the training is over."""
+        """Return the share of the training that is over."""
         if seconds is None:
             return trainer.step / settings.steps
         return min(1.0, (time.perf_counter() - start) / seconds)
@@ -274,7 +266,7 @@ def fit(
                     extra = {
                         "best": best, "best_measured": best_measured, "best_step": best_step, "history": history,
                         "restarts": restarts, "seconds": time.perf_counter() - start, "plateau": plateau.state(),
-                        "references": references, "kept": problem.kept(),
+                        "references": references,
                     }  # fmt: skip
                     _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), extra)
         if stop.is_set() and trainer.share < 1:
@@ -417,8 +409,7 @@ def _save_checkpoint(path, settings: dict, state: _State, extra: dict) -> None:
         t, m, v = state.moments[key]
         arrays |= {f"value/{key}": value.numpy(), f"m/{key}": m.numpy(), f"v/{key}": v.numpy()}
         arrays |= {f"t/{key}": np.int64(t[0]), f"best/{key}": np.asarray(extra["best"][key])}
-    arrays |= {f"kept/{name}": value for name, value in extra["kept"].items()}
-    meta = {k: v for k, v in extra.items() if k not in ("best", "kept")}
+    meta = {k: v for k, v in extra.items() if k != "best"}
     meta |= {"step": state.step, "lr_scale": state.lr_scale, "settings": settings}
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
     with replacing(path) as temporary, open(temporary, "wb") as stream:
@@ -449,7 +440,6 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
         for key in ("best_measured", "best_step", "history", "restarts", "seconds", "plateau", "references"):
             meta[key]  # a KeyError here, not later
         stored_settings = dict(meta["settings"])
-        kept = {name.removeprefix("kept/"): v for name, v in arrays.items() if name.startswith("kept/")}
     except Exception as e:  # zipfile, json and numpy each have their own for a damaged file
         raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({type(e).__name__}: {e})') from None
     sources = [s["source"] for s in (stored_settings, settings) if "source" in s]
@@ -463,7 +453,7 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
     if stored_settings != settings:
         changed = [k for k in {**settings, **stored_settings} if stored_settings.get(k) != settings.get(k)]
         raise FittingError(f'the checkpoint "{path}" was made with other settings ({", ".join(changed)})')
-    return state, {**meta, "best": best, "kept": kept}
+    return state, {**meta, "best": best}
 
 
 #: Entries, of all cores together, that the copies of an array may have in which each core sums gradients on its own: 2

@@ -1,4 +1,4 @@
-"""The plan of the house: imports that point down, no circles."""
+"""The plan of the house: imports that point down, no circles, short files, plain names, one meaning a class name."""
 
 import ast
 from pathlib import Path
@@ -24,6 +24,12 @@ FLOORS = (
     ("commands",),
     ("cli",),
 )
+
+#: Lines that a file of the library may have. A plugin is one file, and its docstring the manual page.
+LINES = 600
+
+#: Names that say how a value came about, or nothing, in place of what it is.
+FORBIDDEN = {"told", "made", "found", "own", "said", "kind", "look", "course", "hair"}
 
 #: The face of the package, which asks for what lies below it by name, when it is asked.
 FACE = "mi_diffind"
@@ -179,6 +185,50 @@ def test_no_circles():
         rooms.setdefault(room(name), set()).update(map(room, others))
     assert circle({name: others - {name} for name, others in rooms.items()}) == ""
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == "b → c → b" and circle({"a": {"b", "c"}, "b": {"c"}}) == ""
+
+
+def test_no_file_is_too_long():
+    lengths = {name: len(path.read_text(encoding="utf-8").splitlines()) for name, path in modules().items()}
+    long = [f"{name}: {n} lines" for name, n in lengths.items()
+            if n > LINES and not name.startswith("mi_diffind.plugins.")]  # fmt: skip
+    assert not long, "\n".join(long)
+
+
+def names_given(tree: ast.AST) -> list[tuple[str, int]]:
+    """The names that a file gives, with their lines: variables, attributes, parameters, functions and classes."""
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            names.append((node.name, node.lineno))
+        elif isinstance(node, ast.arg):
+            names.append((node.arg, node.lineno))
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.append((node.id, node.lineno))
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            names.append((node.attr, node.lineno))
+    return names
+
+
+def test_names_say_what_things_are():
+    wrong = []
+    for module, path in modules().items():
+        for name, line in names_given(ast.parse(path.read_text(encoding="utf-8"))):
+            if name.strip("_").lower() in FORBIDDEN:
+                wrong.append(f"{module}, line {line}: {name}")
+    assert not wrong, "\n".join(wrong)
+    example = "found = 1\nclass Course:\n    def look(self, own, *said, kind=0):\n        self._made, x = own, told"
+    names = [name for name, _ in names_given(ast.parse(example)) if name.strip("_").lower() in FORBIDDEN]
+    assert sorted(names) == ["Course", "_made", "found", "kind", "look", "own", "said"]
+
+
+def test_a_class_name_has_one_meaning():
+    places: dict[str, list[str]] = {}
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name.strip("_"), []).append(f"{module}, line {node.lineno}")
+    twice = [f"{name}: {'; '.join(where)}" for name, where in sorted(places.items()) if len(where) > 1]
+    assert len(places) > 100 and not twice, "\n".join(twice)
 
 
 def test_a_wrong_import_would_be_noticed(tmp_path):
