@@ -39,6 +39,21 @@ def exponential_like(u, rate: float = EXPONENTIAL_RATE):
     return dr.minimum(-dr.log(1 - u * (1 - math.exp(-rate))) / rate, 1)
 
 
+def sample_losses(outputs: Mapping, targets: Mapping, weights: Mapping[str, float], size: int, loss: str) -> list:
+    """
+    Return the weighted absolute or squared differences (``loss``) between outputs and targets, to be summed.
+
+    ``outputs`` and ``targets`` map names to lists of arrays with ``size`` entries; a missing weight counts 1. There is
+    one array of ``size`` numbers for each target in the result; the sum of all entries is the weighted mean.
+    """
+    losses = []
+    for name, target in targets.items():
+        errors = [o - t for o, t in zip(outputs[name], target, strict=True)]
+        errors = [dr.abs(e) if loss == "mae" else dr.square(e) for e in errors]
+        losses.append(weights.get(name, 1.0) / (len(errors) * size) * sum(errors[1:], errors[0]))
+    return losses
+
+
 class Problem:
     """
     What is to be trained: the base class, with defaults, of what every task provides.
@@ -100,12 +115,7 @@ class Problem:
         that one kernel can write them and sum the gradients of all entries.
         """
         inputs, targets = self.batch(rng, size)
-        outputs, losses = self.predict(unfolded(net), inputs), []
-        for name, target in targets.items():
-            errors = [o - t for o, t in zip(outputs[name], target, strict=True)]
-            errors = [dr.abs(e) if self.settings.loss == "mae" else dr.square(e) for e in errors]
-            losses.append(self.weights.get(name, 1.0) / (len(errors) * size) * sum(errors[1:], errors[0]))
-        return losses
+        return sample_losses(self.predict(unfolded(net), inputs), targets, self.weights, size, self.settings.loss)
 
     def measure(self, net) -> dict[str, float]:
         """What is measured on held-out data; the first number decides which state is the best (higher is better)."""

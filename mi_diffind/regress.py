@@ -1,5 +1,5 @@
 """
-Regression checks of scenes against stored renderings: has anything changed that sampling noise does not explain?
+Regression checks of scenes against stored renderings: changes that sampling noise does not explain.
 
 A reference shows the scene as written, learned plugins included. A check finds changes; the distance of an
 approximation from the truth is measured by :mod:`.compare`. Statistics: :mod:`.z_test`; files:

@@ -15,8 +15,8 @@ from mi_diffind.tasks.radiance.march import OPAQUE
 from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
+from .support import distance_shapes as sdf
 from .support import properties
-from .support import solids as sdf
 from .support.differentials import Differentials
 from .support.placed_fields import PlacedField, VariantLight, to_grid
 
@@ -493,7 +493,7 @@ def integrator() -> type:
 
             A ``mode`` of ``None`` is the primal phase. Without smooth surfaces, a single piece is enough.
             """
-            solids = sdf.solids_of(scene) if hasattr(self.surfaces, "sample_solids") else []
+            solids = sdf.distance_shapes_in(scene) if hasattr(self.surfaces, "sample_shapes") else []
             if self.smooth_depth == 0 or not has_smooth(scene):
                 return sampler, self._piece(mode, scene, sampler, path, solids, surfaces, False, False)
 
@@ -591,9 +591,9 @@ def integrator() -> type:
             far = dr.minimum(pi.t, ray.maxt)
             if not solids:
                 return pi, far, mi.Bool(False)
-            met = sdf.meet(solids, ray.o, ray.d, far, active)
-            pi.t = dr.select(met.which > 0, dr.inf, pi.t)
-            return pi, met.t, met.which > 0
+            hit = sdf.intersect(solids, ray.o, ray.d, far, active)
+            pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
+            return pi, hit.t, hit.number > 0
 
         def _see(self, mode, path, placed, ray, far, crossed, first, before):
             """Add the light of a field behind a transmittance ``before``; return the transmittance behind the field."""

@@ -16,22 +16,22 @@ from mi_diffind.tasks.sdf import TASK
 
 from . import Counterpart, Plugin, reports_as, shown_as, warn
 from .support import properties, tables
+from .support.distance_shapes import CELL_BYTES, DistanceShape, Placement, crop_grid, finest, native_grid
 from .support.sdf_meshes import to_mesh
-from .support.solids import CELL_BYTES, Placement, Solid, finest, fitted, native_grid
 
-#: Whose arrays cannot be optimised are shared by all shapes of a file.
+#: Models whose arrays cannot be optimised, shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()
-_lock = threading.RLock()  # Mitsuba makes the shapes of a scene at once; who waits for a kernel may make another one
+_lock = threading.RLock()  # Mitsuba loads shapes in parallel; a thread that waits for a kernel may load another shape
 
-#: A grid that ``trace="grid"`` takes by itself has so many cells along the longest side and bytes in Mitsuba, at most.
+#: Limits of a grid whose resolution is chosen automatically: cells along the longest side, and bytes in Mitsuba.
 FINEST, LARGEST = 512, 3 * 2**30
 
-#: The error of arrays whose file does not tell, in cells of the field: sparse ones have 0.002 to 0.007.
+#: Error, in cells of the field, assumed for a file without measurements; sparse fields have 0.002 to 0.007.
 TYPICAL_ERROR = 0.005
 
 
 def open_model(props: mi.Properties):
-    """The model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
+    """Return the model that the properties ``filename`` and ``storage`` name. Raises ``RuntimeError``."""
     path, storage = properties.filename(props), properties.one_of(props, "storage", ("uint8", "float32"))
     if not path:
         raise RuntimeError('parameter "filename": not given, a file of "mi-diffind fit sdf" is needed')
@@ -48,24 +48,26 @@ def open_model(props: mi.Properties):
 
 def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
     """
-    The grid of a model's field that ``sdfgrid`` takes, its corners in the unit frame, and what is to be said of it:
-    with ``resolution`` cells along the longest side, or 0, as many as it takes for an error below that of the arrays.
+    Return a grid of a model's field for ``sdfgrid``, its corners in the unit frame, and its report.
+
+    ``resolution`` is the number of cells along the longest side; 0 chooses the coarsest grid with an error below that
+    of the arrays.
     """
-    from mi_diffind.tasks.sdf import decode
+    from mi_diffind.tasks.sdf import grids
 
     field, wanted = model.field, model.table.measured.get("mae_surface")
     measured = isinstance(wanted, (int, float)) and 0 < wanted < math.inf
     if not measured:
         wanted = TYPICAL_ERROR * field.spacing
     if resolution:
-        error = decode.trilinear_error(field, decode.surface_points(field, 2**12), resolution)
+        error = grids.trilinear_error(field, grids.surface_points(field, 2**12), resolution)
     else:
         most = min(FINEST, finest(np.subtract(field.upper, field.lower), LARGEST))
-        resolution, error = decode.resolution_for(field, wanted, most)
-    values, lower, upper = decode.grid(field, resolution)
-    decode.interpolable(values, field.band)
-    values, lower, upper = fitted(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
-    said = {
+        resolution, error = grids.resolution_for(field, wanted, most)
+    values, lower, upper = grids.grid(field, resolution)
+    grids.sharpen(values, field.band)
+    values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
+    report = {
         "preset": model.table.preset,
         "storage": model.storage,
         "table_bytes": model.nbytes,
@@ -78,20 +80,21 @@ def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndar
         "arrays_error": float(wanted),
         "arrays_error_measured": measured,
     }
-    return values, lower, upper, said
+    return values, lower, upper, report
 
 
-def sentence(said: dict) -> str:
-    """What is said of a grid, in short."""
-    about = "" if said["arrays_error_measured"] else "about "
+def sentence(report: dict) -> str:
+    """Return the report of a grid as a sentence."""
+    about = "" if report["arrays_error_measured"] else "about "
     return (
-        f"decoded to a grid of {said['resolution']} cells along the longest side, {said['memory_bytes'] / 1e6:,.0f} MB "
-        f"in Mitsuba, {said['seconds']:.1f} s; on average, its surface is {said['error']:.2g} of that side off the "
-        f"arrays', which is {about}{said['arrays_error']:.2g} off the mesh's"
+        f"decoded to a grid of {report['resolution']} cells along the longest side, "
+        f"{report['memory_bytes'] / 1e6:,.0f} MB in Mitsuba, {report['seconds']:.1f} s; on average, its surface is "
+        f"{report['error']:.2g} of that side off the arrays', which is {about}{report['arrays_error']:.2g} off the "
+        f"mesh's"
     )
 
 
-class NeuralSDF(Solid):
+class NeuralSDF(DistanceShape):
     r"""
     .. _shape-neural_sdf:
 
@@ -107,8 +110,8 @@ class NeuralSDF(Solid):
 
      * - to_world
        - |transform|
-       - From the mesh's own place and size to the world: rotations, uniform scales and translations; reflections,
-         too. (Default: none)
+       - From the mesh file's place and size to the world: rotations, uniform scales, translations and reflections.
+         (Default: none)
        - --
 
      * - bsdf
@@ -118,22 +121,22 @@ class NeuralSDF(Solid):
 
      * - normals
        - |string|
-       - Shading normals: ``analytic``, the gradient of the field, which is what the surface is; ``smooth``, the stored
-         normals blended, which rounds edges. (Default: ``analytic``; of ``grid``, ``smooth``)
+       - Shading normals: ``analytic``, the gradient of the field; ``smooth``, the blended normals of nodes, which
+         rounds edges. (Default: ``analytic``; with ``grid``, ``smooth``)
        - --
 
      * - trace
        - |string|
-       - ``arrays``: rays are traced through the arrays themselves, by the integrator :monosp:`path_sdf`. ``grid``: the
-         distances are decoded to Mitsuba's :monosp:`sdfgrid` when the scene is loaded, which any integrator sees.
-         (Default: ``arrays``; in a scene that ``mi-diffind`` or ``mi_diffind.load_file`` loads, ``grid`` if its
-         integrator is another one)
+       - ``arrays``: rays are traced through the arrays themselves, by the integrator :monosp:`path_sdf` only. ``grid``:
+         when the scene is loaded, distances are decoded to Mitsuba's :monosp:`sdfgrid`, which any integrator sees.
+         (Default: ``arrays``; ``grid`` if ``mi-diffind`` or ``mi_diffind.load_file`` loads a scene with another
+         integrator)
        - --
 
      * - resolution
        - |int|
-       - Of ``grid``: cells along the longest side of the field's box, 4 to 512. (Default: as few as it takes for an
-         error below that of the arrays, as far as 512 cells and 3.2 GB allow)
+       - With ``grid``: cells along the longest side of the field's box, 4 to 512. (Default: the coarsest grid with an
+         error below that of the arrays, up to 512 cells and 3.2 GB)
        - --
 
      * - storage
@@ -143,30 +146,30 @@ class NeuralSDF(Solid):
 
      * - tables.nodes, tables.primary, tables.cascaded
        - |tensor|
-       - With ``storage`` ``float32``: of the sparse layout, distance (in spacings) and gradient of each node,
-         ``(n, 4)``; of the others their arrays.
+       - With ``storage`` ``float32``: for the sparse layout, distance (in spacings) and gradient of each node,
+         ``(n, 4)``; for the others, their arrays.
        - |exposed|, |differentiable|
 
-    A mesh stored as a signed distance field in a few hundred kilobytes (Datta et al., *Efficient Graphics
-    Representation with Differentiable Indirection*, SIGGRAPH Asia 2023, supplement 1.6; the default layout is a sparse
-    one of ours). What it holds is a solid: a ray meets its surface from either side, and dielectrics know inside from
-    outside. The exact counterpart is the mesh that the file was made from.
+    Mesh stored as a signed distance field of a few hundred kilobytes (Datta et al., *Efficient Graphics Representation
+    with Differentiable Indirection*, SIGGRAPH Asia 2023, supplement 1.6; the default layout is a sparse one of ours).
+    The shape is a solid: rays hit its surface from either side, and dielectrics distinguish inside from outside. The
+    exact counterpart is the mesh that the file was made from.
 
-    **With** ``arrays``, nothing is decoded. Mitsuba 3.9 knows of no shapes written in Python but meshes, so this one is
-    a mesh without area: other integrators than :monosp:`path_sdf` do not see it. The commands of ``mi-diffind`` and
-    ``mi_diffind.load_file`` decode it for them unless ``trace`` is given or ``storage`` is ``float32``: then, commands
-    refuse the scene, and ``mi_diffind.load_file`` warns. ``mi.load_file`` and ``mi.load_dict`` cannot: the shape is
-    missing in what other integrators render. Several shapes of one file share its arrays. There are no texture
-    coordinates (they are 0), no emitters and no media, and it cannot be in a :monosp:`shapegroup`.
+    **With** ``arrays``, nothing is decoded. In Mitsuba 3.9, the only shapes that can be written in Python are meshes.
+    This shape is therefore a mesh without area, and only :monosp:`path_sdf` sees it. For other integrators, commands of
+    ``mi-diffind`` and ``mi_diffind.load_file`` decode it to a grid, unless ``trace`` is given or ``storage`` is
+    ``float32``: then commands refuse the scene, and ``mi_diffind.load_file`` warns. ``mi.load_file`` and
+    ``mi.load_dict`` do not decode: other integrators render the scene without the shape. Several shapes of one file
+    share its arrays. Texture coordinates are 0; emitters, media and :monosp:`shapegroup` are not supported.
 
-    **With** ``grid``, the resolution is found when the scene is loaded: grids are tried at 4096 places on the surface,
-    and the coarsest one is taken that is off the arrays' surface by no more than that was off the mesh when it was
-    fitted, both on average. Values beside the surface are changed a little, which takes a fifth to a third off the
-    error: what lies between nodes would be too large where the field is convex. Mitsuba takes 40 bytes for each cell of
-    the box around the surface, crossed or not: for a field of 256 kB 400 MB, for one of 1 MB more than 2.5 GB and
-    up to 20 seconds; ``resolution`` says how coarse it is to be instead. Where 512 cells or 3.2 GB do not suffice, a
-    warning says what the errors are; ``mi-diffind inspect`` says it of any scene. Each shape has a grid of its own. A
-    rotation makes of it an instance; the derivatives and parameters are those of :monosp:`sdfgrid`.
+    **With** ``grid``, the resolution is chosen when the scene is loaded: grids are evaluated at 4096 places on the
+    surface, and the coarsest one is taken whose mean distance to the arrays' surface is at most the arrays' mean
+    distance to the mesh when they were fitted. Values beside the surface are corrected for the error of interpolation,
+    which reduces it by a fifth to a third. Mitsuba takes 40 bytes for each cell of the box around the surface, crossed
+    or not: 400 MB for a field of 256 kB, more than 2.5 GB and up to 20 seconds for one of 1 MB; ``resolution`` requests
+    a coarser grid. Where 512 cells or 3.2 GB do not suffice, a warning states the errors; ``mi-diffind inspect`` states
+    them for any scene. Each shape has its own grid. A rotated grid is an instance; derivatives and parameters are those
+    of :monosp:`sdfgrid`.
 
     .. tabs::
         .. code-tab:: xml
@@ -190,12 +193,12 @@ class NeuralSDF(Solid):
         properties.one_of(props, "trace", ("arrays", "grid"))
         if "trace" in props and "resolution" in props:
             raise RuntimeError('parameter "resolution": has no effect with trace="arrays"')
-        props.get("resolution", 0)  # of a grid, if other integrators are to see one
+        props.get("resolution", 0)  # for a grid, if the scene's integrator needs one
         to_world = props.get("to_world", mi.ScalarTransform4f())
         super().__init__(props, self.model.field, Placement.of(to_world, self.model.scale, self.model.centre), smooth)
 
     def entries(self) -> dict:
-        """Names of what can be optimised → tensors."""
+        """Return the tensors that can be optimised, by name."""
         field = self.model.field
         if getattr(field, "nodes", None) is not None:
             return {"nodes": field.nodes}
@@ -239,7 +242,7 @@ class NeuralSDF(Solid):
 
 
 def factory(props: mi.Properties):
-    """The shape, or Mitsuba's own if it is to trace a grid."""
+    """Create the shape, or Mitsuba's ``sdfgrid`` with ``trace="grid"``."""
     if properties.one_of(props, "trace", ("arrays", "grid")) == "arrays":
         return NeuralSDF(props)
     if properties.one_of(props, "storage", ("uint8", "float32")) == "float32":
@@ -249,24 +252,24 @@ def factory(props: mi.Properties):
     if not isinstance(resolution, int) or ("resolution" in props and not 4 <= resolution <= 512):
         raise RuntimeError(f'parameter "resolution": found {resolution}, allowed are whole numbers from 4 to 512')
     to_world = props.get("to_world", mi.ScalarTransform4f())
-    Placement.of(to_world, model.scale, model.centre)  # refuses what is none
+    Placement.of(to_world, model.scale, model.centre)  # raises for an invalid transform
     normals = properties.one_of(props, "normals", ("smooth", "analytic"))
     try:
-        values, lower, upper, said = decoded(model, resolution)
+        values, lower, upper, report = decoded(model, resolution)
     except RuntimeError as e:
         raise RuntimeError(f"{model.table.path}: {e}") from None
     to_unit = mi.ScalarTransform4f().translate(list(model.centre)).scale(model.scale)
     to_world = mi.ScalarTransform4f(np.array(to_world.matrix))
-    made, kept = native_grid(props, values, lower, upper, to_world @ to_unit, normals)
-    said["seconds"] = round(time.perf_counter() - start, 2)
-    said["decoded"] = sentence(said)
-    if not resolution and said["error"] > said["arrays_error"]:
-        finer = f'finer than {FINEST} cells or {LARGEST / 1e9:.1f} GB a grid is only if "resolution" says so'
-        warn(f"{model.table.path}: {said['decoded']}; {finer}")
-    if kept is not made:
-        shown_as(made, kept)
-    reports_as(kept, lambda: said)
-    return made
+    shape, kept = native_grid(props, values, lower, upper, to_world @ to_unit, normals)
+    report["seconds"] = round(time.perf_counter() - start, 2)
+    report["decoded"] = sentence(report)
+    if not resolution and report["error"] > report["arrays_error"]:
+        finer = f'set "resolution" for a grid of more than {FINEST} cells or {LARGEST / 1e9:.1f} GB'
+        warn(f"{model.table.path}: {report['decoded']}; {finer}")
+    if kept is not shape:
+        shown_as(shape, kept)
+    reports_as(kept, lambda: report)
+    return shape
 
 
 PLUGIN = Plugin(
@@ -274,7 +277,7 @@ PLUGIN = Plugin(
     "shape",
     factory,
     task=TASK.name,
-    seen_by=Solid.seen_by,
+    seen_by=DistanceShape.seen_by,
     otherwise=("trace", "grid"),
     exact=Counterpart("ply", ("normals", "trace", "resolution", "storage"), convert=to_mesh),
 )

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from . import Plugin, path_footprint
 from .path_footprint import power_heuristic, relative
-from .support import solids as sdf
+from .support import distance_shapes as sdf
 
 MANUAL = r"""
 .. _integrator-path_sdf:
@@ -19,29 +19,29 @@ Path tracer for signed distance fields (:monosp:`path_sdf`)
 
  * - max_depth, rr_depth, hide_emitters, jitter
    - |int|, |int|, |bool|, |bool|
-   - As of :monosp:`path_footprint`. (Default: -1, 5, false, true)
+   - The same as for :monosp:`path_footprint`. (Default: -1, 5, false, true)
    - --
 
-The estimator of :monosp:`path` for scenes in which a :monosp:`neural_sdf` is traced as it is stored: with any BSDF,
-all emitters, both sampled and weighted by the power heuristic. Ordinary shapes and any number of fields mix: the
-nearest hit wins, light is blocked by either, rays are reflected and refracted by either. A scene without such a field
-is rendered as by :monosp:`path_footprint`, footprints included; in a scene with one, textures see no footprints.
+Path tracer for scenes in which a :monosp:`neural_sdf` is traced as it is stored. The estimator is that of
+:monosp:`path`: any BSDF, all emitters, both sampled and weighted by the power heuristic. Ordinary shapes and any number
+of fields mix: the nearest hit wins, and either kind of shape blocks, reflects and refracts light. A scene without a
+field is rendered by :monosp:`path_footprint`, footprints included; in a scene with one, textures see no footprints.
 
-**Rays** go from one empty region to the next, as the masks of a sparse field say, in a block to where its surface may
-begin, and read only cells that the surface crosses from there. Fields of the other layouts are sphere-traced (Hart,
-*Sphere Tracing*, The Visual Computer 1996): a step is the distance divided by a bound of the field's slope, at least
-:math:`10^{-4}` of the longest side. A hit is where the sign differs from that at the start, so cameras may be within a
-solid, and a place between the last sign and the next is found by false position. Secondary rays start
-:math:`3 \cdot 10^{-4}` of the longest side off the surface: walls thinner than that are not reliable. From
-:math:`10^3` times the size away, single precision leaves :math:`10^{-4}` of it.
+**Rays** skip the empty regions of a sparse field by its masks. In a block they go to where its surface may begin, and
+read only cells that the surface crosses. Fields of the other layouts are sphere-traced (Hart, *Sphere Tracing*, The
+Visual Computer 1996): a step is the distance divided by a bound of the field's slope, at least :math:`10^{-4}` of the
+longest side. A hit is where the sign differs from that at the start, so cameras may be within a solid; the place
+between the last sign and the next is found by false position. Secondary rays start :math:`3 \cdot 10^{-4}` of the
+longest side off the surface: walls thinner than that are not reliable. Seen from :math:`10^3` times its size away, a
+solid's hits are precise to :math:`10^{-4}` of the size, which is single precision.
 
 **Derivatives** are computed by path replay with respect to materials, textures, emitters and, with ``storage``
 ``float32``, the arrays of fields: hits move along their rays by the implicit function theorem, and normals, cosines and
-the solid angles between vertices follow. They are those of *interiors*: where the outline of a solid, its shadow
-or its image in a mirror moves over a pixel, radiance jumps, and this part of the derivative is missing. An
+the solid angles between vertices follow. The derivatives are those of *interiors*: where the outline of a solid, its
+shadow or its image in a mirror moves over a pixel, radiance jumps, and this part of the derivative is missing. An
 optimisation from images therefore learns from shading, not from silhouettes; masks, or a loss on the field itself, have
-to make up for that. Ordinary shapes are constants, and so is what is seen in smooth mirrors and through smooth
-glass. Not for polarised variants, nor for media.
+to compensate. Ordinary shapes are constants, and so are places seen in smooth mirrors and through smooth glass.
+Polarised variants and media are not supported.
 
 .. tabs::
     .. code-tab:: xml
@@ -59,7 +59,7 @@ glass. Not for polarised variants, nor for media.
 
 
 def solid_angle(origin, place, normal):
-    """The solid angle of a unit of area at ``place``, as ``origin`` sees it."""
+    """Return the solid angle of a unit of area at ``place``, seen from ``origin``."""
     to = place - origin
     squared = dr.squared_norm(to)
     return dr.abs(dr.dot(to, normal)) * dr.rcp(squared * dr.sqrt(squared))
@@ -67,7 +67,7 @@ def solid_angle(origin, place, normal):
 
 @cache
 def integrator() -> type:
-    """The class, in the variant that is set."""
+    """Return the integrator's class in the current variant."""
 
     class PathSDF(path_footprint.integrator()):
         __doc__ = MANUAL
@@ -76,33 +76,33 @@ def integrator() -> type:
             return super().to_string().replace("PathFootprint", "PathSDF", 1)
 
         def sample(self, mode, scene, *args, **kwargs):
-            """See ``ADIntegrator.sample``. A scene without solids is what ``path_footprint`` makes of it."""
-            solids = sdf.solids_of(scene)
-            if not solids:
+            """See ``ADIntegrator.sample``. A scene without distance shapes is rendered by ``path_footprint``."""
+            shapes = sdf.distance_shapes_in(scene)
+            if not shapes:
                 return super().sample(mode, scene, *args, **kwargs)
-            return self.sample_solids(mode, scene, solids, *args, **kwargs)
+            return self.sample_shapes(mode, scene, shapes, *args, **kwargs)
 
-        def meet(self, scene, solids, ray, coherent, active):
-            """The nearest of what rays meet: an ordinary shape (else not valid), and a solid."""
+        def intersect(self, scene, shapes, ray, coherent, active):
+            """Return the nearest hit, of an ordinary shape or of a distance shape; the other one is not valid."""
             pi = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-            return self.nearer(solids, ray, pi, active)
+            return self.nearer(shapes, ray, pi, active)
 
-        def nearer(self, solids, ray, pi, active):
-            met = sdf.meet(solids, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active)
-            pi.t = dr.select(met.which > 0, dr.inf, pi.t)
-            return pi, met
+        def nearer(self, shapes, ray, pi, active):
+            hit = sdf.intersect(shapes, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active)
+            pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
+            return pi, hit
 
-        def interaction(self, solids, ray, pi, met, active):
-            """What there is at that place; ordinary shapes are not differentiated."""
+        def interaction(self, shapes, ray, pi, hit, active):
+            """Return the surface interaction at the hit; ordinary shapes are not differentiated."""
             with dr.suspend_grad():
                 si = pi.compute_surface_interaction(ray, ray_flags=mi.RayFlags.All, active=active)
-            return sdf.interaction(solids, met, ray, si, active)
+            return sdf.interaction(shapes, hit, ray, si, active)
 
         @dr.syntax
-        def sample_solids(self, mode, scene, solids, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
-            """As ``sample`` of ``path_footprint``, of a scene with solids."""
+        def sample_shapes(self, mode, scene, shapes, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
+            """Implement ``sample`` for a scene with distance shapes; see ``path_footprint``."""
             primal = mode == dr.ADMode.Primal
-            moving = not primal and any(solid.optimised() for solid in solids)
+            moving = not primal and any(shape.optimised() for shape in shapes)
             environment = scene.environment() is not None and not self.hide_emitters
             context = mi.BSDFContext()
 
@@ -125,15 +125,15 @@ def integrator() -> type:
                 after = self.skip_area_emitters(scene, at.spawn_ray(ray.d), True, hidden)
                 after.t += at.t
                 pi[hidden] = after
-            pi, met = self.nearer(solids, ray, pi, active)
-            came, left = mi.Ray3f(ray), dr.zeros(sdf.Met)  # the ray to the vertex before, and what that was
+            pi, hit = self.nearer(shapes, ray, pi, active)
+            before_ray, before_hit = mi.Ray3f(ray), dr.zeros(sdf.ShapeHit)  # of the vertex before
 
             while dr.hint(active, max_iterations=self.max_depth, label=f"path_sdf ({mode.name})"):
                 with dr.resume_grad(when=moving):
-                    si = self.interaction(solids, ray, pi, met, active)
+                    si = self.interaction(shapes, ray, pi, hit, active)
                     if dr.hint(moving, mode="scalar"):
-                        # Seen from the vertex before, which moves, too
-                        aside = sdf.shift(solids, left, came.d, active & si.is_valid())
+                        # Seen from the vertex before, which also moves
+                        aside = sdf.shift(shapes, before_hit, before_ray.d, active & si.is_valid())
                         turn = aside - ray.d * dr.dot(aside, ray.d)
                         si.wi += dr.detach(si.sh_frame).to_local(turn) * dr.rcp(dr.select(si.is_valid(), si.t, 1))
                 fixed = dr.detach(si)
@@ -153,14 +153,14 @@ def integrator() -> type:
                 lit = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
                 ds, emitter_weight = scene.sample_emitter_direction(fixed, sampler.next_2d(), True, lit)
                 lit &= ds.pdf != 0
-                start = sdf.spawn(solids, met, fixed, ds.d)
+                start = sdf.spawn(shapes, hit, fixed, ds.d)
                 to = ds.p - start
                 distance = dr.norm(to)
-                lit &= ~sdf.occluded(solids, start, to / distance, distance * (1 - mi.math.ShadowEpsilon), lit)
+                lit &= ~sdf.occluded(shapes, start, to / distance, distance * (1 - mi.math.ShadowEpsilon), lit)
                 with dr.resume_grad(when=not primal):
                     factor = mi.Float(1)
                     if dr.hint(moving, mode="scalar"):
-                        # Points of emitters stay where they are, directions to infinite ones do
+                        # Points of emitters stay fixed, and so do directions to infinite ones
                         flags = ds.emitter.flags()
                         finite = ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
                         away = dr.norm(ds.p - si.p)
@@ -176,7 +176,7 @@ def integrator() -> type:
                     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
                     direct = dr.select(lit, throughput * weight * bsdf_value * emitter_weight, 0)
 
-                # Where to go on
+                # Next direction
                 with dr.resume_grad(when=not primal):
                     bs, bsdf_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), going)
                 bs = dr.detach(bs)
@@ -184,10 +184,10 @@ def integrator() -> type:
                 L = L + emitted + direct if primal else L - dr.detach(emitted + direct)
                 out = fixed.to_world(bs.wo)
                 following = fixed.spawn_ray(out)
-                following.o = sdf.spawn(solids, met, fixed, out)
+                following.o = sdf.spawn(shapes, hit, fixed, out)
                 valid |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
-                # Whether to go on: radiance changes by η² at a boundary, which is undone for this
+                # Russian roulette: undo the change of radiance by η² at a boundary
                 passed = throughput * dr.detach(bsdf_weight)
                 eta *= bs.eta
                 largest = dr.max(passed)
@@ -196,20 +196,20 @@ def integrator() -> type:
                 survives = sampler.next_1d() < survival
                 passed[roulette] *= dr.rcp(survival)
                 further = going & (largest != 0) & (~roulette | survives)
-                pi_next, met_next = self.meet(scene, solids, following, False, further)
+                pi_next, hit_next = self.intersect(scene, shapes, following, False, further)
 
                 if dr.hint(not primal, mode="scalar"):
                     factor, wo = mi.Float(1), bs.wo
                     if dr.hint(moving, mode="scalar"):
-                        # The next vertex stays where it is, or the direction if there is none
-                        target = self.interaction(solids, following, pi_next, met_next, further)
+                        # The next vertex stays fixed, or the direction if there is none
+                        target = self.interaction(shapes, following, pi_next, hit_next, further)
                         bound = further & target.is_valid()
                         with dr.resume_grad():
                             toward = dr.select(bound, dr.normalize(target.p - si.p), out)
                             wo = dr.replace_grad(bs.wo, si.to_local(toward))
                             factor = dr.select(bound, relative(solid_angle(si.p, target.p, target.n)), 1)
                     with dr.resume_grad():
-                        # A smooth mirror cannot be evaluated: there, the weight itself is differentiated
+                        # A smooth mirror cannot be evaluated: its weight is differentiated instead
                         smooth = bsdf.eval(context, si, wo, going & ~delta_next)
                         reflected = L * dr.select(delta_next, relative(bsdf_weight), relative(smooth) * factor)
                         contribution = emitted + direct + dr.select(going, reflected, 0)
@@ -223,8 +223,8 @@ def integrator() -> type:
                 density = bs.pdf
                 delta = delta_next
                 depth[going] += 1
-                came, left = ray, met
-                ray, pi, met, active = following, pi_next, met_next, further
+                before_ray, before_hit = ray, hit
+                ray, pi, hit, active = following, pi_next, hit_next, further
 
             shown = dr.select(valid, L, 0) if primal else δL
             return shown, valid, [], L

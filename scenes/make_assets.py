@@ -59,7 +59,7 @@ PEAR = [
 
 
 def write_ply(name, position, normal, uv, faces):
-    """Writes a binary PLY: (n, 3) positions and unit normals, (n, 2) uv, (m, 3) counter-clockwise faces."""
+    """Write a binary PLY: (n, 3) positions and unit normals, (n, 2) uv, (m, 3) counter-clockwise faces."""
     fields = ["x", "y", "z", "nx", "ny", "nz", "u", "v"]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(position)}"]
     header += [f"property float {f}" for f in fields]
@@ -79,7 +79,7 @@ def grid_faces(rows, columns):
 
 
 def grid_normals(position):
-    """Unit normals of a (rows, columns, 3) grid, matching the winding of `grid_faces`."""
+    """Return unit normals of a (rows, columns, 3) grid, matching the winding of `grid_faces`."""
     du = np.gradient(position, axis=1)
     dv = np.gradient(position, axis=0)
     n = np.cross(dv, du)
@@ -121,7 +121,7 @@ def revolve(name, profile, segments=64, samples=64, swap=False):
 
 
 def knot(name, p=2, q=3, tube=0.17, segments=180, sides=20):
-    """A (p, q) torus knot that lies on the floor y = 0; u runs around the tube, v along it."""
+    """Return a (p, q) torus knot that lies on the floor y = 0; u runs around the tube, v along it."""
     t = np.linspace(0, 2 * np.pi, segments + 1)
     r = 0.5 * (1 + 0.5 * np.cos(q * t))
     centre = np.stack([r * np.cos(p * t), 0.3 * np.sin(q * t), r * np.sin(p * t)], -1)
@@ -151,7 +151,7 @@ def knot(name, p=2, q=3, tube=0.17, segments=180, sides=20):
 
 
 def cloth(name, half=0.8, radius=0.42, height=0.38, n=88):
-    """A square cloth draped over a round stand; what does not hang lies on y = 0. An open surface."""
+    """Return a square cloth draped over a round stand, an open surface; its corners lie on y = 0."""
     g = np.linspace(-half, half, n)
     x, z = np.meshgrid(g, g)
     s, theta = np.hypot(x, z), np.arctan2(z, x)
@@ -214,7 +214,7 @@ def noise(rng, shape, scale_y, scale_x, octaves=1):
 
 
 def save(name, image):
-    """Saves values in [0, 1] as an 8-bit PNG, (h, w) grey or (h, w, 3) RGB."""
+    """Save values in [0, 1] as an 8-bit PNG, (h, w) grey or (h, w, 3) RGB."""
     data = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
     Image.fromarray(data).save(ASSETS / name, optimize=True)
 
@@ -294,7 +294,7 @@ def vase(size=512):
 
 
 def hammered(size=256, dents=90):
-    """Normal map of hammered metal: the height is the distance to the nearest of many dents. Periodic."""
+    """Return a normal map of hammered metal: the height is the distance to the nearest of many dents. Periodic."""
     rng = np.random.default_rng(3)
     centres = rng.uniform(0, size, (4 * dents, 2))
     keep = []
@@ -342,7 +342,7 @@ def labels(size=512):
 
 
 def probe(name, folder):
-    """A 1024x512 probe as 512x256 half-float EXR: 2x2 means, cut at PROBE_LIMIT."""
+    """Convert a 1024x512 probe to 512x256 half-float EXR: 2x2 means, cut at PROBE_LIMIT."""
     import mitsuba as mi
     import OpenEXR
 
@@ -356,7 +356,7 @@ def probe(name, folder):
 
 
 def main():
-    """Parses the command line and makes what its inputs allow."""
+    """Parse the command line, and write the assets whose inputs are given."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suzi", help="models/suzi.glb.js of npm's @pmndrs/assets")
     parser.add_argument("--probes", help="folder with interior.exr and forest.exr of blender-data")

@@ -1,7 +1,8 @@
 """
-Write capture_group.xml, capture_thin.xml and capture_glossy.xml, what ``mi-diffind capture`` takes views of for
-radiance fields: things in the light of a probe, nothing below or behind them; and the meshes of the second one,
-``cage.ply`` and ``leaves.ply``. See README.md.
+Write capture_group.xml, capture_thin.xml and capture_glossy.xml, and the meshes ``cage.ply`` and ``leaves.ply``.
+
+``mi-diffind capture`` renders views of these scenes for radiance fields: objects in the light of a probe, with nothing
+below or behind them. See README.md.
 """
 
 from pathlib import Path
@@ -24,22 +25,22 @@ def place(x: float, y: float, z: float) -> dict:
 
 
 def turn(axis: str, angle: float) -> dict:
-    """A rotation around an axis, in degrees."""
+    """Return a rotation around an axis, in degrees."""
     return {axis: 1, "angle": angle}
 
 
 def mesh(file: str, material, id: str = "", **steps):
-    """A mesh of the assets."""
+    """Return a mesh of the assets."""
     return plugin("shape", "ply", transform(**steps), material, id=id or file, filename=f"assets/{file}.ply")
 
 
 def bitmap(name: str, file: str):
-    """A texture."""
+    """Return a texture."""
     return plugin("texture", "bitmap", name=name, filename=f"assets/{file}")
 
 
 def principled(*children, **parameters):
-    """A material."""
+    """Return a material."""
     return plugin("bsdf", "principled", *children, **parameters)
 
 
@@ -68,7 +69,7 @@ def joined(parts: list[tuple]) -> tuple:
 
 
 def cage(name: str, radius: float = 0.95, wire: float = 0.014) -> None:
-    """A globe of wires, on y = 0: meridians and circles of latitude, and a ring on top."""
+    """Return a globe of wires, on y = 0: meridians and circles of latitude, and a ring on top."""
     t = np.linspace(0, 2 * np.pi, 65)
     lines = []
     for k in range(8):
@@ -102,7 +103,7 @@ def leaf(base, direction, length: float, width: float, droop: float) -> tuple:
 
 
 def leaves(name: str, count: int = 26) -> None:
-    """A plant: leaves around three stems, as sunflowers have it, smaller towards the top."""
+    """Return a plant: leaves around three stems, in the spiral of a sunflower, smaller towards the top."""
     parts, rng = [], np.random.default_rng(15)
     for stem in range(3):
         lean = 2.1 * stem + 0.4
@@ -132,6 +133,7 @@ def scene(name: str, what: str, light: str, lighting, content: list) -> None:
 
 
 def main() -> None:
+    """Write the files."""
     clay = principled(base_color=(0.62, 0.31, 0.2), roughness=0.55, specular=0.4)
     porcelain = principled(bitmap("base_color", "vase_color.png"), roughness=0.35, specular=0.5)
     blue = principled(base_color=(0.07, 0.2, 0.5), roughness=0.4, specular=0.5)

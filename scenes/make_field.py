@@ -1,6 +1,8 @@
 """
-Write field.xml: a radiance field among meshes, captured from capture_group.xml and compressed (``mi-diffind capture``,
-``mi-diffind fit field``), see README.md.
+Write field.xml: a radiance field among meshes.
+
+The field was captured from capture_group.xml and compressed (``mi-diffind capture``, ``mi-diffind fit field``). See
+README.md.
 """
 
 from pathlib import Path
@@ -19,6 +21,7 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def main() -> None:
+    """Write the files."""
     camera = {"origin": (2.2, 2.4, 6.5), "target": (0.02, 0.68, 0), "up": (0, 1, 0)}
     content = head(960, 540, {"file": "assets/group.npz"}, fov=41.0, camera=camera)
     at = next(i for i, item in enumerate(content) if item.tag == "integrator")

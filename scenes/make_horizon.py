@@ -24,7 +24,7 @@ PILLARS = [(side * 2.6, -2.2 - 3.6 * k) for k in range(7) for side in (-1, 1)]
 
 
 def tiles(u: float, v: float, id: str, glossy: bool = False):
-    """The material, its maps repeated so often."""
+    """Return the material, its maps repeated the given number of times."""
 
     def of(channels: str, parameter: str):
         scale = transform("to_uv", scale={"x": u, "y": v})
@@ -38,7 +38,7 @@ def tiles(u: float, v: float, id: str, glossy: bool = False):
 
 
 def pillar(x: float, z: float):
-    """A cylinder with a lid."""
+    """Return a cylinder with a lid."""
     ends = [element("point", name=name, x=x, y=y, z=z) for name, y in (("p0", 0), ("p1", 2.8))]
     side = plugin("bsdf", "twosided", element("ref", id="pillar_tiles"))
     lid = plugin("bsdf", "diffuse", reflectance=(0.5, 0.47, 0.42))
@@ -47,6 +47,7 @@ def pillar(x: float, z: float):
 
 
 def main() -> None:
+    """Write the files."""
     camera = {"origin": (0, 1.5, 5.2), "target": (0, 1.05, 0), "up": (0, 1, 0)}
     content = head(960, 540, {"storage": "uint8", "filter": "anisotropic"}, fov=52.0, camera=camera)
     for item in content:

@@ -76,7 +76,7 @@ def sphere(row: int, column: int):
 
 
 def label(row: int):
-    """The name of a row, painted on the floor in front of the row's first spheres."""
+    """Return the name of a row, painted on the floor in front of the row's first spheres."""
     half_width, rows = 1.9, len(ROWS)
     x, z = place(row, 0)
     # the atlas holds one name in each tenth of its height, the first on top, where v = 0; hence the flip
@@ -93,6 +93,7 @@ def label(row: int):
 
 
 def main() -> None:
+    """Write the files."""
     camera = {"origin": (0, 150, 250), "target": (0, 0.25, 0.15), "up": (0, 1, 0)}
     lamp = {"origin": (-7, 5.5, -21), "target": (0, 0, 0), "up": (0, 1, 0)}
     floor = element("rgb", name="reflectance", value=FLOOR)

@@ -16,7 +16,7 @@ LEARNED = {PRESET: f"${PRESET}", "storage": "$storage"}
 
 
 def ball(row: int, column: int):
-    """A sphere of the metal of its row and the roughness of its column."""
+    """Return a sphere of the metal of its row and the roughness of its column."""
     name, material = METALS[row]
     metal = plugin("bsdf", "neural_ggx", id=f"{name}_{column}", **LEARNED, material=material, alpha=ALPHAS[column])
     centre = element("point", name="center", x=1.25 * (column - 2.5), y=0.5, z=1.35 * (row - 1))
@@ -38,6 +38,7 @@ def table():
 
 
 def main() -> None:
+    """Write the files."""
     camera = {"origin": (0, 12, 15.5), "target": (0, 0.25, 0.1), "up": (0, 1, 0)}
     lamp = {"origin": (-5, 6, -5), "target": (0, 0.5, 0), "up": (0, 1, 0)}
     content = [

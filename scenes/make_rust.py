@@ -39,7 +39,7 @@ def write_maps() -> None:
 
 
 def metal(repeats: float, id: str):
-    """The material, its maps repeated so often."""
+    """Return the material, its maps repeated the given number of times."""
 
     def of(channels: str, parameter: str):
         scale = transform("to_uv", scale={"x": repeats, "y": repeats})
@@ -52,6 +52,7 @@ def metal(repeats: float, id: str):
 
 
 def main() -> None:
+    """Write the files."""
     mi.set_variant("scalar_rgb")
     write_maps()
     camera = {"origin": (0, 4.2, 7.5), "target": (0, 0.35, 0.2), "up": (0, 1, 0)}

@@ -19,7 +19,7 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def ref(name: str):
-    """A material by its name."""
+    """Return a material by its name."""
     return element("ref", id=name)
 
 
@@ -29,16 +29,17 @@ def place(x: float, y: float, z: float) -> dict:
 
 
 def turn(axis: str, angle: float) -> dict:
-    """A rotation around an axis, in degrees."""
+    """Return a rotation around an axis, in degrees."""
     return {axis: 1, "angle": angle}
 
 
 def solid(file: str, *children, **steps):
-    """A signed distance field."""
+    """Return a signed distance field."""
     return plugin("shape", "neural_sdf", transform(**steps), *children, filename=f"assets/{file}.npz", trace="$trace")
 
 
 def main() -> None:
+    """Write the files."""
     mi.set_variant("scalar_rgb")
     camera = {"origin": (0.3, 3.1, 8.2), "target": (0.05, 0.85, 0), "up": (0, 1, 0)}
     content = head(960, 540, {"trace": "arrays", "integrator": "path_sdf"}, fov=40.0, camera=camera)

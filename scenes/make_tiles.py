@@ -28,11 +28,13 @@ def noise(random, octaves, falloff=0.55) -> np.ndarray:
 
 
 def smoothstep(low, high, x):
+    """Return the smooth step from 0 at ``low`` to 1 at ``high``."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
 
 def main() -> None:
+    """Write the files."""
     mi.set_variant("scalar_rgb")
     random = np.random.default_rng(7)
     x = (np.arange(SIDE) + 0.5) / SIDE * TILES

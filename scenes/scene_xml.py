@@ -27,40 +27,42 @@ def number(value: float) -> str:
 
 
 def element(tag: str, *children: ET.Element, **attributes) -> ET.Element:
-    """``<tag …>``; numbers become texts, several as ``x, y, z``."""
+    """Return ``<tag …>``; numbers become texts, several as ``x, y, z``."""
     texts = {}
     for key, value in attributes.items():
         several = isinstance(value, (tuple, list))
         texts[key] = value if isinstance(value, str) else ", ".join(map(number, value if several else (value,)))
-    found = ET.Element(tag, texts)
-    found.extend(children)
-    return found
+    node = ET.Element(tag, texts)
+    node.extend(children)
+    return node
 
 
-def plugin(tag: str, kind: str, *children: ET.Element, id: str = "", name: str = "", **parameters) -> ET.Element:
+def plugin(tag: str, plugin_type: str, *children: ET.Element, id: str = "", name: str = "", **parameters) -> ET.Element:
     """
-    ``<tag type="kind">`` with its ``parameters``: ``True`` and ``False``, whole numbers, numbers, texts, and colours
-    (three numbers). ``name`` is the parameter of the parent that it is for.
+    Return ``<tag type="plugin_type">`` with its ``parameters``.
+
+    Parameters are ``True`` and ``False``, whole numbers, numbers, texts, and colours (three numbers). ``name`` is the
+    parameter of the parent.
     """
     labels = {key: value for key, value in (("id", id), ("name", name)) if value}
-    return element(tag, *(parameter(k, v) for k, v in parameters.items()), *children, type=kind, **labels)
+    return element(tag, *(parameter(k, v) for k, v in parameters.items()), *children, type=plugin_type, **labels)
 
 
 def parameter(name: str, value) -> ET.Element:
-    """The element of one parameter, by the type of its value."""
+    """Return the element of one parameter, by the type of its value."""
     if isinstance(value, bool):
         return element("boolean", name=name, value=str(value).lower())
-    kinds = ((Whole, "integer"), (str, "string"), (int, "integer"), (float, "float"), (tuple, "rgb"))
-    return element(next(tag for kind, tag in kinds if isinstance(value, kind)), name=name, value=value)
+    tags = ((Whole, "integer"), (str, "string"), (int, "integer"), (float, "float"), (tuple, "rgb"))
+    return element(next(tag for value_type, tag in tags if isinstance(value, value_type)), name=name, value=value)
 
 
 def transform(name: str = "to_world", **steps: dict) -> ET.Element:
-    """``<transform>`` of ``steps`` (``scale``, ``rotate``, ``translate``, ``lookat``: attributes), in their order."""
+    """Return ``<transform>`` of ``steps`` (``scale``, ``rotate``, ``translate``, ``lookat``: attributes)."""
     return element("transform", *(element(step, **attributes) for step, attributes in steps.items()), name=name)
 
 
 def head(width: int, height: int, learned: dict[str, str], fov: float, camera: dict) -> list[ET.Element]:
-    """What both scenes begin with: ``<default>`` values (``learned``: of their plugins), path tracer, camera, film."""
+    """Return the first elements of a scene: ``<default>`` values (and ``learned`` ones), path tracer, camera, film."""
     defaults = {"spp": 64, "width": width, "height": height, "max_depth": 5, **learned}
     film = plugin(
         "film",
@@ -80,20 +82,20 @@ def head(width: int, height: int, learned: dict[str, str], fov: float, camera: d
 
 
 def environment(file: str, scale: float, angle: float) -> ET.Element:
-    """A light probe, turned around y."""
+    """Return a light probe, turned around y."""
     turned = transform(rotate={"y": 1, "angle": angle})
     return plugin("emitter", "envmap", turned, filename=f"assets/{file}", scale=scale)
 
 
 def softbox(size: tuple[float, float], lookat: dict, radiance: tuple[float, float, float]) -> ET.Element:
-    """A rectangle that shines and reflects nothing."""
+    """Return a rectangle that emits light and reflects none."""
     placed = transform(scale={"x": size[0], "y": size[1]}, lookat=lookat)
     black = plugin("bsdf", "diffuse", reflectance=(0, 0, 0))
     return plugin("shape", "rectangle", placed, black, plugin("emitter", "area", radiance=radiance))
 
 
 def lying(half_width: float, half_depth: float, *children: ET.Element, **translate) -> ET.Element:
-    """A rectangle that lies on its back."""
+    """Return a horizontal rectangle that faces up."""
     steps = {"scale": {"x": half_width, "y": half_depth}, "rotate": {"x": 1, "angle": -90}}
     if translate:
         steps["translate"] = translate

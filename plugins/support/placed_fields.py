@@ -16,7 +16,7 @@ from mi_diffind.tasks.radiance import march as marching
 from mi_diffind.tasks.radiance.files import load
 
 from . import properties, upsampling
-from .solids import Placement
+from .distance_shapes import Placement
 
 #: Luminance of linear sRGB, the same as in Mitsuba.
 LUMINANCE = (0.212671, 0.715160, 0.072169)

@@ -1,4 +1,4 @@
-"""The mesh that a signed distance field was made from, as the shape that stands in its place."""
+"""Exact counterpart of a distance field: the mesh that it was made from."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from . import properties
 
 
 def to_mesh(props: mi.Properties) -> None:
-    """Give the properties of a ``neural_sdf`` the file of its mesh, as a ``ply`` reads it."""
+    """Replace the ``filename`` of a ``neural_sdf`` by that of its mesh, as a ``ply`` file."""
     path = Path(properties.filename(props))
     try:
         settings = TASK.load(path).settings
@@ -27,7 +27,7 @@ def to_mesh(props: mi.Properties) -> None:
         raise RuntimeError(str(e)) from None
     recorded = settings.get("mesh_path")
     if not recorded:
-        raise RuntimeError(f"{path}: does not say which mesh it was made from")
+        raise RuntimeError(f"{path}: names no mesh that it was made from")
     mesh = (path.resolve().parent / recorded).resolve()
     if not mesh.is_file():
         raise RuntimeError(f"{mesh}: no such file, {path.name} was made from it")
@@ -43,15 +43,15 @@ def _folder() -> Path:
 
 @functools.lru_cache
 def _as_ply(path: Path, stamp: tuple) -> str:
-    """A copy of a mesh in another format, kept as long as this process lives."""
+    """Return a PLY copy of a mesh file, kept until the process ends."""
     import trimesh
 
     from mi_diffind.tasks.sdf.mesh import load_mesh
 
     try:
-        found = load_mesh(path)
+        mesh = load_mesh(path)
     except DiffindError as e:
         raise RuntimeError(str(e)) from None
     written = _folder() / f"{path.stem}_{abs(hash((path, stamp))):x}.ply"
-    trimesh.Trimesh(found.vertices * found.scale + found.centre, found.faces, process=False).export(written)
+    trimesh.Trimesh(mesh.to_file_frame(mesh.vertices), mesh.faces, process=False).export(written)
     return str(written)

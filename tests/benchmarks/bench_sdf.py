@@ -26,7 +26,7 @@ import numpy as np
 import mi_diffind  # noqa: F401
 from mi_diffind.files import write_json
 from mi_diffind.measure.clock import machine, timed
-from mi_diffind.tasks.sdf import TASK, decode, tracing
+from mi_diffind.tasks.sdf import TASK, grids, tracing
 from mi_diffind.tasks.sdf.mesh import load_mesh
 
 SIDE = 512
@@ -35,26 +35,26 @@ SIDE = 512
 MESH, GRID, ARRAYS = "Embree, the mesh", "sdfgrid {}³", "the arrays"
 
 
-def rays(kind: str):
+def rays(ray_set: str):
     """Origins and directions in the unit frame."""
     count = SIDE * SIDE
-    if kind == "primary":
+    if ray_set == "primary":
         at = mi.ScalarTransform4f().look_at([0.9, 0.5, 1.3], [0, 0, 0], [0, 1, 0])
         film = {"type": "hdrfilm", "width": SIDE, "height": SIDE}
         sensor = mi.load_dict({"type": "perspective", "fov": 40, "to_world": at, "film": film})
         i = dr.arange(mi.UInt32, count)
         place = (mi.Point2f(i % SIDE, i // SIDE) + 0.5) / SIDE
         ray, _ = sensor.sample_ray(0, 0, place, mi.Point2f(0.5))
-        found = mi.Point3f(ray.o), mi.Vector3f(ray.d)
+        result = mi.Point3f(ray.o), mi.Vector3f(ray.d)
     else:
         rng = np.random.default_rng(1)
         start, end = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, count, 3)))
         o = 0.8 * start
         d = 0.3 * end - o
         d /= np.linalg.norm(d, axis=1, keepdims=True)
-        found = mi.Point3f(np.float32(o.T)), mi.Vector3f(np.float32(d.T))
-    dr.eval(found)
-    return found
+        result = mi.Point3f(np.float32(o.T)), mi.Vector3f(np.float32(d.T))
+    dr.eval(result)
+    return result
 
 
 def scene_of_mesh(mesh):
@@ -69,10 +69,10 @@ def scene_of_mesh(mesh):
 
 def scene_of_grid(field, resolution: int):
     """A scene of Mitsuba's ``sdfgrid`` with so many cells along the longest side."""
-    from mi_diffind.plugins.support.solids import fitted
+    from mi_diffind.plugins.support.distance_shapes import crop_grid
 
-    values, lower, upper = decode.grid(field, resolution)
-    values, lower, upper = fitted(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
+    values, lower, upper = grids.grid(field, resolution)
+    values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
     box = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
     grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
     return mi.load_dict({"type": "scene", "shape": {"type": "sdfgrid", "grid": grid, "to_world": box}})
@@ -88,34 +88,34 @@ def measured(file: Path, resolution: int, rounds: int) -> dict:
 
     def native(scene):
         def run(o, d, coherent):
-            found = scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=coherent)
-            return found.t, found.is_valid()
+            result = scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=coherent)
+            return result.t, result.is_valid()
 
         return run
 
     runs = {name: native(scene) for name, scene in scenes.items()}
     runs[ARRAYS] = lambda o, d, coherent: tracing.trace(model.field, o, d, dr.inf)
     rows = []
-    for kind in ("primary", "random"):
-        o, d = rays(kind)
+    for ray_set in ("primary", "random"):
+        o, d = rays(ray_set)
         times, hits = {name: [] for name in runs}, {}
         for _ in range(rounds + 2):
             for name, run in runs.items():
-                found = timed(functools.partial(run, o, d, kind == "primary"))
-                times[name].append(found.seconds)
-                hits[name] = np.array(found.value[1])
+                result = timed(functools.partial(run, o, d, ray_set == "primary"))
+                times[name].append(result.seconds)
+                hits[name] = np.array(result.value[1])
         first = times[MESH][2:]
         for name, values in times.items():
             ratios = [b / a for a, b in zip(first, values[2:], strict=True)]
             rows.append({
-                "rays": kind, "name": name, "ns": 1e9 * statistics.median(values[2:]) / SIDE**2,
+                "rays": ray_set, "name": name, "ns": 1e9 * statistics.median(values[2:]) / SIDE**2,
                 "ratio": statistics.median(ratios), "ratio_quartiles": statistics.quantiles(ratios)[::2],
                 "hits_differ": float((hits[name] != hits[MESH]).mean()),
             })  # fmt: skip
             print(json.dumps(rows[-1]), flush=True)
     return {
         "name": Path(model.table.settings["mesh_path"]).stem, "triangles": len(mesh.faces), "bytes": model.nbytes,
-        "index_bytes": tracing.index_of(model.field), "rows": rows,
+        "index_bytes": tracing.index_bytes(model.field), "rows": rows,
     }  # fmt: skip
 
 
@@ -129,10 +129,10 @@ def main() -> None:
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(arguments.threads)
-    found = [measured(file, arguments.grid, arguments.rounds) for file in arguments.files]
+    result = [measured(file, arguments.grid, arguments.rounds) for file in arguments.files]
     if arguments.json:
         given = {"threads": arguments.threads, "rounds": arguments.rounds, "grid": arguments.grid}
-        write_json(arguments.json, {**given, "machine": machine(mi.variant()), "files": found})
+        write_json(arguments.json, {**given, "machine": machine(mi.variant()), "files": result})
 
 
 if __name__ == "__main__":

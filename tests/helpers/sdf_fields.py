@@ -5,7 +5,10 @@ import sys
 import drjit as dr
 import numpy as np
 
+from mi_diffind.compat import module_of
+from mi_diffind.lookup import clamp
 from mi_diffind.tasks.sdf.field import DistanceField
+from mi_diffind.tasks.sdf.paper import edge_steps
 
 
 class Ball(DistanceField):
@@ -49,9 +52,57 @@ class Steps(Ball):
         value, slope = super().gradient(p, active)
         return dr.copysign(dr.abs(value) / 3 + 0.02, value), slope
 
-    def look(self, p, d, active=True):
+    def safe_step(self, p, d, active=True):
         value = self.value(p, active)
         return value, dr.abs(value) - 0.02
+
+
+class TrilinearField(DistanceField):
+    """Trilinear interpolation of ``values``, a tensor (X, Y, Z) whose outermost entries lie on the sides of the box."""
+
+    def __init__(self, values, lower, upper, band: float):
+        self.values = values
+        self.resolution = tuple(values.shape)
+        size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, self.resolution, strict=True)]
+        super().__init__(module_of(values), lower, upper, min(size), band)
+        self.size = tuple(map(float, size))
+        # In each cell, every component of the gradient lies between its four differences along the edges
+        steps = [edge_steps(values.numpy(), axis).astype(np.float64) / h for axis, h in enumerate(self.size)]
+        self.slope = max(1.0, float(np.sqrt(sum(s**2 for s in steps).max())))
+
+    def _read(self, p, active):
+        """For each axis the weight of the upper entry, and the eight entries around points."""
+        UInt32, index, weights = self.types.UInt32, [], []
+        for x, a, h, n in zip(p, self.lower, self.size, self.resolution, strict=True):
+            t = clamp((x - a) / h, 0.0, n - 1.0)
+            i = dr.minimum(UInt32(dr.detach(t)), n - 2)
+            index.append(i)
+            weights.append(t - self.types.Float(i))
+        _, ny, nz = self.resolution
+        first = (index[0] * ny + index[1]) * nz + index[2]
+
+        def get(n):
+            return dr.gather(self.types.Float, self.values.array, first + n, active)
+
+        return weights, [[[get((a * ny + b) * nz + c) for c in (0, 1)] for b in (0, 1)] for a in (0, 1)]
+
+    def value(self, p, active=True):
+        active = self.inside(p) & active
+        (u, s, w), v = self._read(p, active)
+        rows = [dr.lerp(dr.lerp(v[a][0][0], v[a][0][1], w), dr.lerp(v[a][1][0], v[a][1][1], w), s) for a in (0, 1)]
+        return dr.select(active, dr.lerp(rows[0], rows[1], u), self.band)
+
+    def gradient(self, p, active=True):
+        active = self.inside(p) & active
+        (u, s, w), v = self._read(p, active)
+        edge = [[dr.lerp(v[a][b][0], v[a][b][1], w) for b in (0, 1)] for a in (0, 1)]
+        across = [[v[a][b][1] - v[a][b][0] for b in (0, 1)] for a in (0, 1)]
+        lines = [dr.lerp(edge[a][0], edge[a][1], s) for a in (0, 1)]
+        dx = lines[1] - lines[0]
+        dy = dr.lerp(edge[0][1] - edge[0][0], edge[1][1] - edge[1][0], u)
+        dz = dr.lerp(dr.lerp(across[0][0], across[0][1], s), dr.lerp(across[1][0], across[1][1], s), u)
+        slope = self.types.Array3f(dx / self.size[0], dy / self.size[1], dz / self.size[2])
+        return dr.select(active, dr.lerp(lines[0], lines[1], u), self.band), dr.select(active, slope, 0)
 
 
 def torus(p):
@@ -66,7 +117,7 @@ def torus(p):
 def sparse_table(shape=torus, spacing=1 / 40, bits=8, scale=2.0, centre=(0.5, -1.0, 0.25)):
     """The table of a formula's sparse field, as ``fit sdf`` would write it."""
     from mi_diffind.tables import Table
-    from mi_diffind.tasks.sdf import codes, encoding, files, nodes, structure
+    from mi_diffind.tasks.sdf import codes, encoding, model, nodes, structure
 
     lower = np.array([-0.5, -0.5, -0.5]) - 1.5 * spacing
     n = int(np.ceil((1 + 3 * spacing) / spacing)) + 1
@@ -80,38 +131,37 @@ def sparse_table(shape=torus, spacing=1 / 40, bits=8, scale=2.0, centre=(0.5, -1
     def sign(p):
         return shape(np.asarray(p))[0] < 0
 
-    found = structure.build(used, sign(lower + spacing * used), (n, n, n), lower, spacing, sign,
-                            lambda p: np.abs(shape(np.asarray(p))[0]))  # fmt: skip
-    positions, block = found.node_positions()
-    d, g = shape(np.array(found.lower) + spacing * positions)
+    grid = structure.build(used, sign(lower + spacing * used), (n, n, n), lower, spacing, sign)
+    positions, block = grid.node_positions()
+    d, g = shape(np.array(grid.lower) + spacing * positions)
 
     def key(p):
-        return np.ravel_multi_index(p.T, found.shape)
+        return np.ravel_multi_index(p.T, grid.shape)
 
     order = np.argsort(key(positions))
     corners = order[np.searchsorted(key(positions), key(around.reshape(-1, 3)), sorter=order)].reshape(-1, 8)
-    sampled = encoding.Sampled(found, positions, block, d / spacing, g, corners, len(cells), 0.0)
+    sampled = encoding.SampledNodes(grid, positions, block, d / spacing, g, corners, len(cells), 0.0)
     frames = encoding.fit_frames(sampled)
-    wanted = encoding.targets(sampled, frames)
+    wanted = encoding.exact_entries(sampled, frames)
     entries = encoding.cluster(wanted, 2**bits)
     pointers = encoding.assign(wanted, entries)
-    table = Table("sdf", files.sparse_arrays(found, frames, codes.pointer_words(pointers, bits), entries))
+    table = Table("sdf", model.sparse_arrays(grid, frames, codes.pointer_words(pointers, bits), entries))
     table.preset = "sparse"
     slope = nodes.slope_bound(d / spacing, g, corners)
-    table.settings = {"layout": "sparse", "lower": list(found.lower), "spacing": spacing, "bits": bits,
-                      "nodes": found.nodes, "slope": slope, "scale": scale, "centre": list(centre)}  # fmt: skip
+    table.settings = {"layout": "sparse", "lower": list(grid.lower), "spacing": spacing, "bits": bits,
+                      "nodes": grid.nodes, "slope": slope, "scale": scale, "centre": list(centre)}  # fmt: skip
     return table
 
 
 def register(mi, fields: dict, name: str = "test_solid") -> None:
     """A shape ``name`` whose ``field`` is the key of one in ``fields``; its box is as large as in the unit frame."""
-    solids = sys.modules["mi_diffind.plugins.support.solids"]
+    shapes = sys.modules["mi_diffind.plugins.support.distance_shapes"]
 
     def make(props):
-        placement = solids.Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
+        placement = shapes.Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
         return Held(props, fields[props["field"]], placement, props.get("smooth", False))
 
-    class Held(solids.Solid):
+    class Held(shapes.DistanceShape):
         def optimised(self):
             return any(dr.is_diff_v(v) and v.index_ad for v in vars(self.field).values() if isinstance(v, mi.Float))
 

@@ -80,18 +80,18 @@ def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     o[within] = np.stack([0.38 * np.cos(angle), 0.38 * np.sin(angle), 0.05 * np.sin(9 * angle)], 1)[within]
     p, v = mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32))
     hit = tracing.intersect(field, p, v, dr.inf)
-    t, found = np.array(hit.t), np.array(hit.found)
+    t, result = np.array(hit.t), np.array(hit.hit)
     near, far, active = tracing.enter(field, p, v, mi.Float(dr.inf))
     start = dr.clip(dr.fma(v, near, p), mi.Vector3f(*field.lower), mi.Vector3f(*field.upper))
-    other, slow, _ = tracing.spheres(field, start, v, far - near, near == 0, active)
+    other, slow, _ = tracing.sphere_trace(field, start, v, far - near, near == 0, active)
     slow = np.where(other, np.array(near + slow), np.inf)
-    assert (np.array(hit.leaving) == within).all() and found[within].all()
+    assert (np.array(hit.leaving) == within).all() and result[within].all()
     assert np.isclose(t, slow, rtol=0, atol=2e-4).mean() > 0.995
     expected = analytic(o[~within], d[~within])
-    both = np.isfinite(expected) & found[~within]
-    assert (np.isfinite(expected) == found[~within]).mean() > 0.995 and both.mean() > 0.3
+    both = np.isfinite(expected) & result[~within]
+    assert (np.isfinite(expected) == result[~within]).mean() > 0.995 and both.mean() > 0.3
     assert np.median(np.abs(t[~within][both] - expected[both])) < 1e-3
-    where = np.array(hit.p).T[found]
+    where = np.array(hit.p).T[result]
     assert np.abs(np.array(field.value(mi.Point3f(where.T)))).max() < 5e-5
 
 
@@ -114,8 +114,8 @@ def test_axis_aligned_rays_through_cells(mi_rgb, folder):
                         origin[1:] = at[1:] if offset == 0 else 0
                         side = np.hypot(*[0.5, 0]) if offset else 0.38 + np.sqrt(0.12**2 - at[2] ** 2)
                     o.append(origin), d.append(direction), expected.append(distance - side)
-    t, found = tracing.trace(field, mi.Point3f(np.float32(o).T), mi.Vector3f(np.float32(d).T), dr.inf)
-    assert np.array(found).all()
+    t, result = tracing.trace(field, mi.Point3f(np.float32(o).T), mi.Vector3f(np.float32(d).T), dr.inf)
+    assert np.array(result).all()
     assert np.abs(np.array(t) - expected).max() < 3e-3
 
 
@@ -134,9 +134,9 @@ def test_grid_and_arrays_agree_and_are_where_the_mesh_is(mi_rgb, folder, turned)
     }
     images, boxes = {}, {}
     for name, dictionary in shapes.items():
-        made = scene(mi, {"torus": {**dictionary, **bsdf, **to_world}})
-        images[name] = np.array(mi.render(made, spp=64, seed=1))
-        box = made.bbox()
+        loaded = scene(mi, {"torus": {**dictionary, **bsdf, **to_world}})
+        images[name] = np.array(mi.render(loaded, spp=64, seed=1))
+        box = loaded.bbox()
         boxes[name] = np.array([box.min, box.max])
     assert np.abs(images["arrays"] - images["grid"]).mean() < 2.5e-3  # noise of 64 samples included
     assert np.abs(images["arrays"] - images["mesh"]).mean() < 2.5e-3
@@ -149,25 +149,25 @@ def test_grid_and_arrays_agree_and_are_where_the_mesh_is(mi_rgb, folder, turned)
 def test_reports(mi_rgb, folder):
     mi = mi_rgb
     turned = mi.ScalarTransform4f().rotate([0, 0, 1], 30)
-    made = scene(mi, {
+    loaded = scene(mi, {
         "a": shape(folder, id="a"),
         "b": shape(folder, id="b", trace="grid", resolution=24),
         "c": shape(folder, id="c", trace="grid", resolution=24, to_world=turned),
     })  # fmt: skip
-    found = {entry["trace"] + str("to_world" in entry["parameters"]): entry for entry in scenes.reports(made)}
-    assert set(found) == {"arraysFalse", "gridFalse", "gridTrue"}
-    assert found["arraysFalse"]["table_bytes"] < 100_000 and found["arraysFalse"]["index_bytes"] > 0
-    turned = found["gridTrue"]
+    result = {entry["trace"] + str("to_world" in entry["parameters"]): entry for entry in scenes.reports(loaded)}
+    assert set(result) == {"arraysFalse", "gridFalse", "gridTrue"}
+    assert result["arraysFalse"]["table_bytes"] < 100_000 and result["arraysFalse"]["index_bytes"] > 0
+    turned = result["gridTrue"]
     assert turned["resolution"] == 24 and turned["grid_bytes"] == 4 * np.prod(np.add(turned["cells"], 1))
     assert turned["memory_bytes"] == 40 * np.prod(turned["cells"]) and "24 cells" in turned["decoded"]
-    json.dumps(list(found.values()))
+    json.dumps(list(result.values()))
 
 
 def test_shapes_of_one_file_share_its_arrays(mi_rgb, folder):
-    made = scene(mi_rgb, {"a": shape(folder), "b": shape(folder)})
-    a, b = (s for s in made.shapes() if isinstance(s, mi_rgb.Mesh))
+    loaded = scene(mi_rgb, {"a": shape(folder), "b": shape(folder)})
+    a, b = (s for s in loaded.shapes() if isinstance(s, mi_rgb.Mesh))
     assert a.model.field is b.model.field
-    params = mi_rgb.traverse(made)
+    params = mi_rgb.traverse(loaded)
     assert not [key for key in params.keys() if "vertex" in key or "tables" in key]
     assert "a.bsdf.reflectance.value" in params
 
@@ -203,8 +203,8 @@ def test_derivatives_reach_the_nodes(mi_rgb, folder):
         "to_world": mi.ScalarTransform4f().look_at([0.5, -3, 2.5], [0.5, -1.75, 0.4], [0, 0, 1]),
     }
     close["film"] = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
-    made = scene(mi, {"a": shape(folder, storage="float32", normals="analytic")}, sensor=close)
-    params = mi.traverse(made)
+    loaded = scene(mi, {"a": shape(folder, storage="float32", normals="analytic")}, sensor=close)
+    params = mi.traverse(loaded)
     key = "a.tables.nodes"
     nodes = mi.TensorXf(params[key])
     integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
@@ -215,16 +215,16 @@ def test_derivatives_reach_the_nodes(mi_rgb, folder):
     for sign in (1, -1):
         params[key] = mi.TensorXf(flat + sign * step)
         params.update()
-        images.append(np.array(mi.render(made, spp=16, seed=2, integrator=integrator)))
+        images.append(np.array(mi.render(loaded, spp=16, seed=2, integrator=integrator)))
     differences = (images[0] - images[1]).sum() / 0.04
     params[key] = mi.TensorXf(flat)
     dr.enable_grad(params[key])
     params.update()
-    image = mi.render(made, params, spp=16, seed=2, integrator=integrator)
+    image = mi.render(loaded, params, spp=16, seed=2, integrator=integrator)
     dr.backward(dr.sum(image.array))
-    found = np.array(dr.grad(params[key]))[:, 0].sum()
+    result = np.array(dr.grad(params[key]))[:, 0].sum()
     assert abs(differences) > 1e-3
-    assert found == pytest.approx(differences, rel=0.03)
+    assert result == pytest.approx(differences, rel=0.03)
 
 
 # -- how fine a grid is ------------------------------------------------------------------------------------------------
@@ -258,11 +258,11 @@ def as_grid(mi, file, **more):
 
 def grid_of(mi, file, **more):
     """What a shape that is a grid reports, its values (Z, Y, X), and its box."""
-    made = as_grid(mi, file, **more)
-    values = np.array(mi.traverse(made)["a.grid"])[..., 0]
-    box = made.bbox()
-    (said,) = scenes.reports(made)
-    return said, values, np.array(box.min), np.array(box.max)
+    loaded = as_grid(mi, file, **more)
+    values = np.array(mi.traverse(loaded)["a.grid"])[..., 0]
+    box = loaded.bbox()
+    (report,) = scenes.reports(loaded)
+    return report, values, np.array(box.min), np.array(box.max)
 
 
 def off_the_field(mi, file, values, lower, upper):
@@ -275,17 +275,17 @@ def off_the_field(mi, file, values, lower, upper):
     a, b = np.random.default_rng(3).uniform(0, 2 * np.pi, (2, 30000))
     p = np.stack([(0.38 + 0.12 * np.cos(b)) * np.cos(a), 0.12 * np.sin(b), (0.38 + 0.12 * np.cos(b)) * np.sin(a)], 1)
     place = (SCALE * p + CENTRE - lower) / (upper - lower) * (np.array(values.shape[::-1]) - 1)
-    found = map_coordinates(values.astype(np.float64), place.T[::-1], order=1)
-    return np.abs(found - field.value(mi.Point3f(p.T.astype(np.float32))).numpy()).mean()
+    result = map_coordinates(values.astype(np.float64), place.T[::-1], order=1)
+    return np.abs(result - field.value(mi.Point3f(p.T.astype(np.float32))).numpy()).mean()
 
 
 @pytest.mark.parametrize("error", [3e-4, 1e-4])
 def test_grids_are_as_coarse_as_the_error_of_the_arrays_allows(mi_rgb, upright_files, error):
     """By brute force: the chosen grid keeps below that error, one that is 6% coarser does not."""
-    said, *grid = grid_of(mi_rgb, upright_files[error])
-    assert said["arrays_error"] == error and said["arrays_error_measured"] and said["error"] <= error
-    assert said["error"] == pytest.approx(off_the_field(mi_rgb, upright_files[error], *grid), rel=0.06)
-    coarser, *grid = grid_of(mi_rgb, upright_files[error], resolution=int(said["resolution"] / 1.06))
+    report, *grid = grid_of(mi_rgb, upright_files[error])
+    assert report["arrays_error"] == error and report["arrays_error_measured"] and report["error"] <= error
+    assert report["error"] == pytest.approx(off_the_field(mi_rgb, upright_files[error], *grid), rel=0.06)
+    coarser, *grid = grid_of(mi_rgb, upright_files[error], resolution=int(report["resolution"] / 1.06))
     assert off_the_field(mi_rgb, upright_files[error], *grid) > 0.97 * error
     assert coarser["error"] > 0.97 * error
 
@@ -293,10 +293,10 @@ def test_grids_are_as_coarse_as_the_error_of_the_arrays_allows(mi_rgb, upright_f
 def test_grids_are_cut_to_what_is_inside(mi_rgb, upright_files):
     """As many bytes as there are nodes; Y is shorter than X and Z, and the torus is hit where it is all the same."""
     mi = mi_rgb
-    said, values, lower, upper = grid_of(mi, upright_files[3e-4], normals="analytic")
+    report, values, lower, upper = grid_of(mi, upright_files[3e-4], normals="analytic")
     z, y, x = values.shape
-    assert z == x > 2.5 * y and said["cells"] == [x - 1, y - 1, z - 1]
-    assert said["grid_bytes"] == 4 * x * y * z and said["memory_bytes"] == 40 * (x - 1) * (y - 1) * (z - 1)
+    assert z == x > 2.5 * y and report["cells"] == [x - 1, y - 1, z - 1]
+    assert report["grid_bytes"] == 4 * x * y * z and report["memory_bytes"] == 40 * (x - 1) * (y - 1) * (z - 1)
     half, cell = SCALE * np.array([0.5, 0.12, 0.5]), (upper - lower) / np.array([x - 1, y - 1, z - 1])
     assert np.allclose(cell, cell[0], rtol=1e-4)
     assert (
@@ -305,11 +305,11 @@ def test_grids_are_cut_to_what_is_inside(mi_rgb, upright_files):
     o, d = rays(np.random.default_rng(4))
     o, d = o[:, [0, 2, 1]], d[:, [0, 2, 1]]
     expected = analytic(o[:, [0, 2, 1]], d[:, [0, 2, 1]])
-    made = mi.load_dict(
+    loaded = mi.load_dict(
         {"type": "scene", "a": {"type": "neural_sdf", "filename": str(upright_files[3e-4]), "trace": "grid"}}
     )
     ray = mi.Ray3f(mi.Point3f((SCALE * o + CENTRE).T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
-    t = np.array(made.ray_intersect(ray).t) / SCALE
+    t = np.array(loaded.ray_intersect(ray).t) / SCALE
     both = np.isfinite(expected) & np.isfinite(t)
     assert (np.isfinite(expected) == np.isfinite(t)).mean() > 0.995 and both.mean() > 0.3
     assert np.median(np.abs(t[both] - expected[both])) < 1e-3
@@ -317,24 +317,24 @@ def test_grids_are_cut_to_what_is_inside(mi_rgb, upright_files):
 
 def test_grids_of_sparse_fields(mi_rgb, upright_files):
     """Where no node is stored, one value of a block stands for all: as if each had been asked for."""
-    from mi_diffind.tasks.sdf import TASK, decode
+    from mi_diffind.tasks.sdf import TASK, grids
 
     field = TASK.open(mi_rgb.TensorXf, upright_files[None]).field
     for resolution in (70, 150):
-        values, lower, upper = decode.grid(field, resolution)
+        values, lower, upper = grids.grid(field, resolution)
         shape = values.shape[::-1]
-        expected = decode.node_values(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape).transpose(2, 1, 0)
+        expected = grids.node_values(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape).transpose(2, 1, 0)
         assert np.abs(values - expected).max() < 1e-6
-        crossed = decode.crossed_blocks(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape)
+        crossed = grids.crossed_blocks(field, lower, (upper[0] - lower[0]) / (shape[0] - 1), shape)
         assert crossed.any() and (resolution < 100 or crossed.mean() < 0.9)
 
 
 def warnings_of(mi, monkeypatch):
     """What Mitsuba is told to warn of from here on."""
-    said = []
+    report = []
     mi.set_log_level(mi.LogLevel.Warn)  # commands that ran before may have asked for less
-    monkeypatch.setattr(mi, "Log", lambda level, text: said.append(text) if level == mi.LogLevel.Warn else None)
-    return said
+    monkeypatch.setattr(mi, "Log", lambda level, text: report.append(text) if level == mi.LogLevel.Warn else None)
+    return report
 
 
 def test_grids_are_no_larger_than_allowed(mi_rgb, upright_files, monkeypatch):
@@ -342,11 +342,11 @@ def test_grids_are_no_larger_than_allowed(mi_rgb, upright_files, monkeypatch):
     plugin = plugins.declared()["neural_sdf"].factory.__globals__  # each variant has modules of its own
     warned = warnings_of(mi_rgb, monkeypatch)
     monkeypatch.setitem(plugin, "LARGEST", 2_000_000)
-    said, *_ = grid_of(mi_rgb, upright_files[1e-6])
-    assert said["memory_bytes"] < 2_000_000 and said["error"] > 10 * said["arrays_error"]
-    assert len(warned) == 1 and said["decoded"] in warned[0] and "1e-06 off the mesh" in warned[0]
-    asked, *_ = grid_of(mi_rgb, upright_files[1e-6], resolution=80)
-    assert asked["memory_bytes"] > 2_000_000 and len(warned) == 1
+    report, *_ = grid_of(mi_rgb, upright_files[1e-6])
+    assert report["memory_bytes"] < 2_000_000 and report["error"] > 10 * report["arrays_error"]
+    assert len(warned) == 1 and report["decoded"] in warned[0] and "1e-06 off the mesh" in warned[0]
+    requested, *_ = grid_of(mi_rgb, upright_files[1e-6], resolution=80)
+    assert requested["memory_bytes"] > 2_000_000 and len(warned) == 1
     monkeypatch.setitem(plugin, "FINEST", 20)
     assert grid_of(mi_rgb, upright_files[1e-6])[0]["resolution"] == 20
     box = [1.0, 0.3, 0.6]
@@ -355,26 +355,26 @@ def test_grids_are_no_larger_than_allowed(mi_rgb, upright_files, monkeypatch):
 
 
 def test_grids_of_files_that_tell_no_error(mi_rgb, upright_files):
-    said, *_ = grid_of(mi_rgb, upright_files[None])
-    assert not said["arrays_error_measured"] and said["arrays_error"] == pytest.approx(0.005 / 40)
-    assert said["error"] <= said["arrays_error"] and "about" in said["decoded"]
+    report, *_ = grid_of(mi_rgb, upright_files[None])
+    assert not report["arrays_error_measured"] and report["arrays_error"] == pytest.approx(0.005 / 40)
+    assert report["error"] <= report["arrays_error"] and "about" in report["decoded"]
 
 
 def test_images_of_grids_are_those_of_arrays(mi_rgb, folder):
     """At the resolution that is found by itself and with the same random numbers, most of the noise cancels."""
     images = []
     for trace in ("arrays", "grid"):
-        made = scene(mi_rgb, {"torus": shape(folder, trace=trace)})
-        images.append(np.array(mi_rgb.render(made, spp=64, seed=1)))
-    assert scenes.reports(made)[0]["resolution"] < 80
+        loaded = scene(mi_rgb, {"torus": shape(folder, trace=trace)})
+        images.append(np.array(mi_rgb.render(loaded, spp=64, seed=1)))
+    assert scenes.reports(loaded)[0]["resolution"] < 80
     assert np.abs(images[0] - images[1]).mean() < 1e-3 < np.abs(images[0] - images[0].mean()).mean() / 20
 
 
 def test_grids_without_anything_inside(mi_rgb):
-    from mi_diffind.plugins.support import solids
+    from mi_diffind.plugins.support import distance_shapes
 
     with pytest.raises(RuntimeError, match="nothing is inside at 6 cells"):
-        solids.fitted(np.ones((5, 6, 7)), np.zeros(3), 0.1)
+        distance_shapes.crop_grid(np.ones((5, 6, 7)), np.zeros(3), 0.1)
 
 
 # -- what cannot be ----------------------------------------------------------------------------------------------------
@@ -455,11 +455,11 @@ def test_other_integrators_see_a_grid(mi_rgb, folder, tmp_path, monkeypatch, xml
     warned = warnings_of(mi_rgb, monkeypatch)
     path = written(folder, tmp_path, '<integer name="resolution" value="40"/>', xml)
     for load in (scenes.load, scenes.load_file):
-        made = load(path)
-        (said,) = scenes.reports(made)
-        assert said["trace"] == "grid" and warned.pop().endswith(said["decoded"]) and not warned
+        loaded = load(path)
+        (report,) = scenes.reports(loaded)
+        assert report["trace"] == "grid" and warned.pop().endswith(report["decoded"]) and not warned
         ray = mi_rgb.Ray3f(mi_rgb.Point3f(CENTRE[0] + 0.76, CENTRE[1], 5), mi_rgb.Vector3f(0, 0, -1))
-        assert dr.all(made.ray_test(ray))
+        assert dr.all(loaded.ray_test(ray))
 
 
 @pytest.mark.parametrize("xml", OURS)
@@ -467,8 +467,8 @@ def test_our_integrator_sees_arrays(mi_rgb, folder, tmp_path, monkeypatch, xml):
     """Also within another one."""
     warned = warnings_of(mi_rgb, monkeypatch)
     for load in (scenes.load, scenes.load_file):
-        (said,) = scenes.reports(load(written(folder, tmp_path, "", xml)))
-        assert said["trace"] == "arrays" and not warned
+        (report,) = scenes.reports(load(written(folder, tmp_path, "", xml)))
+        assert report["trace"] == "arrays" and not warned
 
 
 def test_commands_tell_what_a_grid_takes(mi_rgb, folder, tmp_path, capsys):
@@ -477,8 +477,8 @@ def test_commands_tell_what_a_grid_takes(mi_rgb, folder, tmp_path, capsys):
 
     path = written(folder, tmp_path, '<integer name="resolution" value="40"/>', STOCK[0])
     assert main(["render", str(path), "-o", str(tmp_path / "a.exr"), "--spp", "1", "--variant", mi_rgb.variant()]) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if "decoded to a grid" in line]
-    assert len(said) == 1 and said[0].startswith("warning: ") and "MB in Mitsuba" in said[0]
+    report = [line for line in capsys.readouterr().err.splitlines() if "decoded to a grid" in line]
+    assert len(report) == 1 and report[0].startswith("warning: ") and "MB in Mitsuba" in report[0]
 
 
 def test_scenes_without_an_integrator(mi_rgb, folder, tmp_path, monkeypatch):
@@ -499,8 +499,8 @@ def test_arrays_that_other_integrators_do_not_see(mi_rgb, folder, tmp_path, monk
     with pytest.raises(SceneError, match=r'"ring".*"path_sdf".*found.*"path"'):
         scenes.load(path)
     assert scenes.reports(scenes.load_file(path))[0]["trace"] == "arrays" and len(warned) == 1
-    made = scenes.load(written(folder, tmp_path, more, TRACED))
-    assert len(made.shapes()) == 1
+    loaded = scenes.load(written(folder, tmp_path, more, TRACED))
+    assert len(loaded.shapes()) == 1
     mesh = scenes.load(path, exact=True).shapes()[0]
     assert mesh.face_count() == 96 * 48 * 2 and type(mesh) is mi_rgb.Mesh
 
@@ -513,8 +513,8 @@ def test_load_file_takes_what_mitsuba_takes(mi_rgb, folder, tmp_path):
         '<default name="n" value="3"/>' + integrator("path_sdf", '<integer name="max_depth" value="$n"/>'),
     )
     for parallel in (True, False):
-        made = scenes.load_file(path, parallel=parallel, optimize=False, n=7)
-        assert made.integrator().max_depth == 7
+        loaded = scenes.load_file(path, parallel=parallel, optimize=False, n=7)
+        assert loaded.integrator().max_depth == 7
     with pytest.raises(RuntimeError, match=r"none\.xml"):
         scenes.load_file(tmp_path / "none.xml")
     with pytest.raises(RuntimeError, match="unused"):

@@ -13,7 +13,7 @@ BSDFS = {
 }
 
 
-def scene(mi, shapes: dict, size=(32, 24), look=((0, -5, 2.5), (0, 0, 0)), **more):
+def scene(mi, shapes: dict, size=(32, 24), view=((0, -5, 2.5), (0, 0, 0)), **more):
     """Shapes on a floor, with a lamp, a point light and a sky."""
     at = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}}
@@ -27,7 +27,7 @@ def scene(mi, shapes: dict, size=(32, 24), look=((0, -5, 2.5), (0, 0, 0)), **mor
         "sensor": {
             "type": "perspective",
             "fov": 45,
-            "to_world": at().look_at(*look, [0, 0, 1]),
+            "to_world": at().look_at(*view, [0, 0, 1]),
             "film": film,
             "sampler": {"type": "independent"},
         },
@@ -36,9 +36,9 @@ def scene(mi, shapes: dict, size=(32, 24), look=((0, -5, 2.5), (0, 0, 0)), **mor
     })  # fmt: skip
 
 
-def render(mi, made, integrator="path_sdf", spp=16, seed=0, **options):
-    found = mi.load_dict({"type": integrator, "max_depth": 6, **options})
-    return np.array(mi.render(made, spp=spp, seed=seed, integrator=found))
+def render(mi, loaded, integrator="path_sdf", spp=16, seed=0, **options):
+    tracer = mi.load_dict({"type": integrator, "max_depth": 6, **options})
+    return np.array(mi.render(loaded, spp=spp, seed=seed, integrator=tracer))
 
 
 @pytest.fixture
@@ -47,9 +47,9 @@ def fields(mi_rgb):
     import mi_diffind.compat
 
     types = mi_diffind.compat.module_of(mi_rgb.Float)
-    found = {"ball": Ball(types), "aside": Ball(types, 0.3, (0.15, 0.1, -0.05))}
-    register(mi_rgb, found)
-    return found
+    by_name = {"ball": Ball(types), "aside": Ball(types, 0.3, (0.15, 0.1, -0.05))}
+    register(mi_rgb, by_name)
+    return by_name
 
 
 def solid(mi, name, scale=2.5, **more):
@@ -74,19 +74,21 @@ def same_light(one, other, passes=16):
 @pytest.mark.parametrize("integrator", ["path_footprint", "prb"])
 def test_scenes_without_solids(mi_rgb, integrator):
     ball = {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}}
-    made = scene(mi_rgb, ball)
-    found, expected = (render(mi_rgb, made, name) for name in ("path_sdf", integrator))
-    assert np.allclose(found, expected, rtol=1e-5, atol=1e-6)
+    loaded = scene(mi_rgb, ball)
+    actual, expected = (render(mi_rgb, loaded, name) for name in ("path_sdf", integrator))
+    assert np.allclose(actual, expected, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", [*BSDFS])
-def test_balls_are_spheres(mi_rgb, fields, name):
-    """Light, shadows, reflections and refractions of a solid are those of Mitsuba's sphere."""
-    mi, bsdf = mi_rgb, BSDFS[name]
+@pytest.mark.parametrize("names", [("diffuse", "rough"), ("glass", "mask")], ids="-".join)
+def test_balls_are_spheres(mi_rgb, fields, names):
+    """Light, shadows, reflections and refractions of solids are those of Mitsuba's spheres, two materials a scene."""
+    mi, (first, second) = mi_rgb, (BSDFS[name] for name in names)
     other = {"other": {"type": "sphere", "center": [1.6, 1.0, -0.4], "radius": 0.6, "bsdf": BSDFS["diffuse"]}}
-    found = scene(mi, {"ball": solid(mi, "ball", bsdf=bsdf), **other})
-    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": bsdf}, **other})
-    same_light(lambda seed: render(mi, found, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+    beside = {"to_world": mi.ScalarTransform4f().translate([-1.4, -1.2, 0.2]).scale(2.0), "bsdf": second}
+    actual = scene(mi, {"ball": solid(mi, "ball", bsdf=first), "beside": {**solid(mi, "ball"), **beside}, **other})
+    sphere = {"type": "sphere", "center": [-1.4, -1.2, 0.2], "radius": 0.8, "bsdf": second}
+    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": first}, "beside": sphere, **other})
+    same_light(lambda seed: render(mi, actual, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
 
 
 def test_several_solids_turned_scaled_and_overlapping(mi_rgb, fields):
@@ -105,15 +107,15 @@ def test_several_solids_turned_scaled_and_overlapping(mi_rgb, fields):
         centre = np.array(turn.matrix)[:3] @ [0.15, 0.1, -0.05, 1]
         radius = 0.3 * np.cbrt(abs(np.linalg.det(np.array(turn.matrix)[:3, :3])))
         spheres[name] = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": bsdfs[name]}
-    found, expected = scene(mi, {**solids, **block}), scene(mi, {**spheres, **block})
-    same_light(lambda seed: render(mi, found, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+    actual, expected = scene(mi, {**solids, **block}), scene(mi, {**spheres, **block})
+    same_light(lambda seed: render(mi, actual, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
 
 
 @pytest.mark.parametrize("place", ["within glass", "behind glass", "in the box"])
 def test_where_the_camera_is(mi_rgb, fields, place):
     mi = mi_rgb
     shape = {"within glass": "glass", "behind glass": "glass", "in the box": "diffuse"}[place]
-    look = {
+    view = {
         "within glass": ((0.1, -0.5, 0.2), (0.5, 0.5, -0.2)),
         "behind glass": ((0, -4, 0.2), (0, 0, 0)),
         "in the box": ((0.95, -0.95, 0.95), (0, 0.2, 0)),
@@ -121,18 +123,18 @@ def test_where_the_camera_is(mi_rgb, fields, place):
     pane = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, -2, 0]).scale([1.5, 0.1, 1.5])}
     panes = {"pane": {**pane, "bsdf": BSDFS["glass"]}} if place == "behind glass" else {}
     bsdf = BSDFS["diffuse" if place == "behind glass" else shape]
-    found = scene(mi, {"ball": solid(mi, "ball", bsdf=bsdf), **panes}, look=look)
-    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": bsdf}, **panes}, look=look)
-    same_light(lambda seed: render(mi, found, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+    actual = scene(mi, {"ball": solid(mi, "ball", bsdf=bsdf), **panes}, view=view)
+    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": bsdf}, **panes}, view=view)
+    same_light(lambda seed: render(mi, actual, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
 
 
 @pytest.mark.parametrize("options", [{"max_depth": 1}, {"max_depth": 2, "hide_emitters": True}, {"rr_depth": 1}])
 def test_depths_and_hidden_emitters(mi_rgb, fields, options):
-    mi, look = mi_rgb, ((0, -5, 8.0), (0, 0, 1))
-    found = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, look=look)
-    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}}, look=look)
+    mi, view = mi_rgb, ((0, -5, 8.0), (0, 0, 1))
+    actual = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, view=view)
+    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}}, view=view)
     same_light(
-        lambda seed: render(mi, found, seed=seed, **options),
+        lambda seed: render(mi, actual, seed=seed, **options),
         lambda seed: render(mi, expected, "path", seed=seed, **options),
     )
 
@@ -140,22 +142,22 @@ def test_depths_and_hidden_emitters(mi_rgb, fields, options):
 def test_solids_are_not_hit_by_other_rays(mi_rgb, fields):
     """The shape that stands for a solid tells its extent, and is nowhere."""
     mi = mi_rgb
-    made = mi.load_dict({"type": "scene", "ball": solid(mi, "ball")})
-    box = made.bbox()
+    loaded = mi.load_dict({"type": "scene", "ball": solid(mi, "ball")})
+    box = loaded.bbox()
     assert np.allclose([box.min, box.max], [[-1.25] * 3, [1.25] * 3], atol=1e-6)
     corners = np.stack(np.meshgrid(*[[-1.25, 1.25]] * 3), -1).reshape(-1, 3)
     towards = np.repeat(corners, 8, 0)
     d = towards - np.tile(corners * 3 + 0.1, (8, 1))
     ray = mi.Ray3f(mi.Point3f((towards - d).T), mi.Vector3f(d.T))
-    assert not dr.any(made.ray_test(ray)) and not dr.any(made.ray_intersect(ray).is_valid())
+    assert not dr.any(loaded.ray_test(ray)) and not dr.any(loaded.ray_intersect(ray).is_valid())
 
 
 def test_solids_in_groups_are_refused(mi_rgb, fields):
     mi = mi_rgb
     group = {"type": "shapegroup", "ball": solid(mi, "ball")}
-    made = scene(mi, {"group": group, "one": {"type": "instance", "group": {"type": "ref", "id": "group"}}})
+    loaded = scene(mi, {"group": group, "one": {"type": "instance", "group": {"type": "ref", "id": "group"}}})
     with pytest.raises(RuntimeError) as raised:
-        render(mi, made)
+        render(mi, loaded)
     from mi_diffind import compat
 
     assert "is in a shapegroup" in compat.one_sentence(raised.value)
@@ -187,16 +189,16 @@ def interior(mi):
     return {"sensor": {"type": "perspective", "fov": 20, "to_world": at, "film": film}}
 
 
-def both_modes(mi, made, ball, depth, spp=64, seed=3):
+def both_modes(mi, loaded, ball, depth, spp=64, seed=3):
     """The image's derivative with respect to the radius, and its sum as it comes backward."""
     integrator = mi.load_dict({"type": "path_sdf", "max_depth": depth})
     ball.r = r = mi.Float(0.4)
     dr.enable_grad(r)
     dr.set_grad(r, 1.0)
-    forward = np.array(integrator.render_forward(made, None, spp=spp, seed=seed))
+    forward = np.array(integrator.render_forward(loaded, None, spp=spp, seed=seed))
     ball.r = r = mi.Float(0.4)
     dr.enable_grad(r)
-    integrator.render_backward(made, None, dr.ones(mi.TensorXf, forward.shape), spp=spp, seed=seed)
+    integrator.render_backward(loaded, None, dr.ones(mi.TensorXf, forward.shape), spp=spp, seed=seed)
     backward = np.array(dr.grad(r))
     ball.r = mi.Float(0.4)
     assert backward == pytest.approx(forward.sum(), rel=1e-3)
@@ -208,20 +210,22 @@ def test_derivatives_are_those_of_prb(mi_rgb, fields, name, depth):
     """The same random numbers lead to the same derivatives as for Mitsuba's own sphere, at all vertices of a path."""
     mi = mi_rgb
     other = {"other": {"type": "sphere", "center": [0.6, -0.9, 1.6], "radius": 0.5, "bsdf": BSDFS["rough"]}}
-    made = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS[name]), **other}, **interior(mi))
-    found, _ = both_modes(mi, made, fields["ball"], depth)
-    made = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS[name]}, **other}, **interior(mi))
-    params = mi.traverse(made)
+    loaded = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS[name]), **other}, **interior(mi))
+    actual, _ = both_modes(mi, loaded, fields["ball"], depth)
+    loaded = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS[name]}, **other}, **interior(mi))
+    params = mi.traverse(loaded)
     r = mi.Float(0.4)
     dr.enable_grad(r)
     params["ball.to_world"] = mi.AffineTransform4f().scale(2.5 * r)
     params.update()
     dr.forward(r, dr.ADFlag.ClearEdges)
-    expected = np.array(mi.load_dict({"type": "prb", "max_depth": depth}).render_forward(made, params, spp=64, seed=3))
+    expected = np.array(
+        mi.load_dict({"type": "prb", "max_depth": depth}).render_forward(loaded, params, spp=64, seed=3)
+    )
     # Where paths part, by a rounding error or since frames differ, derivatives are other ones
-    error = np.abs(found - expected)
+    error = np.abs(actual - expected)
     assert np.median(error) < 0.02 * np.median(np.abs(expected))
-    assert found.mean() == pytest.approx(expected.mean(), rel=0.01 if depth == 2 else 0.15)
+    assert actual.mean() == pytest.approx(expected.mean(), rel=0.01 if depth == 2 else 0.15)
 
 
 def test_derivatives_against_differences(mi_rgb, fields):
@@ -229,12 +233,12 @@ def test_derivatives_against_differences(mi_rgb, fields):
     mi, ball = mi_rgb, fields["ball"]
     point = {"type": "point", "position": [-3, -4, 4], "intensity": 20.0}
     dark = {name: {"type": "sphere", "center": [0, 0, 99]} for name in ("lamp", "sky")}
-    made = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, **interior(mi), point=point, **dark)
+    loaded = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, **interior(mi), point=point, **dark)
     integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
     images = []
     for r in (0.399, 0.401):
         ball.r = mi.Float(r)
-        images.append(np.array(mi.render(made, spp=64, seed=3, integrator=integrator)))
+        images.append(np.array(mi.render(loaded, spp=64, seed=3, integrator=integrator)))
     differences = (images[1] - images[0]) / 2e-3
-    forward, _ = both_modes(mi, made, ball, 2)
+    forward, _ = both_modes(mi, loaded, ball, 2)
     assert np.abs(forward - differences).mean() < 2e-3 * np.abs(differences).mean()

@@ -9,8 +9,8 @@ import drjit as dr
 import numpy as np
 
 from ...bits import mask_words
-from ...tasks.sdf.cells import CORNERS, surface_cells
 from ...tasks.sdf.distances import Distances
+from ...tasks.sdf.sampling import CORNERS, surface_cells
 from .byte_grids import NEAREST, ByteCells, dequantised, places, quantised, slope_bound
 
 #: Components of a direction below this count as zero.
@@ -131,7 +131,7 @@ class Bricks(ByteCells):
         nearest = dr.select(dr.isfinite(nearest), nearest, 0)
         return dr.maximum(nearest, 0) + 1e-3 * self.spacing
 
-    def look(self, p, d, active=True):
+    def safe_step(self, p, d, active=True):
         active = self.inside(p) & active
         index, weights = zip(*self._cell(p), strict=True)
         corners, stored = self._stored_corners(index, active)

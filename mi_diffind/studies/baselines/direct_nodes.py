@@ -77,13 +77,13 @@ class DirectNodes(SparseNodes):
         return self.structure.nbytes + self.kept
 
 
-class DirectCoding(encoding.Coding):
+class DirectCoding(encoding.NodeCoding):
     """
-    In place of frames, a cascaded array and pointers: the ``pointers`` are numbers that say it all. Decided on as those
-    are: half of the nodes first; no node changes its side; the surface stays within the cells.
+    In place of frames, a cascaded array and pointers: the ``pointers`` are numbers that say it all. No node changes its
+    side; the surface stays within the cells.
     """
 
-    def __init__(self, sampled: encoding.Sampled, seed: int = 0):
+    def __init__(self, sampled: encoding.SampledNodes, seed: int = 0):
         super().__init__(sampled, 16, seed)
 
     @property
@@ -92,13 +92,11 @@ class DirectCoding(encoding.Coding):
         structure = self.sampled.structure
         return structure.nbytes + 4 * -(-structure.nodes // 2)
 
-    def commit(self, values: np.ndarray, share: float) -> None:
-        order = np.random.default_rng([self.seed, 1]).random(len(values))
-        now = np.flatnonzero((order < share) & ~self.done)
-        self._write(now, values[now, 0], to_octahedral(values[now, 1:]))
-        self.done[now] = True
-        self._keep_sides(values, now)
-        for _ in range(encoding.REPAIRS if share >= 1 else 0):
+    def encode(self, values: np.ndarray) -> None:
+        nodes = np.arange(len(values))
+        self._write(nodes, values[:, 0], to_octahedral(values[:, 1:]))
+        self._keep_sides(values, nodes)
+        for _ in range(encoding.REPAIRS):
             self._keep_sides(values, self._hold_borders())
 
     def _write(self, nodes: np.ndarray, distances: np.ndarray, normals: np.ndarray) -> None:
@@ -119,9 +117,6 @@ class DirectCoding(encoding.Coding):
     def values(self) -> np.ndarray:
         normals = octahedral(_normals(self.pointers))
         return np.concatenate([_distances(self.pointers)[:, None], normals], axis=1).astype(np.float32)
-
-    def state(self) -> dict[str, np.ndarray]:
-        return {"pointers": self.pointers, "done": self.done}
 
     def field(self, types) -> DirectNodes:
         """What it decided on."""

@@ -12,10 +12,10 @@ import drjit as dr
 import numpy as np
 
 from ...fitting import Problem
-from ...tasks.sdf import samples
 from ...tasks.sdf.distances import Distances
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
+from ...tasks.sdf.sampling import sample_box, sample_near
 from ...units import largest_fitting
 from .networks import Network
 
@@ -76,7 +76,7 @@ class HashDistanceField(DistanceField):
         value = dr.clip(dr.detach(value), -BAND, BAND)
         return dr.select(active, value, BAND), dr.select(active, slope, 0)
 
-    def look(self, p, d, active=True):
+    def safe_step(self, p, d, active=True):
         raise NotImplementedError("no bound of the slope of a network is known")
 
 
@@ -122,7 +122,7 @@ def pool(distances: Distances, lower, upper, count: int, seed: int) -> tuple[np.
     Three quarters are near the surface (normal distributions of 0.002 and 0.01), the others uniform.
     """
     rng = np.random.default_rng(seed)
-    near = [samples.near(distances.mesh, 3 * count // 8, width, rng) for width in (0.002, 0.01)]
-    rest = samples.far(lower, upper, count - sum(map(len, near)), rng)
+    near = [sample_near(distances.mesh, 3 * count // 8, width, rng) for width in (0.002, 0.01)]
+    rest = sample_box(lower, upper, count - sum(map(len, near)), rng)
     points = np.clip(np.concatenate([*near, rest]), lower, upper)[rng.permutation(count)].astype(np.float32)
     return points, distances.signed(points, 2 * BAND)

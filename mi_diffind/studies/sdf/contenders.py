@@ -16,9 +16,9 @@ from pathlib import Path
 from ...fitting import FitSettings
 from ...measure.study import Candidate
 from ...measure.training import ConvergenceTraining
-from ...tasks.sdf import decode
 from ...tasks.sdf.distances import Distances
-from ...tasks.sdf.evaluation import Evaluation
+from ...tasks.sdf.evaluation import SurfaceEvaluation
+from ...tasks.sdf.extraction import extract
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 from .. import equal_memory
@@ -47,7 +47,6 @@ PARTS = {
     "bits6": "6 bits a pointer",
     "bits8": "8 bits a pointer",
     "bits16": "16 bits a pointer",
-    "at-once": "pointers all at the end",
     "untrained": "not trained",
     "direct": "16 bits a node, no indirection",
     "direct-untrained": "16 bits a node, not trained",
@@ -69,7 +68,7 @@ FAMILIES = {
 PRESETS = {
     "ours": ("", {}), "indirection": ("dense", {}), "paper": ("paper", {}),
     "paper-constant": ("paper", {"constant": True}),
-    **{f"bits{n}": ("", {"bits": n}) for n in (6, 8, 16)}, "at-once": ("", {}), "untrained": ("", {}),
+    **{f"bits{n}": ("", {"bits": n}) for n in (6, 8, 16)}, "untrained": ("", {}),
 }  # fmt: skip
 
 #: Methods of which an image is rendered.
@@ -130,8 +129,8 @@ class DistanceStudyContext:
         return Distances(self.mesh)
 
     @functools.cached_property
-    def evaluation(self) -> Evaluation:
-        return Evaluation(self.mesh, self.distances, self.settings.points)
+    def evaluation(self) -> SurfaceEvaluation:
+        return SurfaceEvaluation(self.mesh, self.distances, self.settings.points)
 
     @functools.cached_property
     def pools(self):
@@ -157,7 +156,7 @@ class DistanceStudyContext:
         resolution = math.ceil(FINER / model.spacing)
         if resolution <= self.settings.decoded:
             resolution = max(resolution, self.settings.decoded // 3)
-            surface = decode.extract(model, resolution, self.mesh.scale, self.mesh.centre)
+            surface = extract(model, resolution, self.mesh.scale, self.mesh.centre)
             errors |= self.evaluation.chamfer(surface, max(2**10, self.settings.points // 4))
         return errors
 

@@ -1,7 +1,7 @@
 """
 Ablation: contenders that leave out or change a part of our layout, in equal bytes.
 
-Distances and normals that stay as they were sampled; all pointers chosen at the end; and all of a node in its 16 bits,
+Distances and normals that stay as they were sampled, and all of a node in its 16 bits,
 without frames and cascaded array (:mod:`..baselines.direct_nodes`).
 """
 
@@ -10,12 +10,11 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import numpy as np
-
 from ... import task
 from ...fitting import FitResult, FitSettings, fit
-from ...tasks.sdf import training
 from ...tasks.sdf.encoding import sample
+from ...tasks.sdf.evaluation import HeldOut
+from ...tasks.sdf.fit import NodeProblem
 from ...tasks.sdf.nodes import SparseNodes
 from ..baselines import volumes
 from ..baselines.direct_nodes import DirectCoding, DirectNodes
@@ -37,14 +36,6 @@ def settings_of(context) -> FitSettings:
 # -- ours, trained in other ways --------------------------------------------------------------------------------------
 
 
-class AtOnceRequest(task.FitRequest):
-    """Request of a training in which no node has a code until the end."""
-
-    def train(self, problem, title: str | None = None) -> FitResult:
-        problem.stage = len(training.COMMITTED)
-        return super().train(problem, title)
-
-
 class UntrainedRequest(task.FitRequest):
     """Request of a fit without training: nodes keep their sampled values."""
 
@@ -52,19 +43,17 @@ class UntrainedRequest(task.FitRequest):
         return NO_TRAINING
 
 
-class ChangedTraining(DistancePresetContender):
-    """Our preset, trained as a request of another class trains."""
+class UntrainedContender(DistancePresetContender):
+    """Our preset without training."""
 
     def fit(self, progress: bool) -> task.Fitted:
         sdf, arguments = task.tasks()["sdf"], self.arguments()
         options = {a.name: arguments.get(a.name, a.default) for a in sdf.arguments}
-        request = REQUESTS[self.method](
+        request = UntrainedRequest(
             SPARSE, settings_of(self.context), self.context.types, options=options, progress=progress, output=self.file
         )
         return sdf.fit(request)
 
-
-REQUESTS = {"at-once": AtOnceRequest, "untrained": UntrainedRequest}
 
 # -- nodes without indirection ----------------------------------------------------------------------------------------
 
@@ -78,14 +67,15 @@ class DirectContender(DistanceContender):
         start = time.perf_counter()
         coding = volumes.fit_bytes(lambda h: DirectCoding(sample(distances, h)), self.budget)
         structure = coding.sampled.structure
-        held_out = training.HeldOut(distances, types, structure.spacing)
-        problem = training.NodeProblem(SparseNodes(types, structure, 1.0), distances.surface, coding, held_out)
+        held_out = HeldOut(distances, types, structure.spacing)
+        nodes = SparseNodes(types, structure, 1.0)
+        problem = NodeProblem(nodes, distances.surface, coding.sampled, coding.bits, held_out)
         result = NO_TRAINING
         if self.method == "direct":
             result = fit(problem, settings_of(context), progress=progress, title=self.name)
             if result.interrupted:
                 return None
-        coding.commit(problem.net.unit(types).numpy().astype(np.float64), 1.0)
+        coding.encode(problem.values())
         model = coding.field(types)
         if self.file:
             volumes.save(self.file, model)
@@ -97,7 +87,4 @@ class DirectContender(DistanceContender):
 
 
 #: Method → class of its contender.
-CONTENDERS = {
-    "at-once": ChangedTraining, "untrained": ChangedTraining, "direct": DirectContender,
-    "direct-untrained": DirectContender,
-}  # fmt: skip
+CONTENDERS = {"untrained": UntrainedContender, "direct": DirectContender, "direct-untrained": DirectContender}

@@ -10,7 +10,8 @@ trained by least squares, the exact minimum; the network until twice as many ste
 
 The ablation compares ours with parts of it left out or changed (:mod:`.parts`).
 
-Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.Evaluation`; lengths are in units of the longest side.
+Errors are those of :class:`~mi_diffind.tasks.sdf.evaluation.SurfaceEvaluation`; lengths are relative to the
+longest side.
 Times: reads at random points within 0.01 of the surface; primary rays, beside Embree on the mesh and Mitsuba's
 ``sdfgrid``; a whole render.
 """
@@ -53,7 +54,7 @@ from .view import MeshView, scene_distance, traced_distance
 AGAINST = ("dense-trained", "bricks4", "distances-trained", "direct")
 
 #: Modules of the task that only trace and decode fields: models of an earlier run stay valid if they change.
-TRACING_MODULES = ("index", "marching", "tracing", "decode")
+TRACING_MODULES = ("marching", "tracing", "grids", "extraction")
 
 #: Candidates that renders and rays are compared with.
 MESH, GRID = "mesh (Embree)", "sdfgrid"

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...tasks.sdf import decode, tracing
+from ...tasks.sdf import grids, tracing
 from ...tasks.sdf.field import DistanceField
 from ...tasks.sdf.mesh import Mesh
 
@@ -68,10 +68,10 @@ class MeshView:
 
     def grid_scene(self, field: DistanceField, resolution: int, lit: bool = False):
         """Return a scene of Mitsuba's ``sdfgrid``, decoded with ``resolution`` cells along the longest side."""
-        from ...plugins.support.solids import fitted
+        from ...plugins.support.distance_shapes import crop_grid
 
-        values, lower, upper = decode.grid(field, resolution)
-        values, lower, upper = fitted(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
+        values, lower, upper = grids.grid(field, resolution)
+        values, lower, upper = crop_grid(values, lower, (upper[0] - lower[0]) / (values.shape[2] - 1))
         to_world = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         grid = mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32))
         shape = mi.load_dict({"type": "sdfgrid", "grid": grid, "to_world": to_world, "normals": "smooth",
@@ -80,10 +80,10 @@ class MeshView:
 
     def field_scene(self, field: DistanceField, lit: bool = False):
         """Return a scene of the field, traced by ``path_sdf``."""
-        from ...plugins.support.solids import Placement, Solid
+        from ...plugins.support.distance_shapes import DistanceShape, Placement
 
         placement = Placement.of(mi.ScalarTransform4f(), 1.0, (0.0, 0.0, 0.0))
-        return self._scene(Solid(_material(), field, placement, True), "path_sdf", lit)
+        return self._scene(DistanceShape(_material(), field, placement, True), "path_sdf", lit)
 
     def _scene(self, shape, integrator: str, lit: bool):
         scene = {"type": "scene", "shape": shape}

@@ -1,12 +1,12 @@
 """
 Task 6: signed distance fields of meshes.
 
-- :mod:`.mesh`, :mod:`.distances`, :mod:`.samples`: the truth;
-- :mod:`.field`: what every field offers; :mod:`.nodes` (with :mod:`.structure`, :mod:`.codes`), :mod:`.pair`: ours and
-  the supplement's;
-- :mod:`.encoding`, :mod:`.training`, :mod:`.fit`, :mod:`.presets`: how they come about;
-- :mod:`.tracing`, :mod:`.decode`, :mod:`.evaluation`: where rays meet them, as meshes and grids, how good they are;
-- :mod:`.files`, :mod:`.model`: the result, as a file.
+- :mod:`.mesh`, :mod:`.boundary`, :mod:`.distances`, :mod:`.sampling`: ground truth;
+- :mod:`.field`: interface of all fields; :mod:`.nodes` (with :mod:`.structure` and :mod:`.codes`): our sparse layout;
+  :mod:`.paper`: the supplement's arrays;
+- :mod:`.encoding`, :mod:`.fit`: training;
+- :mod:`.tracing`, :mod:`.marching`: rays; :mod:`.grids`, :mod:`.extraction`: decoding; :mod:`.evaluation`: errors;
+- :mod:`.model`: table files.
 """
 
 from __future__ import annotations
@@ -15,22 +15,36 @@ import dataclasses
 
 from ... import units
 from ...arguments import Argument, between, checked, positive
-from ...errors import UsageError
-from ...task import FitRequest, Task
-from .presets import PRESETS
+from ...settings import FitSettings
+from ...task import Task
 
-#: Bits of a pointer that go into words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
+#: Bits of a pointer that divide words evenly (:data:`.codes.POINTERS`, without importing Dr.Jit).
 BITS = (4, 5, 6, 8, 10, 16)
+
+#: Settings of both presets with dense arrays.
+PAIR_SETTINGS = FitSettings(steps=300, batch=2**17, lr=1e-2, schedule="cosine", loss="mae")
 
 
 class Sdf(Task):
-    """The task. Its presets are the recipes of :mod:`.presets`; files are always stored as bytes."""
+    """
+    Task 6, signed distance fields; files are always stored as bytes.
+
+    Presets: ``sparse`` (default), nodes near the surface whose pointers are indices; ``paper``, the supplement's two
+    dense arrays; ``dense``, the same started from the distance.
+    """
 
     name = "sdf"
     title = "the signed distance field of a mesh"
     section = "supplemental 1.6"
-    presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
+    presets = {  # noqa: RUF012
+        "sparse": FitSettings(
+            steps=250, batch=2**18, lr=2e-2, schedule="cosine", loss="mae", measure_every=50, deterministic=True
+        ),
+        "dense": PAIR_SETTINGS,
+        "paper": PAIR_SETTINGS,
+    }
     storages = ()
+    files = "model"
     arguments = (
         Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
         Argument(
@@ -41,34 +55,26 @@ class Sdf(Task):
             "--bits", type=int, choices=BITS, default=10,
             help="bits of a pointer of the sparse layout (default: 10)",
         ),
-        Argument("--ratio", type=between(1, 16), help="of dense and paper: primary's side over cascaded array's side"),
+        Argument(
+            "--ratio", type=between(1, 16),
+            help="for dense and paper: side of the primary over side of the cascaded array",
+        ),
         Argument(
             "--constant", action="store_true",
-            help="of paper: begin with a constant cascaded array, not with the nearest samples",
+            help="for paper: start with a constant cascaded array, not with the nearest samples",
         ),
     )  # fmt: skip
     decode_arguments = (
         Argument(
-            "--resolution", type=positive, metavar="N", help="cells along the longest side (default: finer than it)"
+            "--resolution", type=positive, metavar="N",
+            help="cells along the longest side (default: finer than the field's)",
         ),
-    )
+    )  # fmt: skip
 
     def settings(self, preset, given, options):
-        own = self.presets[preset]
-        steps = given.get("steps", own.steps)
-        return dataclasses.replace(own, measure_every=max(1, steps // 4), **given)
-
-    def check(self, request: FitRequest) -> None:
-        from .fit import asked_bytes
-
-        options = request.options
-        if options["source"] is None:
-            raise UsageError("source: not given, a mesh is needed")
-        asked_bytes(options)
-        if options["constant"] and request.preset != "paper":
-            raise UsageError(f"--constant is of the preset paper, found {request.preset}")
-        if options["ratio"] is not None and PRESETS[request.preset].layout != "pair":
-            raise UsageError(f"--ratio is of the presets dense and paper, found {request.preset}")
+        defaults = self.presets[preset]
+        steps = given.get("steps", defaults.steps)
+        return dataclasses.replace(defaults, measure_every=max(1, steps // 4), **given)
 
     def allocate(self, table, dtype, storage=""):
         return super().allocate(table, dtype, storage) if table.settings["layout"] == "pair" else {}

@@ -1,11 +1,11 @@
 """
-Exact distances to a mesh, from libigl in a process of its own (:mod:`.distances_child`): |d| by a bounding-volume tree,
-the sign, apart, by the winding number.
+Exact distances to the solid that a mesh encloses, computed by libigl in a child process (:mod:`.distances_child`).
 
-A point is inside where the winding number is at least one half. That of a watertight mesh is a whole number. An open
-one is closed first, hole by hole (:func:`.solids.closed`), if that agrees with its winding number; in how much of space
-that lies in between, :attr:`Distances.ambiguity` says. Triangles inside of the solid, where pieces overlap, have no
-part in distances: they would let the distance be zero where no surface is seen.
+The magnitude |d| comes from a bounding-volume tree, the sign from the winding number: a point is inside where the
+winding number is at least 1/2. That of a watertight mesh is a whole number. An open mesh is closed hole by hole first
+(:func:`.boundary.close_holes`) if the closed mesh agrees with its winding number; :attr:`Distances.ambiguity` is the
+share of space that is in doubt. Triangles inside of the solid, where pieces overlap, have no part in distances: with
+them, the distance would be zero where no surface is visible.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import functools
 import importlib.util
 import math
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -24,37 +25,36 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
-from . import solids
-from .distances_child import read, write
+from . import boundary
 from .mesh import NO_VOLUME, Mesh
 
-#: Points per request: fewer than a second's work, so that Ctrl-C is heard.
+#: Points per request: less than a second of work, so that Ctrl-C is noticed.
 CHUNK = 2**17
 
-#: Distance from the surface below which the direction to it is that of the triangle's normal.
+#: Distance from the surface below which the gradient is the triangle's normal.
 TOUCHING = 1e-9
 
-#: A winding number that is further from a whole number than this leaves open what is inside.
+#: Deviation of a winding number from a whole number beyond which the inside is ambiguous.
 AMBIGUOUS = 0.1
 
-#: Points at which the winding number of an open mesh is looked at, and, of those for certain inside, the share that may
-#: be so in the mesh or in the closed one only.
+#: Points at which the winding number of an open mesh is evaluated, and the share of the certain ones among them that
+#: may differ between the mesh and the closed mesh.
 AMBIGUITY_POINTS, DISAGREEMENT = 2**16, 0.01
 
-#: Cells along the longest side of the coarse grid that says which points are far.
+#: Cells along the longest side of the coarse grid with which far points are recognised.
 COARSE = 40
 
 
 class DistancesError(DiffindError, RuntimeError):
-    """Distances could not be found; the message is one sentence that names the mesh."""
+    """Distances cannot be computed; the message is one sentence that names the mesh."""
 
 
 class Distances:
     """
-    Distances, signs and nearest points of the solid that ``mesh`` encloses; points are in the unit frame, ``(N, 3)``.
+    Distances, signs and nearest points of the solid that ``mesh`` encloses, for points (N, 3) in the unit frame.
 
-    A context manager: the process starts at the first question and ends with the block. Where libigl aborts, the
-    question raises :class:`DistancesError`, and the next one starts the process anew.
+    A context manager: the child process starts with the first query and ends with the block. If libigl aborts, the
+    query raises :class:`DistancesError`, and the next query starts a new process.
     """
 
     def __init__(self, mesh: Mesh):
@@ -63,7 +63,7 @@ class Distances:
         self._stderr = None
         self._owner = 0
         self._sent: set[str] = set()
-        self._ambiguity: tuple[float, float] | None = None
+        self._doubt = (0.0, 0.0)
 
     def __enter__(self) -> Distances:
         return self
@@ -75,10 +75,10 @@ class Distances:
         self.close()
 
     def close(self) -> None:
-        """End the process, if it runs."""
+        """End the child process if it runs."""
         child, self._child = self._child, None
         self._sent = set()
-        if child is not None and self._owner == os.getpid():  # not that of whoever was forked
+        if child is not None and self._owner == os.getpid():  # not the process of a forked copy's parent
             for stream in (child.stdin, child.stdout):
                 with contextlib.suppress(OSError):
                     stream.close()
@@ -93,90 +93,86 @@ class Distances:
 
     @functools.cached_property
     def solid(self) -> Mesh:
-        """The mesh, closed: the mesh itself if it is watertight, or cannot be closed sensibly."""
+        """The closed mesh: the mesh itself if it is watertight, or cannot be closed consistently."""
         if self.mesh.watertight:
             return self.mesh
         rng = np.random.default_rng(0)
         points = rng.uniform(self.mesh.lower, self.mesh.upper, (AMBIGUITY_POINTS, 3))
         winding = self.winding(points)
         unclear = np.abs(winding - np.round(winding)) > AMBIGUOUS
-        self._ambiguity = float(unclear.mean()), float((np.abs(winding - 0.5) < 0.25).mean())
-        filled = solids.closed(self.mesh)
-        inside, clear = winding >= 0.5, ~unclear
-        differ = self._ask("inside", points, "filled", filled)["inside"] != inside
-        return filled if np.sum(differ & clear) <= DISAGREEMENT * np.sum(inside & clear) else self.mesh
+        self._doubt = float(unclear.mean()), float((np.abs(winding - 0.5) < 0.25).mean())
+        closed = boundary.close_holes(self.mesh)
+        inside = winding >= 0.5
+        differ = self._ask("inside", points, "closed", closed)[0] != inside
+        agrees = np.sum(differ & ~unclear) <= DISAGREEMENT * np.sum(inside & ~unclear)
+        return closed if agrees else self.mesh
 
     @functools.cached_property
     def surface(self) -> Mesh:
         """
-        What of :attr:`solid` has inside on one side and outside on the other: draw samples from it. Raises
-        :class:`DistancesError` if there is nothing of the kind.
+        The part of :attr:`solid` with inside on one side and outside on the other, from which samples are drawn.
+
+        Raises :class:`DistancesError` if no volume is enclosed.
         """
-        found = solids.bounding(self.solid, self.inside)
-        if not len(found.faces) or (found.watertight and abs(found.volume) < NO_VOLUME):
+        outer = boundary.outer_surface(self.solid, self.inside)
+        if not len(outer.faces) or (outer.watertight and abs(outer.volume) < NO_VOLUME):
             raise DistancesError(f"{self.mesh.path}: encloses no volume, expected the surface of a solid")
-        return found
+        return outer
 
     @property
     def ambiguity(self) -> float:
-        """
-        The share of the bounding box in which the mesh's winding number is further than 0.1 from a whole number, so
-        that it is a matter of opinion what is inside. 0 for a watertight mesh.
-        """
-        return self._ambiguous[0]
-
-    @property
-    def _ambiguous(self) -> tuple[float, float]:
+        """Share of the bounding box in which it is ambiguous what is inside of an open mesh; 0 for a watertight one."""
         self.solid  # noqa: B018
-        return self._ambiguity or (0.0, 0.0)
+        return self._doubt[0]
 
     @property
     def warnings(self) -> list[str]:
-        """A sentence for each thing that has to be said of what is inside of the mesh, besides the mesh's own."""
-        said = []
+        """One sentence for each doubt about the inside of the mesh, besides the mesh's own warnings."""
+        sentences = []
         if not self.mesh.watertight:
-            unclear, doubtful = self._ambiguous
-            how = "its holes were closed" if self.solid is not self.mesh else "inside is where it is at least 0.5"
-            said.append(
+            remedy = "its holes were closed" if self.solid is not self.mesh else "inside is where it is at least 0.5"
+            unclear, doubtful = self._doubt
+            sentences.append(
                 f"{self.mesh.path}: in {_percent(unclear)} of its bounding box's volume it is ambiguous what is inside "
                 f"of the mesh, which is not closed (winding numbers further than {AMBIGUOUS} from a whole number; in "
-                f"{_percent(doubtful)}, from 0.25 to 0.75): {how}"
+                f"{_percent(doubtful)}, from 0.25 to 0.75): {remedy}"
             )
         left = 1 - self.surface.area / self.solid.area
         if left > 1e-6:
-            said.append(
+            sentences.append(
                 f"{self.mesh.path}: pieces overlap: {_percent(left)} of its surface does not bound the solid and was "
                 f"left out"
             )
-        return said
+        return sentences
 
-    # -- questions ----------------------------------------------------------------------------------------------------
+    # -- queries ------------------------------------------------------------------------------------------------------
 
     def nearest(self, points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """|d| ``(N,)`` float64, the nearest triangle of :attr:`surface`, ``(N,)``, and the nearest point, (N, 3)."""
-        found = self._ask("nearest", points, "surface", self.surface)
-        return found["distance"], found["face"], found["closest"]
+        """Return |d| (N,) float64, the nearest triangle of :attr:`surface` (N,), and the nearest point (N, 3)."""
+        return self._ask("nearest", points, "surface", self.surface)
 
     def unsigned(self, points) -> np.ndarray:
-        """|d|, ``(N,)`` float64."""
-        return self._ask("distance", points, "surface", self.surface)["distance"]
+        """Return |d|, ``(N,)`` float64."""
+        return self._ask("distance", points, "surface", self.surface)[0]
 
     def to_triangles(self, points) -> np.ndarray:
-        """The distance to the mesh as it is, whether it encloses anything or not, ``(N,)`` float64."""
-        return self._ask("distance", points, "mesh", self.mesh)["distance"]
+        """Return the distance to all triangles of the mesh, whether they bound a solid or not, ``(N,)`` float64."""
+        return self._ask("distance", points, "mesh", self.mesh)[0]
 
     def winding(self, points) -> np.ndarray:
-        """The winding number of the mesh as it is, ``(N,)``: within about 0.01, and exact where it is near a half."""
-        return self._ask("winding", points, "mesh", self.mesh)["winding"]
+        """Return the winding number of the unclosed mesh, ``(N,)``: within about 0.01, and exact near 1/2."""
+        return self._ask("winding", points, "mesh", self.mesh)[0]
 
     def inside(self, points) -> np.ndarray:
-        """Whether points are inside, ``(N,)`` bool: three times as fast as the winding number itself."""
-        return self._ask("inside", points, "solid", self.solid)["inside"]
+        """Return whether points are inside, ``(N,)`` bool, in a third of the time of :meth:`winding`."""
+        return self._ask("inside", points, "solid", self.solid)[0]
 
     def signed(self, points, limit: float = math.inf) -> np.ndarray:
         """
-        The signed distance, ``(N,)`` float32, truncated to ± ``limit``: with a small one, many points all over space
-        are several times as fast, since most of them need not be looked at.
+        Return the signed distance, ``(N,)`` float32, truncated to ± ``limit``.
+
+        With a small limit, many points all over space are several times as fast, since far ones are recognised by a
+        coarse grid.
         """
         points = _checked(points)
         if limit < math.inf and len(points) > COARSE**3:
@@ -185,72 +181,71 @@ class Distances:
         return sign * np.minimum(self.unsigned(points), limit).astype(np.float32)
 
     def _truncated(self, points: np.ndarray, limit: float) -> np.ndarray:
-        """The same by means of a coarse grid: from a centre's distance follows that its neighbours are far."""
+        """Compute :meth:`signed` with a coarse grid: the distance of a cell's centre bounds those of its points."""
         lower, upper = points.min(axis=0), points.max(axis=0)
         side = max(float((upper - lower).max()) / COARSE, 1e-9)
         index = np.minimum((points - lower) / side, COARSE - 1).astype(np.int64)
-        keys, which = np.unique((index[:, 0] * COARSE + index[:, 1]) * COARSE + index[:, 2], return_inverse=True)
+        keys, cell = np.unique((index[:, 0] * COARSE + index[:, 1]) * COARSE + index[:, 2], return_inverse=True)
         index = np.stack([keys // COARSE**2, keys // COARSE % COARSE, keys % COARSE], axis=-1)
         centres = lower + (index + 0.5) * side
-        distance = self.unsigned(centres)
-        step = np.linalg.norm(points - centres[which], axis=1)
-        far = distance[which] - step >= limit
-        found = np.empty(len(points), np.float32)
+        step = np.linalg.norm(points - centres[cell], axis=1)
+        far = self.unsigned(centres)[cell] - step >= limit
+        values = np.empty(len(points), np.float32)
         if self.solid.watertight:  # the sign changes on the surface only
-            found[far] = np.where(self.inside(centres), -limit, limit)[which[far]]
+            values[far] = np.where(self.inside(centres), -limit, limit)[cell[far]]
         else:
-            found[far] = np.where(self.inside(points[far]), -limit, limit)
-        found[~far] = self.signed(points[~far]).clip(-limit, limit)
-        return found
+            values[far] = np.where(self.inside(points[far]), -limit, limit)
+        values[~far] = self.signed(points[~far]).clip(-limit, limit)
+        return values
 
     def signed_normals(self, points) -> tuple[np.ndarray, np.ndarray]:
         """
-        The signed distance ``(N,)`` and its gradient ``(N, 3)``, float32: away from the nearest point, on the surface
-        the normal of its triangle.
+        Return the signed distance ``(N,)`` and its gradient ``(N, 3)``, float32.
+
+        The gradient points away from the nearest point; on the surface it is the normal of the triangle.
         """
         points = _checked(points)
         d, face, closest = self.nearest(points)
         sign = np.where(self.inside(points), -1.0, 1.0)
         near = d < TOUCHING
-        away = (points - closest) * (sign / np.where(near, 1, d))[:, None]
-        away[near] = self.surface.normals[face[near]]
-        return (sign * d).astype(np.float32), away.astype(np.float32)
+        gradient = (points - closest) * (sign / np.where(near, 1, d))[:, None]
+        gradient[near] = self.surface.normals[face[near]]
+        return (sign * d).astype(np.float32), gradient.astype(np.float32)
 
-    # -- the process --------------------------------------------------------------------------------------------------
+    # -- the child process --------------------------------------------------------------------------------------------
 
-    def _ask(self, question: str, points, name: str, mesh: Mesh) -> dict[str, np.ndarray]:
-        """The answers for all points of a mesh, which is sent under its ``name`` when it is needed, chunk by chunk."""
+    def _ask(self, question: str, points, name: str, mesh: Mesh) -> tuple[np.ndarray, ...]:
+        """Return the answers for all points, chunk by chunk; the mesh is sent once, under its ``name``."""
         points = _checked(points)
         if not len(points):
-            return {key: found[:0] for key, found in self._ask(question, np.zeros((1, 3)), name, mesh).items()}
-        parts = [points[i : i + CHUNK] for i in range(0, len(points), CHUNK)]
+            return tuple(array[:0] for array in self._ask(question, np.zeros((1, 3)), name, mesh))
         if self._owner != os.getpid():
             self.close()
         if self._child is None:
             self._start()
         if name not in self._sent:
-            arrays = {"vertices": mesh.vertices, "faces": mesh.faces.astype(np.int64), "watertight": mesh.watertight}
-            self._request(f"mesh {name}", {key: np.ascontiguousarray(a) for key, a in arrays.items()})
+            faces = np.ascontiguousarray(mesh.faces, np.int64)
+            self._request("mesh", name, (np.ascontiguousarray(mesh.vertices), faces, mesh.watertight))
             self._sent.add(name)
-        answers = [self._request(f"{question} {name}", {"points": part}) for part in parts]
-        return {key: np.concatenate([a[key] for a in answers]) for key in answers[0]}
+        answers = [self._request(question, name, points[i : i + CHUNK]) for i in range(0, len(points), CHUNK)]
+        return tuple(map(np.concatenate, zip(*answers, strict=True)))
 
-    def _request(self, name: str, arrays: dict) -> dict:
+    def _request(self, *request) -> tuple[np.ndarray, ...]:
         try:
-            write(self._child.stdin, name, arrays)
-            answer = read(self._child.stdout)
-        except OSError:
-            answer = None
-        except BaseException:  # Ctrl-C in the middle of an answer: what follows would be the rest of it
+            pickle.dump(request, self._child.stdin, pickle.HIGHEST_PROTOCOL)
+            self._child.stdin.flush()
+            error, arrays = pickle.load(self._child.stdout)
+        except (OSError, EOFError, pickle.UnpicklingError):
+            self._died()
+        except BaseException:  # after Ctrl-C the rest of an answer would be read as the next one
             self.close()
             raise
-        if answer is None:
-            self._died()
-        if answer[0] != name:
-            said = reason(Exception(answer[0].removeprefix("error: ")))
+        if error is not None:
             self.close()
-            raise DistancesError(f"{self.mesh.path}: libigl finds no distances to this mesh ({said})")
-        return answer[1]
+            raise DistancesError(
+                f"{self.mesh.path}: libigl finds no distances to this mesh ({reason(Exception(error))})"
+            )
+        return arrays
 
     def _start(self) -> None:
         if importlib.util.find_spec("igl") is None:
@@ -266,29 +261,29 @@ class Distances:
         )  # fmt: skip
 
     def _died(self) -> None:
-        """The process is gone: say why."""
+        """Raise :class:`DistancesError` with the reason why the child process ended."""
         code = self._child.wait()
         self._stderr.seek(0, os.SEEK_END)
         self._stderr.seek(max(0, self._stderr.tell() - 2000))
         last = self._stderr.read().decode(errors="replace").strip().splitlines()
-        how = f"exit code {code}"
+        cause = f"exit code {code}"
         if code < 0:
             with contextlib.suppress(ValueError):
-                how = signal.Signals(-code).name
-        said = f": {reason(Exception(last[-1]))}" if last else ""
+                cause = signal.Signals(-code).name
+        detail = f": {reason(Exception(last[-1]))}" if last else ""
         self.close()
         raise DistancesError(
-            f"{self.mesh.path}: libigl ended while it looked for distances to this mesh ({how}{said}); a repaired mesh "
-            f"may work"
+            f"{self.mesh.path}: libigl ended while it computed distances to this mesh ({cause}{detail}); a repaired "
+            f"mesh may work"
         )
 
 
 def _checked(points) -> np.ndarray:
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: have the shape {points.shape}, expected (N, 3)")
+        raise ValueError(f"points: found the shape {points.shape}, expected (N, 3)")
     if not np.all(np.isfinite(points)):
-        raise ValueError("points: there are NaN or infinite ones, allowed are finite ones")
+        raise ValueError("points: found NaN or infinite ones, allowed are finite ones")
     return points
 
 

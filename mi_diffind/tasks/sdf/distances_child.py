@@ -1,62 +1,33 @@
 """
-The process in which libigl runs: a script of its own, since some meshes make libigl abort the process that it runs in.
+Child process that runs libigl: a script of its own, since some meshes make libigl abort its process.
 
-It reads requests from standard input and writes answers to standard output until its input ends, and imports NumPy and
-libigl only. A message is one line of JSON, a list of ``[name, dtype, shape]`` after the name of a request, and then the
-bytes of these arrays. A name is a question and, after a space, which mesh it is about.
+Requests arrive on standard input and answers leave on standard output, both as pickles, until the input ends. A request
+is ``(question, name, argument)``: the question ``"mesh"`` registers the arrays of a mesh under a name; any other is a
+method of :class:`MeshQueries` that is called with points. An answer is ``(None, arrays)`` or ``(error, None)``. The
+script imports NumPy and libigl only.
 """
 
 import contextlib
-import json
 import os
+import pickle
 import signal
 import sys
 
 
-def write(stream, name, arrays):
-    """One message: its ``name`` and a dict of arrays."""
-    head = [name, [[key, a.dtype.str, list(a.shape)] for key, a in arrays.items()]]
-    stream.write(json.dumps(head).encode() + b"\n")
-    for a in arrays.values():
-        stream.write(memoryview(a).cast("B") if a.size else b"")
-    stream.flush()
+class MeshQueries:
+    """Queries to libigl about one mesh; its search trees are built on first use."""
 
-
-def read(stream):
-    """The name and the arrays of the next message, ``None`` if there is none."""
-    import numpy as np
-
-    line = stream.readline()
-    if not line.endswith(b"\n"):
-        return None
-    name, heads = json.loads(line)
-    arrays = {}
-    for key, dtype, shape in heads:
-        a = np.empty(shape, dtype)
-        view = memoryview(a).cast("B") if a.size else memoryview(bytearray())
-        while len(view):
-            count = stream.readinto(view)
-            if not count:
-                return None
-            view = view[count:]
-        arrays[key] = a
-    return name, arrays
-
-
-class Queries:
-    """What libigl is asked for, of one mesh. The trees are built when they are needed."""
-
-    #: Accuracies of the fast winding number, and how near to a half its values are doubtful: those are found once more
-    #: with the next accuracy, in the end exactly. The largest errors that were seen are 0.23 and 0.013; the exact
-    #: number takes ten times as long. Of a watertight mesh, whose winding numbers are whole ones, less is in doubt.
+    #: Accuracies of the fast winding number, and the distance from 1/2 below which values are computed once more with
+    #: the next accuracy, in the end exactly, which takes ten times as long. The largest errors observed are 0.23 and
+    #: 0.013. Winding numbers of a watertight mesh are whole, so fewer are in doubt.
     ACCURACIES = ((1.0, 0.3), (2.0, 0.05))
-    WHOLE = ((1.0, 0.15), (2.0, 0.05))
+    WATERTIGHT_ACCURACIES = ((1.0, 0.15), (2.0, 0.05))
 
     def __init__(self, vertices, faces, watertight):
         import igl
 
         self.igl, self.vertices, self.faces = igl, vertices, faces
-        self.accuracies = self.WHOLE if watertight else self.ACCURACIES
+        self.accuracies = self.WATERTIGHT_ACCURACIES if watertight else self.ACCURACIES
         self.tree = self.hierarchy = None
 
     def nearest(self, points):
@@ -66,19 +37,21 @@ class Queries:
             self.tree = self.igl.AABB()
             self.tree.init(self.vertices, self.faces)
         order = spatial_order(points)
-        found = self.tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points[order]))
+        squared, faces, places = self.tree.squared_distance(
+            self.vertices, self.faces, np.ascontiguousarray(points[order])
+        )[:3]
         distance, face, closest = np.empty(len(points)), np.empty(len(points), np.int32), np.empty_like(points)
-        distance[order], face[order], closest[order] = np.sqrt(np.maximum(found[0], 0)), found[1], found[2]
-        return {"distance": distance, "face": face, "closest": closest}
+        distance[order], face[order], closest[order] = np.sqrt(np.maximum(squared, 0)), faces, places
+        return distance, face, closest
 
     def distance(self, points):
-        return {"distance": self.nearest(points)["distance"]}
+        return self.nearest(points)[:1]
 
     def winding(self, points):
-        return {"winding": self._windings(points, self.ACCURACIES[-1:])}
+        return (self._windings(points, self.ACCURACIES[-1:]),)
 
     def inside(self, points):
-        return {"inside": self._windings(points, self.accuracies) >= 0.5}
+        return (self._windings(points, self.accuracies) >= 0.5,)
 
     def _windings(self, points, accuracies):
         import numpy as np
@@ -87,18 +60,18 @@ class Queries:
             self.hierarchy = self.igl.FastWindingNumberBVH()
             self.hierarchy.init(self.vertices, self.faces)
         order = spatial_order(points)
-        found = np.empty(len(points))
+        winding = np.empty(len(points))
         for accuracy, doubt in accuracies:
-            found[order] = self.hierarchy.winding_number(np.ascontiguousarray(points[order]), accuracy)
-            order = order[np.abs(found[order] - 0.5) < doubt]
+            winding[order] = self.hierarchy.winding_number(np.ascontiguousarray(points[order]), accuracy)
+            order = order[np.abs(winding[order] - 0.5) < doubt]
         if len(order):
             exact = self.igl.winding_number(self.vertices, self.faces, np.ascontiguousarray(points[order]))
-            found[order] = np.reshape(exact, -1)
-        return found
+            winding[order] = np.reshape(exact, -1)
+        return winding
 
 
 def spatial_order(points):
-    """An order in which neighbours follow each other (Morton's), in which trees are searched twice as fast."""
+    """Return Morton's order of points: neighbours follow each other, and trees are searched twice as fast."""
     import numpy as np
 
     lower, upper = points.min(axis=0), points.max(axis=0)
@@ -109,28 +82,28 @@ def spatial_order(points):
 
 
 def main():
-    # Whoever is asked by Ctrl-C to stop is the parent, which ends this process; so does the end of the input
+    """Answer requests until the input ends."""
+    # Ctrl-C is handled by the parent, which ends this process; the end of the input ends it, too
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # What libigl prints must not come between the answers
+    # Output of libigl must not mix with the answers
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    requests = sys.stdin.buffer
     meshes = {}
-    while (message := read(requests)) is not None:
-        name, arrays = message
+    while True:
+        question, name, argument = pickle.load(sys.stdin.buffer)
         try:
-            question, _, mesh = name.partition(" ")
             if question == "mesh":
-                meshes[mesh] = Queries(arrays["vertices"], arrays["faces"], bool(arrays["watertight"]))
-                result = {}
+                meshes[name], arrays = MeshQueries(*argument), ()
             else:
-                result = getattr(meshes[mesh], question)(arrays["points"])
+                arrays = getattr(meshes[name], question)(argument)
+            answer = None, arrays
         except Exception as e:
-            name, result = f"error: {type(e).__name__}: {e}", {}
-        write(answers, name, result)
+            answer = f"{type(e).__name__}: {e}", None
+        pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
+        answers.flush()
 
 
 if __name__ == "__main__":
-    del sys.path[0]  # this folder, whose modules might take the place of others
-    with contextlib.suppress(BrokenPipeError):
+    del sys.path[0]  # modules of this folder might shadow others
+    with contextlib.suppress(BrokenPipeError, EOFError):
         main()

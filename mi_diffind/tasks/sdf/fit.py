@@ -1,4 +1,4 @@
-"""``fit sdf``: from a mesh and a number of bytes to arrays, trained, rounded and measured."""
+"""Training of distance fields (``fit sdf``): from a mesh and a number of bytes to a table file."""
 
 from __future__ import annotations
 
@@ -7,65 +7,177 @@ import sys
 import time
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
+from drjit import nn
 
 from ... import units
 from ...errors import UsageError
-from ...fitting import FitResult
-from ...indirection import stored_form
+from ...fitting import Problem
 from ...settings import FittingError
-from ...tables import StoredArray, Table
+from ...tables import Table
 from ...task import FitRequest, Fitted
-from . import codes, encoding, files, nodes, paper, samples, training
+from . import codes, encoding
 from .distances import Distances
-from .evaluation import Evaluation, lost_pieces
+from .evaluation import HELD_OUT, HeldOut, SurfaceEvaluation, lost_pieces
 from .mesh import Mesh, load_mesh
-from .presets import BYTES, PRESETS, ratio_for
+from .model import sparse_arrays
+from .nodes import SparseNodes, coded_field, slope_bound
+from .paper import SAMPLES, fit_pair
 
-#: Spacings from which sizes are found, and the finest and the coarsest one, of the longest side.
+#: Default size in memory, in bytes.
+BYTES = 2**20
+
+#: First, finest and coarsest spacing in the search for a grid's size, relative to the longest side.
 FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 8
 
-#: How much smaller than asked for a sparse field may be.
+#: Share by which a sparse field may be smaller than requested.
 TOLERANCE = 0.02
 
-#: Bytes that a cell that the surface passes through takes, at least: of masks and frames, and of pointers if each had a
-#: word of its own.
+#: Least bytes for a cell that the surface passes through: of masks and frames, and of pointers with a word each.
 BYTES_PER_CELL, WORDS_PER_CELL = 1, 6
-
-#: Samples of the dense arrays, and the share that is uniform in the box.
-SAMPLES, UNIFORM = 2**20, 0.2
 
 #: Held-out points of the final measurement.
 MEASURED = 2**18
 
-#: Share of the surface's cells that may be too thin for the grid before it is said.
+#: Share of the surface's cells without a change of sign above which a warning is printed.
 THIN = 0.3
 
+#: Weights in the loss: the distance (in spacings), the field's gradient and the blended normals of nodes.
+DISTANCE, GRADIENT, SMOOTH = 0.3, 0.05, 0.02
 
-def asked_bytes(options) -> int:
-    """The bytes that are asked for. Raises :class:`UsageError`."""
+#: Distance, in spacings, below which errors are weighted by their squares.
+ROUND = 0.01
+
+# -- training of nodes ------------------------------------------------------------------------------------------------
+
+
+class SurfaceSampler:
+    """Points of a mesh and their normals, uniform over the area, drawn on the device of the training."""
+
+    def __init__(self, mesh: Mesh, types):
+        self.types, self.count = types, len(mesh.faces)
+
+        def flat(v):
+            return types.Float(np.ascontiguousarray(v.reshape(-1), np.float32))
+
+        corners = mesh.corners
+        self.sums = flat(np.cumsum(mesh.areas) / mesh.areas.sum())
+        edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        self.triangles = [flat(v) for v in (corners[:, 0], *edges, mesh.normals)]
+
+    def draw(self, rng, size: int):
+        """Return points, one in each of ``size`` equal parts of the area, and normals: ``(Array3f, Array3f)``."""
+        Float, Array3f = self.types.Float, self.types.Array3f
+        place = (Float(dr.arange(self.types.UInt32, size)) + rng.random(Float, size)) / size
+        index = dr.binary_search(0, self.count - 1, lambda i: dr.gather(Float, self.sums, i) < place)
+        u, v = rng.random(Float, size), rng.random(Float, size)
+        beyond = u + v > 1
+        u, v = dr.select(beyond, 1 - u, u), dr.select(beyond, 1 - v, v)
+        corner, first, second, normal = (dr.gather(Array3f, a, index) for a in self.triangles)
+        return corner + u * first + v * second, normal
+
+
+class NodeValues(nn.Module):
+    """Trainable nodes of a sparse grid: ``values`` (n, 4), distances in spacings and normals of any length."""
+
+    DRJIT_STRUCT = {"values": dr.ArrayBase}  # noqa: RUF012
+
+    def __init__(self, values=None):
+        self.values = values
+
+    def unit(self, types):
+        """Return the nodes with normals of length 1."""
+        d, x, y, z = dr.unravel(types.Array4f, self.values.array)
+        inverse = dr.rsqrt(dr.maximum(x * x + y * y + z * z, 1e-12))
+        return types.TensorXf(dr.ravel(types.Array4f(d, x * inverse, y * inverse, z * inverse)), self.values.shape)
+
+
+class NodeProblem(Problem):
+    """
+    Training of a sparse grid's nodes against the surface itself.
+
+    The field is to be zero on the surface, and its gradient and its smooth normal are to be the surface's normal.
+    Distances elsewhere are not needed, since the nodes begin with theirs.
+    """
+
+    #: The last state is kept: rounding differs from state to state by more than the training still changes.
+    tolerance = 1.0
+
+    def __init__(self, field: SparseNodes, mesh: Mesh, sampled: encoding.SampledNodes, bits: int, held_out: HeldOut):
+        self.field, self.types, self.held_out = field, field.types, held_out
+        self.surface = SurfaceSampler(mesh, self.types)
+        start = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
+        self.net = NodeValues(self.types.TensorXf(np.ascontiguousarray(start, np.float32)))
+        self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": field.spacing, "bits": bits}
+
+    def loss(self, net, rng, size: int):
+        p, n = self.surface.draw(rng, size)
+        self.field.nodes = net.unit(self.types)
+        value, slope, smooth, complete = self.field.blend(p)
+        Array3f = self.types.Array3f
+        square = dr.square(value)
+        error = DISTANCE * (dr.sqrt(square + ROUND**2) if self.settings.loss == "mae" else 10 * square)
+        error += GRADIENT * dr.squared_norm(Array3f(*slope) - n) + SMOOTH * dr.squared_norm(Array3f(*smooth) - n)
+        return dr.select(complete, error, 0) / size
+
+    def measure(self, net):
+        with dr.suspend_grad():
+            self.field.nodes = dr.detach(net.unit(self.types))
+            return self.held_out.measure(self.field)
+
+    def values(self) -> np.ndarray:
+        """Return the trained nodes, (n, 4) float64."""
+        return self.net.unit(self.types).numpy().astype(np.float64)
+
+
+# -- the task ---------------------------------------------------------------------------------------------------------
+
+
+def check(request: FitRequest) -> None:
+    """Raise :class:`UsageError` for options that exclude each other."""
+    options, preset = request.options, request.preset
+    if options["source"] is None:
+        raise UsageError("source: not given, a mesh is needed")
+    requested_bytes(options)
+    if options["constant"] and preset != "paper":
+        raise UsageError(f"--constant: found the preset {preset}, allowed is paper")
+    if options["ratio"] is not None and preset == "sparse":
+        raise UsageError(f"--ratio: found the preset {preset}, allowed are dense and paper")
+
+
+def requested_bytes(options) -> int:
+    """Return the size from the command's options. Raises :class:`UsageError`."""
     try:
         return BYTES if options["bytes"] is None else units.parse_bytes(options["bytes"])
     except ValueError as e:
         raise UsageError(f"--bytes: {e}") from None
 
 
-def fit(request: FitRequest) -> Fitted:
+def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, held_out: int = HELD_OUT) -> Fitted:
     """
-    Fit the mesh. Raises :class:`UsageError`, :class:`.mesh.MeshError`, :class:`.distances.DistancesError` and
-    :class:`~mi_diffind.fitting.FittingError`.
+    Fit the mesh that the request names.
+
+    ``measured`` and ``held_out`` are the numbers of points at which the result and states on the way are measured,
+    ``samples`` the number of training samples of dense arrays. Raises :class:`UsageError`, :class:`.mesh.MeshError`,
+    :class:`.distances.DistancesError` and :class:`~mi_diffind.fitting.FittingError`.
     """
     mesh = load_mesh(request.options["source"])
-    nbytes, recipe = asked_bytes(request.options), PRESETS[request.preset]
+    nbytes = requested_bytes(request.options)
     start = time.perf_counter()
     with Distances(mesh) as distances:
-        said = [*mesh.warnings, *distances.warnings]
-        for warning in said:
+        warnings = [*mesh.warnings, *distances.warnings]
+        for warning in warnings:
             print(f"warning: {warning}", file=sys.stderr)
-        make = fit_sparse if recipe.layout == "sparse" else fit_pair
-        table, result, field, lines = make(mesh, distances, nbytes, recipe, request)
+        lines = []
+        if request.preset == "sparse":
+            sampled = search_grid(distances, nbytes, request.options["bits"])
+            lines += thin_parts(sampled)
+            table, result, field = fit_sparse(distances, sampled, request, held_out)
+        else:
+            table, result, field = fit_pair(distances, nbytes, request, samples, held_out)
         prepared = time.perf_counter() - start - result.seconds
-        found = Evaluation(mesh, distances, MEASURED).measure(field)
+        errors = SurfaceEvaluation(mesh, distances, measured).measure(field)
         lost = lost_pieces(field, distances)
     if lost:
         count = distances.surface.components
@@ -78,36 +190,37 @@ def fit(request: FitRequest) -> Fitted:
         "mesh_path": os.path.relpath(Path(request.options["source"]).resolve(), folder),
         "scale": mesh.scale,
         "centre": list(mesh.centre),
-        "warnings": said,
+        "warnings": warnings,
         **table.settings,
     }
     if request.seconds is not None:
         table.settings["steps"] = result.steps
-    table.measured = {k: float(f"{v:.6g}") for k, v in found.items()}
+    table.measured = {k: float(f"{v:.6g}") for k, v in errors.items()}
     triangles = 12 * (len(mesh.vertices) + len(mesh.faces))
     lines.append(f"{prepared:.1f} s for distances and samples, {result.seconds:.1f} s of training")
     lines.append(f"the mesh itself has {len(mesh.faces):,} triangles, {triangles:,} bytes of positions and indices")
-    figures = {"bytes_asked": nbytes, "mesh_bytes": triangles, "prepared_seconds": prepared, "warnings": said}
+    figures = {"bytes_asked": nbytes, "mesh_bytes": triangles, "prepared_seconds": prepared, "warnings": warnings}
     figures["lost_pieces"] = lost
     return Fitted(table, result, lines, figures)
 
 
-# -- sparse -----------------------------------------------------------------------------------------------------------
+def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.SampledNodes:
+    """
+    Return the finest sampled grid whose field takes at most ``nbytes`` in memory, with ``bits`` bits a pointer.
 
-
-def sampled_for(distances: Distances, nbytes: int, bits: int) -> encoding.Sampled:
-    """The finest grid whose field takes at most ``nbytes`` in memory. Raises :class:`UsageError` if none does."""
-    spacing, found, tried = FIRST, None, {}
+    Raises :class:`UsageError` if even the coarsest one is larger, and :class:`FittingError` if it has no nodes.
+    """
+    spacing, best, tried = FIRST, None, {}
     for _ in range(6):
         sampled = encoding.sample(distances, spacing)
         tried[spacing] = size = coded_bytes(sampled, bits)
         fits = size <= nbytes
-        if fits and (found is None or spacing < found.structure.spacing):
-            found = sampled
+        if fits and (best is None or spacing < best.structure.spacing):
+            best = sampled
         if fits and size >= (1 - TOLERANCE) * nbytes:
             break
-        # Nodes, blocks and their words grow with the square. Where a solid is thinner than cells, so do those that its
-        # surface passes through
+        # Nodes, blocks and their words grow with the square. Where a solid is thinner than cells, so do the cells that
+        # its surface passes through
         fixed = 4 * entries_for(sampled, bits)
         least = BYTES_PER_CELL + WORDS_PER_CELL / codes.POINTERS[bits]
         expected = max(size - fixed, least * sampled.cells)
@@ -116,106 +229,53 @@ def sampled_for(distances: Distances, nbytes: int, bits: int) -> encoding.Sample
         if following in tried:
             break
         spacing = following
-    if found is None:
-        raise UsageError(
-            f"--bytes: {nbytes:,} are fewer than the {min(tried.values()):,} that the coarsest grid of this mesh needs"
+    if best is None:
+        raise UsageError(f"--bytes: found {nbytes:,}, the coarsest grid of this mesh needs {min(tried.values()):,}")
+    if best.structure.nodes == 0:
+        raise FittingError(
+            f"{distances.mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, "
+            f"1/{1 / best.structure.spacing:.0f} of the longest side: ask for more --bytes"
         )
-    return found
+    return best
 
 
-def coded_bytes(sampled: encoding.Sampled, bits: int) -> int:
-    """Bytes in memory of a sampled grid, once its nodes are pointers of ``bits`` bits."""
+def coded_bytes(sampled: encoding.SampledNodes, bits: int) -> int:
+    """Return the bytes in memory of a sampled grid whose nodes are pointers of ``bits`` bits."""
     structure = sampled.structure
     pointers = -(-structure.nodes // codes.POINTERS[bits])
     return structure.nbytes + 4 * (structure.blocks + pointers + entries_for(sampled, bits))
 
 
-def entries_for(sampled: encoding.Sampled, bits: int) -> int:
-    """Entries of the cascaded array: as many as pointers can name, and no more than there are nodes."""
+def entries_for(sampled: encoding.SampledNodes, bits: int) -> int:
+    """Return the size of the cascaded array: as many entries as pointers can name, and at most one per node."""
     return max(1, min(2**bits, sampled.structure.nodes))
 
 
-def fit_sparse(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: FitRequest):
-    bits = request.options["bits"]
-    sampled = sampled_for(distances, nbytes, bits)
-    structure = sampled.structure
-    if structure.nodes == 0:
-        raise FittingError(
-            f"{mesh.path}: the solid is thinner than the cells of {nbytes:,} bytes, 1/{1 / structure.spacing:.0f} of "
-            f"the longest side: ask for more --bytes"
-        )
-    field = nodes.SparseNodes(request.types, structure, 1.0)
-    held_out = training.HeldOut(distances, request.types, structure.spacing)
-    coding = encoding.Coding(sampled, bits, request.settings.seed)
-    problem = training.NodeProblem(field, distances.surface, coding, held_out)
+def thin_parts(sampled: encoding.SampledNodes) -> list[str]:
+    """Return a sentence if parts of the solid may be thinner than a cell."""
+    if sampled.missed <= THIN:
+        return []
+    return [
+        f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of "
+        f"sign: parts may be thinner than a cell, 1/{1 / sampled.structure.spacing:.0f} of the longest side: more "
+        f"--bytes help"
+    ]
+
+
+def fit_sparse(distances: Distances, sampled: encoding.SampledNodes, request: FitRequest, held_out: int = HELD_OUT):
+    """Train and encode the nodes of a sampled grid: ``(table, training result, field)``."""
+    bits, structure, types = request.options["bits"], sampled.structure, request.types
+    held = HeldOut(distances, types, structure.spacing, count=held_out)
+    problem = NodeProblem(SparseNodes(types, structure, 1.0), distances.surface, sampled, bits, held)
     result = request.train(problem)
-    coding.commit(problem.net.unit(request.types).numpy().astype(np.float64), 1.0)
+    coding = encoding.NodeCoding(sampled, bits, request.settings.seed)
+    coding.encode(problem.values())
     words = codes.pointer_words(coding.pointers, bits)
-    told = coding.values().astype(np.float64)
-    slope = nodes.slope_bound(told[:, 0], told[:, 1:], sampled.corners)
-    table = Table("sdf", files.sparse_arrays(structure, coding.frames, words, coding.entries))
-    table.settings = {
+    nodes = coding.values().astype(np.float64)
+    slope = slope_bound(nodes[:, 0], nodes[:, 1:], sampled.corners)
+    settings = {
         "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": bits,
         "nodes": structure.nodes, "slope": slope,
     }  # fmt: skip
-    lines = []
-    if sampled.missed > THIN:
-        lines.append(
-            f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of "
-            f"sign: parts may be thinner than a cell, 1/{1 / structure.spacing:.0f} of the longest side: more --bytes "
-            f"help"
-        )
-    field = files.coded_field(request.types, structure, slope, coding.frames, words, bits, coding.entries)
-    return table, result, field, lines
-
-
-# -- the supplement's --------------------------------------------------------------------------------------------------
-
-
-def fit_pair(mesh: Mesh, distances: Distances, nbytes: int, recipe, request: FitRequest):
-    options = request.options
-    ratio = options["ratio"] or ratio_for(nbytes)
-    extent = mesh.upper - mesh.lower
-    primary, cascaded = paper.resolutions(nbytes, ratio, extent)
-    if 3 * int(np.prod(primary)) + int(np.prod(cascaded)) > nbytes:
-        raise UsageError(f"--bytes: {nbytes:,} are fewer than the smallest arrays need")
-    # The box ends a cell and a half outside of the mesh
-    padding = 1.5 * extent.max() / (max(primary) - 4)
-    lower, upper = mesh.lower - padding, mesh.upper + padding
-    size = upper - lower
-    spacing = float((size / (np.array(primary) - 1)).max())
-    band = max(paper.LEAST_BAND, paper.BAND * spacing)
-    uniform = int(UNIFORM * SAMPLES)
-    seed = request.settings.seed
-    points = np.concatenate([
-        samples.near(distances.surface, SAMPLES - uniform, spacing / 2, [seed, 1]),
-        samples.far(lower, upper, uniform, [seed, 2]),
-    ])  # fmt: skip
-    points = np.clip(points, lower, upper)
-    d = distances.signed(points)
-    unit = (points - lower) / size
-
-    def at(resolution):
-        places = np.stack(np.meshgrid(*[np.linspace(a, b, n) for a, b, n in zip(lower, upper, resolution, strict=True)],
-                                      indexing="ij"), axis=-1)  # fmt: skip
-        return distances.signed(places.reshape(-1, 3)).reshape(resolution)
-
-    start = "constant" if options["constant"] else recipe.start
-    if start == "constant":
-        net = paper.initial("ramp", primary, cascaded, at, unit[:1], np.zeros(1), band)
-    else:
-        net = paper.initial(start, primary, cascaded, at, unit, d, band)
-    net = net.alloc(request.types.TensorXf)
-    field = paper.PairField(request.types, net, lower, upper, band, 1.0)
-    held_out = training.HeldOut(distances, request.types, spacing / 2)
-    problem = training.PairProblem(field, mesh, unit, d, held_out)
-    result: FitResult = request.train(problem)
-    kept = stored_form(problem.net)
-    slope = paper.slope_of(kept, lower, upper, band)
-    arrays = {"primary": StoredArray.of(kept.primary[0]), "cascaded": StoredArray.of(kept.cascaded)}
-    table = Table("sdf", arrays)
-    table.settings = {
-        "layout": "pair", "lower": lower.tolist(), "upper": upper.tolist(), "band": band, "slope": slope,
-        "ratio": primary[0] / cascaded[0], "start": start,
-    }  # fmt: skip
-    return table, result, paper.PairField(request.types, kept, lower, upper, band, slope), []
+    table = Table("sdf", sparse_arrays(structure, coding.frames, words, coding.entries), settings=settings)
+    return table, result, coded_field(types, structure, slope, coding.frames, words, bits, coding.entries)

@@ -1,76 +1,203 @@
 """
-Rays through a sparse grid (:class:`.nodes.SparseNodes`), from cell to cell.
+Ray marching through a sparse grid (:class:`.nodes.SparseNodes`), from cell to cell.
 
-A ray goes from one empty region or block to the next, as words say that are made of the masks (:mod:`.index`). In a
-block with crossed cells it goes to where the block's *slab* begins: between two planes, parallel to the one of its
-frame, beyond which the sign is known. There it goes from cell to cell; only in those that the surface may cross is
-anything read, all corners at once, and evaluated at :data:`SAMPLES` places along the ray. What enters and leaves the
-solid between two places in a cell of the spacing h, no more than h·√3 / :data:`SAMPLES` apart, may be missed.
+A ray goes from one empty region or block to the next by the index's empty-space distances. In a block with crossed
+cells it goes to where the block's *slab* begins: the space between two planes, parallel to that of the block's frame,
+beyond which the sign is known. There it goes from cell to cell; nodes are read only in cells that the surface may
+cross, all corners at once, and the field is evaluated at :data:`SAMPLES` places along the ray. The ray may miss a part
+of the solid that it enters and leaves between two of these places, which are at most h·√3 / :data:`SAMPLES` apart in a
+cell of the spacing h.
 
-Nodes that are trained may move the surface anywhere in their cells: there are no slabs then. Lengths are in spacings
-here, as the structure's.
+While nodes are trained, the surface may move anywhere in their cells, so there are no slabs. Lengths are in spacings,
+as in the structure.
 """
 
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
+from scipy.ndimage import distance_transform_cdt
 
-from ...bits import mask_words
+from ...bits import mask_flags, mask_words
 from . import codes
-from .index import EMPTY, INSIDE, MIDDLE, SLAB, STEPS, cells_of, slabs_of, words_of
-from .nodes import CORNERS
+from .nodes import CORNERS, MIDDLE, bernstein
+from .structure import ACTIVE, BLOCK, place_of
 
-#: Places along the ray at which a cell is looked at, and steps by false position from there.
+#: Places along the ray at which the field is evaluated in a cell, and steps by false position from there.
 SAMPLES, ROOTS = 3, 3
 
-#: How far a ray goes beyond the side of a cell, so that it is in the next one.
-HAIR = 1e-3
+#: Distance by which a ray is advanced beyond the side of a cell, so that it is in the next one.
+EPSILON = 1e-3
 
-#: Components of a direction below this count as zero.
+#: Magnitude below which a component of a direction counts as zero.
 TINY = 1e-12
 
-#: The least rise of a ray above a plane, per spacing: less would be out of whole numbers' range, more beyond a slab's
-#: margin in the longest grid.
+#: Smallest rise of a ray above a plane, per spacing. With less, distances would exceed the range of whole numbers; with
+#: more, the error would exceed a slab's margin in the longest grid.
 LEVEL = 1e-7
+
+#: Flags in the word of a block without crossed cells, above the distance to the next crossed one in blocks: the word is
+#: no number of a block; the block is inside.
+EMPTY, INSIDE = 1 << 31, 1 << 30
+
+#: Largest height of a slab's bounds above or below a block's plane, number of steps in 16 bits, and safety margin.
+SLAB, STEPS, MARGIN = 10.0, 65535, 1e-3
+
+# -- the index --------------------------------------------------------------------------------------------------------
+
+
+class GridCells:
+    """
+    Cells of a structure's blocks, for B blocks with nodes (NumPy).
+
+    - ``crossed`` (B, 64) bool: whether all corners of each cell are stored;
+    - ``inside`` (B, 64) bool: the sign of the other cells;
+    - ``beside`` (B, 8): the blocks that the corners of cells lie in, the block itself where there is none;
+    - ``empty_signs`` (X, Y, Z) bool: signs of blocks without nodes, at their places in the grid of blocks;
+    - ``node`` (B, 5, 5, 5): the numbers of the nodes at the corners of cells, −1 where none is stored.
+    """
+
+    def __init__(self, structure):
+        place = structure.block_positions() // BLOCK
+        number = np.full([n // BLOCK + 1 for n in structure.shape], -1)
+        number[tuple(place.T)] = np.arange(len(place))
+        beside = np.stack([number[tuple((place + n).T)] for n in CORNERS], axis=1)
+
+        # Signs of blocks without nodes; beyond the grid outside
+        regions = structure.regions.shape
+        signs = np.repeat((structure.regions & 1).astype(bool)[..., None], 64, axis=-1)
+        signs[structure.regions == ACTIVE] = mask_flags(structure.region_signs)
+        signs = signs.reshape(*regions, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
+        self.empty_signs = signs.reshape([4 * n for n in regions])
+        empty = np.pad(self.empty_signs, [(0, 1)] * 3)
+
+        stored_nodes = np.concatenate(
+            [mask_flags(structure.block_masks).reshape(-1, 4, 4, 4), np.zeros((1, 4, 4, 4), bool)]
+        )
+        groups = (structure.block_signs[:, None] >> np.arange(8) & 1).astype(bool).reshape(-1, 2, 2, 2)
+        node_signs = groups.repeat(2, 1).repeat(2, 2).repeat(2, 3)
+        inside = np.zeros((len(place), 5, 5, 5), bool)
+        numbers, self.node = np.full((len(place) + 1, 4, 4, 4), -1), np.full((len(place), 5, 5, 5), -1)
+        numbers[stored_nodes] = np.arange(stored_nodes.sum())
+        for neighbour, n in zip(beside.T, CORNERS, strict=True):
+            target = (slice(None), *(slice(4 * e, 4 + e) for e in n))
+            source = (slice(None), *(slice(0, 1 if e else 4) for e in n))
+            self.node[target] = numbers[neighbour][source]
+            sign = empty[tuple((place + n).T)][:, None, None, None]
+            inside[target] = np.where(neighbour[:, None, None, None] >= 0, node_signs[neighbour], sign)[source]
+        stored = self.node >= 0
+        crossed, within = np.ones((len(place), 4, 4, 4), bool), np.zeros((len(place), 4, 4, 4), bool)
+        for a, b, c in CORNERS:
+            corner = (slice(None), slice(a, a + 4), slice(b, b + 4), slice(c, c + 4))
+            crossed &= stored[corner]
+            within |= ~stored[corner] & inside[corner]
+        self.crossed, self.inside = crossed.reshape(-1, 64), within.reshape(-1, 64)
+        self.beside = np.where(beside < 0, np.arange(len(place))[:, None], beside)
+
+
+def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
+    """
+    Return how far above its plane P each block's solid begins and ends, words (B,) of twice 16 bits.
+
+    P is the plane of the block's frame. A place in the block is inside where P is less than the lower bound, outside
+    where P is above the upper bound. In a crossed cell f − P, a polynomial of degree 2 along each axis, lies between
+    its Bernstein coefficients; where f is 0, P lies between their negatives. The signs of all other cells are kept.
+    """
+    (nx, ny, nz), distances, _ = codes.frames(frames)
+    normals = np.stack([nx, ny, nz], axis=1)
+    lower, upper = np.full((2, len(frames)), np.inf)
+    upper *= -1
+    block, bit = np.nonzero(cells.crossed)
+    cell, corners, part = place_of(bit), np.array(CORNERS), 2**17
+    for first in range(0, len(block), part):
+        b, at = block[first : first + part], cell[first : first + part, None] + corners
+        residual = nodes[cells.node[b[:, None], at[..., 0], at[..., 1], at[..., 2]]].astype(np.float64)
+        residual[..., 0] -= distances[b, None] + np.einsum("mki,mi->mk", at - MIDDLE, normals[b])
+        residual[..., 1:] -= normals[b, None]
+        coefficients = bernstein(residual)
+        np.minimum.at(lower, b, -coefficients.max(axis=1))
+        np.maximum.at(upper, b, -coefficients.min(axis=1))
+    block, bit = np.nonzero(~cells.crossed)
+    within = cells.inside[block, bit]
+    planes = distances[block] + np.einsum("mi,mi->m", place_of(bit) - MIDDLE + 0.5, normals[block])
+    half = np.abs(normals[block]).sum(axis=1) / 2
+    np.maximum.at(upper, block[within], (planes + half)[within])
+    np.minimum.at(lower, block[~within], (planes - half)[~within])
+    scale = STEPS / (2 * SLAB)
+    lower = np.floor((np.clip(lower - MARGIN, -SLAB, SLAB) + SLAB) * scale).astype(np.uint32)
+    upper = np.ceil((np.clip(upper + MARGIN, -SLAB, SLAB) + SLAB) * scale).astype(np.uint32)
+    return lower | upper << np.uint32(16)
+
+
+def empty_space_words(structure, cells: GridCells) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the words of regions and of blocks by which rays skip empty space, uint32.
+
+    A region's word is the number of its blocks' words, or flags and distance (:data:`EMPTY`); the words of the blocks
+    ``(R, 64)`` of regions that are not empty are the number of the block, or flags and distance.
+    """
+    empty = cells.empty_signs
+    number, full = np.zeros(empty.shape, np.uint32), np.zeros(empty.shape, bool)
+    at = tuple((structure.block_positions() // BLOCK).T)
+    full[at] = cells.crossed.any(axis=1)
+    number[at] = np.arange(len(cells.crossed))
+    sign = empty.copy()
+    sign[at] = cells.inside[:, 0]  # where no cell is crossed, all have the same
+    shape = structure.regions.shape
+
+    def by_region(v):
+        return v.reshape(np.stack([shape, (4, 4, 4)], 1).ravel()).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 64)
+
+    def flags(full, sign):
+        far = distance_transform_cdt(~full, "chessboard") if full.any() else np.full(full.shape, max(full.shape))
+        return np.int64(EMPTY) | np.where(sign, INSIDE, 0) | far
+
+    blocks = by_region(np.where(full, number, flags(full, sign)).astype(np.uint32))
+    some = by_region(full).any(axis=1)
+    regions = flags(some.reshape(shape), by_region(sign)[:, 0].reshape(shape)).ravel()
+    regions[some] = np.arange(some.sum())
+    return regions.astype(np.uint32), blocks[some]
 
 
 class Marcher:
     """
-    What rays go by, in memory: for each region, and each block of those with nodes, a word that says how many around it
-    are empty and their sign, or its number; for each block with crossed cells, which these are, the signs of the
-    others, the numbers of the blocks beside it, and its plane and slab.
+    Ray-marching index: empty-space distances and per-block slabs, built on the first trace.
+
+    In memory, for each region, and each block of those with nodes, a word with its number or the distance to the next
+    crossed block (:func:`empty_space_words`); for each block with nodes, its :class:`GridCells`, plane and slab.
     """
 
     def __init__(self, field):
         self.field = field
         structure, UInt32 = field.structure, field.types.UInt32
-        crossed, inside, beside, empty, node = cells_of(structure)
-        regions, blocks = words_of(structure, crossed, inside, empty)
-        words = np.concatenate([mask_words(crossed), mask_words(inside)], axis=1)
+        cells = GridCells(structure)
+        regions, blocks = empty_space_words(structure, cells)
+        masks = np.concatenate([mask_words(cells.crossed), mask_words(cells.inside)], axis=1)
         self.cells, self.beside, self.regions, self.words = (
-            UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (words, beside, regions, blocks)
+            UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (masks, cells.beside, regions, blocks)
         )
         self.slabs, nodes = None, field.decoded()
         if nodes is not None:
             frames = field.frames()
-            slabs = np.stack([frames, slabs_of(crossed, inside, node, nodes, frames)], axis=1)
+            slabs = np.stack([frames, slab_words(cells, nodes, frames)], axis=1)
             self.slabs = UInt32(slabs.reshape(-1))
 
     @property
     def nbytes(self) -> int:
-        """Bytes of it."""
-        made = [self.regions, self.words, self.cells, self.beside, *([] if self.slabs is None else [self.slabs])]
-        return 4 * sum(map(dr.width, made))
+        """Bytes of the index in memory."""
+        slabs = [] if self.slabs is None else [self.slabs]
+        return 4 * sum(map(dr.width, [self.regions, self.words, self.cells, self.beside, *slabs]))
 
-    # -- where a ray is -----------------------------------------------------------------------------------------------
+    # -- along a ray --------------------------------------------------------------------------------------------------
 
-    def block(self, course, t, active):
+    def block(self, ray, t, active):
         """
-        Of the block at ``t`` of a ray: whether cells of it are crossed; its number if so; where the ray leaves what is
-        empty around it; whether that is inside.
+        Look up the block at ``t`` of a ray: ``(crossed, number, end, inside)``.
+
+        ``crossed``: cells of the block are crossed, and ``number`` is valid; otherwise the ray leaves the empty space
+        around the block at ``end``, and ``inside`` is its sign.
         """
-        i, j, k = cell = course.cell(t)
+        i, j, k = cell = ray.cell(t)
         types = self.field.types
         UInt32, Int32 = types.UInt32, types.Int32
         _, ny, nz = self.field.structure.regions.shape
@@ -79,24 +206,26 @@ class Marcher:
         place = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
         word = dr.gather(UInt32, self.words, region * 64 + place, active & ~wide)
         word = dr.select(wide, region, word)
-        end = course.end(cell, dr.select(wide, Int32(4), 2), Int32(word & 0xFFFF))
+        end = ray.end(cell, dr.select(wide, Int32(4), 2), Int32(word & 0xFFFF))
         return active & (word < EMPTY), word, dr.maximum(end, t), (word & INSIDE) != 0
 
-    def cell(self, course, t, number, active):
+    def cell(self, ray, t, number, active):
         """
-        From the place ``t`` of a ray, in the block with this number: whether there is a crossed cell before the ray
-        leaves the block; where that begins; where the ray leaves it, or what is not crossed; whether the sign at ``t``
-        is known, and whether it is inside.
+        Find the next crossed cell from ``t`` in the block with this number: ``(crossed, start, end, known, inside)``.
+
+        ``crossed``: there is a crossed cell before the ray leaves the block, from ``start`` to ``end``; otherwise
+        ``end`` is where the ray leaves the cells that are not crossed. ``known``: the sign at ``t`` is known, and is
+        ``inside``.
         """
         types = self.field.types
         UInt32, Int32, Float, Bool = types.UInt32, types.Int32, types.Float, types.Bool
-        cell, start, last = course.cell(t), t, Float(dr.inf)
+        cell, start, last = ray.cell(t), t, Float(dr.inf)
         off, below, within = Bool(False), Bool(False), active
         if self.slabs is not None:
-            first, last, below = self.slab(course, t, number, cell, active)
+            first, last, below = self.slab(ray, t, number, cell, active)
             off, start = (t < first) | (t > last), dr.maximum(t, first)
-            # Not if that is behind, or not in this block
-            there, out = course.cell(start), Int32(0)
+            # Ignored if it lies behind, or not in this block
+            there, out = ray.cell(start), Int32(0)
             for v, w in zip(cell, there, strict=True):
                 out |= (v ^ w) >> 2
             within = active & (t <= last) & (out == 0)
@@ -110,22 +239,23 @@ class Marcher:
         # The cell and its seven neighbours in a cube of 2 × 2 × 2 are bits of one word
         alone = (half & (UInt32(0x330033) << ((y & 2) * 4 + (z & 2)))) == 0
         shift = dr.select(within, dr.select(alone, Int32(1), 0), 2)
-        end = dr.maximum(course.end(cell, shift, 1), start)
+        end = dr.maximum(ray.end(cell, shift, 1), start)
         end = dr.select(crossed, dr.maximum(dr.minimum(end, last), start), end)
         return crossed, start, end, off | ~crossed, dr.select(off, below, ((signs >> bit) & 1) == 1)
 
-    def slab(self, course, t, number, cell, active):
+    def slab(self, ray, t, number, cell, active):
         """
-        Where a ray enters and leaves the slab of the block with this number, which holds ``cell``, and whether it is
-        below the slab at ``t``.
+        Return where a ray enters and leaves the slab of a block, and whether it is below the slab at ``t``.
+
+        The block has this ``number`` and holds ``cell``.
         """
         Float = self.field.types.Float
         frame, word = dr.gather(self.field.types.Array2u, self.slabs, number, active)
-        n, d, _ = codes.frames(frame, self.field.types)
+        n, d, _ = codes.frames(frame, Float)
         low, high = (dr.fma(Float(v), 2 * SLAB / STEPS, -SLAB) for v in (word & 0xFFFF, word >> 16))
         # The height above the plane is at + slope t
         at, slope = d, Float(0)
-        for v, x, o, e in zip(n, cell, course.o, course.d, strict=True):
+        for v, x, o, e in zip(n, cell, ray.o, ray.d, strict=True):
             at, slope = dr.fma(v, o - Float(x & ~3) - MIDDLE, at), dr.fma(v, e, slope)
         slope = dr.select(dr.abs(slope) < LEVEL, LEVEL, slope)
         inverse = dr.rcp(slope)
@@ -134,24 +264,24 @@ class Marcher:
         return first, last, (t < first) == (slope > 0)
 
     def corners(self, number, cell, active=True):
-        """Distance and gradient, in spacings, of the eight nodes of a crossed cell, in the order of ``CORNERS``."""
+        """Return distance and gradient, in spacings, of a crossed cell's eight nodes, in the order of ``CORNERS``."""
         field, Words = self.field, dr.uint32_array_t(self.field.types.Array4f)
         owners = [w for n in (0, 1) for w in dr.gather(Words, self.beside, number * 2 + n, active)]
-        # Which of the blocks beside it a corner lies in, axis by axis
+        # The block in which each corner lies, axis by axis
         for v, m in zip(cell, (4, 2, 1), strict=True):
             last = (v & 3) == 3
             owners = [dr.select(last, w, owners[n - m]) if n & m else w for n, w in enumerate(owners)]
-        found = []
-        for own, corner in zip(owners, CORNERS, strict=True):
+        corners = []
+        for owner, corner in zip(owners, CORNERS, strict=True):
             at = [v + e for v, e in zip(cell, corner, strict=True)]
-            record = field._record(own, active)
+            record = field._record(owner, active)
             _, node, _ = field._in_block(record, *at)
-            found.append(field._node(node, record, *at, active))
-        return found
+            corners.append(field._node(node, record, *at, active))
+        return corners
 
 
-def of(field) -> Marcher:
-    """That of a field, made once."""
+def marcher_of(field) -> Marcher:
+    """Return the field's cached marcher."""
     if "_marcher" not in vars(field):
         field._marcher = Marcher(field)
     return field._marcher
@@ -159,18 +289,20 @@ def of(field) -> Marcher:
 
 def along(corners, start, d):
     """
-    The field's value, in spacings, on the ray ``start + t·d`` through a cell, 0 to 1 along each axis, as a function of
-    ``t``: what each corner says is linear in t, and blended along z, y and x.
+    Return a function of ``t`` that gives the field's value, in spacings, on the ray ``start + t·d`` through a cell.
+
+    The cell extends from 0 to 1 along each axis. Each corner's extrapolation is linear in t; these are blended along z,
+    y and x.
     """
-    said = []
+    lines = []
     for corner, (distance, g) in zip(CORNERS, corners, strict=True):
         offset = [x - e for x, e in zip(start, corner, strict=True)]
         there = dr.fma(g[0], offset[0], dr.fma(g[1], offset[1], g[2] * offset[2]))
         change = dr.fma(g[0], d[0], dr.fma(g[1], d[1], g[2] * d[2]))
-        said.append((dr.fma(0.5, there, distance), 0.5 * change))
+        lines.append((dr.fma(0.5, there, distance), 0.5 * change))
 
     def value(t):
-        values = [dr.fma(change, t, there) for there, change in said]
+        values = [dr.fma(change, t, there) for there, change in lines]
         for axis in (2, 1, 0):
             w = dr.fma(d[axis], t, start[axis])
             values = [dr.fma(w, q - p, p) for p, q in zip(values[::2], values[1::2], strict=True)]
@@ -179,43 +311,44 @@ def along(corners, start, d):
     return value
 
 
-def cross(marcher, course, low, end, number, leaving, fresh):
+def cross(marcher, ray, low, end, number, leaving, fresh):
     """
-    Whether, and where, the sign changes in a crossed cell between ``low`` and ``end`` along the ray; and what it was at
-    the start. ``(found, t, leaving)``.
+    Find the first change of sign in a crossed cell between ``low`` and ``end`` along the ray: ``(hit, t, leaving)``.
+
+    ``leaving`` is the sign at the start of the ray, which a ``fresh`` ray takes from here.
     """
-    cell = course.cell(low)
-    start = [x - course.types.Float(c) for x, c in zip(course.o, cell, strict=True)]
-    value = along(marcher.corners(number, cell), start, course.d)
+    cell = ray.cell(low)
+    start = [x - ray.types.Float(c) for x, c in zip(ray.o, cell, strict=True)]
+    value = along(marcher.corners(number, cell), start, ray.d)
 
     step = (end - low) * (1 / SAMPLES)
     start, high = low, low
     a = b = value(low)
     leaving = dr.select(fresh, a < 0, leaving)
-    found = (a < 0) != leaving
+    hit = (a < 0) != leaving
     for n in range(SAMPLES):
         t = dr.fma(step, n + 1, start)
         v = value(t)
         other = (v < 0) != leaving
-        high, b = dr.select(other & ~found, t, high), dr.select(other & ~found, v, b)
-        found |= other
-        low, a = dr.select(found, low, t), dr.select(found, a, v)
+        high, b = dr.select(other & ~hit, t, high), dr.select(other & ~hit, v, b)
+        hit |= other
+        low, a = dr.select(hit, low, t), dr.select(hit, a, v)
     for _ in range(ROOTS):
         t = dr.fma(high - low, _share(a, b), low)
         v = value(t)
         other = (v < 0) != leaving
         low, a = dr.select(other, low, t), dr.select(other, a, v)
         high, b = dr.select(other, t, high), dr.select(other, v, b)
-    return found, dr.fma(high - low, _share(a, b), low), leaving
+    return hit, dr.fma(high - low, _share(a, b), low), leaving
 
 
 def _share(a, b):
-    """Where between two places with the values a and b of different signs the value is zero; 0 if they are equal."""
+    """Return the share of the way at which values from a to b, of different signs, are zero; 0 if they are equal."""
     return dr.select(a == b, 0, dr.clip(a / (a - b), 0.02, 0.98))
 
 
-class Course:
-    """A ray ``o + t·d`` in a grid, and what of it does not change."""
+class GridRay:
+    """Ray ``o + t·d`` in a grid, with the reciprocals of its direction."""
 
     def __init__(self, field, o, d):
         self.types, self.last = field.types, [n - 2 for n in field.structure.shape]
@@ -225,14 +358,14 @@ class Course:
         self.up = [(v > 0) | s for s, v in zip(still, d, strict=True)]
 
     def cell(self, t):
-        """The cell of the place ``t``."""
+        """Return the cell at ``t``."""
         return [
             dr.clip(self.types.Int32(dr.floor(dr.fma(v, t, x))), 0, n)
             for x, v, n in zip(self.o, self.d, self.last, strict=True)
         ]
 
     def end(self, cell, shift, reach):
-        """Where it leaves the cubes of 2^shift cells around a cell, fewer than ``reach`` in each direction."""
+        """Return where the ray leaves the cubes of 2^shift cells less than ``reach`` of them away from a cell."""
         sides = [
             (self.types.Float(((c >> shift) + dr.select(e, reach, 1 - reach)) << shift) - x) * r
             for x, c, e, r in zip(self.o, cell, self.up, self.inverse, strict=True)
@@ -243,51 +376,52 @@ class Course:
 @dr.syntax
 def march(marcher, o, d, length, fresh, active):
     """
-    Rays ``o + t·d`` from within the grid, ``d`` of length 1, ``o`` and ``t`` in spacings from its lower corner:
-    ``(found, t, leaving)`` of the first change of sign before ``length``. A ray that is ``fresh`` starts with the sign
-    that it finds; others start outside.
+    Find the first change of sign before ``length`` along rays ``o + t·d`` in the grid: ``(hit, t, leaving)``.
+
+    ``d`` has length 1; ``o`` and ``t`` are in spacings from the grid's lower corner. A ``fresh`` ray starts with the
+    sign at its origin, any other one outside.
     """
     types = marcher.field.types
-    course = Course(marcher.field, o, d)
-    t, found, leaving = types.Float(0), types.Bool(False), types.Bool(False)
+    ray = GridRay(marcher.field, o, d)
+    t, hit, leaving = types.Float(0), types.Bool(False), types.Bool(False)
     fresh, active = types.Bool(fresh), types.Bool(active)
-    while dr.hint(active, label="cells that are crossed"):
-        # All rays of a packet go on until each has found one: reading it is what costs
+    while dr.hint(active, label="crossed cells"):
+        # All rays of a packet go on until each has reached a crossed cell, since reading it is expensive
         seeking, number, end = types.Bool(active), types.UInt32(0), t
-        while dr.hint(seeking, label="blocks with cells that are"):
+        while dr.hint(seeking, label="blocks with crossed cells"):
             far = types.Bool(seeking)
-            while dr.hint(far, label="blocks without"):
-                some, word, following, sign = marcher.block(course, t, far)
+            while dr.hint(far, label="empty blocks"):
+                some, word, following, sign = marcher.block(ray, t, far)
                 empty = far & ~some
                 number = dr.select(some, word, number)
                 leaving = dr.select(empty & fresh, sign, leaving)
                 fresh &= ~empty
                 jumped = empty & (sign != leaving)
-                found |= jumped
-                t = dr.select(empty & ~jumped, following + HAIR, t)
+                hit |= jumped
+                t = dr.select(empty & ~jumped, following + EPSILON, t)
                 active &= ~jumped & (t < length)
                 far &= ~some & active
             seeking &= active
-            crossed, start, following, known, sign = marcher.cell(course, t, number, seeking)
+            crossed, start, following, known, sign = marcher.cell(ray, t, number, seeking)
             known &= seeking
             leaving = dr.select(fresh & known, sign, leaving)
             fresh &= ~known
             jumped = known & (sign != leaving)
             crossed &= ~jumped
             end = dr.select(crossed, following, end)
-            found |= jumped
-            t = dr.select(seeking & ~jumped, dr.select(crossed, start, following + HAIR), t)
+            hit |= jumped
+            t = dr.select(seeking & ~jumped, dr.select(crossed, start, following + EPSILON), t)
             active &= ~jumped & (t < length)
             seeking &= ~crossed & active
-        hit, place, leaving = dr.if_stmt(
+        struck, place, leaving = dr.if_stmt(
             (t, end, number, leaving, fresh),
             active,
-            lambda t, end, number, leaving, fresh: cross(marcher, course, t, end, number, leaving, fresh),
+            lambda t, end, number, leaving, fresh: cross(marcher, ray, t, end, number, leaving, fresh),
             lambda t, end, number, leaving, fresh: (types.Bool(False), t, leaving),
         )
-        hit &= active
-        found |= hit
+        struck &= active
+        hit |= struck
         fresh &= ~active
-        t = dr.select(hit, place, dr.select(active, end + HAIR, t))
-        active &= ~hit & (t < length)
-    return found & (t <= length), t, leaving
+        t = dr.select(struck, place, dr.select(active, end + EPSILON, t))
+        active &= ~struck & (t < length)
+    return hit & (t <= length), t, leaving

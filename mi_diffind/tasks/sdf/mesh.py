@@ -1,8 +1,8 @@
 """
 Triangle meshes in the unit frame: the bounding box is centred at the origin and its longest side is 1.
 
-All distances, tolerances and points of this task are in that frame; negative is inside. Any format that trimesh reads
-is read; what had to be repaired for "inside" to mean something is said.
+All distances, tolerances and points of this task are in that frame; negative is inside. Every format of trimesh is
+read. Repairs that "inside" depends on are listed in :attr:`Mesh.warnings`.
 """
 
 from __future__ import annotations
@@ -20,33 +20,32 @@ import numpy as np
 
 from ...errors import DiffindError, reason
 
-#: Of the longest side: what is flatter than this along an axis holds no volume that float32 could tell.
+#: Extent along an axis, relative to the longest side, below which a mesh is flat: float32 resolves no volume in it.
 FLAT = 1e-6
 
-#: Of the cube of the longest side: a closed mesh whose volume is smaller than this encloses nothing.
+#: Volume, relative to the cube of the longest side, below which a closed mesh encloses nothing.
 NO_VOLUME = 1e-12
 
-#: Of the square of the longest edge: twice the area of a triangle that has none.
+#: Twice the area, relative to the square of the longest edge, up to which a triangle counts as degenerate.
 SLIVER = 1e-12
 
-#: The most components whose orientation is looked at one by one.
+#: Largest number of components whose orientation is tested one by one.
 MAX_ORIENTED = 200
 
 
 class MeshError(DiffindError, ValueError):
-    """A mesh that cannot be used; the message is one sentence that names the file and the fault."""
+    """A mesh cannot be used; the message is one sentence that names the file and the fault."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """
-    A triangle mesh: ``vertices`` ``(V, 3)`` float64 in the unit frame, each position once, and ``faces`` ``(F, 3)``
-    int32, counter-clockwise from outside.
+    Triangle mesh: ``vertices`` (V, 3) float64 in the unit frame, and ``faces`` (F, 3) int32.
 
-    ``watertight``: each edge is run through as often one way as the other, so that the winding number is a whole number
-    everywhere but on the surface and changes nowhere else. A point of the file is ``vertices · scale + centre``.
-    ``digest`` is a SHA-256 over vertices and faces; ``warnings`` has a sentence for each thing that was repaired or is
-    doubtful.
+    Each position occurs once; faces are counter-clockwise from outside. ``watertight``: each edge is used as often in
+    one direction as in the other, so the winding number is whole and changes on the surface only. A point of the file
+    is ``vertices · scale + centre``. ``digest`` is a SHA-256 over vertices and faces; ``warnings`` has one sentence for
+    each repair or doubt.
     """
 
     vertices: np.ndarray
@@ -60,7 +59,7 @@ class Mesh:
 
     @property
     def lower(self) -> np.ndarray:
-        """The lower corner of the bounding box, ``(3,)``."""
+        """Lower corner of the bounding box, ``(3,)``."""
         return self.vertices.min(axis=0)
 
     @property
@@ -69,7 +68,7 @@ class Mesh:
 
     @functools.cached_property
     def corners(self) -> np.ndarray:
-        """The vertices of each triangle, ``(F, 3, 3)``."""
+        """Vertices of each triangle, ``(F, 3, 3)``."""
         return self.vertices[self.faces]
 
     @functools.cached_property
@@ -79,7 +78,7 @@ class Mesh:
 
     @functools.cached_property
     def areas(self) -> np.ndarray:
-        """Of each triangle, ``(F,)``."""
+        """Areas of the triangles, ``(F,)``."""
         return np.linalg.norm(self._crosses, axis=1) / 2
 
     @property
@@ -88,35 +87,35 @@ class Mesh:
 
     @functools.cached_property
     def normals(self) -> np.ndarray:
-        """Of each triangle, ``(F, 3)``, of length 1."""
+        """Unit normals of the triangles, ``(F, 3)``."""
         return self._crosses / (2 * self.areas)[:, None]
 
     @functools.cached_property
     def labels(self) -> np.ndarray:
-        """The number of its component for each triangle, ``(F,)``: what is joined by vertices belongs together."""
-        return _labels(self.faces, len(self.vertices))
+        """Component number of each triangle, ``(F,)``; triangles that share a vertex belong together."""
+        return component_labels(self.faces, len(self.vertices))
 
     @property
     def components(self) -> int:
-        """Pieces of the surface; overlapping ones count apart, although they enclose one solid."""
+        """Number of connected pieces of the surface; overlapping pieces count separately."""
         return int(self.labels.max()) + 1
 
     @property
     def volume(self) -> float:
-        """Of a watertight mesh; what overlaps counts as often as it does."""
-        return float(_volumes(self.vertices, self.faces).sum())
+        """Volume of a watertight mesh; where pieces overlap, volume counts once per piece."""
+        return float(tetrahedron_volumes(self.vertices, self.faces).sum())
 
     def to_file_frame(self, points: np.ndarray) -> np.ndarray:
-        """Points of the unit frame, ``(…, 3)``, in units and place of the file."""
+        """Convert points ``(…, 3)`` of the unit frame to units and place of the file."""
         return points * self.scale + np.array(self.centre)
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
     """
-    Read a mesh, or a scene of them whose meshes are taken together, where their transforms put them.
+    Read a mesh file; the meshes of a scene file are joined where its transforms place them.
 
-    Equal vertices become one, triangles without an area are left out, and triangles that are wound against their
-    neighbours, or around their solid the wrong way, are turned. Raises :class:`MeshError`.
+    Equal vertices are merged, degenerate triangles left out, and triangles wound against their neighbours or around
+    their solid the wrong way are turned. Raises :class:`MeshError`.
     """
     path = Path(path)
     if not path.is_file():
@@ -126,7 +125,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
 
 def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Mesh:
-    """The same from arrays in any units and place: ``vertices`` ``(V, 3)`` and ``faces`` ``(F, 3)``, whole numbers."""
+    """Build a mesh from ``vertices`` (V, 3) in any units and place, and ``faces`` (F, 3), as :func:`load_mesh` does."""
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError(f"{name}: has vertices {vertices.shape} and faces {faces.shape}, expected (V, 3) and (F, 3)")
@@ -150,18 +149,18 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
     centre = lower + 0.5 * extent
     vertices = (vertices - centre) / scale
 
-    said = []
-    vertices, faces, watertight = _repaired(vertices, faces, name, said)
+    repairs = []
+    vertices, faces, watertight = _repaired(vertices, faces, name, repairs)
     vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int32)
     digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()
-    mesh = Mesh(vertices, faces, watertight, scale, tuple(float(c) for c in centre), name, digest, said)
+    mesh = Mesh(vertices, faces, watertight, scale, tuple(float(c) for c in centre), name, digest, repairs)
     if mesh.watertight and abs(mesh.volume) < NO_VOLUME:
         raise MeshError(f"{name}: encloses no volume, expected the surface of a solid")
     return mesh
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """All triangles of a file: vertices and faces."""
+    """Read vertices and faces of all triangles of a file."""
     import trimesh
 
     level = logging.getLogger("trimesh").level
@@ -177,34 +176,31 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     finally:
         logging.getLogger("trimesh").setLevel(level)
     if isinstance(loaded, trimesh.Scene):
-        placed = [(loaded.geometry[name], matrix) for _, (matrix, name) in _nodes(loaded)]
+        nodes = [loaded.graph[node] for node in loaded.graph.nodes_geometry]
+        placed = [(loaded.geometry[name], matrix) for matrix, name in nodes]
     else:
         placed = [(loaded, np.eye(4))]
     vertices, faces, first = [], [], 0
     for geometry, matrix in placed:
         if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
             continue
-        own, mirrored = np.asarray(geometry.faces), np.linalg.det(matrix[:3, :3]) < 0
-        found = np.asarray(geometry.vertices, dtype=np.float64)
-        if len(own) and (own.min() < 0 or own.max() >= len(found)):
-            raise MeshError(f"{path}: a triangle names vertex {int(own.max())} of {len(found)}")
-        vertices.append(found if np.array_equal(matrix, np.eye(4)) else found @ matrix[:3, :3].T + matrix[:3, 3])
-        faces.append((own[:, ::-1] if mirrored else own) + first)
-        first += len(found)
+        triangles, mirrored = np.asarray(geometry.faces), np.linalg.det(matrix[:3, :3]) < 0
+        points = np.asarray(geometry.vertices, dtype=np.float64)
+        if triangles.min() < 0 or triangles.max() >= len(points):
+            raise MeshError(f"{path}: a triangle names vertex {int(triangles.max())} of {len(points)}")
+        vertices.append(points if np.array_equal(matrix, np.eye(4)) else points @ matrix[:3, :3].T + matrix[:3, 3])
+        faces.append((triangles[:, ::-1] if mirrored else triangles) + first)
+        first += len(points)
     if not faces:
         raise MeshError(f"{path}: has no triangles, expected a surface that encloses a solid")
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _nodes(scene):
-    return [(node, scene.graph[node]) for node in scene.graph.nodes_geometry]
-
-
 # -- repairs ----------------------------------------------------------------------------------------------------------
 
 
-def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, said: list[str]):
-    """Faces and vertices without what has no area, turned where that is sure; sentences are added to ``said``."""
+def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[str]):
+    """Drop degenerate triangles and turn wrongly wound ones; sentences are added to ``repairs``."""
     twice = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
     faces = faces[~twice]
     if not len(faces):
@@ -213,17 +209,17 @@ def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, said: list[str
     turned = _inconsistent(faces)
     if turned.any():
         faces[turned] = faces[turned, ::-1]
-        said.append(f"{name}: {turned.sum():,} triangles wound against their neighbours were turned")
+        repairs.append(f"{name}: {turned.sum():,} triangles wound against their neighbours were turned")
     turned = _inside_out(vertices, faces)
     if turned.any():
         faces[turned] = faces[turned, ::-1]
         share = "all triangles were" if turned.all() else f"{turned.sum():,} triangles of closed pieces were"
-        said.append(f"{name}: {share} wound inside out and were turned")
+        repairs.append(f"{name}: {share} wound inside out and were turned")
 
-    # Slivers hold their neighbours together, but have no part in distances or in winding numbers
+    # Slivers connect their neighbours, but have no part in distances or in winding numbers
     open_edges = int(np.count_nonzero(_balance(faces, len(vertices))[0]))
     if open_edges:
-        said.append(f"{name}: is not closed, {open_edges:,} edges have more triangles on one side than on the other")
+        repairs.append(f"{name}: is not closed, {open_edges:,} edges have more triangles on one side than on the other")
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     longest = np.max([np.sum((b - a) ** 2, axis=1), np.sum((c - b) ** 2, axis=1), np.sum((a - c) ** 2, axis=1)], axis=0)
     flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) <= SLIVER * longest
@@ -231,65 +227,66 @@ def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, said: list[str
         raise MeshError(f"{name}: has no triangle that has an area, expected the surface of a solid")
     dropped = int(twice.sum() + flat.sum())
     if dropped:
-        said.append(f"{name}: {dropped:,} triangles without an area were left out")
+        repairs.append(f"{name}: {dropped:,} triangles without an area were left out")
     used, faces = np.unique(faces[~flat], return_inverse=True)
     return vertices[used], faces.reshape(-1, 3), not open_edges
 
 
 def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices that are used, each position once, in lexicographic order, and faces that name them."""
+    """Merge equal vertices and drop unused ones: vertices in lexicographic order, and faces that index them."""
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     vertices = vertices[used]
     order = np.lexsort(vertices.T[::-1])
-    found = vertices[order]
-    first = np.concatenate([[True], np.any(found[1:] != found[:-1], axis=1)])
+    ordered = vertices[order]
+    first = np.concatenate([[True], np.any(ordered[1:] != ordered[:-1], axis=1)])
     number = np.empty(len(order), np.int64)
     number[order] = np.cumsum(first) - 1
     renamed = np.empty(len(used), np.int64)
     renamed[used] = number
-    return found[first], renamed[faces]
+    return ordered[first], renamed[faces]
 
 
-def _edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of the three edges of each triangle a number that both directions share, ``(3 F,)``, and the direction, ±1."""
+def directed_edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a key of each triangle's three edges that both directions share, ``(3 F,)``, and the direction, ±1."""
     ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     return ends.min(axis=1) * count + ends.max(axis=1), np.where(ends[:, 0] < ends[:, 1], 1, -1)
 
 
 def _balance(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of each edge, how much more often it is run through one way than the other; and the edge of each side, (F, 3)."""
-    keys, signs = _edges(faces, count)
-    unique, which = np.unique(keys, return_inverse=True)
-    return np.bincount(which, signs, len(unique)), which.reshape(-1, 3)
+    """Return by how much one direction of each edge outnumbers the other, and each triangle's edges, (F, 3)."""
+    keys, signs = directed_edges(faces, count)
+    unique, edge_of = np.unique(keys, return_inverse=True)
+    return np.bincount(edge_of, signs, len(unique)), edge_of.reshape(-1, 3)
 
 
-def _labels(faces: np.ndarray, count: int) -> np.ndarray:
-    """Numbers of components, ``(F,)``."""
+def component_labels(faces: np.ndarray, count: int) -> np.ndarray:
+    """Return the component number of each triangle, ``(F,)``, given the ``count`` of vertices."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    of_vertices = connected_components(graph, directed=False)[1][faces[:, 0]]
-    return np.unique(of_vertices, return_inverse=True)[1]
+    labels = connected_components(graph, directed=False)[1][faces[:, 0]]
+    return np.unique(labels, return_inverse=True)[1]
 
 
-def _volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Of the tetrahedron of each triangle and the origin, ``(F,)``, signed."""
+def tetrahedron_volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the signed volume of the tetrahedron of each triangle and the origin, ``(F,)``."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
 
 
 def _inconsistent(faces: np.ndarray) -> np.ndarray:
     """
-    Which triangles have to be turned for neighbours to agree, ``(F,)``: the smaller half of each piece whose triangles
-    can agree at all, none of the others.
+    Return which triangles have to be turned for neighbours to agree, ``(F,)`` bool.
+
+    These are the smaller half of each piece that can be oriented at all, none of the others.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    keys, signs = _edges(faces, int(faces.max()) + 1)
+    keys, signs = directed_edges(faces, int(faces.max()) + 1)
     order = np.argsort(keys, kind="stable")
     keys, signs, owner = keys[order], signs[order], order // 3
     starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
@@ -312,13 +309,15 @@ def _inconsistent(faces: np.ndarray) -> np.ndarray:
 
 def _inside_out(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
-    Which triangles belong to closed pieces that are wound inside out, ``(F,)``: those of negative volume that do not
-    lie in another piece, as a cavity does. All, if a mesh with open pieces has a negative volume as a whole.
+    Return which triangles belong to closed pieces that are wound inside out, ``(F,)`` bool.
+
+    These are pieces of negative volume that are no cavity of another piece. If a mesh with open pieces has a negative
+    volume as a whole, they are all triangles.
     """
-    labels = _labels(faces, len(vertices))
-    edges, which = _balance(faces, len(vertices))
-    unbalanced = np.bincount(labels, (edges != 0)[which].sum(axis=1))
-    volumes = np.bincount(labels, _volumes(vertices, faces))
+    labels = component_labels(faces, len(vertices))
+    edges, edge_of = _balance(faces, len(vertices))
+    unbalanced = np.bincount(labels, (edges != 0)[edge_of].sum(axis=1))
+    volumes = np.bincount(labels, tetrahedron_volumes(vertices, faces))
     if unbalanced.any() and volumes.sum() < 0:
         return np.ones(len(faces), dtype=bool)
     turned = np.zeros(len(faces), dtype=bool)
@@ -326,19 +325,17 @@ def _inside_out(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     if len(suspects) > MAX_ORIENTED:
         suspects = suspects[np.argsort(volumes[suspects])[:MAX_ORIENTED]]
     for label in suspects:
-        own = labels == label
-        place = vertices[faces[own][0]].mean(axis=0)
-        others = ~own
-        # The other pieces as if they were all wound the right way, for which of them is right is the question
-        winding = _windings(vertices, faces[others], labels[others], place)
-        enclosing = np.sum(np.abs(winding) > 0.5)
-        if enclosing % 2 == 0:
-            turned |= own
+        piece = labels == label
+        place = vertices[faces[piece][0]].mean(axis=0)
+        # Magnitudes, since the orientation of the other pieces is not known either
+        winding = _windings(vertices, faces[~piece], labels[~piece], place)
+        if np.sum(np.abs(winding) > 0.5) % 2 == 0:
+            turned |= piece
     return turned
 
 
 def _windings(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """The winding number of each of the ``labels`` around a place, by the solid angles of Van Oosterom and Strackee."""
+    """Return each component's winding number around a place, by the solid angles of Van Oosterom and Strackee."""
     if not len(faces):
         return np.zeros(1)
     a, b, c = np.moveaxis(vertices[faces] - place, 1, 0)

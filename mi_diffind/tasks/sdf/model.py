@@ -1,28 +1,149 @@
-"""What a table file of task 6 stands for."""
+"""Table files of distance fields: their arrays, the fields that they become, and what users do with them."""
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import UsageError
+from ...files import replacing
+from ...indirection import Indirection
+from ...tables import StoredArray, Table, TableError, load_table
 from ...task import Model
-from .files import field_of
+from . import codes
+from .field import DistanceField
+from .nodes import SparseNodes, coded_field, decoded_nodes
+from .paper import PairField
+from .structure import ACTIVE, Structure, StructureError
 
-#: What meshes are decoded to: trimesh writes them.
+#: Arrays of each layout: name → number of dimensions, and channels (bytes in the sparse layout, except for entries).
+LAYOUTS = {
+    "sparse": {"regions": (3, 1), "region_masks": (1, 16), "blocks": (1, 13), "pointers": (1, 4), "entries": (1, 3)},
+    "pair": {"primary": (3, 3), "cascaded": (3, 1)},
+}
+
+#: Extensions of the mesh formats that ``decode`` writes, through trimesh.
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb")
+
+# -- arrays -----------------------------------------------------------------------------------------------------------
+
+
+def _word_bytes(words: np.ndarray) -> np.ndarray:
+    """Return words (n, k) as bytes (n, 4k)."""
+    return np.ascontiguousarray(words, "<u4").view(np.uint8).reshape(len(words), -1)
+
+
+def _byte_array(raw: np.ndarray) -> StoredArray:
+    channels = raw.shape[-1]
+    return StoredArray(raw, (), (1.0,) * channels, (0.0,) * channels)
+
+
+def sparse_arrays(structure: Structure, frames, pointers, entries) -> dict[str, StoredArray]:
+    """Return the arrays of a sparse field: words of frames (B,) and pointers, and the entries (K, 3), float32."""
+    blocks = [_word_bytes(structure.block_masks), structure.block_signs[:, None], _word_bytes(frames[:, None])]
+    masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
+    return {
+        "regions": _byte_array(structure.regions[..., None]),
+        "region_masks": _byte_array(_word_bytes(masks)),
+        "blocks": _byte_array(np.concatenate(blocks, axis=1)),
+        "pointers": _byte_array(_word_bytes(pointers[:, None])),
+        "entries": StoredArray(np.ascontiguousarray(entries, np.float32)),
+    }
+
+
+def load(path) -> Table:
+    """Read and check a file. Raises :class:`~mi_diffind.tables.TableError`."""
+    table = load_table(path, "sdf")
+    layout = table.settings.get("layout")
+    if layout not in LAYOUTS:
+        raise TableError(f'{path}: has the layout {layout!r}, allowed are "sparse" and "pair"')
+    for name, (dims, channels) in LAYOUTS[layout].items():
+        array = table.arrays.get(name)
+        if array is None or len(array.shape) != dims + 1 or array.shape[-1] != channels:
+            fault = "is missing" if array is None else f"has the shape {array.shape}"
+            raise TableError(
+                f'{path}: the array "{name}" {fault}, expected {dims} dimension(s) and {channels} channels'
+            )
+    vectors = ["lower", "centre", *(["upper"] if layout == "pair" else [])]
+    numbers = ["scale", "slope", *(["spacing", "bits", "nodes"] if layout == "sparse" else ["band"])]
+    for name in (*vectors, *numbers):
+        value = table.settings.get(name)
+        values = value if name in vectors else [value]
+        valid = isinstance(values, list) and len(values) == (3 if name in vectors else 1)
+        valid = valid and all(isinstance(v, (int, float)) and math.isfinite(v) for v in values)
+        if not valid or (name in numbers and values[0] <= 0):
+            allowed = "a positive number" if name in numbers else "3 finite numbers"
+            raise TableError(f'{path}: its setting "{name}" is {value!r}, expected {allowed}')
+    if layout == "sparse":
+        structure_of(table)
+    return table
+
+
+def _words(table: Table, name: str, part=slice(None)) -> np.ndarray:
+    """Return the bytes of an array's channels ``part`` as words, (n, k)."""
+    return np.ascontiguousarray(table.arrays[name].entries[:, part]).view("<u4")
+
+
+def structure_of(table: Table) -> Structure:
+    """Return the structure of a sparse field. Raises :class:`~mi_diffind.tables.TableError` if it is damaged."""
+    settings = table.settings
+    bits, nodes = settings["bits"], settings["nodes"]
+    regions = table.arrays["regions"].entries[..., 0]
+    # Arrays of a file have at least one entry, even if no region has nodes
+    some = slice(None) if (regions == ACTIVE).any() else slice(0)
+    masks, blocks = _words(table, "region_masks")[some], _words(table, "blocks", slice(8))[some]
+    signs = table.arrays["blocks"].entries[some, 8]
+    structure = Structure(
+        tuple(settings["lower"]), float(settings["spacing"]), regions, masks[:, :2], masks[:, 2:], blocks, signs
+    )
+    try:
+        structure.check()
+    except StructureError as e:
+        raise TableError(f"{table.path}: is damaged: {e}") from None
+    if bits not in codes.POINTERS or structure.nodes != nodes:
+        raise TableError(f"{table.path}: is damaged: its masks have {structure.nodes} nodes, its settings {nodes}")
+    words, entries = _words(table, "pointers")[:, 0], len(table.arrays["entries"].entries)
+    if len(words) != max(1, -(-nodes // codes.POINTERS[bits])):
+        raise TableError(f"{table.path}: is damaged: {nodes} pointers of {bits} bits do not fit in {len(words)} words")
+    pointers = codes.pointers_of(words, bits, nodes)
+    if nodes and pointers.max() >= entries:
+        raise TableError(f"{table.path}: is damaged: a pointer names entry {pointers.max()} of {entries}")
+    return structure
+
+
+def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceField:
+    """
+    Return the field of a checked table.
+
+    ``arrays`` are the allocated arrays of a pair. With the ``storage`` ``"float32"``, the nodes of a sparse field are
+    decoded, and can be trained.
+    """
+    settings = table.settings
+    if settings["layout"] == "pair":
+        net = Indirection(arrays["primary"], arrays["cascaded"])
+        return PairField(types, net, settings["lower"], settings["upper"], settings["band"], settings["slope"])
+    structure = structure_of(table)
+    frames, words = _words(table, "blocks", slice(9, 13))[: structure.blocks, 0], _words(table, "pointers")[:, 0]
+    entries = table.arrays["entries"].values
+    if storage == "float32":
+        pointers = codes.pointers_of(words, settings["bits"], structure.nodes)
+        nodes = decoded_nodes(structure, frames, entries[pointers])
+        return SparseNodes(types, structure, settings["slope"], nodes=types.TensorXf(nodes))
+    return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
+
+
+# -- the model --------------------------------------------------------------------------------------------------------
 
 
 class SdfModel(Model):
     """
-    The signed distance field in a file: ``field`` (:class:`.field.Field`), in the unit frame. A point of the mesh's
-    file is ``scale`` · p + ``centre``.
-    """
+    Distance field of a file: ``field`` (:class:`.field.DistanceField`), in the unit frame.
 
-    #: The storage form that was asked for, "" for the file's own.
-    form = ""
+    A point of the mesh's file is ``scale`` · p + ``centre``. ``form`` is the requested storage form, "" for the file's.
+    """
 
     def __init__(self, table, arrays, dtype, form: str = ""):
         self.form = form
@@ -30,6 +151,7 @@ class SdfModel(Model):
 
     def build(self):
         settings = self.table.settings
+        self.sparse = settings["layout"] == "sparse"
         self.field = field_of(self.table, self.arrays, self.types, self.form)
         self.scale, self.centre = float(settings["scale"]), tuple(settings["centre"])
 
@@ -44,16 +166,16 @@ class SdfModel(Model):
 
     @property
     def nbytes(self):
-        return self.memory_nbytes if self.table.settings["layout"] == "sparse" else super().nbytes
+        return self.field.nbytes if self.sparse else super().nbytes
 
     @property
     def memory_nbytes(self):
-        return self.field.nbytes if self.table.settings["layout"] == "sparse" else super().memory_nbytes
+        return self.field.nbytes if self.sparse else super().memory_nbytes
 
     def describe(self):
-        settings, field = self.table.settings, self.field
+        field = self.field
         figures = {
-            "layout": settings["layout"],
+            "layout": self.table.settings["layout"],
             "memory_bytes": self.memory_nbytes,
             "box": [list(field.lower), list(field.upper)],
             "spacing": field.spacing,
@@ -66,7 +188,7 @@ class SdfModel(Model):
             f"{self.memory_nbytes:,} bytes in memory, box of {size} units around {self.centre}",
             f"cells of 1/{1 / field.spacing:.0f} of the longest side, slope at most {field.slope:.2f}",
         ]
-        if settings["layout"] == "sparse":
+        if self.sparse:
             structure = field.structure
             figures |= {"nodes": structure.nodes, "blocks": structure.blocks}
             bits = 8 * self.memory_nbytes / max(1, structure.nodes)
@@ -74,9 +196,13 @@ class SdfModel(Model):
         return figures, lines
 
     def measure(self, mesh=None, count: int = 2**18):
-        """Errors against the mesh in the file ``mesh`` (default: the one that was fitted, if it is where it was)."""
+        """
+        Return errors against the mesh in the file ``mesh``, by default the one that was fitted.
+
+        ``count`` is the number of held-out points.
+        """
         from .distances import Distances
-        from .evaluation import Evaluation
+        from .evaluation import SurfaceEvaluation
         from .mesh import load_mesh
 
         settings, folder = self.table.settings, (self.table.path or Path("x")).resolve().parent
@@ -87,21 +213,22 @@ class SdfModel(Model):
         if loaded.digest != settings.get("source"):
             self._refuse(f"was fitted to another mesh than {path} is now")
         with Distances(loaded) as distances:
-            return Evaluation(loaded, distances, count).measure(self.field)
+            return SurfaceEvaluation(loaded, distances, count).measure(self.field)
 
     def decode(self, output: Path, resolution: int | None = None):
-        """The surface as triangles, or distances as a grid (``.npz``), ``resolution`` cells along the longest side."""
-        from .decode import extract, grid
+        """Write the surface as triangles, or distances as a grid (``.npz``).
+
+        ``resolution`` is the number of cells along the longest side, by default finer than the field's cells.
+        """
+        from .extraction import extract
 
         resolution = resolution or min(1024, round(1.5 / self.field.spacing))
         suffix = output.suffix.lower()
         if suffix == ".npz":
-            return [self._decode_grid(output, resolution, grid)]
+            return [self._decode_grid(output, resolution)]
         if suffix not in MESHES:
             allowed = ", ".join((*MESHES, ".npz"))
             raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are {allowed}')
-        from ...files import replacing
-
         start = time.perf_counter()
         mesh = extract(self.field, resolution, self.scale, self.centre)
         if len(mesh.faces) == 0:
@@ -113,18 +240,13 @@ class SdfModel(Model):
             (output, f"{len(mesh.faces):,} triangles at {resolution} cells along the longest side, {seconds:.1f} s")
         ]
 
-    def _decode_grid(self, output: Path, resolution: int, grid):
-        from ...files import replacing
+    def _decode_grid(self, output: Path, resolution: int):
+        from .grids import grid
 
         values, lower, upper = grid(self.field, resolution)
-
-        def place(p):
-            return np.asarray(p) * self.scale + np.array(self.centre)
-
+        lower, upper = (p * self.scale + np.array(self.centre) for p in (lower, upper))
         with replacing(output) as temporary, open(temporary, "wb") as stream:
-            np.savez_compressed(
-                stream, distance=values * np.float32(self.scale), lower=place(lower), upper=place(upper)
-            )
+            np.savez_compressed(stream, distance=values * np.float32(self.scale), lower=lower, upper=upper)
         shape = " x ".join(map(str, values.shape))
         return output, f"{shape} distances (z, y, x) in units of the mesh"
 

@@ -1,6 +1,9 @@
 """
-The supplement's layout (§ 1.6): a dense 3D primary array whose three channels are the coordinate in a dense 3D cascaded
-array of truncated distances. Both span the padded box of the mesh; their sides follow those of the box.
+Layout of the supplement (§ 1.6): a dense 3D primary array of coordinates in a dense 3D cascaded array of distances.
+
+The primary array has three channels, the cascaded array one, the truncated distance. Both span the padded box of the
+mesh; their sides follow those of the box. The preset ``paper`` starts as the supplement says, ``dense`` from the
+distance itself.
 """
 
 from __future__ import annotations
@@ -9,22 +12,40 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...indirection import DifferentiableArray, Indirection, ramp
+from ...errors import UsageError
+from ...fitting import Problem
+from ...indirection import DifferentiableArray, Indirection, ramp, rounded, stored_form
+from ...tables import StoredArray, Table
+from ...task import FitRequest
 from ...units import largest_fitting
-from .field import DistanceField, edge_steps
+from .distances import Distances
+from .evaluation import HELD_OUT, HeldOut
+from .field import DistanceField
+from .mesh import Mesh
+from .sampling import sample_box, sample_near
 
-#: Of the spacing of the primary array: how far distances are told. At least :data:`LEAST_BAND` of the longest side.
-BAND = 2.5
-LEAST_BAND = 0.02
+#: Table 5 of the supplement: sides of the primary over sides of the cascaded array, by megabytes of both. Its text says
+#: 1.5 to 2.5; the table's values are taken.
+RATIOS = {6: 2.0, 12: 2.56, 16: 2.81, 24: 2.08, 48: 2.71, 96: 2.56}
 
-#: Cells of the cascaded array along an axis, beyond the first, that a bound of the slope looks at one by one.
+#: Largest distance that is stored, in spacings of the primary array, and its minimum, relative to the longest side.
+BAND, LEAST_BAND = 2.5, 0.02
+
+#: Number of cells of the cascaded array along an axis, beyond the first, up to which the bound of the slope is local.
 NARROW = 3
+
+#: Training samples, and the share of them that is uniform in the box.
+SAMPLES, UNIFORM = 2**20, 0.2
+
+#: Starts of the arrays by preset; see :func:`initial`.
+STARTS = {"dense": "distance", "paper": "ramp"}
 
 
 class PairField(DistanceField):
     """
-    ``net`` maps coordinates of the box, [0, 1]³, to distances in units of ``band``, as 2 c − 1 of what the cascaded
-    array says.
+    Field of a dense primary and a dense cascaded array.
+
+    ``net`` maps coordinates of the box, [0, 1]³, to c, which stands for the distance 2 c − 1 in units of ``band``.
     """
 
     def __init__(self, types, net: Indirection, lower, upper, band: float, slope: float):
@@ -39,7 +60,7 @@ class PairField(DistanceField):
 
     def changed(self):
         self.slope = slope_of(self.net, self.lower, self.upper, self.band)
-        # Not a literal of the kernels that rays run: another one would compile them anew
+        # Opaque, no literal: a new value must not compile the kernels of rays again
         self._bound = dr.opaque(self.types.Float, self.slope)
 
     def _coordinates(self, p):
@@ -47,8 +68,8 @@ class PairField(DistanceField):
 
     def value(self, p, active=True):
         active = self.inside(p) & active
-        found = dr.fma(self.net(self._coordinates(p), active)[0], 2 * self.band, -self.band)
-        return dr.select(active, found, self.band)
+        value = dr.fma(self.net(self._coordinates(p), active)[0], 2 * self.band, -self.band)
+        return dr.select(active, value, self.band)
 
     def gradient(self, p, active=True):
         # Central differences: the product of two slopes jumps from cell to cell
@@ -60,10 +81,16 @@ class PairField(DistanceField):
         return self.value(p, active), Array3f(*slope)
 
 
+def ratio_for(nbytes: int) -> float:
+    """Return the ratio of Table 5 for ``nbytes`` bytes: that of the nearest size."""
+    return RATIOS[min(RATIOS, key=lambda size: abs(size * 1e6 - nbytes))]
+
+
 def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """
-    Entries of the primary (3 bytes each) and the cascaded array (1 byte each) along the sides of a box of this
-    ``extent``: as many as ``nbytes`` hold, in this ratio.
+    Return the largest resolutions of primary and cascaded array that take at most ``nbytes`` bytes in this ``ratio``.
+
+    Entries take 3 bytes in the primary and 1 byte in the cascaded array; sides follow the ``extent`` of the box.
     """
     extent = np.asarray(extent, dtype=np.float64)
 
@@ -77,16 +104,17 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
         return 3 * primary.prod() + cascaded.prod() <= nbytes
 
     n = max(4, int((nbytes / (3 + ratio**-3) / np.prod(extent / extent.max())) ** (1 / 3)) + 4)
-    n = largest_fitting(fits, 4, n + 1)
-    primary, cascaded = sides(n)
+    primary, cascaded = sides(largest_fitting(fits, 4, n + 1))
     return tuple(primary.tolist()), tuple(cascaded.tolist())
 
 
 def initial(start: str, primary, cascaded, grid_distance, samples, distances, band: float) -> Indirection:
     """
-    The arrays as they begin (:class:`.presets.Recipe`). ``grid_distance`` is a function that gives distances at the
-    entries of an array of some resolution; ``samples`` in [0, 1]³ (n, 3) and their ``distances`` are those that the
-    training draws from.
+    Return the arrays at the start of the training.
+
+    ``start`` is ``"ramp"``: pointers are a ramp, the cascaded array has the distance of the nearest of the ``samples``
+    in [0, 1]³ (n, 3), whose distances are ``distances`` (n,); or ``"distance"``: the first pointer is the truncated
+    distance, which the function ``grid_distance`` returns at the entries of an array of some resolution.
     """
     pointers = ramp(primary, 3, ("clamp",) * 3)
     if start == "distance":
@@ -96,7 +124,7 @@ def initial(start: str, primary, cascaded, grid_distance, samples, distances, ba
         places = ramp(cascaded, 3, ("clamp",) * 3).reshape(-1, 3)
         nearest = cKDTree(samples).query(places, workers=-1)[1]
         entries = np.clip(distances[nearest] / band, -1, 1).reshape(*cascaded, 1) / 2 + 0.5
-    # Both are folded: distances are bounded, and bytes hold nothing beyond
+    # Both are folded: distances are bounded
     return Indirection(
         DifferentiableArray(primary, 3, pointers, fold=True), DifferentiableArray(cascaded, 1, entries, fold=True)
     )
@@ -104,27 +132,29 @@ def initial(start: str, primary, cascaded, grid_distance, samples, distances, ba
 
 def slope_of(net: Indirection, lower, upper, band: float) -> float:
     """
-    A bound Λ of the field's slope: for each cell of the primary array, how fast its pointers change, times the steepest
-    that the cascaded array is anywhere where they may point.
+    Return a bound Λ of the field's slope.
+
+    For each cell of the primary array: how fast its pointers change, times the steepest slope of the cascaded array
+    among the cells that they may reach.
     """
     pointers, values = net.primary[0].numpy().astype(np.float64), net.cascaded.numpy()[..., 0].astype(np.float64)
     size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, pointers.shape, strict=False)]
     last = np.array(values.shape) - 1
-    # The cells that a cell's pointers reach: the first along each axis, and how many follow
+    # Cells of the cascaded array that pointers reach: the first along each axis, and how many follow
     ends = np.stack([np.stack(_ends(pointers[..., c]), axis=-1) * last[c] for c in range(3)], axis=-2)
     reach = np.clip(np.floor(ends).astype(int), 0, last[:, None] - 1)
     first, more = reach[..., 0], reach[..., 1] - reach[..., 0]
     cells = np.stack([edge_steps(values, c) * last[c] for c in range(3)], axis=-1)
-    # Where these are many, the steepest slope of all
+    # Where they are many, the steepest slope of all cells
     local = np.empty_like(first, dtype=np.float64)
     local[...] = cells.max(axis=(0, 1, 2))
     narrow = np.flatnonzero(np.all(more <= NARROW, axis=-1))
-    first, more, found = first.reshape(-1, 3)[narrow], more.reshape(-1, 3)[narrow], np.zeros((len(narrow), 3))
+    first, more, steepest = first.reshape(-1, 3)[narrow], more.reshape(-1, 3)[narrow], np.zeros((len(narrow), 3))
     for offset in np.ndindex((NARROW + 1,) * 3):
         some = np.flatnonzero(np.all(more >= offset, axis=1))
         at = first[some] + offset
-        found[some] = np.maximum(found[some], cells[tuple(at.T)])
-    local.reshape(-1, 3)[narrow] = found
+        steepest[some] = np.maximum(steepest[some], cells[tuple(at.T)])
+    local.reshape(-1, 3)[narrow] = steepest
     square = 0.0
     for axis in range(3):
         along = sum(edge_steps(pointers[..., c], axis) / size[axis] * local[..., c] for c in range(3))
@@ -133,7 +163,104 @@ def slope_of(net: Indirection, lower, upper, band: float) -> float:
 
 
 def _ends(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the largest of the eight corners of every cell."""
+    """Return the least and the largest of the eight corners of every cell."""
     sides = slice(None, -1), slice(1, None)
     corners = [values[sides[a], sides[b], sides[c]] for a in (0, 1) for b in (0, 1) for c in (0, 1)]
     return np.minimum.reduce(corners), np.maximum.reduce(corners)
+
+
+def edge_steps(values: np.ndarray, axis: int) -> np.ndarray:
+    """Return the largest of the four differences along ``axis`` in every cell of a grid of ``values`` (X, Y, Z)."""
+    steps = np.abs(np.diff(values, axis=axis))
+    for other in {0, 1, 2} - {axis}:
+        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+        ahead[other], behind[other] = slice(1, None), slice(None, -1)
+        steps = np.maximum(steps[tuple(ahead)], steps[tuple(behind)])
+    return steps
+
+
+# -- training ---------------------------------------------------------------------------------------------------------
+
+
+class PairProblem(Problem):
+    """Training of the supplement: truncated distances, mostly near the surface, in units of the band."""
+
+    def __init__(self, field: PairField, mesh: Mesh, points: np.ndarray, distances: np.ndarray, held_out: HeldOut):
+        self.field, self.types, self.net = field, field.types, field.net
+
+        def flat(v):
+            return self.types.Float(np.ascontiguousarray(v, np.float32))
+
+        self.points = [flat(v) for v in points.T]
+        self.targets = flat(np.clip(distances / field.band, -1, 1) / 2 + 0.5)
+        self.identity = {"source": mesh.digest, "resolution": list(self.net.primary[0].resolution)}
+        self.held_out = held_out
+
+    def batch(self, rng, size: int):
+        Float, UInt32 = self.types.Float, self.types.UInt32
+        count = dr.width(self.targets)
+        index = dr.minimum(UInt32(rng.random(Float, size) * count), count - 1)
+        return [dr.gather(Float, v, index) for v in self.points], {"d": [dr.gather(Float, self.targets, index)]}
+
+    def predict(self, net, inputs):
+        return {"d": rounded(net)(inputs)}
+
+    def measure(self, net):
+        with dr.suspend_grad():
+            self.field.net = rounded(net)
+            errors = self.held_out.measure(self.field)
+            self.field.net = net
+            return errors
+
+
+def fit_pair(distances: Distances, nbytes: int, request: FitRequest, samples: int = SAMPLES, held_out: int = HELD_OUT):
+    """
+    Fit dense arrays of ``nbytes`` bytes: ``(table, training result, field)``.
+
+    ``samples`` and ``held_out`` are the numbers of training samples and of points measured on the way. Raises
+    :class:`~mi_diffind.errors.UsageError` if even the smallest arrays are larger.
+    """
+    mesh, options = distances.mesh, request.options
+    extent = mesh.upper - mesh.lower
+    primary, cascaded = resolutions(nbytes, options["ratio"] or ratio_for(nbytes), extent)
+    least = 3 * int(np.prod(primary)) + int(np.prod(cascaded))
+    if least > nbytes:
+        raise UsageError(f"--bytes: found {nbytes:,}, the smallest arrays need {least:,}")
+    # The box ends a cell and a half outside of the mesh
+    padding = 1.5 * extent.max() / (max(primary) - 4)
+    lower, upper = mesh.lower - padding, mesh.upper + padding
+    size = upper - lower
+    spacing = float((size / (np.array(primary) - 1)).max())
+    band = max(LEAST_BAND, BAND * spacing)
+    uniform, seed = int(UNIFORM * samples), request.settings.seed
+    points = np.concatenate([
+        sample_near(distances.surface, samples - uniform, spacing / 2, [seed, 1]),
+        sample_box(lower, upper, uniform, [seed, 2]),
+    ])  # fmt: skip
+    points = np.clip(points, lower, upper)
+    d = distances.signed(points)
+    unit = (points - lower) / size
+
+    def grid_distance(resolution):
+        axes = [np.linspace(a, b, n) for a, b, n in zip(lower, upper, resolution, strict=True)]
+        return distances.signed(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)).reshape(resolution)
+
+    start = "constant" if options["constant"] else STARTS[request.preset]
+    if start == "constant":  # all entries have the one sample's distance, 0
+        net = initial("ramp", primary, cascaded, grid_distance, unit[:1], np.zeros(1), band)
+    else:
+        net = initial(start, primary, cascaded, grid_distance, unit, d, band)
+    net = net.alloc(request.types.TensorXf)
+    field = PairField(request.types, net, lower, upper, band, 1.0)
+    held = HeldOut(distances, request.types, spacing / 2, count=held_out)
+    problem = PairProblem(field, mesh, unit, d, held)
+    result = request.train(problem)
+    stored = stored_form(problem.net)
+    slope = slope_of(stored, lower, upper, band)
+    arrays = {"primary": StoredArray.of(stored.primary[0]), "cascaded": StoredArray.of(stored.cascaded)}
+    settings = {
+        "layout": "pair", "lower": lower.tolist(), "upper": upper.tolist(), "band": band, "slope": slope,
+        "ratio": primary[0] / cascaded[0], "start": start,
+    }  # fmt: skip
+    table = Table("sdf", arrays, settings=settings)
+    return table, result, PairField(request.types, stored, lower, upper, band, slope)

@@ -1,13 +1,13 @@
 """
-Where rays meet the surface of a field (:class:`.field.Field`), in the unit frame.
+Ray intersection with the surface of a distance field (:class:`.field.DistanceField`), in the unit frame.
 
-A ray enters the field's box and goes as far as the field says that the sign cannot change, at least :data:`EPSILON`,
-until the sign is another one than it was at the start (John C. Hart, *Sphere Tracing*, The Visual Computer 1996). It
-starts outside of the solid or inside of it: what is found is the first surface, from either side. Between the last
-place with the sign of the start and the first one with the other, the root is bracketed by false position, by bisection
-if that does not get on.
+A ray enters the field's box and advances as long as its sign equals that at the start. The first change of sign, from
+outside or from inside of the solid, is the hit. Sparse fields are marched from cell to cell (:mod:`.marching`); others
+are sphere-traced (John C. Hart, *Sphere Tracing*, The Visual Computer 1996) with steps of at least :data:`EPSILON`, and
+the root between the last place before the change and the first one after it is bracketed by false position, then by
+bisection.
 
-Nothing here is differentiated: a hit is attached to the field's entries by the implicit function (:func:`attached`).
+Nothing here is differentiated: a hit is attached to the field's entries by the implicit function theorem in the plugin.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ import drjit as dr
 from ...rays import box_interval
 from . import marching
 
-#: The shortest step, in units of the longest side: a solid that a ray crosses in less may be missed.
+#: Shortest step, relative to the longest side; a ray may miss a solid that it crosses in less.
 EPSILON = 1e-4
 
-#: How far along the ray a hit may be off, at most, and the value at which a place counts as on the surface.
+#: Largest error of a hit along the ray, and the value at which a place counts as on the surface.
 TOLERANCE, ZERO = 1e-5, 1e-6
 
-#: How many of the field's cells a ray may go beyond what the field vouches for, where the surface is expected.
+#: Distance, in cells, by which a ray may exceed the safe step where the surface is expected.
 RELAXATION = 1.0
 
 #: Steps by false position before bisection takes over.
@@ -36,11 +36,13 @@ FALSE_POSITIONS = 5
 @dataclass
 class Hit:
     """
-    What a ray met: ``found``; the distance ``t`` along the ray, infinite if nothing was found; the place ``p``, which
-    is more precise than ``o + t·d`` where the ray comes from afar; ``leaving``, whether it came from within the solid.
+    Intersection of rays with a surface.
+
+    ``hit``: whether the surface was hit; ``t``: the distance along the ray, infinite without a hit; ``p``: the place,
+    more precise than ``o + t·d`` for a ray from afar; ``leaving``: whether the ray came from within the solid.
     """
 
-    found: Any
+    hit: Any
     t: Any
     p: Any
     leaving: Any
@@ -48,8 +50,10 @@ class Hit:
 
 def enter(field, o, d, maxt, active=True):
     """
-    Where a ray is in the field's box: ``(near, far, active)``, the distances at which it enters (0 if it starts there)
-    and leaves it. Components of ``d`` may be zero. Not active: it misses the box, or something is NaN.
+    Return the distances at which rays enter and leave the field's box: ``(near, far, active)``.
+
+    A ray that starts in the box enters at 0. Components of ``d`` may be zero. A ray is not active if it misses the
+    box, or if anything is NaN.
     """
     Float = field.types.Float
     active = field.types.Bool(active)
@@ -60,97 +64,93 @@ def enter(field, o, d, maxt, active=True):
 
 def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
     """
-    The first place where rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, change from outside to inside of the
-    solid or the other way. If not ``exact``, only ``found`` and ``leaving`` mean anything, which is faster.
+    Intersect rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, with the surface, from either side.
 
-    A ray that starts in the box starts where the field says; one that does not is outside of the solid.
+    A ray that starts in the box starts with the field's sign, any other one outside of the solid. If not ``exact``,
+    only ``hit`` and ``leaving`` are valid, which is faster.
     """
     Float, Point = field.types.Float, field.types.Array3f
     with dr.suspend_grad():
         o, d, maxt = Point(dr.detach(o)), Point(dr.detach(d)), Float(dr.detach(maxt))
         near, far, active = enter(field, o, d, maxt, active)
-        # From here on, numbers are small. Rounding must not leave a ray outside, where the field says nothing
+        # From here on, numbers are small. Rounding must not leave a ray outside of the box
         start = Point(dr.clip(dr.fma(d, near, o), Point(*field.lower), Point(*field.upper)))
         length = far - near
         if field.marched:
-            found, t, leaving = march(field, start, d, length, near == 0, active)
+            h = field.spacing
+            origin = [(x - a) / h for x, a in zip(start, field.lower, strict=True)]
+            hit, t, leaving = marching.march(marching.marcher_of(field), origin, d, length / h, near == 0, active)
+            t = t * h
         else:
-            found, t, leaving = spheres(field, start, d, length, near == 0, active, exact)
-        # What is solid up to the side of the box ends there
-        cut = active & (far < maxt) & leaving & ~found
+            hit, t, leaving = sphere_trace(field, start, d, length, near == 0, active, exact)
+        # A solid that reaches the side of the box ends there
+        cut = active & (far < maxt) & leaving & ~hit
         t = dr.select(cut, length, t)
-        found |= cut
-        return Hit(found, dr.select(found, near + t, dr.inf), dr.fma(d, t, start), leaving)
-
-
-def march(field, start, d, length, fresh, active):
-    """As :func:`spheres`, of a sparse grid: from cell to cell (:mod:`.marching`)."""
-    marcher = marching.of(field)
-    o = [(x - a) / field.spacing for x, a in zip(start, field.lower, strict=True)]
-    found, t, leaving = marching.march(marcher, o, d, length / field.spacing, fresh, active)
-    return found, t * field.spacing, leaving
+        hit |= cut
+        return Hit(hit, dr.select(hit, near + t, dr.inf), dr.fma(d, t, start), leaving)
 
 
 @dr.syntax
-def spheres(field, start, d, length, fresh, active, exact: bool = True, epsilon: float = EPSILON):
+def sphere_trace(field, start, d, length, fresh, active, exact: bool = True):
     """
-    The first change of sign along rays from ``start``, a place in the box, up to ``length``: ``(found, t, leaving)``.
-    Rays that are ``fresh`` start with the sign that they find, others outside.
+    Find the first change of sign along rays from ``start``, a place in the box, up to ``length``.
+
+    Returns ``(hit, t, leaving)``. A ``fresh`` ray starts with the sign at ``start``, any other one outside.
     """
     types = field.types
     Float, Bool = types.Float, types.Bool
     with dr.suspend_grad():
-        active, found = Bool(active), Bool(False)
+        active, hit = Bool(active), Bool(False)
         leaving = Bool(fresh) & (field.value(start, active) < 0)
 
         reach = RELAXATION * field.spacing
         t, safe = Float(0), Float(0)
-        low, high = Float(0), Float(dr.inf)  # the last place known to be as at the start, the first one that is not
+        low, high = Float(0), Float(dr.inf)  # the last place with the sign at the start, the first one with the other
         low_value, high_value = Float(0), Float(0)
         turns = types.UInt32(0)
         while dr.hint(active, label="sphere tracing"):
-            value, step = field.look(dr.fma(d, t, start), d, active)
+            value, step = field.safe_step(dr.fma(d, t, start), d, active)
             other = (value < 0) != leaving
             size = dr.abs(value)
-            # Too far ahead: between what both places vouch for, the sign may have changed twice
-            back = ~other & ~found & (t - dr.minimum(step, size / field.bound) > safe)
-            found |= other
-            # Where the value will be zero if it goes on as it did
-            ahead = dr.select(back | found, 0, size * (t - low) / (dr.abs(low_value) - size))
-            ahead = dr.select(ahead > 0, dr.minimum(dr.fma(ahead, 1.05, 0.1 * epsilon), reach), 0)
+            # Too far ahead: between the safe steps of both places, the sign may have changed twice
+            back = ~other & ~hit & (t - dr.minimum(step, size / field.bound) > safe)
+            hit |= other
+            # Linear extrapolation to the zero
+            ahead = dr.select(back | hit, 0, size * (t - low) / (dr.abs(low_value) - size))
+            ahead = dr.select(ahead > 0, dr.minimum(dr.fma(ahead, 1.05, 0.1 * EPSILON), reach), 0)
             high = dr.select(other, t, high)
             high_value = dr.select(other, value, high_value)
             low = dr.select(other | back, low, t)
             low_value = dr.select(other | back, low_value, value)
-            safe = dr.select(back | other, safe, t + dr.maximum(step, epsilon))
+            safe = dr.select(back | other, safe, t + dr.maximum(step, EPSILON))
             if dr.hint(exact, mode="scalar"):
                 width = high - low
-                done = found & ((width < TOLERANCE) | ((size < ZERO) & (turns > 0)))
+                done = hit & ((width < TOLERANCE) | ((size < ZERO) & (turns > 0)))
                 share = dr.clip(low_value / (low_value - high_value), 0.03, 0.97)
                 share = dr.select(turns < FALSE_POSITIONS, share, 0.5)
-                turns = dr.select(found, turns + 1, 0)
+                turns = dr.select(hit, turns + 1, 0)
                 following = dr.select(
-                    found, dr.fma(width, share, low), dr.select(back, safe, dr.maximum(safe, t + ahead))
+                    hit, dr.fma(width, share, low), dr.select(back, safe, dr.maximum(safe, t + ahead))
                 )
                 t = dr.select(done, t, following)
-                active &= ~done & (found | (t <= length))
+                active &= ~done & (hit | (t <= length))
             else:
                 t = dr.select(back, safe, dr.maximum(safe, t + ahead))
-                active &= ~found & (t <= length)
-        return found, t, leaving
+                active &= ~hit & (t <= length)
+        return hit, t, leaving
 
 
 def trace(field, o, d, maxt, active=True) -> tuple:
-    """The distances at which rays first meet the surface from either side, infinite if not, and whether they do."""
-    hit = intersect(field, o, d, maxt, active)
-    return hit.t, hit.found
+    """Return the distances at which rays hit the surface, infinite without a hit, and whether they do."""
+    result = intersect(field, o, d, maxt, active)
+    return result.t, result.hit
 
 
 def occluded(field, o, d, maxt, active=True):
-    """Whether rays meet the surface before ``maxt``."""
-    return intersect(field, o, d, maxt, active, exact=False).found
+    """Return whether rays hit the surface before ``maxt``."""
+    return intersect(field, o, d, maxt, active, exact=False).hit
 
 
-def index_of(field) -> int:
-    """Bytes of what tracing makes of a field, once."""
-    return marching.of(field).nbytes if field.marched else 0
+def index_bytes(field) -> int:
+    """Return the bytes of the field's ray-marching index; 0 if it is sphere-traced."""
+    return marching.marcher_of(field).nbytes if field.marched else 0

@@ -1,15 +1,14 @@
 """
-Task 5: textures that are trained for what they look like when they are shaded, not for their values.
+Task 5: textures that are trained for their shaded appearance, not for their values.
 
-Its truth is appearance that is filtered: the analytic Disney BRDF of task 2, averaged over footprints. What is trained
-are the arrays of task 4, through frozen tables of task 2; the result is a file of the task ``texture``.
+The truth is filtered appearance: the analytic Disney BRDF of task 2, averaged over footprints. The arrays are those of
+task 4, shaded by frozen tables of task 2; the result is a file of the task ``texture``.
 
-- :mod:`.material`: what the maps of a material mean, and what light it sends where;
-- :mod:`.reference`: appearance that is filtered; :mod:`.evaluation`: images that no training saw;
-- :mod:`.clip`: derivatives that are limited; :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and
-  what ``fit shading`` does; :mod:`.preview`: a picture on the way;
+- :mod:`.material`: maps as parameters of the BRDF, and shading; :mod:`.reference`: filtered appearance;
+- :mod:`.evaluation`: images under views and lights that no training draws; :mod:`.preview`: a picture of the progress;
+- :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the problem, and ``fit shading``.
 
-Training inside a scene, through renders of it, is :mod:`mi_diffind.scene_training`.
+Training through renders of a scene is :mod:`mi_diffind.scene_training`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from .presets import PRESETS, REFERENCES
 
 
 class Shading(Task):
-    """The task. Its presets are the recipes of :mod:`.presets`; files are those of the task ``texture``."""
+    """Task ``shading``: presets are the recipes of :mod:`.presets`, files are those of the task ``texture``."""
 
     name = "shading"
     title = "a texture, for what it looks like when it is shaded"
@@ -51,7 +50,7 @@ class Shading(Task):
         ),
         Argument(
             "--reference", choices=REFERENCES,
-            help="what shaded values are compared with: 16 unfiltered samples (jittered, default), the paper's 16 "
+            help="samples of the reference: 16 unfiltered ones (jittered, default), the paper's 16 "
             "prefiltered ones (default of paper), or 256 unfiltered ones (converged)",
         ),
         *SOURCES,
@@ -59,9 +58,9 @@ class Shading(Task):
     )  # fmt: skip
 
     def settings(self, preset, given, options):
-        own = PRESETS[preset].settings
-        steps = given.get("steps", own.steps)
-        return dataclasses.replace(own, measure_every=max(1, steps // 10), **given)
+        settings = PRESETS[preset].settings
+        steps = given.get("steps", settings.steps)
+        return dataclasses.replace(settings, measure_every=max(1, steps // 10), **given)
 
 
 TASK = Shading()

@@ -1,4 +1,4 @@
-"""How good a shaded texture is: images of it at levels of detail, under views and lights that no training saw."""
+"""Evaluation of a shaded texture: images at levels of detail, under views and lights that no training draws."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from ..disney.decoder import Decoder
 from ..disney.effects import Effects
 from ..disney.training import uniform_hemisphere
 from .material import shaded, surface_of
-from .reference import KINDS, reference
+from .reference import SAMPLES_PER_SIDE, reference
 
-#: ``(u, v, level, wi, wo) → Array3f`` of shaded values.
+#: Function ``(u, v, level, wi, wo) → Array3f`` of shaded values.
 ShadedReader = Callable[[Any, Any, Any, Any, Any], Any]
 
-#: What images are compared with: letter → kind of reference.
+#: References of the images: letter → sample pattern.
 TRUTHS = {"C": "converged", "P": "prefiltered"}
 
-#: Samples of the converged reference along the side of each texel of level 0, and at most along that of a footprint:
-#: with 16 × 16 in all, its own noise is at 36 dB on level 5 of a glossy material.
+#: Samples of the converged reference along the side of each texel of level 0, and their largest number along the side
+#: of a footprint: with 16 × 16 in all, the noise of the reference is at 36 dB on level 5 of a glossy material.
 PER_TEXEL, LARGEST = 4, 64
 
-#: Seed of the views and lights; trainings draw theirs from other generators.
+#: Seed of the views and lights; trainings use other generators.
 SEED = 20231212
 
 
 def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None) -> ShadedReader:
-    """Filtered parameters, shaded: by ``decoder``, or by the analytic model."""
+    """Return a function that shades filtered parameters: by ``decoder``, or by the analytic model."""
     decoder = decoder or Decoder()
 
     def read(u, v, level, wi, wo):
@@ -44,10 +44,12 @@ def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None)
 
 class ShadedEvaluation:
     """
-    Images of a material, at most ``side`` texels wide and high, of ``levels`` levels of detail, level 0 the first, for
-    ``pairs`` of a view and a light. Each shows another part of the material, and its pixels are those of a level, but
-    shifted by a part of one: as in a render, pixels are not texels. Their references are made here:
-    ``truths[letter][level]``, ``(pairs, rows, columns, 3)``, linear. ``stream`` draws others.
+    Images of a material with reference values, for several levels of detail and pairs of view and light.
+
+    There are ``levels`` levels, from level 0 on, and ``pairs`` pairs; images are at most ``side`` texels wide and high.
+    Each image shows another part of the material; its pixels are shifted by a part of a texel, as in a render.
+    References are ``truths[letter][level]``, ``(pairs, rows, columns, 3)``, linear. Another ``stream`` gives other
+    views, lights and parts.
     """
 
     def __init__(
@@ -58,24 +60,24 @@ class ShadedEvaluation:
         self.levels, self.form = min(levels, pyramid.levels), (levels, pairs, side)
         rng = np.random.default_rng((SEED, stream))
         numbers = rng.random((4, pairs))
-        # One view or light for each of as many strata of the cosine, so that none is far from all others
+        # Strata of the cosine, one view and one light in each
         order = [rng.permutation(pairs) for _ in range(2)]
         cosines = [(o + n) / pairs for o, n in zip(order, numbers[:2], strict=True)]
         self.directions = [(cosines[0][i], numbers[2][i], cosines[1][i], numbers[3][i]) for i in range(pairs)]
         sizes = [level.shape[:2] for level in pyramid.values[: self.levels]]
         self.sizes = [(min(rows, side), min(columns, side)) for rows, columns in sizes]
-        # Of each level and pair, where its image begins, in pixels from the top and from the left
+        # First pixel of the image of each level and pair, from the top and from the left
         spare = np.array(sizes) - np.array(self.sizes)
         shifts = rng.random((self.levels, pairs, 2))
         self.origins = np.floor(rng.random(shifts.shape) * (spare[:, None] + 1)).clip(0, spare[:, None]) + shifts
         self.truths = {letter: [self._truth(TRUTHS[letter], i) for i in range(self.levels)] for letter in truths}
 
     def another(self) -> ShadedEvaluation:
-        """Images of the same form and number under other views and lights, with the converged truth alone."""
+        """Return images of the same number and size under other views and lights, with the converged truth alone."""
         return ShadedEvaluation(self.pyramid, self.effects, *self.form, "C", stream=1)
 
     def _lanes(self, level: int, pairs=None) -> tuple:
-        """``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""
+        """Return ``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""
         types, pairs = self.types, range(len(self.directions)) if pairs is None else pairs
         (rows, columns), whole = self.sizes[level], self.pyramid.values[level].shape
         origins = self.origins[level][list(pairs)]
@@ -91,35 +93,42 @@ class ShadedEvaluation:
         dr.eval(lanes)
         return lanes, shape
 
-    def _truth(self, kind: str, level: int) -> np.ndarray:
+    def _truth(self, pattern: str, level: int) -> np.ndarray:
         lanes, shape = self._lanes(level)
-        side = int(np.clip(PER_TEXEL << level, KINDS[kind], LARGEST)) if kind == "converged" else KINDS[kind]
-        return _image(reference(kind, self.pyramid, *lanes, self.effects, side=side), shape)
+        side = (
+            int(np.clip(PER_TEXEL << level, SAMPLES_PER_SIDE[pattern], LARGEST))
+            if pattern == "converged"
+            else SAMPLES_PER_SIDE[pattern]
+        )
+        return _image(reference(pattern, self.pyramid, *lanes, self.effects, side=side), shape)
 
     def images(self, read: ShadedReader, level: int, pairs=None) -> np.ndarray:
-        """What a reader shows at a level, ``(pairs, rows, columns, 3)``, linear; all pairs unless some are named."""
+        """Return shaded images of a level, ``(pairs, rows, columns, 3)``, linear; all pairs unless some are named."""
         lanes, shape = self._lanes(level, pairs)
         with dr.suspend_grad():
             return _image(read(*lanes), shape)
 
     def measure(self, read: ShadedReader, flip: bool = True) -> dict[str, dict]:
         """
-        For each truth ``psnr_db``, of values clipped to [0, 1], at each level; ``mean_db``, their mean; ``coarse_db``,
-        their mean from level 2 on; ``flip``, the mean FLIP of the images as displayed, at each level of 16 pixels or
-        more, if it is wanted.
+        Return the errors against each truth, by its letter.
+
+        ``psnr_db``: of values clipped to [0, 1], for each level; ``mean_db``: their mean; ``coarse_db``: their mean
+        from level 2 on; ``flip``, if requested: the mean FLIP of the images as displayed, for each level of 16 pixels
+        or more.
         """
-        found = {letter: {"psnr_db": [], "flip": []} for letter in self.truths}
+        errors = {letter: {"psnr_db": [], "flip": []} for letter in self.truths}
         for level in range(self.levels):
-            got = np.clip(self.images(read, level), 0, 1)
+            shown = np.clip(self.images(read, level), 0, 1)
             for letter, truths in self.truths.items():
-                truth, own = np.clip(truths[level], 0, 1), found[letter]
-                own["psnr_db"].append(decibel(float(np.mean((got - truth) ** 2, dtype=np.float64))))
+                truth, figures = np.clip(truths[level], 0, 1), errors[letter]
+                figures["psnr_db"].append(decibel(float(np.mean((shown - truth) ** 2, dtype=np.float64))))
                 if flip and min(truth.shape[1:3]) >= 16:
-                    own["flip"].append(float(np.mean([metrics.flip(a, b) for a, b in zip(truth, got, strict=True)])))
-        for own in found.values():
-            own["mean_db"] = float(np.mean(own["psnr_db"]))
-            own["coarse_db"] = float(np.mean(own["psnr_db"][2:])) if self.levels > 2 else math.nan
-        return found
+                    pairs = zip(truth, shown, strict=True)
+                    figures["flip"].append(float(np.mean([metrics.flip(a, b) for a, b in pairs])))
+        for figures in errors.values():
+            figures["mean_db"] = float(np.mean(figures["psnr_db"]))
+            figures["coarse_db"] = float(np.mean(figures["psnr_db"][2:])) if self.levels > 2 else math.nan
+        return errors
 
 
 def _image(value, shape) -> np.ndarray:

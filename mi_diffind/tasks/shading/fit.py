@@ -1,4 +1,4 @@
-"""``fit shading``: from what was asked for to a texture that is trained for what it looks like."""
+"""``fit shading``: training of a texture for its shaded appearance, as requested on the command line."""
 
 from __future__ import annotations
 
@@ -22,21 +22,22 @@ from .presets import PRESETS, ShadingRecipe
 
 
 def recipe_of(preset: str, settings, options) -> ShadingRecipe:
-    """The recipe of a preset with what the options change."""
-    own = PRESETS[preset]
+    """Return the recipe of a preset with the given options in place of its own."""
+    recipe = PRESETS[preset]
     given = {"share": options["share"], "reference": options["reference"]}
     given = {k: v for k, v in given.items() if v is not None}
     if options["clip"] is not None:
         given["clip"] = None if options["clip"] == math.inf else options["clip"]
-    return dataclasses.replace(own, settings=settings or own.settings, **given)
+    return dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
 
 
-#: Images that measure: of many views and lights, since a few that are almost mirrors decide what a PSNR is.
+#: Number of pairs of view and light, and size, of the images that measure. Many, since a few pairs near the mirror
+#: direction dominate the PSNR.
 PAIRS, SIDE = 32, 48
 
 
 def check(request: FitRequest) -> None:
-    """Raise :class:`UsageError` for options that do not go together."""
+    """Raise :class:`UsageError` for options that exclude each other."""
     options = request.options
     if options["source"] is None:
         raise UsageError("source: not given, a manifest of the maps of a material is needed")
@@ -48,8 +49,9 @@ def check(request: FitRequest) -> None:
 
 def fit(request: FitRequest) -> Fitted:
     """
-    Train as a texture, unless arrays are given that were, then for shading, and measure. With a time, half of it goes
-    to each. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
+    Train as a texture, unless a trained one is given, then for shading, and measure the result.
+
+    Each training takes half of a given time. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
     :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.fitting.FittingError`.
     """
     options = request.options
@@ -66,16 +68,18 @@ def fit(request: FitRequest) -> Fitted:
         start, result = pretrained(source, pyramid, recipe, request)
     if result is None or not result.interrupted:
         seconds = request.seconds
-        own = dataclasses.replace(request, seconds=seconds if result is None or seconds is None else seconds / 2)
-        if own.resume and not os.path.exists(own.checkpoint or ""):
-            own.resume = False  # it was the training as a texture that was interrupted
+        shading_request = dataclasses.replace(
+            request, seconds=seconds if result is None or seconds is None else seconds / 2
+        )
+        if shading_request.resume and not os.path.exists(shading_request.checkpoint or ""):
+            shading_request.resume = False  # the training as a texture was interrupted
         evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
         preview = preview_path(request)
         try:
             net = training.start_of(start, pyramid)
         except ValueError as e:
             raise UsageError(str(e)) from None
-        table, result = training.fit_shading(source, net, recipe, own, pyramid, evaluation, preview)
+        table, result = training.fit_shading(source, net, recipe, shading_request, pyramid, evaluation, preview)
     else:
         table = start
     record_source(request, table)
@@ -97,7 +101,7 @@ def fit(request: FitRequest) -> Fitted:
 
 
 def started(path, source, request: FitRequest) -> Table:
-    """A texture's file to start from. Raises :class:`UsageError` if it is of another source."""
+    """Return the texture to start from. Raises :class:`UsageError` for a texture of another source."""
     table = TEXTURE.load(path)
     if table.settings.get("source", source.digest) != source.digest:
         raise UsageError(f"{path}: was made from another source than {request.options['source']}")
@@ -105,16 +109,18 @@ def started(path, source, request: FitRequest) -> Table:
 
 
 def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequest) -> tuple:
-    """A training as a texture alone, with a checkpoint of its own: its table, and its record."""
-    own = TEXTURES[recipe.texture]
-    settings = dataclasses.replace(own.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic)
-    own = dataclasses.replace(own, settings=settings)
+    """Train as a texture alone, with a separate checkpoint; return the table and the run's record."""
+    texture = TEXTURES[recipe.texture]
+    settings = dataclasses.replace(
+        texture.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic
+    )
+    texture = dataclasses.replace(texture, settings=settings)
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(request.options)
-    size = texture_fit.size_of(source, pyramid, requested_bytes(options, source), own, options)
+    size = texture_fit.size_of(source, pyramid, requested_bytes(options, source), texture, options)
     checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
     first = dataclasses.replace(
         request, preset=recipe.texture, checkpoint=checkpoint, options=options,
         resume=request.resume and os.path.exists(checkpoint or ""),
         seconds=None if request.seconds is None else request.seconds / 2,
     )  # fmt: skip
-    return textures.fit_texture(source, size, own, first, pyramid)
+    return textures.fit_texture(source, size, texture, first, pyramid)

@@ -1,13 +1,13 @@
 """
-The maps of a material as parameters of the Disney BRDF, and what light it sends where.
+Shading of a material: its maps as parameters of the Disney BRDF, and the reflected light.
 
 Values are π · BRDF · cosine of the light, linear: a white Lambertian surface that is lit along its normal has 1.
 Directions are in the frame of the surface, ``wi`` towards the viewer, ``wo`` towards the light. A normal map perturbs
 the frame as Mitsuba's ``normalmap`` does, with its shadowing function (Estevez et al., *A Microfacet-Based Shadowing
 Function to Solve the Bump Terminator Problem*, Ray Tracing Gems 2019) and its flip of normals that face away.
 
-Maps are known by their kind: albedo, normal, roughness, metallic. What a material does not have is as in the plugin
-``disney``. Ambient occlusion is not shaded, no more than ``disney`` and ``principled`` do, nor are other maps.
+Maps are known by their role: albedo, normal, roughness, metallic. A missing parameter has the default of the plugin
+``disney``. Ambient occlusion and other maps are not shaded, since ``disney`` and ``principled`` have no such parameter.
 """
 
 from __future__ import annotations
@@ -28,20 +28,21 @@ from ..disney.decoder import Decoder
 from ..disney.effects import Effects, find_effects
 from ..disney.model import PARAMETERS, Material, sanitize
 from ..disney.training import shade
-from .clip import clipped
 
-#: Values of parameters that no map has, as in the plugin ``disney``.
+#: Values of parameters without a map, the defaults of the plugin ``disney``.
 DEFAULTS = {**dict.fromkeys(PARAMETERS, 0.0), "roughness": 0.5, "specular": 0.5}
 
-#: Kinds of maps that shading reads, and how many channels each may have.
+#: Roles of maps that shading reads, and their allowed numbers of channels.
 READ = {"albedo": (1, 3), "normal": (3,), "roughness": (1,), "metallic": (1,)}
 
 
 @dataclass
 class SurfaceParameters:
     """
-    The material at a place: ``albedo``, a linear colour; ``normal``, of any length, in the frame of the surface;
-    ``roughness`` and ``metallic``. What no map has is a number, and the normal ``None``.
+    Parameters of the material at a point.
+
+    ``albedo``: a linear colour; ``normal``: of any length, in the frame of the surface, ``None`` without a map;
+    ``roughness`` and ``metallic``: arrays, or numbers without a map.
     """
 
     albedo: Any
@@ -51,56 +52,56 @@ class SurfaceParameters:
 
 
 def maps_of(layout: Layout) -> dict[str, MapLayout]:
-    """The maps that shading reads, by their kind. Raises :class:`UsageError` if it cannot read them."""
-    found = {}
+    """Return the maps that shading reads, by role. Raises :class:`UsageError` for maps that it cannot read."""
+    by_role = {}
     for m in layout.maps:
         if m.role not in READ:
             continue
-        if m.role in found:
-            raise UsageError(f'map "{m.name}": found a second {m.role} beside "{found[m.role].name}", one is allowed')
+        if m.role in by_role:
+            raise UsageError(f'map "{m.name}": found a second {m.role} beside "{by_role[m.role].name}", one is allowed')
         if m.channels not in READ[m.role]:
             allowed = " or ".join(map(str, READ[m.role]))
             raise UsageError(f'map "{m.name}": found {m.channels} channels, allowed for {m.role} are {allowed}')
-        found[m.role] = m
-    if not found:
+        by_role[m.role] = m
+    if not by_role:
         raise UsageError(f"source: found no map that shading reads, these are {', '.join(READ)}")
-    return found
+    return by_role
 
 
 def left_out(layout: Layout) -> dict[str, str]:
-    """Map → why it is not shaded."""
+    """Return the names of maps that are not shaded, each with the reason."""
     reason = "the BRDF has no such parameter, its loss is that of a texture"
     return {m.name: reason for m in layout.maps if m.role not in READ}
 
 
 def effects_of(layout: Layout) -> tuple[Effects, dict[str, str]]:
-    """The effects that a material makes use of, and the reasons for what is left out (:func:`.find_effects`)."""
-    known = {name: ValueBounds(value, value) for name, value in DEFAULTS.items()}
-    for kind, m in maps_of(layout).items():
-        name = "base_color" if kind == "albedo" else kind
-        if kind == "normal":
+    """Return the effects of a material, and the reasons for effects that are left out (:func:`.find_effects`)."""
+    bounds = {name: ValueBounds(value, value) for name, value in DEFAULTS.items()}
+    for role, m in maps_of(layout).items():
+        name = "base_color" if role == "albedo" else role
+        if role == "normal":
             continue
         constants = [w[1] for w in m.where if isinstance(w, tuple)]
-        # What is stored twice is stored once: an albedo of one stored channel is grey
+        # Equal channels are stored once: an albedo of one stored channel is grey
         grey = len({w for w in m.where}) == 1
-        known[name] = ValueBounds(grey=grey)
+        bounds[name] = ValueBounds(grey=grey)
         if len(constants) == m.channels:
-            known[name] = ValueBounds(min(constants), max(constants), grey=grey)
-    return find_effects(known)
+            bounds[name] = ValueBounds(min(constants), max(constants), grey=grey)
+    return find_effects(bounds)
 
 
 def linear(values, m: MapLayout):
-    """The channels of a map, linear: the sRGB transfer function backwards, where it is encoded so."""
+    """Return linear channels of a map: decoded from sRGB if the map is encoded in it."""
     if m.color_space != "srgb":
         return values
     return [srgb.to_linear(v) for v in values]
 
 
 def surface_of(maps: FilteredMaps, stored: list) -> SurfaceParameters:
-    """The material at places of which ``stored`` are the stored channels."""
-    found = maps_of(maps.layout)
-    read = maps.maps(stored, [m.name for m in found.values()])
-    channels = {kind: linear(read[m.name], m) for kind, m in found.items()}
+    """Return the material at points with the stored channels ``stored``."""
+    by_role = maps_of(maps.layout)
+    read = maps.maps(stored, [m.name for m in by_role.values()])
+    channels = {role: linear(read[m.name], m) for role, m in by_role.items()}
     array = next((v for values in channels.values() for v in values if dr.is_jit_v(v)), None)
     types = None if array is None else module_of(array)
 
@@ -112,20 +113,21 @@ def surface_of(maps: FilteredMaps, stored: list) -> SurfaceParameters:
     if types is None:  # constant maps alone: the caller's arrays decide
         raise UsageError("source: all of its maps are constant, there is nothing to learn")
     if normal is not None:
-        signed = found["normal"].low < 0
+        signed = by_role["normal"].low < 0
         normal = vector(normal) if signed else 2 * vector(normal) - 1
-    one = {kind: channels[kind][0] if kind in channels else DEFAULTS[kind] for kind in ("roughness", "metallic")}
-    return SurfaceParameters(vector(albedo), normal, **one)
+    numbers = {n: channels[n][0] if n in channels else DEFAULTS[n] for n in ("roughness", "metallic")}
+    return SurfaceParameters(vector(albedo), normal, **numbers)
 
 
-#: The colour of a material without an albedo, as the plugin ``disney`` has it.
+#: Colour of a material without an albedo, the default of the plugin ``disney``.
 DEFAULT_ALBEDO = 0.5
 
 
 def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects: Effects, limit: float | None = None):
     """
-    π · BRDF · cosine, a colour, from ``decoder`` (``None``: straight from the formulas). ``limit``: bound of the
-    derivatives that flow back through the specular lobe, which has no other (:mod:`.clip`).
+    Return π · BRDF · cosine, a colour, from ``decoder`` (``None``: from the formulas).
+
+    ``limit``: bound of the derivatives that flow back through the specular lobe (:func:`clipped`).
     """
     Float = type(wi.x)
     wi_local, wo_local, shadow = wi, wo, 1
@@ -136,7 +138,7 @@ def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects:
         wo_local = type(wo)(dr.dot(wo, s), dr.dot(wo, t), dr.dot(wo, n))
         shadow = shadowing(n, wo)
         visible &= (wi_local.z > 0) & (wo_local.z > 0)
-    # What is not visible is looked at from above, so that nothing it has can become NaN
+    # Invisible points are evaluated from above, so that no value can become NaN
     up = type(wi)(0, 0, 1)
     wi_local, wo_local = dr.select(visible, wi_local, up), dr.select(visible, wo_local, up)
     given = {"roughness": Float(surface.roughness), "metallic": Float(surface.metallic)}
@@ -156,8 +158,9 @@ def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects:
 
 def frame(normal, wi) -> tuple:
     """
-    Tangent, bitangent and normal of a perturbed frame, as Mitsuba's ``normalmap`` makes it of a surface whose tangent
-    is x: a normal that faces away from the viewer is mirrored at the surface's.
+    Return tangent, bitangent and normal of a perturbed frame, as Mitsuba's ``normalmap`` does for the tangent x.
+
+    A normal that faces away from the viewer is mirrored at the surface's normal.
     """
     length = dr.squared_norm(normal)
     n = dr.select(length > 1e-12, normal * dr.rsqrt(dr.maximum(length, 1e-12)), type(normal)(0, 0, 1))
@@ -170,8 +173,9 @@ def frame(normal, wi) -> tuple:
 
 def shadowing(n, wo):
     """
-    The shadowing function of a perturbed normal for a direction above the surface, 2 c / (c + √(c² + α² sin²)), with
-    α² = min(⅛ tan², 1) of the normal.
+    Return the shadowing function of a perturbed normal for a direction above the surface.
+
+    It is 2 c / (c + √(c² + α² sin²)), with α² = min(⅛ tan², 1) of the normal.
     """
     cos2, c = dr.square(n.z), wo.z
     alpha2 = dr.minimum(0.125 * dr.maximum(1 - cos2, 0) / dr.maximum(cos2, 1e-6), 1)
@@ -180,5 +184,39 @@ def shadowing(n, wo):
 
 
 def frozen_decoder(types, preset: str = "", storage: str = "uint8") -> Decoder:
-    """The tables of the plugin ``neural_disney``, which nothing here changes."""
+    """Return the decoder of the plugin ``neural_disney``; training does not change its tables."""
     return DISNEY.open(types.TensorXf, preset=preset, storage=storage).decoder
+
+
+class _Clipped(dr.CustomOp):
+    """Identity with a limited derivative; a derivative of NaN becomes 0."""
+
+    def eval(self, value, limit):
+        self.limit = limit
+        self.add_input(value)
+        return dr.detach(value)
+
+    def forward(self):
+        self.set_grad_out(self._limited(self.grad_in("value")))
+
+    def backward(self):
+        self.set_grad_in("value", self._limited(self.grad_out()))
+
+    def _limited(self, gradient):
+        limited = dr.clip(gradient, -self.limit, self.limit)
+        return dr.select(dr.isnan(gradient), 0, limited)
+
+    def name(self):
+        return "clipped"
+
+
+def clipped(value, limit: float):
+    """
+    Return ``value``, a float or vector of Dr.Jit, unchanged, with its incoming derivatives limited to ±``limit``.
+
+    The remedy for the unbounded derivatives of highlights (supplemental 1.5). NaN becomes 0. Numbers, and values
+    without gradients, are returned as they are.
+    """
+    if not dr.is_jit_v(value) or not dr.grad_enabled(value):
+        return value
+    return dr.custom(_Clipped, value, limit)

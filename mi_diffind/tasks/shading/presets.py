@@ -1,4 +1,4 @@
-"""How a texture is trained for its shading: the supplement's recipe, and ours."""
+"""Recipes of a training for shaded appearance: the supplement's, and ours."""
 
 from __future__ import annotations
 
@@ -7,20 +7,19 @@ from dataclasses import dataclass
 
 from ...settings import FitSettings
 
-#: What training may compare shaded values with (:data:`.reference.KINDS`).
+#: Sample patterns of the reference (:data:`.reference.SAMPLES_PER_SIDE`).
 REFERENCES = ("jittered", "prefiltered", "converged")
 
 
 @dataclass(frozen=True)
 class ShadingRecipe:
     """
-    How a texture is trained for its shading, from arrays that were trained as a texture before.
+    Recipe of a training for shaded appearance, which starts from a trained texture.
 
-    ``share``: λ, the share of the loss of shaded values. ``clip``: bound of the derivatives of the error of a sample
-    that flow back through the specular lobe; ``None``: none. ``reference``: what shaded values are compared with.
-    ``bounded``: are values beyond 1 compared by their logarithms? ``texture``: the recipe of task 4 whose arrays,
-    samples and loss of the texture are used, and which trains them before, unless trained ones are given. ``settings``:
-    the rest; its ``loss`` is that of shaded values.
+    ``share``: λ, the share of the loss of shaded values. ``clip``: bound of the derivatives of a sample's error through
+    the specular lobe (``None``: unlimited). ``reference``: sample pattern of the reference. ``bounded``: whether values
+    above 1 are compared in log space. ``texture``: recipe of task 4, which trains the start unless one is given, and
+    defines the samples and the loss of the texture. ``settings``: the rest; its ``loss`` is that of shaded values.
     """
 
     share: float = 0.9
@@ -31,7 +30,7 @@ class ShadingRecipe:
     settings: FitSettings = dataclasses.field(default_factory=FitSettings)
 
 
-#: Steps of a training that is not told how long it may take.
+#: Steps of a training without a time limit.
 STEPS = 600
 
 _OURS = FitSettings(steps=STEPS, batch=2**16, lr=2e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10)

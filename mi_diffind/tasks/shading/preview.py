@@ -1,4 +1,4 @@
-"""A picture of how far a training has come: shaded images at some levels beside their truth."""
+"""Preview of a training: shaded images at some levels beside their truth."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from ... import srgb
 from ...files import replacing
 from .evaluation import ShadedEvaluation, ShadedReader
 
-#: Levels that are shown, and how often a difference is amplified.
+#: Levels of the preview, and the factor by which differences are amplified.
 LEVELS, AMPLIFIED = (0, 2, 4), 4
 
-#: Mean linear value of the image that is shown, about.
+#: Approximate mean linear value of the image that is chosen.
 BRIGHTNESS = 0.3
 
-#: Pixels along the side of each image, at least.
+#: Smallest number of pixels along the side of each image.
 PANEL = 192
 
 
 def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) -> None:
     """
-    Write a picture of one view and light, under which the material is neither dark nor glaring: for each of
-    :data:`LEVELS` a row, and in it the truth, what a reader shows, and their difference, amplified, as displayed.
+    Write a picture with a row for each of :data:`LEVELS`: truth, shaded image and amplified difference, as displayed.
+
+    View and light are those under which the material is neither dark nor glaring.
     """
     import mitsuba as mi
 
@@ -40,9 +41,9 @@ def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) 
 
 
 def _enlarged(image: np.ndarray, side: int) -> np.ndarray:
-    """An image of at most ``side`` × ``side`` pixels that is about as wide, in whole pixels; the rest stays white."""
+    """Enlarge an image by a whole factor to at most ``side`` × ``side`` pixels; the rest of the square is white."""
     times = max(1, side // max(image.shape[:2]))
     image = image.repeat(times, axis=0).repeat(times, axis=1)
-    found = np.ones((side, side, 3))
-    found[: image.shape[0], : image.shape[1]] = image
-    return found
+    square = np.ones((side, side, 3))
+    square[: image.shape[0], : image.shape[1]] = image
+    return square

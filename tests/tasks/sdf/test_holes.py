@@ -6,13 +6,14 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import pytest
-import solids
+import solid_meshes as solids
 
 from mi_diffind.runtime import array_module
-from mi_diffind.tasks.sdf import codes, decode, encoding, files, nodes, samples
+from mi_diffind.tasks.sdf import codes, encoding, extraction, grids, nodes
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.field import DistanceField
 from mi_diffind.tasks.sdf.mesh import load_mesh, make_mesh
+from mi_diffind.tasks.sdf.sampling import sample_box
 
 ARMADILLO = Path(__file__).resolve().parents[4] / "shared/data/meshes/armadillo.off"
 
@@ -42,13 +43,13 @@ def sampled():
 def coded(types, sampled, bits=8):
     """Sampled, not trained: entries of 8 bits are coarse enough for errors."""
     frames = encoding.fit_frames(sampled)
-    wanted = encoding.targets(sampled, frames)
+    wanted = encoding.exact_entries(sampled, frames)
     entries = encoding.cluster(wanted, min(2**bits, len(wanted)))
     pointers = encoding.assign(wanted, entries)
-    told = nodes.decoded_nodes(sampled.structure, frames, entries[pointers]).astype(np.float64)
-    slope = nodes.slope_bound(told[:, 0], told[:, 1:], sampled.corners)
+    values = nodes.decoded_nodes(sampled.structure, frames, entries[pointers]).astype(np.float64)
+    slope = nodes.slope_bound(values[:, 0], values[:, 1:], sampled.corners)
     words = codes.pointer_words(pointers, bits)
-    return files.coded_field(types, sampled.structure, slope, frames, words, bits, entries)
+    return nodes.coded_field(types, sampled.structure, slope, frames, words, bits, entries)
 
 
 def vectors(types, values):
@@ -67,7 +68,7 @@ def test_wrong_nodes_make_no_floaters(types, sampled):
     values = np.concatenate([s.distances[:, None], s.normals], axis=1)
     values[rng.random(len(values)) < 0.3, 0] *= -1
     field = nodes.SparseNodes(types, s.structure, 3.0, nodes=types.TensorXf(values.astype(np.float32)))
-    points = samples.far(field.lower, field.upper, 40000, 5)
+    points = sample_box(field.lower, field.upper, 40000, 5)
     cell = np.floor((points - field.lower) / field.spacing).astype(int)
     stored = set(map(tuple, s.structure.node_positions()[0].tolist()))
     corners = (cell[:, None] + np.array(nodes.CORNERS)).tolist()
@@ -81,7 +82,7 @@ def test_wrong_nodes_make_no_floaters(types, sampled):
 def test_as_many_pieces_as_the_mesh(types, sampled):
     """Also after coding, decoded finer than the field's cells: two solids, one with a cavity, and nothing else."""
     distances, s = sampled
-    volumes = decode.components(decode.extract(coded(types, s), 108)) * distances.mesh.scale**3
+    volumes = extraction.components(extraction.extract(coded(types, s), 108)) * distances.mesh.scale**3
     assert len(volumes) == 3 and np.sum(volumes < 0) == 1
     assert volumes[1] == pytest.approx(-4 / 3 * math.pi * 0.6**3, rel=0.05)
     assert volumes[2] == pytest.approx(0.5**3, rel=0.05)
@@ -90,11 +91,13 @@ def test_as_many_pieces_as_the_mesh(types, sampled):
 def test_empty_blocks_are_left_out_of_decoding(types, sampled, monkeypatch):
     """The same triangles, whether all of the grid is looked at or what is near stored nodes only."""
     field = coded(types, sampled[1])
-    few = decode.extract(field, 100)
-    blocks = decode.crossed_blocks(field, np.array(field.lower), 1 / 100, [100] * 3)
+    few = extraction.extract(field, 100)
+    blocks = grids.crossed_blocks(field, np.array(field.lower), 1 / 100, [100] * 3)
     assert blocks.shape == (4, 4, 4) and 0.2 < blocks.mean() < 0.95
-    monkeypatch.setattr(decode, "crossed_blocks", lambda field, lower, spacing, cells: np.ones(-(-cells // 32), bool))
-    every = decode.extract(field, 100)
+    monkeypatch.setattr(
+        extraction, "crossed_blocks", lambda field, lower, spacing, cells: np.ones(-(-cells // 32), bool)
+    )
+    every = extraction.extract(field, 100)
     assert np.array_equal(few.vertices, every.vertices) and np.array_equal(few.faces, every.faces)
 
 
@@ -111,7 +114,7 @@ def shoot(types, distances, field, count, seed):
 
     rng = np.random.default_rng(seed)
     h = field.spacing
-    pool = samples.far(distances.mesh.lower - 3 * h, distances.mesh.upper + 3 * h, min(4 * count, 400_000), rng)
+    pool = sample_box(distances.mesh.lower - 3 * h, distances.mesh.upper + 3 * h, min(4 * count, 400_000), rng)
     d = distances.signed(pool, 4 * h)
     deep, free = pool[d < -1.5 * h], pool[d > 1.5 * h]
     missed = astray = 0
@@ -120,14 +123,14 @@ def shoot(types, distances, field, count, seed):
         target = deep[rng.integers(len(deep), size=n)] + rng.uniform(-0.25, 0.25, (n, 3)) * h
         away = rng.normal(size=(n, 3))
         away /= np.linalg.norm(away, axis=1)[:, None]
-        kind = rng.integers(8, size=n)
-        along = kind == 0
+        start = rng.integers(8, size=n)
+        along = start == 0
         away[along] = np.eye(3)[rng.integers(3, size=along.sum())] * rng.choice([-1, 1], (along.sum(), 1))
-        flat = kind == 1
+        flat = start == 1
         away[flat, rng.integers(3, size=flat.sum())] = 0
         away[flat] /= np.linalg.norm(away[flat], axis=1)[:, None]
-        o = target + np.where(kind == 2, 30, 2)[:, None] * away
-        box = kind >= 5
+        o = target + np.where(start == 2, 30, 2)[:, None] * away
+        box = start >= 5
         o[box] = free[rng.integers(len(free), size=box.sum())]
         o = o.astype(np.float32).astype(np.float64)
         towards = target - o
@@ -135,9 +138,9 @@ def shoot(types, distances, field, count, seed):
         t, hit = trace(field, vectors(types, o), vectors(types, towards / length[:, None]), types.Float(math.inf))
         t, hit = t.numpy().astype(np.float64), hit.numpy()
         missed += int(np.sum(~hit | (t > length)))
-        found = hit[:, None] & np.isfinite(t)[:, None]
-        place = np.where(found, o + (towards / length[:, None]) * np.where(hit, t, 0)[:, None], target)
-        some = rng.choice(np.flatnonzero(hit & (kind != 2)), min(20_000, int(hit.sum() // 2)), replace=False)
+        is_hit = hit[:, None] & np.isfinite(t)[:, None]
+        place = np.where(is_hit, o + (towards / length[:, None]) * np.where(hit, t, 0)[:, None], target)
+        some = rng.choice(np.flatnonzero(hit & (start != 2)), min(20_000, int(hit.sum() // 2)), replace=False)
         astray += int(np.sum(distances.unsigned(place[some]) > 1.5 * h))
     return missed, astray
 

@@ -12,14 +12,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import solids
+import solid_meshes as solids
 import trimesh
 
 from mi_diffind.errors import DiffindError
-from mi_diffind.tasks.sdf import samples
-from mi_diffind.tasks.sdf.cells import CORNERS, near_nodes, node_distances, surface_cells
 from mi_diffind.tasks.sdf.distances import Distances, DistancesError
 from mi_diffind.tasks.sdf.mesh import Mesh, MeshError, load_mesh, make_mesh
+from mi_diffind.tasks.sdf.sampling import (
+    CORNERS,
+    near_nodes,
+    node_distances,
+    sample_box,
+    sample_near,
+    sample_surface,
+    surface_cells,
+)
 
 
 def sentence(error):
@@ -30,7 +37,7 @@ def sentence(error):
 
 def inside_share(mesh, distances, count=40000):
     """The share of the bounding box that is inside, by points."""
-    points = samples.far(mesh.lower, mesh.upper, count, 5)
+    points = sample_box(mesh.lower, mesh.upper, count, 5)
     return distances.inside(points).mean()
 
 
@@ -53,11 +60,11 @@ def test_formats(tmp_path, name):
 def test_scene_is_placed(tmp_path):
     """A scene's meshes are taken together where transforms put them, mirrored ones are turned."""
     scene = trimesh.Scene()
-    thing = trimesh.Trimesh(*solids.box(), process=False)
-    scene.add_geometry(thing, transform=np.diag([1.0, 1, 2, 1]))
+    cube = trimesh.Trimesh(*solids.box(), process=False)
+    scene.add_geometry(cube, transform=np.diag([1.0, 1, 2, 1]))
     mirror = np.diag([-1.0, 1, 1, 1])
     mirror[0, 3] = 3
-    scene.add_geometry(thing, transform=mirror)
+    scene.add_geometry(cube, transform=mirror)
     scene.export(tmp_path / "scene.glb")
     mesh = load_mesh(tmp_path / "scene.glb")
     assert mesh.components == 2 and mesh.watertight and mesh.warnings == []
@@ -67,7 +74,7 @@ def test_scene_is_placed(tmp_path):
 def test_scale_and_place_do_not_matter():
     vertices, faces = solids.sphere(8)
     reference = make_mesh(vertices, faces)
-    points = samples.near(reference, 500, 0.05, 1)
+    points = sample_near(reference, 500, 0.05, 1)
     with Distances(reference) as d:
         truth = d.signed(points)
     for scale, centre in ((1e-6, 1e-3), (1e6, -1e9)):
@@ -85,7 +92,7 @@ def test_digest_knows_content():
 
 
 @pytest.mark.parametrize(
-    "content, found",
+    "content, result",
     [
         (b"", "cannot be read as a mesh"),
         (b"OFF\n3 1 0\n0 0 0\n1 0", "cannot be read as a mesh"),
@@ -93,11 +100,11 @@ def test_digest_knows_content():
         (b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", ""),
     ],
 )
-def test_unreadable_files(tmp_path, content, found):
+def test_unreadable_files(tmp_path, content, result):
     (tmp_path / "a.off").write_bytes(content)
     with pytest.raises(MeshError) as error:
         load_mesh(tmp_path / "a.off")
-    assert found in sentence(error) and str(tmp_path / "a.off") in str(error.value)
+    assert result in sentence(error) and str(tmp_path / "a.off") in str(error.value)
 
 
 def test_files_that_are_none(tmp_path):
@@ -130,7 +137,7 @@ NOTHING = np.zeros((0, 3), int)
 
 
 @pytest.mark.parametrize(
-    "vertices, faces, found",
+    "vertices, faces, result",
     [
         (np.zeros((0, 3)), NOTHING, "has no triangles"),
         (np.eye(3), NOTHING, "has no triangles"),
@@ -147,11 +154,11 @@ NOTHING = np.zeros((0, 3), int)
         ([[-1e308, 0, 0], [1e308, 0, 0], [0, 1e308, 1e308]], [[0, 1, 2]], "has the extent inf"),
     ],
 )
-def test_meshes_that_are_none(vertices, faces, found):
+def test_meshes_that_are_none(vertices, faces, result):
     """Refused when they are read, or at the latest when distances are asked for; always in one sentence."""
     with pytest.raises((MeshError, DistancesError)) as error, Distances(make_mesh(vertices, faces, "a.ply")) as d:
         d.signed(np.zeros((1, 3)))
-    assert found in sentence(error) and str(error.value).startswith("a.ply: ")
+    assert result in sentence(error) and str(error.value).startswith("a.ply: ")
 
 
 def test_degenerate_triangles_are_left_out():
@@ -225,17 +232,17 @@ def test_distances_of_a_box():
     """Against the formula, in a frame where the box's longest side is 1."""
     size = np.array([1, 0.6, 0.3])
     mesh = make_mesh(*solids.box(7 * size, (3, 2, 1)))
-    points = np.concatenate([samples.far([-0.7] * 3, [0.7] * 3, 3000, 0), samples.near(mesh, 3000, 0.01, 1)])
+    points = np.concatenate([sample_box([-0.7] * 3, [0.7] * 3, 3000, 0), sample_near(mesh, 3000, 0.01, 1)])
     with Distances(mesh) as d:
         truth = solids.box_distance(points, size)
-        found = d.signed(points)
-        assert found.dtype == np.float32 and np.abs(found - truth).max() < 1e-6
+        result = d.signed(points)
+        assert result.dtype == np.float32 and np.abs(result - truth).max() < 1e-6
         assert np.array_equal(d.inside(points), truth < 0)
         assert np.abs(d.signed(points, 0.05) - truth.clip(-0.05, 0.05)).max() < 1e-6
         value, gradient = d.signed_normals(points)
         step = 1e-5
         ahead = solids.box_distance(points + step * gradient, size)
-    assert np.array_equal(value, found) and np.allclose(np.linalg.norm(gradient, axis=1), 1, atol=1e-5)
+    assert np.array_equal(value, result) and np.allclose(np.linalg.norm(gradient, axis=1), 1, atol=1e-5)
     assert np.quantile(np.abs((ahead - truth) / step - 1), 0.99) < 1e-3  # but for those with several nearest points
 
 
@@ -255,7 +262,7 @@ def test_distances_and_windings_of_a_bad_mesh():
 def test_on_the_surface():
     """Points of the surface have a distance of 0 and the triangle's normal, whatever their rounding."""
     mesh = make_mesh(*solids.sphere(16))
-    points, normals = samples.surface(mesh, 4000, 2)
+    points, normals = sample_surface(mesh, 4000, 2)
     with Distances(mesh) as d:
         value, gradient = d.signed_normals(points)
         _, face, closest = d.nearest(points)
@@ -328,23 +335,23 @@ def test_one_triangle_encloses_nothing():
 def test_overlapping_boxes_are_their_union(shift):
     """Also where sides coincide: |d| inside is to the union's surface, not to the sides buried in it."""
     mesh = make_mesh(*solids.together(solids.box(), solids.box(centre=shift)))
-    points = samples.far([-0.6] * 3, [0.6] * 3, 4000, 1)
+    points = sample_box([-0.6] * 3, [0.6] * 3, 4000, 1)
     with Distances(mesh) as d:
-        found, surface = d.signed(points), d.surface
-        said = [w for w in d.warnings if "pieces overlap" in w]
+        result, surface = d.signed(points), d.surface
+        warnings = [w for w in d.warnings if "pieces overlap" in w]
     file = mesh.to_file_frame(points)
     a, b = solids.box_distance(file, (1, 1, 1)), solids.box_distance(file, (1, 1, 1), shift)
-    assert np.array_equal(found < 0, np.minimum(a, b) < 0) and said
-    outside = found > 0
-    assert np.abs(found - np.minimum(a, b) / mesh.scale)[outside].max() < 0.01
+    assert np.array_equal(result < 0, np.minimum(a, b) < 0) and warnings
+    outside = result > 0
+    assert np.abs(result - np.minimum(a, b) / mesh.scale)[outside].max() < 0.01
     # The exact distance to the union's surface: to all points of either box in front of which neither is
-    cloud, normals = samples.surface(make_mesh(*solids.box()), 40000, 2)
+    cloud, normals = sample_surface(make_mesh(*solids.box()), 40000, 2)
     cloud, ahead = (np.concatenate([c, c + np.array(shift)]) for c in (cloud, cloud + 1e-6 * normals))
     seen = np.minimum(solids.box_distance(ahead, (1, 1, 1)), solids.box_distance(ahead, (1, 1, 1), shift)) > 0
     from scipy.spatial import KDTree
 
     truth, _ = KDTree(cloud[seen]).query(file)
-    error = np.abs(np.abs(found) - truth / mesh.scale)
+    error = np.abs(np.abs(result) - truth / mesh.scale)
     assert np.quantile(error, 0.99) < 0.01 and error.max() < 0.02
     assert surface.area < mesh.area
 
@@ -375,7 +382,7 @@ def test_self_intersecting():
     faces = np.concatenate([np.stack([n(i, j), n(i + 1, j), n(i + 1, j + 1)], 1),
                             np.stack([n(i, j), n(i + 1, j + 1), n(i, j + 1)], 1)])  # fmt: skip
     mesh = make_mesh(ring.reshape(-1, 3), faces)
-    points = samples.far(mesh.lower, mesh.upper, 5000, 4)
+    points = sample_box(mesh.lower, mesh.upper, 5000, 4)
     distance = np.min(np.linalg.norm(mesh.to_file_frame(points)[:, None] - path[None], axis=-1), axis=1)
     with Distances(mesh) as d:
         inside = d.inside(points)
@@ -391,7 +398,7 @@ def test_thin_plate():
     for size in ((1, 1, 20), (1, 1, 0.001)):
         mesh = make_mesh(*solids.box(size))
         unit = np.array(size) / max(size)
-        points = samples.near(mesh, 4000, 0.3 * unit.min(), 3)
+        points = sample_near(mesh, 4000, 0.3 * unit.min(), 3)
         with Distances(mesh) as d:
             truth = solids.box_distance(points, unit)
             assert np.abs(d.signed(points) - truth).max() < 1e-6 and (truth < 0).mean() > 0.05
@@ -400,7 +407,7 @@ def test_thin_plate():
 # -- cells and grids --------------------------------------------------------------------------------------------------
 
 
-def test_surface_cells_miss_nothing(monkeypatch):
+def test_surface_cells_miss_nothing():
     """All cells with a point of the surface in them are named, once, and none further than its half diagonal."""
     mesh = make_mesh(*solids.together(solids.sphere(16), solids.box((0.02, 0.02, 1.5), (1.2, 0, 0))))
     spacing, lower = 1 / 50, mesh.lower - 0.03
@@ -410,7 +417,7 @@ def test_surface_cells_miss_nothing(monkeypatch):
         wide = surface_cells(d, lower, spacing, shape, reach=0.05)
         everywhere = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
         distance = d.unsigned(lower + (everywhere + 0.5) * spacing)
-    points, _ = samples.surface(mesh, 200_000, 0)
+    points, _ = sample_surface(mesh, 200_000, 0)
     hit = np.unique(np.floor((points - lower) / spacing).astype(int), axis=0)
     named = set(map(tuple, cells.tolist()))
     assert len(named) == len(cells) and cells.dtype == np.int32 and set(map(tuple, hit.tolist())) <= named
@@ -419,8 +426,7 @@ def test_surface_cells_miss_nothing(monkeypatch):
     assert np.array_equal(wide, everywhere[distance <= (half + 0.05) * (1 + 1e-6)])
     nodes, corners = near_nodes(cells)
     assert np.array_equal(nodes[corners], cells[:, None] + CORNERS) and len(np.unique(nodes, axis=0)) == len(nodes)
-    monkeypatch.setattr("mi_diffind.tasks.sdf.cells.MAPPED", 0)
-    assert all(np.array_equal(a, b) for a, b in zip(near_nodes(cells), (nodes, corners), strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(near_nodes(cells, 0), (nodes, corners), strict=True))
     assert np.array_equal(nodes, nodes[np.lexsort(nodes.T[::-1])])
     assert near_nodes(cells[:0])[0].shape == (0, 3) and near_nodes(cells[:0])[1].shape == (0, 8)
 
@@ -441,9 +447,9 @@ def test_grid_of_distances():
 
 def test_samples():
     mesh = make_mesh(*solids.together(solids.box(), solids.box((0.1, 0.1, 0.1), (2, 0, 0))))
-    points, normals = samples.surface(mesh, 10_000, 7)
-    assert np.array_equal(points, samples.surface(mesh, 10_000, 7)[0])
-    assert not np.array_equal(points, samples.surface(mesh, 10_000, 8)[0])
+    points, normals = sample_surface(mesh, 10_000, 7)
+    assert np.array_equal(points, sample_surface(mesh, 10_000, 7)[0])
+    assert not np.array_equal(points, sample_surface(mesh, 10_000, 8)[0])
     small = mesh.to_file_frame(points)[:, 0] > 1
     assert abs(small.sum() - 10_000 * 0.06 / 6.06) <= 1, "each part of the surface gets its share"
     with Distances(mesh) as d:
@@ -496,7 +502,7 @@ def test_without_libigl(monkeypatch):
 def test_the_child_ends_with_its_parent():
     """However the parent ends, and without the parent's modules in it."""
     program = textwrap.dedent("""
-        import os, numpy as np, solids
+        import os, numpy as np, solid_meshes as solids
         from mi_diffind.tasks.sdf.distances import Distances
         from mi_diffind.tasks.sdf.mesh import make_mesh
         d = Distances(make_mesh(*solids.box()))
@@ -528,7 +534,7 @@ def test_the_child_ends_with_its_parent():
 def test_ctrl_c_ends_a_question():
     """A Ctrl-C in the middle of a question goes through, and the next one is answered rightly."""
     mesh = make_mesh(*solids.sphere(16))
-    points = samples.far([-0.6] * 3, [0.6] * 3, 2**19, 0)
+    points = sample_box([-0.6] * 3, [0.6] * 3, 2**19, 0)
     with Distances(mesh) as d:
         few = d.signed(points[:100])
         handler = signal.getsignal(signal.SIGINT)
@@ -547,21 +553,21 @@ def test_ctrl_c_ends_a_question():
 
 def test_the_child_outlives_a_thread():
     """Asked first by a thread that ends: the process is not that thread's."""
-    found = []
+    result = []
     with Distances(make_mesh(*solids.box())) as d:
-        thread = threading.Thread(target=lambda: found.append(d.signed(np.zeros((1, 3)))))
+        thread = threading.Thread(target=lambda: result.append(d.signed(np.zeros((1, 3)))))
         thread.start()
         thread.join()
         child = d._child
         time.sleep(0.2)
-        assert d.signed(np.zeros((1, 3))) == found[0] and d._child is child
+        assert d.signed(np.zeros((1, 3))) == result[0] and d._child is child
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_a_fork_leaves_the_child_alone():
     """A forked copy of the parent asks a process of its own, and ends only that."""
     program = textwrap.dedent("""
-        import os, numpy as np, solids
+        import os, numpy as np, solid_meshes as solids
         from mi_diffind.tasks.sdf.distances import Distances
         from mi_diffind.tasks.sdf.mesh import make_mesh
         d = Distances(make_mesh(*solids.box()))

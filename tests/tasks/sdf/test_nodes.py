@@ -5,10 +5,10 @@ import dataclasses
 import drjit as dr
 import numpy as np
 import pytest
-from solids import box, sphere, together
+from solid_meshes import box, sphere, together
 
 from mi_diffind.runtime import array_module
-from mi_diffind.tasks.sdf import codes, decode, encoding, files, nodes, structure
+from mi_diffind.tasks.sdf import codes, encoding, extraction, nodes, structure
 from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.mesh import make_mesh
 
@@ -38,11 +38,11 @@ def decoded(types, sampled):
 
 def coded(types, sampled, bits=8):
     frames = encoding.fit_frames(sampled)
-    wanted = encoding.targets(sampled, frames)
+    wanted = encoding.exact_entries(sampled, frames)
     entries = encoding.cluster(wanted, min(2**bits, len(wanted)))
     pointers = encoding.assign(wanted, entries)
     words = codes.pointer_words(pointers, bits)
-    return files.coded_field(types, sampled.structure, 3.0, frames, words, bits, entries), frames, entries[pointers]
+    return nodes.coded_field(types, sampled.structure, 3.0, frames, words, bits, entries), frames, entries[pointers]
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------
@@ -56,10 +56,10 @@ def test_every_node_of_the_grid_has_its_sign(ad, solid):
     places = np.array(s.lower) + s.spacing * grid
     inside = distances.inside(places)
     # A hair within the cell whose lowest corner the node is, so that rounding does not choose another
-    found = decoded(ad, sampled).value(points(ad, places + 1e-4 * s.spacing)).numpy()
+    result = decoded(ad, sampled).value(points(ad, places + 1e-4 * s.spacing)).numpy()
     sure = np.abs(distances.unsigned(places)) > 1e-3 * s.spacing
     assert 0.02 < inside.mean() < 0.5
-    assert np.array_equal((found < 0)[sure], inside[sure])
+    assert np.array_equal((result < 0)[sure], inside[sure])
 
 
 def test_positions_follow_from_masks(solid):
@@ -75,22 +75,11 @@ def test_positions_follow_from_masks(solid):
     assert np.all(signs.any(axis=1) & ~signs.all(axis=1))
 
 
-def test_empty_regions_keep_their_distance(solid):
-    _, distances, sampled = solid
-    s = sampled.structure
-    index = np.argwhere(s.regions != structure.ACTIVE)
-    rng = np.random.default_rng(0)
-    places = np.array(s.lower) + s.spacing * (16 * index[:, None] + 16 * rng.random((len(index), 64, 3)))
-    known = (s.regions[tuple(index.T)] // 2) * s.spacing
-    assert known.max() > 0
-    assert np.all(distances.unsigned(places.reshape(-1, 3)).reshape(len(index), 64) >= known[:, None])
-
-
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"block_masks": np.zeros((1, 2), np.uint32)}, "blocks have nodes, masks are there for 1"),
-        ({"region_masks": np.zeros((0, 2), np.uint32)}, "regions have nodes, masks are there for 0"),
+        ({"block_masks": np.zeros((1, 2), np.uint32)}, "blocks have nodes, found masks for 1"),
+        ({"region_masks": np.zeros((0, 2), np.uint32)}, "regions have nodes, found masks for 0"),
     ],
 )
 def test_masks_that_do_not_go_together(solid, changes, says):
@@ -107,24 +96,25 @@ def test_frames_are_the_same_for_both_kinds_of_arrays(ad, rng):
     n[:6] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]
     d, s = rng.uniform(-4.4, 4.4, 2000), 2.0 ** rng.uniform(-6.9, 0.4, 2000)
     words = codes.frame_words(n, d, s)
-    normal, distance, scale = codes.frames_numpy(words)
+    axes, distance, scale = codes.frames(words)
+    normal = np.stack(axes, axis=1)
     assert np.degrees(np.arccos(np.sum(normal * n, axis=1).clip(-1, 1))).max() < 0.25
     assert np.abs(distance - d).max() <= 4.5 / 255 + 1e-9
     assert np.all(np.abs(np.log2(scale / s)) <= 0.2501)
-    found, e, k = codes.frames(ad.UInt32(words), ad)
-    assert np.allclose(np.stack([v.numpy() for v in found], axis=1), normal, atol=2e-6)
+    n, e, k = codes.frames(ad.UInt32(words), ad.Float)
+    assert np.allclose(np.stack([v.numpy() for v in n], axis=1), normal, atol=2e-6)
     assert np.allclose(e.numpy(), distance, atol=1e-6) and np.allclose(k.numpy(), scale, rtol=1e-6)
 
 
 def test_residuals_reach_every_direction(rng):
-    """decoded() undoes residuals(), whatever the angle between a node and its block; NumPy against Dr.Jit elsewhere."""
+    """decode_nodes() undoes residuals(), whatever the angle between a node and its block."""
     count = 5000
     n, g = rng.normal(size=(2, count, 3))
     n, g = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (n, g))
     offsets, d, s = rng.uniform(-1.5, 1.5, (count, 3)), rng.uniform(-2, 2, count), 2.0 ** rng.integers(-4, 1, count)
     distance = rng.uniform(-2, 2, count)
-    entry = codes.residuals(distance, g, offsets, n, d, s)
-    back, normal = codes.decoded(tuple(entry.T), tuple(n.T), d, s, tuple(offsets.T))
+    entry = codes.residuals(distance, g, offsets, tuple(n.T), d, s)
+    back, normal = codes.decode_nodes(tuple(entry.T), tuple(n.T), d, s, tuple(offsets.T))
     opposite = np.sum(n * g, axis=1) < -0.99
     assert np.allclose(back, distance, atol=1e-9)
     assert np.allclose(np.stack(normal, axis=1)[~opposite], g[~opposite], atol=1e-6)
@@ -135,7 +125,7 @@ def test_residuals_reach_every_direction(rng):
 def test_entries_beyond_the_projections_edge_stay_unit_vectors():
     n = tuple(np.array([[0.0, 0.6, 0.8]]).T)
     for a in (1.9, 1.9999, 2.5, 100.0):
-        _, normal = codes.decoded((0.0, np.array([a]), np.array([0.0])), n, 0.0, 1.0, (0.0, 0.0, 0.0))
+        _, normal = codes.decode_nodes((0.0, np.array([a]), np.array([0.0])), n, 0.0, 1.0, (0.0, 0.0, 0.0))
         assert np.isclose(np.linalg.norm(np.array(normal)), 1, atol=1e-6), a
 
 
@@ -145,8 +135,8 @@ def test_pointers_in_words(ad, bits, rng):
     words = codes.pointer_words(values, bits)
     assert np.array_equal(codes.pointers_of(words, bits, 1001), values)
     index = ad.UInt32(rng.permutation(1001).astype(np.uint32))
-    found = codes.pointer_at(ad.UInt32(words), index, bits, ad.Bool(True))
-    assert np.array_equal(found.numpy(), values[index.numpy()])
+    result = codes.pointer_at(ad.UInt32(words), index, bits, ad.Bool(True))
+    assert np.array_equal(result.numpy(), values[index.numpy()])
 
 
 # -- what cells say ----------------------------------------------------------------------------------------------------
@@ -187,8 +177,8 @@ def test_gradients_are_those_of_the_values(ad, solid):
     h = 0.02 * s.spacing
     for axis in range(3):
         step = [h if i == axis else 0 for i in range(3)]
-        found = (field.value(p + ad.Array3f(*step)) - field.value(p - ad.Array3f(*step))) / (2 * h)
-        assert np.abs(found.numpy() - slope[axis].numpy()).max() < 5e-3
+        result = (field.value(p + ad.Array3f(*step)) - field.value(p - ad.Array3f(*step))) / (2 * h)
+        assert np.abs(result.numpy() - slope[axis].numpy()).max() < 5e-3
 
     start = field.nodes
     weights = ad.Float(rng.normal(size=400).astype(np.float32))
@@ -200,13 +190,13 @@ def test_gradients_are_those_of_the_values(ad, solid):
     touched = np.argwhere(np.abs(grad) > 1e-3)
     assert len(touched) > 500
     for node, channel in touched[rng.integers(len(touched), size=8)]:
-        found = []
+        result = []
         for sign in (1, -1):
             moved = values.copy()
             moved[node, channel] += sign * 0.01
             field.nodes = ad.TensorXf(moved)
-            found.append(dr.sum(weights * field.value(p))[0] / s.spacing)
-        assert (found[0] - found[1]) / 0.02 == pytest.approx(grad[node, channel], rel=2e-2, abs=2e-3)
+            result.append(dr.sum(weights * field.value(p))[0] / s.spacing)
+        assert (result[0] - result[1]) / 0.02 == pytest.approx(grad[node, channel], rel=2e-2, abs=2e-3)
 
 
 def test_coded_nodes_are_the_decoded_ones(ad, solid):
@@ -270,17 +260,13 @@ def test_the_surface_stays_in_its_cells(ad, solid):
     values[:, 0] += rng.normal(scale=0.1, size=len(values))
     values[:, 1:] += rng.normal(scale=0.5, size=(len(values), 3))
     values[:, 1:] /= np.linalg.norm(values[:, 1:], axis=1, keepdims=True)
-    coding = encoding.Coding(sampled, 8)
-    coding.commit(values, 0.5)
-    assert 0.4 < coding.done.mean() < 0.6
-    before = coding.pointers[coding.done].copy(), coding.done.copy()
-    coding.commit(values, 1.0)
-    assert coding.done.all() and np.mean(coding.pointers[before[1]] == before[0]) > 0.9
-    told = coding.values()
-    assert np.all((told[:, 0] < 0) == (sampled.distances < 0)) and np.all(np.abs(told[:, 0]) > 0.005)
+    coding = encoding.NodeCoding(sampled, 8)
+    coding.encode(values)
+    distances = coding.values()[:, 0]
+    assert np.all((distances < 0) == (sampled.distances < 0)) and np.all(np.abs(distances) > 0.005)
     words = codes.pointer_words(coding.pointers, 8)
-    field = files.coded_field(ad, sampled.structure, 3.0, coding.frames, words, 8, coding.entries)
-    assert len(decode.components(decode.extract(field, 200))) == 2
+    field = nodes.coded_field(ad, sampled.structure, 3.0, coding.frames, words, 8, coding.entries)
+    assert len(extraction.components(extraction.extract(field, 200))) == 2
 
     # On the sides of stored cells behind which there is none, the sign is that of their corners
     s = sampled.structure

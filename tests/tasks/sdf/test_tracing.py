@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from sdf_fields import Ball, Slab, Steps, sparse_table, torus
+from sdf_fields import Ball, Slab, Steps, TrilinearField, sparse_table, torus
 
-from mi_diffind.tasks.sdf import codes, files, index, marching, tracing
-from mi_diffind.tasks.sdf.field import DenseField
+from mi_diffind.tasks.sdf import codes, marching, model, tracing
+from mi_diffind.tasks.sdf.nodes import MIDDLE
 
 COUNT = 4096
 
@@ -26,10 +26,10 @@ def trace(field, o, d, maxt=np.inf):
     types = field.types
     o, d = (types.Array3f(np.array(v, np.float32).T) for v in np.broadcast_arrays(o, d))
     hit = tracing.intersect(field, o, d, types.Float(maxt))
-    t, found = tracing.trace(field, o, d, types.Float(maxt))
-    assert (np.array(found) == np.array(hit.found)).all()
-    assert (np.array(tracing.occluded(field, o, d, types.Float(maxt))) == np.array(found)).all()
-    return np.array(t), np.array(found), np.array(hit.p).T, np.array(hit.leaving)
+    t, is_hit = tracing.trace(field, o, d, types.Float(maxt))
+    assert (np.array(is_hit) == np.array(hit.hit)).all()
+    assert (np.array(tracing.occluded(field, o, d, types.Float(maxt))) == np.array(is_hit)).all()
+    return np.array(t), np.array(is_hit), np.array(hit.p).T, np.array(hit.leaving)
 
 
 def sphere(o, d, r):
@@ -48,16 +48,16 @@ def test_spheres(types, rng, start):
     at = unit(rng.normal(size=(COUNT, 3)))
     o = {"far": 0.3 * at - 2 * d, "near": 0.45 * at, "within": 0.35 * at * rng.random((COUNT, 1))}[start]
     near, far = sphere(o, d, 0.4)
-    t, found, p, leaving = trace(Ball(types), o, d)
+    t, is_hit, p, leaving = trace(Ball(types), o, d)
     expected = near if start != "within" else far
     hits = expected > 0
     clear = np.abs(np.linalg.norm(np.cross(o, d), axis=1) - 0.4) > 1e-5
-    assert (found == hits)[clear].all() and hits.mean() > 0.1
-    both = found & hits & clear
+    assert (is_hit == hits)[clear].all() and hits.mean() > 0.1
+    both = is_hit & hits & clear
     cosine = np.abs(((o + expected[:, None] * d) * d).sum(-1) / 0.4)[both]
     assert (np.abs(t[both] - expected[both]) * cosine < 2e-5).all()
     assert np.abs(np.linalg.norm(p[both], axis=1) - 0.4).max() < 1e-5
-    assert (leaving[both] == (start == "within")).all() and np.isinf(t[~found]).all()
+    assert (leaving[both] == (start == "within")).all() and np.isinf(t[~is_hit]).all()
 
 
 def test_axis_aligned_rays(types):
@@ -72,10 +72,10 @@ def test_axis_aligned_rays(types):
                         direction, origin = np.full(3, zero), np.zeros(3)
                         direction[axis], origin[axis], origin[axis - 1] = sign, -sign * start, offset
                         o.append(origin), d.append(direction), expected.append(t + start - 0.5)
-    t, found, _, _ = trace(ball, np.array(o), np.array(d))
+    t, is_hit, _, _ = trace(ball, np.array(o), np.array(d))
     expected = np.array(expected)
-    assert (found == np.isfinite(expected)).all()
-    assert np.abs(t[found] - expected[found]).max() < 2e-5
+    assert (is_hit == np.isfinite(expected)).all()
+    assert np.abs(t[is_hit] - expected[is_hit]).max() < 2e-5
 
 
 def test_from_a_thousand_times_its_size(types, rng):
@@ -83,19 +83,19 @@ def test_from_a_thousand_times_its_size(types, rng):
     d = unit(rng.normal(size=(COUNT, 3)))
     side = unit(np.cross(d, rng.normal(size=(COUNT, 3)))) * rng.random((COUNT, 1)) * 0.6
     o = side - 1000 * d
-    t, found, p, _ = trace(Ball(types), o, d)
+    t, is_hit, p, _ = trace(Ball(types), o, d)
     distance = np.linalg.norm(side, axis=1)
-    assert found[distance < 0.398].all() and not found[distance > 0.402].any()
-    assert np.abs(np.linalg.norm(p[found], axis=1) - 0.4).max() < 1e-5
-    direct = found & (distance < 0.3)
+    assert is_hit[distance < 0.398].all() and not is_hit[distance > 0.402].any()
+    assert np.abs(np.linalg.norm(p[is_hit], axis=1) - 0.4).max() < 1e-5
+    direct = is_hit & (distance < 0.3)
     assert np.abs(t[direct] - sphere(o, d, 0.4)[0][direct]).max() < 1e-3
 
 
 def test_length_of_rays(types):
     """A ray ends where it is said to end: before the surface it finds nothing."""
     o, d = np.array([[0, 0, -2.0]] * 4), np.array([[0, 0, 1.0]] * 4)
-    _, found, _, _ = trace(Ball(types), o, d, np.array([1.0, 1.599, 1.601, 9], np.float32))
-    assert found.tolist() == [False, False, True, True]
+    _, is_hit, _, _ = trace(Ball(types), o, d, np.array([1.0, 1.599, 1.601, 9], np.float32))
+    assert is_hit.tolist() == [False, False, True, True]
 
 
 def test_what_is_no_ray_ends(types):
@@ -103,8 +103,8 @@ def test_what_is_no_ray_ends(types):
     bad = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0]]
     o = np.array([[0, 0, -2.0]] * 3 + bad[:2] + [[0.45, 0.45, 0.45]])
     d = np.array([*bad, [1.0, 0, 0], [1.0, 0, 0], [0, 0, 0]])
-    _, found, _, _ = trace(Ball(types), o, d, 4.0)
-    assert not found.any()
+    _, is_hit, _, _ = trace(Ball(types), o, d, 4.0)
+    assert not is_hit.any()
 
 
 @pytest.mark.parametrize("thickness", [3e-4, 0.02])
@@ -113,8 +113,8 @@ def test_thin_walls_have_no_holes(types, rng, thickness):
     aim = rng.uniform(-0.2, 0.2, (4 * COUNT, 3))
     aim -= (aim @ slab.axis)[:, None] * slab.axis
     d = unit(rng.normal(size=(4 * COUNT, 3)))
-    t, found, _, _ = trace(slab, aim - 2 * d, d)
-    assert found.all()
+    t, is_hit, _, _ = trace(slab, aim - 2 * d, d)
+    assert is_hit.all()
     cosine = np.abs(d @ slab.axis)
     clear = cosine > 4 * thickness
     assert (np.abs((2 - t) * cosine - thickness / 2)[clear] < 2e-5).all()
@@ -125,19 +125,19 @@ def test_what_the_box_cuts_is_closed(types):
     slab = Slab(types, 0.2)
     o = np.array([[-2.0, 0, 0], [-2.0, 0, 0.3], [0, 0, 0], [0.2, 0, 0.05]])
     d = np.array([[1.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0], [-1.0, 0, 0]])
-    t, found, _, _ = trace(slab, o, d)
-    assert found.tolist() == [True, False, True, True]
+    t, is_hit, _, _ = trace(slab, o, d)
+    assert is_hit.tolist() == [True, False, True, True]
     assert np.abs(t[[0, 2, 3]] - [1.5, 0.5, 0.7]).max() < 1e-5
-    _, found, _, _ = trace(slab, o, d, 0.4)
-    assert not found.any()
+    _, is_hit, _, _ = trace(slab, o, d, 0.4)
+    assert not is_hit.any()
 
 
 def test_jumps_are_bracketed(types, rng):
     """Where the sign changes without a zero, bisection ends at the jump."""
     d = unit(rng.normal(size=(COUNT, 3)))
     o = 0.3 * unit(rng.normal(size=(COUNT, 3))) - 2 * d
-    t, found, _, _ = trace(Steps(types), o, d)
-    assert found.all()
+    t, is_hit, _, _ = trace(Steps(types), o, d)
+    assert is_hit.all()
     assert np.abs(t - sphere(o, d, 0.4)[0]).max() < 5e-5
 
 
@@ -147,19 +147,19 @@ def test_grids_against_a_slow_march(types, rng):
     x = np.linspace(-0.5, 0.5, n)
     grid = np.stack(np.meshgrid(x, x, x, indexing="ij"), -1)
     values = np.linalg.norm(grid, axis=-1) - 0.33 + rng.uniform(-0.02, 0.02, (n, n, n))
-    field = DenseField(types.TensorXf(values.astype(np.float32)), (-0.5,) * 3, (0.5,) * 3, 0.2)
+    field = TrilinearField(types.TensorXf(values.astype(np.float32)), (-0.5,) * 3, (0.5,) * 3, 0.2)
     count = 1024
     d = unit(rng.normal(size=(count, 3)))
     o = 0.4 * rng.random((count, 1)) * unit(rng.normal(size=(count, 3))) - d
-    t, found, _, _ = trace(field, o, d)
+    t, is_hit, _, _ = trace(field, o, d)
     steps = np.arange(0, 2, 2e-4, dtype=np.float32)
     p = (o[:, None] + steps[None, :, None] * d[:, None]).reshape(-1, 3).astype(np.float32)
     inside = np.array(field.value(types.Array3f(p.T)) < 0).reshape(count, -1)
     first = np.where(inside.any(1), steps[inside.argmax(1)], np.inf)
     agree = np.isclose(t, first, rtol=0, atol=4e-4)
     # A ray may touch a bump for less than a step, which either of the two may see
-    assert agree.mean() > 0.998 and np.isfinite(t[found]).all()
-    assert not (found & (t > first + 4e-4)).sum() > 1
+    assert agree.mean() > 0.998 and np.isfinite(t[is_hit]).all()
+    assert not (is_hit & (t > first + 4e-4)).sum() > 1
 
 
 def shell(p):
@@ -172,21 +172,22 @@ def shell(p):
 def coded(types, request):
     """The sparse field of a torus, well coded or badly, and of a thin wall."""
     shape, bits = request.param
-    return files.field_of(sparse_table(shape, bits=bits), {}, types)
+    return model.field_of(sparse_table(shape, bits=bits), {}, types)
 
 
 def test_signs_beyond_slabs(coded, rng):
     """Above a block's slab everything is outside, below it inside; and slabs are thin where blocks are well coded."""
-    structure, marcher = coded.structure, marching.of(coded)
+    structure, marcher = coded.structure, marching.marcher_of(coded)
     words = np.array(marcher.slabs)[1::2]
-    full = index.cells_of(structure)[0].any(axis=1)
-    low, high = (v * (2 * index.SLAB / index.STEPS) - index.SLAB for v in (words & 0xFFFF, words >> 16))
-    normals, middles, _ = codes.frames_numpy(coded.frames())
+    full = marching.GridCells(structure).crossed.any(axis=1)
+    low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
+    axes, middles, _ = codes.frames(coded.frames())
+    normals = np.stack(axes, axis=1)
     block = rng.choice(np.flatnonzero(full), 50 * COUNT)
     place = rng.uniform(0, 4, (len(block), 3))
     p = np.array(structure.lower) + structure.spacing * (structure.block_positions()[block] + place)
     inside = np.array(coded.value(coded.types.Array3f(p.T.astype(np.float32)))) < 0
-    height = middles[block] + np.sum(normals[block] * (place - index.MIDDLE), axis=1)
+    height = middles[block] + np.sum(normals[block] * (place - MIDDLE), axis=1)
     above, below = height > high[block], height < low[block]
     assert not inside[above].any() and inside[below].all()
     assert above.mean() > 0.1 and below.any()
@@ -194,16 +195,18 @@ def test_signs_beyond_slabs(coded, rng):
 
 def test_slabs_keep_the_signs_of_other_cells(coded, rng):
     """Cells that are not crossed have the sign that they are said to have, whatever the block's plane says."""
-    crossed, inside, _, _, node = index.cells_of(coded.structure)
+    cells = marching.GridCells(coded.structure)
+    crossed, inside = cells.crossed, cells.inside
     cell = np.argmax(~crossed, axis=1)
     block = np.flatnonzero(crossed.any(axis=1) & ~crossed.all(axis=1))
     cell = cell[block]
     inside[block, cell] = rng.random(len(block)) < 0.5
-    words = index.slabs_of(crossed, inside, node, coded.decoded(), coded.frames())[block]
-    low, high = (v * (2 * index.SLAB / index.STEPS) - index.SLAB for v in (words & 0xFFFF, words >> 16))
-    normals, middles, _ = (v[block] for v in codes.frames_numpy(coded.frames()))
+    words = marching.slab_words(cells, coded.decoded(), coded.frames())[block]
+    low, high = (v * (2 * marching.SLAB / marching.STEPS) - marching.SLAB for v in (words & 0xFFFF, words >> 16))
+    axes, middles, _ = codes.frames(coded.frames())
+    normals, middles = np.stack(axes, axis=1)[block], middles[block]
     place = np.stack([cell // 16, cell // 4 % 4, cell % 4], axis=1) + rng.random((len(block), 3))
-    height = middles + np.sum(normals * (place - index.MIDDLE), axis=1)
+    height = middles + np.sum(normals * (place - MIDDLE), axis=1)
     within = inside[block, cell]
     assert (height <= high)[within].all() and (height >= low)[~within].all()
     assert 10 < within.sum() < len(block) - 10
@@ -214,31 +217,32 @@ def test_slabs_change_no_hit(types, coded, rng):
     d = unit(rng.normal(size=(3 * COUNT, 3)))
     o = rng.uniform(-0.45, 0.45, (3 * COUNT, 3))
     o[:COUNT] -= 2 * d[:COUNT]
-    t, found, _, leaving = trace(coded, o, d)
-    marching.of(coded).slabs = None
+    t, is_hit, _, leaving = trace(coded, o, d)
+    marching.marcher_of(coded).slabs = None
     slow, met, _, left = trace(coded, o, d)
-    assert 0.3 < found.mean() < 0.95 and 0.05 < leaving.mean() < 0.5
+    assert 0.3 < is_hit.mean() < 0.95 and 0.05 < leaving.mean() < 0.5
     # Looked at in other places, a ray that grazes may be seen to touch, or start, elsewhere
-    assert (found != met).mean() < 1e-3 and (leaving != left).mean() < 1e-3
-    both = found & met
+    assert (is_hit != met).mean() < 1e-3 and (leaving != left).mean() < 1e-3
+    both = is_hit & met
     assert np.quantile(np.abs(t[both] - slow[both]), 0.995) < 2e-5
 
 
 def test_rays_along_the_plane_of_a_block(coded, rng):
     """They enter its slab, if ever, at a distance of which there is a cell."""
-    types, marcher, structure = coded.types, marching.of(coded), coded.structure
-    normals, middles, _ = codes.frames_numpy(coded.frames())
-    block = rng.choice(np.flatnonzero(index.cells_of(structure)[0].any(axis=1)), COUNT)
+    types, marcher, structure = coded.types, marching.marcher_of(coded), coded.structure
+    axes, middles, _ = codes.frames(coded.frames())
+    normals = np.stack(axes, axis=1)
+    block = rng.choice(np.flatnonzero(marching.GridCells(structure).crossed.any(axis=1)), COUNT)
     aside = unit(np.cross(normals[block], rng.normal(size=(COUNT, 3))))
-    middle = structure.block_positions()[block] + index.MIDDLE
+    middle = structure.block_positions()[block] + MIDDLE
     height = rng.uniform(-4, 4, COUNT) - middles[block]
     o = types.Array3f((middle + height[:, None] * normals[block]).T.astype(np.float32))
-    course = marching.Course(coded, o, types.Array3f(aside.T.astype(np.float32)))
+    ray = marching.GridRay(coded, o, types.Array3f(aside.T.astype(np.float32)))
     number, t = types.UInt32(block.astype(np.uint32)), types.Float(0)
     cell = [types.Int32(v) for v in (structure.block_positions()[block].T + 1).astype(np.int32)]
-    first, last, below = marcher.slab(course, t, number, cell, True)
+    first, last, below = marcher.slab(ray, t, number, cell, True)
     assert np.abs(np.array(first)).max() < 2**31 and np.abs(np.array(last)).max() < 2**31
-    low = (np.array(marcher.slabs)[1::2] & 0xFFFF)[block] * (2 * index.SLAB / index.STEPS) - index.SLAB
+    low = (np.array(marcher.slabs)[1::2] & 0xFFFF)[block] * (2 * marching.SLAB / marching.STEPS) - marching.SLAB
     off = (np.array(first) > 0) | (np.array(last) < 0)
     above = middles[block] + height
     clear = off & (np.abs(above - low) > 1e-3)

@@ -22,7 +22,6 @@ from mi_diffind.tasks.disney.decoder import Decoder
 from mi_diffind.tasks.disney.effects import Effects
 from mi_diffind.tasks.disney.training import uniform_hemisphere
 from mi_diffind.tasks.shading import TASK, material, training
-from mi_diffind.tasks.shading.clip import clipped
 from mi_diffind.tasks.shading.evaluation import ShadedEvaluation, reader
 from mi_diffind.tasks.shading.presets import PRESETS
 from mi_diffind.tasks.shading.reference import reference
@@ -70,7 +69,7 @@ def test_clip_changes_derivatives_only(ad):
     x = ad.Float([0.5, -2.0, 3.0, 7.0])
     y = ad.Float([1.0, 2.0, 3.0, 4.0])
     dr.enable_grad(x, y)
-    value = clipped(x, 0.1)
+    value = material.clipped(x, 0.1)
     assert np.array_equal(dr.detach(value).numpy(), dr.detach(x).numpy())
     slopes = ad.Float([0.05, -3.0, 0.1, np.nan])
     dr.backward(dr.sum(slopes * value + 5 * x * y))
@@ -82,12 +81,12 @@ def test_clip_changes_derivatives_only(ad):
 def test_clip_of_vectors_and_forward(ad):
     v = ad.Array3f([1.0, 2.0], [0.0, 0.0], [3.0, -3.0])
     dr.enable_grad(v)
-    out = clipped(v, 0.25)
+    out = material.clipped(v, 0.25)
     dr.set_grad(v, ad.Array3f(1.0, -0.1, -9.0))
     dr.enqueue(dr.ADMode.Forward, v)
     dr.traverse(dr.ADMode.Forward)
     assert np.allclose(numpy_of(dr.grad(out))[0], [0.25, -0.1, -0.25])
-    assert clipped(2.5, 0.1) == 2.5 and clipped(dr.detach(v), 0.1) is not None
+    assert material.clipped(2.5, 0.1) == 2.5 and material.clipped(dr.detach(v), 0.1) is not None
 
 
 def test_clip_is_for_the_specular_lobe(ad, rng):

@@ -1,0 +1,306 @@
+"""
+Shapes of Mitsuba that are signed distance fields, and their ray intersection for our integrators.
+
+Mitsuba 3.9 has no shapes written in Python but meshes. A :class:`DistanceShape` is therefore a mesh of eight triangles
+without area, at the corners of the field's box: the scene knows its extent, its material and its parameters, and no ray
+ever hits it. Integrators that support these shapes (:func:`distance_shapes_in`) trace the fields themselves
+(:func:`intersect`, :func:`occluded`) and compute the surface interaction that Mitsuba would (:func:`interaction`).
+
+Once Mitsuba has Python shapes (``mi.Shape`` with ``bbox``, ``ray_intersect_preliminary``,
+``compute_surface_interaction``), :class:`DistanceShape` becomes one of these, the functions its methods, and any
+integrator sees it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind import compat
+from mi_diffind.tasks.sdf import tracing
+
+#: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
+OFFSET = 3 * tracing.EPSILON
+
+#: Cosine between ray and normal below which the derivative of a hit is that at this cosine.
+GRAZING = 1e-2
+
+#: Bytes of each cell of Mitsuba's ``sdfgrid``, crossed or not: its value, a number, and a box of 32 bytes.
+CELL_BYTES = 40
+
+#: Number of triangles without area, and an attribute that keeps Mitsuba from merging them with other meshes.
+CORNERS, UNMERGED = 8, "face_solid"
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Transform from the unit frame to the world: ``p ↦ size · rotation p + origin``, or with a reflection."""
+
+    rotation: np.ndarray
+    size: float
+    origin: np.ndarray
+
+    @classmethod
+    def of(cls, to_world, scale: float, centre) -> Placement:
+        """
+        Return the placement of a mesh moved by ``to_world`` (``mi.ScalarTransform4f``).
+
+        ``centre`` and ``scale`` are the centre and the longest side of the mesh's box in its units. Raises
+        ``RuntimeError`` unless ``to_world`` is a rotation, a uniform scale and a translation.
+        """
+        matrix = np.array(to_world.matrix, np.float64)
+        linear = matrix[:3, :3]
+        size = float(np.abs(np.linalg.det(linear))) ** (1 / 3)
+        affine = np.isfinite(matrix).all() and size > 0 and np.allclose(matrix[3], (0, 0, 0, 1))
+        if not affine or not np.allclose(linear.T @ linear, size**2 * np.eye(3), atol=1e-4 * size**2):
+            rows = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in linear)
+            raise RuntimeError(
+                f'parameter "to_world": found [{rows}], allowed are rotations, uniform scales and translations'
+            )
+        return cls(linear / size, size * scale, linear @ np.asarray(centre, np.float64) + matrix[:3, 3])
+
+    def world(self, p: np.ndarray) -> np.ndarray:
+        """Return points ``(N, 3)`` of the unit frame in the world."""
+        return self.size * (p @ self.rotation.T) + self.origin
+
+
+class DistanceShape(mi.Mesh):
+    """
+    Shape of a distance ``field``'s surface, placed in the world by ``placement``.
+
+    ``smooth``: shading normals are the field's smooth ones.
+    """
+
+    #: Integrators that trace it.
+    seen_by = ("path_sdf",)
+
+    def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
+        self.field, self.placement, self.smooth = field, placement, smooth
+        self.ready = False
+        super().__init__(props.plugin_name(), CORNERS, CORNERS, props)
+        if self.is_emitter():
+            raise RuntimeError("emitter: found one, signed distance fields emit no light")
+        if self.is_medium_transition():
+            raise RuntimeError("medium: found one, signed distance fields hold none")
+        box = np.array([field.lower, field.upper], np.float64)
+        corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
+        buffers = mi.traverse(self)
+        buffers["vertex_positions"] = placement.world(corners).astype(np.float32).ravel()
+        buffers["faces"] = np.repeat(np.arange(CORNERS, dtype=np.uint32), 3)
+        buffers.update()
+        self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
+        self.ready = True
+        self._place()
+
+    def _place(self) -> None:
+        """Store the placement as opaque numbers, so that another one compiles no new kernel."""
+        placement = self.placement
+        self.axes = mi.Frame3f(*(mi.Vector3f(column.tolist()) for column in placement.rotation.T))
+        dr.make_opaque(self.axes)
+        self.origin = dr.opaque(mi.Point3f, placement.origin.tolist())
+        self.size = dr.opaque(mi.Float, placement.size)
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        if not self.ready:
+            super().traverse(cb)
+            return
+        cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
+
+    def optimised(self) -> bool:
+        """Return whether derivatives with respect to the field are enabled."""
+        return False
+
+    @property
+    def index_bytes(self) -> int:
+        """Bytes of the field's ray-marching index."""
+        return tracing.index_bytes(self.field)
+
+    # -- between the world and the unit frame ---------------------------------------------------------------------
+
+    def local_ray(self, o, d):
+        """Return a ray's origin and direction in the unit frame, where lengths are those of the world by ``size``."""
+        return self.axes.to_local(mi.Vector3f(o - self.origin)) / self.size, self.axes.to_local(d)
+
+    def to_world(self, p):
+        """Return a point of the unit frame in the world."""
+        return mi.Point3f(dr.fma(self.axes.to_world(mi.Vector3f(p)), self.size, self.origin))
+
+    # -- the surface ----------------------------------------------------------------------------------------------
+
+    def moved(self, p, d, active=True):
+        """
+        Attach the hit ``p`` (unit frame) of a ray with the direction ``d`` (world) to the field's entries.
+
+        If derivatives are enabled and not suspended, the hit moves along the ray so that the value stays zero.
+        """
+        p = mi.Point3f(dr.detach(p))
+        if not self.optimised():
+            return p
+        d = self.axes.to_local(dr.detach(d))
+        value, slope = self.field.gradient(p, active)
+        slope = dr.detach(slope)
+        along = dr.dot(slope, d)
+        along = dr.copysign(dr.maximum(dr.abs(along), dr.maximum(GRAZING * dr.norm(slope), 1e-6)), along)
+        return p - mi.Vector3f(d) * ((value - dr.detach(value)) / along)
+
+    def surface(self, p, d, active=True):
+        """
+        Return place, geometric and shading normal, in the world, of the hit ``p`` (unit frame) of a ray.
+
+        The ray has the direction ``d`` (world); the place is attached as in :meth:`moved`.
+        """
+        p = self.moved(p, d, active)
+        if not self.smooth:
+            shading = normal = self._unit(self.field.gradient(p, active)[1], d)
+        else:
+            normal, shading = (self._unit(v, d) for v in self.field.normals(p, active))
+        return self.to_world(p), self.axes.to_world(normal), self.axes.to_world(shading)
+
+    def _unit(self, v, d):
+        length = dr.norm(v)
+        valid = length > 0
+        direction = self.axes.to_local(dr.detach(d))
+        return dr.select(valid, mi.Vector3f(v) / dr.select(valid, length, 1), -direction)
+
+
+def distance_shapes_in(scene: mi.Scene) -> list[DistanceShape]:
+    """Return the distance shapes of a scene. Raises ``RuntimeError`` if one is in a shape group."""
+    shapes = [shape for shape in scene.shapes() if isinstance(shape, DistanceShape)]
+    hidden = [s for s in compat.objects_of(scene) if isinstance(s, DistanceShape) and s not in shapes]
+    if hidden:
+        raise RuntimeError(
+            f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file '
+            f'with a "to_world" of their own share its memory, and trace="grid" may be instanced'
+        )
+    return shapes
+
+
+# -- Mitsuba's grids ---------------------------------------------------------------------------------------------------
+
+
+def crop_grid(values: np.ndarray, lower, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Crop a grid of ``values`` (Z, Y, X) to two cells around its inside; return it with its corners.
+
+    The grid begins at ``lower``. The result is padded with outside until X and Z are equal: where they differ, the
+    ``sdfgrid`` of Mitsuba 3.9 finds next to no hits, and reads beyond its end. Raises ``RuntimeError`` if nothing is
+    inside.
+    """
+    parts = []
+    for axis, count in enumerate(values.shape):
+        inside = np.flatnonzero((values < 0).any(axis=tuple({0, 1, 2} - {axis})))
+        if not len(inside):
+            raise RuntimeError(f"nothing is inside at {max(values.shape) - 1} cells along the longest side")
+        parts.append(slice(max(0, inside[0] - 2), min(count, inside[-1] + 3)))
+    values = values[tuple(parts)]
+    lower = np.asarray(lower, np.float64) + spacing * np.array([part.start for part in reversed(parts)])
+    side = max(values.shape[0], values.shape[2])
+    fill = [(0, side - values.shape[0]), (0, 0), (0, side - values.shape[2])]
+    values = np.pad(values, fill, constant_values=float(values.max()))
+    return values, lower, lower + spacing * (np.array(values.shape[::-1]) - 1)
+
+
+def finest(sides, nbytes: int) -> int:
+    """Return the most cells along the longest of a box's ``sides`` (X, Y, Z) whose grid fits into ``nbytes``."""
+    x, y, z = np.asarray(sides, np.float64) / max(sides)
+    return int((nbytes / (CELL_BYTES * y * max(x, z) ** 2)) ** (1 / 3))
+
+
+def native_grid(props: mi.Properties, values: np.ndarray, lower, upper, to_world, normals: str):
+    """
+    Create Mitsuba's ``sdfgrid`` of ``values`` (Z, Y, X) with the material of ``props``.
+
+    X and Z are equal; ``lower`` and ``upper`` are the corners of the box, which ``to_world`` moves. A rotated grid is
+    an instance, in a ``merge`` with its group. Returns the shape, and the shape that a scene keeps of it.
+    """
+    at = mi.ScalarTransform4f
+    box = at().translate(list(map(float, lower))).scale(list(map(float, np.asarray(upper) - lower)))
+    grid = {
+        "type": "sdfgrid",
+        "id": props.id() or "grid",
+        "grid": mi.TensorXf(np.ascontiguousarray(values[..., None], np.float32)),
+        "normals": normals,
+    }
+    for name, child in props.objects():
+        grid[name] = child
+    linear = np.array(to_world.matrix, np.float64)[:3, :3]
+    if np.allclose(linear, linear[0, 0] * np.eye(3), atol=1e-6 * abs(linear[0, 0])) and linear[0, 0] > 0:
+        shape = mi.load_dict({**grid, "to_world": to_world @ box}, parallel=False)
+        return shape, shape
+    group = mi.load_dict({"type": "shapegroup", "grid": {**grid, "to_world": box}}, parallel=False)
+    instance = mi.load_dict({"type": "instance", "group": group, "to_world": to_world}, parallel=False)
+    both = mi.Properties("merge")
+    both["group"], both["instance"] = group, instance
+    both.set_id(props.id())
+    return mi.PluginManager.instance().create_object(both), instance
+
+
+# -- rays --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class ShapeHit:
+    """Hits of distance shapes: ``number`` of the shape in the list, from 1, or 0; ``t``; ``p`` (unit frame)."""
+
+    number: mi.UInt32
+    t: mi.Float
+    p: mi.Point3f
+
+
+def intersect(shapes: list[DistanceShape], o, d, maxt, active=True) -> ShapeHit:
+    """Return the first hit of rays before ``maxt``; without a hit, ``t`` is ``maxt``."""
+    nearest = ShapeHit(mi.UInt32(0), mi.Float(maxt), mi.Point3f(0))
+    for i, shape in enumerate(shapes):
+        start, direction = shape.local_ray(o, d)
+        result = tracing.intersect(shape.field, start, direction, nearest.t / shape.size, active)
+        nearest.number = dr.select(result.hit, i + 1, nearest.number)
+        nearest.t = dr.select(result.hit, result.t * shape.size, nearest.t)
+        nearest.p = dr.select(result.hit, mi.Point3f(result.p), nearest.p)
+    return nearest
+
+
+def occluded(shapes: list[DistanceShape], o, d, maxt, active=True):
+    """Return whether rays hit any distance shape before ``maxt``."""
+    blocked = mi.Bool(False)
+    for shape in shapes:
+        start, direction = shape.local_ray(o, d)
+        blocked |= tracing.occluded(shape.field, start, direction, maxt / shape.size, active & ~blocked)
+    return blocked
+
+
+def interaction(shapes: list[DistanceShape], hit: ShapeHit, ray, si, active=True):
+    """Replace ``si`` (``mi.SurfaceInteraction3f``) where a distance shape was hit."""
+    for i, shape in enumerate(shapes):
+        here = (hit.number == i + 1) & active
+        p, normal, shading = shape.surface(hit.p, ray.d, here)
+        at = dr.zeros(mi.SurfaceInteraction3f)
+        at.t, at.time, at.wavelengths = hit.t, ray.time, ray.wavelengths
+        at.p, at.n = p, mi.Normal3f(normal)
+        at.sh_frame = mi.Frame3f(shading)
+        at.dp_du, at.dp_dv = at.sh_frame.s, at.sh_frame.t
+        at.wi = at.sh_frame.to_local(-ray.d)
+        at.shape = mi.ShapePtr(shape)
+        si = dr.select(here, at, si)
+    return si
+
+
+def shift(shapes: list[DistanceShape], hit: ShapeHit, d, active=True):
+    """Return zero with the derivative of the hit's place in the world, for rays with the direction ``d``."""
+    change = mi.Vector3f(0)
+    for i, shape in enumerate(shapes):
+        here = (hit.number == i + 1) & active
+        p = shape.to_world(shape.moved(hit.p, d, here))
+        change = dr.select(here, p - dr.detach(p), change)
+    return change
+
+
+def spawn(shapes: list[DistanceShape], hit: ShapeHit, si, d):
+    """Return the origin of a ray from ``si`` in the direction ``d``, off the surface by :data:`OFFSET`."""
+    o = si.spawn_ray(d).o
+    for i, shape in enumerate(shapes):
+        away = dr.copysign(OFFSET * shape.size, dr.dot(si.n, d))
+        o = dr.select(hit.number == i + 1, dr.fma(si.n, away, si.p), o)
+    return mi.Point3f(o)
