@@ -1,6 +1,7 @@
 """
-What is left of our sparse signed distance fields without indirection: a distance and a normal in the 16 bits of each
-node, trained as ours are, and read by the same blend.
+Sparse signed distance fields without indirection: a distance and a normal in the 16 bits of each node.
+
+They are trained like our fields and read by the same blend.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ LEVELS, SIDE = 128, 22
 
 
 def to_octahedral(normals: np.ndarray) -> np.ndarray:
-    """The whole numbers (n, 2) below :data:`SIDE` whose unit vectors are nearest to ``normals`` (n, 3)."""
+    """Return the whole numbers (n, 2) below :data:`SIDE` whose unit vectors are nearest to ``normals`` (n, 3)."""
     n = normals / np.maximum(np.abs(normals).sum(axis=1, keepdims=True), 1e-30)
     folded = (1 - np.abs(n[:, 1::-1])) * np.where(n[:, :2] >= 0, 1, -1)
     top = SIDE - 1
@@ -32,26 +33,26 @@ def to_octahedral(normals: np.ndarray) -> np.ndarray:
 
 
 def octahedral(numbers: np.ndarray) -> np.ndarray:
-    """The unit vectors (…, 3) that whole numbers (…, 2) stand for."""
+    """Return the unit vectors (…, 3) that whole numbers (…, 2) stand for."""
     x, y = np.moveaxis(numbers * (2 / (SIDE - 1)) - 1, -1, 0)
     z = 1 - np.abs(x) - np.abs(y)
     t = np.maximum(-z, 0)
-    found = np.stack([x - np.copysign(t, x), y - np.copysign(t, y), z], axis=-1)
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    vectors = np.stack([x - np.copysign(t, x), y - np.copysign(t, y), z], axis=-1)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _distances(numbers: np.ndarray) -> np.ndarray:
-    """The distances, in spacings, of what nodes hold."""
+    """Return the distances, in spacings, that the nodes' numbers stand for."""
     return (numbers % LEVELS + 0.5 * (1 - LEVELS)) * (2 * NEAREST / LEVELS)
 
 
 def _normals(numbers: np.ndarray) -> np.ndarray:
-    """The whole numbers (n, 2) of the normals of what nodes hold."""
+    """Return the whole numbers (n, 2) of the normals that the nodes' numbers stand for."""
     return np.stack([numbers // LEVELS % SIDE, numbers // (LEVELS * SIDE)], axis=-1).astype(np.uint32)
 
 
 class DirectNodes(SparseNodes):
-    """The nodes of a sparse ``structure`` as ``numbers`` (n,), uint16, in its order."""
+    """Nodes of a sparse ``structure`` as ``numbers`` (n,), uint16, in its order."""
 
     def __init__(self, types, structure: Structure, numbers: np.ndarray, slope: float):
         words = codes.pointer_words(numbers, 16)
@@ -79,8 +80,9 @@ class DirectNodes(SparseNodes):
 
 class DirectCoding(encoding.NodeCoding):
     """
-    In place of frames, a cascaded array and pointers: the ``pointers`` are numbers that say it all. No node changes its
-    side; the surface stays within the cells.
+    Coding of nodes without frames, cascaded array and pointers: ``pointers`` hold distance and normal themselves.
+
+    No node changes its side; the surface stays within the cells.
     """
 
     def __init__(self, sampled: encoding.SampledNodes, seed: int = 0):
@@ -119,7 +121,7 @@ class DirectCoding(encoding.NodeCoding):
         return np.concatenate([_distances(self.pointers)[:, None], normals], axis=1).astype(np.float32)
 
     def field(self, types) -> DirectNodes:
-        """What it decided on."""
-        told = self.values().astype(np.float64)
-        slope = slope_bound(told[:, 0], told[:, 1:], self.sampled.corners)
+        """Return the field of these nodes."""
+        values = self.values().astype(np.float64)
+        slope = slope_bound(values[:, 0], values[:, 1:], self.sampled.corners)
         return DirectNodes(types, self.sampled.structure, self.pointers.astype(np.uint16), slope)
