@@ -18,7 +18,7 @@ def add(commands) -> None:
     sub = verb(commands, "decode", run, HELP)
     sub.add_argument("file", metavar="FILE.npz")
     sub.add_argument(
-        "-o", "--output", required=True, metavar="OUT", help="file to write; of several parts, one each: OUT_NAME"
+        "-o", "--output", required=True, metavar="OUT", help="file to write; several parts become OUT_NAME each"
     )
     variant_option(sub)
     add_arguments(sub, tuple({a.name: a for task in tasks().values() for a in task.decode_arguments}.values()))
@@ -38,7 +38,7 @@ def run(arguments) -> dict:
     given = {name: value for name, value in given.items() if value is not None}
     for name in given:
         if name not in accepted:
-            raise UsageError(f"{arguments.file}: --{name.replace('_', '-')} is of no use for this kind of file")
+            raise UsageError(f"{arguments.file}: --{name.replace('_', '-')} does not apply to this file")
     set_variant(arguments.variant)
     model = load_model(arguments.file, array_module(arguments.variant).TensorXf)
     files = model.decode(Path(output), **given)

@@ -18,7 +18,9 @@ def add(commands) -> None:
     sub.add_argument(
         "--references", metavar="DIR", help='folder of the references (default: "references" by the scene)'
     )
-    sub.add_argument("--out", default="out", metavar="DIR", help="folder for what a failed check saw (default: out)")
+    sub.add_argument(
+        "--out", default="out", metavar="DIR", help="folder for the pictures of failed checks (default: out)"
+    )
     sub.add_argument("--spp", type=positive, help="samples per pixel of a check (default: the reference's)")
     sub.add_argument("--seed", type=natural, help="seed of the random numbers (default: 0; --update: the reference's)")
     scene_options(sub, rendering=False)
