@@ -1,4 +1,4 @@
-"""Arguments of the command line that tasks and studies declare, and kinds of numbers that they may be."""
+"""Command-line arguments that tasks and studies declare, and parsers of their values."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import math
 
 
 class Argument:
-    """
-    An argument of ``fit`` or ``decode`` that only a task adds: as for ``argparse.ArgumentParser.add_argument``, and the
-    name of the ``group`` of which at most one may be given.
+    """Argument of ``fit`` or ``decode`` that a task adds.
+
+    Flags and options are those of ``argparse.ArgumentParser.add_argument``; of the arguments of one ``group``, at most
+    one may be given.
     """
 
     def __init__(self, *flags: str, group: str = "", **options):
@@ -17,12 +18,12 @@ class Argument:
 
     @property
     def name(self) -> str:
-        """Its name in Python, and in :attr:`FitRequest.options`."""
+        """Name in Python, and key in :attr:`.task.FitRequest.options`."""
         return self.options.get("dest", self.flags[0].lstrip("-").replace("-", "_"))
 
     @property
     def default(self):
-        """What stands for it if it is not given."""
+        """Value if the argument is not given."""
         return self.options.get("default", False if self.options.get("action") == "store_true" else None)
 
 
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser, arguments: tuple[Argument, ..
 
 
 def positive(text: str) -> int:
-    """A whole number ≥ 1. Raises ``ArgumentTypeError``."""
+    """Return a whole number ≥ 1. Raises ``ArgumentTypeError``."""
     value = natural(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
@@ -42,7 +43,7 @@ def positive(text: str) -> int:
 
 
 def natural(text: str) -> int:
-    """A whole number ≥ 0. Raises ``ArgumentTypeError``."""
+    """Return a whole number ≥ 0. Raises ``ArgumentTypeError``."""
     try:
         value = int(text)
     except ValueError:
@@ -53,7 +54,7 @@ def natural(text: str) -> int:
 
 
 def between(low: float, high: float):
-    """A parser of numbers from ``low`` to ``high``, which raises ``ArgumentTypeError``."""
+    """Return a parser of numbers from ``low`` to ``high``, which raises ``ArgumentTypeError``."""
 
     def parsed(text: str) -> float:
         try:
@@ -72,7 +73,7 @@ fraction = between(0, 1)
 
 
 def proper_fraction(text: str) -> float:
-    """A number between 0 and 1. Raises ``ArgumentTypeError``."""
+    """Return a number greater than 0 and less than 1. Raises ``ArgumentTypeError``."""
     try:
         value = fraction(text)
     except argparse.ArgumentTypeError:
@@ -94,7 +95,7 @@ def positive_or_none(text: str) -> float:
 
 
 def define(text: str) -> tuple[str, str]:
-    """``NAME=VALUE``, a ``<default>`` of a scene. Raises ``ArgumentTypeError``."""
+    """Return the name and the value of ``NAME=VALUE``, a ``<default>`` of a scene. Raises ``ArgumentTypeError``."""
     name, equals, value = text.partition("=")
     if not (name and equals):
         raise argparse.ArgumentTypeError(f'found {text!r}, expected NAME=VALUE, as in "-D width=320"')
@@ -102,7 +103,10 @@ def define(text: str) -> tuple[str, str]:
 
 
 def checked(parse):
-    """A parser that raises ``ValueError``, as a type of ``argparse``, which shows only messages of its own."""
+    """Make a type of ``argparse`` from a parser that raises ``ValueError``, so that its message is shown.
+
+    The type returns the text itself.
+    """
 
     def parsed(text: str):
         try:
@@ -115,7 +119,7 @@ def checked(parse):
 
 
 def decibels(text: str) -> float:
-    """A PSNR. Raises ``ValueError``."""
+    """Return a PSNR in dB. Raises ``ValueError``."""
     try:
         value = float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""What may be known about a parameter before anything is rendered: bounds of its values."""
+"""Bounds of the values of a material's parameters, known before anything is rendered."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ValueBounds:
-    """
-    What is known about a parameter: its values lie in ``[low, high]``; ``optimised`` says that a derivative with
-    respect to it is asked for, and that it may take any value. ``grey``: its channels are equal, if it is a colour.
+    """Bounds of a parameter: its values lie in ``[low, high]``.
+
+    ``optimised``: a derivative with respect to it is tracked, and it may take any value. ``grey``: its channels are
+    equal, if it is a colour.
     """
 
     low: float = 0.0
@@ -18,5 +19,5 @@ class ValueBounds:
     grey: bool = False
 
     def is_always(self, value: float) -> bool:
-        """Is the parameter this constant, and meant to stay so?"""
+        """Return whether the parameter is this constant and stays so."""
         return self.low == self.high == value and not self.optimised

@@ -1,5 +1,4 @@
-"""
-``mi-diffind``: one verb a module of :mod:`mi_diffind.commands`.
+"""``mi-diffind``: one verb a module of :mod:`mi_diffind.commands`.
 
 Exit codes: 0 done, 1 a check failed, 2 bad usage or bad input, 130 interrupted.
 """
@@ -42,16 +41,16 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser(argv: list[str]) -> argparse.ArgumentParser:
-    """The parser of all verbs, or of the one that is asked for: those of tasks need not be looked for then."""
+    """Build the parser of the verb in ``argv``; other verbs are only named, without imports of tasks."""
     parser = argparse.ArgumentParser(
         prog="mi-diffind", description="Learned lookup tables for Mitsuba 3: differentiable indirection."
     )
     parser.add_argument("--version", action="version", version=f"mi-diffind {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    asked = next((word for word in argv if not word.startswith("-")), None)
+    chosen = next((word for word in argv if not word.startswith("-")), None)
     for name in VERBS:
         module = importlib.import_module(f"{__package__}.commands.{name}")
-        if name == asked:
+        if name == chosen:
             module.add(commands)
         else:
             commands.add_parser(name, help=module.HELP)

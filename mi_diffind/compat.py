@@ -1,15 +1,15 @@
-"""
-Every hook into what Mitsuba 3.9 and Dr.Jit 1.5 do not promise, one a function or constant, each with a test that says
-what broke (``tests/test_compat.py``). Where another version does it differently, this file changes and no other.
+"""Hooks into what Mitsuba 3.9 and Dr.Jit 1.5 do not promise, one a function or constant.
+
+Each has a test that names the hook which broke (``tests/test_compat.py``). Where another version differs, this file
+changes and no other.
 
 What Mitsuba 3.10 brings, and where it belongs: *footprints* (``si.footprint``, a ``Matrix2f`` of which the columns are
 conjugate diameters in uv; ``RayFlags.Footprint``; a texture's ``filtered()``) replace footprints that we estimate;
 *Python shapes* (``mi.Shape`` with ``primitive_count`` and ``ray_intersect_preliminary``) replace factories that return
-native shapes; the *new mesh* interface concerns ``mi.Mesh`` subclasses alone. Nothing of these three is used yet: what
-will use them asks here.
+native shapes; the *new mesh* interface concerns ``mi.Mesh`` subclasses alone. None of these three is used yet.
 
-Mitsuba and Dr.Jit are imported when a function is called, so that importing this costs nothing and may come before LLVM
-is chosen (:mod:`.runtime`).
+Functions import Mitsuba and Dr.Jit when they are called, so that this module may be imported before LLVM is chosen
+(:mod:`.runtime`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from pathlib import Path
 
 
 def llvm_version() -> tuple[int, int, int]:
-    """
-    The LLVM that Dr.Jit has loaded, -1 first if none; waits for its start. ``dr.detail`` is not part of the interface;
-    a public function would replace this.
+    """Return the version of the LLVM that Dr.Jit has loaded, -1 first if none; waits for its start.
+
+    ``dr.detail`` is not part of the interface; a public function would replace this.
     """
     import drjit
 
@@ -36,9 +36,9 @@ def llvm_version() -> tuple[int, int, int]:
 
 
 def core_library() -> str:
-    """
-    The path of Dr.Jit's native library, whose name and place in the package are not promised. A public way to choose
-    LLVM again would replace this and :class:`JitCore`.
+    """Return the path of Dr.Jit's native library, whose name and place in the package are not promised.
+
+    A public way to choose LLVM again would replace this and :class:`JitCore`.
     """
     import drjit
 
@@ -47,8 +47,7 @@ def core_library() -> str:
 
 
 class JitCore:
-    """
-    C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures.
+    """C++ functions of Dr.Jit's library by their mangled names (Itanium ABI), which change with their signatures.
 
     These are ``jit_shutdown(int)``, ``jit_init(uint32_t)``, ``jit_launch_stats(size_t *, size_t *, size_t *)``,
     ``jit_registry_id_bound(const char *, const char *)`` and
@@ -71,13 +70,13 @@ class JitCore:
         self._set_target.argtypes, self._set_target.restype = [ctypes.c_char_p] * 2 + [ctypes.c_uint32], None
 
     def launches(self) -> int:
-        """Kernels that have been launched since the start."""
+        """Return the number of kernels launched since the start."""
         counts = [ctypes.c_size_t() for _ in range(3)]
         self._launch_stats(*map(ctypes.byref, counts))
         return counts[0].value
 
     def holds_objects(self, variant: str) -> bool:
-        """Are there scene objects of this Mitsuba variant?"""
+        """Return whether scene objects of this Mitsuba variant exist."""
         return any(self._id_bound(variant.encode(), domain.encode()) for domain in self.DOMAINS)
 
     def shutdown(self) -> None:
@@ -94,8 +93,7 @@ class JitCore:
 
 
 def limit_code_generation(target: str) -> None:
-    """
-    Generate LLVM code for the processor ``target``, written as name, features and lanes: ``haswell:+avx2,+fma:8``.
+    """Generate LLVM code for the processor ``target``, written as name, features and lanes: ``haswell:+avx2,+fma:8``.
 
     Names and features are LLVM's; this processor must have all of the features. Lanes of single precision, a power of
     two. Call it before the first kernel and the first scene. Dr.Jit has no Python function for this. Raises
@@ -113,9 +111,9 @@ def limit_code_generation(target: str) -> None:
 
 
 def new_scope(dtype) -> None:
-    """
-    From here on, Dr.Jit merges no computation of the backend of ``dtype`` with an earlier one. ``dr.detail`` is not
-    part of the interface; nothing public does it.
+    """Start a scope: Dr.Jit merges no later computation of the backend of ``dtype`` with an earlier one.
+
+    ``dr.detail`` is not part of the interface; no public function does this.
     """
     import drjit as dr
 
@@ -123,39 +121,40 @@ def new_scope(dtype) -> None:
 
 
 def kernel_code(entry: dict) -> str:
-    """
-    The intermediate code of an entry of ``dr.kernel_history()``: LLVM's or PTX, whose form is Dr.Jit's own affair
-    (:func:`is_ptx`, :func:`llvm_target`, :mod:`.operations`). Counters kept by Dr.Jit would replace reading it.
+    """Return the intermediate code of an entry of ``dr.kernel_history()``: LLVM's or PTX.
+
+    Its form is not promised (:func:`is_ptx`, :func:`llvm_target`, :mod:`.operations`). Counters kept by Dr.Jit would
+    replace reading it.
     """
     return entry["ir"].getvalue()
 
 
 def is_ptx(code: str) -> bool:
-    """Is this PTX, for CUDA, and not LLVM's? By its first word."""
+    """Return whether this is PTX, for CUDA, and not LLVM's code, by its first word."""
     return code.lstrip().startswith(".version")
 
 
 def llvm_target(code: str) -> tuple[str, int] | None:
-    """The processor that LLVM code is for and the lanes of its vectors, as Dr.Jit writes them; ``None``: not found."""
+    """Return the processor and the lanes of vectors in LLVM code; ``None`` if they are not found."""
     name, width = re.search(r'"target-cpu"="([^"]+)"', code), re.search(r"<(\d+) x float>", code)
     return (name[1], int(width[1])) if name and width else None
 
 
 def kernel_seconds(history: list[dict]) -> float:
-    """Seconds that the kernels of a ``dr.kernel_history()`` took; the keys and the unit, ms, are not promised."""
+    """Return the seconds that the kernels of a ``dr.kernel_history()`` took; its unit, ms, is not promised."""
     return sum(entry["execution_time"] for entry in history) / 1e3
 
 
 def was_compiled(history: list[dict]) -> bool:
-    """Did a kernel of a ``dr.kernel_history()`` have to be compiled, or be fetched from the disk?"""
+    """Return whether a kernel of a ``dr.kernel_history()`` was compiled or fetched from the disk."""
     return any(not entry.get("cache_hit", True) or entry.get("cache_disk", False) for entry in history)
 
 
 @contextlib.contextmanager
 def room_for_sums(entries: int):
-    """
-    Let each core sum the gradients of arrays on its own as long as all copies together have at most so many entries
-    (``dr.set_expand_threshold``, of one copy; what it is compared with has changed between versions).
+    """Let each core sum the gradients of arrays by itself, up to ``entries`` in the copies of all cores together.
+
+    ``dr.set_expand_threshold`` takes the entries of one copy; its meaning has changed between versions.
     """
     import drjit as dr
 
@@ -168,9 +167,9 @@ def room_for_sums(entries: int):
 
 
 def use_threads(count: int) -> None:
-    """
-    Compute on so many cores. A sum that is under way has a place for each thread that there was at its start: Dr.Jit
-    does not check that none is, so this waits.
+    """Compute on ``count`` cores, after waiting for all computations.
+
+    A sum in progress has a place for each thread at its start, and Dr.Jit does not check for one.
     """
     import drjit as dr
 
@@ -184,17 +183,17 @@ def use_threads(count: int) -> None:
 
 
 def module_of(array):
-    """
-    The module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``: where its class says
-    that it comes from, which is a convention. ``dr.replace_type_t`` and its like, with all types, would replace it.
+    """Return the module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``.
+
+    It is the module of the class, by convention. ``dr.replace_type_t`` and its like, with all types, would replace it.
     """
     return sys.modules[(array if isinstance(array, type) else type(array)).__module__]
 
 
 def has_gradient(value) -> bool:
-    """
-    Is a derivative with respect to this array asked for, also where derivatives are suspended? ``dr.grad_enabled`` says
-    no in the latter case; ``index_ad`` is an inner number.
+    """Return whether a derivative with respect to this array is tracked, also where derivatives are suspended.
+
+    ``dr.grad_enabled`` says no in the latter case; ``index_ad`` is an internal number.
     """
     import drjit as dr
 
@@ -206,9 +205,10 @@ def has_gradient(value) -> bool:
 
 
 def identity(value) -> tuple:
-    """
-    What tells an array from another one that took its place, as long as somebody keeps it: numbers of Dr.Jit's
-    variables (``index``), which are given anew once one is gone. A counter of changes would replace it.
+    """Return numbers that identify the content of an array as long as the array is kept.
+
+    They are the indices of Dr.Jit's variables (``index``), which are used again once a variable is gone. A counter of
+    changes would replace them.
     """
     import drjit as dr
 
@@ -220,15 +220,16 @@ def identity(value) -> tuple:
 
 
 def adam_state(optimizer) -> dict[str, tuple]:
-    """
-    The state of an ``Adam``: name → ``(value, t, m, v)``, the parameter, the number of the step, the moments (flat).
-    The tuples in ``optimizer.state`` are Dr.Jit's own; a public way to save an optimiser would replace this.
+    """Return the state of an ``Adam``: name → ``(value, t, m, v)``.
+
+    ``value`` is the parameter, ``t`` the number of the step, ``m`` and ``v`` are the moments (flat). The tuples in
+    ``optimizer.state`` are Dr.Jit's own; a public way to save an optimiser would replace this.
     """
     return {key: (value, t, m, v) for key, (value, _, _, (t, m, v, _)) in optimizer.state.items()}
 
 
 def set_adam_state(optimizer, key: str, value, t, m, v) -> None:
-    """Give the parameter ``key`` of an ``Adam`` this state, of :func:`adam_state`, or as NumPy arrays and a number."""
+    """Set the state of the parameter ``key`` of an ``Adam``, from :func:`adam_state` or NumPy arrays and a number."""
     import drjit as dr
 
     old, promoted, rate, (t_old, m_old, v_old, v_max) = optimizer.state[key]
@@ -242,8 +243,8 @@ def set_adam_state(optimizer, key: str, value, t, m, v) -> None:
 
 
 def on_variant_change(callback) -> None:
-    """
-    Call ``callback(old, new)`` after each ``mi.set_variant``; the same function a second time changes nothing.
+    """Call ``callback(old, new)`` after each ``mi.set_variant``; the same function is registered once.
+
     ``mi.detail`` is not part of the interface; plugins found by Mitsuba itself would replace it.
     """
     import mitsuba as mi
@@ -257,33 +258,34 @@ CONSTANT_TEXTURES = ("UniformSpectrum", "SRGBReflectanceSpectrum")
 
 
 def texture_class(texture) -> str:
-    """
-    Mitsuba's own name of a texture's class, ``""`` for one written in Python, which may be of any name. Names of
-    classes are not promised; names of plugins are, but a loaded object does not know its own.
+    """Return Mitsuba's name of a texture's class, ``""`` for a class written in Python, which may have any name.
+
+    Names of classes are not promised; names of plugins are, but a loaded object does not know its own.
     """
     return texture.class_name() if type(texture).__module__.startswith("mitsuba") else ""
 
 
 def is_constant_texture(texture) -> bool:
-    """Is it one of :data:`CONSTANT_TEXTURES`?"""
+    """Return whether a texture is one of :data:`CONSTANT_TEXTURES`."""
     return texture_class(texture) in CONSTANT_TEXTURES
 
 
 def is_uniform_spectrum(texture) -> bool:
-    """Is it the same at all wavelengths, too? Its parameter is then ``value``."""
+    """Return whether a texture is constant over wavelengths, too. Its parameter is then ``value``."""
     return texture_class(texture) == "UniformSpectrum"
 
 
 def is_bitmap(texture) -> bool:
-    """Is it a ``bitmap``, of any storage (``BitmapTextureImpl<…>``)? Its parameter is then ``data``."""
+    """Return whether a texture is a ``bitmap`` of any storage. Its parameter is then ``data``."""
     return texture_class(texture).startswith("BitmapTextureImpl")
 
 
 def srgb_coefficients() -> tuple:
-    """
-    Mitsuba's table for spectra from colours (Jakob and Hanika 2019), of which neither place nor form is promised:
-    its side ``n``, the positions ``(n,)`` along the largest component, the coefficients ``(3·n³, 3)``, all float32.
-    ``mi.srgb_model_fetch`` for arrays would replace it. Raises ``RuntimeError`` in one sentence.
+    """Return Mitsuba's table for spectra from colours (Jakob and Hanika 2019).
+
+    Returned are its side ``n``, the positions ``(n,)`` along the largest component, and the coefficients ``(3·n³, 3)``,
+    all float32. Neither place nor form of the file is promised; ``mi.srgb_model_fetch`` for arrays would replace it.
+    Raises ``RuntimeError`` in one sentence.
     """
     import mitsuba as mi
     import numpy as np
@@ -299,10 +301,11 @@ def srgb_coefficients() -> tuple:
 
 
 def normal_edges(pi, si, ray, active) -> tuple:
-    """
-    Two vectors in space, ``mi.Vector3f``: along them the shading normal changes by ``si.dn_du`` and ``si.dn_dv``, if
-    ``si`` is of ``pi.compute_surface_interaction(ray)`` with ``RayFlags.dNSdUV``. These are ``dp_du`` and ``dp_dv``,
-    but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in barycentric coordinates.
+    """Return two vectors in space along which the shading normal changes by ``si.dn_du`` and ``si.dn_dv``.
+
+    They are ``mi.Vector3f``; ``si`` is of ``pi.compute_surface_interaction(ray)`` with ``RayFlags.dNSdUV``. The vectors
+    are ``dp_du`` and ``dp_dv``, but edges of the triangle for meshes, where Mitsuba 3.9 gives derivatives in
+    barycentric coordinates.
     """
     import drjit as dr
     import mitsuba as mi
@@ -319,9 +322,10 @@ def normal_edges(pi, si, ray, active) -> tuple:
 
 def replay_integrator() -> type:
     """
-    The base class of integrators that replay paths for derivatives, ``RBIntegrator``, of the variant that is set, which
-    Mitsuba loads anew *after* it called what :func:`on_variant_change` set. Its place is not promised; what is used of
-    it, ``sample_rays`` and the interface of ``sample``, is only described in its code.
+    Return ``RBIntegrator`` of the variant that is set, the base class of integrators that replay paths for derivatives.
+
+    Mitsuba loads it anew *after* it called the function of :func:`on_variant_change`. Its place is not promised;
+    ``sample_rays`` and the interface of ``sample`` are only described in its code.
     """
     import mitsuba as mi
 
@@ -329,10 +333,10 @@ def replay_integrator() -> type:
 
 
 def written_in_python(integrator) -> bool:
-    """
-    Is it an integrator written in Python upon Mitsuba's base classes, whose ``sample`` takes a mode? These are loaded
-    anew with a variant, so that they cannot be asked for by themselves; ``CppADIntegrator``, of which they all are, is
-    an inner class.
+    """Return whether an integrator is written in Python upon Mitsuba's base classes.
+
+    ``sample`` of such an integrator takes a mode. These classes are loaded anew with a variant, so that ``isinstance``
+    cannot name them; ``CppADIntegrator``, their common base, is an internal class.
     """
     import mitsuba as mi
 
@@ -340,21 +344,22 @@ def written_in_python(integrator) -> bool:
 
 
 def replays_paths(integrator) -> bool:
-    """Is it one that :func:`replay_integrator` is the base of, by the name of that?"""
-    return any(kind.__name__ == "RBIntegrator" for kind in type(integrator).__mro__)
+    """Return whether an integrator derives from :func:`replay_integrator`'s class, by the name of that class."""
+    return any(base.__name__ == "RBIntegrator" for base in type(integrator).__mro__)
 
 
 def samples_in_python(integrator) -> bool:
-    """Is it one of Mitsuba's integrators in Python (``prb``, …), whose ``sample`` takes a mode?"""
+    """Return whether an integrator derives from ``ADIntegrator``; its ``sample`` takes a mode."""
     import mitsuba as mi
 
     return isinstance(integrator, mi.ad.integrators.common.ADIntegrator)
 
 
 def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
-    """
-    Put samples into an image block, with further channels ``aovs``: what Mitsuba's integrators in Python do in a
-    function of their own, for all variants and films (``ADIntegrator._splat_to_block``).
+    """Put samples into an image block, with further channels ``aovs``.
+
+    Mitsuba's integrators in Python do this in a function of their own, for all variants and films
+    (``ADIntegrator._splat_to_block``).
     """
     import mitsuba as mi
 
@@ -366,8 +371,7 @@ def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
 
 
 def objects_of(scene) -> list:
-    """
-    Return all objects of a loaded scene, each once, wherever they hide (in a ``twosided``, a ``bumpmap``, …).
+    """Return all objects of a loaded scene, each once, wherever they hide (in a ``twosided``, a ``bumpmap``, …).
 
     They are the keys of ``hierarchy`` of ``mi.traverse``, which is not in the manual and lists some twice.
     """
@@ -377,16 +381,15 @@ def objects_of(scene) -> list:
 
 
 def is_instance(shape) -> bool:
-    """Is it an ``instance`` of a ``shapegroup``? By the name of its class, which is not promised."""
+    """Return whether a shape is an ``instance`` of a ``shapegroup``, by the name of its class (not promised)."""
     return shape.class_name() == "Instance"
 
 
 def is_shared(holder: list) -> bool:
-    """
-    Does anything but the list ``holder`` refer to its first item, an object of Mitsuba's own?
+    """Return whether anything but the list ``holder`` refers to its first item, an object of Mitsuba's own.
 
-    Their classes allow no weak references, but references from C++ count in Python, too. How many ``sys.getrefcount``
-    adds by itself differs between versions of Python: a new object that nothing else refers to says it.
+    Classes of Mitsuba's objects allow no weak references, but references from C++ count in Python, too. The number that
+    ``sys.getrefcount`` adds by itself differs between versions of Python, so it is measured on a new object.
     """
     return _references(holder) > _references([object()])
 
@@ -396,9 +399,9 @@ def _references(holder: list) -> int:
 
 
 def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -> tuple:
-    """
-    The configuration and the state of a parsed scene file (``mi.parser``, which is new in 3.8 and still moves), with
-    ``defines`` for its ``<default>`` values, before anything is built.
+    """Return the configuration and the state of a parsed scene file, before anything is built.
+
+    ``defines`` are its ``<default>`` values. ``mi.parser`` is new in 3.8 and still changes.
     """
     import mitsuba as mi
 
@@ -414,7 +417,7 @@ def copy_parsed(state) -> tuple:
 
 
 def instantiate(config, state):
-    """Build what a parsed scene describes: transforms and merges it, in place, as ``mi.load_file`` does."""
+    """Build the parsed scene: transform and merge it, in place, as ``mi.load_file`` does."""
     import mitsuba as mi
 
     mi.parser.transform_all(config, state)
@@ -422,45 +425,48 @@ def instantiate(config, state):
 
 
 def keep_meshes(config) -> None:
-    """Have a parsed scene built with all its meshes apart, where Mitsuba joins those of one material by default."""
+    """Keep all meshes of a parsed scene apart, where Mitsuba joins those of one material by default."""
     config.merge_meshes = False
 
 
 def build_as(config, parallel: bool, optimize: bool) -> None:
-    """Have a parsed scene built as ``mi.load_file`` does with these arguments."""
+    """Build a parsed scene as ``mi.load_file`` does with these arguments."""
     config.parallel, config.merge_equivalent, config.merge_meshes = parallel, optimize, optimize
 
 
-def properties_of(state, kind=None) -> list:
+def properties_of(state, object_type=None) -> list:
+    """Return the properties (``mi.Properties``) of all objects of a parsed scene, or of one ``mi.ObjectType``.
+
+    Changing them changes the scene.
     """
-    The properties (``mi.Properties``) of all objects of a parsed scene, or of those of a ``kind``, an
-    ``mi.ObjectType``; to change them changes the scene.
-    """
-    return [node.props for node in state.nodes if kind is None or node.type == kind]
+    return [node.props for node in state.nodes if object_type is None or node.type == object_type]
 
 
 def parsed_files(state) -> list[str]:
-    """The files that were parsed: the scene and what it includes."""
+    """Return the files that were parsed: the scene and the files that it includes."""
     return [str(file) for file in state.files]
 
 
 def property_kind(props, key: str) -> str:
-    """What a parsed parameter is: ``number``, ``colour``, ``text``, ``object`` (nested or referred to) or ``other``."""
+    """Return the type of a parsed parameter as a word.
+
+    It is ``number``, ``colour``, ``text``, ``object`` (nested or referred to) or ``other``.
+    """
     import mitsuba as mi
 
-    kinds, found = mi.Properties.Type, props.type(key)
-    if found in (kinds.Float, kinds.Integer):
+    types, parameter = mi.Properties.Type, props.type(key)
+    if parameter in (types.Float, types.Integer):
         return "number"
-    if found in (kinds.Reference, kinds.ResolvedReference):
+    if parameter in (types.Reference, types.ResolvedReference):
         return "object"
-    return {kinds.Color: "colour", kinds.String: "text"}.get(found, "other")
+    return {types.Color: "colour", types.String: "text"}.get(parameter, "other")
 
 
 @contextlib.contextmanager
 def film_size(sensor, width: int, height: int):
-    """
-    Give the film of a loaded sensor another size (pixels) while the context is open; yields whether that is possible:
-    the parameter ``film.size`` is not in the manual, and a film with a crop window keeps its size.
+    """Give the film of a loaded sensor another size (pixels) while the context is open; yield whether that is possible.
+
+    The parameter ``film.size`` is not in the manual, and a film with a crop window keeps its size.
     """
     import mitsuba as mi
 
@@ -479,10 +485,10 @@ def film_size(sensor, width: int, height: int):
 
 
 def one_sentence(error: BaseException) -> str:
-    """
-    What went wrong, without the layers around it, of which the form is not promised: Mitsuba prefixes source lines
-    (``[file.cpp:12]``), embeds Python tracebacks, and hides the cause of an error at render time behind
-    ``drjit.custom(...) error``. Errors that keep their type would replace this.
+    """Return the message of an error without the layers around it, whose form is not promised.
+
+    Mitsuba prefixes source lines (``[file.cpp:12]``), embeds Python tracebacks, and hides the cause of an error at
+    render time behind ``drjit.custom(...) error``. Errors that keep their type would replace this.
     """
     while error.__cause__ is not None:
         error = error.__cause__

@@ -1,23 +1,24 @@
-"""What can be wrong with what a user gave: one base class, whose message is one sentence for that user."""
+"""Base class of all errors that a user can cause."""
 
 from __future__ import annotations
 
 
 class DiffindError(Exception):
-    """
-    Bad input, or a place that cannot be written; the message is one sentence that names the file or the parameter, what
-    was found and what is allowed. The command line prints it and ends with exit code 2.
+    """Bad input, or a place that cannot be written.
+
+    The message is one sentence: the file or the parameter, what was found, what is allowed. The command line prints it
+    and ends with exit code 2.
     """
 
 
 class UsageError(DiffindError):
-    """Bad input that the argument parser cannot see."""
+    """Bad input that the argument parser cannot detect."""
 
 
 def reason(error: BaseException, **names: str) -> str:
-    """
-    What ``error`` says, on one line and no longer than one: for a sentence that quotes it. ``names`` (shown → in the
-    error) are shown in place of longer ones.
+    """Return the message of ``error`` on one line of at most 100 characters, to be quoted in a sentence.
+
+    ``names`` (shown → in the error) are shown in place of longer ones.
     """
     import textwrap
 

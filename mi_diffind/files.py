@@ -1,4 +1,4 @@
-"""Writing files so that nothing half-written stays behind."""
+"""Writing of files such that no half-written file stays behind."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ class OutputError(DiffindError, OSError):
 
 
 def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
-    """
-    The folder ``path``, made if ``create`` and its parent exists. Raises :class:`OutputError` if it does not exist or
-    cannot be written.
+    """Return the folder ``path``, made if ``create`` is set and its parent exists.
 
-    Called before long work starts, so that a typing error costs seconds, not the result.
+    Raises :class:`OutputError` if it does not exist or cannot be written. It is called before long work starts, so that
+    a typing error costs seconds and not the result.
     """
     path = Path(path)
     try:
         if create and path.parent.is_dir() and not path.exists():
             path.mkdir()
         if not path.is_dir():
-            kind = "is not a folder" if path.exists() else "does not exist"
-            raise OutputError(f'output folder "{path}" {kind}')
+            fault = "is not a folder" if path.exists() else "does not exist"
+            raise OutputError(f'output folder "{path}" {fault}')
         with tempfile.TemporaryFile(dir=path):
             pass
     except OutputError:
@@ -39,7 +38,7 @@ def writable_folder(path: str | os.PathLike, create: bool = False) -> Path:
 
 
 def writable_file(path: str | os.PathLike) -> Path:
-    """The file ``path``, new or to be replaced. Raises :class:`OutputError` if its folder cannot be written."""
+    """Return the file ``path``, new or to be replaced. Raises :class:`OutputError` if its folder cannot be written."""
     path = Path(path)
     writable_folder(path.parent)
     if path.is_dir():
@@ -49,9 +48,10 @@ def writable_file(path: str | os.PathLike) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike):
-    """
-    Yield the path of a temporary file beside ``path`` (with the same extension); rename it to ``path`` on success,
-    remove it on failure. Raises :class:`OutputError` if the folder or the file cannot be written, as on a full disk.
+    """Yield the path of a temporary file beside ``path``; rename it to ``path`` on success, remove it on failure.
+
+    The temporary file has the same extension. Raises :class:`OutputError` if the folder or the file cannot be written,
+    as on a full disk.
     """
     path = writable_file(path)
     name = None

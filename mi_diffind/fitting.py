@@ -1,5 +1,4 @@
-"""
-The training loop, one for all tasks: Adam on random batches, with schedules, checkpoints and guards.
+"""The training loop, one for all tasks: Adam on random batches, with schedules, checkpoints and guards.
 
 A task describes itself as a :class:`Problem`; :func:`fit` does the rest. Everything random is drawn from the seed, the
 step and the number of restarts, so that a run is repeatable and an interrupted one continues exactly where it stopped.
@@ -55,14 +54,12 @@ def sample_losses(outputs: Mapping, targets: Mapping, weights: Mapping[str, floa
 
 
 class Problem:
-    """
-    What is to be trained: the base class, with defaults, of what every task provides.
+    """Base class of problems: the arrays that a task trains, its loss and its measurement.
 
-    Most problems draw samples (:meth:`batch`) and say what the tables have for them (:meth:`predict`). One that is not
-    of that kind replaces :meth:`loss`, for instance by that of a render: its ``net`` may then be the parameters of a
-    loaded scene (``mi.SceneParameters``, reduced to those that are trained by ``keep``), which is a mapping that takes
-    an optimiser's values by ``update`` just as a ``drjit.nn.Module`` does. Gradients can be shaped on their way by
-    custom operations (``dr.custom``).
+    Most problems draw samples (:meth:`batch`) and evaluate the tables for them (:meth:`predict`). Other problems
+    replace :meth:`loss`, for instance by the loss of a render: ``net`` may then be the parameters of a loaded scene
+    (``mi.SceneParameters``, reduced to the trained ones by ``keep``), a mapping that takes an optimiser's values by
+    ``update`` as a ``drjit.nn.Module`` does. Custom operations (``dr.custom``) can shape gradients on their way.
     """
 
     #: The trainable module (``drjit.nn.Module``), allocated, or another mapping of names to arrays with ``update``.
@@ -82,51 +79,45 @@ class Problem:
 
     def begin(self, step: int, share: float) -> str:
         """
-        Called before step ``step``, when the ``share`` of the training is over, for a problem that changes on the way.
-        Returns the kind of step: only losses of the same kind are compared.
+        Prepare step ``step``, when the ``share`` of the training is over, for a problem that changes during training.
+
+        Returns the phase of the training: only losses of the same phase are compared.
         """
         return ""
-
-    def kept(self) -> dict[str, np.ndarray]:
-        """What the problem has decided on the way (:meth:`begin`), for a checkpoint: arrays by name."""
-        return {}
-
-    def restore(self, kept: dict[str, np.ndarray]) -> None:
-        """Take up what :meth:`kept` returned, when a training is resumed."""
 
     def batch(self, rng, size: int):
         """Draw ``size`` samples: ``(inputs, targets)``, the targets a dict of name → list of arrays."""
         raise NotImplementedError(f"{type(self).__name__} has neither batch() and predict() nor a loss() of its own")
 
     def predict(self, net, inputs) -> dict[str, list]:
-        """
-        What the tables say for ``inputs``, in the form of the targets. ``net`` is a copy of the problem's, with entries
-        that are folded already (:func:`.indirection.unfolded`).
+        """Evaluate the tables for ``inputs``, in the form of the targets.
+
+        ``net`` is a copy of the problem's, with entries that are folded already (:func:`.indirection.unfolded`).
         """
         raise NotImplementedError
 
     def loss(self, net, rng, size: int):
-        """
-        The loss of a step that may draw ``size`` samples from ``rng``: differentiable with respect to ``net``, an array
-        or a list of arrays, whose entries are summed.
+        """Return the loss of a step that may draw ``size`` samples from ``rng``.
 
-        Here: the weighted mean of the differences between :meth:`predict` and the targets of :meth:`batch`, absolute
-        or squared (``settings.loss``), as one array of ``size`` numbers for each target. They are not summed here, so
-        that one kernel can write them and sum the gradients of all entries.
+        It is differentiable with respect to ``net``, an array or a list of arrays, whose entries are summed. By default
+        it is the weighted mean of the differences between :meth:`predict` and the targets of :meth:`batch`, absolute or
+        squared (``settings.loss``), as one array of ``size`` numbers for each target. They are not summed here, so that
+        one kernel can write them and sum the gradients of all entries.
         """
         inputs, targets = self.batch(rng, size)
         return sample_losses(self.predict(unfolded(net), inputs), targets, self.weights, size, self.settings.loss)
 
     def measure(self, net) -> dict[str, float]:
-        """What is measured on held-out data; the first number decides which state is the best (higher is better)."""
+        """Return figures on held-out data; the first one decides which state is the best (higher is better)."""
         raise NotImplementedError
 
 
 @dataclass
 class FitResult:
-    """
-    The best state that was seen: what was ``measured`` of it, the ``step`` it was reached at, and how the run went.
-    ``history`` has what was measured on the way, with the loss (``None`` if it was not known).
+    """Record of a training: the best state and the history.
+
+    ``measured`` are the figures of the best state, reached at ``step`` of ``steps``. ``history`` lists the figures of
+    all measurements with the loss (``None`` if it was not known).
     """
 
     measured: dict[str, float]
@@ -140,7 +131,7 @@ class FitResult:
 
     @property
     def outcome(self) -> str:
-        """Which state was kept, and after Ctrl-C why it is not the last one: for a sentence."""
+        """State that was kept and, after Ctrl-C, why it is not the last one: for a sentence."""
         if not self.interrupted:
             return f"best step {self.step}"
         name, value = next(iter(self.measured.items()))
@@ -155,9 +146,9 @@ class FitResult:
 
 @dataclass
 class _State:
-    """
-    Everything that a training consists of: tables and, for each, Adam's step count and moments. Dr.Jit arrays (never
-    written in place, so a snapshot costs nothing) or, from a checkpoint, NumPy arrays.
+    """State of a training: parameters and, for each, Adam's step count and moments.
+
+    They are Dr.Jit arrays (never written in place, so a snapshot costs nothing) or, from a checkpoint, NumPy arrays.
     """
 
     step: int
@@ -176,15 +167,14 @@ def fit(
     title=None,
     seconds: float | None = None,
 ) -> FitResult:
-    """
-    Train ``problem.net`` in place and leave the best state found in it.
+    """Train ``problem.net`` in place and leave the best state of the training in it.
 
     ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
     read first (it must belong to the same settings). ``title`` stands before the progress bar. With ``seconds``, the
-    training ends after so long, its schedules follow the clock in place of the steps, of which there are as many as can
-    be made, and it is measured ten times. Ctrl-C ends the training after the current step, which is measured, too, and
-    keeps the best state so far. If the loss or a parameter becomes NaN, or the loss explodes, the last good state is
-    restored and the learning rate halved; ``log`` (default: print to stderr) is told so in one sentence.
+    training ends after that time, its schedules follow the clock in place of the steps, and it is measured ten times.
+    Ctrl-C ends the training after the current step, which is measured, too, and keeps the best state so far. If the
+    loss or a parameter becomes NaN, or the loss explodes, the last good state is restored and the learning rate halved;
+    ``log`` (default: print to stderr) gets one sentence about it.
 
     Raises :class:`FittingError` if the training diverges again and again, or the checkpoint does not fit.
     """
@@ -195,13 +185,12 @@ def fit(
             raise FittingError(f'the checkpoint "{checkpoint}" would replace a file that is not one')
     trainer, plateau = _Trainer(problem, settings), _Plateau(settings)
     best, best_measured, best_step, history, restarts, spent = None, None, 0, [], 0, 0.0
-    references = {}  # running means of the loss by kind of step; from the first on, lest an explosion after it sets one
+    references = {}  # running mean of the loss of each phase, from its first step on, lest an explosion sets it
     if resume:
         if checkpoint is None:
             raise FittingError("resuming (--resume) needs the checkpoint (--checkpoint FILE) of the run to go on with")
         state, extra = _load_checkpoint(checkpoint, _all_settings(problem, settings), trainer)
         trainer.restore(state)
-        problem.restore(extra["kept"])
         best, best_measured, best_step = extra["best"], extra["best_measured"], extra["best_step"]
         history, restarts, spent = extra["history"], extra["restarts"], extra["seconds"]
         trainer.restarts = restarts
@@ -211,7 +200,7 @@ def fit(
     start = time.perf_counter() - spent
 
     def share() -> float:
-        """How much of the training is over."""
+        """Return the share of the training that is over."""
         if seconds is None:
             return trainer.step / settings.steps
         return min(1.0, (time.perf_counter() - start) / seconds)
@@ -247,7 +236,7 @@ def fit(
             if seconds is not None:
                 measured = int(10 * trainer.share) > int(10 * share_before)
             due = trainer.step % settings.check_every == 0 or measured
-            reference = references.get(trainer.kind)
+            reference = references.get(trainer.phase)
             if not (due or last or reference is None):
                 continue
             value = float(loss[0])
@@ -268,7 +257,7 @@ def fit(
                 trainer.share = share()
                 bar.show(trainer)
                 continue
-            references[trainer.kind] = value if reference is None else 0.5 * (reference + value)
+            references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
@@ -277,7 +266,7 @@ def fit(
                     extra = {
                         "best": best, "best_measured": best_measured, "best_step": best_step, "history": history,
                         "restarts": restarts, "seconds": time.perf_counter() - start, "plateau": plateau.state(),
-                        "references": references, "kept": problem.kept(),
+                        "references": references,
                     }  # fmt: skip
                     _save_checkpoint(checkpoint, _all_settings(problem, settings), trainer.snapshot(), extra)
         if stop.is_set() and trainer.share < 1:
@@ -293,7 +282,7 @@ def fit(
 
 
 class _Bar:
-    """The progress bar: in steps, or in the seconds that a training is given, of which it shows those that are left."""
+    """Progress bar, in steps, or in the seconds that are left of the time of a training."""
 
     def __init__(self, steps: int, seconds: float | None, title: str | None, progress: bool):
         self.seconds, self.text = seconds, {}
@@ -347,11 +336,11 @@ class _Plateau:
 
 
 class _Trainer:
-    """The optimiser and its module; the only place that touches Adam's internals."""
+    """Optimiser and its module; the only class that touches Adam's internals."""
 
     def __init__(self, problem: Problem, settings: FitSettings):
         self.problem, self.settings = problem, settings
-        self.step, self.lr_scale, self.restarts, self.kind = 0, 1.0, 0, ""
+        self.step, self.lr_scale, self.restarts, self.phase = 0, 1.0, 0, ""
         self.share = 0.0  # of the training that is over
         self.optimizer = Adam(lr=settings.lr)
         self.optimizer.update(problem.net)
@@ -371,7 +360,7 @@ class _Trainer:
         seed = dr.opaque(self.module.UInt64, (settings.seed << 32) + self.restarts * settings.steps + self.step)
         rng = dr.rng(seed=seed)
         net.update(self.optimizer)
-        self.kind = self.problem.begin(self.step, self.share)
+        self.phase = self.problem.begin(self.step, self.share)
         losses = self.problem.loss(net, rng, settings.batch)
         losses = losses if isinstance(losses, list) else [losses]
         losses = [values.array if dr.is_tensor_v(values) else values for values in losses]
@@ -410,7 +399,7 @@ class _Trainer:
 
 
 def _all_settings(problem: Problem, settings: FitSettings) -> dict:
-    """What a checkpoint has to agree in."""
+    """Return the settings that a checkpoint has to agree in."""
     return {**asdict(settings), **json.loads(json.dumps(dict(problem.identity)))}
 
 
@@ -420,8 +409,7 @@ def _save_checkpoint(path, settings: dict, state: _State, extra: dict) -> None:
         t, m, v = state.moments[key]
         arrays |= {f"value/{key}": value.numpy(), f"m/{key}": m.numpy(), f"v/{key}": v.numpy()}
         arrays |= {f"t/{key}": np.int64(t[0]), f"best/{key}": np.asarray(extra["best"][key])}
-    arrays |= {f"kept/{name}": value for name, value in extra["kept"].items()}
-    meta = {k: v for k, v in extra.items() if k not in ("best", "kept")}
+    meta = {k: v for k, v in extra.items() if k != "best"}
     meta |= {"step": state.step, "lr_scale": state.lr_scale, "settings": settings}
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
     with replacing(path) as temporary, open(temporary, "wb") as stream:
@@ -452,7 +440,6 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
         for key in ("best_measured", "best_step", "history", "restarts", "seconds", "plateau", "references"):
             meta[key]  # a KeyError here, not later
         stored_settings = dict(meta["settings"])
-        kept = {name.removeprefix("kept/"): v for name, v in arrays.items() if name.startswith("kept/")}
     except Exception as e:  # zipfile, json and numpy each have their own for a damaged file
         raise FittingError(f'the checkpoint "{path}" is damaged or of another task ({type(e).__name__}: {e})') from None
     sources = [s["source"] for s in (stored_settings, settings) if "source" in s]
@@ -466,7 +453,7 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
     if stored_settings != settings:
         changed = [k for k in {**settings, **stored_settings} if stored_settings.get(k) != settings.get(k)]
         raise FittingError(f'the checkpoint "{path}" was made with other settings ({", ".join(changed)})')
-    return state, {**meta, "best": best, "kept": kept}
+    return state, {**meta, "best": best}
 
 
 #: Entries, of all cores together, that the copies of an array may have in which each core sums gradients on its own: 2

@@ -1,9 +1,8 @@
-"""
-The primitive: differentiable arrays, and one read with the output of another.
+"""Differentiable arrays, and the indirection: one read with the output of another.
 
-Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH Asia 2023. Both classes
-are ``drjit.nn`` modules: PyTrees with dotted parameter names, so that ``opt.update(net)`` hands the tables to an
-optimiser, ``net.update(opt)`` takes them back, and ``nn.Sequential``, hash grids and MLPs compose with them.
+Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH Asia 2023. Both classes are
+``drjit.nn`` modules: PyTrees with dotted parameter names, so that ``opt.update(net)`` hands the tables to an optimiser,
+``net.update(opt)`` takes them back, and ``nn.Sequential``, hash grids and MLPs compose with them.
 """
 
 from __future__ import annotations
@@ -28,11 +27,12 @@ INITIALISATIONS = ("ramp", "constant", "random")
 
 
 def fold(x):
-    """
-    The triangle wave that folds any real number into ``[0, 1)``: period 2, slope ±1, ``fold(x) = x`` on ``[0, 1)``,
-    ``fold(1) = 1 − 2⁻²³``, ``fold(−x) = fold(x)`` up to rounding. NaN and infinities become 0.
+    """Fold any real number into ``[0, 1)`` by a triangle wave of period 2 and slope ±1.
 
-    It stays a hair below 1 so that a coordinate made of it never wraps around a ``"repeat"`` border. The slope at
+    ``fold(x) = x`` on ``[0, 1)``, ``fold(1) = 1 − 2⁻²³``, ``fold(−x) = fold(x)`` up to rounding. NaN and infinities
+    become 0.
+
+    The result stays below 1 so that a coordinate made of it never wraps around a ``"repeat"`` border. The slope at
     exactly 1 is −1, not 0: the last entry of a ramp can be trained.
     """
     t = x - 2 * dr.floor(x * 0.5)
@@ -41,9 +41,9 @@ def fold(x):
 
 
 class DifferentiableArray(nn.Module):
-    """
-    A table that is read at a continuous coordinate by multilinear interpolation, differentiable with respect to its
-    entries and to the coordinate.
+    """Table that is read at a continuous coordinate by multilinear interpolation.
+
+    It is differentiable with respect to its entries and to the coordinate.
 
     Parameters:
         resolution: entries along each of the 1 to 4 input dimensions, ``(N_1, …, N_d)``; an ``int`` means 1D.
@@ -143,23 +143,23 @@ class DifferentiableArray(nn.Module):
             raise RuntimeError("this DifferentiableArray has no entries yet: call .alloc(tensor type) first")
 
     def _like(self) -> DifferentiableArray:
-        """A copy that shares everything but the cache of parameter names."""
+        """Return a copy that shares everything but the cache of parameter names."""
         result = type(self)()
         for name in self.DRJIT_STRUCT:
             setattr(result, name, getattr(self, name))
         return result
 
     def copy(self) -> DifferentiableArray:
-        """A copy that shares the entries; assigning to one does not change the other."""
+        """Return a copy that shares the entries; assigning to one does not change the other."""
         self._require_entries()
         result = self._like()
         result.data = type(self.data)(self.data)
         return result
 
     def unfolded(self, change=None) -> DifferentiableArray:
-        """
-        A copy that holds its entries folded already, after ``change`` (a function of a flat array) if given;
-        differentiable with respect to the entries of this one. For floats.
+        """Return a copy that holds its entries folded already, after ``change`` (a function of a flat array) if given.
+
+        It is differentiable with respect to the entries of this array. For floats.
         """
         self._require_entries()
         result, entries = self._like(), self.data.array
@@ -169,9 +169,10 @@ class DifferentiableArray(nn.Module):
         return result
 
     def rounded(self, bits: int) -> DifferentiableArray:
-        """
-        A copy whose entries, numbers in [0, 1] after the fold, are rounded as :meth:`quantised` stores them, with the
-        gradients of the entries as they are (straight-through estimation): training takes rounding into account.
+        """Return a copy whose entries in [0, 1], after the fold, are rounded as :meth:`quantised` stores them.
+
+        Gradients are those of the unrounded entries (straight-through estimation): training takes rounding into
+        account.
         """
         steps = 2**bits - 1
 
@@ -182,10 +183,10 @@ class DifferentiableArray(nn.Module):
         return self.unfolded(change)
 
     def quantised(self, bits: int) -> DifferentiableArray:
-        """
-        A copy in ``"uint8"`` storage, of entries that are numbers in [0, 1] after the fold: each is stored in ``bits``
-        bits, 1 to 8, which stand for multiples of ``1 / (2^bits − 1)``. Nothing of the range is given to what is not
-        used, and :attr:`is_pointer` holds.
+        """Return a copy in ``"uint8"`` storage, of entries that are numbers in [0, 1] after the fold.
+
+        Each entry is stored in ``bits`` bits, 1 to 8, which stand for multiples of ``1 / (2^bits − 1)``, whatever range
+        is used; :attr:`is_pointer` holds.
         """
         steps = 2**bits - 1
         codes = np.rint(self.numpy().astype(np.float64) * steps).astype(np.uint8)
@@ -193,9 +194,10 @@ class DifferentiableArray(nn.Module):
         return self.from_numpy(codes, type(self.data), self.border, "uint8", False, affine, bits, **self._form())
 
     def to(self, storage: str) -> DifferentiableArray:
-        """
-        A copy in another storage form. Leaving ``"float32"`` applies the fold for good: quantised entries are
-        ``fold(entry)``, and inference needs no non-linearity. ``"uint8"`` is for reading only.
+        """Return a copy in another storage form.
+
+        Leaving ``"float32"`` applies the fold for good: quantised entries are ``fold(entry)``, and inference needs no
+        non-linearity. ``"uint8"`` is for reading only.
         """
         if storage not in lookup.STORAGES:
             raise ValueError(f'storage: found "{storage}", allowed are {lookup.STORAGES}')
@@ -204,16 +206,15 @@ class DifferentiableArray(nn.Module):
         return self.from_numpy(self.numpy(), module_of(self.data).TensorXf, self.border, storage, **self._form())
 
     def _form(self) -> dict:
-        """What :meth:`from_numpy` has to know of an array beside its entries."""
+        """Return further arguments of :meth:`from_numpy` that make an array of the same form."""
         return {}
 
     @classmethod
     def from_numpy(cls, values, dtype, border="clamp", storage="float32", fold=False, quantization=None, bits=8):
-        """
-        An allocated array holding ``values`` of shape ``(N_1, …, N_d, channels)``.
+        """Return an allocated array holding ``values`` of shape ``(N_1, …, N_d, channels)``.
 
         With ``storage="uint8"``, ``quantization = (scale, offset)`` says that ``values`` are already bytes, and
-        ``bits`` < 8 that they need only so many bits each, which is then what they take in memory.
+        ``bits`` < 8 that they need only so many bits each in memory.
         """
         values = np.asarray(values)
         if storage not in lookup.STORAGES:
@@ -241,7 +242,7 @@ class DifferentiableArray(nn.Module):
         return result
 
     def numpy(self) -> np.ndarray:
-        """The entries as they are interpolated (after the fold, dequantised), float32, ``(N_1, …, N_d, channels)``."""
+        """Return the entries as they are interpolated (folded, dequantised), float32, ``(N_1, …, N_d, channels)``."""
         self._require_entries()
         if self.storage == "uint8":
             codes = self.codes().astype(np.float64)
@@ -251,7 +252,7 @@ class DifferentiableArray(nn.Module):
         return data.numpy().astype(np.float32)[..., : self.channels]
 
     def codes(self) -> np.ndarray:
-        """The bytes of an array in ``"uint8"`` storage, shape ``(N_1, …, N_d, channels)``."""
+        """Return the bytes of an array in ``"uint8"`` storage, shape ``(N_1, …, N_d, channels)``."""
         if self.storage != "uint8":
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
         if self.bits < 8:
@@ -262,11 +263,11 @@ class DifferentiableArray(nn.Module):
         return lookup.unpack(self.data.numpy(), self.resolution, self.channels)
 
     def at(self, x) -> DifferentiableArray:
-        """
-        The array of one dimension less that remains where the *last* coordinate is ``x``, a number in an array of size
-        1: ``array.at(x)([a]) == array([a, x])`` up to rounding. In single precision, its entries folded already;
-        differentiable with respect to the entries and to ``x``. Raises ``ValueError`` for an array of one dimension or
-        several numbers.
+        """Fix the *last* coordinate at ``x``, an array of size 1, and return the array of one dimension less.
+
+        ``array.at(x)([a]) == array([a, x])`` up to rounding. The result is in single precision, its entries folded
+        already, differentiable with respect to the entries and to ``x``. Raises ``ValueError`` for an array of one
+        dimension or several numbers.
         """
         self._require_entries()
         if self.dims < 2:
@@ -290,9 +291,10 @@ class DifferentiableArray(nn.Module):
         return result
 
     def entry(self, index, active=True) -> list:
-        """
-        The channels of entries by their number in a list of all, the last axis fastest, which has to be one that there
-        is; without interpolation, folded. Differentiable with respect to the entries of float storage.
+        """Return the channels of entries without interpolation, folded.
+
+        ``index`` is the number of an existing entry, the last axis fastest. Differentiable with respect to the entries
+        of float storage.
         """
         self._require_entries()
         if self.storage == "uint8":
@@ -310,7 +312,7 @@ class DifferentiableArray(nn.Module):
 
     @property
     def is_pointer(self) -> bool:
-        """Are all entries bytes that stand for numbers in [0, 1], so that whatever is read is a coordinate?"""
+        """Whether all entries are bytes that stand for numbers in [0, 1], so that every read is a coordinate."""
         if self.storage != "uint8":
             return False
         pairs = list(zip(self.scale, self.offset, strict=True))
@@ -335,9 +337,10 @@ class DifferentiableArray(nn.Module):
 
     @property
     def memory_nbytes(self) -> int:
-        """
-        Bytes in memory: with padded channels, and with the entries that packed tables repeat so that one gather brings
-        several corners (:func:`mi_diffind.lookup.packed_layout`).
+        """Bytes in memory, with padded channels and repeated entries.
+
+        Packed tables repeat entries so that one gather brings several corners
+        (:func:`mi_diffind.lookup.packed_layout`).
         """
         self._require_entries()
         return dr.width(self.data) * (2 if self.storage == "float16" else 4)
@@ -349,9 +352,10 @@ class DifferentiableArray(nn.Module):
     # -- reading ----------------------------------------------------------------------------------------------------
 
     def __call__(self, x, active=True, inside=False):
-        """
-        Read at ``x`` (see the class). ``active`` masks lanes that must not access memory; they return 0. ``inside``:
-        all coordinates are known to lie in [0, 1], as those that bytes hold may be.
+        """Read at ``x`` (see the class).
+
+        ``active`` masks lanes that must not access memory; they return 0. ``inside``: all coordinates are known to lie
+        in [0, 1], as those from bytes may be.
         """
         self._require_entries()
         coordinates, is_coopvec = coordinates_of(x, module_of(self.data).Float)
@@ -393,9 +397,9 @@ class DifferentiableArray(nn.Module):
 
 
 class Indirection(nn.Module):
-    """
-    Differentiable indirection, ``y = C[fold(P)[x]]``: what is read from the primary arrays is the coordinate at which
-    the cascaded array is read.
+    """Differentiable indirection, ``y = C[fold(P)[x]]``.
+
+    A read of the primary arrays ``P`` gives the coordinate at which the cascaded array ``C`` is read.
 
     Parameters:
         primary: one :class:`DifferentiableArray` or several, whose outputs are concatenated. Their entries are folded
@@ -445,7 +449,7 @@ class Indirection(nn.Module):
         return Indirection(primary, cascaded, self.inputs), channels
 
     def to(self, storage: str, cascaded: str | None = None) -> Indirection:
-        """A copy whose primaries are stored as ``storage``, the cascaded array as ``cascaded`` (default: the same)."""
+        """Return a copy with other storage forms of the primaries and of the cascaded array (default: the same)."""
         return Indirection([p.to(storage) for p in self.primary], self.cascaded.to(cascaded or storage), self.inputs)
 
     @property
@@ -454,7 +458,7 @@ class Indirection(nn.Module):
         return sum(p.nbytes for p in self.primary) + self.cascaded.nbytes
 
     def pointer(self, x, active=True) -> list:
-        """The coordinate at which the cascaded array is read for the inputs ``x``."""
+        """Return the coordinate at which the cascaded array is read for the inputs ``x``."""
         x, _ = coordinates_of(x)
         if len(x) != self.dims:
             raise ValueError(f"an indirection of {self.dims} input(s) was read at {len(x)} coordinate(s)")
@@ -475,11 +479,11 @@ class Indirection(nn.Module):
 
 def unfolded(net):
     """
-    A copy of a module, or of a tuple or list of modules, in which all arrays are :meth:`.DifferentiableArray.unfolded`.
+    Return a copy of a module, tuple or list of modules in which all arrays are :meth:`.DifferentiableArray.unfolded`.
 
-    For training: if all entries are folded before anything is read, then a backward pass comes to all reads before it
-    comes to a fold, and the sums of all gradients are made by one kernel. (To pass through a fold it has to wait for
-    the sums behind it, and what follows would have to repeat the reads.)
+    For training: if all entries are folded before anything is read, a backward pass comes to all reads before it comes
+    to a fold, and one kernel sums all gradients. Otherwise the pass through a fold waits for the sums behind it, and
+    what follows repeats the reads.
     """
     if isinstance(net, DifferentiableArray):
         return net if net.storage == "uint8" else net.unfolded()
@@ -494,22 +498,25 @@ def unfolded(net):
 
 
 def rounded(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
-    """
-    A copy of ``net`` as training sees it that takes rounding into account (:meth:`.DifferentiableArray.rounded`): the
-    entries of each primary to its ``bits`` (default: 8), the cascaded array's to 8.
+    """Return a copy of ``net`` for training that takes rounding into account (:meth:`.DifferentiableArray.rounded`).
+
+    Entries of each primary are rounded to its ``bits`` (default: 8), the cascaded array's to 8.
     """
     widths = zip(net.primary, bits or [8] * len(net.primary), strict=True)
     return Indirection([array.rounded(width) for array, width in widths], net.cascaded.rounded(8), net.inputs)
 
 
 def stored_form(net: Indirection, bits: Sequence[int] | None = None) -> Indirection:
-    """The arrays of ``net`` as they are stored: what :func:`rounded` stands for, as bytes."""
+    """Return the arrays of ``net`` as they are stored, as bytes; :func:`rounded` predicts their values."""
     widths = zip(net.primary, bits or [8] * len(net.primary), strict=True)
     return Indirection([array.quantised(width) for array, width in widths], net.cascaded.quantised(8), net.inputs)
 
 
 def ramp(resolution: Sequence[int], channels: int, border: Sequence[str]) -> np.ndarray:
-    """Entries equal to their own position, ``(N_1, …, N_d, channels)``; channel ``k`` runs along axis ``k mod d``."""
+    """Return entries equal to their own position, ``(N_1, …, N_d, channels)``.
+
+    Channel ``k`` runs along axis ``k mod d``.
+    """
     grids = np.meshgrid(
         *[
             np.arange(n, dtype=np.float32) / max(1, n if b == "repeat" else n - 1)
@@ -538,10 +545,10 @@ def padded_tensor(dtype, values: np.ndarray, resolution, channels: int):
 
 
 def aligned(shape, dtype) -> np.ndarray:
-    """
-    An uninitialised array that starts at a multiple of 64 bytes. On the CPU, Dr.Jit uses NumPy's memory as it is, and
-    from memory that is aligned less it gathers number by number instead of packet by packet: half the speed in single
-    precision, a fifth in half precision.
+    """Return an uninitialised NumPy array that starts at a multiple of 64 bytes.
+
+    On the CPU, Dr.Jit uses NumPy's memory as it is, and from memory that is aligned less it gathers number by number
+    instead of packet by packet: half the speed in single precision, a fifth in half precision.
     """
     count, size = math.prod(shape), np.dtype(dtype).itemsize
     memory = np.empty(count * size + 64, np.uint8)
@@ -550,8 +557,8 @@ def aligned(shape, dtype) -> np.ndarray:
 
 
 def coordinates_of(x, default=None):
-    """
-    A list of single-precision arrays from whatever the caller passed, and whether it was a cooperative vector.
+    """Return coordinates as a list of single-precision arrays, and whether they were a cooperative vector.
+
     Numbers become arrays like the others, or like ``default``.
     """
     is_coopvec = isinstance(x, nn.CoopVec)

@@ -1,4 +1,4 @@
-"""Ctrl-C that lets a long job finish its step and keep what it has."""
+"""Ctrl-C that lets a long job finish its step and keep its result so far."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import threading
 
 @contextlib.contextmanager
 def interruptible():
-    """
-    Yield a ``threading.Event`` that the first Ctrl-C sets; a second one raises ``KeyboardInterrupt`` as usual.
+    """Yield a ``threading.Event`` that the first Ctrl-C sets; a second one raises ``KeyboardInterrupt`` as usual.
 
     Outside of the main thread, where no signal arrives, the event is never set.
     """

@@ -1,5 +1,4 @@
-"""
-Multilinear reads of small tables: 1 to 4 dimensions, any number of channels, three storage forms.
+"""Multilinear reads of small tables: 1 to 4 dimensions, any number of channels, three storage forms.
 
 Conventions, the same everywhere in this package:
 
@@ -33,8 +32,7 @@ BORDERS = ("clamp", "repeat")
 
 
 def clamp(x, low: float, high: float):
-    """
-    ``x`` limited to ``[low, high]``; NaN becomes ``low``.
+    """Limit ``x`` to ``[low, high]``; NaN becomes ``low``.
 
     Unlike ``dr.clip``, which propagates NaN, and unlike ``dr.fmin``/``dr.fmax``, whose gradient at a tie belongs to the
     bound, this keeps the gradient of ``x`` at the bounds themselves.
@@ -44,7 +42,7 @@ def clamp(x, low: float, high: float):
 
 
 def padded_channels(channels: int) -> int:
-    """Channels as stored: 1, 2, or the next multiple of 4, so that every read is a packet gather."""
+    """Return the number of stored channels, 1, 2, or the next multiple of 4, so that every read is a packet gather."""
     return channels if channels <= 2 else 4 * math.ceil(channels / 4)
 
 
@@ -54,8 +52,7 @@ WIDE_BYTES = 2**20
 
 
 def packed_layout(resolution: Sequence[int], channels: int) -> tuple[int, int, int]:
-    """
-    How a table of bytes is packed: ``(inner, stride, words)``.
+    """Return the layout of a packed table of bytes: ``(inner, stride, words)``.
 
     A texel stores the ``2^inner`` corners of a cell along the last ``inner`` axes, each in ``stride`` bytes, in
     ``words`` words of 32 bits. One word may hold what fits (a one-channel bilinear read is a single gather), and up to
@@ -70,12 +67,12 @@ def packed_layout(resolution: Sequence[int], channels: int) -> tuple[int, int, i
 
 
 def _packet(count: int) -> int:
-    """How many of ``count`` consecutive values one gather fetches."""
+    """Return how many of ``count`` consecutive values one gather fetches."""
     return next(p for p in (4, 2, 1) if count % p == 0)
 
 
 def gathers(resolution: Sequence[int], channels: int, storage: str, bits: int = 8) -> int:
-    """Number of gather instructions that one read takes."""
+    """Return the number of gather instructions that one read takes."""
     dims = len(resolution)
     if storage == "uint8" and bits < 8:
         return 2**dims * channels_words(channels, bits)
@@ -87,8 +84,9 @@ def gathers(resolution: Sequence[int], channels: int, storage: str, bits: int = 
 
 
 def _axis(x, n: int, border: str, inside: bool = False):
-    """
-    Cell index, next index and weight of the next one along an axis with ``n`` entries; ``inside``: x is in [0, 1].
+    """Return the cell, the next cell and the weight of the next one along an axis with ``n`` entries.
+
+    ``inside``: ``x`` is in [0, 1].
     """
     UInt32 = dr.uint32_array_t(type(x))
     if n == 1:
@@ -106,9 +104,9 @@ def _axis(x, n: int, border: str, inside: bool = False):
 
 
 def _corners(axes, resolution):
-    """
-    All ``2^d`` pairs (texel index, weight) of a cell, built axis by axis so that products are shared; along an axis
-    whose coordinate is a number that Dr.Jit knows, such as 0, only those that weigh anything.
+    """Return the ``2^d`` pairs (texel index, weight) of a cell, built axis by axis so that products are shared.
+
+    Along an axis whose coordinate is a number that Dr.Jit knows, such as 0, only corners of weight other than zero.
     """
     result = [(None, None)]
     for (lower, upper, w), n in zip(axes, resolution, strict=True):
@@ -124,12 +122,12 @@ def _corners(axes, resolution):
 
 
 def _is_zero(weight) -> bool:
-    """Is this a constant of the code, and zero? Without evaluating anything."""
+    """Return whether a weight is the constant zero in the code, without evaluating anything."""
     return weight.state == dr.VarState.Literal and not dr.grad_enabled(weight) and weight[0] == 0
 
 
 def weighted_sum(terms):
-    """Σ weight · value for each channel."""
+    """Return Σ weight · value for each channel."""
     total = None
     for weight, values in terms:
         if total is None:
@@ -149,8 +147,7 @@ def read_float(
     transform=None,
     stored: int | None = None,
 ):
-    """
-    Read a table of 16- or 32-bit floats.
+    """Read a table of 16- or 32-bit floats.
 
     ``data`` is the flat array of shape ``(N_1·…·N_d·stored,)``, where ``stored`` is ``padded_channels(channels)``
     unless given, ``x`` the ``d`` coordinates. Returns a list of ``channels`` arrays of the coordinates' (single
@@ -164,7 +161,10 @@ def read_float(
 
 
 def fetch_float(data, channels: int, stored: int, active, transform, Float, index) -> list:
-    """The channels of an entry of a flat array of floats that holds ``stored`` numbers an entry, as ``Float``."""
+    """Return the channels of an entry of a flat array of floats as ``Float``.
+
+    The array holds ``stored`` numbers an entry.
+    """
     packet = _packet(stored)
     groups = stored // packet
     suffix = "f16" if dr.is_half_v(type(data)) else "f"
@@ -172,8 +172,8 @@ def fetch_float(data, channels: int, stored: int, active, transform, Float, inde
     values = []
     for group in range(groups):
         where = index if groups == 1 else dr.fma(index, groups, group)
-        found = dr.gather(Packet or type(data), data, where, active)
-        values += [Float(v) for v in (found if Packet else [found])]
+        packet_values = dr.gather(Packet or type(data), data, where, active)
+        values += [Float(v) for v in (packet_values if Packet else [packet_values])]
     values = values[:channels]
     return values if transform is None else [transform(v) for v in values]
 
@@ -189,15 +189,15 @@ def read_packed(
     active=True,
     inside: bool = False,
 ):
-    """
-    Read a table of bytes packed in ``UInt32`` words (:func:`pack`). Channel ``k`` of the result is
-    ``offset[k] + scale[k] · (interpolated byte)``. Differentiable with respect to ``x`` only. ``inside``: all
-    coordinates are known to lie in [0, 1], which saves looking.
+    """Read a table of bytes packed in ``UInt32`` words (:func:`pack`).
+
+    Channel ``k`` of the result is ``offset[k] + scale[k] · (interpolated byte)``. Differentiable with respect to ``x``
+    only. ``inside``: all coordinates are known to lie in [0, 1], which saves a comparison.
 
     Two bytes of a word lie where a float has its mantissa, and rotated by half a word so do the other two. Under the
-    exponent of 1, they read ``1 + byte/256`` and ``1 + byte/65536`` without any conversion; since the weights of a
-    read sum to one, the ones are subtracted once at the end. What the latter loses by that, at most 1/64 of a step in
-    1D and 2D, grows with the number of corners: from 3D on those bytes are converted instead.
+    exponent of 1, they read ``1 + byte/256`` and ``1 + byte/65536`` without any conversion; since the weights of a read
+    sum to one, the ones are subtracted once at the end. The second pair loses at most 1/64 of a step by that in 1D and
+    2D, and more with more corners: from 3D on those bytes are converted instead.
     """
     Float = type(x[0])
     UInt32, Int32 = type(words), dr.int32_array_t(type(words))
@@ -216,17 +216,17 @@ def read_packed(
 
     def fetch(index) -> list:
         """All words of a texel, each also rotated."""
-        found = []
+        gathered = []
         for group in range(groups):
             where = index if groups == 1 else dr.fma(index, groups, group)
             if packet == 1:
-                found.append(dr.gather(UInt32, words, where, active))
+                gathered.append(dr.gather(UInt32, words, where, active))
             else:
-                found += list(dr.gather(getattr(module, f"Array{packet}u"), words, where, active))
-        return [(w, (w << 16) | (w >> 16)) for w in found]
+                gathered += list(dr.gather(getattr(module, f"Array{packet}u"), words, where, active))
+        return [(w, (w << 16) | (w >> 16)) for w in gathered]
 
-    def byte(found, position: int):
-        word = found[position // 4][position % 4 // 2]
+    def byte(texel, position: int):
+        word = texel[position // 4][position % 4 // 2]
         if position % 2 and channels == 1:  # the corners of one channel are summed, so all have to be of one kind
             word = word << 8
         elif position % 2:
@@ -239,8 +239,8 @@ def read_packed(
         # Axes whose corners share a texel contribute their lower index only
         for (lower, _, _), n in zip(axes[outer:], resolution[outer:], strict=True):
             index = lower if index is None else dr.fma(index, n, lower)
-        found = fetch(index)
-        corners = [[byte(found, k * stride + channel) for channel in range(channels)] for k in range(2**inner)]
+        texel = fetch(index)
+        corners = [[byte(texel, k * stride + channel) for channel in range(channels)] for k in range(2**inner)]
         if channels > 2:  # weights that all channels share are less work than a step along each axis for each
             corners = [weighted_sum(zip(inner_weights, corners, strict=True))] if inner else corners
         else:
@@ -259,7 +259,7 @@ def read_packed(
 
 
 def channels_words(channels: int, bits: int) -> int:
-    """Words of 32 bits that have to be read to find all bits of an entry in a table of fewer than 8 bits a channel."""
+    """Return the number of 32-bit words to read for all bits of an entry with fewer than 8 bits a channel."""
     width = channels * bits
     return (width + 63 - math.gcd(width, 32)) // 32  # entries begin at multiples of the divisor
 
@@ -276,8 +276,7 @@ def read_bits(
     inside: bool = False,
     bits: int = 4,
 ):
-    """
-    Read a table of fewer than 8 ``bits`` a channel (:func:`.bits.pack_bits`, in words of 32 bits and one word more).
+    """Read a table of fewer than 8 ``bits`` a channel (:func:`.bits.pack_bits`, in words of 32 bits and one word more).
 
     The table takes no more memory than these bits. A corner takes one gather if entries never cross the end of a word,
     else two. Otherwise like :func:`read_packed`.
@@ -290,23 +289,23 @@ def read_bits(
 
 
 def fetch_bits(words, channels: int, bits: int, active, Float, index) -> list:
-    """The numbers that :func:`.bits.pack_bits` packed for an entry, as ``Float``."""
+    """Return the numbers that :func:`.bits.pack_bits` packed for an entry, as ``Float``."""
     UInt32, width = type(words), channels * bits
     Int32, count = dr.int32_array_t(UInt32), channels_words(channels, bits)
     start = index * width
     first, shift = start >> 5, start & 31
-    found = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
+    gathered = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
     if count > 1:  # what is left of a word, and what the next one adds above it
-        pairs = zip(found, [*found[1:], UInt32(0)], strict=True)
-        found = [(low >> shift) | ((high << (31 - shift)) << 1) for low, high in pairs]
+        pairs = zip(gathered, [*gathered[1:], UInt32(0)], strict=True)
+        gathered = [(low >> shift) | ((high << (31 - shift)) << 1) for low, high in pairs]
     else:
-        found = [found[0] >> shift]
+        gathered = [gathered[0] >> shift]
     values = []
     for k in range(channels):
         word, at = divmod(k * bits, 32)
-        value = found[word] >> at
+        value = gathered[word] >> at
         if at + bits > 32:
-            value |= found[word + 1] << (32 - at)
+            value |= gathered[word + 1] << (32 - at)
         values.append(Float(Int32(value & (2**bits - 1))))
     return values
 
@@ -314,7 +313,7 @@ def fetch_bits(words, channels: int, bits: int, active, Float, index) -> list:
 def entry_packed(
     words, scale, offset, resolution: Sequence[int], channels: int, index, active=True, bits: int = 8
 ) -> list:
-    """The channels of the entries ``index`` of a table of bytes (:func:`pack`) or of fewer ``bits``."""
+    """Return the channels of the entries ``index`` of a table of bytes (:func:`pack`) or of fewer ``bits``."""
     UInt32, Int32 = type(words), dr.int32_array_t(type(words))
     Float = dr.float32_array_t(UInt32)
     if bits < 8:
@@ -323,16 +322,15 @@ def entry_packed(
         _, _, per_texel = packed_layout(resolution, channels)
         codes = []
         for word in range((channels + 3) // 4):
-            found = dr.gather(UInt32, words, index if per_texel == 1 else index * per_texel + word, active)
-            for rotated in (found, (found << 16) | (found >> 16)):
+            word_values = dr.gather(UInt32, words, index if per_texel == 1 else index * per_texel + word, active)
+            for rotated in (word_values, (word_values << 16) | (word_values >> 16)):
                 codes += [Float(Int32((rotated >> shift) & 0xFF)) for shift in (15, 7)]
     values = [dr.fma(c, scale[k], offset[k]) for k, c in enumerate(codes[:channels])]
     return values if active is True else [dr.select(active, v, 0) for v in values]
 
 
 def quantize(values, channels: int):
-    """
-    Bytes of a NumPy array of shape ``(…, channels)``, one affine map a channel.
+    """Quantise a NumPy array of shape ``(…, channels)`` to bytes, with one affine map a channel.
 
     Returns ``(codes, scale, offset)`` with ``values ≈ offset + scale · codes``, at most half a ``scale`` off; the
     smallest and the largest value of each channel are hit exactly.
@@ -349,9 +347,10 @@ def quantize(values, channels: int):
 
 
 def pack(codes, border: Sequence[str]):
-    """
-    The words that :func:`read_packed` reads, from a NumPy ``uint8`` array of shape ``(N_1, …, N_d, c)``: a flat
-    ``uint32`` array in the layout of :func:`packed_layout`, the last axis fastest. See :func:`unpack` for the bits.
+    """Pack a NumPy ``uint8`` array of shape ``(N_1, …, N_d, c)`` into the words that :func:`read_packed` reads.
+
+    Returns a flat ``uint32`` array in the layout of :func:`packed_layout`, the last axis fastest. See :func:`unpack`
+    for the bits.
     """
     import numpy as np
 
@@ -372,13 +371,14 @@ def pack(codes, border: Sequence[str]):
 
 
 def unpack(words, resolution: Sequence[int], channels: int):
-    """
-    The bytes of a packed table, ``(N_1, …, N_d, channels)``: byte 0 of a word lies in bits 15 to 22, byte 1 in bits 7
-    to 14, and bytes 2 and 3 there once the word is rotated by 16.
+    """Return the bytes of a packed table, ``(N_1, …, N_d, channels)``.
+
+    Byte 0 of a word lies in bits 15 to 22, byte 1 in bits 7 to 14, and bytes 2 and 3 there once the word is rotated by
+    16.
     """
     import numpy as np
 
     words = np.asarray(words, dtype=np.uint32)
     rotated = words << 16 | words >> 16
-    found = np.stack([words >> 15, words >> 7, rotated >> 15, rotated >> 7], axis=-1) & 0xFF
-    return found.astype(np.uint8).reshape(*resolution, -1)[..., :channels].copy()
+    codes = np.stack([words >> 15, words >> 7, rotated >> 15, rotated >> 7], axis=-1) & 0xFF
+    return codes.astype(np.uint8).reshape(*resolution, -1)[..., :channels].copy()

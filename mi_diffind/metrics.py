@@ -1,4 +1,4 @@
-"""Image errors: thin layers over NumPy and NVIDIA's FLIP. Images are linear, shape ``(height, width, 3)``."""
+"""Errors of images: thin layers over NumPy and NVIDIA's FLIP. Images are linear, shape ``(height, width, 3)``."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from .srgb import for_display
 
 
 def psnr(reference: np.ndarray, image: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of linear values clipped to [0, 1]; infinite for equal images."""
+    """Return the peak signal-to-noise ratio in dB of linear values clipped to [0, 1]; infinite for equal images."""
     mse = float(np.mean((np.clip(reference, 0, 1) - np.clip(image, 0, 1)) ** 2, dtype=np.float64))
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
 def mae(reference: np.ndarray, image: np.ndarray) -> float:
-    """Mean absolute error of linear values, not clipped."""
+    """Return the mean absolute error of linear values, not clipped."""
     return float(np.mean(np.abs(reference - image), dtype=np.float64))
 
 
 def flip(reference: np.ndarray, image: np.ndarray) -> float:
-    """
-    Return the mean LDR-FLIP (Andersson et al. 2020; 0: equal to the eye) of linear images as a screen displays them.
+    """Return the mean LDR-FLIP (Andersson et al. 2020; 0: equal to the eye) of linear images as a screen displays them.
 
     They are encoded by :func:`.srgb.for_display`; the viewing distance is the default one, 67 pixels per degree.
     """
@@ -30,7 +29,7 @@ def flip(reference: np.ndarray, image: np.ndarray) -> float:
 
 
 def flip_shown(reference: np.ndarray, image: np.ndarray) -> float:
-    """As :func:`flip`, of images that are displayed as they are, in [0, 1]."""
+    """Return :func:`flip` of images that are encoded for a screen already, in [0, 1]."""
     import flip_evaluator
 
     pair = [np.ascontiguousarray(i, dtype=np.float32) for i in (reference, image)]
@@ -39,9 +38,9 @@ def flip_shown(reference: np.ndarray, image: np.ndarray) -> float:
 
 
 def ssim(reference: np.ndarray, image: np.ndarray) -> float | None:
-    """
-    Structural similarity (Wang et al. 2004) of values in [0, 1], the mean over channels; ``None`` if scikit-image is
-    not installed or the image is smaller than the window of 7 texels.
+    """Return the structural similarity (Wang et al. 2004) of values in [0, 1], the mean over channels.
+
+    ``None`` if scikit-image is not installed or the image is smaller than the window of 7 texels.
     """
     try:
         from skimage.metrics import structural_similarity
@@ -53,16 +52,12 @@ def ssim(reference: np.ndarray, image: np.ndarray) -> float | None:
 
 
 def angle(reference: np.ndarray, image: np.ndarray) -> float:
-    """Mean angle in degrees between unit normals, stored as (n + 1)/2, that were brought to length 1."""
+    """Return the mean angle in degrees between normals stored as (n + 1)/2, each brought to length 1."""
     a, b = (2 * v[..., :3].astype(np.float64) - 1 for v in (reference, image))
     a, b = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-6) for v in (a, b))
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1))).mean())
 
 
 def compare(reference: np.ndarray, image: np.ndarray) -> dict[str, float]:
-    """All of the above in one dictionary: ``psnr_db``, ``flip``, ``mae``."""
-    return {
-        "psnr_db": psnr(reference, image),
-        "flip": flip(reference, image),
-        "mae": mae(reference, image),
-    }
+    """Return ``psnr_db``, ``flip`` and ``mae`` of two images."""
+    return {"psnr_db": psnr(reference, image), "flip": flip(reference, image), "mae": mae(reference, image)}

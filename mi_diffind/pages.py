@@ -1,9 +1,9 @@
-"""
-An array whose resolution follows its content: pages of different resolutions behind a small index.
+"""Arrays whose resolution follows the content: pages of different resolutions behind a small index.
 
-The domain is divided into ``A × B × …`` pages. Each has a grid of entries of its own, which includes the borders of the
-page: one entry makes it constant, and what lies on the border of two pages is held by both, so that they join where
-their entries agree. A word for each page says where its entries begin and how many it has; a read gathers it first.
+The domain is divided into ``A × B × …`` pages. Each has its own grid of entries, which includes the borders of the
+page: one entry makes it constant, and two neighbouring pages both hold the values on their border, so that they join
+where their entries agree. A word for each page says where its entries begin and how many it has; a read gathers it
+first.
 
 :func:`page_sizes` chooses the resolutions for data on a grid, :func:`page_entries` the entries.
 """
@@ -49,8 +49,7 @@ PART, ESTIMATED = 4096, 1024
 
 
 class PagedArray(DifferentiableArray):
-    """
-    A :class:`.DifferentiableArray` of 1 to 3 dimensions that consists of pages of different resolutions.
+    """A :class:`.DifferentiableArray` of 1 to 3 dimensions that consists of pages of different resolutions.
 
     Parameters:
         sizes: entries along each side of each page, whole numbers of shape ``(A, B, …, d)``, at most 256, 32 or 16 in
@@ -81,23 +80,23 @@ class PagedArray(DifferentiableArray):
         if not 1 <= dims <= len(SIDE_BITS) or sizes.ndim != dims + 1 or sizes.size == 0:
             raise ValueError(f"sizes: found the shape {sizes.shape}, allowed are (A, 1), (A, B, 2) and (A, B, C, 3)")
         if sizes.dtype.kind not in "iu" or sizes.min() < 1 or sizes.max() > 2 ** SIDE_BITS[dims - 1]:
-            found = f"{sizes.min()} to {sizes.max()} of type {sizes.dtype}"
-            raise ValueError(f"sizes: found {found}, allowed are whole numbers from 1 to {2 ** SIDE_BITS[dims - 1]}")
+            given = f"{sizes.min()} to {sizes.max()} of type {sizes.dtype}"
+            raise ValueError(f"sizes: found {given}, allowed are whole numbers from 1 to {2 ** SIDE_BITS[dims - 1]}")
         shift = tuple(map(float, np.broadcast_to(shift, (dims,))))
         if not all(0 <= s <= 1 for s in shift):
             raise ValueError(f"shift: found {shift}, allowed are numbers from 0 to 1")
         super().__init__(sizes.shape[:-1], channels, "constant", None, fold, border)
         self.sizes, self.shift, self.index = sizes.astype(np.int64), shift, ()
         if self.entries > most_entries(dims):
-            found = f"{self.entries:,} entries in all pages together"
-            raise ValueError(f"sizes: found {found}, allowed are {most_entries(dims):,}")
+            given = f"{self.entries:,} entries in all pages together"
+            raise ValueError(f"sizes: found {given}, allowed are {most_entries(dims):,}")
         if np.shape(init) not in ((), (self.entries, self.channels)):
             raise ValueError(f"init: found shape {np.shape(init)}, expected {(self.entries, self.channels)}")
         self.init = np.asarray(init, np.float32)
 
     @property
     def entries(self) -> int:
-        """Entries of all pages together."""
+        """Number of entries of all pages together."""
         return int(self.sizes.prod(axis=-1).sum())
 
     # -- allocation and storage forms -------------------------------------------------------------------------------
@@ -113,13 +112,16 @@ class PagedArray(DifferentiableArray):
         return result, self.channels
 
     def _words(self, dtype):
-        """The index: for each page, its first entry and, in the lower bits, its sides less one, the last one lowest."""
+        """Return the index: for each page, its first entry and, in the lower bits, its sides less one.
+
+        The last side has the lowest bits.
+        """
         flat, bits = self.sizes.reshape(-1, self.dims), SIDE_BITS[self.dims - 1]
-        found = np.cumsum(flat.prod(axis=1)) - flat.prod(axis=1)
+        index = np.cumsum(flat.prod(axis=1)) - flat.prod(axis=1)
         for axis in range(self.dims):
-            found = found << bits | (flat[:, axis] - 1)
-        words = aligned(found.shape, np.uint32)
-        words[...] = found
+            index = index << bits | (flat[:, axis] - 1)
+        words = aligned(index.shape, np.uint32)
+        words[...] = index
         return module_of(dtype).UInt32(words)
 
     def _form(self) -> dict:
@@ -139,9 +141,9 @@ class PagedArray(DifferentiableArray):
         sizes=None,
         shift=0.0,
     ):
-        """
-        An allocated array of pages of ``sizes`` that holds ``values``, ``(entries, channels)``; the rest as in
-        :meth:`.DifferentiableArray.from_numpy`. Bytes are never held several times.
+        """Return an allocated array of pages of ``sizes`` that holds ``values``, ``(entries, channels)``.
+
+        Other parameters are those of :meth:`.DifferentiableArray.from_numpy`. Bytes are never held several times.
         """
         values = np.asarray(values)
         if storage not in lookup.STORAGES:
@@ -170,7 +172,7 @@ class PagedArray(DifferentiableArray):
         return result
 
     def codes(self) -> np.ndarray:
-        """The bytes of an array in ``"uint8"`` storage, ``(entries, channels)``."""
+        """Return the bytes of an array in ``"uint8"`` storage, ``(entries, channels)``."""
         if self.storage != "uint8":
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
         packed = self.data.numpy().view(np.uint8)
@@ -235,7 +237,7 @@ class PagedArray(DifferentiableArray):
         return nn.CoopVec(*values) if is_coopvec else values
 
     def _corners(self, x: Sequence, active, inside: bool) -> list:
-        """The ``2^d`` pairs (entry, weight) of a cell."""
+        """Return the ``2^d`` pairs (entry, weight) of a cell."""
         Float, UInt32 = type(x[0]), type(self.index[0])
         page, places = None, []
         for along, n, shift, border in zip(x, self.resolution, self.shift, self.border, strict=True):
@@ -267,7 +269,7 @@ class PagedArray(DifferentiableArray):
 
 
 def most_entries(dims: int) -> int:
-    """Entries that all pages of an array may have together."""
+    """Return the largest number of entries that all pages of an array may have together."""
     return 2 ** (32 - dims * SIDE_BITS[dims - 1])
 
 
@@ -275,38 +277,39 @@ def most_entries(dims: int) -> int:
 
 
 def page_counts(shape: Sequence[int]) -> tuple[int, ...]:
-    """Pages along each axis of data of so many texels, each at most :data:`SAMPLES` wide."""
+    """Return the number of pages along each axis of data with these texels, each at most :data:`SAMPLES` wide."""
     return tuple(math.ceil(n / SAMPLES) for n in shape)
 
 
 def page_sizes(values: np.ndarray, border: tuple[str, str], entries: float) -> np.ndarray:
-    """
-    Resolutions, ``(A, B, 2)``, of the pages of an image ``values``, ``(height, width, k)``, for at most so many
-    ``entries`` together, but at least one a page: those with the smallest squared error of all channels together, if
-    entries are fitted to the image and read linearly.
+    """Choose the resolutions, ``(A, B, 2)``, of the pages of an image ``values``, ``(height, width, k)``.
+
+    All pages together have at most ``entries`` entries, but at least one each. The choice has the smallest squared
+    error of all channels together, if entries are fitted to the image and read linearly.
     """
     return page_sizes_of([values], border, entries)[0]
 
 
 def page_sizes_of(images: Sequence[np.ndarray], border: tuple[str, str], entries: float) -> list[np.ndarray]:
-    """
-    The same of several images that share the ``entries``: those with the smallest sum of the mean squared errors of
-    each.
+    """Choose the resolutions of the pages of several images that share the ``entries``.
+
+    The choice has the smallest sum of the mean squared errors of the images; otherwise like :func:`page_sizes`.
     """
     errors = []
     for values in images:
-        found = np.concatenate([_errors(part) for part in _parts(_windows(values, border))])
-        errors.append(found / math.prod(values.shape[:2]))
+        page_errors = np.concatenate([_errors(part) for part in _parts(_windows(values, border))])
+        errors.append(page_errors / math.prod(values.shape[:2]))
     chosen = _OPTIONS[_allocated(np.concatenate(errors), entries)]
     parts = np.split(chosen, np.cumsum([len(e) for e in errors])[:-1])
     return [part.reshape(*page_counts(i.shape[:2]), 2) for part, i in zip(parts, images, strict=True)]
 
 
 def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest: float = 0.0) -> tuple[float, float]:
-    """
-    What pages gain over one grid of as many ``entries``, in dB, and the PSNR they have, both if entries are fitted to
-    an image ``values``, ``(height, width, k)``, and read linearly. ``rest``: mean squared error that both have beside
-    that. Errors are those of all channels together. An estimate from 1024 pages at most, which needs no training.
+    """Estimate the gain of pages over one grid of as many ``entries``, in dB, and the PSNR of the pages.
+
+    Entries of both are fitted to an image ``values``, ``(height, width, k)``, and read linearly. ``rest`` is a mean
+    squared error that both have in addition. Errors are those of all channels together. The estimate uses at most 1024
+    pages and no training.
     """
     windows = _windows(values, border)
     some = windows[np.random.default_rng(0).permutation(len(windows))[:ESTIMATED]]
@@ -323,10 +326,10 @@ def page_gain(values: np.ndarray, border: tuple[str, str], entries: float, rest:
 
 
 def _allocated(errors: np.ndarray, entries: float) -> np.ndarray:
-    """
-    Which of the options each page takes. Lagrange: the one that minimises ``error + λ · entries``, with the smallest λ
-    that leads to no more entries than there may be. Where many pages want more at once, since they are equal, the first
-    of them get it.
+    """Return the option that each page takes, by Lagrange's method.
+
+    A page takes the option that minimises ``error + λ · entries``, with the smallest λ that leads to at most
+    ``entries``. Where many equal pages want more at the same λ, the first of them get it.
     """
     cost = _OPTIONS.prod(axis=1)
 
@@ -343,38 +346,39 @@ def _allocated(errors: np.ndarray, entries: float) -> np.ndarray:
 
 
 def page_entries(values: np.ndarray, border: tuple[str, str], sizes: np.ndarray) -> np.ndarray:
-    """
-    The entries of pages of ``sizes``, ``(A, B, 2)``, that reproduce ``values``, ``(height, width, k)``, with the
-    smallest squared error: ``(entries, k)``, to be read with a ``shift`` of half a texel (:func:`page_shift`).
+    """Return the entries, ``(entries, k)``, of pages of ``sizes``, ``(A, B, 2)``, that reproduce an image best.
+
+    They have the smallest squared error to ``values``, ``(height, width, k)``, when they are read with a ``shift`` of
+    half a texel (:func:`page_shift`).
     """
     windows, flat = _windows(values, border), np.asarray(sizes).reshape(-1, 2)
     ends = np.cumsum(flat.prod(axis=1))
-    found = np.empty((ends[-1], values.shape[2]), np.float32)
+    entries = np.empty((ends[-1], values.shape[2]), np.float32)
     inverse = {n: np.linalg.pinv(_ENDS[:, None] * _tents(n)) * _ENDS for n in SIDES}
     for rows, columns in np.unique(flat, axis=0):
         which = np.flatnonzero((flat == (rows, columns)).all(axis=1))
         fitted = inverse[rows] @ windows[which].astype(np.float64) @ inverse[columns].T
         where = (ends[which] - rows * columns)[:, None] + np.arange(rows * columns)
-        found[where] = fitted.transpose(0, 2, 3, 1).reshape(len(which), rows * columns, -1)
-    return found
+        entries[where] = fitted.transpose(0, 2, 3, 1).reshape(len(which), rows * columns, -1)
+    return entries
 
 
 def page_shift(shape: Sequence[int]) -> tuple[float, ...]:
-    """Where the first page has to begin so that it begins at a texel's centre: half a texel, in units of a page."""
+    """Return half a texel, in units of a page: the ``shift`` that puts the first page's corner at a texel's centre."""
     return tuple(0.5 * pages / n for pages, n in zip(page_counts(shape), shape, strict=True))
 
 
 def page_positions(sizes: np.ndarray, shift: Sequence[float]) -> np.ndarray:
-    """Where the entries of pages of ``sizes``, ``(A, …, d)``, lie: ``(entries, d)``, from 0 to 1 but for the shift."""
+    """Return the positions of the entries of pages of ``sizes``, ``(entries, d)``, from 0 to 1 plus the shift."""
     *counts, _ = np.shape(sizes)
-    found = []
+    positions = []
     for page in np.ndindex(*counts):
         sides = [
             (i + shift[axis] + (np.linspace(0, 1, n) if n > 1 else np.array([0.5]))) / counts[axis]
             for axis, (i, n) in enumerate(zip(page, sizes[page], strict=True))
         ]
-        found.append(np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, len(sides)))
-    return np.concatenate(found)
+        positions.append(np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, len(sides)))
+    return np.concatenate(positions)
 
 
 #: A page shares what lies on its border with its neighbours: half the weight, here its root.
@@ -382,7 +386,7 @@ _ENDS = np.sqrt(np.r_[0.5, np.ones(SAMPLES - 1), 0.5])
 
 
 def _tents(n: int) -> np.ndarray:
-    """What the ``n`` entries along a side contribute to the samples of a page, ``(SAMPLES + 1, n)``."""
+    """Return the weights of the ``n`` entries along a side in the samples of a page, ``(SAMPLES + 1, n)``."""
     if n == 1:
         return np.ones((SAMPLES + 1, 1))
     positions = np.arange(SAMPLES + 1) / SAMPLES * (n - 1)
@@ -390,9 +394,9 @@ def _tents(n: int) -> np.ndarray:
 
 
 def _windows(values: np.ndarray, border: tuple[str, str]) -> np.ndarray:
-    """
-    The samples of each page, those of its border included, ``(pages, k, SAMPLES + 1, SAMPLES + 1)``: texels, or if
-    pages are no whole number of texels wide, what lies between them.
+    """Return the samples of each page, its border included, ``(pages, k, SAMPLES + 1, SAMPLES + 1)``.
+
+    They are texels, or interpolated between texels if pages are no whole number of texels wide.
     """
     for axis, pages in enumerate(page_counts(values.shape[:2])):
         n = values.shape[axis]
@@ -403,8 +407,8 @@ def _windows(values: np.ndarray, border: tuple[str, str]) -> np.ndarray:
         one, two = (np.take(values, i, axis=axis) for i in both)
         values = one + weight * (two - one)
     side = SAMPLES + 1
-    found = np.lib.stride_tricks.sliding_window_view(values, (side, side), axis=(0, 1))[::SAMPLES, ::SAMPLES]
-    return found.reshape(-1, values.shape[2], side, side)
+    windows = np.lib.stride_tricks.sliding_window_view(values, (side, side), axis=(0, 1))[::SAMPLES, ::SAMPLES]
+    return windows.reshape(-1, values.shape[2], side, side)
 
 
 def _parts(windows: np.ndarray):
@@ -412,14 +416,14 @@ def _parts(windows: np.ndarray):
 
 
 def _errors(windows: np.ndarray) -> np.ndarray:
-    """Squared errors, ``(pages, options)``, of all resolutions: what is left of the data beside their projections."""
+    """Return the squared errors, ``(pages, options)``, of the projections of the data onto all resolutions."""
     weighted = (windows * np.outer(_ENDS, _ENDS)).astype(np.float32)
     whole = np.einsum("pkij,pkij->p", weighted, weighted, dtype=np.float64)
     bases = [np.linalg.qr(_ENDS[:, None] * _tents(n))[0].astype(np.float32) for n in SIDES]
-    found = []
+    errors = []
     for rows in bases:
         half = rows.T @ weighted
         for columns in bases:
             projected = half @ columns
-            found.append(whole - np.einsum("pkij,pkij->p", projected, projected, dtype=np.float64))
-    return np.maximum(np.stack(found, axis=1), 0)
+            errors.append(whole - np.einsum("pkij,pkij->p", projected, projected, dtype=np.float64))
+    return np.maximum(np.stack(errors, axis=1), 0)

@@ -6,8 +6,7 @@ import drjit as dr
 
 
 def box_interval(o, d, lower, upper, near, far, active) -> tuple:
-    """
-    Cut the parts ``near`` ≤ t ≤ ``far`` of rays ``o + t·d`` down to those in the box: ``(near, far, active)``.
+    """Cut the parts ``near`` ≤ t ≤ ``far`` of rays ``o + t·d`` down to those in the box: ``(near, far, active)``.
 
     ``o``, ``d`` are Dr.Jit points and vectors; ``lower``, ``upper`` the corners, three numbers each; ``near``, ``far``
     and ``active`` Dr.Jit arrays. A component of ``d`` may be zero, also along a face of the box: such a ray is active

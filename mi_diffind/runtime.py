@@ -1,15 +1,13 @@
-"""
-What has to be right before anything can run: LLVM.
+"""Choice of the LLVM library that Dr.Jit loads, and registration of the plugins.
 
-On a CPU, Dr.Jit compiles through LLVM, which it looks for the moment ``drjit`` is imported. Dr.Jit 1.5
-accepts LLVM 15 to 18, but the first kernel with a minimum or maximum then aborts the whole process (``Cannot
-select: fminimum``), which no ``try`` can catch. :func:`install` therefore chooses the library before that:
+On a CPU, Dr.Jit compiles through LLVM, which it looks for the moment ``drjit`` is imported. Dr.Jit 1.5 accepts LLVM 15
+to 18, but the first kernel with a minimum or maximum then aborts the whole process (``Cannot select: fminimum``), which
+no ``try`` can catch. :func:`install` therefore chooses the library before that:
 
-1. ``DRJIT_LIBLLVM_PATH``, if the user has set it;
-2. the library that pip installed (``karellen-llvm-core``);
-3. the system's, if it is new enough.
+1. ``DRJIT_LIBLLVM_PATH``, if the user has set it; 2. the library that pip installed (``karellen-llvm-core``); 3. the
+system's, if it is new enough.
 
-If ``drjit`` was imported first and has picked an unusable version, the choice is made again, as long as no kernel has
+If ``drjit`` was imported first and has loaded an unusable version, the choice is made again, as long as no kernel has
 run and no scene object exists. If no usable library exists, the LLVM backend is switched off, so that
 ``mi.set_variant("llvm_…")`` raises instead of aborting later; CUDA variants are not concerned.
 """
@@ -53,11 +51,10 @@ _CORRECT = "correct the path, or unset the variable to use the one of 'pip insta
 
 @dataclass(frozen=True)
 class Choice:
-    """
-    The outcome of the search for LLVM.
+    """Outcome of the search for LLVM.
 
     ``path`` is the library to use, or ``None`` to leave the search to Dr.Jit (platforms that we do not search);
-    ``origin`` says where it came from; ``problem`` is a sentence for the user if no library is usable.
+    ``origin`` says where it was found; ``problem`` is a sentence for the user if no library is usable.
     """
 
     path: str | None
@@ -66,9 +63,9 @@ class Choice:
 
 
 def library_version(path: str) -> int | None:
-    """
-    The major version of the LLVM library at ``path``: 15 if it is older than 16 (when ``LLVMGetVersion`` came),
-    ``None`` if it is no loadable LLVM library at all.
+    """Return the major version of the LLVM library at ``path``.
+
+    15 if it is older than 16 (when ``LLVMGetVersion`` was added), ``None`` if it is no loadable LLVM library.
     """
     try:
         library = ctypes.CDLL(path)  # RTLD_LOCAL: Dr.Jit's own search does not see it
@@ -84,17 +81,17 @@ def library_version(path: str) -> int | None:
 
 
 def pip_libraries() -> list[str]:
-    """Paths of the LLVM libraries that pip installed into this environment, newest first."""
-    found = []
+    """Return the paths of the LLVM libraries that pip installed into this environment, newest first."""
+    paths = []
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         files = importlib.metadata.distribution("karellen-llvm-core").files or ()
-        found += [str(Path(f.locate()).resolve()) for f in files if _named_version(f.name) is not None]
-    found += glob.glob(os.path.join(sys.prefix, "lib", "libLLVM*.so*"))
-    return _newest_first(found)
+        paths += [str(Path(f.locate()).resolve()) for f in files if _named_version(f.name) is not None]
+    paths += glob.glob(os.path.join(sys.prefix, "lib", "libLLVM*.so*"))
+    return _newest_first(paths)
 
 
 def system_libraries(patterns=_SYSTEM_PATTERNS) -> list[str]:
-    """Paths of the LLVM libraries that the operating system has, newest first."""
+    """Return the paths of the LLVM libraries of the operating system, newest first."""
     return _newest_first(path for pattern in patterns for path in glob.glob(pattern))
 
 
@@ -109,19 +106,18 @@ def _newest_first(paths) -> list[str]:
 
 
 def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, version=library_version) -> Choice:
-    """
-    Choose the LLVM library: an explicit setting wins, then pip's, then the system's. Changes nothing.
+    """Choose the LLVM library: an explicit setting wins, then pip's, then the system's. Changes nothing.
 
     The arguments exist for tests: the environment, the two searches and the function that reads a version.
     """
     explicit = environ.get(ENV)
     if explicit:
-        found = version(explicit)
-        if found is None:
+        major = version(explicit)
+        if major is None:
             problem = f"{ENV}={explicit} is not a loadable LLVM library: {_CORRECT}."
-        elif found < MIN_LLVM:
+        elif major < MIN_LLVM:
             problem = (
-                f"{ENV}={explicit} is LLVM {found if found > 15 else '15 or older'}, with which Dr.Jit aborts: "
+                f"{ENV}={explicit} is LLVM {major if major > 15 else '15 or older'}, with which Dr.Jit aborts: "
                 f"version {MIN_LLVM} or newer is needed: {_CORRECT}."
             )
         else:
@@ -134,15 +130,13 @@ def choose_llvm(environ=os.environ, pip=pip_libraries, system=system_libraries, 
     too_old = []
     for origin, paths in (("pip", pip()), ("system", system())):
         for path in paths:
-            found = version(path)
-            if found is not None and found >= MIN_LLVM:
+            major = version(path)
+            if major is not None and major >= MIN_LLVM:
                 return Choice(path, origin)
             too_old.append(path)
     seen = f" (found only {too_old[0]}, which is too old)" if too_old else ""
     return Choice(
-        None,
-        "none",
-        f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}.",
+        None, "none", f"Dr.Jit's CPU variants need LLVM {MIN_LLVM} or newer and none was found{seen}: {_ADVICE}."
     )
 
 
@@ -150,15 +144,15 @@ _problem: str | None = None
 
 
 def llvm_problem() -> str | None:
-    """The sentence that says why LLVM variants cannot run here, or ``None`` if they can."""
+    """Return the sentence that says why LLVM variants cannot run here, or ``None`` if they can."""
     return _problem
 
 
 def install(register_plugins: Callable[[], None]) -> None:
-    """
-    See to it that Dr.Jit starts with a usable LLVM and that Mitsuba knows the plugins (``register_plugins`` is called
-    once Mitsuba is there), whether these two have been imported already or will be. Called by ``import mi_diffind``,
-    which imports neither of them itself.
+    """Make Dr.Jit start with a usable LLVM, and register the plugins as soon as Mitsuba is imported.
+
+    ``import mi_diffind`` calls this, whether Dr.Jit and Mitsuba have been imported already or will be; it imports
+    neither.
     """
     hooks = {}
     if "drjit" in sys.modules:
@@ -174,9 +168,9 @@ def install(register_plugins: Callable[[], None]) -> None:
 
 
 class _Hook(importlib.abc.MetaPathFinder):
-    """
-    Opens a context around the first import of each of some packages, which others find. To be asked where a package is
-    (``importlib.util.find_spec``) is no import, and one that fails may be tried again.
+    """Context around the first import of each of some packages.
+
+    A search for a package (``importlib.util.find_spec``) is no import, and an import that fails may be tried again.
     """
 
     def __init__(self, contexts: dict):
@@ -208,7 +202,7 @@ def _followed_by(action: Callable[[], None]):
 
 @contextlib.contextmanager
 def _starting_drjit():
-    """Around the import of Dr.Jit, which then uses the library that :func:`choose_llvm` names, or none."""
+    """Surround the import of Dr.Jit, which then uses the library that :func:`choose_llvm` names, or none."""
     global _problem
     choice = choose_llvm()
     _problem = choice.problem
@@ -224,11 +218,10 @@ def _starting_drjit():
 
 
 def correct_llvm() -> Choice:
-    """
-    Make Dr.Jit, which has been imported already, use the library that :func:`choose_llvm` names.
+    """Make Dr.Jit, which has been imported already, use the library that :func:`choose_llvm` names.
 
-    Raises ``ImportError`` with one sentence if Dr.Jit already runs kernels on, or holds objects of, an LLVM that
-    would abort. Warns (``RuntimeWarning``) and switches the LLVM backend off if there is no usable library.
+    Raises ``ImportError`` with one sentence if Dr.Jit already runs kernels on, or holds objects of, an LLVM that would
+    abort. Warns (``RuntimeWarning``) and switches the LLVM backend off if there is no usable library.
     """
     global _problem
     running = compat.llvm_version()
@@ -265,8 +258,7 @@ def _hidden_llvm():
 
 
 def _restart_llvm(path: str | None) -> None:
-    """
-    Stop Dr.Jit's LLVM backend and start it again with the library at ``path`` (``None``: leave it off).
+    """Stop Dr.Jit's LLVM backend and start it again with the library at ``path`` (``None``: leave it off).
 
     Dr.Jit has no Python function for this, its library has (:class:`.compat.JitCore`). Variables survive the restart,
     registered scene objects and kernels do not.
@@ -300,10 +292,9 @@ def _restart_llvm(path: str | None) -> None:
 
 
 def array_module(variant: str | None = None):
-    """
-    The module of differentiable Dr.Jit types to compute with outside of Mitsuba: ``drjit.llvm.ad`` or
-    ``drjit.cuda.ad``, that of a Mitsuba ``variant``; ``None`` means the GPU if there is one.
+    """Return the module of differentiable Dr.Jit types to compute with outside of Mitsuba.
 
+    It is ``drjit.llvm.ad`` or ``drjit.cuda.ad``, that of a Mitsuba ``variant``; ``None`` means the GPU if there is one.
     Raises :class:`~mi_diffind.errors.UsageError` if that cannot run here.
     """
     import drjit as dr

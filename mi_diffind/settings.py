@@ -1,4 +1,4 @@
-"""How to train: settings that every task shares. Free of Dr.Jit, so that a command line can name the defaults."""
+"""Settings of a training that every task shares. Importing this imports no Dr.Jit."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class FittingError(DiffindError, RuntimeError):
 
 @dataclass(frozen=True)
 class FitSettings:
-    """
-    How to train. ``lr`` is Adam's learning rate, ``schedule`` its course: ``"constant"``, ``"cosine"`` (to zero) or
-    ``"plateau"`` (halved when the loss has not improved for a tenth of the steps). ``measure_every`` and
-    ``check_every`` are numbers of steps between measurements and between looks at the loss.
+    """Settings of a training.
 
-    With ``deterministic``, the same settings give the same bytes: the LLVM backend then trains on one core, since
-    the sums that several make together depend on who comes first (in their last digits). No effect on CUDA, where
-    sums are made by atomics.
+    ``lr`` is Adam's learning rate; ``schedule`` changes it: ``"constant"``, ``"cosine"`` (to zero) or ``"plateau"``
+    (halved when the loss has not improved for a tenth of the steps). ``measure_every`` and ``check_every`` are the
+    numbers of steps between two measurements and between two checks of the loss.
+
+    With ``deterministic``, the same settings give the same bytes: the LLVM backend then trains on one core, because the
+    last digits of a sum over several cores depend on their order. It has no effect on CUDA, which sums by atomics.
     """
 
     steps: int = 2000

@@ -1,5 +1,4 @@
-"""
-The sRGB transfer function (IEC 61966-2-1) and its inverse, for numbers, NumPy arrays and Dr.Jit arrays.
+"""The sRGB transfer function (IEC 61966-2-1) and its inverse, for numbers, NumPy arrays and Dr.Jit arrays.
 
 Importing this module imports no Dr.Jit: an array that is not NumPy's brings its own.
 """
@@ -15,15 +14,19 @@ POLYNOMIAL = (
 )
 
 
-def from_linear(values):
-    """Encode linear ``values``. Values above 1 follow the same power, negative ones the straight part."""
+def from_linear(values, fused: bool = True):
+    """Encode linear ``values``. Values above 1 follow the same power, negative ones the straight part.
+
+    For Dr.Jit arrays, ``fused`` rounds the last product and difference once, not twice; trainings differ in that.
+    """
     if isinstance(values, (np.ndarray, np.generic)):
         root = np.power(np.maximum(values, 0.0031308), 1 / 2.4)
         return np.where(values <= 0.0031308, 12.92 * values, 1.055 * root - 0.055)
     import drjit as dr
 
     root = dr.power(dr.maximum(values, 0.0031308), 1 / 2.4)
-    return dr.select(values <= 0.0031308, 12.92 * values, dr.fma(1.055, root, -0.055))
+    curve = dr.fma(1.055, root, -0.055) if fused else 1.055 * root - 0.055
+    return dr.select(values <= 0.0031308, 12.92 * values, curve)
 
 
 def to_linear(values):

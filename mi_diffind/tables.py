@@ -1,10 +1,9 @@
-"""
-The file that holds one trained thing: a ``.npz`` archive (readable by ``numpy.load``, never pickled).
+"""The table file: a ``.npz`` archive of one trained result (readable by ``numpy.load``, never pickled).
 
-It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``, or,
-of entries with fewer than 8 bits, their bits one after the other (:func:`.bits.pack_bits`), and an array ``meta`` of
-UTF-8 bytes: JSON with the format version, the task and its preset, for each array its shape, borders, storage form, and
-(of bytes) affine map and bits, the training settings, the seed and what was measured. The same content gives the same
+It contains one array for each table, ``float32``, ``float16`` or ``uint8`` entries of shape ``(N_1, …, N_d, c)``;
+entries with fewer than 8 bits are packed one after the other (:func:`.bits.pack_bits`). An array ``meta`` of UTF-8
+bytes holds JSON with the format version, the task and its preset, for each array its shape, borders, storage form, and
+(of bytes) affine map and bits, the training settings, the seed and the measurements. The same content gives the same
 bytes.
 """
 
@@ -42,10 +41,11 @@ class TableError(DiffindError, ValueError):
 
 @dataclass(frozen=True)
 class StoredArray:
-    """
-    One array as a file holds it: ``entries`` of shape ``(N_1, …, N_d, c)``, whose dtype is the ``storage`` form, and
-    the ``border`` of each axis (default: ``"clamp"``). Bytes stand for ``offset + scale · byte``, one number a channel,
-    and are stored with ``bits`` bits each, 1 to 8.
+    """One array as a file holds it.
+
+    ``entries`` have the shape ``(N_1, …, N_d, c)`` and the dtype of the ``storage`` form; ``border`` is one word an
+    axis (default: ``"clamp"``). Bytes stand for ``offset + scale · byte``, one number a channel, and are stored with
+    ``bits`` bits each, 1 to 8.
     """
 
     entries: np.ndarray
@@ -60,15 +60,15 @@ class StoredArray:
 
     @staticmethod
     def of(array: DifferentiableArray) -> StoredArray:
-        """What has to be stored of an allocated array, in its storage form."""
+        """Return the stored form of an allocated array."""
         if array.storage == "uint8":
             return StoredArray(array.codes(), array.border, array.scale, array.offset, array.bits)
         return StoredArray(array.numpy().astype(_DTYPES[array.storage]), array.border)
 
     def allocate(self, dtype, storage: str = "", fold: bool = False) -> DifferentiableArray:
-        """
-        An array of the tensor type ``dtype`` that holds these entries, in a storage form ("": this one). ``fold``: the
-        entries pass through the fold if they are floats, so that an optimiser may leave the range.
+        """Return an array of the tensor type ``dtype`` with these entries, in a storage form ("": this one).
+
+        ``fold``: float entries pass through the fold, so that an optimiser may leave the range.
         """
         form = self.to(storage or self.storage)
         affine = (form.scale, form.offset) if form.storage == "uint8" else None
@@ -77,7 +77,7 @@ class StoredArray:
         )
 
     def to(self, storage: str) -> StoredArray:
-        """In another storage form; from bytes or half precision nothing that was lost comes back."""
+        """Return the array in another storage form; precision that bytes or halves have lost does not come back."""
         if storage not in STORAGES:
             raise ValueError(f'storage: found "{storage}", allowed are {STORAGES}')
         if storage == self.storage:
@@ -112,7 +112,7 @@ class StoredArray:
 
     @property
     def is_pointer(self) -> bool:
-        """Do all entries that can be stored lie in [0, 1]? (For bytes; floats are folded when they are read.)"""
+        """Whether all bytes stand for numbers in [0, 1]. Floats are folded when they are read."""
         steps = 2**self.bits - 1
         pairs = zip(self.scale, self.offset, strict=True)
         return all(o >= 0 and s >= 0 and o + steps * s <= 1 + 1e-6 for s, o in pairs)
@@ -123,9 +123,10 @@ PAGES = "_pages"
 
 
 def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArray]:
-    """
-    What has to be stored of an allocated array, by name: one array; or of pages the entries, one after the other, and
-    as ``NAME_pages`` the sizes of pages, ``(A, …, d)``, with the borders.
+    """Return the stored form of an allocated array by name.
+
+    An array of pages gives two: its entries, and as ``NAME_pages`` the sizes of the pages, ``(A, …, d)``, with the
+    borders.
     """
     if not isinstance(array, PagedArray):
         return {name: StoredArray.of(array)}
@@ -140,9 +141,9 @@ def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArra
 def allocate_pages(
     entries: StoredArray, pages: StoredArray, dtype, shift=0.0, storage: str = "", fold: bool = False
 ) -> PagedArray:
-    """
-    The pages whose ``entries`` and sizes are stored (:func:`stored_arrays`); the rest as in
-    :meth:`.StoredArray.allocate`. Raises ``ValueError`` if they do not go together.
+    """Return the array of pages whose ``entries`` and sizes are stored (:func:`stored_arrays`).
+
+    Other parameters are those of :meth:`.StoredArray.allocate`. Raises ``ValueError`` if the two arrays do not match.
     """
     form = entries.to(storage or entries.storage)
     affine = (form.scale, form.offset) if form.storage == "uint8" else None
@@ -153,7 +154,7 @@ def allocate_pages(
 
 
 def page_sides(pages: StoredArray) -> np.ndarray:
-    """The sizes of pages. Raises ``ValueError`` for an array that holds none."""
+    """Return the sizes of pages. Raises ``ValueError`` for an array that holds none."""
     dims = pages.entries.ndim - 1
     ones = (1.0,) * dims
     if pages.shape[-1] != dims or pages.storage != "uint8" or (pages.scale, pages.offset) != (ones, ones):
@@ -162,7 +163,7 @@ def page_sides(pages: StoredArray) -> np.ndarray:
 
 
 def gathers_of(table: Table, name: str) -> int:
-    """Number of gather instructions that one read takes of an array of a table; of the sizes of pages, one."""
+    """Return the number of gather instructions of a read of an array of a table (of the sizes of pages: one)."""
     array = table.arrays[name]
     if name.endswith(PAGES) and name.removesuffix(PAGES) in table.arrays:
         return 1
@@ -176,10 +177,11 @@ def gathers_of(table: Table, name: str) -> int:
 
 @dataclass
 class Table:
-    """
-    What a table file holds: named ``arrays``, the ``task`` and the ``preset`` that they are of, the ``settings`` of the
-    training and its ``seed``, and what was ``measured`` (units in the names, e.g. ``psnr_db``). ``path`` is the file
-    that it was read from, if any.
+    """Content of a table file.
+
+    Named ``arrays``, the ``task`` and the ``preset`` that they belong to, the ``settings`` of the training and its
+    ``seed``, and the ``measured`` figures (units in the names, e.g. ``psnr_db``). ``path`` is the file that it was read
+    from, if any.
     """
 
     task: str
@@ -197,11 +199,11 @@ class Table:
 
     @property
     def storage(self) -> str:
-        """The storage form of all arrays, those of all with a "/" between them if there are several, "" of none."""
+        """Storage form of all arrays; several are joined with a "/", "" stands for no arrays."""
         return "/".join(dict.fromkeys(array.storage for array in self.arrays.values()))
 
     def to(self, storage: str) -> Table:
-        """A copy with all arrays in another storage form."""
+        """Return a copy with all arrays in another storage form."""
         return replace(self, arrays={name: array.to(storage) for name, array in self.arrays.items()})
 
 
@@ -241,8 +243,7 @@ def save_table(path: str | os.PathLike, table: Table) -> None:
 
 
 def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[str, tuple] | None = None) -> Table:
-    """
-    Read and check a table file.
+    """Read and check a table file.
 
     ``task`` and ``shapes`` (array name → shape, ``None`` in place of a free dimension) say what is expected. Raises
     :class:`TableError` with one sentence on anything else: a file that is missing, truncated or no archive, an
@@ -379,25 +380,22 @@ def _check_bits(path, name: str, bits) -> None:
 
 
 def _array(archive, info, path, name: str, dtype: np.dtype, shape: tuple | None) -> np.ndarray:
-    """One member of the archive; its header is checked against the claimed size before anything is allocated."""
+    """Read one member of the archive; its header is checked against the claimed size before memory is allocated."""
     with archive.open(info) as stream:
         try:
             version = np.lib.format.read_magic(stream)
-            reader = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }[version]
-            found_shape, fortran, found_dtype = reader(stream)
+            reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+            stored_shape, fortran, stored_dtype = reader(stream)
         except (ValueError, KeyError) as e:
             raise TableError(f'{path}: array "{name}" has a damaged header ({reason(e)})') from None
-        if found_dtype != dtype:
-            raise TableError(f'{path}: array "{name}" has the type {found_dtype}, expected {dtype}')
-        if fortran or (shape is not None and found_shape != shape):
-            raise TableError(f'{path}: array "{name}" has the shape {found_shape}, expected {shape}')
-        nbytes = math.prod(found_shape) * dtype.itemsize
+        if stored_dtype != dtype:
+            raise TableError(f'{path}: array "{name}" has the type {stored_dtype}, expected {dtype}')
+        if fortran or (shape is not None and stored_shape != shape):
+            raise TableError(f'{path}: array "{name}" has the shape {stored_shape}, expected {shape}')
+        nbytes = math.prod(stored_shape) * dtype.itemsize
         if nbytes > info.file_size:
             raise TableError(f'{path}: array "{name}" claims {nbytes:,} bytes but the file holds {info.file_size:,}')
         data = stream.read()  # checks the CRC
     if len(data) != nbytes:
         raise TableError(f'{path}: array "{name}" holds {len(data):,} bytes, expected {nbytes:,}')
-    return np.frombuffer(data, dtype).reshape(found_shape)
+    return np.frombuffer(data, dtype).reshape(stored_shape)

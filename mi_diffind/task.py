@@ -1,5 +1,4 @@
-"""
-Base classes of tasks, the registry of all tasks, and the function ``fit``.
+"""Base classes of tasks, the registry of all tasks, and the function ``fit``.
 
 A task is a ground truth, arrays that are fitted to it, and a table file that holds them. It declares itself as
 ``TASK``, a :class:`Task`, in the package ``mi_diffind/tasks/NAME`` or in a module that an entry point of the group
@@ -51,10 +50,11 @@ DATA = Path(__file__).resolve().parent / "data"
 
 @dataclass
 class FitRequest:
-    """
-    What a training is asked for: the ``preset`` and its ``settings`` as they were changed, the module of Dr.Jit
-    ``types`` to train with, the ``storage`` form of the result ("": the task's own), and the task's own arguments
-    (``options``, all of them). ``output`` is the file that the result will be written to, if it is known.
+    """Request for one training.
+
+    ``preset`` and its ``settings`` as they were changed, the module of Dr.Jit ``types`` to train with, the ``storage``
+    form of the result ("": the task's own), and the task's own arguments (``options``, all of them). ``seconds`` limits
+    the time in place of the steps; ``output`` is the file for the result, if it is known.
     """
 
     preset: str
@@ -69,7 +69,7 @@ class FitRequest:
     output: Path | None = None
 
     def train(self, problem: Problem, title: str | None = None) -> FitResult:
-        """Train a problem as it was asked for."""
+        """Train a problem with the settings of this request."""
         from .fitting import fit
 
         return fit(
@@ -77,13 +77,13 @@ class FitRequest:
         )
 
     def recorded(self) -> dict:
-        """The settings, as a table file keeps them."""
+        """Return the settings in the form in which a table file keeps them."""
         return {**asdict(self.settings), **({"seconds": self.seconds} if self.seconds is not None else {})}
 
 
 @dataclass
 class Fitted:
-    """The ``table`` that a training made, its record, further lines to print and figures for ``--json``."""
+    """Result of a training: the ``table``, the record, further lines to print and figures for ``--json``."""
 
     table: Table
     result: FitResult
@@ -92,10 +92,10 @@ class Fitted:
 
 
 class Model:
-    """
-    What a table file stands for: the base class. ``table`` is what was read and checked, ``arrays`` what it was
-    allocated as, by name, for the tensor type ``dtype``. A task's own class makes of them what can be evaluated
-    (:meth:`build`).
+    """Base class of the content of a table file, ready to be evaluated.
+
+    ``table`` is what was read and checked, ``arrays`` its arrays by name, allocated for the tensor type ``dtype``. A
+    task's own class builds from them what can be evaluated (:meth:`build`).
     """
 
     #: Storage forms that ``inspect --measure`` compares; "" means the file's own.
@@ -107,19 +107,19 @@ class Model:
 
     @property
     def types(self) -> ModuleType:
-        """The module of the Dr.Jit types to compute with."""
+        """Module of the Dr.Jit types to compute with."""
         return module_of(self.dtype)
 
     def copy(self) -> Model:
-        """A model of its own that shares the memory of this one's arrays."""
+        """Return another model that shares the memory of this one's arrays."""
         return type(self)(self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype)
 
     def build(self) -> None:
-        """Make what can be evaluated of ``arrays``."""
+        """Build what can be evaluated from ``arrays``."""
 
     @property
     def storage(self) -> str:
-        """The storage form of the arrays, those of all with a "/" between them if there are several, "" of none."""
+        """Storage form of the arrays; several are joined with a "/", "" stands for no arrays."""
         return "/".join(dict.fromkeys(array.storage for array in self.arrays.values()))
 
     @property
@@ -133,20 +133,20 @@ class Model:
         return sum(array.memory_nbytes for array in self.arrays.values())
 
     def describe(self) -> tuple[dict, list[str]]:
-        """What there is to say beyond its arrays and its training: for ``--json``, and as lines of text."""
+        """Return figures for ``--json``, and lines of text, beyond the arrays and the training."""
         return {}, []
 
     def measure(self, **options) -> dict[str, float]:
-        """
-        Errors against the truth (units in the names: ``psnr_db``). Raises
-        :class:`~mi_diffind.tables.TableError` if there is none at hand.
+        """Return errors against the truth, with units in the names (``psnr_db``).
+
+        Raises :class:`~mi_diffind.tables.TableError` if there is no truth at hand.
         """
         self._refuse("cannot be measured")
 
     def decode(self, output: Path, **options) -> list[tuple[Path, str]]:
-        """
-        Write what the table stands for, in an ordinary format, and return each file with a line about it. Raises
-        :class:`~mi_diffind.tables.TableError` if there is no such format, and
+        """Write the content in an ordinary format, and return each file with a line about it.
+
+        Raises :class:`~mi_diffind.tables.TableError` if there is no such format, and
         :class:`~mi_diffind.errors.UsageError` for bad options.
         """
         self._refuse("stand for nothing that could be decoded")
@@ -158,11 +158,10 @@ class Model:
 
 
 class Task:
-    """
-    A task: the base class. Class attributes say what it is, methods how it is done.
+    """Base class of tasks. Class attributes describe the task, methods carry it out.
 
-    A task has to have a ``name`` (that of its package), a ``title`` (what it is of, for help texts), its ``section`` in
-    the paper, ``presets`` (the first is the default), and :meth:`problem` and :meth:`table`, or a ``fit.py``.
+    A task has to have a ``name`` (that of its package), a ``title`` (for help texts), its ``section`` in the paper,
+    ``presets`` (the first is the default), and either :meth:`problem` and :meth:`table` or a ``fit.py``.
     """
 
     #: The word that stands for it on the command line and in table files.
@@ -186,12 +185,11 @@ class Task:
     # -- training ---------------------------------------------------------------------------------------------------
 
     def settings(self, preset: str, given: Mapping, options: Mapping) -> FitSettings:
-        """The settings of a preset with what was ``given`` in place of its own; ``options`` are the task's own."""
+        """Return the settings of a preset with the ``given`` ones in place; ``options`` are the task's own."""
         return dataclasses.replace(self.presets[preset], **given)
 
     def check(self, request: FitRequest) -> None:
-        """
-        Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
+        """Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
 
         Calls ``check`` of the task's ``fit.py`` if there is one.
         """
@@ -199,16 +197,15 @@ class Task:
             check(request)
 
     def problem(self, request: FitRequest) -> Problem:
-        """What is to be trained, arrays allocated."""
+        """Return the problem to train, with its arrays allocated."""
         raise NotImplementedError
 
     def table(self, problem: Problem, request: FitRequest) -> Table:
-        """The arrays of a problem, as a file holds them: in single precision, or as the task stores them."""
+        """Return the arrays of a problem as a file holds them: in single precision, or as the task stores them."""
         raise NotImplementedError
 
     def fit(self, request: FitRequest) -> Fitted:
-        """
-        Train, and measure the result in its storage form.
+        """Train, and measure the result in its storage form.
 
         Calls ``fit`` of the task's ``fit.py`` if there is one, else trains :meth:`problem` once.
         """
@@ -222,15 +219,14 @@ class Task:
         if request.seconds is not None:
             table.settings["steps"] = result.steps
         table = table.to(request.storage) if request.storage else table
-        found = self.model(table, request.types.TensorXf).measure()
-        table.measured = {k: float(f"{v:.5g}") for k, v in found.items()}
+        measured = self.model(table, request.types.TensorXf).measure()
+        table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
         return Fitted(table, result)
 
     # -- files ------------------------------------------------------------------------------------------------------
 
     def load(self, path: str | os.PathLike) -> Table:
-        """
-        Read and check a file of this task, by ``load`` of ``files.py`` if there is one.
+        """Read and check a file of this task, by ``load`` of ``files.py`` if there is one.
 
         Raises :class:`~mi_diffind.tables.TableError`.
         """
@@ -244,8 +240,7 @@ class Task:
         return self._implementation("MODEL", self.files, "model") or Model
 
     def allocate(self, table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
-        """
-        Return the arrays of a checked table for the tensor type ``dtype``, by ``allocate`` of ``files.py`` if any.
+        """Return the arrays of a checked table for the tensor type ``dtype``, by ``allocate`` of ``files.py`` if any.
 
         ``storage`` is the storage form ("": the file's own).
         """
@@ -259,17 +254,20 @@ class Task:
             package = sys.modules[cls.__module__].__package__
             for module in modules if package else ():
                 if importlib.util.find_spec(f"{package}.{module}") is not None:
-                    found = getattr(importlib.import_module(f"{package}.{module}"), name, None)
-                    if found is not None:
-                        return found
+                    implementation = getattr(importlib.import_module(f"{package}.{module}"), name, None)
+                    if implementation is not None:
+                        return implementation
         return None
 
     def model(self, table: Table, dtype, storage: str = "") -> Model:
-        """What a checked table stands for, allocated. Raises :class:`~mi_diffind.tables.TableError`."""
+        """Return the model of a checked table. Raises :class:`~mi_diffind.tables.TableError`."""
         return self.model_class()(table, self.allocate(table, dtype, storage), dtype)
 
     def file(self, filename: str | os.PathLike = "", preset: str = "") -> Path:
-        """The file that is read: ``filename``, or the one that ships for ``preset`` ("": the default)."""
+        """Return the path ``filename``, or of the file that ships for ``preset`` ("": the default).
+
+        Raises ``ValueError`` if no such file ships.
+        """
         if str(filename):
             return Path(filename)
         if not self.shipped:
@@ -279,12 +277,13 @@ class Task:
         return DATA / self.shipped[preset or next(iter(self.shipped))]
 
     def open(self, dtype, filename: str | os.PathLike = "", preset: str = "", storage: str = "") -> Model:
-        """
-        The model of ``filename`` ("": the shipped tables of ``preset``) for the tensor type ``dtype``, in a storage
-        form ("": the file's own). Raises :class:`~mi_diffind.tables.TableError` or ``ValueError``.
+        """Return the model of ``filename``, or of the shipped tables of ``preset``, for the tensor type ``dtype``.
 
-        A file is read and checked once, and what is returned shares its memory (Dr.Jit arrays are never written in
-        place), yet assigning to the arrays of one model does not change another.
+        ``storage`` is the storage form ("": the file's own). Raises :class:`~mi_diffind.tables.TableError` or
+        ``ValueError``.
+
+        A file is read and checked once. Models share its memory (Dr.Jit arrays are never written in place), yet
+        assigning to the arrays of one model does not change another.
         """
         if storage and storage not in STORAGES:
             raise ValueError(f'parameter "storage": found "{storage}", allowed are {", ".join(STORAGES)}')
@@ -298,7 +297,7 @@ class Task:
 
 
 def stamp(path: Path) -> tuple:
-    """What changes when a file does."""
+    """Return numbers that change when a file does: its time and size."""
     try:
         stat = path.stat()
     except OSError:
@@ -313,12 +312,15 @@ def _open(task: Task, path: Path, stamp: tuple, dtype, storage: str) -> Model:
 
 @functools.lru_cache
 def tasks() -> dict[str, Task]:
-    """All tasks by name: those of this package, then those that entry points add."""
-    return discovery.load(f"{__package__}.tasks", "TASK", kind=Task)
+    """Return all tasks by name: the package's own first, then those of entry points."""
+    return discovery.load(f"{__package__}.tasks", "TASK", expected=Task)
 
 
 def task_of(table: Table) -> Task:
-    """The task of a table that was read. Raises :class:`~mi_diffind.tables.TableError` if it is not installed."""
+    """Return the task of a table that was read.
+
+    Raises :class:`~mi_diffind.tables.TableError` if it is not installed.
+    """
     from .tables import TableError
 
     if table.task not in tasks():
@@ -328,7 +330,7 @@ def task_of(table: Table) -> Task:
 
 
 def load_model(path: str | os.PathLike, dtype, storage: str = "") -> Model:
-    """What a table file of any task stands for. Raises :class:`~mi_diffind.tables.TableError`."""
+    """Return the model of a table file of any task. Raises :class:`~mi_diffind.tables.TableError`."""
     from .tables import load_table
 
     task = task_of(load_table(path))
@@ -347,12 +349,13 @@ def fit(
     output: str | os.PathLike | None = None,
     **given,
 ) -> Fitted:
-    """
-    Train the tables of the task ``name`` by one of its presets ("": the default); ``given`` are settings of the
-    training (``steps``, ``lr``, …, see :class:`~mi_diffind.settings.FitSettings`) and the task's own arguments, in
-    place of the preset's. Nothing is written but the ``checkpoint``; ``output`` only says where the table will go.
+    """Train the tables of the task ``name`` by one of its presets ("": the default).
 
-    Raises :class:`~mi_diffind.errors.UsageError` for what the task does not know, and as the training does.
+    ``given`` are settings of the training (``steps``, ``lr``, …, see :class:`~mi_diffind.settings.FitSettings`) and the
+    task's own arguments, in place of the preset's. Nothing is written but the ``checkpoint``; ``output`` only says
+    where the table will go.
+
+    Raises :class:`~mi_diffind.errors.UsageError` for an unknown name or value, and as the training does.
     """
     from .runtime import array_module
 

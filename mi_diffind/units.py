@@ -1,4 +1,4 @@
-"""What users ask for: sizes in bytes, compression ratios, bits per texel."""
+"""Sizes as users write them: bytes, compression ratios, bits per texel; and the search for the largest that fits."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ _UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 
 
 def parse_compression(text: str | float) -> float:
-    """A compression ratio such as ``12x`` or ``12``. Raises ``ValueError``."""
+    """Return a compression ratio, written as ``12x`` or ``12``. Raises ``ValueError``."""
     match = re.fullmatch(rf"(?P<number>{_NUMBER})\s*[x×]?", str(text).strip(), re.IGNORECASE | re.ASCII)
     return _positive(match, text, "a compression ratio", "12x or 7.5")
 
 
 def parse_bpp(text: str | float) -> float:
-    """Bits per texel of the image, all its channels together, such as ``2``. Raises ``ValueError``."""
+    """Return a number of bits per texel of all channels together, such as ``2``. Raises ``ValueError``."""
     match = re.fullmatch(rf"(?P<number>{_NUMBER})", str(text).strip(), re.IGNORECASE | re.ASCII)
     return _positive(match, text, "a number of bits per texel", "2 or 0.5")
 
 
 def parse_bytes(text: str | float) -> int:
-    """
-    A number of bytes such as ``262144``, ``256k`` or ``1.5M`` (k = 1024, M = 1024², G = 1024³, in either case and with
-    or without ``B`` or ``iB``). Raises ``ValueError``.
+    """Return a number of bytes, written as ``262144``, ``256k`` or ``1.5M``.
+
+    k = 1024, M = 1024², G = 1024³, in either case, with or without ``B`` or ``iB``. Raises ``ValueError``.
     """
     pattern = rf"(?P<number>{_NUMBER})\s*(?P<unit>[kmg]?)(i?b)?"
     match = re.fullmatch(pattern, str(text).strip(), re.IGNORECASE | re.ASCII)
@@ -43,9 +43,9 @@ def parse_size(
     nbytes: str | float | None = None,
     bpp: str | float | None = None,
 ) -> int:
-    """
-    The bytes that are asked for (at least 1), from exactly one of a ``compression`` ratio of ``uncompressed_bytes``, a
-    number of bytes and bits for each of ``texels``. Raises ``ValueError``.
+    """Return a size in bytes (at least 1) from exactly one of a compression ratio, bytes and bits per texel.
+
+    ``compression`` divides ``uncompressed_bytes``, ``bpp`` counts bits for each of ``texels``. Raises ``ValueError``.
     """
     given = {"compression": compression, "bytes": nbytes, "bpp": bpp}
     given = {name: value for name, value in given.items() if value is not None}

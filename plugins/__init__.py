@@ -173,7 +173,7 @@ def _load() -> list[Plugin]:
     """Execute the modules of plugins afresh and return their declarations."""
     for name in discovery.modules(__name__, IGNORED).values():  # all of them first, since modules import each other
         sys.modules.pop(name, None)
-    return list(discovery.load(__name__, "PLUGIN", IGNORED, kind=Plugin).values())
+    return list(discovery.load(__name__, "PLUGIN", IGNORED, expected=Plugin).values())
 
 
 def _refusal(name: str, variant: str):

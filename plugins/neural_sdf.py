@@ -1,3 +1,5 @@
+"""Signed distance field as a shape, traced through its arrays or decoded to a grid."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 import math

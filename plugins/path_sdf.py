@@ -1,3 +1,5 @@
+"""Path tracer for scenes with signed distance fields."""
+
 from __future__ import annotations  # Delayed parsing of type annotations
 
 from functools import cache

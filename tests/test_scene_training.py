@@ -358,7 +358,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     scene = scene_file(tmp_path / "material.npz", NAMES)
     parsed = scenes.ParsedScene(scene)
     recipe = SceneRecipe(share=1.0, reference_spp=16)
-    changed = {"steps": 6, "measure_every": 3, "batch": 2048, "lr": 0.1, "schedule": "constant"}
+    changed = {"steps": 12, "measure_every": 6, "batch": 2048, "lr": 0.1, "schedule": "constant"}
     recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
 
     def fitted_scene(**more):
@@ -374,7 +374,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
 
     found, result = fitted_scene()
     history = [h["psnr_db"] for h in result.history]
-    assert result.steps == 6 and result.restarts == 0 and history[1] > history[0] + 1
+    assert result.steps == 12 and result.restarts == 0 and history[1] > history[0] + 1
     preview = np.array(mi.Bitmap(str(tmp_path / "preview.png")))
     assert preview.shape == (24, 72, 3) and np.ptp(preview[:, :48]) > 50
 

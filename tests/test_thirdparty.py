@@ -130,7 +130,7 @@ def test_inspect_and_decode(fitted, commands, tmp_path):
     assert set(forms) == {"float32", "float16", "uint8"} and forms["uint8"]["bytes"] == 80
     assert forms["float16"]["psnr_db"] == pytest.approx(found["measured"]["psnr_db"], rel=1e-4)
     assert 'output "back.png": found the extension ".png", allowed is .csv' in err
-    assert "--width is of no use for this kind of file" in err
+    assert "--width does not apply to this file" in err
     truth, back = (np.loadtxt(p, delimiter=",", skiprows=n) for p, n in ((DATA, 2), (tmp_path / "back.csv", 1)))
     np.testing.assert_allclose(back[:, 0], truth[:, 0], atol=1e-4)
     mse = np.mean(((back[:, 1] - truth[:, 1]) / 1537) ** 2)

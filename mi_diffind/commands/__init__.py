@@ -1,8 +1,7 @@
-"""
-The verbs of ``mi-diffind``, one a module, each with two functions: ``add(commands)`` defines its options, and
-``run(arguments)`` does the work and returns what ``--json`` is to write. Of the keys of that, ``interrupted`` and
-``failed`` make the exit code.
+"""Verbs of ``mi-diffind``, one a module.
 
-What imports Mitsuba's scenes, plots or measures is imported by ``run``, so that ``--help`` and a typing error are
-answered at once.
+Each module has two functions: ``add(commands)`` defines its options; ``run(arguments)`` does the work and returns what
+``--json`` writes. The keys ``interrupted`` and ``failed`` of the result decide the exit code.
+
+``run`` imports scenes, plots and measurements itself, so that ``--help`` and a typing error are answered at once.
 """

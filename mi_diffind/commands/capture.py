@@ -1,4 +1,4 @@
-"""``mi-diffind capture``: a scene from all sides, as images with poses that radiance fields are made from."""
+"""``mi-diffind capture``: views of a scene from all sides with their poses, the input of a radiance field."""
 
 from __future__ import annotations
 
@@ -16,37 +16,49 @@ def add(commands) -> None:
     sub = verb(commands, "capture", run, HELP)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument(
-        "-o", "--output", required=True, metavar="FOLDER", help="of the views; gone on with if it is there"
+        "-o", "--output", required=True, metavar="FOLDER", help="folder of the views; an unfinished one is completed"
     )
     sub.add_argument("--views", type=positive, default=60, help="views for training (default: 60)")
     sub.add_argument("--test", type=natural, default=20, help="test views between them (default: 20)")
     sub.add_argument("--resolution", type=positive, default=160, metavar="N", help="side in pixels (default: 160)")
-    sub.add_argument("--path", choices=["sphere", "orbit"], default="sphere", help="of the cameras (default: sphere)")
+    sub.add_argument(
+        "--path", choices=["sphere", "orbit"], default="sphere", help="path of the cameras (default: sphere)"
+    )
     sub.add_argument(
         "--elevation", type=float, nargs=2, metavar=("LOW", "HIGH"),
         help="degrees above the horizon (default: -90 90 for a sphere, 20 20 for an orbit, which swings between both)",
     )  # fmt: skip
-    sub.add_argument("--radius", type=float, metavar="R", help="distance of the cameras (default: all is in sight)")
+    sub.add_argument(
+        "--radius", type=float, metavar="R", help="distance of the cameras (default: the whole box is visible)"
+    )
     sub.add_argument(
         "--centre", type=float, nargs=3, metavar=("X", "Y", "Z"),
-        help="what they look at (default: the middle of the box)",
+        help="point that the cameras face (default: the middle of the box)",
     )  # fmt: skip
-    sub.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), default=(0, 1, 0), help="default: 0 1 0")
+    sub.add_argument(
+        "--up",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        default=(0, 1, 0),
+        help="upward direction (default: 0 1 0)",
+    )
     sub.add_argument("--fov", type=float, default=40.0, help="field of view in degrees (default: 40)")
     sub.add_argument(
         "--objects", nargs="+", metavar="ID", default=(),
-        help="shapes that are captured (default: all that are no lights); others only light and shade them",
+        help="shapes to capture (default: all but lights); the others only cast light and shadow",
     )  # fmt: skip
     sub.add_argument("--format", choices=["png", "exr"], default="png", help="8 bits, or linear (default: png)")
     scene_options(sub, rendering=False)
     sub.add_argument("--spp", type=positive, default=256, help="samples per pixel (default: 256)")
-    sub.add_argument("--seed", type=natural, default=0, help="of the random numbers (default: 0)")
+    sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
 
 
 def run(arguments) -> dict:
-    """
-    Render what is missing of the views. Returns what is printed; after Ctrl-C, of the views that there are. Raises
-    :class:`UsageError`, and as :mod:`mi_diffind.capture` does.
+    """Render the views that are missing and return what is printed.
+
+    After Ctrl-C, the result lists the views that exist. Raises :class:`UsageError`, and as :mod:`mi_diffind.capture`
+    does.
     """
     require_scene(arguments.scene)
     writable_folder(Path(arguments.output).parent)
@@ -64,17 +76,17 @@ def run(arguments) -> dict:
         settings.check()
     except ValueError as e:
         raise UsageError(f"--{e}") from None
-    found = capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
-    print("\n".join(capture.lines(found)))
+    captured = capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
+    print("\n".join(capture.lines(captured)))
     return {
-        "interrupted": len(found.files) < found.total,
+        "interrupted": len(captured.files) < captured.total,
         "scene": arguments.scene,
-        "output": str(found.folder),
-        "files": found.files,
-        "views": found.total,
-        "rendered": found.rendered,
-        "seconds": found.seconds,
-        "radius": found.radius,
-        "centre": found.centre.tolist(),
-        "box": found.box.tolist(),
+        "output": str(captured.folder),
+        "files": captured.files,
+        "views": captured.total,
+        "rendered": captured.rendered,
+        "seconds": captured.seconds,
+        "radius": captured.radius,
+        "centre": captured.centre.tolist(),
+        "box": captured.box.tolist(),
     }

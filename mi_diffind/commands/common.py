@@ -1,4 +1,4 @@
-"""What verbs share: kinds of arguments, options that several have, checks before the work starts."""
+"""Options that several verbs have, and checks before the work starts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..errors import UsageError
 
 
 def verb(commands, name: str, run, help: str) -> argparse.ArgumentParser:
-    """The parser of a new verb among ``commands``; what ``run(arguments)`` returns is what ``--json`` writes."""
+    """Add a verb to ``commands`` and return its parser; ``--json`` writes what ``run(arguments)`` returns."""
     sub = commands.add_parser(name, help=help, description=help)
     sub.set_defaults(run=run)
     _json_option(sub, None)
@@ -21,12 +21,12 @@ def verb(commands, name: str, run, help: str) -> argparse.ArgumentParser:
 
 
 def alternatives(sub: argparse.ArgumentParser, name: str):
-    """The subparsers of a verb that has another parser for each ``name`` (a task, a study), for :func:`alternative`."""
+    """Add subparsers to a verb, one for each ``name`` (a task, a study), to be filled by :func:`alternative`."""
     return sub.add_subparsers(dest=name, required=True, metavar=name.upper())
 
 
 def alternative(parsers, name: str, help: str) -> argparse.ArgumentParser:
-    """The parser of one of the alternatives of a verb."""
+    """Add the parser of one task or study to those of a verb."""
     sub = parsers.add_parser(name, help=help, description=help)
     _json_option(sub, argparse.SUPPRESS)  # a default would replace what was given before the task
     return sub
@@ -37,12 +37,12 @@ def _json_option(sub: argparse.ArgumentParser, default: str | None) -> None:
 
 
 def variant_option(sub: argparse.ArgumentParser) -> None:
-    """``--variant``, for :func:`set_variant`."""
+    """Add ``--variant``, for :func:`set_variant`."""
     sub.add_argument("--variant", help="Mitsuba variant (default: cuda_ad_rgb with a GPU, else llvm_ad_rgb)")
 
 
 def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
-    """``--variant``, ``-D`` (``defines``: pairs of strings) and, with ``rendering``, ``--spp`` and ``--seed``."""
+    """Add ``--variant``, ``-D`` (``defines``: pairs of strings) and, with ``rendering``, ``--spp`` and ``--seed``."""
     variant_option(sub)
     sub.add_argument(
         "-D",
@@ -62,9 +62,9 @@ def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
 
 
 def set_variant(name: str | None) -> None:
-    """
-    Set the Mitsuba variant ``name``, or, if it is ``None``, the RGB variant for the GPU if there is one, else for the
-    CPU. Raises :class:`UsageError` if it cannot run here.
+    """Set the Mitsuba variant ``name``; ``None``: the RGB variant of the GPU if there is one, else of the CPU.
+
+    Raises :class:`UsageError` if it cannot run here.
     """
     import drjit as dr
     import mitsuba as mi
@@ -85,6 +85,6 @@ def set_variant(name: str | None) -> None:
 
 
 def require_scene(path: str) -> None:
-    """Raise :class:`UsageError` if there is no file ``path``: before an output folder is made for it."""
+    """Raise :class:`UsageError` if there is no file ``path``."""
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such scene file")

@@ -1,4 +1,4 @@
-"""``mi-diffind compare``: a scene as written and with other plugins, exact ones by default, side by side."""
+"""``mi-diffind compare``: a scene as written beside the same scene with other plugins, by default exact ones."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Render the scene twice and write the pictures. Returns the figures and the ``files``. Raises
-    :class:`~mi_diffind.commands.common.UsageError`, and as :mod:`mi_diffind.compare` does.
+    """Render the scene twice, write the pictures, and return the figures and the ``files``.
+
+    Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.compare` does.
     """
     require_scene(arguments.scene)
     writable_folder(arguments.out, create=True)

@@ -1,4 +1,4 @@
-"""``mi-diffind decode``: what a table file stands for, in an ordinary format again."""
+"""``mi-diffind decode``: the content of a table file in an ordinary format."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ def add(commands) -> None:
     sub = verb(commands, "decode", run, HELP)
     sub.add_argument("file", metavar="FILE.npz")
     sub.add_argument(
-        "-o", "--output", required=True, metavar="OUT", help="file to write; of several parts, one each: OUT_NAME"
+        "-o", "--output", required=True, metavar="OUT", help="file to write; several parts become OUT_NAME each"
     )
     variant_option(sub)
     add_arguments(sub, tuple({a.name: a for task in tasks().values() for a in task.decode_arguments}.values()))
 
 
 def run(arguments) -> dict:
-    """
-    Write the files; returns their names as ``files``. Raises :class:`UsageError`,
-    :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.files.OutputError`.
+    """Write the files and return their names as ``files``.
+
+    Raises :class:`UsageError`, :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.files.OutputError`.
     """
     output = writable_file(arguments.output)
     from ..runtime import array_module
     from ..tables import load_table
 
-    own = {argument.name for argument in task_of(load_table(arguments.file)).decode_arguments}
+    accepted = {argument.name for argument in task_of(load_table(arguments.file)).decode_arguments}
     given = {a.name: getattr(arguments, a.name) for task in tasks().values() for a in task.decode_arguments}
     given = {name: value for name, value in given.items() if value is not None}
     for name in given:
-        if name not in own:
-            raise UsageError(f"{arguments.file}: --{name.replace('_', '-')} is of no use for this kind of file")
+        if name not in accepted:
+            raise UsageError(f"{arguments.file}: --{name.replace('_', '-')} does not apply to this file")
     set_variant(arguments.variant)
     model = load_model(arguments.file, array_module(arguments.variant).TensorXf)
     files = model.decode(Path(output), **given)

@@ -15,8 +15,8 @@ from .common import alternative, alternatives, set_variant, variant_option, verb
 SETTINGS = (
     ("batch", "samples a step", {"type": positive}),
     ("lr", "Adam's learning rate", {"type": float}),
-    ("loss", "what is minimised", {"choices": LOSSES}),
-    ("schedule", "of the learning rate", {"choices": SCHEDULES}),
+    ("loss", "error to minimise", {"choices": LOSSES}),
+    ("schedule", "schedule of the learning rate", {"choices": SCHEDULES}),
     ("seed", "seed of the random numbers", {"type": natural}),
 )
 
@@ -35,19 +35,23 @@ def _add(sub, task: Task) -> None:
     add_arguments(sub, task.arguments)
     sub.add_argument("-o", "--output", required=True, metavar="FILE.npz", help="table file to write")
     preset = next(iter(task.presets))
-    sub.add_argument("--preset", choices=list(task.presets), default=preset, help=f"how (default: {preset})")
+    sub.add_argument(
+        "--preset", choices=list(task.presets), default=preset, help=f"layout and training (default: {preset})"
+    )
     if task.storages:
         default = task.storages[0]
         sub.add_argument("--storage", choices=task.storages, default=default, help=f"storage form (default: {default})")
     variant_option(sub)
     length = sub.add_mutually_exclusive_group()
     length.add_argument("--steps", type=positive, help=f"optimisation steps (default: {_default(task, 'steps')})")
-    length.add_argument("--seconds", type=positive, help="time of the training, in place of steps")
-    for name, text, kind in SETTINGS:
-        sub.add_argument(f"--{name}", **kind, help=f"{text} (default: {_default(task, name)})")
-    sub.add_argument("--all-cores", action="store_true", help="faster, but not the same bytes each time")
+    length.add_argument("--seconds", type=positive, help="length of the training in seconds, in place of steps")
+    for name, text, options in SETTINGS:
+        sub.add_argument(f"--{name}", **options, help=f"{text} (default: {_default(task, name)})")
+    sub.add_argument(
+        "--all-cores", action="store_true", help="train on all cores: faster, but the bytes differ from run to run"
+    )
     sub.add_argument("--checkpoint", metavar="FILE", help="keep the state of the training in FILE")
-    sub.add_argument("--resume", action="store_true", help="go on from --checkpoint, with the same settings")
+    sub.add_argument("--resume", action="store_true", help="continue from --checkpoint, with the same settings")
 
 
 def _default(task: Task, name: str) -> str:
@@ -59,9 +63,10 @@ def _default(task: Task, name: str) -> str:
 
 
 def run(arguments) -> dict:
-    """
-    Train and write the table file. Returns its size, accuracy and how the training went; after Ctrl-C, of the best so
-    far. Raises :class:`~mi_diffind.errors.DiffindError`.
+    """Train, write the table file, and return its size, its accuracy and the history of the training.
+
+    After Ctrl-C, these are of the best state so far. Raises :class:`UsageError`,
+    :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.
     """
     output = Path(arguments.output)
     if output.suffix.lower() != ".npz":

@@ -1,4 +1,4 @@
-"""``mi-diffind inspect``: what is in a table file, or which learned plugins a scene uses."""
+"""``mi-diffind inspect``: the content of a table file, or the learned plugins of a scene."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Print what the file holds and return it. Raises :class:`UsageError`, and
-    :class:`~mi_diffind.tables.TableError` or :class:`~mi_diffind.scenes.SceneError` for a file that cannot be read.
+    """Print what the file holds and return it.
+
+    Raises :class:`UsageError`, and :class:`~mi_diffind.tables.TableError` or :class:`~mi_diffind.scenes.SceneError` for
+    a file that cannot be read.
     """
     if Path(arguments.file).suffix.lower() == ".xml":
         if arguments.measure:
@@ -75,10 +76,10 @@ def _inspect_table(arguments) -> dict:
     measured = {}
     for form in model.forms if arguments.measure else ():
         model = task.model(table, dtype, form)
-        found = model.measure()
-        measured[model.storage] = {"bytes": model.nbytes, "memory_bytes": model.memory_nbytes, **found}
+        figures_of_form = model.measure()
+        measured[model.storage] = {"bytes": model.nbytes, "memory_bytes": model.memory_nbytes, **figures_of_form}
         print(f"  as {model.storage}: {model.nbytes:,} bytes ({model.memory_nbytes:,} in memory)")
-        for key, value in found.items():
+        for key, value in figures_of_form.items():
             print(f"    {key:28} {value:.5g}")
     return {
         "file": arguments.file,
@@ -96,7 +97,7 @@ def _inspect_table(arguments) -> dict:
 
 
 def _print_rays(n: dict) -> None:
-    """What the rays of a camera read of a radiance field (:class:`mi_diffind.tasks.radiance.march.RayCounts`)."""
+    """Print what camera rays read of a radiance field (:class:`mi_diffind.tasks.radiance.march.RayCounts`)."""
     total = max(1, n["steps"])
     print(
         f"    rays      {n['crossing']:,} of {n['rays']:,} cross the field, {n['opaque']:,} of them end opaque\n"
@@ -115,22 +116,22 @@ def _inspect_scene(arguments) -> dict:
     reports = scenes.reports(parsed.load())
     total = sum(t.nbytes for t in tables.values())
     print(f"{arguments.file}: {len(learned)} learned plugin(s), {total:,} bytes of tables in {len(tables)} file(s)")
-    for found in reports:
-        given = {k: found[k] for k in ("filename", "channels") if k in found} | found["parameters"]
+    for report in reports:
+        given = {k: report[k] for k in ("filename", "channels") if k in report} | report["parameters"]
         given = (f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in given.items())
-        stored = f", {found['table_bytes']:,} bytes as {found['storage']}" if found.get("storage") else ""
-        print(f"  {found['id'] or '(no id)'}: {found['plugin']}, {', '.join(given) or 'defaults'}")
-        print(f"    preset    {found.get('preset') or '(unknown)'}{stored}")
-        if "rays" in found:
-            _print_rays(found["rays"])
-        elif found["kind"] == "shape":
-            said = (f"{text} {found[key]}".strip() for key, text in _RAYS.items() if key in found)
-            print("    rays      " + ", ".join(said))
+        stored = f", {report['table_bytes']:,} bytes as {report['storage']}" if report.get("storage") else ""
+        print(f"  {report['id'] or '(no id)'}: {report['plugin']}, {', '.join(given) or 'defaults'}")
+        print(f"    preset    {report.get('preset') or '(unknown)'}{stored}")
+        if "rays" in report:
+            _print_rays(report["rays"])
+        elif report["kind"] == "shape":
+            facts = (f"{text} {report[key]}".strip() for key, text in _RAYS.items() if key in report)
+            print("    rays      " + ", ".join(facts))
         else:
-            print(f"    in use    {', '.join(found.get('effects_in_use', ())) or 'grazing reflection only'}")
-            left_out = ", ".join(f"{k} ({v})" for k, v in found.get("effects_left_out", {}).items())
+            print(f"    in use    {', '.join(report.get('effects_in_use', ())) or 'grazing reflection only'}")
+            left_out = ", ".join(f"{k} ({v})" for k, v in report.get("effects_left_out", {}).items())
             print(f"    left out  {left_out or 'nothing'}")
-        for method, n in found["operations"].items():
+        for method, n in report["operations"].items():
             print(
                 f"    {method:9} {n['gathers']} reads of {n['bytes_gathered']} bytes, {n['flops']} flops "
                 f"({n['add']} add, {n['mul']} mul, {n['div']} div, {n['sqrt']} sqrt), {n['instructions']} instructions"

@@ -1,4 +1,4 @@
-"""``mi-diffind regress``: do scenes still render as their stored references do?"""
+"""``mi-diffind regress``: a check that scenes still render like their stored references."""
 
 from __future__ import annotations
 
@@ -18,16 +18,19 @@ def add(commands) -> None:
     sub.add_argument(
         "--references", metavar="DIR", help='folder of the references (default: "references" by the scene)'
     )
-    sub.add_argument("--out", default="out", metavar="DIR", help="folder for what a failed check saw (default: out)")
+    sub.add_argument(
+        "--out", default="out", metavar="DIR", help="folder for the pictures of failed checks (default: out)"
+    )
     sub.add_argument("--spp", type=positive, help="samples per pixel of a check (default: the reference's)")
     sub.add_argument("--seed", type=natural, help="seed of the random numbers (default: 0; --update: the reference's)")
     scene_options(sub, rendering=False)
 
 
 def run(arguments) -> dict:
-    """
-    Check each scene, or store its reference again. Returns the result of each in ``scenes`` and how many ``failed``.
-    Raises :class:`UsageError`, and as :mod:`mi_diffind.regress` does.
+    """Check each scene, or store its reference again.
+
+    Returns the result of each in ``scenes`` and the number that ``failed``. Raises :class:`UsageError`, and as
+    :mod:`mi_diffind.regress` does.
     """
     for path in arguments.scenes:
         require_scene(path)

@@ -1,4 +1,4 @@
-"""``mi-diffind render``: a scene that names learned plugins, as an image."""
+"""``mi-diffind render``: an image or an orbit of a scene that names learned plugins."""
 
 from __future__ import annotations
 
@@ -51,9 +51,10 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Render the scene and write the image. Returns what is printed, which learned plugins the scene names and how long it
-    took; after Ctrl-C of the passes that are done. Raises :class:`UsageError`, and as :mod:`mi_diffind.scenes` does.
+    """Render the scene and write the image.
+
+    Returns what is printed, the learned plugins of the scene and the times; after Ctrl-C, of the passes that are done.
+    Raises :class:`UsageError`, and as :mod:`mi_diffind.scenes` does.
     """
     from tqdm import tqdm
 
@@ -111,7 +112,7 @@ def run(arguments) -> dict:
 
 
 def _orbit(arguments, output: Path, scene, spp: int) -> dict:
-    """Render and write the frames of an orbit; after Ctrl-C, of those that are done."""
+    """Render and write the frames of an orbit; after Ctrl-C, those that are done."""
     import mitsuba as mi
     from tqdm import tqdm
 
@@ -142,20 +143,20 @@ def _orbit(arguments, output: Path, scene, spp: int) -> dict:
 
 
 def _choose_depth(arguments, parsed) -> dict:
-    """The depth to render to, and why; what was not measured is None."""
+    """Choose the depth to render to and say why; what was not measured is None."""
     from .. import depth, scenes
 
     if arguments.depth == "auto":
         tolerance = arguments.depth_tolerance or depth.TOLERANCE
-        found = depth.auto_depth(parsed, tolerance, arguments.seed)
-        print("\n".join(depth.summary(found)))
-        return {"requested": "auto", **found}
-    own = None
+        probe = depth.auto_depth(parsed, tolerance, arguments.seed)
+        print("\n".join(depth.summary(probe)))
+        return {"requested": "auto", **probe}
+    scene_depth = None
     with contextlib.suppress(scenes.SceneError):  # no integrator with a depth: fine, unless one is asked for
-        own = parsed.path_integrator()[1]
-    chosen = own if arguments.depth == "scene" else arguments.depth
+        scene_depth = parsed.path_integrator()[1]
+    chosen = scene_depth if arguments.depth == "scene" else arguments.depth
     unknown = ("tolerance", "shares", "left_out", "left_out_in_a_tile", "probe_seconds")
-    return {"requested": arguments.depth, "chosen": chosen, "scene": own, **dict.fromkeys(unknown)}
+    return {"requested": arguments.depth, "chosen": chosen, "scene": scene_depth, **dict.fromkeys(unknown)}
 
 
 def _depth(text: str) -> int | str:

@@ -1,19 +1,11 @@
-"""``mi-diffind tradeoff``: time against accuracy, of all forms of a task or of a scene."""
+"""``mi-diffind tradeoff``: time against accuracy of all forms of a task, or of a scene."""
 
 from __future__ import annotations
 
 from ..errors import UsageError
 from ..files import writable_folder
 from ..studies import studies
-from .common import (
-    alternative,
-    alternatives,
-    require_scene,
-    scene_options,
-    set_variant,
-    variant_option,
-    verb,
-)
+from .common import alternative, alternatives, require_scene, scene_options, set_variant, variant_option, verb
 
 HELP = "measure time against accuracy, of all forms of a task or of a scene"
 
@@ -34,9 +26,9 @@ def add(commands) -> None:
 
 
 def run(arguments) -> dict:
-    """
-    Measure and write table and plot. Returns the result with its ``files``; after Ctrl-C, what there is up to then.
-    Raises :class:`UsageError`, :class:`~mi_diffind.files.OutputError`, and what the study's own input may raise
+    """Measure, write table and plot, and return the result with its ``files``; after Ctrl-C, the part that is done.
+
+    Raises :class:`UsageError`, :class:`~mi_diffind.files.OutputError`, and what the study's own input raises
     (:class:`~mi_diffind.maps.source.SourceError`, :class:`~mi_diffind.scenes.SceneError`).
     """
     study = studies()[arguments.study]

@@ -18,4 +18,4 @@ from ..measure.study import Study
 @functools.lru_cache
 def studies() -> dict[str, Study]:
     """Return all studies by name: those of this package, then those of entry points."""
-    return discovery.load(__name__, "STUDY", ignored=("baselines", "equal_memory", "maps"), kind=Study)
+    return discovery.load(__name__, "STUDY", ignored=("baselines", "equal_memory", "maps"), expected=Study)

@@ -129,7 +129,7 @@ def decoded(dtype, file, stamp):
 def counterpart(mi, file, channels="albedo", **more):
     """``bitmap`` with the image that the file decodes to."""
     layout = layout_of(file)
-    bitmap = mi.Bitmap(aligned(decoded(mi.TensorXf, file, os.stat(file).st_mtime_ns)[channels]))
+    bitmap = mi.Bitmap(np.ascontiguousarray(decoded(mi.TensorXf, file, os.stat(file).st_mtime_ns)[channels]))
     bitmap.set_srgb_gamma(layout[channels].color_space == "srgb")
     raw = {"raw": True} if channels in ("normal", "roughness", "metallic") else {}
     return {"type": "bitmap", "bitmap": bitmap, "format": "variant", **raw, **more}
@@ -943,7 +943,7 @@ def test_exact_counterpart(mi_any, material):
     mi = mi_any
     folder, _, orm = material
     exact = scenes.load(folder / "scene.xml", exact=True)
-    mi.Bitmap(aligned(orm[..., 1:2])).write(str(folder / "roughness.png"))
+    mi.Bitmap(np.ascontiguousarray(orm[..., 1:2])).write(str(folder / "roughness.png"))
     textures = (
         '<texture type="bitmap" name="base_color"><string name="filename" value="albedo.png"/></texture>'
         '<texture type="bitmap" name="roughness"><string name="filename" value="roughness.png"/>'

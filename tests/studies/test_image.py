@@ -31,8 +31,8 @@ def smooth(height, width, channels, seed=0):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def asked():
-    """The seconds that trainings were asked to take; they take :data:`STEPS` steps."""
+def requested_seconds():
+    """The seconds that trainings were requested_seconds to take; they take :data:`STEPS` steps."""
     seconds, fit_image = [], training.fit_image
 
     def stepwise(source, size, recipe, request, *options):
@@ -47,7 +47,7 @@ def asked():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, asked):
+def folder(tmp_path_factory, requested_seconds):
     """A material of three maps, and what a quick run leaves of it."""
     import mitsuba as mi
 
@@ -60,20 +60,20 @@ def folder(tmp_path_factory, asked):
     (folder / "m.json").write_text(json.dumps({name: f"{name}.png" for name in maps}))
     command = ["tradeoff", "image", str(folder / "m.json"), "--quick", "--seconds", "3", "--dims", "4"]
     assert main([*command, "--out", str(folder / "out"), "--json", str(folder / "r.json")]) == 0
-    assert asked == [3, 3]
+    assert requested_seconds == [3, 3]
     return folder
 
 
 def test_what_is_written(folder):
     result = json.loads((folder / "r.json").read_text())
-    made = {name: c for name, c in result["candidates"].items() if not c["is_reference"]}
+    candidates = {name: c for name, c in result["candidates"].items() if not c["is_reference"]}
     trained = ["ours 12x 3 s", "paper 12x 3 s"]
-    assert set(trained) <= set(made)
-    for name, c in made.items():
+    assert set(trained) <= set(candidates)
+    for name, c in candidates.items():
         assert c["bytes"] > 0 and math.isfinite(c["errors"]["psnr_db"]), name
         assert c["competes"] == ("JPEG" not in name and "WebP" not in name), name
     for name in trained:
-        c = made[name]
+        c = candidates[name]
         assert c["details"]["ratio"] == pytest.approx(12, rel=0.05) and c["details"]["steps"] == STEPS
         assert c["bytes"] * c["details"]["ratio"] == pytest.approx(result["details"]["source_bytes"])
         assert c["training_seconds"] > 0 and c["details"]["seconds_asked"] == 3
@@ -87,7 +87,7 @@ def test_what_is_written(folder):
     assert {r["candidate"] for r in table} == set(result["candidates"])
     by_name = {r["candidate"]: r for r in table}
     assert by_name["paper 12x 3 s"]["case"] == "coherent places" and by_name["bicubic 12x"]["case"] == ""
-    for name, c in made.items():
+    for name, c in candidates.items():
         assert float(by_name[name]["psnr_normal_db"]) == pytest.approx(c["errors"]["psnr_normal_db"], rel=1e-5)
     assert (folder / "out" / "tradeoff_image.png").stat().st_size > 10_000
     assert not list((folder / "out").glob("*.partial*"))
@@ -172,18 +172,18 @@ def test_verdicts():
         errors = {"psnr_db": psnr, "psnr_between_db": psnr, "psnr_mean_db": psnr, "flip": flip}
         return {"details": {"kind": kind, "compression": compression}, "in_picture": in_picture, "errors": errors}
 
-    made = {
+    candidates = {
         "ours": candidate("indirection", 40.0, 0.02), "worse": candidate("indirection", 30.0, 0.03),
         "without": candidate("indirection", 50.0, 0.0, in_picture=False), "blocks": candidate("ASTC", 39.0, 0.01),
         "ours at 6": candidate("indirection", 45.0, 0.01, 6.0),
     }  # fmt: skip
-    (line,) = conclusions.conclusions({"candidates": made})
+    (line,) = conclusions.conclusions({"candidates": candidates})
     assert line.startswith("12x, ours and blocks: PSNR 40.00 against 39.00: ours; ")
     assert line.endswith("FLIP 0.0200 against 0.0100: ASTC")
 
 
 def test_a_run_goes_on(folder, tmp_path, capfd, monkeypatch):
-    """After Ctrl-C in the second training, the first is not made again; its file has to be there."""
+    """After Ctrl-C in the second training, the first is not trained again if its file exists."""
     import signal
 
     step, seen = fitting._Trainer.take_step, []
@@ -202,8 +202,8 @@ def test_a_run_goes_on(folder, tmp_path, capfd, monkeypatch):
         assert main(command) == 130
     assert (tmp_path / "tradeoff_image.partial.json").is_file()
     result = json.loads((tmp_path / "tradeoff_image.json").read_text())
-    made = [name for name, c in result["candidates"].items() if not c["is_reference"]]
-    assert result["interrupted"] and made == ["ours 12x 1 s"]
+    candidates = [name for name, c in result["candidates"].items() if not c["is_reference"]]
+    assert result["interrupted"] and candidates == ["ours 12x 1 s"]
     capfd.readouterr()
     assert main(command) == 0
     out, err = capfd.readouterr()

@@ -345,18 +345,24 @@ def test_what_is_written(folder):
     assert result["conclusions"][0].startswith("24 KiB: ")
 
 
-def test_what_was_made_is_known(folder):
+@pytest.fixture(scope="module")
+def planned(folder):
+    """The plan for two budgets, the first of which is that of the folder's run, and its records of an earlier run."""
     import mitsuba as mi
 
     from mi_diffind.tasks.sdf.mesh import load_mesh
 
     assert mi.variant() == "llvm_ad_rgb"
+    settings, before = DistanceStudySettings((24576, 32768), tuple(LEFT_OUT)), {}
+    return plan_of(load_mesh(folder / "dent.ply"), str(folder / "dent.ply"), settings, before), before
+
+
+def test_trained_models_are_cached(folder, planned):
     result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
-    request = DistanceStudySettings((24576,), tuple(LEFT_OUT))
-    plan = plan_of(load_mesh(folder / "dent.ply"), str(folder / "dent.ply"), request)
-    assert [job.name for job in plan.jobs] == list(result["jobs"])
+    jobs = planned[0].jobs[:2]
+    assert [job.name for job in jobs] == list(result["jobs"])
     models = folder / "out" / "tradeoff_sdf_models"
-    for job in plan.jobs:
+    for job in jobs:
         record = result["jobs"][job.name]
         assert job.cached_record(models, None) is None and job.cached_record(None, record) is None
         assert job.cached_record(models, record) == record
@@ -416,19 +422,14 @@ def test_parts_are_jobs(tmp_path):
     assert not np.array_equal(*(job.model.state["numbers"] for job in plan.jobs[1:]))
 
 
-def test_errors_of_an_earlier_run(folder):
-    """They stand for what is not timed; what is timed is made unless its file is there."""
-    from mi_diffind.tasks.sdf.mesh import load_mesh
-
-    request = DistanceStudySettings((24576, 32768), tuple(LEFT_OUT))
-    mesh, models = load_mesh(folder / "dent.ply"), folder / "out" / "tradeoff_sdf_models"
-    plan = plan_of(mesh, str(folder / "dent.ply"), request)
-    assert [job.cached_record(models, None) for job in plan.jobs] == [None] * 4
-    before = {job.name: {"name": job.name} for job in plan.jobs}
-    plan = plan_of(mesh, str(folder / "dent.ply"), request, before)
-    assert [job.cached_record(models, None) for job in plan.jobs] == list(before.values())
-    assert [job.cached_record(None, None) for job in plan.jobs] == [None, None, *list(before.values())[2:]]
-    assert plan.jobs[0].cached_record(models, {"own": 1}) == {"own": 1}
+def test_errors_of_an_earlier_run(folder, planned):
+    """They stand for contenders that are not timed; those that are timed are trained unless their files are there."""
+    jobs, before, models = planned[0].jobs, planned[1], folder / "out" / "tradeoff_sdf_models"
+    assert [job.cached_record(models, None) for job in jobs] == [None] * 4
+    before |= {job.name: {"name": job.name} for job in jobs}
+    assert [job.cached_record(models, None) for job in jobs] == list(before.values())
+    assert [job.cached_record(None, None) for job in jobs] == [None, None, *list(before.values())[2:]]
+    assert jobs[0].cached_record(models, {"own": 1}) == {"own": 1}
 
 
 def result_of(**errors):

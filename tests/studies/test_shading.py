@@ -12,7 +12,7 @@ from mi_diffind.cli import main
 from mi_diffind.studies.shading import conclusions, materials
 
 
-def test_made_materials():
+def test_generated_materials():
     """They repeat, have unit normals and are what they are called."""
     for name in materials.MATERIALS:
         found = {m.name: m for m in materials.generated_source(name, 64).maps}
@@ -152,7 +152,7 @@ COMMAND = ["--quick", "--lambda", "1", "--remedies", "on", "--side", "16", "--fr
 
 
 def test_what_is_written(tmp_path, monkeypatch, capsys):
-    """A whole run, interrupted in the last training, and gone on with: what was made is not made again."""
+    """A whole run, interrupted in the last training and continued: finished trainings are not repeated."""
     out = tmp_path / "out"
     command = ["tradeoff", "shading", "lacquer", *COMMAND, "--out", str(out), "--json", str(tmp_path / "r.json")]
     trained, take_step = [], fitting._Trainer.take_step
@@ -195,14 +195,14 @@ def test_what_is_written(tmp_path, monkeypatch, capsys):
         e = c["errors"]
         assert {"c_mean_db", "p_mean_db", "c_coarse_db", "c_l0_db", "c_flip", "flicker", "flicker_error"} <= set(e)
         assert np.isfinite(list(e.values())).all() and 5 < e["c_mean_db"] < 60
-    made = result["candidates"]
-    assert made["lacquer, lambda 1, clip, schedule"]["bytes"] < made["lacquer, filtered"]["bytes"] / 6
+    candidates = result["candidates"]
+    assert candidates["lacquer, lambda 1, clip, schedule"]["bytes"] < candidates["lacquer, filtered"]["bytes"] / 6
     record = result["jobs"]["lacquer, lambda 1, clip, schedule, seed 0"]["details"]
     assert record["share"] == 1 and record["clip"] and record["restarts"] == 0 and len(record["C"]["psnr_db"]) == 3
     with open(out / "tradeoff_shading.csv", encoding="utf-8") as stream:
         rows = {r["candidate"]: r for r in csv.DictReader(stream)}
     assert float(rows["lacquer, LEAN"]["c_mean_db"]) == pytest.approx(
-        made["lacquer, LEAN"]["errors"]["c_mean_db"], rel=1e-4
+        candidates["lacquer, LEAN"]["errors"]["c_mean_db"], rel=1e-4
     )
     for kind in ("", "_levels", "_strip", "_zoom"):
         assert (out / f"tradeoff_shading{kind}.png").stat().st_size > 10_000

@@ -258,22 +258,22 @@ def test_what_is_written(small):
     plan = plans.plan(load_source(path), str(path), settings, reads=plans.READS[:1], more_reads=(), scenes=scenes)
     result, summary = quick_result(plan, folder / "out")
     assert requests == [("texture", "", 3), ("texture", "paper", 3)]
-    made = result["candidates"]
+    candidates = result["candidates"]
     blocks = ["ASTC 12x, trilinear"] * ("astc" in codecs.available())
     filtered = ["mipmap, trilinear", "ours 12x, trilinear", "paper 12x, trilinear", *blocks]
     bitmaps = [f"bitmap, {n} spp" for n in (1, 4, 16, 64)] + [f"bitmap, {n} spp, multijittered" for n in (4, 16, 64)]
-    assert set(made) == {*filtered, *bitmaps}
-    assert made["mipmap, trilinear"]["bytes"] == 4 * sum(4**i for i in range(6))
-    assert made["bitmap, 1 spp"]["bytes"] == 4 * 32 * 32
+    assert set(candidates) == {*filtered, *bitmaps}
+    assert candidates["mipmap, trilinear"]["bytes"] == 4 * sum(4**i for i in range(6))
+    assert candidates["bitmap, 1 spp"]["bytes"] == 4 * 32 * 32
     for name in blocks:
-        assert 0 < made[name]["bytes"] <= made["ours 12x, trilinear"]["bytes"]
-    order = [made[f"bitmap, {n} spp"]["errors"]["psnr_plane_db"] for n in (1, 4, 16, 64)]
+        assert 0 < candidates[name]["bytes"] <= candidates["ours 12x, trilinear"]["bytes"]
+    order = [candidates[f"bitmap, {n} spp"]["errors"]["psnr_plane_db"] for n in (1, 4, 16, 64)]
     assert order == sorted(order) and order[-1] - order[0] == pytest.approx(10 * math.log10(64), abs=5)
-    flicker = [made[f"bitmap, {n} spp"]["errors"]["flicker_error"] for n in (1, 4, 16, 64)]
+    flicker = [candidates[f"bitmap, {n} spp"]["errors"]["flicker_error"] for n in (1, 4, 16, 64)]
     assert flicker == sorted(flicker, reverse=True)
-    assert made["mipmap, trilinear"]["errors"]["psnr_plane_db"] > order[0] + 1
+    assert candidates["mipmap, trilinear"]["errors"]["psnr_plane_db"] > order[0] + 1
     case = result["cases"]["plane"]
-    assert set(case["passes"]["render"]) == set(made)
+    assert set(case["passes"]["render"]) == set(candidates)
     assert set(case["queries"]["read"]) == {"bitmap, 1 spp", *filtered}
     for name in ("ours 12x", "paper 12x"):
         found = result["jobs"][name]["details"]["levels"]
@@ -281,13 +281,13 @@ def test_what_is_written(small):
     (panel,) = [p for p in panels(result) if p.title == "plane"]
     assert panel.x_label == "time of one render, ms" and not panel.lines
     assert {p.name: p.accuracy for p in panel.points} == {
-        n: c["errors"]["psnr_plane_db"] for n, c in made.items() if c["in_picture"]
+        n: c["errors"]["psnr_plane_db"] for n, c in candidates.items() if c["in_picture"]
     }
-    fronts = {n: t["on_front"] for n, t in case["passes"]["render"].items() if made[n]["in_picture"]}
+    fronts = {n: t["on_front"] for n, t in case["passes"]["render"].items() if candidates[n]["in_picture"]}
     assert {p.name: p.on_front for p in panel.points} == fronts and any(fronts.values())
     with open(folder / "out" / "tradeoff_texture.csv", encoding="utf-8") as stream:
         table = list(csv.DictReader(stream))
-    assert {(r["candidate"], r["query"]) for r in table} >= {(n, "render") for n in made}
+    assert {(r["candidate"], r["query"]) for r in table} >= {(n, "render") for n in candidates}
     for kind in ("", "_crops", "_zoom", "_levels"):
         assert (folder / "out" / f"tradeoff_texture{kind}.png").stat().st_size > 10_000
     assert not list((folder / "out").glob("*.partial*"))

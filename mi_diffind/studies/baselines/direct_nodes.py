@@ -1,11 +1,10 @@
 """
-What is left of our sparse signed distance fields without indirection: a distance and a normal in the 16 bits of each
-node, trained as ours are, and read by the same blend.
+Sparse signed distance fields without indirection: a distance and a normal in the 16 bits of each node.
+
+Nodes are trained and blended as those of our layout.
 """
 
 from __future__ import annotations
-
-import dataclasses
 
 import drjit as dr
 import numpy as np
@@ -14,14 +13,15 @@ from ...tasks.sdf import codes, encoding
 from ...tasks.sdf.nodes import SparseNodes, slope_bound
 from ...tasks.sdf.structure import Structure
 from .byte_grids import NEAREST
+from .volumes import structure_arrays
 
-#: Steps of a distance between ± :data:`.byte_grids.NEAREST`, and of each of the normal's octahedral coordinates: of all
-#: that 16 bits can tell apart, those with the best normals.
+#: Steps of a distance between ± :data:`.byte_grids.NEAREST`, and of each of the normal's octahedral coordinates: the
+#: combination of 16 bits with the best normals.
 LEVELS, SIDE = 128, 22
 
 
 def to_octahedral(normals: np.ndarray) -> np.ndarray:
-    """The whole numbers (n, 2) below :data:`SIDE` whose unit vectors are nearest to ``normals`` (n, 3)."""
+    """Return the octahedral coordinates (n, 2), integers below :data:`SIDE`, nearest to ``normals`` (n, 3)."""
     n = normals / np.maximum(np.abs(normals).sum(axis=1, keepdims=True), 1e-30)
     folded = (1 - np.abs(n[:, 1::-1])) * np.where(n[:, :2] >= 0, 1, -1)
     top = SIDE - 1
@@ -32,33 +32,32 @@ def to_octahedral(normals: np.ndarray) -> np.ndarray:
 
 
 def octahedral(numbers: np.ndarray) -> np.ndarray:
-    """The unit vectors (…, 3) that whole numbers (…, 2) stand for."""
+    """Return the unit vectors (…, 3) of integer octahedral coordinates (…, 2)."""
     x, y = np.moveaxis(numbers * (2 / (SIDE - 1)) - 1, -1, 0)
     z = 1 - np.abs(x) - np.abs(y)
     t = np.maximum(-z, 0)
-    found = np.stack([x - np.copysign(t, x), y - np.copysign(t, y), z], axis=-1)
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    vectors = np.stack([x - np.copysign(t, x), y - np.copysign(t, y), z], axis=-1)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _distances(numbers: np.ndarray) -> np.ndarray:
-    """The distances, in spacings, of what nodes hold."""
+    """Return the distances of stored numbers, in spacings."""
     return (numbers % LEVELS + 0.5 * (1 - LEVELS)) * (2 * NEAREST / LEVELS)
 
 
 def _normals(numbers: np.ndarray) -> np.ndarray:
-    """The whole numbers (n, 2) of the normals of what nodes hold."""
+    """Return the octahedral coordinates (n, 2) of stored numbers."""
     return np.stack([numbers // LEVELS % SIDE, numbers // (LEVELS * SIDE)], axis=-1).astype(np.uint32)
 
 
 class DirectNodes(SparseNodes):
-    """The nodes of a sparse ``structure`` as ``numbers`` (n,), uint16, in its order."""
+    """Field of a sparse ``structure`` whose nodes are ``numbers`` (n,), uint16, in its order."""
 
     def __init__(self, types, structure: Structure, numbers: np.ndarray, slope: float):
         words = codes.pointer_words(numbers, 16)
         super().__init__(types, structure, slope, pointers=words, bits=16)
-        self.state = {"numbers": numbers, "slope": slope}
-        self.state |= {f"structure_{f.name}": getattr(structure, f.name) for f in dataclasses.fields(structure)}
-        self.kept = 4 * len(words)
+        self.state = {"numbers": numbers, "slope": slope, **structure_arrays(structure)}
+        self.number_bytes = 4 * len(words)
 
     def _node(self, number, record, i, j, k, active):
         Float, number = self.types.Float, codes.pointer_at(self._pointers, number, 16, active)
@@ -74,13 +73,14 @@ class DirectNodes(SparseNodes):
 
     @property
     def nbytes(self) -> int:
-        return self.structure.nbytes + self.kept
+        return self.structure.nbytes + self.number_bytes
 
 
 class DirectCoding(encoding.NodeCoding):
     """
-    In place of frames, a cascaded array and pointers: the ``pointers`` are numbers that say it all. No node changes its
-    side; the surface stays within the cells.
+    Codes of nodes without frames and cascaded array: ``pointers`` hold a distance and a normal each.
+
+    As in the base class, no node changes its side, and the surface stays within the stored cells.
     """
 
     def __init__(self, sampled: encoding.SampledNodes, seed: int = 0):
@@ -110,7 +110,7 @@ class DirectCoding(encoding.NodeCoding):
 
     def _keep_sides(self, wanted: np.ndarray, nodes: np.ndarray) -> None:
         wrong = nodes[self._distances(nodes, self.pointers[nodes, None])[:, 0] < self.least[nodes]]
-        # Up to the next step
+        # Half a step more, so that quantisation does not round the distance down below the least one
         least = self.least[wrong] + NEAREST / LEVELS
         self._write(wrong, self.side[wrong] * least, _normals(self.pointers[wrong]))
 
@@ -119,7 +119,7 @@ class DirectCoding(encoding.NodeCoding):
         return np.concatenate([_distances(self.pointers)[:, None], normals], axis=1).astype(np.float32)
 
     def field(self, types) -> DirectNodes:
-        """What it decided on."""
-        told = self.values().astype(np.float64)
-        slope = slope_bound(told[:, 0], told[:, 1:], self.sampled.corners)
+        """Return the field of the chosen codes."""
+        values = self.values().astype(np.float64)
+        slope = slope_bound(values[:, 0], values[:, 1:], self.sampled.corners)
         return DirectNodes(types, self.sampled.structure, self.pointers.astype(np.uint16), slope)

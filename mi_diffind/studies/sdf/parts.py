@@ -1,8 +1,8 @@
 """
 Ablation: contenders that leave out or change a part of our layout, in equal bytes.
 
-Distances and normals that stay as they were sampled, and all of a node in its 16 bits,
-without frames and cascaded array (:mod:`..baselines.direct_nodes`).
+The parts: the training, so that distances and normals stay as they were sampled; and indirection, so that the 16 bits
+of a node hold its distance and normal, without frames and cascaded array (:mod:`..baselines.direct_nodes`).
 """
 
 from __future__ import annotations

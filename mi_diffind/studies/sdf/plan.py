@@ -74,7 +74,7 @@ def plan(mesh: Mesh, name: str, settings: DistanceStudySettings, before: dict[st
 
     ``before``: records of an earlier run, which are taken over at all budgets but the first.
     """
-    context = DistanceStudyContext(mesh, name, settings, array_module(mi.variant()), before or {})
+    context = DistanceStudyContext(mesh, name, settings, array_module(mi.variant()), {} if before is None else before)
     methods, first = PARTS if settings.ablation else METHODS, settings.sizes[0]
     pairs = equal_memory.combinations(methods, settings.sizes, FIRST_ONLY, settings.without)
     jobs = {job.name: job for job in (contender(method, nbytes, context) for method, nbytes in pairs)}

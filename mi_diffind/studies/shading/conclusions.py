@@ -147,11 +147,11 @@ def conclusions(result: dict) -> list[str]:
     runs: dict[str, list[dict]] = {}
     for material in materials:
         for (remedy, share), details in material.runs.items():
-            runs.setdefault(remedy, []).extend(details if share > 0 else [])
+            if share > 0:
+                runs.setdefault(remedy, []).extend(details)
     for remedy, details in runs.items():
         counts = [f"{sum(name in d['trouble'] for d in details)} {phrase}" for name, phrase in _PHRASES.items()]
-        if details:
-            lines.append(f"{remedy}: of {len(details)} runs with lambda > 0, {enumeration(counts)}")
+        lines.append(f"{remedy}: of {len(details)} runs with lambda > 0, {enumeration(counts)}")
     return lines
 
 

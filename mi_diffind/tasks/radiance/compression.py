@@ -21,7 +21,7 @@ from .training import FieldSession, ImagesProblem, ViewImages
 from .volume_field import NodeField, PackedPaletteField
 
 #: Raw densities of the first and the last density level: empty, and opaque.
-EMPTIEST, DENSEST = -7.0, 12.0
+EMPTIEST, DENSEST = -7.0, 8.0
 
 #: Bits of a density level, the number of the last level, and the raw density from one level to the next.
 DENSITY_BITS = 6
@@ -133,11 +133,16 @@ class PaletteProblem(ImagesProblem):
         self.range = [self.session.types.Float(np.float32(v)) for v in byte_range(self.net["palette"].numpy())]
 
     def stored(self) -> dict[str, np.ndarray]:
-        """Return the stored arrays: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``."""
+        """
+        Return what is stored: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``.
+
+        ``density_range`` holds the raw density of level 0 and the step from one level to the next.
+        """
         palette = self.net["palette"].numpy()
         scale, offset = byte_range(palette)
         return {
             "levels": np.rint(fold(self.net["density"].array).numpy().astype(np.float64) * LAST_LEVEL).astype(np.uint8),
+            "density_range": (EMPTIEST, LEVEL_STEP),
             "index": self.coding.index,
             "palette": np.clip(np.rint((palette - offset) / scale), 0, 255).astype(np.uint8),
             "scale": scale,
@@ -154,7 +159,7 @@ def byte_range(palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def packed_field(nodes: Nodes, stored: dict, index_bits: int) -> PackedPaletteField:
     """Return the field of what :meth:`PaletteProblem.stored` returned, on ``nodes`` with a packed index."""
     return PackedPaletteField(
-        nodes, stored["levels"], DENSITY_BITS, (EMPTIEST, LEVEL_STEP), stored["index"], index_bits, stored["palette"],
+        nodes, stored["levels"], DENSITY_BITS, stored["density_range"], stored["index"], index_bits, stored["palette"],
         stored["scale"], stored["offset"],
     )  # fmt: skip
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...indirection import Indirection
 from ...tables import StoredArray, Table, TableError, load_table
-from .compression import EMPTIEST, INDEX_BITS, LAST_LEVEL, LEVEL_STEP, packed_field
+from .compression import INDEX_BITS, LAST_LEVEL, packed_field
 from .nodes import Nodes
 from .paper import PairsField
 from .volume_field import NodeField, VolumeField
@@ -45,7 +45,8 @@ def palette_table(nodes: Nodes, stored: dict, index_bits: int) -> Table:
     """Return the table of what :meth:`.compression.PaletteProblem.stored` returned."""
     arrays, settings = stored_nodes(nodes)
     index = stored["index"].astype(np.uint32)
-    arrays["density"] = byte_array(stored["levels"][:, None], LEVEL_STEP, EMPTIEST)
+    offset, scale = stored["density_range"]
+    arrays["density"] = byte_array(stored["levels"][:, None], scale, offset)
     arrays["index"] = byte_array(np.stack([index & 255, index >> 8], axis=1))
     arrays["palette"] = StoredArray(stored["palette"], (), tuple(stored["scale"]), tuple(stored["offset"]))
     return Table("field", arrays, settings={"layout": "sparse", "index_bits": index_bits, **settings})
@@ -162,7 +163,7 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
     if floats:
         return NodeField(nodes, tensor(density.values[:, 0]), tensor(palette.values), types.UInt32(index))
     stored = {
-        "levels": density.entries[:, 0], "index": index, "palette": palette.entries, "scale": palette.scale,
-        "offset": palette.offset,
+        "levels": density.entries[:, 0], "density_range": (density.offset[0], density.scale[0]), "index": index,
+        "palette": palette.entries, "scale": palette.scale, "offset": palette.offset,
     }  # fmt: skip
     return packed_field(nodes, stored, settings["index_bits"])

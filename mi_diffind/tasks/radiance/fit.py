@@ -130,7 +130,8 @@ class FieldFit:
         if path and not result.interrupted:  # the next run would take an interrupted grid for a finished one
             table = self.grid_table(grid)
             table.preset, table.settings["source"] = "grid", views.digest
-            table.measured = rounded_figures(result.measured)
+            stored = files.field_of(table, request.types)  # without invisible cells, in half precision
+            table.measured = rounded_figures(self.session.held_out_images.evaluate(stored))
             save_table(path, table)
             grid = grid_of(files.load(path), request.types)
         return grid, result

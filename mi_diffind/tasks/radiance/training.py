@@ -149,9 +149,10 @@ class ImagesProblem(Problem):
         seen = differentiable(self.field_of(net), o, d, 0, dr.inf, True, offset)
         total = types.Float(0)
         for c in range(3):
-            reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1))
+            reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1), fused=False)
             # The prediction is not clamped at white: its slope leads back into the range
-            total += dr.square(srgb.from_linear(seen.colour[c] + seen.transmittance * grey) - reference)
+            shown = srgb.from_linear(seen.colour[c] + seen.transmittance * grey, fused=False)
+            total += dr.square(shown - reference)
         return total * (1 / (3 * count))
 
     def measure(self, net):

@@ -169,7 +169,7 @@ def test_same_command_same_file(folder, tmp_path):
 
 def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
     """In the second stage of the grid: the first is not made again, and the result is that of an unbroken run."""
-    options = {"source": str(folder), "resolution": 24, "batch": 1024, "steps": 60, "variant": "llvm_ad_rgb"}
+    options = {"source": str(folder), "resolution": 24, "batch": 512, "steps": 40, "variant": "llvm_ad_rgb"}
     whole = fit("field", preset="grid", progress=False, **options).table
     stages, ended = [], []
 

@@ -23,6 +23,7 @@ from mi_diffind.tasks.sdf.distances import Distances
 from mi_diffind.tasks.sdf.evaluation import SurfaceEvaluation
 from mi_diffind.tasks.sdf.mesh import load_mesh
 from mi_diffind.tasks.sdf.model import SdfModel
+from mi_diffind.tasks.sdf.tracing import trace
 
 BYTES = 96 * 1024
 SHORT = ["--steps", "60", "--batch", "16384", "--variant", "llvm_ad_rgb"]
@@ -169,6 +170,18 @@ def test_decoded_nodes_are_the_field(folder, ad, rng):
     p = ad.Array3f(*rng.uniform(field.lower, field.upper, (20000, 3)).T.astype(np.float32))
     assert np.abs(field.value(p).numpy() - other.value(p).numpy()).max() < 0.02 * field.spacing
     assert other.nodes.shape == (field.structure.nodes, 4) and field.nodes is None
+
+
+def test_files_with_bounds_of_empty_regions(folder, tmp_path, ad, rng):
+    """Earlier files hold a bound of the distance above an empty region's sign: it is ignored."""
+    table = load_table(folder / "solids.npz")
+    damaged(table, "regions", lambda a: a.__setitem__(a != 255, a[a != 255] | 6))
+    save_table(tmp_path / "old.npz", table)
+    fields = [opened(path, ad).field for path in (folder / "solids.npz", tmp_path / "old.npz")]
+    p = ad.Array3f(*rng.uniform(fields[0].lower, fields[0].upper, (20000, 3)).T.astype(np.float32))
+    assert np.array_equal(*(field.value(p).numpy() for field in fields))
+    origin, direction = ad.Array3f(-2 * p), ad.Array3f(dr.normalize(p))
+    assert np.array_equal(*(trace(field, origin, direction, 9.0)[0].numpy() for field in fields))
 
 
 def test_decode_and_inspect(folder, tmp_path, capsys):
