@@ -1,5 +1,4 @@
-"""
-Views of a scene from all sides, with camera poses, in the layout of NeRF's Blender data (Mildenhall et al. 2020).
+"""Views of a scene from all sides, with camera poses, in the layout of NeRF's Blender data (Mildenhall et al. 2020).
 
 A folder holds ``transforms_train.json``, ``transforms_test.json`` and an image with alpha for each view. Images show
 the scene's surfaces in its light; lights, environments included, are hidden and leave alpha 0. Poses and boxes are in
@@ -56,8 +55,7 @@ class CaptureError(DiffindError, RuntimeError):
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """
-    Settings of a capture: number and size of the views, samples, camera path.
+    """Settings of a capture: number and size of the views, samples, camera path.
 
     ``views`` are for training, ``test`` further ones for tests: square images of ``resolution`` pixels with a field of
     view ``fov`` (degrees) and ``spp`` samples a pixel. ``objects`` are the ids of the captured shapes (none: all
@@ -118,13 +116,9 @@ class CaptureSettings:
         return sphere_directions(self.views, self.test, low, high, self.seed)
 
 
-# -- capture ----------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Captured:
-    """
-    State of a folder after a capture.
+    """State of a folder after a capture.
 
     ``files`` of images and their ``total`` once complete; the number ``rendered`` now, in ``seconds``; ``radius``,
     ``centre`` and ``box`` ``(2, 3)`` of the cameras' target; ``opaque``: no rendered pixel has alpha below 1.
@@ -148,8 +142,7 @@ def capture(
     defines: dict[str, str] | None = None,
     progress: bool = True,
 ) -> Captured:
-    """
-    Render the views of a scene file into ``folder``, in the variant that is set.
+    """Render the views of a scene file into ``folder``, in the variant that is set.
 
     The folder is created if its parent exists. Views of an earlier capture with the same settings of the same scene are
     kept; after Ctrl-C the current view is the last. Raises :class:`CaptureError`, also for a folder with other
@@ -299,8 +292,7 @@ class CaptureCamera:
 
 
 def _only(inner, shapes: list):
-    """
-    Return an integrator whose camera rays see only these ``shapes``, and pass through all others.
+    """Return an integrator whose camera rays see only these ``shapes``, and pass through all others.
 
     Rays pass through up to :data:`THROUGH` surfaces. Right before the first surface of the shapes, ``inner`` takes
     over, which sees everything.
@@ -339,9 +331,6 @@ def _only(inner, shapes: list):
             return dr.select(hit, light, 0), valid & hit, []
 
     return ObjectsOnly(mi.Properties("only"))
-
-
-# -- files ------------------------------------------------------------------------------------------------------------
 
 
 def _record(parsed: scenes.ParsedScene, settings: CaptureSettings) -> dict:

@@ -1,5 +1,4 @@
-"""
-Comparison of a scene as written with the same scene after a swap of plugins: accuracy and render time.
+"""Comparison of a scene as written with the same scene after a swap of plugins: accuracy and render time.
 
 Learned plugins are replaced by their exact counterparts, or all plugins that have another counterpart, such as
 Mitsuba's ``principled``, by that.
@@ -39,8 +38,7 @@ def compare(
     defines: dict[str, str] | None = None,
     against: str = "exact",
 ) -> Comparison:
-    """
-    Render ``path`` as written and with counterparts, in turn, pass by pass, with the same random numbers.
+    """Render ``path`` as written and with counterparts, in turn, pass by pass, with the same random numbers.
 
     Every learned plugin is replaced by its exact counterpart. ``against`` may name another counterpart, such as
     ``"principled"``: then every plugin that has it is replaced, learned or not.
@@ -114,8 +112,7 @@ def compare(
 
 
 def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
-    """
-    Write ``comparison.png`` and EXR images into ``folder``, which is created if its parent exists; return the paths.
+    """Write ``comparison.png`` and EXR images into ``folder``, which is created if its parent exists; return the paths.
 
     The EXR images are ``written.exr``, ``exact.exr`` (or by the name of the other counterpart) and ``error.exr``
     (absolute difference). Raises :class:`~mi_diffind.files.OutputError`.

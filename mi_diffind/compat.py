@@ -22,8 +22,6 @@ import struct
 import sys
 from pathlib import Path
 
-# -- Dr.Jit's library: starting LLVM again -----------------------------------------------------------------------------
-
 
 def llvm_version() -> tuple[int, int, int]:
     """Return the version of the LLVM that Dr.Jit has loaded, -1 first if none; waits for its start.
@@ -107,9 +105,6 @@ def limit_code_generation(target: str) -> None:
     JitCore().set_target(match[1], match[2], int(match[3]))
 
 
-# -- Dr.Jit: kernels ---------------------------------------------------------------------------------------------------
-
-
 def new_scope(dtype) -> None:
     """Start a scope: Dr.Jit merges no later computation of the backend of ``dtype`` with an earlier one.
 
@@ -179,9 +174,6 @@ def use_threads(count: int) -> None:
         dr.set_thread_count(count)
 
 
-# -- Dr.Jit: arrays ----------------------------------------------------------------------------------------------------
-
-
 def module_of(array):
     """Return the module with the types of the same backend as an array or type, such as ``drjit.llvm.ad``.
 
@@ -237,9 +229,6 @@ def set_adam_state(optimizer, key: str, value, t, m, v) -> None:
     dr.make_opaque(new)
     dr.enable_grad(new)
     optimizer.state[key] = new, promoted, rate, (type(t_old)(t), type(m_old)(m), type(v_old)(v), v_max)
-
-
-# -- Mitsuba: variants, classes ----------------------------------------------------------------------------------------
 
 
 def on_variant_change(callback) -> None:
@@ -321,8 +310,7 @@ def normal_edges(pi, si, ray, active) -> tuple:
 
 
 def replay_integrator() -> type:
-    """
-    Return ``RBIntegrator`` of the variant that is set, the base class of integrators that replay paths for derivatives.
+    """Return ``RBIntegrator`` of the active variant, the base class of integrators that replay paths.
 
     Mitsuba loads it anew *after* it called the function of :func:`on_variant_change`. Its place is not promised;
     ``sample_rays`` and the interface of ``sample`` are only described in its code.
@@ -365,9 +353,6 @@ def splat(block, film, place, light, alpha, aovs: list, wavelengths) -> None:
 
     put = mi.ad.integrators.common.ADIntegrator._splat_to_block
     put(block, film, place, value=light, weight=1.0, alpha=alpha, aovs=aovs, wavelengths=wavelengths)
-
-
-# -- Mitsuba: scenes ---------------------------------------------------------------------------------------------------
 
 
 def objects_of(scene) -> list:

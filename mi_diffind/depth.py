@@ -1,5 +1,4 @@
-"""
-Light of a scene by path depth: the share of each bounce, and the smallest depth that leaves out almost nothing.
+"""Light of a scene by path depth: the share of each bounce, and the smallest depth that leaves out almost nothing.
 
 Depths are counted like Mitsuba's ``max_depth``: 1 is emitted light alone, 2 adds direct light, 3 adds light that
 bounced twice, and so on.
@@ -58,8 +57,7 @@ MIDDLE_GREY = 0.18
 
 @dataclass(frozen=True)
 class Bounce:
-    """
-    Light that arrives at one ``depth`` (1: an emitter is seen), as parts of all scattered light, 0 to 1.
+    """Light that arrives at one ``depth`` (1: an emitter is seen), as parts of all scattered light, 0 to 1.
 
     ``share``: of this depth (emitted light has none); ``rest``: left out by a render up to this depth;
     ``rest_in_a_tile``: the largest part that any tile would lose of its own light.
@@ -85,8 +83,7 @@ def probe(
     on_pass: Callable[[], object] | None = None,
     stop: threading.Event | None = None,
 ) -> np.ndarray:
-    """
-    Return the luminance of a coarse image by depth, ``(depths, height, width)``, float64; ``[k]`` is depth ``k + 1``.
+    """Return the luminance of a coarse image by depth, float64 ``(depths, height, width)``; ``[k]`` is depth ``k + 1``.
 
     There are ``max_depth`` depths, at most :data:`MAX_BINS`; deeper paths, or infinitely deep ones (-1), are followed
     as well, and the last entry sums them.
@@ -208,8 +205,7 @@ def check_tolerance(tolerance: float) -> None:
 
 
 def choose(shares: list[Bounce], max_depth: int, tolerance: float = TOLERANCE) -> int:
-    """
-    Return the smallest depth with a ``rest`` below ``tolerance`` and ``rest_in_a_tile`` below ten times that.
+    """Return the smallest depth with a ``rest`` below ``tolerance`` and ``rest_in_a_tile`` below ten times that.
 
     If there is none, the scene's own ``max_depth`` (-1: infinite). Raises ``ValueError`` as :func:`check_tolerance`.
     """
@@ -221,8 +217,7 @@ def choose(shares: list[Bounce], max_depth: int, tolerance: float = TOLERANCE) -
 
 
 def auto_depth(parsed: scenes.ParsedScene, tolerance: float = TOLERANCE, seed: int = 0, progress: bool = True) -> dict:
-    """
-    Probe a scene and choose the depth of its paths.
+    """Probe a scene and choose the depth of its paths.
 
     Returns ``chosen`` and ``scene`` (its own depth, never exceeded; -1: infinite), ``tolerance``, ``shares`` (of each
     depth: ``depth``, ``light``, and the figures of a :class:`Bounce`), ``left_out`` and ``left_out_in_a_tile``

@@ -39,8 +39,7 @@ def exponential_like(u, rate: float = EXPONENTIAL_RATE):
 
 
 def sample_losses(outputs: Mapping, targets: Mapping, weights: Mapping[str, float], size: int, loss: str) -> list:
-    """
-    Return the weighted absolute or squared differences (``loss``) between outputs and targets, to be summed.
+    """Return the weighted absolute or squared differences (``loss``) between outputs and targets, to be summed.
 
     ``outputs`` and ``targets`` map names to lists of arrays with ``size`` entries; a missing weight counts 1. There is
     one array of ``size`` numbers for each target in the result; the sum of all entries is the weighted mean.
@@ -78,8 +77,7 @@ class Problem:
     settings: FitSettings = FitSettings()
 
     def begin(self, step: int, share: float) -> str:
-        """
-        Prepare step ``step``, when the ``share`` of the training is over, for a problem that changes during training.
+        """Prepare step ``step`` of a problem that changes; ``share`` of the training is over.
 
         Returns the phase of the training: only losses of the same phase are compared.
         """

@@ -116,8 +116,6 @@ class DifferentiableArray(nn.Module):
             raise ValueError(f"value: found {value}, one number or {self.channels} are needed, one a channel")
         self.data = None
 
-    # -- allocation and storage forms -------------------------------------------------------------------------------
-
     def _alloc(self, dtype, size=-1, rng=None):
         if size not in (-1, self.dims):
             raise ValueError(f"an array of {self.dims} dimension(s) was given {size} input(s)")
@@ -308,8 +306,6 @@ class DifferentiableArray(nn.Module):
         Float = module_of(self.data).Float
         return lookup.fetch_float(entries, self.channels, self.data.shape[-1], active, transform, Float, index)
 
-    # -- properties -------------------------------------------------------------------------------------------------
-
     @property
     def is_pointer(self) -> bool:
         """Whether all entries are bytes that stand for numbers in [0, 1], so that every read is a coordinate."""
@@ -348,8 +344,6 @@ class DifferentiableArray(nn.Module):
     def __repr__(self) -> str:
         size = "x".join(map(str, self.resolution))
         return f"DifferentiableArray({size}, channels={self.channels}, storage={self.storage}, fold={self.folded})"
-
-    # -- reading ----------------------------------------------------------------------------------------------------
 
     def __call__(self, x, active=True, inside=False):
         """Read at ``x`` (see the class).
@@ -478,8 +472,7 @@ class Indirection(nn.Module):
 
 
 def unfolded(net):
-    """
-    Return a copy of a module, tuple or list of modules in which all arrays are :meth:`.DifferentiableArray.unfolded`.
+    """Return a copy of a module, tuple or list of modules whose arrays are :meth:`.DifferentiableArray.unfolded`.
 
     For training: if all entries are folded before anything is read, a backward pass comes to all reads before it comes
     to a fold, and one kernel sums all gradients. Otherwise the pass through a fold waits for the sums behind it, and

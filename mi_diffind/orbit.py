@@ -32,8 +32,7 @@ def orbit(
     on_frame: Callable[[], object] | None = None,
     stop: threading.Event | None = None,
 ) -> list[np.ndarray]:
-    """
-    Render a loaded scene ``frames`` times, while its first camera moves once around the scene.
+    """Render a loaded scene ``frames`` times, while its first camera moves once around the scene.
 
     For each frame, the camera turns about the axis ``up`` through ``centre`` (default: the middle of all shapes that
     are no lights) by 360° divided by the number of frames. The first frame is the camera's own view, to which it
@@ -91,8 +90,7 @@ def strip(frames: Sequence[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
 
 
 def write(path: str | os.PathLike, frames: Sequence[np.ndarray], seconds: float = 4.0) -> None:
-    """
-    Write linear frames as a film that loops every ``seconds`` (``.webp``, ``.gif``), or as one image (:func:`strip`).
+    """Write linear frames as a film that loops in ``seconds`` (``.webp``, ``.gif``), or as one image (:func:`strip`).
 
     Alpha is kept in formats that support it.
     """

@@ -99,8 +99,6 @@ class PagedArray(DifferentiableArray):
         """Number of entries of all pages together."""
         return int(self.sizes.prod(axis=-1).sum())
 
-    # -- allocation and storage forms -------------------------------------------------------------------------------
-
     def _alloc(self, dtype, size=-1, rng=None):
         if size not in (-1, self.dims):
             raise ValueError(f"an array of {self.dims} dimension(s) was given {size} input(s)")
@@ -181,8 +179,6 @@ class PagedArray(DifferentiableArray):
     def at(self, x):
         raise NotImplementedError("an array of pages cannot be reduced by a dimension")
 
-    # -- properties -------------------------------------------------------------------------------------------------
-
     def check_shape(self) -> None:
         allowed = [(self.entries, n) for n in (self.channels, lookup.padded_channels(self.channels))]
         if self.data.shape not in allowed:
@@ -210,8 +206,6 @@ class PagedArray(DifferentiableArray):
             f"PagedArray({pages} pages, {self.entries} entries, channels={self.channels}, storage={self.storage}, "
             f"fold={self.folded})"
         )
-
-    # -- reading ----------------------------------------------------------------------------------------------------
 
     def __call__(self, x, active=True, inside=False):
         self._require_entries()
@@ -271,9 +265,6 @@ class PagedArray(DifferentiableArray):
 def most_entries(dims: int) -> int:
     """Return the largest number of entries that all pages of an array may have together."""
     return 2 ** (32 - dims * SIDE_BITS[dims - 1])
-
-
-# -- which resolution, which entries ----------------------------------------------------------------------------------
 
 
 def page_counts(shape: Sequence[int]) -> tuple[int, ...]:

@@ -11,8 +11,7 @@ GOLDEN = math.pi * (3 - math.sqrt(5))
 
 
 def sphere_directions(views: int, test: int, low: float, high: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return unit vectors ``(views, 3)`` and ``(test, 3)``, spread evenly between two elevations (radians); z is up.
+    """Return unit vectors ``(views, 3)`` and ``(test, 3)``, spread evenly between two elevations (radians); z is up.
 
     Both are Fibonacci lattices. The seed gives the angle by which the first is turned about the axis; the second is
     turned so that its smallest distance to the first is as large as possible.
@@ -26,8 +25,7 @@ def sphere_directions(views: int, test: int, low: float, high: float, seed: int)
 
 
 def orbit_directions(views: int, test: int, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return unit vectors ``(views, 3)`` and ``(test, 3)`` of a closed orbit around z that swings between two elevations.
+    """Return unit vectors ``(views, 3)`` and ``(test, 3)`` of a closed orbit around z between two elevations.
 
     Elevations are radians. Test directions lie between the others, as evenly as their numbers allow.
     """

@@ -1,5 +1,4 @@
-"""
-Stored renderings of scenes: the EXR files that :mod:`.regress` checks against, and partial renders of them.
+"""Stored renderings of scenes: the EXR files that :mod:`.regress` checks against, and partial renders of them.
 
 A reference is kept beside its scene, as ``references/SCENE.VARIANT.exr``: the image (``R``, ``G``, ``B``, or ``Y`` in
 mono variants), the variance of one sample (``variance.R``, …), and a header attribute with the settings of the render.
@@ -31,8 +30,7 @@ class BadReference(scenes.SceneError):
 
 @dataclass(frozen=True)
 class Reference:
-    """
-    A stored rendering: ``image`` and the ``variance`` of one sample, both ``(height, width, channels)``, float32.
+    """A stored rendering: ``image`` and the ``variance`` of one sample, both ``(height, width, channels)``, float32.
 
     Values are linear, of 3 channels (red, green, blue) or 1 (mono variants). ``about`` holds ``scene`` (file name
     without its extension), ``variant``, ``defines`` (texts for the scene's ``<default>`` values), ``budget`` (samples
@@ -52,8 +50,7 @@ def reference_path(path: str | os.PathLike, references: str | os.PathLike | None
 
 
 def read_reference(path: str | os.PathLike, references: str | os.PathLike | None = None) -> Reference:
-    """
-    Return the stored reference of a scene file in the current variant, or in its twin for the other backend.
+    """Return the stored reference of a scene file in the current variant, or in its twin for the other backend.
 
     ``llvm_…`` and ``cuda_…`` variants render the same. Raises :class:`BadReference`.
     """

@@ -1,5 +1,4 @@
-"""
-Regression checks of scenes against stored renderings: changes that sampling noise does not explain.
+"""Regression checks of scenes against stored renderings: changes that sampling noise does not explain.
 
 A reference shows the scene as written, learned plugins included. A check finds changes; the distance of an
 approximation from the truth is measured by :mod:`.compare`. Statistics: :mod:`.z_test`; files:
@@ -75,8 +74,7 @@ def render_with_variance(
     stop: threading.Event | None = None,
     moments: PassMoments | None = None,
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """
-    Render ``passes`` (at least 2) independent images, and return mean, variance and number of samples.
+    """Render ``passes`` (at least 2) independent images, and return mean, variance and number of samples.
 
     A pass has ``spp / passes`` samples a pixel, rounded up to a power of two: then no pixel is shared by two threads,
     which would add up its samples in any order, and the same arguments give the same bits. ``moments`` holds passes
@@ -109,9 +107,6 @@ def _samples_of_a_pass(spp: int, passes: int) -> int:
     return 1 << (-(-spp // passes) - 1).bit_length()
 
 
-# -- prediction of the check of a new reference ------------------------------------------------------------------------
-
-
 def probe(
     scene,
     spp: int,
@@ -120,8 +115,7 @@ def probe(
     stop: threading.Event | None = None,
     samples: int = PROBE_SAMPLES,
 ) -> float:
-    """
-    Return the part of the pixels, 0 to 1, that would fail a check at ``spp`` samples a pixel if nothing has changed.
+    """Return the part of the pixels, 0 to 1, that would fail a check at ``spp`` samples a pixel if nothing has changed.
 
     The estimate comes from an image of fewer pixels that each see more of the scene, with the samples a pixel of a
     check and of its reference: ``samples`` altogether, unless 256 pixels need more. Of 34 passes, each pair in turn is
@@ -165,9 +159,6 @@ def _smaller(scene, pixels: int):
         yield
 
 
-# -- references --------------------------------------------------------------------------------------------------------
-
-
 def update_reference(
     path: str | os.PathLike,
     references: str | os.PathLike | None = None,
@@ -177,8 +168,7 @@ def update_reference(
     defines: dict[str, str] | None = None,
     probe_samples: int = PROBE_SAMPLES,
 ) -> dict:
-    """
-    Render a reference of the scene file ``path`` in the current variant and store it (:func:`reference_path`).
+    """Render a reference of the scene file ``path`` in the current variant and store it (:func:`reference_path`).
 
     ``spp`` are the samples per pixel of a check; the reference gets 16 times as many or more. Settings that are not
     given are those of the reference that is replaced: ``spp`` (else two million samples of the image), ``seed`` (else
@@ -294,9 +284,6 @@ def _facts(path, reference: str, width: int, height: int, seed: int, defines: di
     }  # fmt: skip
 
 
-# -- checks ------------------------------------------------------------------------------------------------------------
-
-
 def regress(
     path: str | os.PathLike,
     references: str | os.PathLike | None = None,
@@ -306,8 +293,7 @@ def regress(
     progress: bool = True,
     defines: dict[str, str] | None = None,
 ) -> dict:
-    """
-    Render the scene file ``path`` in the current variant and test it against its reference (:func:`.z_test.z_test`).
+    """Render the scene file ``path`` in the current variant and test it against its reference (:func:`.z_test.z_test`).
 
     ``spp`` and ``defines`` are the reference's unless given. Every ``seed`` is independent of the reference. If the
     check fails and ``out`` names a folder, the images are written there (:func:`write_failure`).
@@ -358,8 +344,7 @@ def _check_size(path, reference: Reference, height: int, width: int, channels: i
 def write_failure(
     folder: str | os.PathLike, image: np.ndarray, reference: Reference, test: ZTest, result: dict
 ) -> dict[str, str]:
-    """
-    Write the images of a failed check into ``folder``, which is created if its parent exists, and return the paths.
+    """Write the images of a failed check into ``folder``, which is created if its parent exists, and return the paths.
 
     These are ``SCENE.VARIANT.image.exr``, ``….reference.exr``, ``….error.exr`` (absolute difference),
     ``….p_value.exr`` and a picture of all, ``….png``. Raises :class:`~mi_diffind.files.OutputError`.

@@ -1,5 +1,4 @@
-"""
-Scene files: parsing, loading, rendering, and the learned plugins and tables that they name.
+"""Scene files: parsing, loading, rendering, and the learned plugins and tables that they name.
 
 Everything here runs in the variant that is set.
 """
@@ -36,8 +35,7 @@ class SceneError(DiffindError, RuntimeError):
 
 
 class ParsedScene:
-    """
-    Scene file ``path``, parsed once, with ``defines`` (name → value) in place of its ``<default>`` values.
+    """Scene file ``path``, parsed once, with ``defines`` (name → value) in place of its ``<default>`` values.
 
     Answers questions about the file, and builds any number of scenes from it: each from a copy of the parsed state.
     All methods raise :class:`SceneError`, as does the constructor for a file that cannot be parsed.
@@ -65,8 +63,7 @@ class ParsedScene:
         change: Callable[[object], object] | None = None,
         merge: bool = True,
     ):
-        """
-        Return a loaded scene, as :func:`load_file` does.
+        """Return a loaded scene, as :func:`load_file` does.
 
         With ``exact``, every learned plugin is replaced by its exact counterpart, or by the one that ``against`` names.
         ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
@@ -94,8 +91,7 @@ class ParsedScene:
             return loaded
 
     def path_integrator(self) -> tuple[str, int]:
-        """
-        Return the plugin name and the ``max_depth`` of the integrator that follows the scene's paths.
+        """Return the plugin name and the ``max_depth`` of the integrator that follows the scene's paths.
 
         It may be nested in others, like ``aov``. A scene with none of :data:`MAX_DEPTHS`, or with several, is an error.
         """
@@ -105,8 +101,7 @@ class ParsedScene:
             return name, int(props.get("max_depth", MAX_DEPTHS[name]))
 
     def learned_plugins(self, against: str = "exact") -> list[dict]:
-        """
-        Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
+        """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
 
         With ``against``, of all plugins that have the counterpart of this name.
         """
@@ -114,8 +109,7 @@ class ParsedScene:
             return [plugin.described(props) for props, plugin in _replaceable(self._state, against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
-        """
-        Return the distinct tables that learned plugins read: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`.
+        """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`.
 
         ``learned`` are descriptions from :meth:`learned_plugins`.
         """
@@ -155,8 +149,7 @@ def load(path: str | os.PathLike, defines: dict[str, str] | None = None, **optio
 
 
 def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = True, **defines):
-    """
-    Load a scene file as ``mi.load_file`` does, prepared for filtering textures and for stored shapes.
+    """Load a scene file as ``mi.load_file`` does, prepared for filtering textures and for stored shapes.
 
     ``defines`` replace the scene's ``<default>`` values; ``parallel`` and ``optimize`` are Mitsuba's own arguments.
     Beyond ``mi.load_file``, textures that filter themselves learn which sensor sees them: the first one of the scene,
@@ -222,8 +215,7 @@ def _replaceable(state, against: str) -> list[tuple]:
 
 
 def _decode_unseen(state, integrators: list[str]) -> list[str]:
-    """
-    Have shapes decoded whose arrays none of the ``integrators`` traces, and return their ids.
+    """Have shapes decoded whose arrays none of the ``integrators`` traces, and return their ids.
 
     Left out are shapes for which the scene states how they are traced, or that their arrays are optimised.
     """
@@ -263,8 +255,7 @@ def _unseen(scene, integrators: list[str]) -> str:
 
 
 def instances(scene) -> list:
-    """
-    Return all Mitsuba objects of a loaded scene that the package's plugins created, each once.
+    """Return all Mitsuba objects of a loaded scene that the package's plugins created, each once.
 
     Nested objects (in a ``twosided``, a ``bumpmap``, …) are included.
     """
@@ -279,8 +270,7 @@ def learned_instances(scene) -> list:
 
 
 def reports(scene) -> list[dict]:
-    """
-    Return a report on each learned plugin of a loaded scene.
+    """Return a report on each learned plugin of a loaded scene.
 
     It has the description of :meth:`ParsedScene.learned_plugins`; the plugin's own report, ``preset``,
     ``effects_in_use``, ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage``, ``table_bytes`` and
@@ -315,8 +305,7 @@ def render(
     on_pass: Callable[[], object] | None = None,
     stop: threading.Event | None = None,
 ) -> tuple[np.ndarray, list[float]]:
-    """
-    Render in ``passes`` of about ``spp / passes`` samples a pixel each and average them.
+    """Render in ``passes`` of about ``spp / passes`` samples a pixel each and average them.
 
     Returns the linear image ``(height, width, channels)``, float32, and the seconds of each pass (the first includes
     compilation). ``on_pass()`` is called after each pass. Once ``stop`` is set, the running pass is the last, and the

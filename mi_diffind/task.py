@@ -182,8 +182,6 @@ class Task:
     #: The module of the task's package that reads its table files.
     files: str = "files"
 
-    # -- training ---------------------------------------------------------------------------------------------------
-
     def settings(self, preset: str, given: Mapping, options: Mapping) -> FitSettings:
         """Return the settings of a preset with the ``given`` ones in place; ``options`` are the task's own."""
         return dataclasses.replace(self.presets[preset], **given)
@@ -222,8 +220,6 @@ class Task:
         measured = self.model(table, request.types.TensorXf).measure()
         table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
         return Fitted(table, result)
-
-    # -- files ------------------------------------------------------------------------------------------------------
 
     def load(self, path: str | os.PathLike) -> Table:
         """Read and check a file of this task, by ``load`` of ``files.py`` if there is one.

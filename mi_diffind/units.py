@@ -67,8 +67,7 @@ def _positive(match: re.Match | None, text, what: str, example: str) -> float:
 
 
 def largest_fitting(fits: Callable[[float], bool], low: float, high: float, steps: int | None = None) -> float:
-    """
-    Return the largest number from ``low`` to below ``high`` that ``fits``, by bisection; ``low`` if none above it does.
+    """Return the largest number from ``low`` to below ``high`` that ``fits``, by bisection; ``low`` if none does.
 
     ``fits`` holds up to some number and not beyond, such as "this side takes at most so many bytes". Both ends are
     whole numbers, and so is the result; with ``steps``, they are real numbers and are halved that often.

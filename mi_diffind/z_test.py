@@ -1,5 +1,4 @@
-"""
-Statistics of rendered images: mean and variance of passes, and a z-test of an image against a noisy reference.
+"""Statistics of rendered images: mean and variance of passes, and a z-test of an image against a noisy reference.
 
 Both follow Mitsuba's ``src/render/tests/test_renders.py``: a render within a fixed sample budget is compared, pixel by
 pixel, with a reference and its variance.
@@ -22,8 +21,7 @@ REQUIRED = 0.9975
 
 @dataclass(frozen=True)
 class ZTest:
-    """
-    Result of :func:`z_test`: ``p_values`` ``(height, width, channels)`` and their threshold ``alpha``.
+    """Result of :func:`z_test`: ``p_values`` ``(height, width, channels)`` and their threshold ``alpha``.
 
     ``failing``, booleans ``(height, width)``: pixels with a channel at or below the threshold; ``fraction``: part of
     the pixels that pass; ``passed``: whether that is enough.
@@ -39,8 +37,7 @@ class ZTest:
 def z_test(
     image: np.ndarray, reference: np.ndarray, variance: np.ndarray, spp: int, reference_spp: float = math.inf
 ) -> ZTest:
-    """
-    Test whether ``image`` (``spp`` samples a pixel) shows the same scene as ``reference`` (``reference_spp``).
+    """Test whether ``image`` (``spp`` samples a pixel) shows the same scene as ``reference`` (``reference_spp``).
 
     All three arrays are ``(height, width, channels)``, linear; ``variance`` is that of one sample. For each value,
 
@@ -72,8 +69,7 @@ def pixel_threshold(pixels: int) -> float:
 
 @dataclass
 class PassMoments:
-    """
-    Running mean and variance of the passes of a render.
+    """Running mean and variance of the passes of a render.
 
     ``mean`` of all ``samples`` of a pixel, ``(height, width, channels)``, float64; ``squares``, the sum over the
     ``passes`` of their samples times their squared deviation from the mean.

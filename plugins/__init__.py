@@ -1,5 +1,4 @@
-"""
-Mitsuba plugins, one a file. ``import mi_diffind`` registers them; nothing here needs to be imported by hand.
+"""Mitsuba plugins, one a file. ``import mi_diffind`` registers them; nothing here needs to be imported by hand.
 
 A plugin's module declares it as ``PLUGIN`` (:class:`Plugin`). Modules are discovered: those of this package, and those
 that other packages name as entry points of the group ``mi_diffind.plugins``. Mitsuba's classes differ from variant to
@@ -25,8 +24,7 @@ OBJECT_TYPES = {"bsdf": "BSDF", "texture": "Texture", "shape": "Shape", "volume"
 
 @dataclass(frozen=True)
 class Counterpart:
-    """
-    Plugin that may replace another one in a scene.
+    """Plugin that may replace another one in a scene.
 
     The plugin called ``name`` takes the same parameters except ``learned_only``, and needs those of ``given`` in
     addition. If more has to change, ``convert(props)`` changes the properties (``mi.Properties``), or raises
@@ -52,8 +50,7 @@ class Counterpart:
 
 @dataclass(frozen=True)
 class Plugin:
-    """
-    Declaration of a plugin.
+    """Declaration of a plugin.
 
     - ``name``: its ``type`` in a scene; ``object_type``: one of :data:`OBJECT_TYPES`;
     - ``factory(props)``: a class, or a function, which may return an object of one of Mitsuba's own classes;
@@ -86,8 +83,7 @@ class Plugin:
         return self.exact if against == "exact" else next((c for c in self.others if c.name == against), None)
 
     def described(self, props) -> dict:
-        """
-        Return a plain description of the properties (``mi.Properties``) of an instance.
+        """Return a plain description of the properties (``mi.Properties``) of an instance.
 
         It has the keys ``plugin``, ``kind`` (the object type), ``id`` and ``parameters`` (numbers, text, colours and
         matrices as lists, ``"texture"`` for any named object). Parameters that only the learned plugin has, and the
@@ -231,8 +227,7 @@ def warn(text: str) -> None:
 
 
 def reports_as(instance, report: Callable[[], dict]) -> None:
-    """
-    Attach ``report()`` to ``instance``, an object of one of Mitsuba's own classes that a factory is about to return.
+    """Attach ``report()`` to ``instance``, an object of one of Mitsuba's own classes that a factory is about to return.
 
     ``report`` replaces the method of that name of plugins written in Python. It must not hold the object.
     """
@@ -241,8 +236,7 @@ def reports_as(instance, report: Callable[[], dict]) -> None:
 
 
 def shown_as(instance, part) -> None:
-    """
-    Declare that only ``part`` of ``instance`` stays in the scene.
+    """Declare that only ``part`` of ``instance`` stays in the scene.
 
     A factory calls this before it returns an object that scenes take apart and drop, such as a ``merge`` of shapes.
     """

@@ -263,8 +263,6 @@ class Disney(mi.BSDF):
         ]
         self.m_flags = self.m_components[0] | self.m_components[1] | self.m_components[2]
 
-    # -- parameters -------------------------------------------------------------------------------------------------
-
     def _textures(self) -> dict[str, mi.Texture]:
         textures = {"base_color": self.base_color, **self.scalars}
         if isinstance(self.reflectance, mi.Texture):
@@ -285,8 +283,6 @@ class Disney(mi.BSDF):
             dr.make_opaque(self.reflectance)
         dr.make_opaque(self.rates)
         self._prepare_constants()
-
-    # -- effects in use, and coefficients that are evaluated once ------------------------------------------------------
 
     def _find_effects(self) -> tuple[Effects, dict[str, str]]:
         """Return the parts of the model in use, and the reasons for the others, from the bounds last determined."""
@@ -330,8 +326,7 @@ class Disney(mi.BSDF):
         return {}
 
     def report(self) -> dict:
-        """
-        Return a description of this instance, for ``mi-diffind inspect``.
+        """Return a description of this instance, for ``mi-diffind inspect``.
 
         Keys: ``preset`` of its tables ("" without tables), ``effects_in_use``, ``effects_left_out`` (effect → reason),
         ``evaluated_once`` (groups of coefficients), ``storage`` and ``table_bytes``.
@@ -343,8 +338,6 @@ class Disney(mi.BSDF):
             "effects_left_out": reasons,
             "evaluated_once": sorted(group for group in self._constant if group != "effects"),
         }
-
-    # -- evaluation -------------------------------------------------------------------------------------------------
 
     def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool):
         """Return a parameter at ``si``, clamped to its range (NaN → 0), since textures and optimisers overshoot."""
@@ -374,8 +367,7 @@ class Disney(mi.BSDF):
         return dr.select(active, si.wi, up), dr.select(active, wo, up), active
 
     def _surface(self, si, active, effects: Effects, value: bool = True, density: bool = True):
-        """
-        Return the parameters at ``si`` and the coefficients that values and densities need.
+        """Return the parameters at ``si`` and the coefficients that values and densities need.
 
         All coefficients are computed here: at their first use, derivatives may be suspended.
         """
@@ -489,8 +481,7 @@ def _are_directions(wi, wo):
 
 
 class Parameters:
-    """
-    Parameters of a material at a surface interaction: ``roughness``, …, ``specular``, ``albedo``, ``luminance``.
+    """Parameters of a material at a surface interaction: ``roughness``, …, ``specular``, ``albedo``, ``luminance``.
 
     Each is read at its first use, so unused parameters are not read.
     """

@@ -15,8 +15,7 @@ from .support.textures import luminance
 
 
 class FilteredTexture(MapTexture):
-    """
-    Texture of one map of a :class:`~mi_diffind.maps.compressed.FilteredMaps`, read at the footprint's level of detail.
+    """Texture of one map of a :class:`~mi_diffind.maps.compressed.FilteredMaps`, read at the footprint's level.
 
     No gradient passes through the footprint at a hit (:func:`.footprint.footprint`). ``cone`` describes the sensor that
     sees the texture (:class:`.footprint.Cone`; ``None``: unknown). A sample that is the only one of its pixel is read
@@ -33,8 +32,6 @@ class FilteredTexture(MapTexture):
     def set_cone(self, cone: Cone | None) -> None:
         """Set the sensor that sees the texture; ``None``: the one that the parameters describe, if any."""
         self.cone = cone or self._cone_of_parameters
-
-    # -- reading ----------------------------------------------------------------------------------------------------
 
     def _values(self, si):
         if self.filter.name == "off" or not self.is_spatially_varying():
@@ -109,11 +106,8 @@ class FilteredTexture(MapTexture):
             gradient.append((ahead - behind) / width)
         return self._before(*gradient)
 
-    # -- description -------------------------------------------------------------------------------------------------
-
     def report(self) -> dict:
-        """
-        Return the description of :meth:`.MapTexture.report` and three more keys.
+        """Return the description of :meth:`.MapTexture.report` and three more keys.
 
         ``filter``; ``taps``, the number of places read for one footprint; ``footprint``, the names of the footprint's
         sources in their order, none if nothing is filtered.

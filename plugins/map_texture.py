@@ -20,8 +20,7 @@ DECODED = 2**22
 
 
 class MapTexture(mi.Texture):
-    """
-    Texture of one map of a :class:`~mi_diffind.maps.compressed.CompressedMaps`.
+    """Texture of one map of a :class:`~mi_diffind.maps.compressed.CompressedMaps`.
 
     The class implements colours and data, wrapping, transformation, spectra and the sampling of positions. A derived
     class opens the maps in :meth:`_open`, and may override the read in :meth:`_values`. Like the modules of plugins,
@@ -51,8 +50,6 @@ class MapTexture(mi.Texture):
         """Open the maps that the properties name, and read further properties of the class. Raises ``RuntimeError``."""
         raise NotImplementedError
 
-    # -- parameters -------------------------------------------------------------------------------------------------
-
     def traverse(self, cb: mi.TraversalCallback):
         tables.traverse(cb, self._shared.tables)
         cb.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
@@ -78,8 +75,6 @@ class MapTexture(mi.Texture):
         if not self._shared.unchanged(self._state):
             self._clear_cache()
 
-    # -- reading ----------------------------------------------------------------------------------------------------
-
     @property
     def _size(self) -> tuple[int, int]:
         """Width and height of the image."""
@@ -101,8 +96,7 @@ class MapTexture(mi.Texture):
         return self._read(self._uv(si))
 
     def _read(self, uv) -> list[mi.Float]:
-        """
-        Return the channels of the map at ``uv``, converted, in inactive lanes, too.
+        """Return the channels of the map at ``uv``, converted, in inactive lanes, too.
 
         No place is out of bounds, and Dr.Jit merges equal reads only if their masks are equal.
         """
@@ -182,8 +176,6 @@ class MapTexture(mi.Texture):
         si.wavelengths = mi.MI_CIE_MIN + extent * sample
         return si.wavelengths, self.eval(si, active) * extent
 
-    # -- properties of the whole image ---------------------------------------------------------------------------------
-
     def is_spatially_varying(self):
         return any(not isinstance(where, tuple) for where in self.map.where)
 
@@ -220,8 +212,7 @@ class MapTexture(mi.Texture):
         return self._max
 
     def _decoded(self) -> np.ndarray:
-        """
-        Return the converted image, float32, ``(height, width, channels)``.
+        """Return the converted image, float32, ``(height, width, channels)``.
 
         It is decoded in another thread: this one may be recording a loop or a call, where nothing can be evaluated.
         """
@@ -233,8 +224,6 @@ class MapTexture(mi.Texture):
         with ThreadPoolExecutor(1) as pool:
             values = pool.submit(decode).result()
         return srgb.to_linear(values) if self._is_encoded() else values
-
-    # -- sampling of positions ----------------------------------------------------------------------------------------
 
     def _sampled(self) -> PositionDistribution:
         self._check_cache()
@@ -253,11 +242,8 @@ class MapTexture(mi.Texture):
             return mi.Float(1)
         return self._sampled().density(pos if self._transform is None else self._transform @ pos, active)
 
-    # -- description -------------------------------------------------------------------------------------------------
-
     def report(self) -> dict:
-        """
-        Return a description of this instance, for ``mi-diffind inspect``.
+        """Return a description of this instance, for ``mi-diffind inspect``.
 
         Keys: ``preset``, ``map``; ``channels_read`` and ``channels_left_out``, numbers of stored channels;
         ``effects_in_use`` and ``effects_left_out`` (→ reason), which include the maps of the file; ``evaluated_once``,

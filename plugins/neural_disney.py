@@ -92,8 +92,6 @@ class NeuralDisney(Disney):
         opened = tables.open_tables(props, TASK, STORAGE)
         self.decoder, self.preset = opened.decoder, opened.table.preset
 
-    # -- parameters -------------------------------------------------------------------------------------------------
-
     def _arrays(self) -> dict:
         return {name: getattr(self.decoder.arrays, name) for name in self.decoder.arrays.SHAPES}
 

@@ -129,8 +129,7 @@ own. Inside another integrator, such as :monosp:`aov`, alpha is 0 or 1.
 
 @dataclass  # which is what loops of Dr.Jit take for state
 class FollowedRays:
-    """
-    State of the rays of a wavefront while they are followed.
+    """State of the rays of a wavefront while they are followed.
 
     ``active`` rays continue; ``handed`` rays have ended where the inner integrator takes over. ``clear`` is the product
     of the transmittances up to the first surface that changed the ray, ``turned`` tells whether one did, and ``count``
@@ -180,8 +179,7 @@ def has_smooth(scene: mi.Scene) -> bool:
 
 
 def in_order(fields: list, entered: list) -> list:
-    """
-    Return pairs of a field and the rays that enter it at this place of the order along a ray.
+    """Return pairs of a field and the rays that enter it at this place of the order along a ray.
 
     ``entered`` holds, for each of ``fields``, the distance at which rays enter it and whether they do.
     """
@@ -291,8 +289,6 @@ def integrator() -> type:
                     raise RuntimeError(f'parameter "aovs": found "{text}", allowed are {", ".join(AOVS)}, each once')
             return names
 
-        # -- as an object of Mitsuba ------------------------------------------------------------------------------
-
         def traverse(self, cb: mi.TraversalCallback) -> None:
             for name, values in self.placed.exposed.items():
                 cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
@@ -333,8 +329,6 @@ def integrator() -> type:
                 _, _, _, ray, _, _ = self._begin(scene, sensor, 0, 1)
                 pi = scene.ray_intersect_preliminary(ray, coherent=True, active=True)
                 return self.placed.count(ray, dr.minimum(pi.t, ray.maxt)).asdict()
-
-        # -- the film ---------------------------------------------------------------------------------------------
 
         def sample_rays(self, scene, sensor, sampler):
             """Sample camera rays as the inner integrator does."""
@@ -415,11 +409,8 @@ def integrator() -> type:
             light, alpha, aovs, state = self.primal(scene, sampler, ray, active)
             return light, alpha > 0, aovs, state
 
-        # -- rays -------------------------------------------------------------------------------------------------
-
         def primal(self, scene, sampler, ray, active=True) -> tuple:
-            """
-            Return light, alpha and further channels of camera rays, and the state for the differential phases.
+            """Return light, alpha and further channels of camera rays, and the state for the differential phases.
 
             The state holds light, one minus alpha, depth, opacity and the state of the inner integrator.
             """
@@ -433,8 +424,7 @@ def integrator() -> type:
             return light, 1 - clear, [aovs[name] for name in self.aovs], state
 
         def replayed(self, mode, scene, sampler, ray, state, surfaces, adjoint=None) -> tuple:
-            """
-            Run a differential phase.
+            """Run a differential phase.
 
             ``Forward`` returns the derivatives of light, alpha and channels. ``Backward`` propagates the derivatives
             with respect to these, ``adjoint`` (channels as a dictionary), to the parameters.
@@ -488,8 +478,7 @@ def integrator() -> type:
             return light, valid, state
 
         def _follow(self, mode, scene, sampler, path, surfaces, carried: bool) -> tuple:
-            """
-            Follow rays up to the surfaces at which the inner integrator takes over.
+            """Follow rays up to the surfaces at which the inner integrator takes over.
 
             A ``mode`` of ``None`` is the primal phase. Without smooth surfaces, a single piece is enough.
             """
@@ -506,8 +495,7 @@ def integrator() -> type:
             )
 
         def _piece(self, mode, scene, sampler, path, solids, surfaces, onward: bool, carried: bool) -> FollowedRays:
-            """
-            Follow a piece of each ray up to a surface and, if ``onward``, across it where it is smooth.
+            """Follow a piece of each ray up to a surface and, if ``onward``, across it where it is smooth.
 
             ``carried``: the rays have differentials.
             """

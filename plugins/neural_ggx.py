@@ -151,8 +151,6 @@ class NeuralGGX(mi.BSDF):
         self.m_flags = flags
         when_outermost(self._prepare_constants)
 
-    # -- parameters -------------------------------------------------------------------------------------------------
-
     def _textures(self) -> dict[str, mi.Texture]:
         textures = {"alpha": self.alpha, "eta": self.eta, "k": self.k}
         if self.specular_reflectance is not None:
@@ -177,8 +175,6 @@ class NeuralGGX(mi.BSDF):
     def parameters_changed(self, keys: list[str] = ()):
         tables.check_shapes(self._tables())
         self._prepare_constants()
-
-    # -- terms that are evaluated once ---------------------------------------------------------------------------------
 
     def _parameters(self) -> list[TrackedParameter]:
         return [self._tracked_alpha, *self._tracked_ior, *([self._tracked_factor] if self._tracked_factor else [])]
@@ -212,8 +208,6 @@ class NeuralGGX(mi.BSDF):
     def _has_factor(self) -> bool:
         return self._tracked_factor is not None and not self._tracked_factor.bounds().is_always(1)
 
-    # -- evaluation ---------------------------------------------------------------------------------------------------
-
     def _prepare(self, ctx, si, wo, active):
         """Return directions that are safe to compute with in every lane, and the mask of lanes whose result counts."""
         # Directions have length 1; the comparison is false for NaN and infinities
@@ -224,8 +218,7 @@ class NeuralGGX(mi.BSDF):
         return dr.select(active, si.wi, up), dr.select(active, wo, up), active
 
     def _value(self, ctx, si, r: Roughness, wi, wo, active):
-        """
-        Return f · cos = F D̂ (n·o) / (d(n·i) d(n·o)).
+        """Return f · cos = F D̂ (n·o) / (d(n·i) d(n·o)).
 
         Smith's masking is 2c/d(c), so that no cosine is divided by at the horizon.
         """
@@ -293,8 +286,7 @@ class NeuralGGX(mi.BSDF):
         return bs, dr.select(active, value * dr.rcp(dr.select(active, bs.pdf, 1)), 0)
 
     def report(self) -> dict:
-        """
-        Return a description of this instance, for ``mi-diffind inspect``.
+        """Return a description of this instance, for ``mi-diffind inspect``.
 
         Keys: ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason), ``evaluated_once``, ``storage``
         and ``table_bytes``.
@@ -362,8 +354,7 @@ def _index_of_refraction(props: mi.Properties) -> tuple[mi.Texture, mi.Texture]:
 
 
 def _polarised(ctx, eta, k, h, cos, wi, wo):
-    """
-    Return the Mueller matrix of the reflection by microfacets of normal ``h``, in the Stokes bases of both directions.
+    """Return the Mueller matrix of a reflection by microfacets of normal ``h``, in both directions' Stokes bases.
 
     Light arrives along ``-wo_hat`` and leaves along ``wi_hat``.
     """

@@ -49,8 +49,7 @@ def open_model(props: mi.Properties):
 
 
 def decoded(model, resolution: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict]:
-    """
-    Return a grid of a model's field for ``sdfgrid``, its corners in the unit frame, and its report.
+    """Return a grid of a model's field for ``sdfgrid``, its corners in the unit frame, and its report.
 
     ``resolution`` is the number of cells along the longest side; 0 chooses the coarsest grid with an error below that
     of the arrays.

@@ -156,8 +156,7 @@ def integrator() -> type:
 
         @dr.syntax
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **kwargs):
-            """
-            Trace paths; see ``ADIntegrator.sample``.
+            """Trace paths; see ``ADIntegrator.sample``.
 
             In the differential phases, ``L`` is the radiance that is still to come at the current vertex; it starts as
             the radiance of the whole path (``state_in``).

@@ -1,5 +1,4 @@
-"""
-Write capture_group.xml, capture_thin.xml and capture_glossy.xml, and the meshes ``cage.ply`` and ``leaves.ply``.
+"""Write capture_group.xml, capture_thin.xml and capture_glossy.xml, and the meshes ``cage.ply`` and ``leaves.ply``.
 
 ``mi-diffind capture`` renders views of these scenes for radiance fields: objects in the light of a probe, with nothing
 below or behind them. See README.md.

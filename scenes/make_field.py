@@ -1,5 +1,4 @@
-"""
-Write field.xml: a radiance field among meshes.
+"""Write field.xml: a radiance field among meshes.
 
 The field was captured from capture_group.xml and compressed (``mi-diffind capture``, ``mi-diffind fit field``). See
 README.md.

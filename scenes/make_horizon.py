@@ -1,5 +1,4 @@
-"""
-Write horizon.xml: a floor of glazed tiles to the horizon, pillars that recede, a mirror ball and a ball of tiles.
+"""Write horizon.xml: a floor of glazed tiles to the horizon, pillars that recede, a mirror ball and a ball of tiles.
 
 The light is a sun and a sky of one colour, which is only found by scattering: of what is diffuse it has no noise, so
 that one sample a pixel shows what becomes of the textures.

@@ -1,5 +1,4 @@
-"""
-Write solids.xml: meshes and the signed distance fields that were made from them, ``mi-diffind fit sdf``, see README.md.
+"""Write solids.xml: meshes and the signed distance fields fitted to them; see README.md.
 
 ``-D trace=grid -D integrator=path`` shows the same through Mitsuba's own grids.
 """

@@ -1,5 +1,4 @@
-"""
-Write the maps of a floor of glazed tiles, 384², periodic: albedo, normal, roughness, occlusion, and their manifest.
+"""Write the maps of a floor of glazed tiles, 384², periodic: albedo, normal, roughness, occlusion, and their manifest.
 
 They are compressed by ``mi-diffind fit image scenes/assets/tiles.json -o scenes/assets/tiles.npz``.
 """

@@ -1,5 +1,4 @@
-"""
-Writing scene files for people to read: what ``make_materials.py``, ``make_metals.py`` and ``make_horizon.py`` share.
+"""Writing scene files for people to read: what ``make_materials.py``, ``make_metals.py`` and ``make_horizon.py`` share.
 
 Mitsuba's own writer (``mi.parser.write_file``, of a parsed dictionary) is made for converting scenes, and loses what
 these files are for: it knows no ``<default>`` but the width of the film, writes no comments, turns a ``lookat`` into
@@ -38,8 +37,7 @@ def element(tag: str, *children: ET.Element, **attributes) -> ET.Element:
 
 
 def plugin(tag: str, plugin_type: str, *children: ET.Element, id: str = "", name: str = "", **parameters) -> ET.Element:
-    """
-    Return ``<tag type="plugin_type">`` with its ``parameters``.
+    """Return ``<tag type="plugin_type">`` with its ``parameters``.
 
     Parameters are ``True`` and ``False``, whole numbers, numbers, texts, and colours (three numbers). ``name`` is the
     parameter of the parent.

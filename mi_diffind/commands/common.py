@@ -9,8 +9,6 @@ from .. import runtime
 from ..arguments import define, natural, positive
 from ..errors import UsageError
 
-# -- parsers ----------------------------------------------------------------------------------------------------------
-
 
 def verb(commands, name: str, run, help: str) -> argparse.ArgumentParser:
     """Add a verb to ``commands`` and return its parser; ``--json`` writes what ``run(arguments)`` returns."""
@@ -56,9 +54,6 @@ def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
     if rendering:
         sub.add_argument("--spp", type=positive, help="samples per pixel (default: the scene's)")
         sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
-
-
-# -- before the work starts -------------------------------------------------------------------------------------------
 
 
 def set_variant(name: str | None) -> None:

@@ -1,5 +1,4 @@
-"""
-Images and the maps of materials, which several tasks store.
+"""Images and the maps of materials, which several tasks store.
 
 - :mod:`.source`: reads an image, or the maps of a manifest; :mod:`.layout`: chooses the stored channels.
 - :mod:`.pyramid`: mip pyramids; :mod:`.components`: borders, smaller versions and principal components.

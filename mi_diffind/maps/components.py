@@ -11,8 +11,7 @@ TILEABLE = 1.5
 
 
 def borders(values: np.ndarray) -> tuple[str, str]:
-    """
-    Return the borders along v and u of an image of shape ``(height, width, channels)``.
+    """Return the borders along v and u of an image of shape ``(height, width, channels)``.
 
     ``"repeat"`` where the first row (or column) continues the last one (:data:`TILEABLE`), else ``"clamp"``.
     """
@@ -28,8 +27,7 @@ def borders(values: np.ndarray) -> tuple[str, str]:
 
 
 def downscale(values: np.ndarray, rows: int, columns: int, border: tuple[str, str]) -> np.ndarray:
-    """
-    Return ``values``, ``(height, width, k)``, filtered at the entries of an array of ``rows`` × ``columns``, float32.
+    """Return ``values``, ``(height, width, k)``, filtered at the entries of a ``rows`` × ``columns`` array, float32.
 
     The filter is a tent as wide as the distance of two entries, or of two texels if that is more.
     """
@@ -53,8 +51,7 @@ def _tent(entries: int, texels: int, border: str) -> np.ndarray:
 
 
 def smoothness(values: np.ndarray) -> float:
-    """
-    Return the smoothness of an image, ``(height, width, k)`` in [0, 1], in dB.
+    """Return the smoothness of an image, ``(height, width, k)`` in [0, 1], in dB.
 
     It is the PSNR of the image in which each texel is the mean of its four neighbours. Noise has 20, a photograph 40.
     """

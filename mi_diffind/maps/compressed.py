@@ -18,8 +18,7 @@ CHUNK = 2**20
 
 
 class CompressedMaps:
-    """
-    Base class of maps that are stored in arrays.
+    """Base class of maps that are stored in arrays.
 
     ``layout`` lists the maps; ``types`` is the module of the Dr.Jit types of a read, ``None`` if all channels are
     constant; ``border`` is that of the image along v and u.
@@ -28,8 +27,6 @@ class CompressedMaps:
     layout: Layout
     types: ModuleType | None
     border: tuple[str, str]
-
-    # -- reading ----------------------------------------------------------------------------------------------------
 
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v) in [0, 1]²; v runs down from the upper left corner of the image."""
@@ -44,8 +41,7 @@ class CompressedMaps:
         return self.maps(self.stored(u, v, active), names or self.layout.names)
 
     def decode(self, names: Sequence[str] | None = None, width: int = 0, height: int = 0) -> dict[str, np.ndarray]:
-        """
-        Return the maps at the texel centres of an image, by default of the source's size.
+        """Return the maps at the texel centres of an image, by default of the source's size.
 
         float32, ``(height, width, channels)``, in the color space of each map.
         """
@@ -73,11 +69,8 @@ class CompressedMaps:
                     images[name][start : start + count, c] = value if isinstance(value, float) else value.numpy()
         return {name: image.reshape(height, width, -1) for name, image in images.items()}
 
-    # -- errors -----------------------------------------------------------------------------------------------------
-
     def measure(self, source: Source) -> dict[str, float]:
-        """
-        Return the errors at texel centres against ``source``.
+        """Return the errors at texel centres against ``source``.
 
         - ``psnr_db``: all channels together; ``psnr_MAP_db``: each map; ``psnr_mean_db``: the mean over maps.
         - ``psnr_between_db``: all channels at 2²⁰ random places, against the bilinear interpolation of the source.
@@ -121,8 +114,7 @@ class CompressedMaps:
 
 
 class FilteredMaps(CompressedMaps):
-    """
-    Base class of maps that are read at any level of detail.
+    """Base class of maps that are read at any level of detail.
 
     Each of the ``levels`` is half as large as the one before it; level 0 is the source, ``levels - 1`` one texel.
     """
@@ -130,8 +122,7 @@ class FilteredMaps(CompressedMaps):
     levels: int
 
     def filtered(self, u, v, level, active=True) -> list:
-        """
-        Return the stored channels at (u, v) in [0, 1]² and a level of detail, a real number for each place.
+        """Return the stored channels at (u, v) in [0, 1]² and a level of detail, a real number for each place.
 
         Linear between levels. Numbers beyond the levels mean the nearest level, NaN means 0.
         """

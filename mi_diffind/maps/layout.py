@@ -1,5 +1,4 @@
-"""
-Stored channels of a material, and the maps as functions of them.
+"""Stored channels of a material, and the maps as functions of them.
 
 The maps of a material (:mod:`.source`) have more channels than content: a grey base colour is one channel three times,
 the third component of a normal follows from the other two, a metallic map may be black. A :class:`Layout` lists the
@@ -31,8 +30,7 @@ FROM_NORMAL = "z"
 
 @dataclass(frozen=True)
 class MapLayout:
-    """
-    Origin and range of the channels of one map.
+    """Origin and range of the channels of one map.
 
     ``where`` holds, for each channel, the index of a stored channel, or :data:`FROM_NORMAL`, the third component of a
     unit normal whose others are the map's first two channels, or ``("constant", value)``. A stored number s in [0, 1]
@@ -76,8 +74,7 @@ class MapLayout:
 
 @dataclass(frozen=True)
 class Layout:
-    """
-    Size, maps and stored channels of a material.
+    """Size, maps and stored channels of a material.
 
     ``initial`` has the paper's initial value of each stored channel, ``groups`` the name of its map.
     """
@@ -92,8 +89,7 @@ class Layout:
     def of(
         source: Source, once: bool = True, two_channel_normals: bool | None = None, filtered: bool = False
     ) -> Layout:
-        """
-        Return the layout of ``source``.
+        """Return the layout of ``source``.
 
         - ``once``: store equal channels once, and constant channels as a number.
         - ``two_channel_normals``: leave out the third component of normal maps (``None``: where it follows from the
@@ -177,8 +173,7 @@ class Layout:
         return stored
 
     def decode(self, name: str, stored: Sequence, exp2=np.exp2, root=None) -> list:
-        """
-        Return the channels of a map, in its color space, from the stored channels in [0, 1].
+        """Return the channels of a map, in its color space, from the stored channels in [0, 1].
 
         Stored channels that the map does not need may be ``None``. ``exp2`` and ``root``, a square root that is 0 for
         negative numbers, are NumPy's unless given.
@@ -208,8 +203,7 @@ class Layout:
 
     @staticmethod
     def from_json(settings: dict) -> Layout:
-        """
-        Return the layout of :meth:`to_json`.
+        """Return the layout of :meth:`to_json`.
 
         Raises ``KeyError``, ``TypeError``, ``ValueError`` or ``OverflowError`` for damaged settings.
         """

@@ -21,8 +21,7 @@ from .source import Source, load_source
 def allocate_maps(
     table: Table, dtype, storage: str, size_of: Callable[[str], tuple[int, int]]
 ) -> dict[str, DifferentiableArray]:
-    """
-    Return the arrays of a checked table for the tensor type ``dtype``, by name.
+    """Return the arrays of a checked table for the tensor type ``dtype``, by name.
 
     Arrays of bytes stay bytes, which can only be read; with the ``storage`` ``"float32"`` they become floats that pass
     through the fold and can be optimised. ``size_of(name)`` returns rows and columns of the image that an array of
@@ -100,8 +99,7 @@ class MapsModel(Model):
         height: int | None = None,
         **reading,
     ):
-        """
-        Write the maps (``map``: only those named) in ``width`` × ``height`` texels, by default the source's.
+        """Write the maps (``map``: only those named) in ``width`` × ``height`` texels, by default the source's.
 
         ``.png`` has 8 bits a channel in the color space of the map; ``.exr`` is linear, in half precision unless its
         range is too small. ``reading`` is passed on to :meth:`.CompressedMaps.decode`. Returns each path with a line of

@@ -1,5 +1,4 @@
-"""
-Mip pyramids of the maps of a material, read trilinearly as graphics hardware does.
+"""Mip pyramids of the maps of a material, read trilinearly as graphics hardware does.
 
 - **Levels.** Level 0 is the source. Each further level has max(1, n // 2) of the n texels along each axis, down to one
   texel. A texel is the mean of the rectangle that it covers: two by two texels of the level below; along an axis with
@@ -50,8 +49,7 @@ def halved(values: np.ndarray) -> np.ndarray:
 
 
 class Pyramid(FilteredMaps):
-    """
-    Mip pyramid of the stored channels of a ``layout``, uncompressed: the reference of all filtered textures.
+    """Mip pyramid of the stored channels of a ``layout``, uncompressed: the reference of all filtered textures.
 
     ``values`` are the levels, float32, ``(height, width, stored)``, each channel in [0, 1] as :meth:`.Layout.encode`
     returns it. Without ``types`` the pyramid cannot be read, only its ``values``. Raises ``ValueError`` for levels of
@@ -81,8 +79,7 @@ class Pyramid(FilteredMaps):
 
     @staticmethod
     def of(source: Source, layout: Layout | None = None, types: ModuleType | None = None, border=None) -> Pyramid:
-        """
-        Return the pyramid of a source.
+        """Return the pyramid of a source.
 
         ``layout`` is any layout of this source (default: ``Layout.of(source, filtered=True)``); a stored channel of
         several maps is averaged as in the first of them. ``border`` along v and u is by default
@@ -144,8 +141,6 @@ class Pyramid(FilteredMaps):
         channels = [self._owners[w] for w in m.where if isinstance(w, int)]
         return all((o.color_space, o.low, o.high, o.knee) == ("srgb", 0, 1, 0) for o in (m, *channels))
 
-    # -- reading ----------------------------------------------------------------------------------------------------
-
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v) in level 0, bilinear."""
         if not self.layout.stored:
@@ -159,8 +154,7 @@ class Pyramid(FilteredMaps):
         return self.encoded(self.interpolated(u, v, level, active))
 
     def interpolated(self, u, v, level, active=True, whole: bool = False) -> list:
-        """
-        Return the interpolated values before they are encoded, which can be averaged further.
+        """Return the interpolated values before they are encoded, which can be averaged further.
 
         They are linear for sRGB colours and for high dynamic range. ``whole``: levels are whole numbers, which halves
         the reads.

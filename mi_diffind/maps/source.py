@@ -1,5 +1,4 @@
-"""
-Sources of a compression: one image, or the maps of a material that a JSON manifest lists.
+"""Sources of a compression: one image, or the maps of a material that a JSON manifest lists.
 
 A manifest gives the name and the file of each map, relative to the manifest's folder::
 
@@ -50,8 +49,7 @@ class SourceError(DiffindError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """
-    One map of a material.
+    """One map of a material.
 
     - ``values``: ``(height, width, channels)``, float32, in the encoding of ``file`` (bytes divided by 255, 16-bit
       numbers by 65535).
@@ -73,8 +71,7 @@ class Map:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """
-    The ``maps`` of an image or material, all of ``height`` × ``width`` texels, with at most 16 channels together.
+    """The ``maps`` of an image or material, all of ``height`` × ``width`` texels, with at most 16 channels together.
 
     ``digest`` is a SHA-256 over their names, layout and values; ``cleaned`` counts the NaN and infinite values that
     were replaced.
@@ -102,8 +99,7 @@ class Source:
 
 
 def load_source(path: str | os.PathLike, nonfinite: str = "error") -> Source:
-    """
-    Read an image or a manifest (``.json``).
+    """Read an image or a manifest (``.json``).
 
     An image is a map called ``"image"`` and, if it has an alpha channel, a map ``"alpha"``. It is sRGB if it is grey or
     RGB of 8 or 16 bits, else linear. A map of a manifest is by default sRGB if it is an albedo of 8 or 16 bits and 1 or
@@ -128,8 +124,7 @@ def load_source(path: str | os.PathLike, nonfinite: str = "error") -> Source:
 def from_arrays(
     arrays: dict[str, np.ndarray], color_spaces: dict[str, str] | None = None, nonfinite: str = "error"
 ) -> Source:
-    """
-    Return a source of arrays by name, ``(height, width)`` or ``(height, width, channels)``.
+    """Return a source of arrays by name, ``(height, width)`` or ``(height, width, channels)``.
 
     Types are 8- or 16-bit unsigned integers and floats. ``color_spaces`` (name → ``"srgb"`` or ``"linear"``) replaces
     the defaults, which are a manifest's; ``"image"`` of 1 or 3 channels counts as an albedo. No channel counts as
@@ -167,9 +162,6 @@ def role_of(name: str) -> str:
     """Return the role (:data:`ROLES`) of a map by its name, such as ``"albedo"`` for ``"base_color"``."""
     plain = name.lower().replace("_", "").removesuffix("texture").removesuffix("map")
     return next((role for role, names in _SYNONYMS.items() if plain in names), "other")
-
-
-# -- manifests --------------------------------------------------------------------------------------------------------
 
 
 def _load_manifest(path: Path, nonfinite: str) -> Source:
@@ -229,9 +221,6 @@ def _unique(pairs: list) -> dict:
             raise ValueError(f'the key "{key}" comes twice')
         result[key] = value
     return result
-
-
-# -- images -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,9 +338,6 @@ def _jpeg_ends(data: bytes) -> bool:
         if marker not in (0x01, 0xD8):  # these have no length
             position += int.from_bytes(data[position : position + 2], "big")
     return False
-
-
-# -- maps -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

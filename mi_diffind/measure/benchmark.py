@@ -1,5 +1,4 @@
-"""
-Benchmark of a :class:`.study.Plan`: time, memory and operations of each candidate beside its accuracy.
+"""Benchmark of a :class:`.study.Plan`: time, memory and operations of each candidate beside its accuracy.
 
 *Time* is that of the kernels alone (:mod:`.clock`). All candidates run in turn, one round of all before the next round,
 so that a change of clock rate or of load affects all of them alike; results are medians and quartiles of the rounds.
@@ -61,8 +60,7 @@ class Stopped(Exception):
 def measure(
     plan: Plan, settings: BenchmarkSettings, folder: str | os.PathLike | None = None, progress: bool = True
 ) -> dict:
-    """
-    Measure a plan, or the rest of it if ``folder`` holds partial results of an interrupted run.
+    """Measure a plan, or the rest of it if ``folder`` holds partial results of an interrupted run.
 
     Partial results stay in ``folder`` until :func:`.report.write` has written the result.
 
@@ -228,9 +226,6 @@ class BenchmarkSteps:
                 this_round[PASS_WALL] = dict(walls)
             times.append(this_round)
             self.store.save(5)
-
-
-# -- the result -------------------------------------------------------------------------------------------------------
 
 
 def _assemble(plan: Plan, cases: list[Case], settings: BenchmarkSettings, data: dict) -> dict:

@@ -1,5 +1,4 @@
-"""
-Noise and bias of renders with learned tables, and the sample count at which the two are equal.
+"""Noise and bias of renders with learned tables, and the sample count at which the two are equal.
 
 Noise is that of the samples, which more time reduces; bias is that of the approximation, which no time reduces.
 
@@ -61,8 +60,7 @@ LEAST = 3
 
 @dataclass(frozen=True)
 class Estimate:
-    """
-    Result of :func:`estimate`.
+    """Result of :func:`estimate`.
 
     ``square``: mean square of the mean image, unbiased, so it may be negative; its ``standard_error``; ``noise``: mean
     square of the noise of one image.
@@ -84,8 +82,7 @@ class Estimate:
 
 
 def estimate(images: Sequence[np.ndarray], weights: np.ndarray | float = 1.0) -> Estimate:
-    """
-    Return estimates of mean(weights · E[image]²) and mean(weights · Var[image]).
+    """Return estimates of mean(weights · E[image]²) and mean(weights · Var[image]).
 
     ``images`` are K ≥ 3 independent ones of the same distribution and shape. With
     Gᵢⱼ = mean(weights · imageᵢ · imageⱼ), the estimates are the mean of Gᵢⱼ over all i ≠ j, and the mean of Gᵢᵢ minus
@@ -109,8 +106,7 @@ def estimate(images: Sequence[np.ndarray], weights: np.ndarray | float = 1.0) ->
 
 
 def weights_of(image: np.ndarray) -> np.ndarray:
-    """
-    Return the weights of the relative error, 1 / (m² + 0.01), of a linear ``image`` ``(height, width, channels)``.
+    """Return the weights of the relative error, 1 / (m² + 0.01), of a linear ``image`` ``(height, width, channels)``.
 
     m is the mean of the image over 5 × 5 pixels, at its edges over those that exist.
     """
@@ -128,15 +124,11 @@ def _along(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 def error(image: np.ndarray, truth: np.ndarray, weights: np.ndarray, truth_noise: float) -> float:
-    """
-    Return the relative MSE of an image against a noisy truth, mean(weights · (image − truth)²) − ``truth_noise``.
+    """Return the relative MSE of an image against a noisy truth, mean(weights · (image − truth)²) − ``truth_noise``.
 
     ``truth_noise`` is the weighted mean square of the noise of ``truth``, which has the shape of ``image``.
     """
     return float(np.mean(weights * (image.astype(np.float64) - truth) ** 2)) - truth_noise
-
-
-# -- results -------------------------------------------------------------------------------------------------
 
 
 def root(square: float) -> float:
@@ -145,8 +137,7 @@ def root(square: float) -> float:
 
 
 def describe(relative: Estimate, displayed: Estimate) -> dict:
-    """
-    Return the bias as numbers, from estimates with relative weights and with those of displayed values.
+    """Return the bias as numbers, from estimates with relative weights and with those of displayed values.
 
     ``measured`` (whether it differs from zero), ``mse`` (may be negative), ``mse_standard_error``; ``rmse``,
     ``rmse_standard_error`` and ``rounding_only`` (no more than the rounding of 32-bit floats), or the bound
@@ -171,8 +162,7 @@ def describe(relative: Estimate, displayed: Estimate) -> dict:
 
 
 def crossover(bias: Estimate, noise_of_a_sample: float, points: list[dict]) -> dict:
-    """
-    Return the sample count at which the noise of the learned render equals the bias.
+    """Return the sample count at which the noise of the learned render equals the bias.
 
     ``spp`` with ``spp_low`` and ``spp_high`` (two standard errors), ``seconds``, ``seconds_wall``, ``extrapolated``; if
     no bias was measured, only ``spp_above``. ``points`` are dictionaries with ``version``, ``spp``, ``timed``,
@@ -199,8 +189,7 @@ def practical(at: dict) -> bool:
 
 
 def seconds_of(spp: float, seconds: dict[int, float]) -> float | None:
-    """
-    Return the time of a render of ``spp`` samples per pixel, from measured times (count → seconds).
+    """Return the time of a render of ``spp`` samples per pixel, from measured times (count → seconds).
 
     Linear between them, and beyond with the slope from the first to the last; ``None`` below the first or without any.
     """

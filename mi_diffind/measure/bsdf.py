@@ -18,8 +18,7 @@ TEXTURE_SIZE = 64
 
 
 def directions(lanes: int, seed: int = 7):
-    """
-    Return random inputs of BSDFs, ``(si, wo, sample1, sample2)``, for so many ``lanes``, evaluated.
+    """Return random inputs of BSDFs, ``(si, wo, sample1, sample2)``, for so many ``lanes``, evaluated.
 
     ``si.wi`` and ``wo`` are uniform over the hemisphere, ``si.uv`` and the random numbers over [0, 1].
     """
@@ -35,8 +34,7 @@ def directions(lanes: int, seed: int = 7):
 
 
 def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dict[str, dict]:
-    """
-    Return query (:data:`QUERIES`) → name of a BSDF → function; ``inputs`` are those of :func:`directions`.
+    """Return query (:data:`QUERIES`) → name of a BSDF → function; ``inputs`` are those of :func:`directions`.
 
     The floor has the same inputs, ``uv`` among them if the materials are ``textured``.
     """

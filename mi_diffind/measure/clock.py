@@ -1,5 +1,4 @@
-"""
-Clock of all studies: seconds of kernels by Dr.Jit's own measurement, and a description of the machine.
+"""Clock of all studies: seconds of kernels by Dr.Jit's own measurement, and a description of the machine.
 
 A time of kernels does not include tracing, code generation and compilation. No derivatives are computed.
 """
@@ -25,8 +24,7 @@ Query = Callable[[], object]
 
 @dataclass(frozen=True)
 class Timed:
-    """
-    Result and times of a function.
+    """Result and times of a function.
 
     ``value``: its evaluated result; ``seconds`` of its kernels, ``seconds_wall`` from beginning to end; ``compiled``:
     whether a kernel was compiled or read from the cache on disk.

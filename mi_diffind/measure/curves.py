@@ -22,8 +22,7 @@ def curves(axes, candidates: Iterable[dict], styles: Styles, place: Callable[[di
 
 
 def against_time(axes, result: dict, timings: Mapping, styles: Styles, error: str, axis: str) -> list[plot.Label]:
-    """
-    Draw an ``error`` of candidates against their times; references are vertical lines.
+    """Draw an ``error`` of candidates against their times; references are vertical lines.
 
     ``axis`` is the label of the time axis. Returns the labels of points, for :func:`.plot.place_labels`.
     """

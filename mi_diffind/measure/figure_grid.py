@@ -52,8 +52,7 @@ def text(lines: Sequence[str]) -> Cell:
 
 
 def write(path: str | os.PathLike, cells: Sequence[Cell], columns: int, shape: Sequence[int]) -> None:
-    """
-    Draw ``cells`` row by row, each seven inches wide, and write ``path`` (``.png``).
+    """Draw ``cells`` row by row, each seven inches wide, and write ``path`` (``.png``).
 
     ``shape`` is that of the pictures, (height, width, …). Raises :class:`~mi_diffind.files.OutputError`.
     """

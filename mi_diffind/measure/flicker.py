@@ -1,5 +1,4 @@
-"""
-Flicker of a plane that a camera moves towards, and a figure of its frames.
+"""Flicker of a plane that a camera moves towards, and a figure of its frames.
 
 The frames are aligned by reprojection: a grid of points of the plane, visible in every frame, is projected into each
 frame, where the image is read with bilinear interpolation. *Flicker* is the variance of a point's displayed values over
@@ -28,8 +27,7 @@ class MovingView:
     frames: int
 
     def places(self, frame: int) -> np.ndarray:
-        """
-        Return the positions in a frame of the :data:`POINTS` × :data:`POINTS` points, row by row, ``(n, 2)``.
+        """Return the positions in a frame of the :data:`POINTS` × :data:`POINTS` points, row by row, ``(n, 2)``.
 
         Positions are x and y in pixels; the centre of the first pixel is at 0.5.
         """
@@ -45,8 +43,7 @@ class MovingView:
         return {"flicker": flicker(points), "flicker_error": flicker(points - self.aligned(truth))}
 
     def figure(self, title: str, caption: str, strips: Mapping[str, np.ndarray], truth: np.ndarray):
-        """
-        Return a figure with a row for each strip of frames and for the ``truth``.
+        """Return a figure with a row for each strip of frames and for the ``truth``.
 
         Each row shows some of the frames and, on the right, one line of the plane in all frames, time downwards.
         """

@@ -1,5 +1,4 @@
-"""
-Counts of operations in the kernels that Dr.Jit makes of a computation.
+"""Counts of operations in the kernels that Dr.Jit makes of a computation.
 
 The accounting is that of the paper's supplement (1.2.1): an addition or multiplication is 1 flop, a division 2, a
 square root or logarithm 4; a fused multiply-add is an addition and a multiplication. Minima, comparisons, selections,
@@ -28,8 +27,7 @@ FLOPS = {"add": 1, "mul": 1, "div": 2, "sqrt": 4, "log": 4}
 
 @dataclass(frozen=True)
 class Operations:
-    """
-    Operations of one lane.
+    """Operations of one lane.
 
     Floating-point ``add`` (and subtract), ``mul``, ``div`` (and reciprocal), ``sqrt`` (and its reciprocal), ``log``
     (and other transcendental functions that are one instruction); ``gathers``, reads of memory at a computed place (one
@@ -60,8 +58,7 @@ class Operations:
 
 
 def count(function: Callable[[], object]) -> Operations:
-    """
-    Count the operations of evaluating the result of ``function()``, a tree of LLVM or CUDA arrays of Dr.Jit.
+    """Count the operations of evaluating the result of ``function()``, a tree of LLVM or CUDA arrays of Dr.Jit.
 
     Kernels that the function launches itself are counted, too. Inputs should be evaluated and opaque
     (``dr.make_opaque``): pending computations become part of the count, and literals are folded into the kernel. Clears
@@ -181,8 +178,7 @@ def _ptx(text: str) -> Iterator[Counted]:
 
 
 def bsdf_operations(bsdf, methods: tuple[str, ...] = ("eval", "pdf", "sample")) -> dict[str, Operations]:
-    """
-    Count the operations of methods of a Mitsuba BSDF (``mi.BSDF``), one call each, with all lobes.
+    """Count the operations of methods of a Mitsuba BSDF (``mi.BSDF``), one call each, with all lobes.
 
     Directions, position, frame and random numbers are inputs; texture lookups are part of the count. Compiles a kernel
     for each of ``methods``, unless Dr.Jit has it in its cache. Raises ``ValueError`` for other methods.

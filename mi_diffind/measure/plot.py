@@ -1,5 +1,4 @@
-"""
-Printable plots of measurements: panels of accuracy against time or bytes, with labels, Pareto front and caption.
+"""Printable plots of measurements: panels of accuracy against time or bytes, with labels, Pareto front and caption.
 
 Also training curves, and the parts of other plots: figures with a caption, logarithmic ticks, placement of labels.
 """
@@ -82,12 +81,8 @@ class Label:
     angle: float = 0.0
 
 
-# -- figures -----------------------------------------------------------------------------------------------------------
-
-
 def figure(title: str, caption: str, width: float, height: float, above: float = 0.3, dpi: int = 200):
-    """
-    Return a Matplotlib figure with ``width`` × ``height`` inches for axes, a title above and a caption below.
+    """Return a Matplotlib figure with ``width`` × ``height`` inches for axes, a title above and a caption below.
 
     The title takes ``above`` inches. The layout is constrained until :func:`fix_layout`.
     """
@@ -142,12 +137,8 @@ def plain(value: float) -> str:
     return f"{value:,.0f}" if value >= 1000 else f"{value:g}"
 
 
-# -- accuracy against time --------------------------------------------------------------------------------------------
-
-
 def draw_panels(title: str, panels: Sequence[Panel], y_label: str, caption: str):
-    """
-    Return a Matplotlib figure with up to two panels a row; time or bytes are on a logarithmic axis.
+    """Return a Matplotlib figure with up to two panels a row; time or bytes are on a logarithmic axis.
 
     If there are several representations, a legend names them.
     """
@@ -234,17 +225,13 @@ def _label(axes, panel: Panel, styles: dict) -> None:
     place_labels(axes, labels, [(p.time, p.accuracy) for p in panel.points], spans)
 
 
-# -- labels -----------------------------------------------------------------------------------------------------------
-
-
 def place_labels(
     axes,
     labels: Iterable[Label],
     points: Sequence[tuple[float, float]],
     spans: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
 ) -> None:
-    """
-    Write each label near its anchor where it covers no other text, in the given order.
+    """Write each label near its anchor where it covers no other text, in the given order.
 
     Labels also avoid ``points`` and ``spans`` (pairs of ends), both in data coordinates, and if possible the lines of
     ``axes``. A thin line leads from an anchor to a label that is away. The layout must be fixed (:func:`fix_layout`).
@@ -314,12 +301,8 @@ def _overlap(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.maximum(sides, 0).prod(axis=-1).sum(axis=1)
 
 
-# -- training curves ---------------------------------------------------------------------------------------------
-
-
 def draw_training_curves(title: str, records: dict[str, dict], caption: str):
-    """
-    Draw PSNR over steps of trainings (records of :class:`.training.ConvergenceTraining`).
+    """Draw PSNR over steps of trainings (records of :class:`.training.ConvergenceTraining`).
 
     Each training has a panel, each of its runs a line, from the shortest (light) to the longest (dark). A training
     that has not converged is marked in red.

@@ -28,9 +28,6 @@ COLUMNS = (
 QUANTITIES = {"bytes": ("bytes", "bytes"), "training_seconds": ("seconds of training", "training")}
 
 
-# -- files ------------------------------------------------------------------------------------------------------------
-
-
 def write_files(
     name: str,
     folder: str | os.PathLike,
@@ -39,8 +36,7 @@ def write_files(
     columns: Iterable[str],
     pictures: dict[str, Callable[[], object]],
 ) -> dict[str, str]:
-    """
-    Write ``tradeoff_NAME.csv`` (``rows``), ``.json`` (``result``) and pictures, and return the paths.
+    """Write ``tradeoff_NAME.csv`` (``rows``), ``.json`` (``result``) and pictures, and return the paths.
 
     ``pictures`` maps ``"png"`` (``tradeoff_NAME.png``) or another word (``tradeoff_NAME_WORD.png``) to a function that
     draws a Matplotlib figure. Partial results of a complete run are removed from ``folder``. Raises
@@ -72,8 +68,7 @@ def publish(result: dict, paths: dict[str, str], lines: list[str]) -> dict:
 
 
 def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> dict[str, str]:
-    """
-    Write the files (:func:`write_files`) of a result of :func:`.benchmark.measure`, and return their paths.
+    """Write the files (:func:`write_files`) of a result of :func:`.benchmark.measure`, and return their paths.
 
     The pictures are the panels, training curves, and those of the ``plan`` if the run is complete.
     """
@@ -92,8 +87,7 @@ def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> 
 
 
 def rows(result: dict) -> list[dict]:
-    """
-    Return the result as rows of a table: one for each case, query (or whole pass) and candidate.
+    """Return the result as rows of a table: one for each case, query (or whole pass) and candidate.
 
     Candidates of no case have one row. The columns are :data:`COLUMNS`, one for each error and one for each number or
     text among the details of candidates. ``time`` is in ``unit``, floor subtracted (``hidden``: it is only a bound).
@@ -127,12 +121,8 @@ def _candidate_cells(result: dict, name: str) -> dict:
     return {"candidate": name, **cells, **c["errors"], **details}
 
 
-# -- the picture ------------------------------------------------------------------------------------------------------
-
-
 def panels(result: dict) -> list[plot.Panel]:
-    """
-    Return the panels of a result: accuracy against the plan's quantities, then against time, one panel a case.
+    """Return the panels of a result: accuracy against the plan's quantities, then against time, one panel a case.
 
     Times are those of the first query, or of a pass. Candidates have labels and quartiles, references vertical lines.
     """
@@ -192,9 +182,6 @@ def caption(result: dict) -> str:
         f"{machine_line(result)} Medians and quartiles of {s['rounds']} interleaved rounds of {s['lanes']:,} lanes on "
         f"all cores, input and output (the floor) subtracted{errors}.{state(result)}",
     ])  # fmt: skip
-
-
-# -- lines of text ----------------------------------------------------------------------------------------------------
 
 
 def summary(result: dict, plan: Plan | None = None) -> list[str]:

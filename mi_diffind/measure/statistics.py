@@ -26,8 +26,7 @@ def flat_spread(name: str, values: Iterable[float]) -> dict[str, float]:
 
 
 def timing(values: Iterable[float], floor: float = 0.0) -> dict:
-    """
-    Return the time of rounds without the ``floor``, in the unit of ``values``.
+    """Return the time of rounds without the ``floor``, in the unit of ``values``.
 
     ``time``, ``q1``, ``q3`` are at least :data:`HIDDEN` of the floor; ``with_floor`` is the median with it, ``floor``
     and ``rounds`` are as given; ``hidden``: ``time`` is only an upper bound.
@@ -41,8 +40,7 @@ def timing(values: Iterable[float], floor: float = 0.0) -> dict:
 
 
 def ratio(a: Sequence[float], b: Sequence[float], floor: float = 0.0) -> dict:
-    """
-    Return the ratio ``a / b`` of times, round by round, without the ``floor``.
+    """Return the ratio ``a / b`` of times, round by round, without the ``floor``.
 
     ``median``, ``q1``, ``q3`` are NaN if ``b`` is hidden behind the floor; ``with_floor`` is the median of the ratios
     with it; ``hidden``: ``a`` is hidden, so that the median is only an upper bound.
@@ -58,8 +56,7 @@ def ratio(a: Sequence[float], b: Sequence[float], floor: float = 0.0) -> dict:
 
 
 def pareto(points: Sequence[Sequence[float]], slack: Sequence[float] | float = 0.0) -> list[bool]:
-    """
-    Return for each of ``points`` whether it is on the Pareto front; smaller coordinates are better.
+    """Return for each of ``points`` whether it is on the Pareto front; smaller coordinates are better.
 
     A point is on the front if no other point is better in one coordinate and at least equal in all. Coordinates that
     differ by at most ``slack`` (for each coordinate, or for all) are equal; a point with a NaN is not on the front.

@@ -1,5 +1,4 @@
-"""
-Store of partial results in the output folder: the same command continues an interrupted run.
+"""Store of partial results in the output folder: the same command continues an interrupted run.
 
 Partial results stay until the result is written. A run is continued only if its key is unchanged. The files are
 ``tradeoff_NAME.partial.json``, and ``tradeoff_NAME.partial.ARRAYS.npz`` for each group of arrays.
@@ -23,8 +22,7 @@ from .statistics import finite
 
 
 class Store:
-    """
-    Partial results of the study ``name`` under a ``key`` (a tree for JSON).
+    """Partial results of the study ``name`` under a ``key`` (a tree for JSON).
 
     ``data``: section → tree for JSON; ``arrays``: name → group of NumPy arrays by name. ``folder`` is made if its
     parent exists; ``None`` writes nothing.

@@ -1,5 +1,4 @@
-"""
-Declaration of studies: a study, its plan, and the candidates, jobs and cases of the plan.
+"""Declaration of studies: a study, its plan, and the candidates, jobs and cases of the plan.
 
 A module of :mod:`mi_diffind.studies`, or one that an entry point of the group ``mi_diffind.studies`` names, has a
 :class:`Study` as its ``STUDY``. The command line imports all of them, so a declaration imports neither Mitsuba nor
@@ -19,8 +18,7 @@ FLOOR = "floor"
 
 
 class Study:
-    """
-    Base class of studies.
+    """Base class of studies.
 
     ``name``: the word of the command and of the files (``tradeoff_NAME.…``); ``title``: a phrase for the help.
 
@@ -45,8 +43,7 @@ class Study:
         raise NotImplementedError(f'the study "{self.name}" has no plan')
 
     def run(self, arguments) -> dict | None:
-        """
-        Run a study that has no plan: measure, write the files and print the result.
+        """Run a study that has no plan: measure, write the files and print the result.
 
         Returns the result with its ``files``, after Ctrl-C an incomplete one with ``interrupted``. ``None``, the
         default: the command measures the plan.
@@ -56,8 +53,7 @@ class Study:
 
 @dataclass
 class Candidate:
-    """
-    Candidate of a comparison: a representation at a setting.
+    """Candidate of a comparison: a representation at a setting.
 
     ``errors(samples)`` measures its errors against the truth. Without it, the errors are those of its job's record, or
     it has none: the truth (``is_truth``), or a candidate that computes something else, which ``note`` explains.
@@ -87,8 +83,7 @@ class Candidate:
 
 
 class Job:
-    """
-    Work that is done before the measurement, such as a training; shared by the candidates that name it.
+    """Work that is done before the measurement, such as a training; shared by the candidates that name it.
 
     Its record is a tree for JSON: ``seconds``, and optionally ``bytes``, ``errors``, ``converged``, ``details``, and
     ``runs``, the curves of trainings (:mod:`.training`).
@@ -107,8 +102,7 @@ class Job:
 
 @dataclass
 class Case:
-    """
-    Situation in which candidates are timed.
+    """Situation in which candidates are timed.
 
     ``queries(lanes)`` returns query → name of a candidate, or :data:`FLOOR` → function. ``passes()``, if given, returns
     name of a candidate (those with ``in_passes``) → function of the pass number that does one whole pass, such as a
@@ -131,8 +125,7 @@ class Case:
 
 @dataclass
 class Plan:
-    """
-    Plan of a measurement: candidates, cases, jobs, and the reports of a study.
+    """Plan of a measurement: candidates, cases, jobs, and the reports of a study.
 
     ``accuracy`` names the error of pictures and of the Pareto front; larger is better, as for a PSNR. ``ratios`` are
     pairs of candidates whose times are divided. Partial results are continued only if ``details`` and the fingerprint

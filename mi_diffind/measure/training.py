@@ -1,5 +1,4 @@
-"""
-Training to convergence: runs of twice as many steps, until a run gains next to nothing.
+"""Training to convergence: runs of twice as many steps, until a run gains next to nothing.
 
 Only representations that are trained to convergence can be compared. A representation has converged if a run of twice
 as many steps, with the same schedule stretched to them, gained less than :data:`GAIN` dB; if the longest run gained
@@ -26,8 +25,7 @@ GAIN = 0.5
 
 
 class ConvergenceTraining(Job):
-    """
-    Training of a representation to convergence.
+    """Training of a representation to convergence.
 
     ``problem()`` returns a new problem with untrained parameters; ``settings`` are those of the first, shortest run,
     ``longest`` is the largest number of steps; each run is measured ``measurements`` times. After :meth:`run` or
@@ -50,8 +48,7 @@ class ConvergenceTraining(Job):
         return None
 
     def run(self, folder: Path | None = None, progress: bool = True) -> dict | None:
-        """
-        Train, from the checkpoint if ``folder`` has one.
+        """Train, from the checkpoint if ``folder`` has one.
 
         Returns the record, or ``None`` after Ctrl-C: ``name``, ``steps``, ``seconds`` and ``psnr_db`` of the best run,
         ``gain_db`` of the last doubling (``None``: there was none), ``converged``, ``entries`` (numbers trained), and

@@ -1,5 +1,4 @@
-"""
-Task 5 inside a scene: arrays of a ``neural_texture``, trained by differentiating renders of the scene that shows it.
+"""Task 5 inside a scene: arrays of a ``neural_texture``, trained by differentiating renders of the scene that shows it.
 
 References are renders of the same scene with exact plugins and many samples. The result is a table file of the task
 ``texture``. This package stands above plugins and scenes, which it renders; :mod:`mi_diffind.tasks.shading` trains for

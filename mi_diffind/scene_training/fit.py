@@ -49,8 +49,7 @@ def fit_scene(
     references: str | os.PathLike | None = None,
     preview: Path | None = None,
 ) -> tuple[Table, FitResult]:
-    """
-    Train the arrays of a texture of a scene for the ``views``, and return the stored table and the run's record.
+    """Train the arrays of a texture of a scene for the ``views``, and return the stored table and the run's record.
 
     ``file`` is the texture's file, needed if the scene reads several. ``request`` gives duration and checkpoint; its
     settings are those of the ``recipe``. ``references`` is a folder that keeps the reference images; ``preview`` a

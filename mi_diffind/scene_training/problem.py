@@ -1,5 +1,4 @@
-"""
-Training problem of a scene: (1 − λ) · loss of the texture + λ · difference between renders and references.
+"""Training problem of a scene: (1 − λ) · loss of the texture + λ · difference between renders and references.
 
 *Unbiased.* The derivative of a squared error is 2 (I − R) ∂I, a product of two random numbers if I is a render of few
 samples. The product is right on average only if both are independent: the value I comes from one set of samples, its
@@ -48,8 +47,7 @@ def exposure_of(references: Sequence[np.ndarray]) -> float:
 
 
 class SceneProblem(Problem):
-    """
-    Training problem (:mod:`mi_diffind.fitting`) of a texture in a scene.
+    """Training problem (:mod:`mi_diffind.fitting`) of a texture in a scene.
 
     ``texture`` is the problem of the same arrays without a scene, whose ``net`` is trained; ``scene`` reads the arrays.
     ``trained`` and ``measured`` are pairs of a view and its reference, ``(height, width, channels)``. ``preview`` is a
@@ -114,8 +112,7 @@ class SceneProblem(Problem):
         return dr.select(size < bound, dr.square(error), bound * (2 * size - bound))
 
     def measure(self, net) -> dict[str, float]:
-        """
-        Return ``psnr_db`` of renders of the measured views, with rounded entries, and the PSNR of the texture.
+        """Return ``psnr_db`` of renders of the measured views, with rounded entries, and the PSNR of the texture.
 
         Values are clipped to [0, 1]. The errors of two halves of the samples are multiplied, so that their variance
         does not count.

@@ -22,8 +22,7 @@ STEPS = 400
 
 @dataclass(frozen=True)
 class SceneRecipe:
-    """
-    Recipe of a training inside a scene.
+    """Recipe of a training inside a scene.
 
     ``share``: λ, the share of the loss of rendered images; the rest is the loss of the texture. ``spp``: samples a
     pixel of the trained renders, at least 1, and of their footprints: choose the number with which the result will be

@@ -29,8 +29,7 @@ SEEDS = 1 << 31
 
 @dataclass
 class ReferenceRenders:
-    """
-    Images of the views of a scene, rendered with exact plugins at ``spp`` samples a pixel.
+    """Images of the views of a scene, rendered with exact plugins at ``spp`` samples a pixel.
 
     ``against`` names other counterparts than the exact ones. ``folder`` (created if its parent exists; ``None``: keep
     nothing) holds one file for each image. The name of a file depends on everything that the image depends on: the
@@ -82,8 +81,7 @@ class ReferenceRenders:
         return hashlib.sha256((self.digest + json.dumps(asdict(view))).encode()).hexdigest()
 
     def images(self, views: Sequence[View]) -> list[np.ndarray]:
-        """
-        Return the linear images, ``(height, width, channels)``, float32; missing ones are rendered.
+        """Return the linear images, ``(height, width, channels)``, float32; missing ones are rendered.
 
         The exact scene is dropped afterwards: Dr.Jit compiles the materials of all loaded scenes into every kernel.
         """

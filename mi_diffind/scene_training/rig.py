@@ -14,8 +14,7 @@ PARALLEL = 1e-4
 
 
 class Rig:
-    """
-    First sensor and lights of a loaded scene, moved through scene parameters: nothing is loaded or compiled again.
+    """First sensor and lights of a loaded scene, moved through scene parameters: nothing is loaded or compiled again.
 
     Raises :class:`~mi_diffind.scenes.SceneError` if the scene has nothing that could be moved, or looked at.
     """

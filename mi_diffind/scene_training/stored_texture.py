@@ -26,8 +26,7 @@ PLUGIN = "neural_texture"
 
 
 def texture_file(parsed: scenes.ParsedScene, file: str | os.PathLike | None = None) -> tuple[Path, str]:
-    """
-    Return the file of the texture that is trained, and the ``source`` that the scene gives for it ("": none).
+    """Return the file of the texture that is trained, and the ``source`` that the scene gives for it ("": none).
 
     The file is ``file``, or the only one that textures of the scene read. Raises
     :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.scenes.SceneError`.

@@ -18,8 +18,7 @@ from .views import View, ViewDistribution
 
 
 class TrainedScene:
-    """
-    Loaded scene in which textures of ``file`` read the arrays of ``table``, which can be replaced.
+    """Loaded scene in which textures of ``file`` read the arrays of ``table``, which can be replaced.
 
     All maps of a file read the same arrays. Each array has one parameter for each map; setting one of them sets the
     array for all maps. Renders use the integrator ``prb`` in place of ``path``, the same estimator: paths are sampled
@@ -83,8 +82,7 @@ class TrainedScene:
             texture.set_cone(cone)
 
     def render(self, seed, seed_grad, spp: int | None = None):
-        """
-        Return the image of the current view, a tensor that is differentiable by the arrays.
+        """Return the image of the current view, a tensor that is differentiable by the arrays.
 
         Values come from the samples of ``seed``, derivatives from those of ``seed_grad``: the derivative of the loss by
         the image is then independent of the derivative of the image by the arrays, and their product is right on

@@ -16,8 +16,7 @@ from ..errors import UsageError
 
 @dataclass(frozen=True)
 class View:
-    """
-    One view and its light: angles in degrees, ``origin`` and ``distance`` in units of the scene.
+    """One view and its light: angles in degrees, ``origin`` and ``distance`` in units of the scene.
 
     ``None`` leaves a value as in the scene (:class:`ViewDistribution`).
     """
@@ -32,8 +31,7 @@ class View:
 
 @dataclass(frozen=True)
 class ViewDistribution:
-    """
-    Distribution of views and lights: ranges ``(low, high)``; ``None`` leaves a value as in the scene.
+    """Distribution of views and lights: ranges ``(low, high)``; ``None`` leaves a value as in the scene.
 
     The camera orbits ``target`` (``None``: the surface in the middle of the scene's image): ``azimuth`` is its turn
     about the direction ``up``, ``elevation`` its height above the plane through the target, both in degrees, and

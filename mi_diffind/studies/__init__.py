@@ -1,5 +1,4 @@
-"""
-Studies of ``mi-diffind tradeoff``: each compares candidates by accuracy, bytes and time.
+"""Studies of ``mi-diffind tradeoff``: each compares candidates by accuracy, bytes and time.
 
 Each module here, and each that an entry point of the group ``mi_diffind.studies`` names, declares a study as its
 ``STUDY`` (:class:`mi_diffind.measure.study.Study`). Studies load plugins, so this package lies above them.

@@ -1,5 +1,4 @@
-"""
-Equal-memory comparison: each method is trained once per memory budget (:class:`Contender`) and cached.
+"""Equal-memory comparison: each method is trained once per memory budget (:class:`Contender`) and cached.
 
 Trained models are files in a folder, so an interrupted study continues with the models that are there.
 """
@@ -19,8 +18,6 @@ import numpy as np
 from .. import task
 from ..files import replacing
 from ..measure.study import Candidate, Job
-
-# -- selection --------------------------------------------------------------------------------------------------------
 
 
 def add_without_option(parser: argparse.ArgumentParser) -> None:
@@ -46,13 +43,9 @@ def combinations(
     return [(m, budget) for budget in budgets for m in methods if budget == budgets[0] or m not in first_only]
 
 
-# -- contenders -------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Contender(Job):
-    """
-    A ``method`` at one memory ``budget``: the job that trains or encodes it, and the candidate that is measured.
+    """A ``method`` at one memory ``budget``: the job that trains or encodes it, and the candidate that is measured.
 
     ``budget`` is in the study's unit (bytes, or a compression ratio), ``context`` is what all contenders of the study
     share. After :meth:`cached_record` or :meth:`run`, :attr:`model` is the trained or encoded representation.
@@ -114,8 +107,7 @@ class Contender(Job):
 
 
 class PresetContender(Contender):
-    """
-    A contender that a task trains by one of its presets, as ``mi-diffind fit`` does.
+    """A contender that a task trains by one of its presets, as ``mi-diffind fit`` does.
 
     The context has ``types``, the module of Dr.Jit types.
     """
@@ -169,9 +161,6 @@ class PresetContender(Contender):
 
     def load(self, path: Path):
         return self.representation(self.open(path))
-
-
-# -- results ----------------------------------------------------------------------------------------------------------
 
 
 def candidates_by_budget(result: dict) -> dict[Any, dict[str, dict]]:

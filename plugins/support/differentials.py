@@ -1,5 +1,4 @@
-"""
-Ray differentials along a path: the shift of a ray for a step of one sample's width in x and in y on the film.
+"""Ray differentials along a path: the shift of a ray for a step of one sample's width in x and in y on the film.
 
 After Igehy, *Tracing Ray Differentials*, SIGGRAPH 1999, with one formula for reflection and refraction; the rule for
 rough bounces is our own (:meth:`Differentials.bounced`). All values are detached.
@@ -24,8 +23,7 @@ GRAZING = 1e-4
 
 @dataclass  # a type that loops of Dr.Jit accept as state
 class Differentials:
-    """
-    Differentials of the rays of a wavefront.
+    """Differentials of the rays of a wavefront.
 
     A step in x or y adds ``ox`` or ``oy`` to the origin and ``dx`` or ``dy`` to the direction, all ``mi.Vector3f``.
     Rough bounces add a cone around the ray, which is ``width`` wide at the origin and grows by ``spread`` per unit of
@@ -49,8 +47,7 @@ class Differentials:
         return cls(*(mi.Vector3f(v) for v in differences), mi.Float(0), mi.Float(0))
 
     def at(self, ray, si) -> Differentials:
-        """
-        Return the differentials at a hit.
+        """Return the differentials at a hit.
 
         ``ox`` and ``oy`` are the shifts of the place on the tangent plane, ``width`` is the width of the cone there,
         perpendicular to the ray.
@@ -67,8 +64,7 @@ class Differentials:
         )
 
     def footprint(self, ray, si) -> tuple[mi.Vector2f, mi.Vector2f]:
-        """
-        Return the footprint ``ddx, ddy`` in uv at a hit (:meth:`at`).
+        """Return the footprint ``ddx, ddy`` in uv at a hit (:meth:`at`).
 
         The second moments of the steps' parallelogram and of the cone's disc are added.
         """
@@ -81,8 +77,7 @@ class Differentials:
         return dr.select(wide, both[0], ddx), dr.select(wide, both[1], ddy)
 
     def bounced(self, ray, si, wo, eta, pdf, delta, scale, edges) -> Differentials:
-        """
-        Return the differentials after a bounce at a hit (:meth:`at`) into the direction ``wo`` (world space).
+        """Return the differentials after a bounce at a hit (:meth:`at`) into the direction ``wo`` (world space).
 
         ``pdf`` is the density of the direction per solid angle, unless it is the only one (``delta``); ``eta`` is the
         relative index of refraction in that direction; ``scale`` is the scale of a sample's footprint.

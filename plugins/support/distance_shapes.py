@@ -1,5 +1,4 @@
-"""
-Shapes of Mitsuba that are signed distance fields, and their ray intersection for our integrators.
+"""Shapes of Mitsuba that are signed distance fields, and their ray intersection for our integrators.
 
 Mitsuba 3.9 has no shapes written in Python but meshes. A :class:`DistanceShape` is therefore a mesh of eight triangles
 without area, at the corners of the field's box: the scene knows its extent, its material and its parameters, and no ray
@@ -45,8 +44,7 @@ class Placement:
 
     @classmethod
     def of(cls, to_world, scale: float, centre) -> Placement:
-        """
-        Return the placement of a mesh moved by ``to_world`` (``mi.ScalarTransform4f``).
+        """Return the placement of a mesh moved by ``to_world`` (``mi.ScalarTransform4f``).
 
         ``centre`` and ``scale`` are the centre and the longest side of the mesh's box in its units. Raises
         ``RuntimeError`` unless ``to_world`` is a rotation, a uniform scale and a translation.
@@ -68,8 +66,7 @@ class Placement:
 
 
 class DistanceShape(mi.Mesh):
-    """
-    Shape of a distance ``field``'s surface, placed in the world by ``placement``.
+    """Shape of a distance ``field``'s surface, placed in the world by ``placement``.
 
     ``smooth``: shading normals are the field's smooth ones.
     """
@@ -118,8 +115,6 @@ class DistanceShape(mi.Mesh):
         """Bytes of the field's ray-marching index."""
         return tracing.index_bytes(self.field)
 
-    # -- between the world and the unit frame ---------------------------------------------------------------------
-
     def local_ray(self, o, d):
         """Return a ray's origin and direction in the unit frame, where lengths are those of the world by ``size``."""
         return self.axes.to_local(mi.Vector3f(o - self.origin)) / self.size, self.axes.to_local(d)
@@ -128,11 +123,8 @@ class DistanceShape(mi.Mesh):
         """Return a point of the unit frame in the world."""
         return mi.Point3f(dr.fma(self.axes.to_world(mi.Vector3f(p)), self.size, self.origin))
 
-    # -- the surface ----------------------------------------------------------------------------------------------
-
     def moved(self, p, d, active=True):
-        """
-        Attach the hit ``p`` (unit frame) of a ray with the direction ``d`` (world) to the field's entries.
+        """Attach the hit ``p`` (unit frame) of a ray with the direction ``d`` (world) to the field's entries.
 
         If derivatives are enabled and not suspended, the hit moves along the ray so that the value stays zero.
         """
@@ -147,8 +139,7 @@ class DistanceShape(mi.Mesh):
         return p - mi.Vector3f(d) * ((value - dr.detach(value)) / along)
 
     def surface(self, p, d, active=True):
-        """
-        Return place, geometric and shading normal, in the world, of the hit ``p`` (unit frame) of a ray.
+        """Return place, geometric and shading normal, in the world, of the hit ``p`` (unit frame) of a ray.
 
         The ray has the direction ``d`` (world); the place is attached as in :meth:`moved`.
         """
@@ -178,12 +169,8 @@ def distance_shapes_in(scene: mi.Scene) -> list[DistanceShape]:
     return shapes
 
 
-# -- Mitsuba's grids ---------------------------------------------------------------------------------------------------
-
-
 def crop_grid(values: np.ndarray, lower, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Crop a grid of ``values`` (Z, Y, X) to two cells around its inside; return it with its corners.
+    """Crop a grid of ``values`` (Z, Y, X) to two cells around its inside; return it with its corners.
 
     The grid begins at ``lower``. The result is padded with outside until X and Z are equal: where they differ, the
     ``sdfgrid`` of Mitsuba 3.9 finds next to no hits, and reads beyond its end. Raises ``RuntimeError`` if nothing is
@@ -210,8 +197,7 @@ def finest(sides, nbytes: int) -> int:
 
 
 def native_grid(props: mi.Properties, values: np.ndarray, lower, upper, to_world, normals: str):
-    """
-    Create Mitsuba's ``sdfgrid`` of ``values`` (Z, Y, X) with the material of ``props``.
+    """Create Mitsuba's ``sdfgrid`` of ``values`` (Z, Y, X) with the material of ``props``.
 
     X and Z are equal; ``lower`` and ``upper`` are the corners of the box, which ``to_world`` moves. A rotated grid is
     an instance, in a ``merge`` with its group. Returns the shape, and the shape that a scene keeps of it.
@@ -236,9 +222,6 @@ def native_grid(props: mi.Properties, values: np.ndarray, lower, upper, to_world
     both["group"], both["instance"] = group, instance
     both.set_id(props.id())
     return mi.PluginManager.instance().create_object(both), instance
-
-
-# -- rays --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass

@@ -1,5 +1,4 @@
-"""
-Filters of textures: the level of detail and the places of the reads for a footprint.
+"""Filters of textures: the level of detail and the places of the reads for a footprint.
 
 A footprint has two columns, ``ddx`` and ``ddy``, full conjugate diameters of an ellipse in the coordinates of the
 texture (:mod:`.footprint`). A level of detail is a number ≥ 0; level l has texels 2^l times those of the image.
@@ -68,8 +67,7 @@ class Filter:
 
 
 def cone_of(props: mi.Properties) -> footprint.Cone | None:
-    """
-    Return :meth:`.Cone.from_properties`, the same object for equal properties.
+    """Return :meth:`.Cone.from_properties`, the same object for equal properties.
 
     Dr.Jit merges the reads of several textures only if they share their variables.
     """
@@ -98,8 +96,7 @@ def isotropic(ddx: mi.Vector2f, ddy: mi.Vector2f) -> mi.Float:
 
 
 def anisotropic(ddx: mi.Vector2f, ddy: mi.Vector2f, taps: int) -> tuple[mi.Float, mi.Vector2f]:
-    """
-    Return the level of all ``taps`` along the major axis of a footprint in texels of the image, and that axis.
+    """Return the level of all ``taps`` along the major axis of a footprint in texels of the image, and that axis.
 
     A tap is as wide as the minor axis, or wider if the taps would not cover the major axis otherwise; its level is
     :data:`FINER` than this width. Graphics hardware reads fewer taps where these suffice; always reading all of them is
@@ -121,8 +118,7 @@ def offsets(taps: int) -> list[float]:
 
 
 def random(si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float]:
-    """
-    Return two random numbers in [0, 1) for a hit: a hash of the bits of its position and uv.
+    """Return two random numbers in [0, 1) for a hit: a hash of the bits of its position and uv.
 
     Every texture, and every pass over the same path, gets the same numbers.
     """

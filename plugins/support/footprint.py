@@ -1,5 +1,4 @@
-"""
-Footprint of a pixel at a surface hit: two full conjugate diameters of an ellipse in uv, ``ddx`` and ``ddy``.
+"""Footprint of a pixel at a surface hit: two full conjugate diameters of an ellipse in uv, ``ddx`` and ``ddy``.
 
 Both are ``mi.Vector2f``, the columns of ``si.footprint`` in Mitsuba 3.10. Their |det| (:func:`area`) is
 |ddx(uv) × ddy(uv)| of Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH Asia
@@ -37,8 +36,7 @@ STRAIGHT = 2e-2
 
 @dataclass(eq=False)  # a type in which frozen functions (``dr.freeze``) look for arrays
 class Cone:
-    """
-    Geometry of a sensor's pixels in world space, as opaque arrays, so that another sensor needs no new kernel.
+    """Geometry of a sensor's pixels in world space, as opaque arrays, so that another sensor needs no new kernel.
 
     - ``projection``: one of :data:`PROJECTIONS`;
     - ``origin``: the centre of projection, or of the lens; ``axis``: the unit vector of the viewing direction;
@@ -63,8 +61,7 @@ class Cone:
 
     @classmethod
     def of(cls, sensor: mi.Sensor, spp: int | None = None) -> Cone:
-        """
-        Return the cone of a loaded sensor, at ``spp`` samples per pixel (default: that of its sampler).
+        """Return the cone of a loaded sensor, at ``spp`` samples per pixel (default: that of its sampler).
 
         The projection is derived from the sensor's rays: all go through one point or one lens, or all are parallel, and
         pixels are parallelograms. Raises ``RuntimeError`` for other sensors (``distant``, ``irradiancemeter``,
@@ -115,8 +112,7 @@ class Cone:
 
     @classmethod
     def from_properties(cls, props: mi.Properties) -> Cone | None:
-        """
-        Return the cone of a perspective sensor that a texture's properties describe; ``None`` without such properties.
+        """Return the cone of a perspective sensor that a texture's properties describe, or ``None``.
 
         They are ``sensor_to_world`` (a transformation without scale), ``fov`` (in degrees, along x), ``resolution``
         (number of square pixels along x) and ``spp`` (default 1), for plain Mitsuba, which does not call
@@ -168,12 +164,8 @@ def _number(props: mi.Properties, name: str, default: float) -> float:
         raise RuntimeError(f'parameter "{name}": found {props[name]}, a number is needed') from None
 
 
-# -- at a hit ----------------------------------------------------------------------------------------------------------
-
-
 def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi.Vector2f, mi.Vector2f]:
-    """
-    Return the footprint at a hit: ``ddx, ddy`` in the surface's uv, before any ``to_uv``. It is always finite.
+    """Return the footprint at a hit: ``ddx, ddy`` in the surface's uv, before any ``to_uv``. It is always finite.
 
     In each lane, the first of these sources counts that is neither zero nor infinite nor NaN: ``si.footprint``, which
     Mitsuba 3.10 has; the partial derivatives ``si.duv_dx`` and ``si.duv_dy``, if an integrator filled them; the
@@ -196,8 +188,7 @@ def footprint(si: mi.SurfaceInteraction3f, cone: Cone | None = None) -> tuple[mi
 
 
 def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Vector2f]:
-    """
-    Return the footprint of a sensor's sample, from the position of the hit alone.
+    """Return the footprint of a sensor's sample, from the position of the hit alone.
 
     A direct hit: the steps of a pixel are projected along the line of sight onto the plane of dp_du and dp_dv. With the
     distance t, the cosine z between the line and the sensor's axis, and the angle θ between the line and the normal,
@@ -239,8 +230,7 @@ def seen_by(cone: Cone, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector2f, mi.Ve
 
 
 def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Vector2f:
-    """
-    Return the offset in uv from a hit to the place seen at the centre of its pixel.
+    """Return the offset in uv from a hit to the place seen at the centre of its pixel.
 
     It removes the jitter of a sample that is the only one of its pixel. It is zero for indirect hits, for several
     samples per pixel, and for sensors with a lens.
@@ -260,8 +250,7 @@ def to_centre(cone: Cone | None, si: mi.SurfaceInteraction3f, ddx, ddy) -> mi.Ve
 
 
 def in_uv(x, y, along, du, dv) -> tuple[mi.Vector2f, mi.Vector2f]:
-    """
-    Project the vectors ``x`` and ``y`` along a direction onto the plane of ``du`` and ``dv``, and return them in uv.
+    """Project the vectors ``x`` and ``y`` along a direction onto the plane of ``du`` and ``dv``, and return them in uv.
 
     Components are limited to ± :data:`LARGEST`; they are zero where du and dv are parallel or zero, or a value is NaN.
     """
@@ -285,9 +274,6 @@ def _finite(v: mi.Vector2f) -> mi.Vector2f:
     return dr.select(dr.isnan(v), 0, dr.clip(v, -LARGEST, LARGEST))
 
 
-# -- geometry of a footprint -------------------------------------------------------------------------------------------
-
-
 def transformed(ddx: mi.Vector2f, ddy: mi.Vector2f, matrix) -> tuple[mi.Vector2f, mi.Vector2f]:
     """Apply ``to_uv`` to a footprint in uv; ``matrix``, 3 × 3, is a list of its rows."""
     (a, b), (c, d) = (tuple(row)[:2] for row in tuple(matrix)[:2])
@@ -301,8 +287,7 @@ def area(ddx: mi.Vector2f, ddy: mi.Vector2f) -> mi.Float:
 
 
 def axes(ddx: mi.Vector2f, ddy: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Vector2f]:
-    """
-    Return the full lengths ≥ 0 in uv of the ellipse's major and minor axis, and the unit vector of the major axis.
+    """Return the full lengths ≥ 0 in uv of the ellipse's major and minor axis, and the unit vector of the major axis.
 
     For a circle, the vector is (1, 0). All are finite; major · minor is :func:`area`.
     """
@@ -341,17 +326,13 @@ def _major(p, q, r) -> tuple:
     return dr.sqrt(0.5 * (p + r) + root), direction
 
 
-# -- scenes ------------------------------------------------------------------------------------------------------------
-
-
 def textures(scene: mi.Scene) -> list:
     """Return the textures of a loaded scene that have a method ``set_cone(cone)``, each once."""
     return [node for node in compat.objects_of(scene) if hasattr(node, "set_cone")]
 
 
 def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None) -> int:
-    """
-    Set the cone of all textures of a loaded scene that use one (:func:`textures`), and return their number.
+    """Set the cone of all textures of a loaded scene that use one (:func:`textures`), and return their number.
 
     ``spp`` is the number of samples per pixel (default: that of the sampler). Call again after a change of the sensor
     or of the samples. Without a supported sensor (:meth:`Cone.of`) the cone is ``None``, with a warning if there is an

@@ -37,8 +37,7 @@ _lock = threading.RLock()  # a thread that waits for a kernel may enter another 
 
 
 class SharedMaps:
-    """
-    Maps and their arrays (name → ``DifferentiableArray``), shared by all textures that read them.
+    """Maps and their arrays (name → ``DifferentiableArray``), shared by all textures that read them.
 
     Equal reads are merged by Dr.Jit only if textures share their variables.
     """
@@ -77,8 +76,7 @@ class SharedMaps:
 
 
 def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
-    """
-    Return the maps in a file of a task whose models have an ``image``. Raises ``TableError``.
+    """Return the maps in a file of a task whose models have an ``image``. Raises ``TableError``.
 
     They are shared by all textures that have the file open, unless their arrays have been changed since.
     """
@@ -114,8 +112,7 @@ def open_compressed(task: Task, props: mi.Properties) -> tuple[SharedMaps, str]:
 
 
 def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps, str]:
-    """
-    Return the mip pyramid that the properties name, and the path of its file ("" without a file).
+    """Return the mip pyramid that the properties name, and the path of its file ("" without a file).
 
     ``filename`` names an image or a manifest, ``bitmap`` is an object, ``pyramid`` names one of :data:`PYRAMIDS`. With
     ``raw``, sRGB values are not converted.
@@ -184,9 +181,6 @@ def map_of(layout: Layout, channels: str) -> MapLayout:
 def is_data(layout: MapLayout) -> bool:
     """Return whether a map holds data, which are never converted; ``raw`` is then true by default."""
     return layout.role in DATA_ROLES and layout.color_space == "linear"
-
-
-# -- the exact counterpart ---------------------------------------------------------------------------------------------
 
 
 def to_bitmap(task: Task, props: mi.Properties) -> None:

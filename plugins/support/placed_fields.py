@@ -23,8 +23,7 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 class PlacedField:
-    """
-    Radiance field (:class:`mi_diffind.tasks.radiance.volume_field.VolumeField`) in a scene, placed by ``to_world``.
+    """Radiance field (:class:`mi_diffind.tasks.radiance.volume_field.VolumeField`) in a scene, placed by ``to_world``.
 
     The transform is a similarity. Densities are per unit of length in the field's frame, so that a scaled field keeps
     its appearance.
@@ -38,8 +37,7 @@ class PlacedField:
         self.size = dr.opaque(mi.Float, self.placement.size)
 
     def held(self) -> list:
-        """
-        Return all arrays that rays read.
+        """Return all arrays that rays read.
 
         A plugin keeps them as an attribute of its instance, since a frozen function (``dr.freeze``) does not traverse
         other objects.
@@ -116,8 +114,7 @@ def _arrays_of(value, visited: set) -> list:
 
 
 class VariantLight:
-    """
-    Conversion of linear RGB radiance to the light of the current variant: RGB, luminance or a spectrum.
+    """Conversion of linear RGB radiance to the light of the current variant: RGB, luminance or a spectrum.
 
     The spectrum is that of Mitsuba's emitters: the upsampled colour, of at most ½, times that of the illuminant D65.
     """
@@ -166,8 +163,7 @@ def _coloured(colour):
 
 
 def to_grid(props: mi.Properties) -> None:
-    """
-    Replace the compressed field in ``filename`` by the grid that it was made from, its exact counterpart.
+    """Replace the compressed field in ``filename`` by the grid that it was made from, its exact counterpart.
 
     Raises ``RuntimeError`` if the grid was not kept or its file does not exist.
     """

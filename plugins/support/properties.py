@@ -19,8 +19,7 @@ def is_number(props: mi.Properties, name: str) -> bool:
 
 
 def check_range(props: mi.Properties, name: str, low: float, high: float) -> None:
-    """
-    Refuse a number outside of ``[low, high]``.
+    """Refuse a number outside of ``[low, high]``.
 
     Textures are not checked, since a constructor would have to wait for a kernel.
     """

@@ -11,8 +11,7 @@ from . import properties
 
 
 def open_tables(props: mi.Properties, task: Task, storage: str = "") -> Model:
-    """
-    Open the file that the properties ``filename``, ``storage`` and ``preset`` name (:meth:`.Task.open`).
+    """Open the file that the properties ``filename``, ``storage`` and ``preset`` name (:meth:`.Task.open`).
 
     ``storage`` is the default of the property of that name ("": the form of the file); ``preset`` defaults to that of
     the file, or of the task.

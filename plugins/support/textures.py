@@ -32,8 +32,7 @@ def spectrum(values: list, wavelengths, upsampled: bool):
 
 
 def wrapped(uv, wrap_mode: str, size: tuple[int, int], repeats: list[bool]) -> list:
-    """
-    Return the coordinates u and v at which an image of ``size`` (width, height) is read.
+    """Return the coordinates u and v at which an image of ``size`` (width, height) is read.
 
     ``repeats`` tells for each coordinate whether the arrays repeat by themselves. With ``mirror`` and ``clamp``, no
     coordinate lies beyond the outermost texel centres.
@@ -74,8 +73,7 @@ class PositionDistribution:
 
     @classmethod
     def of(cls, image: np.ndarray, wrap_mode: str) -> PositionDistribution:
-        """
-        Return the distribution proportional to the luminance of an image, ``(height, width, channels)``.
+        """Return the distribution proportional to the luminance of an image, ``(height, width, channels)``.
 
         It is interpolated as a texture of that ``wrap_mode`` is.
         """

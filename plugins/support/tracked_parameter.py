@@ -15,8 +15,7 @@ _waiting = threading.local()
 
 
 def when_outermost(work) -> None:
-    """
-    Do ``work``, which may wait for a kernel, now, or after the work that this thread is already waiting in.
+    """Do ``work``, which may wait for a kernel, now, or after the work that this thread is already waiting in.
 
     Mitsuba loads scenes in several threads, and a thread that waits for a kernel takes up the next task, which may
     construct the next material: without this queue, constructors would nest without bounds.
@@ -36,8 +35,7 @@ def when_outermost(work) -> None:
 
 
 class TrackedParameter:
-    """
-    Parameter of a BSDF, a texture or a number, with bounds of its values.
+    """Parameter of a BSDF, a texture or a number, with bounds of its values.
 
     ``constant``: the value is the same everywhere (a colour in spectral variants is not, since it varies with the
     wavelengths). ``is_eta``: bounds are those of the reflectance of this index of refraction.
@@ -91,8 +89,7 @@ class TrackedParameter:
 
 
 def value_bounds(texture, colour: bool = False) -> ValueBounds:
-    """
-    Return bounds of the values of ``texture`` (or a number): of its ``eval`` if ``colour``, else of its ``eval_1``.
+    """Return bounds of the values of ``texture`` (or a number): of its ``eval`` if ``colour``, else of its ``eval_1``.
 
     Bounds of constants and bitmaps are known, for any filter; those of any other texture are unknown.
     """

@@ -1,5 +1,4 @@
-"""
-Spectra from colours at render time, by Jakob and Hanika's model with the coefficients that come with Mitsuba.
+"""Spectra from colours at render time, by Jakob and Hanika's model with the coefficients that come with Mitsuba.
 
 Jakob and Hanika, *A Low-Dimensional Function Space for Efficient Spectral Upsampling*, Computer Graphics Forum 38(2),
 2019. Mitsuba's textures are converted when they are loaded; this module reads the same table, 3 × 64³ × 3 numbers,
@@ -38,8 +37,7 @@ def _load():
 
 
 def coefficients(rgb):
-    """
-    Return the coefficients of the model for linear sRGB colours, clamped to [0, 1] as in Mitsuba.
+    """Return the coefficients of the model for linear sRGB colours, clamped to [0, 1] as in Mitsuba.
 
     They are meaningless for greys, whose spectra are constant.
     """

@@ -21,8 +21,7 @@ GROUP, INSIDE, OUTSIDE = 4, 0xFFFE, 0xFFFF
 
 
 class Bricks(ByteCells):
-    """
-    Bricks of ``side``³ cells; only those that the surface crosses are stored.
+    """Bricks of ``side``³ cells; only those that the surface crosses are stored.
 
     ``nodes``: uint8 ``(K, n, n, n)``, the bricks in C order of their places. With ``n = side + 1`` each brick has an
     *apron*, all that its cells need, so that a read asks the index once. With ``n = side`` a cell at the end of a brick
@@ -67,8 +66,7 @@ class Bricks(ByteCells):
         self.nbytes, self.slope = nodes.size + self.index_bytes, slope
 
     def _find(self, bricks, active):
-        """
-        Look up the bricks at places (three arrays) in the index.
+        """Look up the bricks at places (three arrays) in the index.
 
         Returns whether a brick is stored, its number, whether it is inside if it is not stored, and whether its group
         has a number.
@@ -154,8 +152,7 @@ def _grouped(values: np.ndarray) -> np.ndarray:
 
 
 def bricks(types, distances: Distances, spacing: float, side: int, apron: bool = True) -> Bricks:
-    """
-    Return the bricks of ``side``³ cells that have a cell with corners of both signs, with exact distances.
+    """Return the bricks of ``side``³ cells that have a cell with corners of both signs, with exact distances.
 
     Without an ``apron``, all bricks are stored that have a corner of such a cell.
     """

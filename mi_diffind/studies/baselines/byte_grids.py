@@ -1,5 +1,4 @@
-"""
-Signed distances of 8 bits in equal cells: dense grids, and the interpolation and training that bricks share with them.
+"""Signed distances of 8 bits in equal cells: dense grids; interpolation and training shared with bricks.
 
 Everything is in the unit frame of :mod:`mi_diffind.tasks.sdf.field`. Distances are stored in ``2^bits`` equal steps
 between ± ``band``; no step has its middle at zero, so no sign is lost. Bytes are those of all that a read needs: nodes
@@ -59,8 +58,7 @@ def slope_bound(values: np.ndarray, spacing: float) -> float:
 
 
 class ByteCells(DistanceField):
-    """
-    Base class: trilinear interpolation of 8-bit distances in equal cells.
+    """Base class: trilinear interpolation of 8-bit distances in equal cells.
 
     ``cells`` is their number along each axis, the first of which is at ``lower``.
     """
@@ -113,9 +111,6 @@ class ByteCells(DistanceField):
         return dr.select(active, value, self.band), dr.select(active, slope * (self.step / self.spacing), 0)
 
 
-# -- dense grids ------------------------------------------------------------------------------------------------------
-
-
 class ByteGrid(ByteCells):
     """Dense grid of ``nodes``, uint8 ``(X, Y, Z)``, the first of which is at ``lower``."""
 
@@ -163,14 +158,10 @@ def _dense_cells(mesh: Mesh, spacing: float) -> np.ndarray:
     return np.ceil((mesh.upper - mesh.lower) / spacing + 1).astype(int)
 
 
-# -- training ---------------------------------------------------------------------------------------------------------
-
-
 def least_squares(
     distances: Distances, lower, spacing: float, shape, keys: np.ndarray, values: np.ndarray, keep: float = KEEP
 ) -> np.ndarray:
-    """
-    Return ``values`` with those nodes trained that belong to a cell which the surface crosses.
+    """Return ``values`` with those nodes trained that belong to a cell which the surface crosses.
 
     ``keys`` are the places of the nodes in a grid of ``shape`` nodes (C order, ascending); only cells with all of their
     nodes count. Trilinear interpolation of the trained nodes is nearest to distances and normals at random points of

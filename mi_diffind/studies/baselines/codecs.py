@@ -1,5 +1,4 @@
-"""
-Image codecs that learned textures are compared with: thin layers over maintained packages, each of them optional.
+"""Image codecs that learned textures are compared with: thin layers over maintained packages, each of them optional.
 
 An image is float32, ``(height, width, channels)`` with 1 to 4 channels and values in [0, 1], and is rounded to 8 bits
 before it is encoded. Decoded values are the stored ones, without any transfer function; errors are meant to be measured
@@ -56,8 +55,7 @@ class CodecError(DiffindError, RuntimeError):
 
 @dataclass
 class Encoded:
-    """
-    Result of encoding and decoding an image with ``codec``, for example ``"ASTC 8x8"``.
+    """Result of encoding and decoding an image with ``codec``, for example ``"ASTC 8x8"``.
 
     ``nbytes`` counts the payload of blocks or samples, or whole files; ``image`` is decoded, float32 in [0, 1], of the
     input's shape.
@@ -88,8 +86,7 @@ def install_notes(codecs: Iterable[str] = tuple(_PACKAGES)) -> list[str]:
 def astc(
     image: np.ndarray, block: str = "8x8", quality: str = "exhaustive", normal: bool = False, reduce: int = 1
 ) -> Encoded:
-    """
-    Encode an image with ASTC, linear LDR profile, on one core.
+    """Encode an image with ASTC, linear LDR profile, on one core.
 
     One channel is stored as luminance, two as luminance and alpha with equal weights. ``block`` is one of
     :data:`ASTC_BLOCKS`, ``quality`` a preset of the encoder, from ``fastest`` to ``exhaustive``. With ``normal``, only
@@ -159,8 +156,7 @@ def bc7(image: np.ndarray) -> Encoded:
 
 
 def jpeg(image: np.ndarray, quality: int, subsampling: str = "4:4:4") -> Encoded:
-    """
-    Encode an image as progressive JPEG with optimised Huffman tables; ``quality`` is from 1 to 100.
+    """Encode an image as progressive JPEG with optimised Huffman tables; ``quality`` is from 1 to 100.
 
     Two channels become two files, four channels one file of three and one of one; their bytes are added.
     """
@@ -168,8 +164,7 @@ def jpeg(image: np.ndarray, quality: int, subsampling: str = "4:4:4") -> Encoded
 
 
 def webp(image: np.ndarray, quality: int) -> Encoded:
-    """
-    Encode an image as lossy WebP by the slowest method; ``quality`` is from 0 to 100.
+    """Encode an image as lossy WebP by the slowest method; ``quality`` is from 0 to 100.
 
     WebP halves the resolution of colour. Files are as in :func:`jpeg`.
     """
@@ -177,8 +172,7 @@ def webp(image: np.ndarray, quality: int) -> Encoded:
 
 
 def bicubic(image: np.ndarray, nbytes: int) -> Encoded:
-    """
-    Scale an image down until its 8-bit samples fit into ``nbytes`` (1×1 if none does), and up by bicubic filtering.
+    """Scale an image down until its 8-bit samples fit into ``nbytes`` (1×1 if none does), and up by bicubic filtering.
 
     The aspect ratio is kept. The image is scaled down by an antialiased Lanczos or bicubic filter, whichever has the
     smaller error.
@@ -201,8 +195,7 @@ def bicubic(image: np.ndarray, nbytes: int) -> Encoded:
 
 
 def at_bytes(codec: str, image: np.ndarray, nbytes: int) -> Encoded:
-    """
-    Encode an image in at most ``nbytes`` with a codec other than ASTC.
+    """Encode an image in at most ``nbytes`` with a codec other than ASTC.
 
     ``jpeg`` and ``webp`` take the highest quality that fits, else the lowest; JPEG is tried with and without chroma
     subsampling. ``bc7`` has one size only.
@@ -232,8 +225,7 @@ def astc_material(
     choose: str = "medium",
     cache: dict | None = None,
 ) -> tuple[dict[str, Encoded], int]:
-    """
-    Encode the ``maps`` of a material, name → image, with ASTC in ``nbytes`` together, with the least squared error.
+    """Encode the ``maps`` of a material, name → image, with ASTC in ``nbytes`` together, with the least squared error.
 
     Each map has its own block size and resolution (one of ``reduces``, see :func:`astc`); three equal channels are
     stored as luminance, the maps named in ``normals`` with or without z. With ``uniform``, all maps share the best
@@ -288,8 +280,7 @@ def astc_levels(
     cache: dict | None = None,
     dropped: Iterable[int] = (0, 1, 2),
 ) -> tuple[dict[str, EncodedLevels], int]:
-    """
-    Encode the ``maps`` of a material with their mip maps, name → levels, finest first, in ``nbytes`` together.
+    """Encode the ``maps`` of a material with their mip maps, name → levels, finest first, in ``nbytes`` together.
 
     Each map has its own block size and may drop some of its finest levels (one of ``dropped``), which are then read
     from the first stored level with bicubic filtering. The squared error of the finest levels is minimised. Otherwise

@@ -1,5 +1,4 @@
-"""
-Sparse signed distance fields without indirection: a distance and a normal in the 16 bits of each node.
+"""Sparse signed distance fields without indirection: a distance and a normal in the 16 bits of each node.
 
 Nodes are trained and blended as those of our layout.
 """
@@ -77,8 +76,7 @@ class DirectNodes(SparseNodes):
 
 
 class DirectCoding(encoding.NodeCoding):
-    """
-    Codes of nodes without frames and cascaded array: ``pointers`` hold a distance and a normal each.
+    """Codes of nodes without frames and cascaded array: ``pointers`` hold a distance and a normal each.
 
     As in the base class, no node changes its side, and the surface stays within the stored cells.
     """

@@ -1,5 +1,4 @@
-"""
-Signed distance fields of a hash grid and a network (``drjit.nn``).
+"""Signed distance fields of a hash grid and a network (``drjit.nn``).
 
 Source: Müller et al., *Instant Neural Graphics Primitives with a Multiresolution Hash Encoding*, 2022.
 """
@@ -116,8 +115,7 @@ class HashProblem(Problem):
 
 
 def pool(distances: Distances, lower, upper, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return ``count`` points in a box and their distances, ``(count, 3)`` and ``(count,)``.
+    """Return ``count`` points in a box and their distances, ``(count, 3)`` and ``(count,)``.
 
     Three quarters are near the surface (normal distributions of 0.002 and 0.01), the others uniform.
     """

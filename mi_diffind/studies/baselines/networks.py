@@ -11,8 +11,7 @@ from ...measure.operations import Operations
 
 
 class Network(nn.Module):
-    """
-    Multilayer perceptron from ``inputs`` coordinates to one number.
+    """Multilayer perceptron from ``inputs`` coordinates to one number.
 
     There are ``layers`` hidden layers of ``width`` leaky rectified units. With ``grid``, the options of
     ``nn.HashGridEncoding``, a hash grid encodes the coordinates. With ``table``, a number of entries on a side, the
@@ -79,8 +78,7 @@ class Network(nn.Module):
         return 4 * self.parameters
 
     def products(self) -> Operations:
-        """
-        Return the operations of the matrix products, which a kernel's code does not show: they are calls or loops.
+        """Return the operations of the matrix products, which a kernel's code does not show: they are calls or loops.
 
         Each weight counts as one multiplication and one addition, each weight and bias as one read.
         """

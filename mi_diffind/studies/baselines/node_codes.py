@@ -1,5 +1,4 @@
-"""
-Compression of sparse grids in files: numbers of up to 8 bits, predicted from neighbours, then zlib.
+"""Compression of sparse grids in files: numbers of up to 8 bits, predicted from neighbours, then zlib.
 
 Each channel has the prediction that leaves the fewest bytes: none, the previous neighbour along z, or the mean of the
 previous neighbours along x, y and z that are stored. Masks of nodes are bits after zlib.
@@ -21,8 +20,7 @@ PREDICTIONS = ("none", "before", "mean")
 
 @dataclass(frozen=True, eq=False)
 class QuantisationSteps:
-    """
-    Uniform quantisation of the channels of an array ``(n, C)``.
+    """Uniform quantisation of the channels of an array ``(n, C)``.
 
     Value = ``low`` + ``step`` · code, with codes from 0 to ``levels`` − 1; ``low`` and ``step`` are float32 ``(C,)``,
     ``levels`` are at most 256.
@@ -36,8 +34,7 @@ class QuantisationSteps:
     def over(
         values: np.ndarray, levels: int = 256, weights: np.ndarray | None = None, tail: float = 0.0
     ) -> QuantisationSteps:
-        """
-        Return ``levels`` steps over the range of ``values`` (n, C).
+        """Return ``levels`` steps over the range of ``values`` (n, C).
 
         The range is without the share ``tail`` of the ``weights`` (n,) at either end.
         """
@@ -138,8 +135,7 @@ class Neighbours:
 
 
 def coded_bytes(stored: np.ndarray, channels: np.ndarray, predict: bool = True) -> int:
-    """
-    Return the bytes after zlib of a mask ``(X, Y, Z)`` and of the ``channels`` (n, C), uint8, of its nodes.
+    """Return the bytes after zlib of a mask ``(X, Y, Z)`` and of the ``channels`` (n, C), uint8, of its nodes.
 
     Channels are compressed one by one; without ``predict``, the codes are not predicted.
     """

@@ -1,5 +1,4 @@
-"""
-Classical filters of normal maps that shading-aware textures are compared with.
+"""Classical filters of normal maps that shading-aware textures are compared with.
 
 Each filter takes the maps of a material at every level of detail, uncompressed, and returns a reader, as in
 :mod:`mi_diffind.tasks.shading.evaluation`: ``(u, v, level, wi, wo) → Array3f`` of shaded values.
@@ -67,9 +66,6 @@ def moment_pyramid(levels: Sequence[np.ndarray], types, border) -> Pyramid:
     return Pyramid(Layout(width, height, maps, (0.5,) * count, ("moments",) * count), levels, types, border)
 
 
-# -- the source -------------------------------------------------------------------------------------------------------
-
-
 def unit_normals(source: Source) -> np.ndarray | None:
     """Return the source's normals, ``(height, width, 3)``, of length 1; ``None`` without a normal map."""
     m = next((m for m in source.maps if m.role == "normal"), None)
@@ -102,8 +98,7 @@ def slope_moments(normals: np.ndarray, roughness: np.ndarray) -> np.ndarray:
 def interpolated(
     function: Callable, normals: np.ndarray, roughness: np.ndarray, border, two: bool = False
 ) -> np.ndarray:
-    """
-    Return means over each texel of a ``function`` of normals and roughness, ``(height, width, k)``.
+    """Return means over each texel of a ``function`` of normals and roughness, ``(height, width, k)``.
 
     Normals and roughness are interpolated bilinearly at :data:`INSIDE` positions along each side of a texel. With
     ``two``, the third component of normals is not interpolated but computed from the other two.
@@ -139,17 +134,13 @@ def means(base: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-# -- analytic filters -------------------------------------------------------------------------------------------------
-
-
 def filtered(pyramid: Pyramid, effects: Effects) -> ShadedReader:
     """Return the reader that shades filtered parameters."""
     return reader(pyramid, effects)
 
 
 def toksvig_alpha2(alpha2, length):
-    """
-    Return α² of a GGX lobe whose normals have a mean of ``length`` (0, 1].
+    """Return α² of a GGX lobe whose normals have a mean of ``length`` (0, 1].
 
     Toksvig scales the exponent s of a Blinn–Phong lobe: s' = s r / (r + s (1 − r)). The exponent of a lobe with
     roughness α is s = 2/α² − 2 (Walter et al. 2007), so α'² = 2/(s' + 2).
@@ -187,8 +178,7 @@ def _moments(function: Callable, source: Source, pyramid: Pyramid, smooth: bool)
 
 
 def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = False) -> ShadedReader:
-    """
-    Return the reader of an anisotropic lobe around the normal of the mean slope.
+    """Return the reader of an anisotropic lobe around the normal of the mean slope.
 
     The covariance of slopes is measured in the surface's tangent plane; in the frame of a tilted normal n, slopes are,
     to first order, n_z times their projections onto the frame's tangents. The mean of α²/2 is added to the covariance;
@@ -220,8 +210,7 @@ def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = Fals
 
 
 def lobe(covariance, alpha2, s, t, n) -> tuple:
-    """
-    Return ``α_x, α_y`` and the two axes of a lobe about a normal ``n`` with tangents ``s``, ``t``.
+    """Return ``α_x, α_y`` and the two axes of a lobe about a normal ``n`` with tangents ``s``, ``t``.
 
     ``covariance`` is that of the slopes in the surface, ``(xx, yy, xy)``, ``alpha2`` the α² of facets on them.
     """
@@ -263,9 +252,6 @@ def _in_frame(axes, wi, wo, value: Callable):
     return dr.select(visible, shadowing(axes[2], wo) * value(i, o), 0)
 
 
-# -- fitted roughness -------------------------------------------------------------------------------------------------
-
-
 def roughness_reader(pyramid: Pyramid, effects: Effects, levels: Sequence[np.ndarray]) -> ShadedReader:
     """Return the reader of filtered parameters with another roughness, ``(height, width)`` for each level."""
     baked = moment_pyramid([level[..., None] for level in levels], pyramid.types, pyramid.border)
@@ -288,8 +274,7 @@ def directions(types, count: int = PAIRS, seed: int = SEED) -> list[tuple]:
 
 
 def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndarray]:
-    """
-    Return the roughness, ``(height, width)`` for each level, that minimises the error against the converged truth.
+    """Return the roughness, ``(height, width)`` for each level, that minimises the error against the converged truth.
 
     The error is that of filtered parameters at a texel's centre: the squared error of values clipped to [0, 1], over
     ``pairs`` of a view and a light. The roughness is never below the filtered one (where light is lost, least squares
@@ -332,8 +317,7 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndar
 
 
 def _side(level: int) -> int:
-    """
-    Return the samples along the side of a footprint: at least two for each texel.
+    """Return the samples along the side of a footprint: at least two for each texel.
 
     With one, all samples might lie at centres of texels, or all at corners, where normals vary less.
     """
@@ -383,8 +367,7 @@ def roughness_of(pyramid: Pyramid) -> list[np.ndarray]:
 
 
 def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
-    """
-    Return a pyramid with another roughness, ``(height, width)`` for each level, in a stored channel of its own.
+    """Return a pyramid with another roughness, ``(height, width)`` for each level, in a stored channel of its own.
 
     The pyramid is meant to be compressed in place of the source's.
     """
@@ -407,9 +390,6 @@ def with_roughness(pyramid: Pyramid, levels: Sequence[np.ndarray]) -> Pyramid:
     return Pyramid(changed, values, pyramid.types, pyramid.border)
 
 
-# -- biases of the level of detail ------------------------------------------------------------------------------------
-
-
 def biased(read: ShadedReader, biases: Sequence[float]) -> ShadedReader:
     """Return ``read`` with ``biases`` added to the level of detail, one for each whole level, interpolated between."""
 
@@ -425,8 +405,7 @@ def biased(read: ShadedReader, biases: Sequence[float]) -> ShadedReader:
 
 
 def choose_biases(read: ShadedReader, pyramid: Pyramid, effects: Effects, places: int = PLACES) -> list[float]:
-    """
-    Return, for each level, the one of :data:`BIASES` with the smallest error of ``read`` against the converged truth.
+    """Return, for each level, the entry of :data:`BIASES` whose ``read`` is nearest to the converged truth.
 
     The error is measured at random ``places``, views and lights. Few of them see a highlight, so the same ones are used
     for all levels.

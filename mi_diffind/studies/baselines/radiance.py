@@ -1,5 +1,4 @@
-"""
-Fields of the baselines on nodes: grids of 8 bits, dense or sparse, plain, in principal components or with a codebook.
+"""Baseline fields on nodes: 8-bit grids, dense or sparse, plain, in principal components or with a codebook.
 
 The codebook is the idea of VQRF (Li et al. 2023). A baseline is a :class:`CoefficientField` of float tensors while it
 is trained, rounded as it is stored, and then a :class:`ByteField`, which reads bytes.
@@ -19,8 +18,7 @@ RAW = (-8.0, 12.0)
 
 
 class CoefficientField(NodeField):
-    """
-    :class:`~mi_diffind.tasks.radiance.volume_field.NodeField` whose colours may pass through a matrix.
+    """:class:`~mi_diffind.tasks.radiance.volume_field.NodeField` whose colours may pass through a matrix.
 
     The array ``colour`` is ``(m, C)``, C a multiple of four. ``matrix``, ``(C + 1, 12)``, maps a row of it to twelve
     coefficients of colour and then adds its last line; it is one of the ``arrays``, if there is one.
@@ -53,8 +51,7 @@ def transformed(types, matrix, values: list, active=True) -> list:
 
 
 class ByteField(NodeVolume):
-    """
-    Stored form of a :class:`CoefficientField`, which reads bytes.
+    """Stored form of a :class:`CoefficientField`, which reads bytes.
 
     ``density`` (n,) and ``colour`` (m, C) are uint8 with the ``steps`` of each; ``matrix`` is (C + 1, 12) or ``None``,
     ``rows`` (n,) the row of each node or ``None``. Nodes are in lexicographic order, without an entry for no node.

@@ -1,5 +1,4 @@
-"""
-Baselines without nodes: planes and lines (TensoRF, Chen et al. 2022), and a hash grid with a network.
+"""Baselines without nodes: planes and lines (TensoRF, Chen et al. 2022), and a hash grid with a network.
 
 The latter follows Instant-NGP (Müller et al. 2022) with the modules of ``drjit.nn``. Both skip empty space by an
 :class:`Occupancy`.
@@ -72,8 +71,6 @@ def occupied_bytes(state: dict) -> int:
     return len(mask_bytes(chessboard_distances(cells) == 0))
 
 
-# -- planes and lines -------------------------------------------------------------------------------------------------
-
 TABLES = ("density_planes", "colour_planes")
 
 #: Axes of a plane, and of the line that goes with it.
@@ -81,8 +78,7 @@ PLANES = (((0, 1), 2), ((0, 2), 1), ((1, 2), 0))
 
 
 class PlanesField(OccupancyField):
-    """
-    Field of sums over three planes of products of ``R`` channels of a plane and a line.
+    """Field of sums over three planes of products of ``R`` channels of a plane and a line.
 
     The arrays ``density_planes`` and ``colour_planes`` hold the texels of the three planes and then of the three lines,
     ``(n, R)`` each, R a multiple of four. ``matrix`` ``(3 R + 1, 12)`` maps the products of the colours to twelve
@@ -224,15 +220,12 @@ class PlanesFit:
         return HEADER + packed + state["matrix"].nbytes + occupied_bytes(state)
 
 
-# -- hash grid and network --------------------------------------------------------------------------------------------
-
 #: Hash grid: levels, numbers a level, and coarsest resolution; units of the hidden layer of the network.
 LEVELS, FEATURES, COARSEST, WIDTH = 8, 2, 16, 32
 
 
 class HashVolumeField(OccupancyField):
-    """
-    Field of a hash grid and a network of one hidden layer, which returns a raw density and twelve coefficients.
+    """Field of a hash grid and a network of one hidden layer, which returns a raw density and twelve coefficients.
 
     The arrays ``entries`` and ``weights`` are flat.
     """

@@ -1,5 +1,4 @@
-"""
-Training of the baselines on nodes: from a grid, to parameters that are trained through images, to bytes.
+"""Training of the baselines on nodes: from a grid, to parameters that are trained through images, to bytes.
 
 A fit has a ``net``, tensors by name that an optimiser trains at one rate, and ``field_of``, which makes a field of it.
 """
@@ -27,8 +26,7 @@ LEAST = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class WeightedGrid:
-    """
-    Numbers on the nodes of a sparse or dense grid, with the weight of each node in the training views.
+    """Numbers on the nodes of a sparse or dense grid, with the weight of each node in the training views.
 
     ``density`` (n,) is raw, ``colour`` is (n, 12), and ``seen`` (n,) is the number of rays that end at each node; all
     are in lexicographic order of the ``nodes``.
@@ -79,8 +77,7 @@ class WeightedGrid:
         return corners_of(cells)
 
     def resampled(self, scale: float, sparse: bool = True) -> WeightedGrid:
-        """
-        Return the grid on nodes ``scale`` times as far apart: those of :meth:`coarser` if ``sparse``, otherwise all.
+        """Return the grid on nodes ``scale`` times as far apart: those of :meth:`coarser` if ``sparse``, otherwise all.
 
         Raw densities are interpolated; colours are means weighted by ``seen``. (Mean densities over cells would make
         walls transparent: 3 dB worse, and 1.6 dB after 200 steps of training.)
@@ -100,8 +97,7 @@ class WeightedGrid:
 
 
 def visibility(field: NodeField, images, every: int = 2) -> np.ndarray:
-    """
-    Return how many rays of the views end at each node of a field, ``(n,)``.
+    """Return how many rays of the views end at each node of a field, ``(n,)``.
 
     This is the derivative of the images with respect to the colours of the nodes, all equal, by one ray for ``every``
     pixels along x and y.
@@ -123,12 +119,8 @@ def visibility(field: NodeField, images, every: int = 2) -> np.ndarray:
     return dr.grad(arrays["colour"]).numpy().reshape(-1, field.arrays["colour"].shape[-1])[:, 0] * every**2
 
 
-# -- on nodes ---------------------------------------------------------------------------------------------------------
-
-
 class NodesFit:
-    """
-    Training of a grid of bytes: ``density`` (n, 1) and coefficients of ``colour``, each with its quantisation steps.
+    """Training of a grid of bytes: ``density`` (n, 1) and coefficients of ``colour``, each with its quantisation steps.
 
     There is a row of ``colour`` for each node, or ``rows`` (n,) names the row of each. ``matrix`` maps a row to twelve
     coefficients, if there is one.
@@ -237,8 +229,7 @@ def plain(grid: WeightedGrid, levels: int = 256) -> NodesFit:
 
 
 def display(grid: WeightedGrid) -> np.ndarray:
-    """
-    Return the sensitivity of the displayed image to each coefficient of colour, (12,).
+    """Return the sensitivity of the displayed image to each coefficient of colour, (12,).
 
     It is the slope of sRGB times the radiance, as a root mean square over nodes weighted by ``seen``.
     """

@@ -23,8 +23,6 @@ from .byte_grids import NEAREST, ByteGrid, dequantised, least_squares, quantised
 #: Spacings, of the longest side: where :func:`fit_bytes` begins, and its limits.
 FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 12
 
-# -- sparse distances -------------------------------------------------------------------------------------------------
-
 
 class DistanceNodes(SparseNodes):
     """Distances of ``bits`` each at the nodes of a sparse ``structure``: our layout without normals and indirection."""
@@ -89,9 +87,6 @@ def structure_arrays(structure: Structure) -> dict:
     return {f"structure_{f.name}": getattr(structure, f.name) for f in dataclasses.fields(structure)}
 
 
-# -- files ------------------------------------------------------------------------------------------------------------
-
-
 def save(path: Path | str, field: DistanceField) -> None:
     """Write a field's ``state``, the arguments of its class without ``types``; :func:`load` reads it."""
     with replacing(path) as temporary:
@@ -121,12 +116,8 @@ def _compressed(field: DistanceField) -> bytes:
     return file.getvalue()
 
 
-# -- memory budget ----------------------------------------------------------------------------------------------------
-
-
 def fit_bytes(make: Callable[[float], DistanceField], nbytes: int) -> DistanceField:
-    """
-    Return the field ``make(spacing)`` with the finest spacing that fits into ``nbytes``.
+    """Return the field ``make(spacing)`` with the finest spacing that fits into ``nbytes``.
 
     The field is within 1.5% of ``nbytes`` if few attempts reach that, else within 3% if possible. Raises ``ValueError``
     if no spacing fits.

@@ -1,5 +1,4 @@
-"""
-Study ``tradeoff disney``: accuracy of the Disney BRDF against time.
+"""Study ``tradeoff disney``: accuracy of the Disney BRDF against time.
 
 Candidates are ``disney``, ``neural_disney`` with each preset and in each storage form, and Mitsuba's ``principled``,
 with constant and with textured materials. :mod:`.plan` describes them.

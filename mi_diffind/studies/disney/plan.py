@@ -1,5 +1,4 @@
-"""
-Plan of the Disney study: ``disney``, ``neural_disney`` and ``principled`` with constant and with textured materials.
+"""Plan of the Disney study: ``disney``, ``neural_disney`` and ``principled`` with constant and with textured materials.
 
 ``disney`` evaluates formulas; ``neural_disney`` is measured with each preset, in each storage form, and with one of its
 tables only. Errors are measured against :mod:`~mi_diffind.tasks.disney.model`, formulas that no plugin shares.
@@ -101,12 +100,8 @@ def plan(quick: bool = False) -> Plan:
     )
 
 
-# -- candidates -------------------------------------------------------------------------------------------------------
-
-
 def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
-    """
-    Return the candidates (``quick``: without half precision) and the builders of their BSDFs.
+    """Return the candidates (``quick``: without half precision) and the builders of their BSDFs.
 
     A builder is a function from parameters, as for ``mi.load_dict``, to a BSDF.
     """
@@ -156,9 +151,6 @@ def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
         candidates.append(Candidate(name, "one table", factor, size, None, errors(decoder), in_passes=False, note=once))
         plugins[name] = with_decoder(lambda arrays, f=factor: FactoredDecoder(arrays, read=(f,)))
     return candidates, plugins
-
-
-# -- cases ------------------------------------------------------------------------------------------------------------
 
 
 def _material(material: str, parameters: dict) -> dict:

@@ -1,5 +1,4 @@
-"""
-Study ``tradeoff ggx``: accuracy of the GGX distribution of normals against time and bytes.
+"""Study ``tradeoff ggx``: accuracy of the GGX distribution of normals against time and bytes.
 
 Candidates are indirection at several sizes and in each storage form, single tables, networks and the formula, all
 trained to convergence, and the rough conductor that uses the distribution. :mod:`.plan` describes them.

@@ -1,5 +1,4 @@
-"""
-Plan of the GGX study: indirection, single tables, networks and the formula, trained to convergence, at two inputs.
+"""Plan of the GGX study: indirection, single tables, networks and the formula, trained to convergence, at two inputs.
 
 Every representation is measured with two parametrisations of its *inputs*: the plain one, (cos θ_h, α) as in the
 paper, and the logarithmic one of ``neural_ggx`` (:class:`~mi_diffind.tasks.ggx.model.Encoding`). All learn the same
@@ -80,8 +79,7 @@ _STORED = {"float32": ("", 4), "float16": (" f16", 2), "uint8": (" u8", 1)}
 
 
 def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
-    """
-    Return the plan of the study in the current variant.
+    """Return the plan of the study in the current variant.
 
     ``quick``: fewer candidates, whose first training takes ``quick_steps`` steps and whose longest twice as many.
     """
@@ -174,8 +172,6 @@ class GGXCandidates:
         )  # fmt: skip
         self.readers[name], self.inputs[name] = reader, encoding.inputs
 
-    # -- candidates ---------------------------------------------------------------------------------------------------
-
     def add_tables(self, inputs: str) -> None:
         """Register indirection at several sizes and single tables; with plain inputs also with raw output."""
         plain = inputs == "plain"
@@ -250,8 +246,6 @@ class GGXCandidates:
         self.readers["formula"] = lambda: lambda cos, sin2, alpha: ggx(sin2, alpha)
         self.inputs["formula"] = "any"
         self.ratios += [(self.reference(inputs), "formula") for inputs in INPUTS[::-1]]
-
-    # -- cases --------------------------------------------------------------------------------------------------------
 
     def case(self, name: str, inputs: str, details: dict) -> Case:
         names = [n for n in self.readers if self.inputs[n] in (inputs, "any")]

@@ -1,5 +1,4 @@
-"""
-Study ``tradeoff image``: quality of a compressed image or material against bytes, seconds of training and read time.
+"""Study ``tradeoff image``: quality of a compressed image or material against bytes, seconds of training and read time.
 
 Codecs encode the same maps in the same bytes. :mod:`.plan` describes the contenders.
 """

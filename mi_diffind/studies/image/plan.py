@@ -1,5 +1,4 @@
-"""
-Plan of the image study: contenders in equal bytes, with their errors, seconds of training and time of a read.
+"""Plan of the image study: contenders in equal bytes, with their errors, seconds of training and time of a read.
 
 *Bytes*: at each compression ratio, indirection into cascaded arrays of 2, 3 and 4 dimensions by our preset and the
 paper's is compared with codecs (:mod:`..baselines.codecs`) at the largest size that is not above; ASTC with one block
@@ -40,8 +39,7 @@ BITMAPS = {"bitmap, 8 bits": True, "bitmap, floats": False}
 
 @dataclass(frozen=True)
 class ImageStudySettings:
-    """
-    Settings of the image study.
+    """Settings of the image study.
 
     ``compressions`` are the compression ratios, ``seconds`` and ``paper_seconds`` the lengths of trainings by our and
     by the paper's preset, ``dims`` the dimensions of the cascaded array (4: all trainings, others: the shortest).
@@ -115,9 +113,6 @@ def plan(source: Source, name: str, settings: ImageStudySettings) -> Plan:
         table=table,
         conclusions=conclusions,
     )
-
-
-# -- contenders -------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -249,17 +244,13 @@ def _codecs(context: ImageStudyContext) -> list[EncodedImage]:
     return jobs
 
 
-# -- errors -----------------------------------------------------------------------------------------------------------
-
-
 def _clipped(values: np.ndarray) -> np.ndarray:
     """Return values in the range that codecs of 8 bits can hold."""
     return np.clip(values, 0, 1).astype(np.float32)
 
 
 def errors_of(source: Source, maps: dict[str, np.ndarray]) -> dict:
-    """
-    Return the errors of decoded maps, rounded to 8 bits.
+    """Return the errors of decoded maps, rounded to 8 bits.
 
     ``psnr_db`` is that of all channels together; ``psnr_mean_db``, ``flip`` and ``ssim`` are means over maps. Each map
     has ``psnr_NAME_db``, ``flip_NAME``, ``ssim_NAME``, and normal maps ``angle_NAME_deg``, the mean angle.
@@ -298,9 +289,6 @@ def between(source: Source, maps: dict[str, np.ndarray]) -> float:
 def _picture(values: np.ndarray) -> np.ndarray:
     """Return three channels to show a map as a picture."""
     return values[..., :3] if values.shape[-1] >= 3 else np.repeat(values[..., :1], 3, axis=-1)
-
-
-# -- time of a read ---------------------------------------------------------------------------------------------------
 
 
 def _reads(source: Source, jobs: dict[str, TrainedImage], place: str, lanes: int) -> dict:

@@ -1,5 +1,4 @@
-"""
-``tradeoff field``: the radiance field of a capture in equal bytes, ours against grids, codebooks, planes and others.
+"""``tradeoff field``: the radiance field of a capture in equal bytes, ours against grids, codebooks, planes and others.
 
 The study measures errors in held-out views and the times of reads and renders (:mod:`.plan`).
 """

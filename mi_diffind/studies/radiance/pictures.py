@@ -30,8 +30,7 @@ def of(context) -> dict[str, Callable[[dict], object]]:
 
 
 def views(context, result: dict):
-    """
-    Return the figure of a result.
+    """Return the figure of a result.
 
     The top row shows the first test view and its renders by all fields at the first budget, the row below their
     differences. The bottom row shows errors of all budgets against bytes, and of the first against the time of a

@@ -1,5 +1,4 @@
-"""
-Contenders, cases and budgets of the study of radiance fields.
+"""Contenders, cases and budgets of the study of radiance fields.
 
 All contenders begin with one trained grid and are trained through the same images for the same number of steps. *Dense*
 and *sparse* grids have thirteen numbers of 8 bits at a node, or 6 bits for colours. *Components* are principal
@@ -105,8 +104,7 @@ RANKS = (8, 16)
 
 @dataclass(frozen=True)
 class RadianceStudySettings:
-    """
-    Settings of the study.
+    """Settings of the study.
 
     ``ratios`` are the budgets, as compression against a dense float32 grid; the first is timed and shown. ``without``
     names the methods left out. ``resolution`` is that of the grid, trained for ``grid_steps`` (0: as its preset says).
@@ -223,9 +221,6 @@ def plan(session: FieldSession, source: str, settings: RadianceStudySettings) ->
         table=table,
         conclusions=conclusions,
     )  # fmt: skip
-
-
-# -- contenders -------------------------------------------------------------------------------------------------------
 
 
 class RadianceContender(equal_memory.Contender):
@@ -437,9 +432,6 @@ class HashContender(BaselineContender):
         if result.interrupted:
             return None
         return self.finish(hash_fit, time.perf_counter() - start, steps=result.steps)
-
-
-# -- times ------------------------------------------------------------------------------------------------------------
 
 
 def _reads(context: RadianceStudyContext, names, lanes: int) -> dict:

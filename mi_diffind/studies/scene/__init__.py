@@ -1,5 +1,4 @@
-"""
-Study ``tradeoff scene``: error against render time of a scene, as written and with exact plugins.
+"""Study ``tradeoff scene``: error against render time of a scene, as written and with exact plugins.
 
 Monte Carlo noise decreases with render time, the bias of learned tables does not; the study measures both and the
 sample count at which they are equal (:mod:`~mi_diffind.measure.bias`).

@@ -23,8 +23,7 @@ _GREY, _PURPLE, _DARK_PURPLE, _DASHES = "0.35", "#7a3b8f", "#5e2a70", (0, (4, 2.
 
 
 def draw(result: dict, caption: str):
-    """
-    Return a Matplotlib figure of a result of :func:`.renders.measure` that has timed points.
+    """Return a Matplotlib figure of a result of :func:`.renders.measure` that has timed points.
 
     Both axes are logarithmic, points have quartiles. Dashed curves extrapolate the sum of noise and bias beyond the
     last point. The bias is a horizontal band, or a line if only its upper bound is known; the crossover is a vertical

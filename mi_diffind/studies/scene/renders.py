@@ -1,5 +1,4 @@
-"""
-Renders of the scene study: a scene as written and with exact plugins, at several sample counts, with errors and times.
+"""Renders of the scene study: a scene as written and with exact plugins, at several sample counts.
 
 Errors and biases are those of :mod:`~mi_diffind.measure.bias`. *Times* are those of the kernels of a whole render
 (:mod:`~mi_diffind.measure.clock`) and the wall-clock time. Exact and learned versions are rendered in turn. The kernel
@@ -41,8 +40,7 @@ _QUICK_SPP = 4
 
 @dataclass(frozen=True)
 class SceneStudySettings:
-    """
-    Settings of the scene study: sample counts and numbers of passes.
+    """Settings of the scene study: sample counts and numbers of passes.
 
     ``spp`` is the highest sample count (``None``: the scene's own, in a quick run at most 4), ``step`` the factor, a
     power of two, from one count to the next. ``passes`` is the number of renders at the highest count, which the truth
@@ -61,8 +59,7 @@ class SceneStudySettings:
         return cls(spp, 2, 8, 3, True) if quick else cls(spp)
 
     def counts(self, scene_spp: int) -> list[int]:
-        """
-        Return the sample counts, ascending, for a scene whose own count is ``scene_spp``.
+        """Return the sample counts, ascending, for a scene whose own count is ``scene_spp``.
 
         The highest is rounded down to a power of two (only with these are passes repeatable); the lower ones follow by
         division by ``step``.
@@ -83,8 +80,7 @@ def measure(
     progress: bool = True,
     launch_samples: int = LAUNCH_SAMPLES,
 ) -> dict:
-    """
-    Measure the errors and times of a scene file, learned and exact.
+    """Measure the errors and times of a scene file, learned and exact.
 
     If ``folder`` holds an interrupted run of the same key, only the missing part is measured; measurements stay there
     until :func:`.report.write` has written the result. Equal arguments give equal errors if the film's filter is a box.
@@ -235,9 +231,6 @@ def _images(store: Store) -> dict[str, list[np.ndarray]]:
 
 def _errors(image: np.ndarray, truth: np.ndarray, weights: np.ndarray, truth_noise: float) -> dict[str, float]:
     return {"mse": error(image, truth, weights, truth_noise), "psnr_db": metrics.psnr(truth, image)}
-
-
-# -- the result -------------------------------------------------------------------------------------------------------
 
 
 def _assemble(store: Store, counts: list[int]) -> dict:

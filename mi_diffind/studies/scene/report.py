@@ -19,8 +19,7 @@ COLUMNS = (
 
 
 def rows(result: dict) -> list[dict]:
-    """
-    Return one table row, with the columns :data:`COLUMNS`, for each version and sample count.
+    """Return one table row, with the columns :data:`COLUMNS`, for each version and sample count.
 
     Time ratios (learned / exact) are in the rows of ``learned``.
     """

@@ -1,5 +1,4 @@
-"""
-Study of signed distance fields (``tradeoff sdf``): errors and times of ours and of other methods in equal bytes.
+"""Study of signed distance fields (``tradeoff sdf``): errors and times of ours and of other methods in equal bytes.
 
 The other methods are dense grids, bricks, sparse distances, the supplement's arrays and a hash grid with a network;
 :mod:`.plan` describes the measurements.

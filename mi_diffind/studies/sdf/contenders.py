@@ -1,5 +1,4 @@
-"""
-Contenders of the study of distance fields: grids, bricks, sparse distances, presets of ``fit sdf``, a hash grid.
+"""Contenders of the study of distance fields: grids, bricks, sparse distances, presets of ``fit sdf``, a hash grid.
 
 Each method is as fine as the memory budget allows; the search for the spacing is part of the seconds. All bytes count
 that a read needs, the index included. Lengths are in units of the mesh's longest side.
@@ -87,8 +86,7 @@ HASH_SETTINGS = FitSettings(seed=1, schedule="cosine", deterministic=False, lr=1
 
 @dataclass(frozen=True)
 class DistanceStudySettings:
-    """
-    Arguments of the study.
+    """Arguments of the study.
 
     ``sizes``: memory budgets in bytes, the first of which is timed; ``without``: methods that are left out;
     ``ablation``: parts of ours in place of other methods, and no rays; ``points``: held-out points; ``steps`` of
@@ -111,8 +109,7 @@ class DistanceStudySettings:
 
 @dataclass
 class DistanceStudyContext:
-    """
-    State that all contenders share: the ``mesh`` of the file ``name``, its distances and held-out points.
+    """State that all contenders share: the ``mesh`` of the file ``name``, its distances and held-out points.
 
     ``before`` maps names of contenders to records of an earlier run, which count at all budgets but the first.
     """

@@ -1,5 +1,4 @@
-"""
-Ablation: contenders that leave out or change a part of our layout, in equal bytes.
+"""Ablation: contenders that leave out or change a part of our layout, in equal bytes.
 
 The parts: the training, so that distances and normals stay as they were sampled; and indirection, so that the 16 bits
 of a node hold its distance and normal, without frames and cascaded array (:mod:`..baselines.direct_nodes`).
@@ -33,9 +32,6 @@ def settings_of(context) -> FitSettings:
     return task.tasks()["sdf"].settings(SPARSE, {"deterministic": False, **steps}, {})
 
 
-# -- ours, trained in other ways --------------------------------------------------------------------------------------
-
-
 class UntrainedRequest(task.FitRequest):
     """Request of a fit without training: nodes keep their sampled values."""
 
@@ -53,9 +49,6 @@ class UntrainedContender(DistancePresetContender):
             SPARSE, settings_of(self.context), self.context.types, options=options, progress=progress, output=self.file
         )
         return sdf.fit(request)
-
-
-# -- nodes without indirection ----------------------------------------------------------------------------------------
 
 
 class DirectContender(DistanceContender):

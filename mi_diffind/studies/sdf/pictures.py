@@ -35,8 +35,7 @@ CURVES = (
 
 
 def shapes(context: DistanceStudyContext, jobs: dict[str, DistanceContender], view: MeshView, result: dict):
-    """
-    Draw the errors of contenders of the first budget (``jobs``), and of all budgets.
+    """Draw the errors of contenders of the first budget (``jobs``), and of all budgets.
 
     Above, the angles between normals of the mesh and of the fields, where rays meet them; below, errors of all budgets
     against bytes, and errors of the first budget against the time of a ray.

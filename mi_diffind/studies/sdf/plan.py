@@ -1,5 +1,4 @@
-"""
-Plan of the study of distance fields: all methods in equal bytes of memory, their errors, and times of reads and rays.
+"""Plan of the study of distance fields: methods in equal memory, their errors, and times of reads and rays.
 
 *Dense grids* of 8 bits hold exact distances, or trained nodes. *Bricks* of 4³ and 8³ cells with 8 bits lie where the
 surface passes; each has its own borders, or they share nodes as OpenVDB's leaves do. *Sparse distances* are our layout
@@ -69,8 +68,7 @@ def contender(method: str, nbytes: int, context: DistanceStudyContext) -> Distan
 
 
 def plan(mesh: Mesh, name: str, settings: DistanceStudySettings, before: dict[str, dict] | None = None) -> Plan:
-    """
-    Return the plan for a ``mesh``, of the file ``name``, in the variant that is set.
+    """Return the plan for a ``mesh``, of the file ``name``, in the variant that is set.
 
     ``before``: records of an earlier run, which are taken over at all budgets but the first.
     """
@@ -146,9 +144,6 @@ def _model_sources() -> list[Path]:
         *(studies / "baselines" / f"{name}.py"
           for name in ("byte_grids", "bricks", "volumes", "direct_nodes", "hash_grids", "networks")),
     ]  # fmt: skip
-
-
-# -- time -------------------------------------------------------------------------------------------------------------
 
 
 def _reads(context: DistanceStudyContext, jobs: Contenders, lanes: int) -> dict:

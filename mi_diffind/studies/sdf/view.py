@@ -33,8 +33,7 @@ class MeshView:
         self.right, self.up, self.forward = right, np.cross(away, right), -away
 
     def rays(self, types, count: int | None = None):
-        """
-        Return origins and directions of the rays through all pixels' centres, row by row from the top, evaluated.
+        """Return origins and directions of the rays through all pixels' centres, row by row from the top, evaluated.
 
         With ``count``, so many rays of a film of the same shape.
         """
@@ -54,8 +53,6 @@ class MeshView:
         ]
         dr.make_opaque(rays)
         return rays
-
-    # -- scenes -------------------------------------------------------------------------------------------------------
 
     def mesh_scene(self, lit: bool = False):
         """Return a scene of the mesh, alone or ``lit`` on a floor."""

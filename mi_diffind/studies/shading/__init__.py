@@ -1,5 +1,4 @@
-"""
-Study ``tradeoff shading``: textures trained for shading at several weights λ of the shading loss.
+"""Study ``tradeoff shading``: textures trained for shading at several weights λ of the shading loss.
 
 They are compared with textures trained without it and with classical filters of normals, as in the paper's figure 2.
 :mod:`.plan` describes the contenders.

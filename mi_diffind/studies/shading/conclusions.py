@@ -1,5 +1,4 @@
-"""
-Conclusions of the shading study: a table, gains over λ = 0 and over classical filters, effects of the remedies.
+"""Conclusions of the shading study: a table, gains over λ = 0 and over classical filters, effects of the remedies.
 
 All figures come from the records of jobs, so an interrupted run reports the finished ones.
 """
@@ -25,8 +24,7 @@ COARSE = 2
 
 @dataclass
 class MaterialCurves:
-    """
-    Records of a material: ``classical`` and ``compressed`` map labels to details, ``runs`` maps (remedies, λ) to them.
+    """Records of a material: ``classical``, ``compressed`` (by label) and ``runs`` (by remedies and λ).
 
     ``runs`` has the details of all seeds; those of λ = 0 stand under all remedies that they are the base of.
     """
@@ -93,9 +91,6 @@ def curves(result: dict) -> dict[str, MaterialCurves]:
     return materials
 
 
-# -- the table --------------------------------------------------------------------------------------------------------
-
-
 def table(result: dict) -> list[str]:
     """Return, for each material, a table of errors against both truths; errors of levels are those against C."""
     lines = []
@@ -134,9 +129,6 @@ def trouble(runs: list[dict]) -> str:
     """Return the names of troubles, each with the number of runs."""
     names = [name for d in runs for name in d.get("trouble", [])]
     return ", ".join(f"{name} {names.count(name)}" for name in dict.fromkeys(names))
-
-
-# -- sentences --------------------------------------------------------------------------------------------------------
 
 
 def conclusions(result: dict) -> list[str]:

@@ -1,5 +1,4 @@
-"""
-Procedural materials of the shading study, computed from a seed.
+"""Procedural materials of the shading study, computed from a seed.
 
 All maps are 8-bit, as in files, and repeat. ``hammered`` is a metal with texel-scale normals and dielectric rust;
 ``weave`` is a fabric of two colours of yarn; ``lacquer`` is a glossy dielectric with a pattern under a slightly uneven
@@ -19,8 +18,7 @@ SIDE = 512
 
 
 def noise(rng, side: int, slope: float, low: float = 1.0, high: float = 1e9) -> np.ndarray:
-    """
-    Return a random field that repeats, mean 0 and variance 1, ``(side, side)``.
+    """Return a random field that repeats, mean 0 and variance 1, ``(side, side)``.
 
     Amplitudes are proportional to the frequency to the power of −``slope``, between ``low`` and ``high`` periods along
     the side, and zero elsewhere.

@@ -1,5 +1,4 @@
-"""
-Plan of the shading study: textures trained for shading at several weights λ, and classical filters of normals.
+"""Plan of the shading study: textures trained for shading at several weights λ, and classical filters of normals.
 
 For each material, a texture is trained as task 4 trains it, and then continued for the same time by task 5 at several
 weights λ of the shading loss; λ = 0 continues task 4. Two remedies against instability at a large λ are on or off:
@@ -86,8 +85,7 @@ REMEDIES = (Remedies(True, True), Remedies(False, True), Remedies(True, False), 
 
 @dataclass(frozen=True)
 class ShadingStudySettings:
-    """
-    Settings of the shading study.
+    """Settings of the shading study.
 
     ``lambdas`` are the weights λ, 0 among them, ``ways`` the combinations of remedies, ``seeds`` the number of seeds.
     ``length`` is that of the training for shading, ``pretraining`` that of the training as a texture before it, in the
@@ -106,8 +104,7 @@ class ShadingStudySettings:
 
 
 def materials_of(names: Sequence[str], side: int, quick: bool = False) -> dict[str, Source]:
-    """
-    Return the sources of manifests and of generated materials, by name; a default list if ``names`` is empty.
+    """Return the sources of manifests and of generated materials, by name; a default list if ``names`` is empty.
 
     Raises ``SourceError`` and ``ValueError``.
     """
@@ -132,9 +129,6 @@ class CachedEvaluation(ShadedEvaluation):
     def another(self) -> ShadedEvaluation:
         self._another = self._another or super().another()
         return self._another
-
-
-# -- a material -------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -201,9 +195,6 @@ class ShadingStudyContext:
         trained = textures.to_table(stored, {**request.recorded(), "source": self.source.digest, "steps": result.steps})
         trained.preset, trained.seed = "ours", seed
         return trained, result
-
-
-# -- jobs -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -358,9 +349,6 @@ def troubles(details: dict, base: dict | None) -> list[str]:
     if base is not None and details["C"]["mean_db"] < base["C"]["mean_db"]:
         names.append("below")
     return names
-
-
-# -- the plan ---------------------------------------------------------------------------------------------------------
 
 
 def plan(sources: dict[str, Source], settings: ShadingStudySettings) -> Plan:

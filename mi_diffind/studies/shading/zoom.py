@@ -1,5 +1,4 @@
-"""
-Zoom of the shading study: a shaded plane that a camera moves towards.
+"""Zoom of the shading study: a shaded plane that a camera moves towards.
 
 The camera looks straight down, so a pixel's footprint is a square, as levels of detail assume, and each pixel is seen
 from its own direction under one light. Images are those of a reader, without a renderer and its noise.

@@ -1,5 +1,4 @@
-"""
-Study ``tradeoff texture``: error and time of renders with filtered, compressed textures against bitmaps.
+"""Study ``tradeoff texture``: error and time of renders with filtered, compressed textures against bitmaps.
 
 A texture that filters itself is compared with supersampled bitmaps, uncompressed mip maps, and ASTC with mip maps in
 equal bytes: by the error against the time of a render, the error of each level of detail, and the flicker of a moving

@@ -43,8 +43,7 @@ def levels(result: dict) -> dict[str, dict[str, list[float]]]:
 
 
 def speed(result: dict, case: str, name: str, against: str = "bitmap") -> tuple[float, bool] | None:
-    """
-    Return the time of a bitmap with the error of a candidate, relative to the candidate's time, and a flag.
+    """Return the time of a bitmap with the error of a candidate, relative to the candidate's time, and a flag.
 
     The flag is true if the ratio is only a lower bound, because even the highest sample count has a larger error.
     Between sample counts, time is interpolated as a power of the error. ``against`` is the sampling of the bitmap,

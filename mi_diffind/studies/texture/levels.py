@@ -31,8 +31,7 @@ def pyramid_of(maps: dict[str, list[np.ndarray]], like: Pyramid) -> Pyramid:
 
 
 def errors(truth: dict[str, list[np.ndarray]], maps: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:
-    """
-    Return the PSNR, in dB, of each level at its texel centres: of ``all`` channels together and of each map.
+    """Return the PSNR, in dB, of each level at its texel centres: of ``all`` channels together and of each map.
 
     Values are those of the source's files, clipped to [0, 1].
     """

@@ -60,8 +60,7 @@ def zoom(context, readers: dict, result: dict):
 
 
 def levels(context, readers: dict, result: dict):
-    """
-    Draw the PSNR of each level of all compressed textures.
+    """Draw the PSNR of each level of all compressed textures.
 
     If distributions of footprints are compared, a second panel shows the share of samples on each level.
     """

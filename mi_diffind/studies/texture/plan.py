@@ -1,5 +1,4 @@
-"""
-Plan of the texture study: filtered textures, bitmaps and ASTC, by errors of renders, levels, flicker and time.
+"""Plan of the texture study: filtered textures, bitmaps and ASTC, by errors of renders, levels, flicker and time.
 
 A map of a material covers a surface in a light without noise (:mod:`.test_scenes`). The truth is ``bitmap`` at many
 multijittered samples. The candidates are ``bitmap`` at 1 to 64 samples per pixel, independent or multijittered;
@@ -78,8 +77,7 @@ _TRUTH_SEED = 1 << 20
 
 @dataclass(frozen=True)
 class TextureStudySettings:
-    """
-    Settings of the texture study.
+    """Settings of the texture study.
 
     ``map`` is the name of the rendered map; a texture is trained for ``seconds`` at each of ``compressions``. ``astc``
     and ``astc_choice`` are presets of the ASTC encoder as in the image study. ``film`` and ``zoom_film`` are sizes of
@@ -129,8 +127,7 @@ def plan(
     more_reads: Sequence[tuple[str, bool]] = MORE_READS,
     scenes: dict[str, TextureScene] | None = None,
 ) -> Plan:
-    """
-    Return the plan for ``source``, read from the file ``name``, in the current variant.
+    """Return the plan for ``source``, read from the file ``name``, in the current variant.
 
     ``tables`` are trained already. ``reads`` and ``more_reads`` are the filters as in :data:`READS` and
     :data:`MORE_READS`, ``scenes`` the stills (default: :func:`.test_scenes.still_scenes`).
@@ -211,8 +208,7 @@ class TextureStudyContext:
         return reader.render(scene, self.settings.film, self.size, seed)
 
     def errors(self, reader: TextureReader) -> dict[str, float]:
-        """
-        Return the errors of a reader.
+        """Return the errors of a reader.
 
         ``psnr_SCENE_db`` and ``flip_SCENE`` are those of the means over seeds; ``flicker`` and ``flicker_error`` those
         of the zoom.
@@ -226,8 +222,6 @@ class TextureStudyContext:
             errors[f"psnr_{name}_db"] = decibel(float(np.mean([e["mse"] for e in each])))
             errors[f"flip_{name}"] = float(np.mean([e["flip"] for e in each]))
         return {**errors, **self.zoom.errors(self.zoom.render(reader), self.truths["zoom"].model)}
-
-    # -- readers ------------------------------------------------------------------------------------------------------
 
     def bitmap(self, spp: int = 1, sampler: str = "independent") -> TextureReader:
         """Return Mitsuba's texture with 8 bits."""
@@ -250,9 +244,6 @@ class TextureStudyContext:
         name = f"study {id(pyramid)}"
         PYRAMIDS[name] = pyramid
         return self.filtered({"type": "mipmap", "pyramid": name}, filter_name, centred)
-
-
-# -- jobs -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -358,9 +349,6 @@ class EncodedTexture(TextureContender):
         return context.mipmap(levels.pyramid_of(self.model, context.pyramid), filter_name, centred)
 
 
-# -- candidates -------------------------------------------------------------------------------------------------------
-
-
 class TextureCandidates:
     """Builder of the plan: jobs, candidates, and a function for each candidate that returns its reader."""
 
@@ -448,9 +436,6 @@ class TextureCandidates:
                 TrainedTexture("footprints", compression, context, f"{preset} {compression:g}x, {samples} footprints",
                                preset="paper" if preset == "paper" else "", footprint_samples=samples)
             )  # fmt: skip
-
-
-# -- time -------------------------------------------------------------------------------------------------------------
 
 
 def _case(context: TextureStudyContext, scene: TextureScene, candidates: list[Candidate], readers: dict) -> Case:

@@ -1,5 +1,4 @@
-"""
-Scenes that the texture study renders: a textured surface and a camera, in a light that adds no noise.
+"""Scenes that the texture study renders: a textured surface and a camera, in a light that adds no noise.
 
 The material is ``diffuse`` under a ``directional`` light, which a path tracer samples deterministically: samples of a
 pixel differ only in the position at which the texture is read. The irradiance is such that a surface that faces the
@@ -22,8 +21,7 @@ from ... import srgb
 
 @dataclass(frozen=True)
 class TextureScene:
-    """
-    A textured surface, a camera and a light.
+    """A textured surface, a camera and a light.
 
     The uv of ``shape`` (without its material) covers ``extent`` units of length along u and v. The camera at ``origin``
     looks at ``target``, ``fov`` degrees wide; light comes from ``towards_light``. ``texels`` is the area of a pixel in
@@ -146,13 +144,9 @@ def zoom_scene() -> TextureScene:
     )
 
 
-# -- renders ----------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class TextureReader:
-    """
-    A texture plugin with the settings of its renders.
+    """A texture plugin with the settings of its renders.
 
     ``texture(repeats)`` returns the plugin's dictionary for ``mi.load_dict``, given the number of repetitions. ``spp``,
     ``sampler`` and the integrator ``path`` are those of its renders. ``prepare(scene)`` is called with each loaded
@@ -192,8 +186,7 @@ def displayed(image) -> np.ndarray:
 
 
 def errors(truth: np.ndarray, image: np.ndarray, counted: np.ndarray) -> dict[str, float]:
-    """
-    Return ``mse`` and ``flip`` of an image as displayed, averaged over the ``counted`` pixels.
+    """Return ``mse`` and ``flip`` of an image as displayed, averaged over the ``counted`` pixels.
 
     FLIP depends on neighbouring pixels; outside of the mask it is given the truth.
     """

@@ -1,5 +1,4 @@
-"""
-Task 2: the Disney BRDF (Burley 2012), exact and as tables.
+"""Task 2: the Disney BRDF (Burley 2012), exact and as tables.
 
 - :mod:`.model`: the reference model, and parameters, factors and colours that all forms share;
 - :mod:`.effects`: the parts of the model that a material uses;

@@ -1,5 +1,4 @@
-"""
-Base class of the tables of the Disney BRDF.
+"""Base class of the tables of the Disney BRDF.
 
 A layout (:class:`.paper.PaperArrays`, :class:`.factored.FactoredArrays`) is a ``drjit.nn`` module of named
 :class:`~mi_diffind.indirection.DifferentiableArray` s. It declares their sizes and the range of their entries, and
@@ -18,8 +17,7 @@ from .decoder import warp_roughness
 
 
 class DisneyArrays(nn.Module):
-    """
-    Base class of the layouts.
+    """Base class of the layouts.
 
     ``Layout().alloc(TensorXf)`` starts from ramps and coarse samples of the target functions. Parameters are called
     ``NAME.data``.
@@ -79,12 +77,9 @@ class DisneyArrays(nn.Module):
             sum(self.encoder_anisotropic([material.anisotropic], active)),
         )
 
-    # -- training ---------------------------------------------------------------------------------------------------
-
     @classmethod
     def targets(cls, m, wi, wo, uniform) -> dict[str, list]:
-        """
-        Return the exact values, name of a table → its channels.
+        """Return the exact values, name of a table → its channels.
 
         ``m`` are materials, ``wi`` and ``wo`` directions, ``uniform`` two arrays of uniform random numbers.
         """

@@ -1,5 +1,4 @@
-"""
-The Disney BRDF in two steps: coefficients of the material, then values for pairs of directions.
+"""The Disney BRDF in two steps: coefficients of the material, then values for pairs of directions.
 
 :class:`Decoder` is the model of :mod:`.model` rearranged for speed, with the same values up to rounding. Only the parts
 in use (:class:`.effects.Effects`) are computed. Coefficients come in groups (:data:`GROUPS`), each of which depends on
@@ -34,8 +33,7 @@ GROUPS = {
 
 
 class Decoder:
-    """
-    Analytic form of the model.
+    """Analytic form of the model.
 
     In all methods, ``p`` is an object with the sanitised parameters (:func:`.model.sanitize`), ``albedo`` (a colour)
     and ``luminance`` as attributes; ``c`` maps groups to coefficients; ``e`` are the effects in use; ``g`` is the
@@ -64,8 +62,6 @@ class Decoder:
     def coefficients(self, group: str, p: Any, e: Effects) -> dict:
         """Return the coefficients of one group."""
         return getattr(self, f"_{group}")(p, e)
-
-    # -- the material -----------------------------------------------------------------------------------------------
 
     def _ggx(self, p, e: Effects) -> dict:
         """Return the coefficients of the specular lobe (:func:`ggx_coefficients`)."""
@@ -98,8 +94,7 @@ class Decoder:
         return {"f0": f0}
 
     def _coat(self, p, e: Effects) -> dict:
-        """
-        Return the coefficients of the clearcoat: ``GTR1 = scale |h|² / (sin² + α² cos²)``.
+        """Return the coefficients of the clearcoat: ``GTR1 = scale |h|² / (sin² + α² cos²)``.
 
         ``scale`` contains the lobe's strength; ``log`` is for sampling.
         """
@@ -126,11 +121,8 @@ class Decoder:
             shares["clearcoat"] = p.clearcoat
         return shares
 
-    # -- directions -------------------------------------------------------------------------------------------------
-
     def value(self, c: dict, e: Effects, lobes, p, wi, wo, active=True):
-        """
-        Return BRDF · ``wo.z`` of the lobes named in ``lobes``: a colour, or a number if all of them are colourless.
+        """Return BRDF · ``wo.z`` of the lobes named in ``lobes``: a colour, or a number if all of them are colourless.
 
         Only forms that read tables at parameters use ``p``.
         """
@@ -175,8 +167,6 @@ class Decoder:
         coat = self.coat(c)
         return coat["scale"] * g.h2 * fresnel * wo.z * masked / (coat_quadric(coat["a2"], g) * denominator)
 
-    # -- factors that tables may replace -------------------------------------------------------------------------------
-
     def ggx(self, c):
         """Return the specular lobe's coefficients (:func:`ggx_coefficients`)."""
         return c["ggx"]
@@ -199,8 +189,7 @@ class Decoder:
 
 
 def ggx_coefficients(ax, ay=None) -> dict:
-    """
-    Return the coefficients of GGX: α, its square for masking, and ``q`` with ``D = (|h|² / Σ q_k h_k²)²``.
+    """Return the coefficients of GGX: α, its square for masking, and ``q`` with ``D = (|h|² / Σ q_k h_k²)²``.
 
     The sum has positive terms only: nothing cancels at the peak, and nothing overflows at roughness 0. Without ``ay``,
     the distribution is isotropic, and ``q`` has two coefficients.
@@ -244,8 +233,7 @@ def coat_masking_denominator(cosine):
 
 
 def warp_roughness(roughness):
-    """
-    Return the coordinate of a roughness in the encoder: ``√(r + c)``, mapped to [0, 1].
+    """Return the coordinate of a roughness in the encoder: ``√(r + c)``, mapped to [0, 1].
 
     GGX coefficients span decades where roughness is low; the eight entries of the encoder lie closer together there
     (0, 0.04, 0.12, 0.23, …). With ``c = 0.01`` the slope at roughness 0 stays finite.

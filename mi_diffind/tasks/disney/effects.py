@@ -1,5 +1,4 @@
-"""
-Parts of the Disney BRDF that a material uses, derived from the bounds of its parameters before rendering.
+"""Parts of the Disney BRDF that a material uses, derived from the bounds of its parameters before rendering.
 
 Parts that are not in use are neither traced nor read nor sampled. This changes no value: each part has a factor that is
 exactly 0 for every value that the parameter can take.
@@ -15,8 +14,7 @@ from .model import PARAMETERS
 
 @dataclass(frozen=True)
 class Effects:
-    """
-    Parts of the model in use.
+    """Parts of the model in use.
 
     ``diffuse``: Burley's base diffuse; ``subsurface``: its Hanrahan–Krueger-like alternative; ``sheen``, and
     ``sheen_tint``, its tint; ``metal``: reflection coloured by the albedo; ``dielectric``: colourless reflection at
@@ -48,8 +46,7 @@ class Effects:
 
 
 def find_effects(bounds: dict[str, ValueBounds]) -> tuple[Effects, dict[str, str]]:
-    """
-    Return the effects in use, and for each of the others the reason, in words, why it is not in use.
+    """Return the effects in use, and for each of the others the reason, in words, why it is not in use.
 
     ``bounds`` maps ``base_color`` and the names of :data:`.model.PARAMETERS` to their bounds; a missing parameter may
     have any value. Parameters that are being optimised keep their effect, and its derivative, whatever their value.

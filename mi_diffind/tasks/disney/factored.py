@@ -1,5 +1,4 @@
-"""
-Layout of the preset ``tables``: a better factorisation than the paper's, in tables of one coordinate.
+"""Layout of the preset ``tables``: a better factorisation than the paper's, in tables of one coordinate.
 
 =============== ========= ======== =============================== ===================================================
 array           size      channels read at                         holds
@@ -90,12 +89,9 @@ class FactoredArrays(DisneyArrays):
             table.arrays[name] = StoredArray(entries)
         return table
 
-    # -- training ---------------------------------------------------------------------------------------------------
-
     @classmethod
     def targets(cls, m, wi, wo, uniform) -> dict[str, list]:
-        """
-        Return the exact values, see :meth:`.DisneyArrays.targets`.
+        """Return the exact values, see :meth:`.DisneyArrays.targets`.
 
         Tables of one coordinate are trained at uniform coordinates: those of random directions would hardly ever lie
         near the horizon, where errors matter as much.
@@ -138,8 +134,7 @@ class FactoredArrays(DisneyArrays):
 
 
 class FactoredDecoder(decoder.Decoder):
-    """
-    Form of the model that reads :class:`FactoredArrays` in place of some arithmetic.
+    """Form of the model that reads :class:`FactoredArrays` in place of some arithmetic.
 
     ``read`` names the factors that are read: any of ``alpha``, ``masking`` and ``coat``. A study leaves some of them
     out, to measure the cost of one table.

@@ -1,5 +1,4 @@
-"""
-Reference model: Burley, *Physically Based Shading at Disney*, 2012.
+"""Reference model: Burley, *Physically Based Shading at Disney*, 2012.
 
 All functions work on Dr.Jit arrays of one width, in the local frame with the normal (0, 0, 1), for unit directions
 ``wi`` (towards the viewer) and ``wo`` (towards the light) with positive cosines ``wi.z`` and ``wo.z``. Values for other
@@ -62,8 +61,7 @@ PARAMETERS = tuple(f.name for f in fields(Material))
 
 @dataclass
 class Factors:
-    """
-    Factors that depend on the directions, each a scalar array.
+    """Factors that depend on the directions, each a scalar array.
 
     With ``c = wo.z``, ``s = (1 − l·h)^5`` and ``m`` = metallic:
     ``specular``: D · G · c / (4 (n·l)(n·v)); ``metal_base``: m (1 − s); ``base``: (1 − m)(1 − s);
@@ -91,8 +89,7 @@ class Geometry:
 
 
 def geometry(wi, wo) -> Geometry:
-    """
-    Return the geometry of two unit vectors.
+    """Return the geometry of two unit vectors.
 
     ``l·h = |wi + wo| / 2`` needs no normalisation, and is no 0/0 where the directions are opposite.
     """
@@ -114,8 +111,7 @@ def schlick(cosine):
 
 
 def roughness_to_alpha(roughness, anisotropic):
-    """
-    Return ``(α_x, α_y)``, each at least :data:`ALPHA_MIN`.
+    """Return ``(α_x, α_y)``, each at least :data:`ALPHA_MIN`.
 
     They are roughness² divided by and multiplied with the aspect √(1 − 0.9 anisotropic).
     """
@@ -125,8 +121,7 @@ def roughness_to_alpha(roughness, anisotropic):
 
 
 def masking_denominator(w, ax, ay):
-    """
-    Return ``d(w) = c + √(c² + α_x² x² + α_y² y²)`` with ``c = w.z``.
+    """Return ``d(w) = c + √(c² + α_x² x² + α_y² y²)`` with ``c = w.z``.
 
     Smith's masking is ``G₁ = 2c / d``, and ``G / (4 (n·l)(n·v)) = 1 / (d(wi) d(wo))`` is finite at the horizon, where
     ``d ≥ min(α_x, α_y)``.
@@ -146,8 +141,7 @@ def coat_alpha(gloss):
 
 
 def gtr1(g: Geometry, alpha):
-    """
-    Return GTR1, with the denominator written as ``sin² + α² cos²``.
+    """Return GTR1, with the denominator written as ``sin² + α² cos²``.
 
     The published form ``1 + (α² − 1) cos²`` cancels near the peak, to zero or below it.
     """
@@ -163,8 +157,7 @@ def coat_masking(cosine):
 
 
 def diffuse_factors(roughness, cos_d2, fresnel_sum, fresnel_product, cos_ratio, cos_o):
-    """
-    Return Burley's base diffuse and the Hanrahan–Krueger-inspired subsurface approximation, times ``cos_o``.
+    """Return Burley's base diffuse and the Hanrahan–Krueger-inspired subsurface approximation, times ``cos_o``.
 
     The other arguments are ``(l·h)²``, ``F_L + F_V``, ``F_L F_V`` and ``cos_o / (cos_i + cos_o)``.
     """

@@ -1,5 +1,4 @@
-"""
-Layout of the preset ``paper``: the paper's Table 1, with a small encoder before it.
+"""Layout of the preset ``paper``: the paper's Table 1, with a small encoder before it.
 
 The *encoder* is two 1D primary arrays, which map roughness (warped, see :func:`.decoder.warp_roughness`) and anisotropy
 to coordinates; it depends on the material only. The *decoder* is five cascaded arrays, the same for every material:
@@ -69,8 +68,7 @@ class PaperArrays(DisneyArrays):
         return self.bounded("masking", self.masking([encoded_roughness, dr.sqrt(cos_product + TINY)], active))[0]
 
     def factors(self, material, wi, wo, encoded: dict, lobes, active=True) -> Factors:
-        """
-        Return the factors of :func:`.model.compose` for ``lobes``, from five reads; those of other lobes are 0.
+        """Return the factors of :func:`.model.compose` for ``lobes``, from five reads; those of other lobes are 0.
 
         ``encoded`` holds the coefficients of the material: ``roughness`` (encoded), ``q`` and, for the clearcoat,
         ``k``.
@@ -107,8 +105,6 @@ class PaperArrays(DisneyArrays):
             flat=flat,
             clearcoat=clearcoat,
         )
-
-    # -- training ---------------------------------------------------------------------------------------------------
 
     @classmethod
     def targets(cls, m, wi, wo, uniform) -> dict[str, list]:

@@ -1,5 +1,4 @@
-"""
-Importance sampling of the Disney BRDF: choice of a lobe, directions and their density.
+"""Importance sampling of the Disney BRDF: choice of a lobe, directions and their density.
 
 The density has to be normalised exactly even where tables are approximate, so it is always computed from the analytic
 distributions: a cosine for diffuse and sheen, visible normals (Heitz 2018) for the specular lobe, GTR1 half vectors for
@@ -31,8 +30,7 @@ def required(e: Effects) -> tuple[str, ...]:
 
 
 def lobe_probabilities(c: dict, e: Effects, cos_i, rates: dict) -> dict:
-    """
-    Return the probability of sampling each lobe, proportional to an estimate of its albedo for the direction ``wi``.
+    """Return the probability of sampling each lobe, proportional to an estimate of its albedo for the direction ``wi``.
 
     ``rates`` maps lobes to factors on their shares; a lobe that it lacks is turned off. The specular lobe has a
     positive probability unless it is turned off.
@@ -72,8 +70,7 @@ def density(c: dict, e: Effects, probabilities: dict, wi, wo):
 
 
 def sample_gtr1(a2, log_a2, sample):
-    """
-    Return a half vector with density ``GTR1(h) · h.z`` (Burley 2012, appendix B.2).
+    """Return a half vector with density ``GTR1(h) · h.z`` (Burley 2012, appendix B.2).
 
     ``a2`` and ``log_a2`` are α² and its logarithm, ``sample`` is uniform in [0, 1)².
     """

@@ -1,5 +1,4 @@
-"""
-Training of the Disney tables: distributions, per-factor targets, errors.
+"""Training of the Disney tables: distributions, per-factor targets, errors.
 
 Each factor is learned against its own analytic target, because the product of all of them is unbounded and dominated
 by the specular peak (supplemental 1.2). View and light directions are uniform over the hemisphere,
@@ -33,8 +32,7 @@ def uniform_hemisphere(types, u, v):
 
 
 def random_materials(rng, types, size: int, distribution: str = "training") -> Material:
-    """
-    Draw ``size`` materials.
+    """Draw ``size`` materials.
 
     ``distribution``: ``"training"`` (metallic and roughness exponential-like, others uniform) or ``"uniform"``.
     """
@@ -65,8 +63,7 @@ class Shaded(Material):
 
 
 def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects = Effects(), lobes=None):  # noqa: B008
-    """
-    Return BRDF · cosine in RGB, from ``decoder``, or by the published formulas if it is ``None``.
+    """Return BRDF · cosine in RGB, from ``decoder``, or by the published formulas if it is ``None``.
 
     ``lobes`` names the lobes to sum; by default, all that are in use.
     """
@@ -78,8 +75,7 @@ def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects
 
 
 class DisneyProblem(Problem):
-    """
-    Training problem of a layout ``net``, which is read by ``decoder``, a class.
+    """Training problem of a layout ``net``, which is read by ``decoder``, a class.
 
     ``psnr_db`` is measured at ``samples`` random directions and materials, seeded and held out: PSNR of BRDF · cosine,
     clipped to [0, 1], against the analytic model.
@@ -106,8 +102,7 @@ class DisneyProblem(Problem):
 def measure(
     decoder: Decoder, types, samples: int = 10**6, distribution: str = "training", seed: int = 2023
 ) -> dict[str, float]:
-    """
-    Measure the accuracy of a decoder over random materials and directions (uniform over the hemisphere).
+    """Measure the accuracy of a decoder over random materials and directions (uniform over the hemisphere).
 
     Returns ``psnr_db`` of BRDF · cosine clipped to [0, 1], ``psnr_brdf_db`` of the BRDF without the cosine, clipped
     likewise, and ``mae``.

@@ -1,5 +1,4 @@
-"""
-Task 1: the isotropic GGX distribution of normals, read from arrays (supplemental 1.1).
+"""Task 1: the isotropic GGX distribution of normals, read from arrays (supplemental 1.1).
 
 The reference is Trowbridge and Reitz's distribution (Walter et al. 2007, equation 33) with the normal (0, 0, 1),
 
@@ -65,8 +64,7 @@ def ggx(sin2, alpha):
 
 @dataclass(frozen=True)
 class Encoding:
-    """
-    Mapping of (θ_h, α) to the coordinates of a read, and of the value that is read to D; see the module.
+    """Mapping of (θ_h, α) to the coordinates of a read, and of the value that is read to D; see the module.
 
     ``inputs`` is ``"logarithmic"`` or ``"plain"``, ``output`` is ``"root"`` or ``"raw"``.
     """
@@ -91,8 +89,7 @@ class Encoding:
         return dr.square(dr.maximum(ALPHA_MIN * dr.rcp(alpha), 1))
 
     def coordinate_normal(self, cos, sin2, stretch=1, limit=1):
-        """
-        Return the coordinate in [0, 1] of the half vector's angle, from cos θ_h ≥ 0 and sin²θ_h.
+        """Return the coordinate in [0, 1] of the half vector's angle, from cos θ_h ≥ 0 and sin²θ_h.
 
         The stretched squared sine is limited to ``limit``.
         """
@@ -114,8 +111,7 @@ class Encoding:
         return dr.pi * dr.square(alpha)
 
     def decode(self, y, peak):
-        """
-        Return D for the value ``y`` that was read and ``peak`` = 1/(π α²).
+        """Return D for the value ``y`` that was read and ``peak`` = 1/(π α²).
 
         D is limited to 0 to :data:`PEAKS` times ``peak``; NaN becomes 0.
         """
@@ -130,8 +126,7 @@ ENCODINGS = {"tables": Encoding(), "paper": Encoding("plain", "raw")}
 
 @dataclass
 class Roughness:
-    """
-    Terms of a read of the distribution that depend on α alone.
+    """Terms of a read of the distribution that depend on α alone.
 
     ``alpha2`` = α²; ``peak`` = 1/(π α²); ``stretch`` and ``limit`` of sin²θ_h; ``tail``, the q at which the tail begins
     (``None``: no tail); and either ``coordinate``, that of α, or ``net``, the function of the other coordinate that
@@ -148,8 +143,7 @@ class Roughness:
 
 
 class LearnedGGX:
-    """
-    Distribution read from ``net``, any function from a list of two coordinates in [0, 1] to a list of one array.
+    """Distribution read from ``net``, any function from a list of two coordinates in [0, 1] to a list of one array.
 
     ``net`` may be an :class:`~mi_diffind.indirection.Indirection`, a single array or a network. Without ``tail``, all
     of the distribution is read, as in training.
@@ -170,8 +164,7 @@ class LearnedGGX:
         return terms
 
     def constant_roughness(self, alpha) -> Roughness:
-        """
-        Return :meth:`roughness` of an α that is one number.
+        """Return :meth:`roughness` of an α that is one number.
 
         An indirection's primary array is reduced to one row: two entries to read instead of four.
         """
@@ -197,8 +190,7 @@ class LearnedGGX:
 
 
 def indirection(primary: int = 16, cascaded: int = 8) -> Indirection:
-    """
-    Return the arrays of task 1, not yet allocated. Raises ``ValueError``.
+    """Return the arrays of task 1, not yet allocated. Raises ``ValueError``.
 
     The primary array has ``primary``² × 2 entries and starts as the undistorted uv ramp; the cascaded array has
     ``cascaded``² × 1 entries, starts at 0.5 and has no non-linearity on its output.

@@ -17,8 +17,7 @@ BANDS = ((0.001, 0.01), (0.01, 0.1), (0.1, 0.5), (0.5, 1.0))
 
 
 def draw(rng, types, size: int, preset: str = "paper"):
-    """
-    Draw ``size`` samples ``(cos θ_h, sin²θ_h, α)``: cosine-weighted normals and exponential-like roughness.
+    """Draw ``size`` samples ``(cos θ_h, sin²θ_h, α)``: cosine-weighted normals and exponential-like roughness.
 
     For the preset ``"tables"``, half of the normals are drawn from the peak (:mod:`.model`).
     """
@@ -33,8 +32,7 @@ def draw(rng, types, size: int, preset: str = "paper"):
 
 
 def measure(distribution: Callable, types, samples: int = 10**6, seed: int = 2023) -> dict[str, float]:
-    """
-    Measure the errors of ``distribution(cos, sin2, alpha)`` against :func:`ggx`.
+    """Measure the errors of ``distribution(cos, sin2, alpha)`` against :func:`ggx`.
 
     On the bounded range: ``psnr_db`` and ``mae`` of D clipped to [0, 1], over ``samples`` of :func:`draw`. On the peak,
     for each of :data:`BANDS`: ``peak_error_LOW_HIGH``, the largest of |D̂/D − 1| at the normal itself over 64
@@ -66,8 +64,7 @@ def measure(distribution: Callable, types, samples: int = 10**6, seed: int = 202
 
 
 class GGXProblem(Problem):
-    """
-    Training problem of the distribution for any representation ``net``, which maps two coordinates to one output.
+    """Training problem of the distribution for any representation ``net``, which maps two coordinates to one output.
 
     ``preset`` selects the samples (:func:`draw`); ``encoding`` defaults to that of the preset.
     """

@@ -1,5 +1,4 @@
-"""
-Task 3: images and materials as a primary array that points into a cascaded one.
+"""Task 3: images and materials as a primary array that points into a cascaded one.
 
 Sources and stored channels are in :mod:`mi_diffind.maps`.
 

@@ -1,5 +1,4 @@
-"""
-Initial arrays of task 3: a primary array of 1 to 4 channels, read at uv, that points into a cascaded array.
+"""Initial arrays of task 3: a primary array of 1 to 4 channels, read at uv, that points into a cascaded array.
 
 - The supplement's: the primary is the uv ramp, repeated for each further channel; the cascaded array is constant for
   each role of a map.
@@ -40,8 +39,7 @@ def joined(primaries: Sequence[DifferentiableArray], cascaded: DifferentiableArr
 
 
 def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> Indirection:
-    """
-    Return initial arrays from the principal components of ``values``, ``(height, width, k)`` in [0, 1]; not allocated.
+    """Return initial arrays from the principal components of ``values``, ``(height, width, k)`` in [0, 1]; unallocated.
 
     Of two primaries, the first takes the components of the differences of neighbours, which need its resolution most;
     the second takes components of the rest. Channels beyond the image's ``k`` start as ramps along u or v.

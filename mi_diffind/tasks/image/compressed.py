@@ -19,8 +19,7 @@ PRIMARY_PAGES = PRIMARIES[0] + PAGES
 
 
 class CompressedImage(CompressedMaps):
-    """
-    A compressed image or material.
+    """A compressed image or material.
 
     ``layout`` lists the maps, ``net`` maps (v, u) in [0, 1]² to the stored channels. ``net`` is ``None`` if all
     channels are constant.
@@ -39,9 +38,6 @@ class CompressedImage(CompressedMaps):
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v)."""
         return [] if self.net is None else self.net([v, u], active)
-
-
-# -- files ------------------------------------------------------------------------------------------------------------
 
 
 def allocate(table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:

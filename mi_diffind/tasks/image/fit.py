@@ -47,8 +47,7 @@ def check(request: FitRequest) -> None:
 
 
 def fit(request: FitRequest) -> Fitted:
-    """
-    Choose sizes, train, and measure.
+    """Choose sizes, train, and measure.
 
     Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError` and
     :class:`~mi_diffind.fitting.FittingError`.

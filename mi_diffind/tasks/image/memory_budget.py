@@ -1,5 +1,4 @@
-"""
-Memory budgets of task 3: resolutions of the arrays for a number of bytes (the paper's supplement, section 1.3).
+"""Memory budgets of task 3: resolutions of the arrays for a number of bytes (the paper's supplement, section 1.3).
 
 Equation 1, ``bytes = 4 N_p² + k N_c⁴``, is for square images, a four-dimensional cascaded array and one byte an entry.
 Here the primary has ``rows × columns`` entries in place of ``N_p²`` (in the proportions of the image), ``dims``
@@ -35,8 +34,7 @@ TOLERANCE = 0.05
 
 
 def resolution_ratio(compression: float, resolution: float) -> float:
-    """
-    Return the default of ``ρ = N_p / N_c`` for a compression ratio and the side of the image in texels.
+    """Return the default of ``ρ = N_p / N_c`` for a compression ratio and the side of the image in texels.
 
     The side of a non-square image is the square root of its texels. :data:`RATIOS`, interpolated linearly in
     ``log2(compression)`` and constant outside of 3 … 24, times a factor for the resolution: 1 at 4096; up to 2048 the
@@ -51,8 +49,7 @@ def resolution_ratio(compression: float, resolution: float) -> float:
 
 @dataclass(frozen=True)
 class CoarsePrimary:
-    """
-    A second primary array, of lower resolution.
+    """A second primary array, of lower resolution.
 
     It holds ``dims`` coordinates of the pointer in ``bits`` bits; ``scale`` is its side as a multiple of the first's.
     """
@@ -68,8 +65,7 @@ class CoarsePrimary:
 
 @dataclass(frozen=True)
 class ImageBudget:
-    """
-    Resolutions of the arrays of an image.
+    """Resolutions of the arrays of an image.
 
     - ``rows``, ``columns``: sides of the primary; ``dims``, ``bits``: coordinates of a pointer, bits of each.
     - ``cascaded``: side of the cascaded array of ``channels`` channels.
@@ -117,9 +113,6 @@ class ImageBudget:
         return math.sqrt(self.rows * self.columns) / self.cascaded
 
 
-# -- resolutions from bytes -------------------------------------------------------------------------------------------
-
-
 def paper_search(
     uncompressed_bytes: int,
     compression: float,
@@ -130,8 +123,7 @@ def paper_search(
     dims: int = 4,
     bits: int = 8,
 ) -> ImageBudget:
-    """
-    Return the result of the paper's linear search over the sides ``N_c`` = 4, 8, 12, … of the cascaded array.
+    """Return the result of the paper's linear search over the sides ``N_c`` = 4, 8, 12, … of the cascaded array.
 
     The search minimises ``|compression − uncompressed_bytes / bytes|``, with ``N_p = ratio · N_c`` in multiples
     of 8. Equation 1 has squares only: for a non-square image the ``N_p²`` entries are spread in its proportions, in
@@ -161,8 +153,7 @@ def search(
     dims: int = 4,
     bits: int = 8,
 ) -> ImageBudget:
-    """
-    Return :func:`paper_search` with the ratio of :func:`resolution_ratio`, corrected if it is more than 5% off.
+    """Return :func:`paper_search` with the ratio of :func:`resolution_ratio`, corrected if it is more than 5% off.
 
     Sides in steps can miss ``compression`` by far (4K RGB at 12x becomes 13.4x at ρ = 80). Then the cascaded array is
     kept, or reduced until it takes at most half of the bytes, and the primary becomes the largest that fits
@@ -180,8 +171,7 @@ def search(
 
 
 def cascaded_side(budget: float, channels: int, dims: int = 4, share: float = 0.08) -> int:
-    """
-    Return the side of a cascaded array that takes at most ``share`` of ``budget`` bytes.
+    """Return the side of a cascaded array that takes at most ``share`` of ``budget`` bytes.
 
     A multiple of 4, at least 4 and at most :data:`CASCADED_LIMITS`.
     """
@@ -199,8 +189,7 @@ def fit_bytes(
     bits: int = 8,
     coarse: CoarsePrimary | None = None,
 ) -> ImageBudget:
-    """
-    Return the largest primary that fits into ``budget`` bytes beside a cascaded array of side ``cascaded``.
+    """Return the largest primary that fits into ``budget`` bytes beside a cascaded array of side ``cascaded``.
 
     It has the proportions of the image (a square one exactly, others to 2% or one texel) and is no larger than it. Its
     least size is 1×1: only then can the bytes exceed ``budget``.

@@ -25,8 +25,7 @@ PAGED = ("pages of 5 bits", "pages of 6 bits", "pages of 2 + 6 bits")
 
 @dataclass(frozen=True)
 class ImageRecipe:
-    """
-    Storage and training of an image.
+    """Storage and training of an image.
 
     - ``once``: store equal channels once, and constant channels as numbers (:meth:`.Layout.of`).
     - ``normals``: leave out the third component of normals where it follows from the others.

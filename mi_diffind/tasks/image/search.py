@@ -31,8 +31,7 @@ NEAR = 1.06
 
 @dataclass
 class RatioSearch:
-    """
-    Result of :func:`ratio_search`.
+    """Result of :func:`ratio_search`.
 
     ``tried`` has one dictionary a training (sizes, ``bytes``, ``psnr_db``). ``best`` is the table and the record of the
     best short training, which an interrupted search returns.
@@ -46,8 +45,7 @@ class RatioSearch:
 
 
 def default_size(source: Source, nbytes: float, recipe: ImageRecipe) -> ImageBudget:
-    """
-    Return the default budget of a recipe for ``nbytes`` bytes.
+    """Return the default budget of a recipe for ``nbytes`` bytes.
 
     The supplement's search, or, with ``components`` or two primaries, a cascaded array of
     :func:`.memory_budget.cascaded_side` and the largest primary that fits beside it.
@@ -73,8 +71,7 @@ def sized(source: Source, nbytes: float, recipe: ImageRecipe, cascaded: int) -> 
 def ratio_search(
     source: Source, nbytes: float, recipe: ImageRecipe, request: FitRequest, free: bool = True, border=None
 ) -> RatioSearch:
-    """
-    Return the best of several budgets of ``nbytes`` bytes, each trained for :data:`SHORT` of the steps.
+    """Return the best of several budgets of ``nbytes`` bytes, each trained for :data:`SHORT` of the steps.
 
     The side of the cascaded array (and so the ratio ρ) is varied first; with ``free`` then the structure of the primary
     and the dimensions. The best so far is kept after each. ``request`` and ``border`` are those of :func:`.fit_image`.
@@ -152,8 +149,7 @@ def psnr_search(
     most: int = 8,
     log: Callable[[str], None] = print,
 ) -> tuple[Table | None, FitResult | None, list[dict]]:
-    """
-    Search the smallest file whose ``psnr_db`` is at least ``goal``, by trainings of full length.
+    """Search the smallest file whose ``psnr_db`` is at least ``goal``, by trainings of full length.
 
     Sizes follow the secant of quality over the logarithm of bytes. The search ends when a sufficient size is within
     :data:`NEAR` of an insufficient one, or after ``most`` trainings. Returns the table (``None`` if not even the

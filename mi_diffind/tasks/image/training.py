@@ -1,5 +1,4 @@
-"""
-Training of task 3: samples, targets and the stored result.
+"""Training of task 3: samples, targets and the stored result.
 
 A step draws a texel of the source for each sample, stratified. The target is the texel at its centre, or the bilinear
 value at a jittered place within it. The supplement's recipe jitters all samples, which trains a bilinearly smoothed
@@ -54,8 +53,7 @@ def structure_of(source: Source, recipe: ImageRecipe, nbytes: float | None = Non
 
 
 def dims_of(recipe: ImageRecipe, structure: str, stored: int) -> int:
-    """
-    Return the dimensions of the cascaded array for ``stored`` channels.
+    """Return the dimensions of the cascaded array for ``stored`` channels.
 
     A single primary of pages has at most ``stored`` (at least 2): more entries gain more than more coordinates.
     """
@@ -87,8 +85,7 @@ def layout_of(source: Source, recipe: ImageRecipe) -> Layout:
 
 
 class ImageProblem(Problem):
-    """
-    Training problem of an image.
+    """Training problem of an image.
 
     ``net`` maps (v, u) to the stored channels; ``bits`` are those of the entries of each primary; ``values`` are the
     stored channels, ``(height, width, stored)``; ``border`` is that of the image along v and u.
@@ -186,8 +183,7 @@ class ImageProblem(Problem):
 def problem_of(
     source: Source, size: ImageBudget, recipe: ImageRecipe, types, layout: Layout | None = None, border=None
 ) -> ImageProblem:
-    """
-    Return the problem of training ``source`` at a size by a recipe, with initial arrays.
+    """Return the problem of training ``source`` at a size by a recipe, with initial arrays.
 
     Raises ``ValueError`` for pages without components, which their resolution follows.
     """
@@ -209,8 +205,7 @@ def fit_image(
     border: tuple[str, str] | None = None,
     title: str | None = None,
 ) -> tuple[Table, FitResult]:
-    """
-    Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
+    """Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
 
     ``size`` is ``None`` for an image of one colour, which needs no arrays. ``border`` along v and u is by default
     :func:`.components.borders`. ``request`` holds the Dr.Jit types, the time and the checkpoint; its settings are

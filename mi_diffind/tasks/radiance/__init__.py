@@ -1,5 +1,4 @@
-"""
-Task 7: radiance fields from images of a scene.
+"""Task 7: radiance fields from images of a scene.
 
 - :mod:`.views`, :mod:`.visual_hull`: captured images with cameras, and the space that they may occupy;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;

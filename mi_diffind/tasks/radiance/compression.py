@@ -1,5 +1,4 @@
-"""
-Compression of a grid to density levels and a palette: initial clusters, training through the images, and sizes.
+"""Compression of a grid to density levels and a palette: initial clusters, training through the images, and sizes.
 
 Each node stores a density level, a step on a straight line of raw densities, and an index into a palette of colours
 that all nodes share.
@@ -46,8 +45,7 @@ SAMPLES, ROUNDS = 60, 10
 
 @dataclass
 class PaletteCoding:
-    """
-    Palette coding of a grid's ``nodes``.
+    """Palette coding of a grid's ``nodes``.
 
     ``levels`` ``(n,)`` are densities in [0, 1] between :data:`EMPTIEST` and :data:`DENSEST`; ``index`` ``(n,)``
     (uint32) names a row of ``palette`` ``(P, 12)`` in ``index_bits`` bits.
@@ -75,8 +73,7 @@ def palette_coding(grid: NodeGrid, index_bits: int, seed: int) -> PaletteCoding:
 
 
 def clusters(colour: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return ``count`` cluster centres of ``colour`` ``(n, 12)`` and the index of the nearest one for each row.
+    """Return ``count`` cluster centres of ``colour`` ``(n, 12)`` and the index of the nearest one for each row.
 
     The centres, ``(count, 12)``, are found by Lloyd's algorithm on random rows.
     """
@@ -97,8 +94,7 @@ def clusters(colour: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.
 
 
 class PaletteProblem(ImagesProblem):
-    """
-    Training of a :class:`PaletteCoding` through the images of a session.
+    """Training of a :class:`PaletteCoding` through the images of a session.
 
     Density levels and palette are rounded as they are stored, with straight-through gradients. Indices are constant.
     """
@@ -133,8 +129,7 @@ class PaletteProblem(ImagesProblem):
         self.range = [self.session.types.Float(np.float32(v)) for v in byte_range(self.net["palette"].numpy())]
 
     def stored(self) -> dict[str, np.ndarray]:
-        """
-        Return what is stored: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``.
+        """Return what is stored: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``.
 
         ``density_range`` holds the raw density of level 0 and the step from one level to the next.
         """
@@ -172,8 +167,7 @@ def packed_bytes(grid: NodeGrid, index_bits: int) -> int:
 
 
 def sized(grid: NodeGrid, images: ViewImages, nbytes: int | None) -> tuple[NodeGrid, int]:
-    """
-    Return the visible part of a grid at the highest resolution that fits in ``nbytes``, and its bits of an index.
+    """Return the visible part of a grid at the highest resolution that fits in ``nbytes``, and its bits of an index.
 
     At the full resolution, an index has as many bits as fit; at a lower one, 10, or 8 if these do not fit. With
     ``None``, the resolution and the bits are the default. Raises ``ValueError`` if no grid fits.

@@ -1,5 +1,4 @@
-"""
-Radiance fields decoded to dense grids: NumPy archives, or OpenVDB files that Blender and others read.
+"""Radiance fields decoded to dense grids: NumPy archives, or OpenVDB files that Blender and others read.
 
 The Python package index has no OpenVDB (``openvdb`` comes with conda-forge, Debian's ``python3-openvdb`` and Blender's
 Python), so the module is used where it is installed and is not required.
@@ -38,8 +37,7 @@ MODULES = ("openvdb", "pyopenvdb")
 
 
 def grid(field: VolumeField, resolution: int | None = None) -> dict[str, np.ndarray]:
-    """
-    Return a field sampled at the nodes ``lower + voxel · (i, j, k)`` of a dense grid, as float32 arrays by name.
+    """Return a field sampled at the nodes ``lower + voxel · (i, j, k)`` of a dense grid, as float32 arrays by name.
 
     ``density`` ``(X, Y, Z)`` is per unit of length. ``colour`` ``(X, Y, Z, 12)`` holds numbers a and b for each of red,
     green and blue: the radiance in direction d is exp(a + b·d) (:func:`.volume_field.colour_of`). ``lower`` is
@@ -126,8 +124,7 @@ def mean_colour(numbers: np.ndarray) -> np.ndarray:
 
 
 def decode(field: VolumeField, output: Path, resolution: int | None = None) -> list[tuple[Path, str]]:
-    """
-    Write a field as a dense grid and return the file with a line about its content.
+    """Write a field as a dense grid and return the file with a line about its content.
 
     A ``.npz`` file holds the arrays of :func:`grid`; a ``.vdb`` file holds grids ``density`` and ``color``, the mean
     radiance over all directions. Raises :class:`~mi_diffind.errors.UsageError` for another extension, a bad resolution,

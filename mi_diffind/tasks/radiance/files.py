@@ -142,8 +142,7 @@ def index_of(table: Table) -> np.ndarray:
 
 
 def field_of(table: Table, types, storage: str = "") -> VolumeField:
-    """
-    Return the field of a checked table.
+    """Return the field of a checked table.
 
     It is packed for rendering; with the ``storage`` ``"float32"``, its ``arrays`` can be trained instead.
     """

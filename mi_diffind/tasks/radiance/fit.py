@@ -53,8 +53,7 @@ def check(request: FitRequest) -> None:
 
 
 def fit(request: FitRequest) -> Fitted:
-    """
-    Fit a field to the views in a folder.
+    """Fit a field to the views in a folder.
 
     Raises :class:`UsageError`, :class:`.views.ViewsError`, :class:`~mi_diffind.tables.TableError` and
     :class:`~mi_diffind.fitting.FittingError`.
@@ -114,8 +113,6 @@ class FieldFit:
         figures = {"grid_seconds": grid_seconds, "dense_bytes": dense, "memory_bytes": size, "warnings": warnings}
         return Fitted(table, result, lines, figures)
 
-    # -- the grid -----------------------------------------------------------------------------------------------------
-
     def grid(self) -> tuple[NodeGrid, FitResult | None]:
         """Return the grid: that of ``--grid`` if the file exists, else a trained one, which is written there."""
         request, views, path = self.request, self.session.views, self.request.options["grid"]
@@ -137,8 +134,7 @@ class FieldFit:
         return grid, result
 
     def trained_grid(self) -> tuple[NodeGrid, FitResult]:
-        """
-        Train a grid in stages.
+        """Train a grid in stages.
 
         With a checkpoint, each stage has one of its own beside it, and the grid of the last finished stage is kept in
         ``CHECKPOINT.grid.npz``.
@@ -202,8 +198,6 @@ class FieldFit:
         visible = self.visible(grid)
         return files.grid_table(visible.nodes, visible.density, visible.colour)
 
-    # -- the compressed field -----------------------------------------------------------------------------------------
-
     def wanted_bytes(self, grid: NodeGrid) -> int | None:
         """Return the bytes in memory that the options ask for, or ``None``."""
         options = self.request.options
@@ -214,8 +208,7 @@ class FieldFit:
         return None
 
     def train(self, problem: ImagesProblem, stopped: bool, suffix: str = "") -> FitResult:
-        """
-        Train a problem through the images, with the checkpoint of the request and a ``suffix``.
+        """Train a problem through the images, with the checkpoint of the request and a ``suffix``.
 
         If the training of the grid was ``stopped``, the problem is only measured, so that its state is kept; a resumed
         run then continues with the grid.

@@ -1,5 +1,4 @@
-"""
-Sparse grid of plain numbers, trained from coarse to fine: the field that is compressed.
+"""Sparse grid of plain numbers, trained from coarse to fine: the field that is compressed.
 
 Training begins in the visual hull at a quarter of the nodes along each side, continues at half of them and ends with
 all of them. Between these stages, cells that no ray sees (:func:`weights`) are removed and the others are divided.
@@ -48,8 +47,7 @@ class NodeGrid:
 
 
 class GridProblem(ImagesProblem):
-    """
-    Training of a :class:`NodeGrid` through images, with a little total variation of its densities (:data:`SMOOTH`).
+    """Training of a :class:`NodeGrid` through images, with a little total variation of its densities (:data:`SMOOTH`).
 
     The variation makes neighbours agree that no image distinguishes, which is worth half a decibel in held-out views.
     """
@@ -125,8 +123,7 @@ def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
 
 
 def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 0) -> NodeGrid:
-    """
-    Return the grid reduced to ``cells`` (:func:`visible`), at ``factor`` times as many nodes along each side.
+    """Return the grid reduced to ``cells`` (:func:`visible`), at ``factor`` times as many nodes along each side.
 
     ``wide`` cells of the given grid around them are kept, too.
     """

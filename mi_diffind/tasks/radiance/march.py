@@ -1,5 +1,4 @@
-"""
-Ray marching: emission and absorption from front to back, the derivatives of both, and counts of the reads.
+"""Ray marching: emission and absorption from front to back, the derivatives of both, and counts of the reads.
 
 A ray is divided into steps of a fixed length from the point where it enters the box; the last step is cut where the ray
 leaves. Distances count from the point of entry, since a step might be too short to change a distance from afar. Each
@@ -31,8 +30,7 @@ ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
 class Marched:
-    """
-    Result of a marched ray: ``colour`` (premultiplied), ``transmittance`` and ``depth``.
+    """Result of a marched ray: ``colour`` (premultiplied), ``transmittance`` and ``depth``.
 
     ``depth`` is Σ w t over the steps; divided by the opacity, it is the mean distance.
     """
@@ -46,8 +44,7 @@ class Marched:
 
 
 def box(field, o, d, near, far, active):
-    """
-    Return the part of each ray in the field's box: its origin, the distance to it, its length, and whether it exists.
+    """Return the part of each ray in the field's box: origin, distance, length, and whether it exists.
 
     A ray with NaN has no part in the box.
     """
@@ -61,8 +58,7 @@ def box(field, o, d, near, far, active):
 
 @dr.syntax
 def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
-    """
-    March the rays ``o + t d`` through a field, for t from ``near`` to ``far``.
+    """March the rays ``o + t d`` through a field, for t from ``near`` to ``far``.
 
     ``d`` has unit length; ``offset`` in [0, 1) is the position within a step at which the field is read.
     """
@@ -110,8 +106,7 @@ def _next(field, o, d, t, far, step, offset, active):
 
 
 def replay(field, o, d, near, far, active, offset, marched: Marched, d_colour, d_transmittance=0, d_depth=0) -> None:
-    """
-    Add to the gradients of ``field.arrays``, given those with respect to colour, transmittance and depth.
+    """Add to the gradients of ``field.arrays``, given those with respect to colour, transmittance and depth.
 
     ``marched`` is what :func:`march` returned for these arguments.
     """
@@ -179,8 +174,7 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
 
 @dr.syntax
 def visibility(field, o, d, near, far, active, target) -> None:
-    """
-    Raise ``target`` to the largest weight that each cell of ``field.nodes`` has in one of these rays.
+    """Raise ``target`` to the largest weight that each cell of ``field.nodes`` has in one of these rays.
 
     The weight of a step is its transmittance times its opacity. ``target`` has an entry for each node of the grid; that
     of a cell is at its first corner.
@@ -230,13 +224,9 @@ def differentiable(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     return Marched(*dr.custom(_March, field.arrays, field.with_arrays({}), o, d, near, far, active, offset))
 
 
-# -- counts of reads --------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class RayCounts:
-    """
-    Number of ``rays``, of those that cross the field's box (``crossing``), and of those that end opaque (``opaque``).
+    """Numbers of ``rays``, of those ``crossing`` the field's box, and of those that end ``opaque``.
 
     ``steps`` is the number of steps in the box. Of these, ``hidden`` lie behind an opaque part, ``skipped`` in space
     known to be empty, ``looks`` read the density, and ``colours`` read the radiance, too.
@@ -256,8 +246,7 @@ class RayCounts:
 
 
 class CountingField(VolumeField):
-    """
-    Field that counts the reads of density and radiance of another ``field``.
+    """Field that counts the reads of density and radiance of another ``field``.
 
     ``reads_all``: no space is known to be empty, so every step up to an opaque part reads the density.
     """

@@ -102,8 +102,7 @@ class RadianceFieldModel(Model):
         return count(self.field, o, d, 0, np.inf).asdict()
 
     def measure(self, capture=None):
-        """
-        Return the PSNR of the test views of a capture.
+        """Return the PSNR of the test views of a capture.
 
         ``capture`` is its folder; by default, that of the capture that was fitted, if it still exists.
         """

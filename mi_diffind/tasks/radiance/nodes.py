@@ -1,5 +1,4 @@
-"""
-Nodes of a dense or sparse grid: their numbers, their memory index, and the empty distances between them.
+"""Nodes of a dense or sparse grid: their numbers, their memory index, and the empty distances between them.
 
 A sparse grid stores the corners of all occupied cells. A cell is occupied if all its corners are stored, and empty
 otherwise. Rays cross empty space by the distances of a coarser grid, whose cells span :data:`COARSE` cells along each
@@ -25,8 +24,7 @@ COLUMN = 31
 
 
 class Nodes:
-    """
-    Nodes at ``lower + spacing · (i, j, k)``, with ``(i, j, k)`` below ``shape``.
+    """Nodes at ``lower + spacing · (i, j, k)``, with ``(i, j, k)`` below ``shape``.
 
     ``stored``, bool of this shape, marks the nodes of a sparse grid. They are numbered from 1 in lexicographic order,
     and 0 stands for no node. Without ``stored``, all nodes are numbered from 0. The index that maps positions to
@@ -98,8 +96,7 @@ class Nodes:
         return dr.fma(dr.fma(x, self._sides.y, y), self._sides.z, z)
 
     def corners(self, p, active=True) -> tuple[list, object]:
-        """
-        Return eight pairs (weight, node number) of the cell that holds ``p``, and whether that cell is occupied.
+        """Return eight pairs (weight, node number) of the cell that holds ``p``, and whether that cell is occupied.
 
         Numbers of an empty cell may be 0.
         """
@@ -167,8 +164,7 @@ def corners_of(cells: np.ndarray) -> np.ndarray:
 
 
 def chessboard_distances(cells: np.ndarray) -> np.ndarray:
-    """
-    Return the distance of each cell of the coarser grid to the nearest one that holds an occupied cell.
+    """Return the distance of each cell of the coarser grid to the nearest one that holds an occupied cell.
 
     Distances are in cells of the coarser grid, in the maximum norm, at most :data:`FARTHEST`; uint8.
     """
@@ -197,8 +193,7 @@ def numbered(stored: np.ndarray) -> np.ndarray:
 
 
 def column_words(stored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the numbers of nodes as masks and ranks: two uint32 arrays.
+    """Return the numbers of nodes as masks and ranks: two uint32 arrays.
 
     The first, ``(w, 2)``, holds a bit for each column, set if the column has stored nodes, 32 to a word, and the number
     of set bits before. The second, ``(c, 2)``, holds the mask of each such column and the number of its first node.

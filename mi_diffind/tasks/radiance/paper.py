@@ -1,5 +1,4 @@
-"""
-Layout of the supplement (§ 1.7): two pairs of dense 3D arrays, one for density and one for twelve numbers of colour.
+"""Layout of the supplement (§ 1.7): two pairs of dense 3D arrays, one for density and one for twelve numbers of colour.
 
 The primary arrays begin as ramps, the cascaded arrays as the grid resampled to their size. Cells that no ray sees are
 empty, as in all fields here; the supplement keeps them.
@@ -24,8 +23,7 @@ EMPTIEST, DENSEST = -8.0, 16.0
 
 
 class PairsField(NodeVolume):
-    """
-    Radiance field of two indirections, ``density`` and ``colour``.
+    """Radiance field of two indirections, ``density`` and ``colour``.
 
     Both map coordinates of the box, [0, 1]³, to numbers in [0, 1] that stand for the range from ``low`` to ``high``,
     13 numbers each, density first. Cells of ``nodes`` that are not stored are empty.
@@ -69,8 +67,7 @@ class PairsField(NodeVolume):
 
 
 def sides(nbytes: float, ratio: float, channels: int, extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """
-    Return the shapes of a primary and a cascaded array that together fill ``nbytes``, in the ratio ``ratio``.
+    """Return the shapes of a primary and a cascaded array that together fill ``nbytes``, in the ratio ``ratio``.
 
     An entry of the primary array has 3 bytes, one of the cascaded array ``channels``. The sides are proportional to
     the ``extent`` of the box.

@@ -33,8 +33,7 @@ def dense_bytes(shape) -> int:
 
 @dataclass(frozen=True)
 class RadianceRecipe:
-    """
-    Layout of the arrays and settings of the training.
+    """Layout of the arrays and settings of the training.
 
     The layout is ``"sparse"`` (:mod:`.compression`), ``"pairs"`` (:mod:`.paper`) or ``"grid"`` (:mod:`.grid`).
     """

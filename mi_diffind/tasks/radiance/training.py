@@ -1,5 +1,4 @@
-"""
-Training of a radiance field through images: rays of random patches of the views, in front of random greys.
+"""Training of a radiance field through images: rays of random patches of the views, in front of random greys.
 
 A patch of 4 × 4 neighbouring pixels shares most of what its rays read, which is 2.5 times as fast as single pixels.
 """
@@ -79,8 +78,7 @@ class ViewImages:
         return values[: views.height, : views.width]
 
     def evaluate(self, field: VolumeField) -> dict[str, float]:
-        """
-        Return the PSNR of sRGB values before white in decibels, as means over the views.
+        """Return the PSNR of sRGB values before white in decibels, as means over the views.
 
         ``psnr_white_db`` is that of all pixels. ``psnr_foreground_db``, of the pixels with an alpha above 0, is the
         first figure, since white flatters.
@@ -126,8 +124,7 @@ def load_held_out(folder) -> tuple[CapturedViews, bool]:
 
 
 class ImagesProblem(Problem):
-    """
-    Training of a field through the images of a session.
+    """Training of a field through the images of a session.
 
     ``net`` maps names to tensors (a dictionary or a module); ``field_of`` makes a :class:`.VolumeField` of them,
     differentiably. The loss is the mean squared difference of sRGB values in front of random greys, which trains the

@@ -1,5 +1,4 @@
-"""
-Captured views: images of a scene with the poses of their cameras, read from a folder.
+"""Captured views: images of a scene with the poses of their cameras, read from a folder.
 
 ``mi-diffind capture``, Blender and nerfstudio write such folders. Two layouts are read: ``transforms_train.json``,
 ``transforms_test.json`` and ``transforms_val.json`` of NeRF's Blender data (Mildenhall et al. 2020), and the
@@ -46,8 +45,7 @@ class ViewsError(DiffindError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class CapturedViews:
-    """
-    Images of one split of a capture, with their cameras.
+    """Images of one split of a capture, with their cameras.
 
     ``images`` ``(V, height, width, 4)``, float32, holds linear colours multiplied by alpha, and alpha in [0, 1].
     ``poses`` ``(V, 4, 4)``, float64, map camera to world. ``focal`` and ``centre``, ``(V, 2)``, are in pixels, the
@@ -85,8 +83,7 @@ class CapturedViews:
         return self.poses[:, :3, 3]
 
     def rays(self, view, x, y) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return origins and unit directions ``(…, 3)``, float64, of the rays through the centres of pixels.
+        """Return origins and unit directions ``(…, 3)``, float64, of the rays through the centres of pixels.
 
         ``view`` names the images, ``x`` and ``y`` the columns and rows, counted from 0 at the upper left; fractions are
         allowed.
@@ -103,8 +100,7 @@ class CapturedViews:
 
 
 def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews:
-    """
-    Read the views of a ``split``: "train", "test" or "val".
+    """Read the views of a ``split``: "train", "test" or "val".
 
     The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``,
     ``test_filenames`` and ``val_filenames``. If no file or list names the test views, every eighth view is one.
@@ -140,9 +136,6 @@ def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews
     for array in (images, poses, focal, centre, *([] if box is None else [box])):
         digest.update(np.ascontiguousarray(array))
     return CapturedViews(images, poses, focal, centre, tuple(names), folder, has_alpha, box, digest.hexdigest())
-
-
-# -- lists of views ---------------------------------------------------------------------------------------------------
 
 
 def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
@@ -211,9 +204,6 @@ def _box(file: Path, content: dict) -> np.ndarray | None:
             f"[[x, y, z], [x, y, z]]"
         )
     return box
-
-
-# -- cameras ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -305,9 +295,6 @@ def _pose(where: str, matrix) -> np.ndarray:
     if np.linalg.det(rotation) < 0:
         raise ViewsError(f"{where} has a transform_matrix that mirrors, a rotation is needed")
     return pose
-
-
-# -- images -----------------------------------------------------------------------------------------------------------
 
 
 def _image_file(file: Path, name: str) -> Path:

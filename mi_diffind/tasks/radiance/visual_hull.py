@@ -18,8 +18,7 @@ MARGIN = 2
 
 
 def box_of(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the lower and upper corner of the box of the captured objects.
+    """Return the lower and upper corner of the box of the captured objects.
 
     The box is the ``aabb`` of the capture, cut to the visual hull if the images have alpha. Without an ``aabb``, the
     search covers a cube around the point that the cameras look at, up to the nearest camera. Raises
@@ -59,8 +58,7 @@ def _focus(views: CapturedViews) -> tuple[np.ndarray, float]:
 
 
 def hull(views: CapturedViews, lower, spacing: float, shape) -> np.ndarray:
-    """
-    Return the nodes ``lower + spacing · (i, j, k)`` of the visual hull: bool of this ``shape``.
+    """Return the nodes ``lower + spacing · (i, j, k)`` of the visual hull: bool of this ``shape``.
 
     A node belongs to it if a share :data:`SIGHTED` of the views have it in sight and none of these shows it empty: a
     pixel within a voxel of its projection has an alpha above 0.

@@ -1,5 +1,4 @@
-"""
-Radiance fields: the interface of all of them, and those whose numbers lie on the nodes of a grid.
+"""Radiance fields: the interface of all of them, and those whose numbers lie on the nodes of a grid.
 
 A field fills a box. Each point has a density σ per unit of length and, in each direction, a radiance (linear RGB, never
 negative), so that a ray sees ``Σ T_i (1 − exp(−σ_i δ_i)) c_i`` (:mod:`.march`).
@@ -23,8 +22,7 @@ BRIGHTEST = 12.0
 
 
 class VolumeField:
-    """
-    Radiance field in the box from ``lower`` to ``upper``: the base class.
+    """Radiance field in the box from ``lower`` to ``upper``: the base class.
 
     ``voxel`` is the side of a voxel. Rays take steps of length ``step``, half a voxel. ``arrays`` maps names to the
     tensors that can be differentiated.
@@ -46,16 +44,14 @@ class VolumeField:
         return result
 
     def density_at(self, p, active=True) -> tuple:
-        """
-        Return the density at the points ``p`` of the box, at least 0, and the data that :meth:`radiance_at` needs.
+        """Return the density at the points ``p`` of the box, at least 0, and the data that :meth:`radiance_at` needs.
 
         The data are a list of arrays that carry no derivatives, such as the weights and numbers of nearby nodes.
         """
         raise NotImplementedError
 
     def radiance_at(self, point_data: list, p, d, active=True) -> list:
-        """
-        Return the radiance [r, g, b] that leaves the points ``p`` towards −``d``.
+        """Return the radiance [r, g, b] that leaves the points ``p`` towards −``d``.
 
         ``d`` has unit length; ``point_data`` is what :meth:`density_at` returned for the same points.
         """
@@ -77,8 +73,7 @@ class NodeVolume(VolumeField):
         return self.nodes.free_distance(p, d, active)
 
     def interpolated_density(self, node_density, p, active) -> tuple:
-        """
-        Return what :meth:`density_at` does, from ``node_density(number, active)``, the raw density of a node.
+        """Return what :meth:`density_at` does, from ``node_density(number, active)``, the raw density of a node.
 
         The data of a point are its eight weights and then its eight node numbers.
         """
@@ -95,8 +90,7 @@ class NodeVolume(VolumeField):
 
 
 def density_of(raw, per_voxel):
-    """
-    Return the density σ of a raw number: softplus(raw) − :data:`FAINT` per voxel, never negative.
+    """Return the density σ of a raw number: softplus(raw) − :data:`FAINT` per voxel, never negative.
 
     ``per_voxel`` is one over the side of a voxel. A raw number below about −6 is exactly empty, 10 is opaque.
     """
@@ -111,8 +105,7 @@ def raw_of(density: np.ndarray, voxel: float) -> np.ndarray:
 
 
 def colour_of(coefficients: list, d) -> list:
-    """
-    Return the radiance [r, g, b] in direction ``d``: exp(a + b·d), clamped at exp(:data:`BRIGHTEST`).
+    """Return the radiance [r, g, b] in direction ``d``: exp(a + b·d), clamped at exp(:data:`BRIGHTEST`).
 
     ``coefficients`` are twelve numbers, a and b for each of red, green and blue. The exponent is linear in them.
     """
@@ -124,8 +117,7 @@ def colour_of(coefficients: list, d) -> list:
 
 
 class NodeField(NodeVolume):
-    """
-    Radiance field of numbers at nodes, interpolated trilinearly.
+    """Radiance field of numbers at nodes, interpolated trilinearly.
 
     ``density`` ``(n,)`` holds raw densities (:func:`density_of`), ``colour`` ``(m, 12)`` the coefficients of
     :func:`colour_of`; both are float tensors. ``palette_index`` ``(n,)``, uint32, names the row of ``colour`` of each
@@ -164,8 +156,7 @@ def blended(types, flat, packets: int, weights: list, rows: list, active) -> lis
 
 
 class DenseVolumeField(NodeField):
-    """
-    :class:`NodeField` with a number at every node of a box, from NumPy arrays.
+    """:class:`NodeField` with a number at every node of a box, from NumPy arrays.
 
     ``density`` ``(X, Y, Z)`` holds raw densities and ``colour`` is ``(X, Y, Z, 12)``; nodes begin at ``lower`` and are
     ``voxel`` apart.
@@ -180,8 +171,7 @@ class DenseVolumeField(NodeField):
 
 
 class PackedPaletteField(NodeVolume):
-    """
-    Compressed field in its form for rendering: a word of ``density_bits`` + ``index_bits`` bits at each node.
+    """Compressed field in its form for rendering: a word of ``density_bits`` + ``index_bits`` bits at each node.
 
     The low bits of a node are a density level, which stands for the raw density ``density_range[0]`` + level ·
     ``density_range[1]``. The high bits are an index into ``palette`` ``(P, 12)``, uint8, whose bytes stand for

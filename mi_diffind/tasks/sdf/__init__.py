@@ -1,5 +1,4 @@
-"""
-Task 6: signed distance fields of meshes.
+"""Task 6: signed distance fields of meshes.
 
 - :mod:`.mesh`, :mod:`.boundary`, :mod:`.distances`, :mod:`.sampling`: ground truth;
 - :mod:`.field`: interface of all fields; :mod:`.nodes` (with :mod:`.structure` and :mod:`.codes`): our sparse layout;
@@ -26,8 +25,7 @@ PAIR_SETTINGS = FitSettings(steps=300, batch=2**17, lr=1e-2, schedule="cosine", 
 
 
 class Sdf(Task):
-    """
-    Task 6, signed distance fields; files are always stored as bytes.
+    """Task 6, signed distance fields; files are always stored as bytes.
 
     Presets: ``sparse`` (default), nodes near the surface whose pointers are indices; ``paper``, the supplement's two
     dense arrays; ``dense``, the same started from the distance.

@@ -21,8 +21,7 @@ PLACES = np.array([[1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], 
 
 
 def close_holes(mesh: Mesh) -> Mesh:
-    """
-    Return the mesh with each hole closed by a fan of triangles around the middle of its edge.
+    """Return the mesh with each hole closed by a fan of triangles around the middle of its edge.
 
     The result is watertight for any holes.
     """
@@ -55,8 +54,7 @@ def close_holes(mesh: Mesh) -> Mesh:
 
 
 def outer_surface(mesh: Mesh, inside: Callable[[np.ndarray], np.ndarray]) -> Mesh:
-    """
-    Return the triangles of ``mesh``, or parts of them, that have the solid behind them only.
+    """Return the triangles of ``mesh``, or parts of them, that have the solid behind them only.
 
     ``inside`` maps points (N, 3) to bool (N,). The mesh itself is returned if all of its triangles qualify.
     """
@@ -92,8 +90,7 @@ def outer_surface(mesh: Mesh, inside: Callable[[np.ndarray], np.ndarray]) -> Mes
 
 
 def _bounds(points: np.ndarray, normals: np.ndarray, inside, watertight: bool) -> np.ndarray:
-    """
-    Return whether points on triangles have the solid on exactly one side, behind them.
+    """Return whether points on triangles have the solid on exactly one side, behind them.
 
     The winding number of a watertight mesh is larger by one behind a triangle, so only the front is tested then.
     """

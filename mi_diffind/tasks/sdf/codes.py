@@ -1,5 +1,4 @@
-"""
-Codes of a sparse grid's nodes: each node holds a distance and a normal, coded in the frame of its block.
+"""Codes of a sparse grid's nodes: each node holds a distance and a normal, coded in the frame of its block.
 
 A block of 4 × 4 × 4 nodes is described by a plane, its *frame*: a normal N (octahedral, 2 × 10 bits), the distance D of
 the block's middle (8 bits), and a scale s (4 bits). A node holds a pointer into one small array that all blocks share,
@@ -51,9 +50,6 @@ def _functions(array):
     return dr if dr.is_array_v(array) else NUMPY
 
 
-# -- frames -----------------------------------------------------------------------------------------------------------
-
-
 def orthonormal(n):
     """Return two vectors that complete unit vectors ``n`` to a right-handed frame (Duff et al., JCGT 2017)."""
     x, y, z = n
@@ -83,8 +79,7 @@ def frame_words(normals: np.ndarray, distances: np.ndarray, scales: np.ndarray) 
 
 
 def frames(words, Float=np.float64):
-    """
-    Unpack the frames of blocks: the normal (three arrays), the middle's distance in spacings, and the scale.
+    """Unpack the frames of blocks: the normal (three arrays), the middle's distance in spacings, and the scale.
 
     ``words`` are ``UInt32`` and ``Float`` the type of the result, of Dr.Jit; or a NumPy array of words.
     """
@@ -104,12 +99,8 @@ def frames(words, Float=np.float64):
     return (x * inverse, y * inverse, z * inverse), d, f.select((k & 1) == 1, power * math.sqrt(2), power)
 
 
-# -- entries ----------------------------------------------------------------------------------------------------------
-
-
 def residuals(distances, normals, offsets, n, d, scales) -> np.ndarray:
-    """
-    Return the exact entries ``(m, 3)`` of nodes: the inverse of :func:`decode_nodes`.
+    """Return the exact entries ``(m, 3)`` of nodes: the inverse of :func:`decode_nodes`.
 
     Nodes have ``distances`` (m,) in spacings, ``normals`` (m, 3) and ``offsets`` from the middle of their block (m, 3);
     their frames are ``n`` (three arrays), ``d`` (m,) and ``scales`` (m,).
@@ -124,8 +115,7 @@ def residuals(distances, normals, offsets, n, d, scales) -> np.ndarray:
 
 
 def decode_nodes(entry, n, d, scale, offset):
-    """
-    Return the distance (in spacings) and the normal (three arrays) of nodes.
+    """Return the distance (in spacings) and the normal (three arrays) of nodes.
 
     ``entry`` is ``(e, a, b)``; ``n`` (three arrays), ``d`` and ``scale`` are the frame; ``offset`` (three arrays) is
     the node's position relative to the block's middle.
@@ -164,9 +154,6 @@ def entries(words, offset, step, Float=np.float64):
     parts = words & 1023, words >> 10 & 2047, words >> 21
     fma = _functions(words).fma
     return [fma(Float(p), float(s), float(o)) for p, s, o in zip(parts, step, offset, strict=True)]
-
-
-# -- pointers ---------------------------------------------------------------------------------------------------------
 
 
 def pointer_words(pointers: np.ndarray, bits: int) -> np.ndarray:

@@ -1,5 +1,4 @@
-"""
-Exact distances to the solid that a mesh encloses, computed by libigl in a child process (:mod:`.distances_child`).
+"""Exact distances to the solid that a mesh encloses, computed by libigl in a child process (:mod:`.distances_child`).
 
 The magnitude |d| comes from a bounding-volume tree, the sign from the winding number: a point is inside where the
 winding number is at least 1/2. That of a watertight mesh is a whole number. An open mesh is closed hole by hole first
@@ -50,8 +49,7 @@ class DistancesError(DiffindError, RuntimeError):
 
 
 class Distances:
-    """
-    Distances, signs and nearest points of the solid that ``mesh`` encloses, for points (N, 3) in the unit frame.
+    """Distances, signs and nearest points of the solid that ``mesh`` encloses, for points (N, 3) in the unit frame.
 
     A context manager: the child process starts with the first query and ends with the block. If libigl aborts, the
     query raises :class:`DistancesError`, and the next query starts a new process.
@@ -89,8 +87,6 @@ class Distances:
             self._stderr.close()
             self._stderr = None
 
-    # -- the solid ----------------------------------------------------------------------------------------------------
-
     @functools.cached_property
     def solid(self) -> Mesh:
         """The closed mesh: the mesh itself if it is watertight, or cannot be closed consistently."""
@@ -109,8 +105,7 @@ class Distances:
 
     @functools.cached_property
     def surface(self) -> Mesh:
-        """
-        The part of :attr:`solid` with inside on one side and outside on the other, from which samples are drawn.
+        """The part of :attr:`solid` with inside on one side and outside on the other, from which samples are drawn.
 
         Raises :class:`DistancesError` if no volume is enclosed.
         """
@@ -145,8 +140,6 @@ class Distances:
             )
         return sentences
 
-    # -- queries ------------------------------------------------------------------------------------------------------
-
     def nearest(self, points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return |d| (N,) float64, the nearest triangle of :attr:`surface` (N,), and the nearest point (N, 3)."""
         return self._ask("nearest", points, "surface", self.surface)
@@ -168,8 +161,7 @@ class Distances:
         return self._ask("inside", points, "solid", self.solid)[0]
 
     def signed(self, points, limit: float = math.inf) -> np.ndarray:
-        """
-        Return the signed distance, ``(N,)`` float32, truncated to ± ``limit``.
+        """Return the signed distance, ``(N,)`` float32, truncated to ± ``limit``.
 
         With a small limit, many points all over space are several times as fast, since far ones are recognised by a
         coarse grid.
@@ -199,8 +191,7 @@ class Distances:
         return values
 
     def signed_normals(self, points) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the signed distance ``(N,)`` and its gradient ``(N, 3)``, float32.
+        """Return the signed distance ``(N,)`` and its gradient ``(N, 3)``, float32.
 
         The gradient points away from the nearest point; on the surface it is the normal of the triangle.
         """
@@ -211,8 +202,6 @@ class Distances:
         gradient = (points - closest) * (sign / np.where(near, 1, d))[:, None]
         gradient[near] = self.surface.normals[face[near]]
         return (sign * d).astype(np.float32), gradient.astype(np.float32)
-
-    # -- the child process --------------------------------------------------------------------------------------------
 
     def _ask(self, question: str, points, name: str, mesh: Mesh) -> tuple[np.ndarray, ...]:
         """Return the answers for all points, chunk by chunk; the mesh is sent once, under its ``name``."""

@@ -1,5 +1,4 @@
-"""
-Child process that runs libigl: a script of its own, since some meshes make libigl abort its process.
+"""Child process that runs libigl: a script of its own, since some meshes make libigl abort its process.
 
 Requests arrive on standard input and answers leave on standard output, both as pickles, until the input ends. A request
 is ``(question, name, argument)``: the question ``"mesh"`` registers the arrays of a mesh under a name; any other is a

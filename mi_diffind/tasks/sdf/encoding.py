@@ -26,8 +26,7 @@ REPAIRS = 12
 
 @dataclass
 class SampledNodes:
-    """
-    Nodes of a sparse grid with their exact distances and normals.
+    """Nodes of a sparse grid with their exact distances and normals.
 
     ``positions`` in the ``structure`` (n, 3), ``block`` (n,), ``distances`` in spacings (n,), ``normals`` (n, 3), and
     the ``corners`` of the grid's cells (K, 8), z fastest.
@@ -129,8 +128,7 @@ def assign(values: np.ndarray, entries: np.ndarray) -> np.ndarray:
 
 
 class NodeCoding:
-    """
-    Codes of a grid's nodes: ``frames`` of blocks, ``entries`` of the cascaded array, ``pointers`` of nodes.
+    """Codes of a grid's nodes: ``frames`` of blocks, ``entries`` of the cascaded array, ``pointers`` of nodes.
 
     No node changes its side, since the stored cells are those in which the signs of nodes change. Nor does the surface
     leave them: where a stored cell borders on one that is not, nodes are moved until its face has one sign.
@@ -210,8 +208,7 @@ class NodeCoding:
 
     @functools.cached_property
     def _borders(self) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Faces of stored cells that border on cells that are not stored.
+        """Faces of stored cells that border on cells that are not stored.
 
         Each is given by its cell's nodes (m, 2, 2, 2), turned so that the first coordinate is 0 on the face, and by the
         axis across the face (m,).

@@ -1,5 +1,4 @@
-"""
-Accuracy of a distance field against held-out points of the mesh.
+"""Accuracy of a distance field against held-out points of the mesh.
 
 All lengths are relative to the mesh's longest side.
 """
@@ -43,8 +42,7 @@ class HeldOut:
         self.near, self.points = (types.Array3f(*np.ascontiguousarray(v.T, np.float32)) for v in (near, points))
 
     def measure(self, field) -> dict[str, float]:
-        """
-        Return ``agree``, the share of points near the surface whose sign is right, and ``normal_deg``.
+        """Return ``agree``, the share of points near the surface whose sign is right, and ``normal_deg``.
 
         ``normal_deg`` is the mean angle between the gradient and the mesh's normal on the surface, in degrees.
         """
@@ -59,8 +57,7 @@ class HeldOut:
 
 
 class SurfaceEvaluation:
-    """
-    Held-out points of ``mesh`` and errors of fields at them.
+    """Held-out points of ``mesh`` and errors of fields at them.
 
     ``count`` points uniform in its box, padded by 0.05; ``count`` uniform among those within ``band`` of the surface;
     ``count``/4 on the surface, uniform over its area.
@@ -108,8 +105,7 @@ class SurfaceEvaluation:
         return near
 
     def measure(self, field: DistanceField) -> dict[str, float]:
-        """
-        Return the errors of a field.
+        """Return the errors of a field.
 
         - ``iou``: intersection over union of the solids. Points of the band count near the surface, uniform ones
           elsewhere, so that thin solids are measured as well as thick ones;
@@ -144,8 +140,7 @@ class SurfaceEvaluation:
         return _ratio(*(total + self.band_volume / self.count * _overlap(near, self.near_distance < 0)))
 
     def chamfer(self, decoded, count: int = 2**18) -> dict[str, float]:
-        """
-        Compare a decoded ``trimesh.Trimesh`` (units and place of the file) with the solid.
+        """Compare a decoded ``trimesh.Trimesh`` (units and place of the file) with the solid.
 
         ``chamfer``: mean distance from points uniform on one surface to the other one, averaged over both directions,
         infinite if one is empty; ``components``: pieces of the decoded surface, ``components_mesh``: those of the
@@ -166,8 +161,7 @@ class SurfaceEvaluation:
 
     @functools.cached_property
     def components(self) -> int:
-        """
-        Number of pieces of the solid's surface.
+        """Number of pieces of the solid's surface.
 
         They are counted on the mesh itself or, if its pieces overlap or it is open, on a grid of 256 cells of exact
         distances.
@@ -186,8 +180,7 @@ class SurfaceEvaluation:
 
 
 def lost_pieces(field: DistanceField, distances: Distances, count: int = 32, seed: int = 2) -> int:
-    """
-    Return how many pieces of the mesh's surface are missing in the field.
+    """Return how many pieces of the mesh's surface are missing in the field.
 
     A piece is missing if the field's surface is further than one of its cells from all of ``count`` points on it.
     """

@@ -13,8 +13,7 @@ OFF_NODE = 1e-3
 
 
 def extract(field: DistanceField, resolution: int, scale: float = 1.0, centre=(0.0, 0.0, 0.0)):
-    """
-    Return the closed surface as a ``trimesh.Trimesh``; it has no vertices if nothing is inside.
+    """Return the closed surface as a ``trimesh.Trimesh``; it has no vertices if nothing is inside.
 
     Vertices are in units and place of the file: ``vertices · scale + centre``. ``resolution`` is the number of cells
     along the longest side; choose cells finer than the field's where the result is to be measured. Values are kept of
@@ -47,8 +46,7 @@ def extract(field: DistanceField, resolution: int, scale: float = 1.0, centre=(0
 
 
 def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Run marching cubes over ``cells`` (along x, y, z): vertices ``(V, 3)`` float64 in units of cells, faces ``(F, 3)``.
+    """Run marching cubes over ``cells`` (x, y, z): vertices ``(V, 3)`` float64 in units of cells, faces ``(F, 3)``.
 
     Faces are counter-clockwise from outside. ``layers(first, last)`` returns the values at the nodes of x from
     ``first`` to ``last``, ``(last − first + 1, Y, Z)``, which are kept ``smallest`` away from zero. Only the
@@ -79,8 +77,7 @@ def march(layers, cells, smallest: float, crossed=None) -> tuple[np.ndarray, np.
 
 
 def _joined(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Merge the equal vertices of adjacent blocks.
+    """Merge the equal vertices of adjacent blocks.
 
     A vertex on a grid's edge is the same wherever it comes from. No vertex lies on a node, so the edge is identified by
     the middle of its two nodes; a vertex in the middle of a cell belongs to one block only.
@@ -105,8 +102,7 @@ def trimesh_of(vertices: np.ndarray, faces: np.ndarray):
 
 
 def components(mesh) -> np.ndarray:
-    """
-    Return the signed volumes of the pieces of a closed ``trimesh.Trimesh``, the largest magnitude first.
+    """Return the signed volumes of the pieces of a closed ``trimesh.Trimesh``, the largest magnitude first.
 
     Cavities have negative volumes.
     """

@@ -1,5 +1,4 @@
-"""
-Interface of signed distance fields: values, gradients, and safe steps for sphere tracing.
+"""Interface of signed distance fields: values, gradients, and safe steps for sphere tracing.
 
 Points are in the *unit frame*: the mesh's bounding box is centred at the origin and its longest side is 1. Distances
 are negative inside.
@@ -13,8 +12,7 @@ import drjit as dr
 
 
 class DistanceField:
-    """
-    Base class of truncated signed distance fields.
+    """Base class of truncated signed distance fields.
 
     ``lower`` and ``upper`` are the corners of the field's box; everything beyond it is outside. ``slope`` is a bound
     Λ ≥ |∇f| wherever the field is continuous, ``spacing`` the side of its finest cells, ``band`` the largest distance
@@ -49,8 +47,7 @@ class DistanceField:
         return (x >= a) & (x <= d) & (y >= b) & (y <= e) & (z >= c) & (z <= f)
 
     def value(self, p, active=True):
-        """
-        Return the signed distance at points ``p`` (``Array3f``, or three ``Float``), truncated to ± ``band``.
+        """Return the signed distance at points ``p`` (``Array3f``, or three ``Float``), truncated to ± ``band``.
 
         The sign is right everywhere, the magnitude near the surface. Outside of the box the value is ``band``.
         """
@@ -69,8 +66,7 @@ class DistanceField:
         return self.gradient(p, active)[1], self.normal(p, active)
 
     def safe_step(self, p, d, active=True):
-        """
-        Return the value at ``p`` and a step along which the sign cannot change: ``(Float, Float)``.
+        """Return the value at ``p`` and a step along which the sign cannot change: ``(Float, Float)``.
 
         The direction ``d`` has length 1; the step is finite and ≥ 0. Only the sign of the value counts.
         """

@@ -49,8 +49,6 @@ DISTANCE, GRADIENT, SMOOTH = 0.3, 0.05, 0.02
 #: Distance, in spacings, below which errors are weighted by their squares.
 ROUND = 0.01
 
-# -- training of nodes ------------------------------------------------------------------------------------------------
-
 
 class SurfaceSampler:
     """Points of a mesh and their normals, uniform over the area, drawn on the device of the training."""
@@ -94,8 +92,7 @@ class NodeValues(nn.Module):
 
 
 class NodeProblem(Problem):
-    """
-    Training of a sparse grid's nodes against the surface itself.
+    """Training of a sparse grid's nodes against the surface itself.
 
     The field is to be zero on the surface, and its gradient and its smooth normal are to be the surface's normal.
     Distances elsewhere are not needed, since the nodes begin with theirs.
@@ -131,9 +128,6 @@ class NodeProblem(Problem):
         return self.net.unit(self.types).numpy().astype(np.float64)
 
 
-# -- the task ---------------------------------------------------------------------------------------------------------
-
-
 def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that exclude each other."""
     options, preset = request.options, request.preset
@@ -155,8 +149,7 @@ def requested_bytes(options) -> int:
 
 
 def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, held_out: int = HELD_OUT) -> Fitted:
-    """
-    Fit the mesh that the request names.
+    """Fit the mesh that the request names.
 
     ``measured`` and ``held_out`` are the numbers of points at which the result and states on the way are measured,
     ``samples`` the number of training samples of dense arrays. Raises :class:`UsageError`, :class:`.mesh.MeshError`,
@@ -205,8 +198,7 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
 
 
 def search_grid(distances: Distances, nbytes: int, bits: int) -> encoding.SampledNodes:
-    """
-    Return the finest sampled grid whose field takes at most ``nbytes`` in memory, with ``bits`` bits a pointer.
+    """Return the finest sampled grid whose field takes at most ``nbytes`` in memory, with ``bits`` bits a pointer.
 
     Raises :class:`UsageError` if even the coarsest one is larger, and :class:`FittingError` if it has no nodes.
     """

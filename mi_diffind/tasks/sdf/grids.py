@@ -1,5 +1,4 @@
-"""
-Regular grids of a distance field's values, and the coarsest grid that interpolates the field well enough.
+"""Regular grids of a distance field's values, and the coarsest grid that interpolates the field well enough.
 
 Grids have cubic cells, ``resolution`` of them along the longest side of the field's box.
 """
@@ -25,8 +24,6 @@ CHUNK = 2**22
 #: Finest grid that is decoded.
 MAX_RESOLUTION = 1024
 
-# -- values -----------------------------------------------------------------------------------------------------------
-
 
 def spacing_for(field: DistanceField, resolution: int) -> float:
     """Return the side of a grid's cells. Raises :class:`~mi_diffind.errors.UsageError` for a bad resolution."""
@@ -38,8 +35,7 @@ def spacing_for(field: DistanceField, resolution: int) -> float:
 
 
 def grid(field: DistanceField, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Return the field at the nodes of a grid, float32 ``(Z, Y, X)``, and the corners of the grid's box.
+    """Return the field at the nodes of a grid, float32 ``(Z, Y, X)``, and the corners of the grid's box.
 
     The box begins at the field's lower corner and ends where no cell is cut. Its sides are outside.
     """
@@ -68,8 +64,7 @@ def _expand_blocks(values: np.ndarray, shape) -> np.ndarray:
 
 
 def crossed_blocks(field: DistanceField, lower, spacing: float, cells) -> np.ndarray:
-    """
-    Return which blocks of :data:`BLOCK` cells along each side the surface may pass through, bool (X, Y, Z).
+    """Return which blocks of :data:`BLOCK` cells along each side the surface may pass through, bool (X, Y, Z).
 
     For a sparse field these are the blocks with stored nodes around, for any other field all blocks.
     """
@@ -99,8 +94,7 @@ def crossed_blocks(field: DistanceField, lower, spacing: float, cells) -> np.nda
 
 
 def node_values(field: DistanceField, lower, spacing: float, shape, where=None) -> np.ndarray:
-    """
-    Return values at the nodes ``lower + spacing · (i, j, k)`` of a grid of the ``shape`` (X, Y, Z), float32.
+    """Return values at the nodes ``lower + spacing · (i, j, k)`` of a grid of the ``shape`` (X, Y, Z), float32.
 
     With ``where``, numbers of nodes in that shape, the result is ``(N,)``, otherwise it has the shape.
     """
@@ -117,15 +111,12 @@ def node_values(field: DistanceField, lower, spacing: float, shape, where=None) 
     return np.concatenate(values).reshape(shape if where is None else count)
 
 
-# -- values that interpolate well -------------------------------------------------------------------------------------
-
 #: Share of a node's value that remains where the correction would change its sign.
 REMAINDER = 0.1
 
 
 def sharpen(values: np.ndarray, band: float) -> None:
-    """
-    Correct a :func:`grid` in place so that its trilinear interpolation is nearer to the field; signs stay.
+    """Correct a :func:`grid` in place so that its trilinear interpolation is nearer to the field; signs stay.
 
     ``band`` is the largest distance that the field returns; the correction is that of :func:`_sharpened`.
     """
@@ -140,8 +131,7 @@ def sharpen(values: np.ndarray, band: float) -> None:
 
 
 def _sharpened(values: np.ndarray, around, band: float) -> np.ndarray:
-    """
-    Correct values at nodes, given those of their six neighbours, for the error of interpolation.
+    """Correct values at nodes, given those of their six neighbours, for the error of interpolation.
 
     The interpolation of a quadratic function exceeds it where it is convex, on average over a cell by a twelfth of the
     second differences along the three axes. Values decrease by as much, unless that changes the sign or one of the
@@ -156,8 +146,6 @@ def _sharpened(values: np.ndarray, around, band: float) -> np.ndarray:
     return np.where(near, moved, values)
 
 
-# -- the resolution that is needed ------------------------------------------------------------------------------------
-
 #: Coarsest grid that is considered, and the factor by which the result may be finer than needed.
 COARSEST, FINER = 8, 1.03
 
@@ -171,8 +159,7 @@ PARTS = 16
 def resolution_for(
     field: DistanceField, error: float, finest: int = MAX_RESOLUTION, seed: int = 0
 ) -> tuple[int, float]:
-    """
-    Return the coarsest sufficient grid's cells along the longest side, from 8 to ``finest``, and its mean error.
+    """Return the coarsest sufficient grid's cells along the longest side, from 8 to ``finest``, and its mean error.
 
     A grid suffices if its trilinear interpolation differs from the field by at most ``error`` on average on the field's
     surface; the result is within 3% of the coarsest one. If ``finest`` does not suffice, it is returned with its larger
@@ -198,8 +185,7 @@ def resolution_for(
 
 
 def trilinear_error(field: DistanceField, points: np.ndarray, resolution: int) -> float:
-    """
-    Return the mean difference between the field and the interpolation of a :func:`sharpen`-ed grid at ``points``.
+    """Return the mean difference between the field and the interpolation of a :func:`sharpen`-ed grid at ``points``.
 
     ``points`` are ``(N, 3)``; the error of none is 0.
     """
@@ -225,8 +211,7 @@ def trilinear_error(field: DistanceField, points: np.ndarray, resolution: int) -
 
 
 def surface_points(field: DistanceField, count: int, seed: int = 0) -> np.ndarray:
-    """
-    Return about ``count`` points of the field's surface, ``(N, 3)``, nearly uniform over its area.
+    """Return about ``count`` points of the field's surface, ``(N, 3)``, nearly uniform over its area.
 
     Points near the surface are moved onto it by Newton's method along the gradient. Without a surface, N is 0.
     """

@@ -1,5 +1,4 @@
-"""
-Ray marching through a sparse grid (:class:`.nodes.SparseNodes`), from cell to cell.
+"""Ray marching through a sparse grid (:class:`.nodes.SparseNodes`), from cell to cell.
 
 A ray goes from one empty region or block to the next by the index's empty-space distances. In a block with crossed
 cells it goes to where the block's *slab* begins: the space between two planes, parallel to that of the block's frame,
@@ -43,12 +42,9 @@ EMPTY, INSIDE = 1 << 31, 1 << 30
 #: Largest height of a slab's bounds above or below a block's plane, number of steps in 16 bits, and safety margin.
 SLAB, STEPS, MARGIN = 10.0, 65535, 1e-3
 
-# -- the index --------------------------------------------------------------------------------------------------------
-
 
 class GridCells:
-    """
-    Cells of a structure's blocks, for B blocks with nodes (NumPy).
+    """Cells of a structure's blocks, for B blocks with nodes (NumPy).
 
     - ``crossed`` (B, 64) bool: whether all corners of each cell are stored;
     - ``inside`` (B, 64) bool: the sign of the other cells;
@@ -96,8 +92,7 @@ class GridCells:
 
 
 def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
-    """
-    Return how far above its plane P each block's solid begins and ends, words (B,) of twice 16 bits.
+    """Return how far above its plane P each block's solid begins and ends, words (B,) of twice 16 bits.
 
     P is the plane of the block's frame. A place in the block is inside where P is less than the lower bound, outside
     where P is above the upper bound. In a crossed cell f − P, a polynomial of degree 2 along each axis, lies between
@@ -130,8 +125,7 @@ def slab_words(cells: GridCells, nodes, frames) -> np.ndarray:
 
 
 def empty_space_words(structure, cells: GridCells) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the words of regions and of blocks by which rays skip empty space, uint32.
+    """Return the words of regions and of blocks by which rays skip empty space, uint32.
 
     A region's word is the number of its blocks' words, or flags and distance (:data:`EMPTY`); the words of the blocks
     ``(R, 64)`` of regions that are not empty are the number of the block, or flags and distance.
@@ -160,8 +154,7 @@ def empty_space_words(structure, cells: GridCells) -> tuple[np.ndarray, np.ndarr
 
 
 class Marcher:
-    """
-    Ray-marching index: empty-space distances and per-block slabs, built on the first trace.
+    """Ray-marching index: empty-space distances and per-block slabs, built on the first trace.
 
     In memory, for each region, and each block of those with nodes, a word with its number or the distance to the next
     crossed block (:func:`empty_space_words`); for each block with nodes, its :class:`GridCells`, plane and slab.
@@ -188,11 +181,8 @@ class Marcher:
         slabs = [] if self.slabs is None else [self.slabs]
         return 4 * sum(map(dr.width, [self.regions, self.words, self.cells, self.beside, *slabs]))
 
-    # -- along a ray --------------------------------------------------------------------------------------------------
-
     def block(self, ray, t, active):
-        """
-        Look up the block at ``t`` of a ray: ``(crossed, number, end, inside)``.
+        """Look up the block at ``t`` of a ray: ``(crossed, number, end, inside)``.
 
         ``crossed``: cells of the block are crossed, and ``number`` is valid; otherwise the ray leaves the empty space
         around the block at ``end``, and ``inside`` is its sign.
@@ -210,8 +200,7 @@ class Marcher:
         return active & (word < EMPTY), word, dr.maximum(end, t), (word & INSIDE) != 0
 
     def cell(self, ray, t, number, active):
-        """
-        Find the next crossed cell from ``t`` in the block with this number: ``(crossed, start, end, known, inside)``.
+        """Find the next crossed cell from ``t`` in a block: ``(crossed, start, end, known, inside)``.
 
         ``crossed``: there is a crossed cell before the ray leaves the block, from ``start`` to ``end``; otherwise
         ``end`` is where the ray leaves the cells that are not crossed. ``known``: the sign at ``t`` is known, and is
@@ -244,8 +233,7 @@ class Marcher:
         return crossed, start, end, off | ~crossed, dr.select(off, below, ((signs >> bit) & 1) == 1)
 
     def slab(self, ray, t, number, cell, active):
-        """
-        Return where a ray enters and leaves the slab of a block, and whether it is below the slab at ``t``.
+        """Return where a ray enters and leaves the slab of a block, and whether it is below the slab at ``t``.
 
         The block has this ``number`` and holds ``cell``.
         """
@@ -288,8 +276,7 @@ def marcher_of(field) -> Marcher:
 
 
 def along(corners, start, d):
-    """
-    Return a function of ``t`` that gives the field's value, in spacings, on the ray ``start + t·d`` through a cell.
+    """Return a function of ``t`` that gives the field's value, in spacings, on the ray ``start + t·d`` through a cell.
 
     The cell extends from 0 to 1 along each axis. Each corner's extrapolation is linear in t; these are blended along z,
     y and x.
@@ -312,8 +299,7 @@ def along(corners, start, d):
 
 
 def cross(marcher, ray, low, end, number, leaving, fresh):
-    """
-    Find the first change of sign in a crossed cell between ``low`` and ``end`` along the ray: ``(hit, t, leaving)``.
+    """Find the first change of sign in a crossed cell between ``low`` and ``end`` along the ray: ``(hit, t, leaving)``.
 
     ``leaving`` is the sign at the start of the ray, which a ``fresh`` ray takes from here.
     """
@@ -375,8 +361,7 @@ class GridRay:
 
 @dr.syntax
 def march(marcher, o, d, length, fresh, active):
-    """
-    Find the first change of sign before ``length`` along rays ``o + t·d`` in the grid: ``(hit, t, leaving)``.
+    """Find the first change of sign before ``length`` along rays ``o + t·d`` in the grid: ``(hit, t, leaving)``.
 
     ``d`` has length 1; ``o`` and ``t`` are in spacings from the grid's lower corner. A ``fresh`` ray starts with the
     sign at its origin, any other one outside.

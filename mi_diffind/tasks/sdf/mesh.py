@@ -1,5 +1,4 @@
-"""
-Triangle meshes in the unit frame: the bounding box is centred at the origin and its longest side is 1.
+"""Triangle meshes in the unit frame: the bounding box is centred at the origin and its longest side is 1.
 
 All distances, tolerances and points of this task are in that frame; negative is inside. Every format of trimesh is
 read. Repairs that "inside" depends on are listed in :attr:`Mesh.warnings`.
@@ -39,8 +38,7 @@ class MeshError(DiffindError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """
-    Triangle mesh: ``vertices`` (V, 3) float64 in the unit frame, and ``faces`` (F, 3) int32.
+    """Triangle mesh: ``vertices`` (V, 3) float64 in the unit frame, and ``faces`` (F, 3) int32.
 
     Each position occurs once; faces are counter-clockwise from outside. ``watertight``: each edge is used as often in
     one direction as in the other, so the winding number is whole and changes on the surface only. A point of the file
@@ -111,8 +109,7 @@ class Mesh:
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
-    """
-    Read a mesh file; the meshes of a scene file are joined where its transforms place them.
+    """Read a mesh file; the meshes of a scene file are joined where its transforms place them.
 
     Equal vertices are merged, degenerate triangles left out, and triangles wound against their neighbours or around
     their solid the wrong way are turned. Raises :class:`MeshError`.
@@ -196,9 +193,6 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-# -- repairs ----------------------------------------------------------------------------------------------------------
-
-
 def _repaired(vertices: np.ndarray, faces: np.ndarray, name: str, repairs: list[str]):
     """Drop degenerate triangles and turn wrongly wound ones; sentences are added to ``repairs``."""
     twice = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
@@ -278,8 +272,7 @@ def tetrahedron_volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _inconsistent(faces: np.ndarray) -> np.ndarray:
-    """
-    Return which triangles have to be turned for neighbours to agree, ``(F,)`` bool.
+    """Return which triangles have to be turned for neighbours to agree, ``(F,)`` bool.
 
     These are the smaller half of each piece that can be oriented at all, none of the others.
     """
@@ -308,8 +301,7 @@ def _inconsistent(faces: np.ndarray) -> np.ndarray:
 
 
 def _inside_out(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """
-    Return which triangles belong to closed pieces that are wound inside out, ``(F,)`` bool.
+    """Return which triangles belong to closed pieces that are wound inside out, ``(F,)`` bool.
 
     These are pieces of negative volume that are no cavity of another piece. If a mesh with open pieces has a negative
     volume as a whole, they are all triangles.

@@ -28,8 +28,6 @@ LAYOUTS = {
 #: Extensions of the mesh formats that ``decode`` writes, through trimesh.
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb")
 
-# -- arrays -----------------------------------------------------------------------------------------------------------
-
 
 def _word_bytes(words: np.ndarray) -> np.ndarray:
     """Return words (n, k) as bytes (n, 4k)."""
@@ -115,8 +113,7 @@ def structure_of(table: Table) -> Structure:
 
 
 def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceField:
-    """
-    Return the field of a checked table.
+    """Return the field of a checked table.
 
     ``arrays`` are the allocated arrays of a pair. With the ``storage`` ``"float32"``, the nodes of a sparse field are
     decoded, and can be trained.
@@ -135,12 +132,8 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceFi
     return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
 
 
-# -- the model --------------------------------------------------------------------------------------------------------
-
-
 class SdfModel(Model):
-    """
-    Distance field of a file: ``field`` (:class:`.field.DistanceField`), in the unit frame.
+    """Distance field of a file: ``field`` (:class:`.field.DistanceField`), in the unit frame.
 
     A point of the mesh's file is ``scale`` · p + ``centre``. ``form`` is the requested storage form, "" for the file's.
     """
@@ -196,8 +189,7 @@ class SdfModel(Model):
         return figures, lines
 
     def measure(self, mesh=None, count: int = 2**18):
-        """
-        Return errors against the mesh in the file ``mesh``, by default the one that was fitted.
+        """Return errors against the mesh in the file ``mesh``, by default the one that was fitted.
 
         ``count`` is the number of held-out points.
         """

@@ -1,5 +1,4 @@
-"""
-Sparse signed distance field: nodes near the surface that hold a distance and a normal, read by indirection.
+"""Sparse signed distance field: nodes near the surface that hold a distance and a normal, read by indirection.
 
 Reading a cell whose eight nodes are stored blends their linear extrapolations (§ 1.6 of the supplement describes dense
 arrays only; this layout is ours):
@@ -28,8 +27,7 @@ MIDDLE = (BLOCK - 1) / 2
 
 
 class SparseNodes(DistanceField):
-    """
-    Field of the nodes of a ``structure``, in one of two forms.
+    """Field of the nodes of a ``structure``, in one of two forms.
 
     Decoded nodes can be trained: ``nodes`` is a tensor (n, 4) of distances in spacings and gradients. Coded nodes are
     ``pointers`` (words, with ``bits`` bits each) into ``entries`` (words, with the :func:`.codes.entry_scale`
@@ -62,8 +60,6 @@ class SparseNodes(DistanceField):
         self._pointers = None if pointers is None else UInt32(pointers)
         self._entries = None if entries is None else UInt32(entries)
         self._affine = None if offset is None else (tuple(map(float, offset)), tuple(map(float, step)))
-
-    # -- where nodes are ----------------------------------------------------------------------------------------------
 
     def _grid(self, p):
         """Return the cell of points, as whole numbers of its lowest corner, and the place within it."""
@@ -101,8 +97,6 @@ class SparseNodes(DistanceField):
         group = (x >> 1) * 4 + (y >> 1) * 2 + (z >> 1)
         return stored, (record[2] & 0xFFFFFF) + rank, (record[2] >> (24 + group) & 1) == 1
 
-    # -- what they hold -----------------------------------------------------------------------------------------------
-
     def _node(self, number, record, i, j, k, active):
         """Return the distance, in spacings, and the gradient of a node."""
         if self.nodes is not None:
@@ -116,8 +110,7 @@ class SparseNodes(DistanceField):
         return codes.decode_nodes(entry, n, d, scale, offset)
 
     def _corners(self, cell, active):
-        """
-        Return, for each corner of a cell: ``(stored, number, record, position, inside)``.
+        """Return, for each corner of a cell: ``(stored, number, record, position, inside)``.
 
         ``inside`` is the sign of a corner that is not stored.
         """
@@ -140,8 +133,7 @@ class SparseNodes(DistanceField):
         return corners
 
     def _blend(self, p, active, derivatives: bool):
-        """
-        Blend the corners of a cell: ``(value, gradient, smooth normal, complete, some, inside)``.
+        """Blend the corners of a cell: ``(value, gradient, smooth normal, complete, some, inside)``.
 
         The value is in spacings; the gradient is computed if ``derivatives``. ``complete``: all corners are stored;
         ``some``: at least one is; ``inside``: corners that are not stored lie inside.
@@ -188,8 +180,7 @@ class SparseNodes(DistanceField):
         return value, slope, smooth, complete, some, inside
 
     def blend(self, p):
-        """
-        Return what training needs at ``p``: ``(value in spacings, gradient, smooth normal, complete)``.
+        """Return what training needs at ``p``: ``(value in spacings, gradient, smooth normal, complete)``.
 
         Gradient and normal are three arrays each; ``complete``: all nodes of the cell are stored.
         """
@@ -222,8 +213,6 @@ class SparseNodes(DistanceField):
             return self.types.Array3f(*(dr.select(active & some, x, 0) for x in v))
 
         return dr.select(active, value, self.band), vector(slope), vector(smooth)
-
-    # -- what is stored ------------------------------------------------------------------------------------------------
 
     def frames(self) -> np.ndarray:
         """Return the words of the blocks' frames, ``(B,)``."""
@@ -270,8 +259,7 @@ def _bit_and_rank(low, high, bit):
 
 
 def slope_bound(values: np.ndarray, gradients: np.ndarray, corners: np.ndarray, part: int = 2**17) -> float:
-    """
-    Return a bound Λ of |∇f| in all cells: values (n,) in spacings, gradients (n, 3), corners (K, 8), z fastest.
+    """Return a bound Λ of |∇f| in all cells: values (n,) in spacings, gradients (n, 3), corners (K, 8), z fastest.
 
     The derivatives lie between their own Bernstein coefficients, which are twice the differences of those of f.
     """
@@ -302,8 +290,7 @@ _BERNSTEIN = _bernstein()
 
 
 def bernstein(nodes: np.ndarray) -> np.ndarray:
-    """
-    Return the Bernstein coefficients of cells, ``(K, 27)``, z fastest; values of f lie between them.
+    """Return the Bernstein coefficients of cells, ``(K, 27)``, z fastest; values of f lie between them.
 
     In a cell f is a polynomial of degree 2 along each axis. ``nodes`` are value in spacings and gradient at the eight
     corners, ``(K, 8, 4)``.

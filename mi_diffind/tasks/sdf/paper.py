@@ -1,5 +1,4 @@
-"""
-Layout of the supplement (§ 1.6): a dense 3D primary array of coordinates in a dense 3D cascaded array of distances.
+"""Layout of the supplement (§ 1.6): a dense 3D primary array of coordinates in a dense 3D cascaded array of distances.
 
 The primary array has three channels, the cascaded array one, the truncated distance. Both span the padded box of the
 mesh; their sides follow those of the box. The preset ``paper`` starts as the supplement says, ``dense`` from the
@@ -42,8 +41,7 @@ STARTS = {"dense": "distance", "paper": "ramp"}
 
 
 class PairField(DistanceField):
-    """
-    Field of a dense primary and a dense cascaded array.
+    """Field of a dense primary and a dense cascaded array.
 
     ``net`` maps coordinates of the box, [0, 1]³, to c, which stands for the distance 2 c − 1 in units of ``band``.
     """
@@ -87,8 +85,7 @@ def ratio_for(nbytes: int) -> float:
 
 
 def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """
-    Return the largest resolutions of primary and cascaded array that take at most ``nbytes`` bytes in this ``ratio``.
+    """Return the largest resolutions of primary and cascaded array in this ``ratio`` that fit ``nbytes`` bytes.
 
     Entries take 3 bytes in the primary and 1 byte in the cascaded array; sides follow the ``extent`` of the box.
     """
@@ -109,8 +106,7 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
 
 
 def initial(start: str, primary, cascaded, grid_distance, samples, distances, band: float) -> Indirection:
-    """
-    Return the arrays at the start of the training.
+    """Return the arrays at the start of the training.
 
     ``start`` is ``"ramp"``: pointers are a ramp, the cascaded array has the distance of the nearest of the ``samples``
     in [0, 1]³ (n, 3), whose distances are ``distances`` (n,); or ``"distance"``: the first pointer is the truncated
@@ -131,8 +127,7 @@ def initial(start: str, primary, cascaded, grid_distance, samples, distances, ba
 
 
 def slope_of(net: Indirection, lower, upper, band: float) -> float:
-    """
-    Return a bound Λ of the field's slope.
+    """Return a bound Λ of the field's slope.
 
     For each cell of the primary array: how fast its pointers change, times the steepest slope of the cascaded array
     among the cells that they may reach.
@@ -179,9 +174,6 @@ def edge_steps(values: np.ndarray, axis: int) -> np.ndarray:
     return steps
 
 
-# -- training ---------------------------------------------------------------------------------------------------------
-
-
 class PairProblem(Problem):
     """Training of the supplement: truncated distances, mostly near the surface, in units of the band."""
 
@@ -214,8 +206,7 @@ class PairProblem(Problem):
 
 
 def fit_pair(distances: Distances, nbytes: int, request: FitRequest, samples: int = SAMPLES, held_out: int = HELD_OUT):
-    """
-    Fit dense arrays of ``nbytes`` bytes: ``(table, training result, field)``.
+    """Fit dense arrays of ``nbytes`` bytes: ``(table, training result, field)``.
 
     ``samples`` and ``held_out`` are the numbers of training samples and of points measured on the way. Raises
     :class:`~mi_diffind.errors.UsageError` if even the smallest arrays are larger.

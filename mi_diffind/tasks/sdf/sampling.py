@@ -1,5 +1,4 @@
-"""
-Points sampled on and around a mesh, and the grid cells that its surface passes through.
+"""Points sampled on and around a mesh, and the grid cells that its surface passes through.
 
 A grid has a ``lower`` corner, cells with sides of length ``spacing``, and ``shape``, the number of cells along x, y and
 z. Cell ``(i, j, k)`` begins at ``lower + spacing · (i, j, k)``. A ``seed`` is a number or a ``numpy.random.Generator``.
@@ -21,12 +20,9 @@ LARGEST_TABLE = 2**26
 #: Largest number of cells along an axis at the coarsest level of :func:`surface_cells`.
 COARSEST = 16
 
-# -- points -----------------------------------------------------------------------------------------------------------
-
 
 def sample_surface(mesh: Mesh, count: int, seed) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return ``count`` points uniform over the area, and the normals of their triangles: ``(count, 3)`` twice, float64.
+    """Return ``count`` points uniform over the area, and the normals of their triangles: ``(count, 3)`` twice, float64.
 
     The area is divided into ``count`` equal parts with one point in each, so that small pieces get their share.
     """
@@ -53,12 +49,8 @@ def sample_box(lower, upper, count: int, seed) -> np.ndarray:
     return np.random.default_rng(seed).uniform(lower, upper, (count, 3))
 
 
-# -- cells ------------------------------------------------------------------------------------------------------------
-
-
 def surface_cells(distances: Distances, lower, spacing: float, shape, reach: float = 0.0) -> np.ndarray:
-    """
-    Return the cells whose circumscribed sphere comes within ``reach`` of the surface, searching from coarse to fine.
+    """Return the cells whose circumscribed sphere comes within ``reach`` of the surface, searching from coarse to fine.
 
     The result is ``(K, 3)``, int32, in lexicographic order. No cell that the surface passes through is missing; about a
     sixth of the cells are only passed by.
@@ -82,8 +74,7 @@ def surface_cells(distances: Distances, lower, spacing: float, shape, reach: flo
 
 
 def near_nodes(cells: np.ndarray, largest_table: int = LARGEST_TABLE) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the corners of cells, each once, and for each cell the positions of its eight corners among them.
+    """Return the corners of cells, each once, and for each cell the positions of its eight corners among them.
 
     The nodes are ``(M, 3)``, int32, in lexicographic order; the positions are ``(K, 8)``, int32, z fastest.
     """
@@ -102,8 +93,7 @@ def near_nodes(cells: np.ndarray, largest_table: int = LARGEST_TABLE) -> tuple[n
 
 
 def node_distances(distances: Distances, lower, spacing: float, shape, limit: float) -> np.ndarray:
-    """
-    Return the signed distance at all nodes ``lower + spacing · (i, j, k)`` of a grid, truncated to ± ``limit``.
+    """Return the signed distance at all nodes ``lower + spacing · (i, j, k)`` of a grid, truncated to ± ``limit``.
 
     The result is float32 of the ``shape`` (nodes along x, y and z). Distances are computed near the surface only; of
     the other nodes, neighbours share a sign, which is computed once.

@@ -1,5 +1,4 @@
-"""
-Masks of a sparse grid: which nodes are stored, from which the place of a node in a list follows by ranks.
+"""Masks of a sparse grid: which nodes are stored, from which the place of a node in a list follows by ranks.
 
 Nodes lie at ``lower + spacing · (i, j, k)``. A *block* is 4 × 4 × 4 nodes, a *region* 4 × 4 × 4 blocks. A dense grid
 says which regions have nodes, a mask in each of these which blocks have some, and a mask in each of these which nodes
@@ -40,8 +39,7 @@ class StructureError(DiffindError, ValueError):
 
 @dataclass(frozen=True)
 class Structure:
-    """
-    Masks of the stored nodes and signs of the others.
+    """Masks of the stored nodes and signs of the others.
 
     - ``regions`` (X, Y, Z) bytes: :data:`ACTIVE`, or the sign (1: inside) of a region without nodes;
     - ``region_masks``, ``region_signs`` (R, 2) words of 32 bits: for each region with nodes, its blocks with nodes, and
@@ -122,8 +120,7 @@ class Structure:
 
 
 def build(positions: np.ndarray, inside: np.ndarray, shape, lower, spacing: float, sign) -> Structure:
-    """
-    Build the structure of nodes at ``positions`` (n, 3), whole numbers, that are ``inside`` (n,) or not.
+    """Build the structure of nodes at ``positions`` (n, 3), whole numbers, that are ``inside`` (n,) or not.
 
     The grid has ``shape`` nodes. ``sign`` is a function of points (m, 3) that returns whether they are inside. Nodes
     are in any order; :meth:`Structure.node_positions` has the order of the result.

@@ -1,5 +1,4 @@
-"""
-Ray intersection with the surface of a distance field (:class:`.field.DistanceField`), in the unit frame.
+"""Ray intersection with the surface of a distance field (:class:`.field.DistanceField`), in the unit frame.
 
 A ray enters the field's box and advances as long as its sign equals that at the start. The first change of sign, from
 outside or from inside of the solid, is the hit. Sparse fields are marched from cell to cell (:mod:`.marching`); others
@@ -35,8 +34,7 @@ FALSE_POSITIONS = 5
 
 @dataclass
 class Hit:
-    """
-    Intersection of rays with a surface.
+    """Intersection of rays with a surface.
 
     ``hit``: whether the surface was hit; ``t``: the distance along the ray, infinite without a hit; ``p``: the place,
     more precise than ``o + t·d`` for a ray from afar; ``leaving``: whether the ray came from within the solid.
@@ -49,8 +47,7 @@ class Hit:
 
 
 def enter(field, o, d, maxt, active=True):
-    """
-    Return the distances at which rays enter and leave the field's box: ``(near, far, active)``.
+    """Return the distances at which rays enter and leave the field's box: ``(near, far, active)``.
 
     A ray that starts in the box enters at 0. Components of ``d`` may be zero. A ray is not active if it misses the
     box, or if anything is NaN.
@@ -63,8 +60,7 @@ def enter(field, o, d, maxt, active=True):
 
 
 def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
-    """
-    Intersect rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, with the surface, from either side.
+    """Intersect rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, with the surface, from either side.
 
     A ray that starts in the box starts with the field's sign, any other one outside of the solid. If not ``exact``,
     only ``hit`` and ``leaving`` are valid, which is faster.
@@ -92,8 +88,7 @@ def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
 
 @dr.syntax
 def sphere_trace(field, start, d, length, fresh, active, exact: bool = True):
-    """
-    Find the first change of sign along rays from ``start``, a place in the box, up to ``length``.
+    """Find the first change of sign along rays from ``start``, a place in the box, up to ``length``.
 
     Returns ``(hit, t, leaving)``. A ``fresh`` ray starts with the sign at ``start``, any other one outside.
     """

@@ -1,5 +1,4 @@
-"""
-Task 5: textures that are trained for their shaded appearance, not for their values.
+"""Task 5: textures that are trained for their shaded appearance, not for their values.
 
 The truth is filtered appearance: the analytic Disney BRDF of task 2, averaged over footprints. The arrays are those of
 task 4, shaded by frozen tables of task 2; the result is a file of the task ``texture``.

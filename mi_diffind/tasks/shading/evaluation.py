@@ -43,8 +43,7 @@ def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None)
 
 
 class ShadedEvaluation:
-    """
-    Images of a material with reference values, for several levels of detail and pairs of view and light.
+    """Images of a material with reference values, for several levels of detail and pairs of view and light.
 
     There are ``levels`` levels, from level 0 on, and ``pairs`` pairs; images are at most ``side`` texels wide and high.
     Each image shows another part of the material; its pixels are shifted by a part of a texel, as in a render.
@@ -109,8 +108,7 @@ class ShadedEvaluation:
             return _image(read(*lanes), shape)
 
     def measure(self, read: ShadedReader, flip: bool = True) -> dict[str, dict]:
-        """
-        Return the errors against each truth, by its letter.
+        """Return the errors against each truth, by its letter.
 
         ``psnr_db``: of values clipped to [0, 1], for each level; ``mean_db``: their mean; ``coarse_db``: their mean
         from level 2 on; ``flip``, if requested: the mean FLIP of the images as displayed, for each level of 16 pixels

@@ -48,8 +48,7 @@ def check(request: FitRequest) -> None:
 
 
 def fit(request: FitRequest) -> Fitted:
-    """
-    Train as a texture, unless a trained one is given, then for shading, and measure the result.
+    """Train as a texture, unless a trained one is given, then for shading, and measure the result.
 
     Each training takes half of a given time. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
     :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.fitting.FittingError`.

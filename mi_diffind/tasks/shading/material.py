@@ -1,5 +1,4 @@
-"""
-Shading of a material: its maps as parameters of the Disney BRDF, and the reflected light.
+"""Shading of a material: its maps as parameters of the Disney BRDF, and the reflected light.
 
 Values are π · BRDF · cosine of the light, linear: a white Lambertian surface that is lit along its normal has 1.
 Directions are in the frame of the surface, ``wi`` towards the viewer, ``wo`` towards the light. A normal map perturbs
@@ -38,8 +37,7 @@ READ = {"albedo": (1, 3), "normal": (3,), "roughness": (1,), "metallic": (1,)}
 
 @dataclass
 class SurfaceParameters:
-    """
-    Parameters of the material at a point.
+    """Parameters of the material at a point.
 
     ``albedo``: a linear colour; ``normal``: of any length, in the frame of the surface, ``None`` without a map;
     ``roughness`` and ``metallic``: arrays, or numbers without a map.
@@ -124,8 +122,7 @@ DEFAULT_ALBEDO = 0.5
 
 
 def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects: Effects, limit: float | None = None):
-    """
-    Return π · BRDF · cosine, a colour, from ``decoder`` (``None``: from the formulas).
+    """Return π · BRDF · cosine, a colour, from ``decoder`` (``None``: from the formulas).
 
     ``limit``: bound of the derivatives that flow back through the specular lobe (:func:`clipped`).
     """
@@ -157,8 +154,7 @@ def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects:
 
 
 def frame(normal, wi) -> tuple:
-    """
-    Return tangent, bitangent and normal of a perturbed frame, as Mitsuba's ``normalmap`` does for the tangent x.
+    """Return tangent, bitangent and normal of a perturbed frame, as Mitsuba's ``normalmap`` does for the tangent x.
 
     A normal that faces away from the viewer is mirrored at the surface's normal.
     """
@@ -172,8 +168,7 @@ def frame(normal, wi) -> tuple:
 
 
 def shadowing(n, wo):
-    """
-    Return the shadowing function of a perturbed normal for a direction above the surface.
+    """Return the shadowing function of a perturbed normal for a direction above the surface.
 
     It is 2 c / (c + √(c² + α² sin²)), with α² = min(⅛ tan², 1) of the normal.
     """
@@ -211,8 +206,7 @@ class _Clipped(dr.CustomOp):
 
 
 def clipped(value, limit: float):
-    """
-    Return ``value``, a float or vector of Dr.Jit, unchanged, with its incoming derivatives limited to ±``limit``.
+    """Return ``value``, a float or vector of Dr.Jit, unchanged, with its incoming derivatives limited to ±``limit``.
 
     The remedy for the unbounded derivatives of highlights (supplemental 1.5). NaN becomes 0. Numbers, and values
     without gradients, are returned as they are.

@@ -13,8 +13,7 @@ REFERENCES = ("jittered", "prefiltered", "converged")
 
 @dataclass(frozen=True)
 class ShadingRecipe:
-    """
-    Recipe of a training for shaded appearance, which starts from a trained texture.
+    """Recipe of a training for shaded appearance, which starts from a trained texture.
 
     ``share``: λ, the share of the loss of shaded values. ``clip``: bound of the derivatives of a sample's error through
     the specular lobe (``None``: unlimited). ``reference``: sample pattern of the reference. ``bounded``: whether values

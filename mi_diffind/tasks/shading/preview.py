@@ -21,8 +21,7 @@ PANEL = 192
 
 
 def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) -> None:
-    """
-    Write a picture with a row for each of :data:`LEVELS`: truth, shaded image and amplified difference, as displayed.
+    """Write a picture with a row for each of :data:`LEVELS`: truth, shaded image, amplified difference.
 
     View and light are those under which the material is neither dark nor glaring.
     """

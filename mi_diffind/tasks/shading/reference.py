@@ -1,5 +1,4 @@
-"""
-Reference appearance of a material from afar: shaded first, filtered afterwards (supplemental 1.5).
+"""Reference appearance of a material from afar: shaded first, filtered afterwards (supplemental 1.5).
 
 The footprint of a level of detail L is a square of 2^L × 2^L texels, along the axes. The analytic model shades samples
 of the footprint, and their mean is the reference. Three patterns of samples:
@@ -32,8 +31,7 @@ CHUNK = 2**22
 
 
 def reference(pattern: str, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, rng=None, side: int = 0):
-    """
-    Return the shaded value (:func:`.material.shaded`) of footprints around (u, v), an ``Array3f`` without derivatives.
+    """Return the shaded value (:func:`.material.shaded`) of footprints around (u, v), ``Array3f``, without derivatives.
 
     ``level`` is the level of detail, a real number; each footprint is seen along ``wi`` and lit along ``wo``. ``rng``
     jitters the samples (``"jittered"`` needs one; without, samples are the centres of strata); ``side`` replaces the

@@ -1,5 +1,4 @@
-"""
-Training of task 5: arrays of a texture, trained for their shaded appearance.
+"""Training of task 5: arrays of a texture, trained for their shaded appearance.
 
 The loss is (1 − λ) · texture + λ · shading. The first term is the loss of task 4, in the units of its own recipe. The
 second compares shaded values, for views and lights uniform over the hemisphere: the arrays, shaded by frozen tables of
@@ -35,8 +34,7 @@ FALL, TOP = 0.7, 9
 
 
 class ShadingProblem(textures.TextureProblem):
-    """
-    Training problem of shaded appearance.
+    """Training problem of shaded appearance.
 
     ``net`` reads the stored channels, ``pyramid`` is the truth of the maps. The images of ``evaluation`` decide which
     state is the best (``None``: the PSNR of the texture decides).
@@ -127,8 +125,7 @@ def fit_shading(
     evaluation: ShadedEvaluation | None = None,
     preview: Path | None = None,
 ) -> tuple[Table, FitResult]:
-    """
-    Train the arrays ``start`` (:func:`start_of`) of ``source`` for shading; return a stored table and the run's record.
+    """Train the arrays ``start`` (:func:`start_of`) of ``source`` for shading; return its table and the run's record.
 
     The table is of the task ``texture``, with its errors as a texture and as shaded images of the ``evaluation``. The
     best state is chosen by other images of the same form; it may be the start (settings ``kept_start``). ``preview`` is

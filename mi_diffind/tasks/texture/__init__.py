@@ -1,5 +1,4 @@
-"""
-Task 4: compressed textures and materials that are filtered as they are read, at a place and a level of detail.
+"""Task 4: compressed textures and materials that are filtered as they are read, at a place and a level of detail.
 
 Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffind.maps`.
 

@@ -1,5 +1,4 @@
-"""
-Initial arrays of task 4.
+"""Initial arrays of task 4.
 
 The paper's arrays start from ramps and a constant for each role of a map. Ours start from the principal components of
 the texture's levels, so at step 0 they are smaller pictures of fewer channels.
@@ -38,8 +37,7 @@ def from_ramps(layout: Layout, size: PaperBudget, border: tuple[str, str], level
 
 @dataclass(frozen=True)
 class PrincipalComponents:
-    """
-    Principal components of a texture, scaled to [0, 1] as pointers of its texels.
+    """Principal components of a texture, scaled to [0, 1] as pointers of its texels.
 
     ``mean``, ``(k,)``; ``directions``, ``(dims, k)``, those with the largest differences between neighbours first;
     ``low`` and ``high``, ``(dims,)``, the range of each component.
@@ -100,8 +98,7 @@ def enlarged(values: np.ndarray, rows: int, columns: int, border: Sequence[str])
 
 
 def from_components(values: Sequence[np.ndarray], size: TextureBudget, border: tuple[str, str]) -> LayeredNet:
-    """
-    Return initial arrays from the levels ``values`` of a texture, each ``(height, width, k)`` in [0, 1]; not allocated.
+    """Return initial arrays from the levels ``values`` of a texture, each ``(height, width, k)`` in [0, 1].
 
     Each fine array holds the difference between the pointers of its level and the sum of the coarser arrays.
     """

@@ -26,8 +26,7 @@ PAPER = ("primary0", "primary1", "cascaded")
 
 
 class CompressedTexture(FilteredMaps):
-    """
-    A compressed texture or material, read at any level of detail.
+    """A compressed texture or material, read at any level of detail.
 
     ``layout`` lists the maps, ``net`` reads the arrays (:mod:`.nets`). ``net`` is ``None`` if all channels are
     constant.
@@ -57,11 +56,8 @@ class CompressedTexture(FilteredMaps):
         """Return the stored channels at (u, v) and a level of detail."""
         return [] if self.net is None else self.net.filtered(u, v, self.clamped(level, type(u)), active)
 
-    # -- how good it is -----------------------------------------------------------------------------------------------
-
     def measure(self, source: Source) -> dict[str, float]:
-        """
-        Return the errors against the mip pyramid of ``source``.
+        """Return the errors against the mip pyramid of ``source``.
 
         - ``psnr_db``, ``psnr_MAP_db``: all channels, and each map, at the texel centres of level 0.
         - ``psnr_l0_db``, ``psnr_l1_db``, …: all channels at the texel centres of each level; ``psnr_worst_db``: the
@@ -111,9 +107,6 @@ class CompressedTexture(FilteredMaps):
             return float(np.mean([np.mean((a.numpy() - b.numpy()) ** 2, dtype=np.float64) for a, b in pairs]))
 
 
-# -- files ------------------------------------------------------------------------------------------------------------
-
-
 def allocate(table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
     """Return the arrays of a checked table: :func:`~mi_diffind.maps.model.allocate_maps` of this task."""
     layout = Layout.from_json(table.settings["layout"])
@@ -156,8 +149,7 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
 
 
 def structure_of(settings: dict, layout: Layout):
-    """
-    Return the structure of the arrays of a file and the border along v and u (``None`` for the paper's arrays).
+    """Return the structure of the arrays of a file and the border along v and u (``None`` for the paper's arrays).
 
     Raises ``KeyError``, ``TypeError`` or ``ValueError`` for damaged settings.
     """

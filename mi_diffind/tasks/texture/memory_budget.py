@@ -1,5 +1,4 @@
-"""
-Memory budgets of task 4: resolutions of the arrays for a number of bytes.
+"""Memory budgets of task 4: resolutions of the arrays for a number of bytes.
 
 The paper's arrays follow equation 2 of the supplement, ``bytes = 3 N_p0² + N_p1 + k N_c³ N_lod``, a table of ratios
 ``ρ = N_p0 / N_c`` and a linear search (:func:`paper_size`). Our arrays lie on the grids of levels of detail, so only
@@ -32,8 +31,7 @@ TOLERANCE = 0.05
 
 
 def paper_bytes(primary: int, lods: int, cascaded: int, channels: int) -> int:
-    """
-    Return the bytes of the paper's arrays (equation 2).
+    """Return the bytes of the paper's arrays (equation 2).
 
     ``primary`` is N_p0², ``lods`` is N_lod (N_p1 is four times that), ``cascaded`` is N_c and ``channels`` is k.
     """
@@ -49,8 +47,7 @@ def lods_of(height: int, width: int) -> int:
 
 
 def ratio(compression: float, channels: int) -> float:
-    """
-    Return the default of ``ρ``: :data:`RATIOS` for up to three channels, else :data:`MATERIAL_RATIOS`.
+    """Return the default of ``ρ``: :data:`RATIOS` for up to three channels, else :data:`MATERIAL_RATIOS`.
 
     Interpolated linearly in ``log2(compression)``, constant outside of 3 … 24. The supplement gives values for 4K only.
     """
@@ -74,8 +71,7 @@ class PaperBudget:
 
 
 def paper_size(nbytes: float, source_bytes: int, channels: int, height: int, width: int) -> PaperBudget:
-    """
-    Return the result of the paper's linear search over the sides ``N_c`` = 4, 8, ….
+    """Return the result of the paper's linear search over the sides ``N_c`` = 4, 8, ….
 
     The search minimises the difference of compression ratios, with ``N_p0 = ρ N_c`` in multiples of 8 and no larger
     than the image. If the best is more than 5% off, primary 0 is resized to fit beside the same ``N_c``, or beside a
@@ -110,9 +106,6 @@ def _spread(entries: float, height: int, width: int) -> tuple[int, int]:
     return (one, other) if height <= width else (other, one)
 
 
-# -- ours -------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class FineArray:
     """A fine array on the grid of a ``level`` of detail, with so many ``channels`` of ``bits`` bits."""
@@ -128,8 +121,7 @@ class FineArray:
 
 @dataclass(frozen=True)
 class TextureBudget:
-    """
-    Resolutions of our arrays.
+    """Resolutions of our arrays.
 
     - ``fine``: the fine arrays, the finest first.
     - ``skip``: first level of detail of the coarse array, whose pointers have ``dims`` coordinates of ``bits`` bits.
@@ -239,8 +231,7 @@ def choose(
     cascaded: int | None = None,
     smooth: bool = False,
 ) -> TextureBudget:
-    """
-    Return our arrays for a texture of ``channels`` stored channels and at most ``nbytes`` bytes.
+    """Return our arrays for a texture of ``channels`` stored channels and at most ``nbytes`` bytes.
 
     The structure is that of :data:`LADDER` (:data:`SMOOTH_LADDER` for a ``smooth`` texture) with the most bytes that
     fits, moved to coarser levels if none does; the cascaded array takes the rest. ``skip``, ``fine`` and ``cascaded``

@@ -1,5 +1,4 @@
-"""
-Reads of the arrays at a place and a level of detail: the paper's structure, and ours.
+"""Reads of the arrays at a place and a level of detail: the paper's structure, and ours.
 
 Both have the methods ``filtered(u, v, level)`` and ``stored(u, v)``, which reads level 0 with fewer gathers. Levels are
 those of a mip pyramid: 0 is the source, each further level is half as large.
@@ -28,8 +27,7 @@ class PaperStructure:
 
 
 class PaperNet(nn.Module):
-    """
-    The paper's arrays (supplement, table 3).
+    """The paper's arrays (supplement, table 3).
 
     ``primary0`` has 3 channels and is read at (v, u); ``primary1`` has 1 channel and is read at the footprint. Together
     they point into ``cascaded``, ``N_lod × N_c³``.
@@ -82,8 +80,7 @@ class PaperNet(nn.Module):
 
 @dataclass(frozen=True)
 class FineLayer:
-    """
-    A fine array, on the grid of the level of detail ``level``.
+    """A fine array, on the grid of the level of detail ``level``.
 
     Its value, less :attr:`zero` and times the ``scale`` of each channel, is added to the pointer in full up to the
     level ``until`` and fades out from there to ``until + 1``. ``bits`` are those of an entry. A ``paged`` layer
@@ -109,8 +106,7 @@ class FineLayer:
 
 @dataclass(frozen=True)
 class LayeredStructure:
-    """
-    Structure of our arrays.
+    """Structure of our arrays.
 
     - ``height``, ``width``: size of the texture in texels.
     - ``layers``: the fine arrays, the finest first.
@@ -136,8 +132,7 @@ class LayeredStructure:
 
 
 class LayeredNet(nn.Module):
-    """
-    Our arrays.
+    """Our arrays.
 
     - ``coarse``: pointers of all texels of the levels from ``structure.skip`` on, level by level, read trilinearly.
     - ``fine``: differences of the pointers of finer levels, each array on the grid of its level, in few bits and not of

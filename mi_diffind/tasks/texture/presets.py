@@ -10,8 +10,7 @@ from ...settings import FitSettings
 
 @dataclass(frozen=True)
 class TextureRecipe:
-    """
-    Storage and training of a texture.
+    """Storage and training of a texture.
 
     - ``layered``: our arrays, on the grids of levels of detail, which start from principal components; else the
       paper's arrays, which start from ramps.

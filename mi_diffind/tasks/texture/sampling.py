@@ -1,5 +1,4 @@
-"""
-Footprints: pixel sizes in units of the texture, and the distributions that the paper's training draws them from.
+"""Footprints: pixel sizes in units of the texture, and the distributions that the paper's training draws them from.
 
 The supplement's section "Sampling LODs" draws footprints x as powers of a uniform number, so that a fraction p = 0.5 of
 them lies below t = 1 / N_base, where N_base is the side of the texture in texels (equations 3 to 6). It also describes
@@ -40,8 +39,7 @@ def exponential_rate(t: float) -> float:
 
 
 def footprints(u, distribution: str, base: int):
-    """
-    Draw footprints in [0, 1] for a texture of side ``base`` from uniform numbers ``u`` in (0, 1].
+    """Draw footprints in [0, 1] for a texture of side ``base`` from uniform numbers ``u`` in (0, 1].
 
     ``distribution`` is ``"power"``, ``x = u^n`` (equation 3), or ``"exponential"``, ``x = −ln(u) / λ_e`` (equation 7),
     at most 1. Raises ``ValueError`` for another name.
@@ -61,8 +59,7 @@ def share_below(x: np.ndarray, distribution: str, base: int) -> np.ndarray:
 
 
 def footprint_histogram(distribution: str, levels: int) -> np.ndarray:
-    """
-    Return the share of footprints that is nearest to each of ``levels`` levels of detail.
+    """Return the share of footprints that is nearest to each of ``levels`` levels of detail.
 
     The texture has the side 2^(levels − 1). Shape ``(levels,)``; the shares sum to 1.
     """
@@ -77,8 +74,7 @@ def level_of(x, levels: int):
 
 
 def footprint_of(level, levels: int):
-    """
-    Return the footprint in [0, 1] of a level of detail: the inverse of :func:`level_of`.
+    """Return the footprint in [0, 1] of a level of detail: the inverse of :func:`level_of`.
 
     Level 0 has the footprint of one texel; smaller footprints are magnified and read level 0, too.
     """

@@ -1,5 +1,4 @@
-"""
-Training of task 4: samples, targets and the stored result.
+"""Training of task 4: samples, targets and the stored result.
 
 The reference is a mip pyramid, read trilinearly (:mod:`mi_diffind.maps.pyramid`). Our recipe draws a texel of a level
 for each sample, stratified; half of the steps read the texel's centre, half a jittered place and level of detail. The
@@ -71,8 +70,7 @@ class TextureProblem(Problem):
         return f"jittered: {self.jittered}"
 
     def _stretch(self, size: int) -> tuple:
-        """
-        Return the stratum of each of ``size`` samples, as arrays of whole numbers.
+        """Return the stratum of each of ``size`` samples, as arrays of whole numbers.
 
         Level of detail; first texel, and number of texels, that the sample may be in; columns and rows of the level;
         index of the level's first texel among those of all levels.
@@ -176,8 +174,7 @@ def fit_texture(
     request: FitRequest,
     pyramid: Pyramid,
 ) -> tuple[Table, FitResult]:
-    """
-    Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
+    """Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
 
     ``size`` is ``None`` for a texture of one colour, which needs no arrays. ``request`` holds the Dr.Jit types, the
     time and the checkpoint; its settings are replaced by those of the ``recipe``. Errors are those of
