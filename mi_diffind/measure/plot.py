@@ -132,6 +132,12 @@ def image_panel(axes, image: np.ndarray, title: str = "", label: str = "") -> No
     axes.set_yticks([])
 
 
+def crop_to(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of the smallest rectangle that holds a ``mask``, all of them if it is empty."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else (slice(None),) * 2
+
+
 def plain(value: float) -> str:
     """Return the text of a number at a tick."""
     return f"{value:,.0f}" if value >= 1000 else f"{value:g}"

@@ -77,7 +77,6 @@ def plan(quick: bool = False) -> Plan:
     return Plan(
         study="disney",
         title="Disney BRDF: accuracy against time",
-        variant=mi.variant(),
         candidates=candidates,
         cases=cases,
         queries=QUERIES,
