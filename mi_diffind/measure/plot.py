@@ -18,14 +18,9 @@ from ..files import replacing
 
 #: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
-    ("#b2182b", "o"),
-    ("#2166ac", "s"),
-    ("#c47a00", "D"),
-    ("#1b7837", "^"),
-    ("#762a83", "v"),
-    ("#4d4d4d", "P"),
+    ("#b2182b", "o"), ("#2166ac", "s"), ("#c47a00", "D"), ("#1b7837", "^"), ("#762a83", "v"), ("#4d4d4d", "P"),
     ("#12908e", "X"),
-)
+)  # fmt: skip
 
 #: Distances from an anchor to the nearest edge of its label that are tried, in points (1/72 inch).
 RADII = (6, 9, 12, 18, 26, 36, 48, 62, 80)

@@ -45,16 +45,10 @@ from .conclusions import conclusions, ratio_text, table
 
 #: Method → its label. Those of :data:`ONCE` are trained at the first budget only.
 KINDS = {
-    "dense": "dense grid, 8 bits",
-    "sparse": "sparse grid, 8 bits",
-    "sparse6": "sparse grid, 6-bit colours",
-    "components": "principal components",
-    "codebook": "codebook",
-    "planes": "planes and lines",
-    "hash": "hash grid + network",
-    "paper": "paper",
-    "ours": "ours",
-}
+    "dense": "dense grid, 8 bits", "sparse": "sparse grid, 8 bits", "sparse6": "sparse grid, 6-bit colours",
+    "components": "principal components", "codebook": "codebook", "planes": "planes and lines",
+    "hash": "hash grid + network", "paper": "paper", "ours": "ours",
+}  # fmt: skip
 ONCE = ("dense", "planes", "hash")
 
 #: Method → the group that it belongs to in pictures.
