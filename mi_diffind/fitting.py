@@ -462,7 +462,6 @@ LARGEST_SUMS = 2**28
 @contextlib.contextmanager
 def _cores(deterministic: bool):
     before = dr.thread_count()
-
     if deterministic:
         compat.use_threads(1)
     try:

@@ -256,11 +256,7 @@ class Disney(mi.BSDF):
             front = front | mi.BSDFFlags.SpatiallyVarying
         glossy = mi.BSDFFlags.GlossyReflection | front
         anisotropic = glossy | mi.BSDFFlags.Anisotropic
-        self.m_components = [
-            mi.BSDFFlags.DiffuseReflection | front,
-            anisotropic if is_anisotropic else glossy,
-            glossy,
-        ]
+        self.m_components = [mi.BSDFFlags.DiffuseReflection | front, anisotropic if is_anisotropic else glossy, glossy]
         self.m_flags = self.m_components[0] | self.m_components[1] | self.m_components[2]
 
     def _textures(self) -> dict[str, mi.Texture]:

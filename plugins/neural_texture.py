@@ -97,10 +97,6 @@ PLUGIN = Plugin(
     "texture",
     NeuralTexture,
     task=TASK.name,
-    exact=Counterpart(
-        "bitmap",
-        ("filename", "channels", "storage", "source"),
-        convert=_to_bitmap,
-    ),
+    exact=Counterpart("bitmap", ("filename", "channels", "storage", "source"), convert=_to_bitmap),
     others=(Counterpart("mipmap", ("storage", "source"), convert=functools.partial(to_mipmap, TASK)),),
 )
