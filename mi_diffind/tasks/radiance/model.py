@@ -18,18 +18,8 @@ PIXELS = 96
 class RadianceFieldModel(Model):
     """Radiance field of a file: ``field`` (:class:`.volume_field.VolumeField`), in the coordinates of its capture."""
 
-    #: Requested storage form; "" means that of the file.
-    form = ""
-
-    def __init__(self, table, arrays, dtype, form: str = ""):
-        self.form = form
-        super().__init__(table, arrays, dtype)
-
     def build(self):
         self.field = field_of(self.table, self.types, self.form)
-
-    def copy(self):
-        return type(self)(self.table, {}, self.dtype, self.form)
 
     @property
     def storage(self):

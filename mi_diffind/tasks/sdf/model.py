@@ -135,23 +135,14 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceFi
 class SdfModel(Model):
     """Distance field of a file: ``field`` (:class:`.field.DistanceField`), in the unit frame.
 
-    A point of the mesh's file is ``scale`` · p + ``centre``. ``form`` is the requested storage form, "" for the file's.
+    A point of the mesh's file is ``scale`` · p + ``centre``.
     """
-
-    def __init__(self, table, arrays, dtype, form: str = ""):
-        self.form = form
-        super().__init__(table, arrays, dtype)
 
     def build(self):
         settings = self.table.settings
         self.sparse = settings["layout"] == "sparse"
         self.field = field_of(self.table, self.arrays, self.types, self.form)
         self.scale, self.centre = float(settings["scale"]), tuple(settings["centre"])
-
-    def copy(self):
-        return type(self)(
-            self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype, self.form
-        )
 
     @property
     def storage(self):

@@ -11,7 +11,6 @@ Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffi
 from __future__ import annotations
 
 import argparse
-import dataclasses
 
 from ...arguments import Argument, natural, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
@@ -40,6 +39,7 @@ class Texture(Task):
     section = "supplemental 1.4"
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
+    measurements = 10
     arguments = (
         SOURCE,
         *(size for size in SIZES if size.name != "psnr"),
@@ -64,11 +64,6 @@ class Texture(Task):
         *DECODED,
         Argument("--level", type=natural, metavar="N", help="level of detail (default: 0, the source's)"),
     )
-
-    def settings(self, preset, given, options):
-        defaults = PRESETS[preset].settings
-        steps = given.get("steps", defaults.steps)
-        return dataclasses.replace(defaults, measure_every=max(1, steps // 10), **given)
 
 
 TASK = Texture()
