@@ -76,9 +76,15 @@ class FitRequest:
             problem, self.settings, self.checkpoint, self.resume, self.progress, title=title, seconds=self.seconds
         )
 
-    def recorded(self) -> dict:
-        """Return the settings in the form in which a table file keeps them."""
-        return {**asdict(self.settings), **({"seconds": self.seconds} if self.seconds is not None else {})}
+    def recorded(self, result: FitResult | None = None) -> dict:
+        """Return the settings as a table file keeps them: with a limit of time, the steps are those of the result."""
+        limited = {} if self.seconds is None else {"seconds": self.seconds}
+        steps = {} if self.seconds is None or result is None else {"steps": result.steps}
+        return {**asdict(self.settings), **steps, **limited}
+
+    def relative(self, path: str | os.PathLike) -> str:
+        """Return a path relative to the folder of the output, as a table file keeps it."""
+        return os.path.relpath(Path(path).resolve(), (self.output or Path("x")).resolve().parent)
 
 
 @dataclass
@@ -221,9 +227,7 @@ class Task:
         result = request.train(problem)
         table = self.table(problem, request)
         table.preset, table.seed = request.preset, request.settings.seed
-        table.settings = {**request.recorded(), **table.settings}
-        if request.seconds is not None:
-            table.settings["steps"] = result.steps
+        table.settings = {**request.recorded(result), **table.settings}
         table = table.to(request.storage) if request.storage else table
         measured = self.model(table, request.types.TensorXf).measure()
         table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}

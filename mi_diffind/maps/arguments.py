@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from .. import units
@@ -67,8 +66,7 @@ def requested_border(options) -> tuple[str, str] | None:
 
 def record_source(request, table) -> None:
     """Store the path of the source in the settings of ``table``, relative to the folder of the output."""
-    folder = (request.output or Path("x")).resolve().parent
-    table.settings["source_path"] = os.path.relpath(Path(request.options["source"]).resolve(), folder)
+    table.settings["source_path"] = request.relative(request.options["source"])
 
 
 def size_figures(source: Source, table, requested: float | None) -> tuple[dict, str]:

@@ -48,7 +48,9 @@ class RadianceField(Task):
         Argument("--grid", metavar="FILE", help="grid to compress; if the file does not exist, it is made"),
     )  # fmt: skip
     decode_arguments = (
-        Argument("--resolution", type=positive, metavar="N", help="nodes along the longest side (default: the field's)"),
+        Argument(
+            "--resolution", type=positive, metavar="N", help="nodes along the longest side (default: the field's)"
+        ),
     )
 
     def allocate(self, table, dtype, storage=""):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -176,18 +174,15 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
         count = distances.surface.components
         lines.append(f"{lost} of {count} pieces of the mesh are too small for the field: more --bytes help")
     table.preset, table.seed = request.preset, request.settings.seed
-    folder = (request.output or Path("x")).resolve().parent
     table.settings = {
-        **request.recorded(),
+        **request.recorded(result),
         "source": mesh.digest,
-        "mesh_path": os.path.relpath(Path(request.options["source"]).resolve(), folder),
+        "mesh_path": request.relative(request.options["source"]),
         "scale": mesh.scale,
         "centre": list(mesh.centre),
         "warnings": warnings,
         **table.settings,
     }
-    if request.seconds is not None:
-        table.settings["steps"] = result.steps
     table.measured = {k: float(f"{v:.6g}") for k, v in errors.items()}
     triangles = 12 * (len(mesh.vertices) + len(mesh.faces))
     lines.append(f"{prepared:.1f} s for distances and samples, {result.seconds:.1f} s of training")

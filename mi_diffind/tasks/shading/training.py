@@ -139,9 +139,7 @@ def fit_shading(
     result = request.train(problem, "shading")
     kept = any(before[name] > result.measured[name] for name in list(before)[:1])
     identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
-    settings = {**request.recorded(), **identity}
-    if request.seconds is not None:
-        settings["steps"] = result.steps
+    settings = {**request.recorded(result), **identity}
     if kept:
         settings["kept_start"] = True
     texture = CompressedTexture(pyramid.layout, first if kept else textures.stored_form(problem.net))
