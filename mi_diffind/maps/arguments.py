@@ -64,11 +64,6 @@ def requested_border(options) -> tuple[str, str] | None:
     return None if options["border"] == "auto" else (options["border"],) * 2
 
 
-def record_source(request, table) -> None:
-    """Store the path of the source in the settings of ``table``, relative to the folder of the output."""
-    table.settings["source_path"] = request.relative(request.options["source"])
-
-
 def size_figures(source: Source, table, requested: float | None) -> tuple[dict, str]:
     """Return the sizes of a trained table for ``--json``, and a line of text; ``requested`` are the bytes wanted."""
     achieved = source.nbytes / table.nbytes if table.nbytes else None

@@ -81,10 +81,11 @@ def fit_scene(
     )  # fmt: skip
     problem.identity |= {"views": dataclasses.asdict(views)}
     result = request.train(problem)
-    settings = {**request.recorded(), **{k: v for k, v in problem.identity.items() if k not in ("structure", "border")}}
+    settings = {
+        **request.recorded(result),
+        **{k: v for k, v in problem.identity.items() if k not in ("structure", "border")},
+    }
     settings["scene_path"] = _relative(parsed.path, request)
-    if request.seconds is not None:
-        settings["steps"] = result.steps
     trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net)), settings)
     trained_table.settings["source_path"] = _relative(source_path, request)
     trained_table.preset, trained_table.seed = request.preset, recipe.settings.seed

@@ -7,10 +7,9 @@ import math
 import os
 
 from ...errors import UsageError
-from ...maps.arguments import preview_path, record_source, requested_border, requested_bytes
+from ...maps.arguments import preview_path, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
-from ...tables import Table
 from ...task import FitRequest, Fitted
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
@@ -62,7 +61,9 @@ def fit(request: FitRequest) -> Fitted:
     if not pyramid.layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
     if options["start"] is not None:
-        start, result = started(options["start"], source, request), None
+        start, result = TEXTURE.load(options["start"]), None
+        if start.settings.get("source", source.digest) != source.digest:
+            raise UsageError(f"{options['start']}: was made from another source than {options['source']}")
     else:
         start, result = pretrained(source, pyramid, recipe, request)
     if result is None or not result.interrupted:
@@ -81,7 +82,7 @@ def fit(request: FitRequest) -> Fitted:
         table, result = training.fit_shading(source, net, recipe, shading_request, pyramid, evaluation, preview)
     else:
         table = start
-    record_source(request, table)
+    table.settings["source_path"] = request.relative(options["source"])
     lines = [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
@@ -97,14 +98,6 @@ def fit(request: FitRequest) -> Fitted:
         "bits": {name: a.bits for name, a in table.arrays.items()},
     }
     return Fitted(table, result, lines, figures)
-
-
-def started(path, source, request: FitRequest) -> Table:
-    """Return the texture to start from. Raises :class:`UsageError` for a texture of another source."""
-    table = TEXTURE.load(path)
-    if table.settings.get("source", source.digest) != source.digest:
-        raise UsageError(f"{path}: was made from another source than {request.options['source']}")
-    return table
 
 
 def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequest) -> tuple:

@@ -10,24 +10,18 @@ Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffi
 
 from __future__ import annotations
 
-import argparse
-
-from ...arguments import Argument, natural, positive
+from ...arguments import Argument, checked, natural, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
 from ...task import Task
 from .presets import PRESETS
 
 
-def _structure(text: str) -> str:
-    """Return a structure of arrays. Raises ``ArgumentTypeError``."""
+def _parse_structure(text: str) -> None:
+    """Raise ``ValueError`` for a text that names no structure of arrays."""
     from .memory_budget import parse_structure
 
-    try:
-        if text not in ("auto", "pages"):
-            parse_structure(text)
-    except ValueError as e:
-        raise argparse.ArgumentTypeError(str(e)) from None
-    return text
+    if text not in ("auto", "pages"):
+        parse_structure(text)
 
 
 class Texture(Task):
@@ -44,7 +38,7 @@ class Texture(Task):
         SOURCE,
         *(size for size in SIZES if size.name != "psnr"),
         Argument(
-            "--structure", type=_structure, metavar="L:C:B,…",
+            "--structure", type=checked(_parse_structure), metavar="L:C:B,…",
             help="pages, or level, channels and bits of each fine array, as in 0:1:2,1:2:4 (default: auto)",
         ),
         Argument(
