@@ -108,9 +108,10 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
 def initial(start: str, primary, cascaded, grid_distance, samples, distances, band: float) -> Indirection:
     """Return the arrays at the start of the training.
 
-    ``start`` is ``"ramp"`` or ``"constant"``: pointers are a ramp, the cascaded array has the distance of the nearest of the ``samples``
-    in [0, 1]³ (n, 3), whose distances are ``distances`` (n,); or ``"distance"``: the first pointer is the truncated
-    distance, which the function ``grid_distance`` returns at the entries of an array of some resolution.
+    ``start`` is ``"ramp"`` or ``"constant"``: pointers are a ramp, the cascaded array has the distance of the nearest
+    of the ``samples`` in [0, 1]³ (n, 3), whose distances are ``distances`` (n,); or ``"distance"``: the first pointer
+    is the truncated distance, which the function ``grid_distance`` returns at the entries of an array of some
+    resolution.
     """
     pointers = ramp(primary, 3, ("clamp",) * 3)
     if start == "distance":
@@ -237,8 +238,8 @@ def fit_pair(distances: Distances, nbytes: int, request: FitRequest, samples: in
         return distances.signed(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)).reshape(resolution)
 
     start = "constant" if options["constant"] else STARTS[request.preset]
-    samples = (unit[:1], np.zeros(1)) if start == "constant" else (unit, d)  # constant: the one sample's distance, 0
-    net = initial(start, primary, cascaded, grid_distance, *samples, band).alloc(request.types.TensorXf)
+    known = (unit[:1], np.zeros(1)) if start == "constant" else (unit, d)  # constant: the one sample's distance, 0
+    net = initial(start, primary, cascaded, grid_distance, *known, band).alloc(request.types.TensorXf)
     field = PairField(request.types, net, lower, upper, band, 1.0)
     held = HeldOut(distances, request.types, spacing / 2, count=held_out)
     problem = PairProblem(field, mesh, unit, d, held)
