@@ -9,10 +9,10 @@ import numpy as np
 
 from ...indirection import Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout
-from .compression import INDEX_BITS, LAST_LEVEL, packed_field
+from .compression import DENSITY_BITS, INDEX_BITS, LAST_LEVEL
 from .nodes import Nodes
 from .paper import PairsField
-from .volume_field import NodeField, VolumeField
+from .volume_field import NodeField, PackedPaletteField, VolumeField
 
 #: Layout → name of an array → number of its dimensions, and channels.
 LAYOUTS = {
@@ -138,4 +138,4 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
         "levels": density.entries[:, 0], "density_range": (density.offset[0], density.scale[0]), "index": index,
         "palette": palette.entries, "scale": palette.scale, "offset": palette.offset,
     }  # fmt: skip
-    return packed_field(nodes, stored, settings["index_bits"])
+    return PackedPaletteField(nodes, stored, DENSITY_BITS, settings["index_bits"])

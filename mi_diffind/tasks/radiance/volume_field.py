@@ -173,21 +173,21 @@ class DenseVolumeField(NodeField):
 class PackedPaletteField(NodeVolume):
     """Compressed field in its form for rendering: a word of ``density_bits`` + ``index_bits`` bits at each node.
 
-    The low bits of a node are a density level, which stands for the raw density ``density_range[0]`` + level ·
-    ``density_range[1]``. The high bits are an index into ``palette`` ``(P, 12)``, uint8, whose bytes stand for
-    ``offset`` + ``scale`` · byte. ``levels`` and ``index`` are NumPy arrays ``(n,)``. Entries of the palette take 16
-    bytes in memory.
+    ``stored`` is that of :meth:`.compression.PaletteProblem.stored`. The low bits of a node are a density level, which
+    stands for the raw density ``density_range[0]`` + level · ``density_range[1]``. The high bits are an index into
+    ``palette`` ``(P, 12)``, uint8, whose bytes stand for ``offset`` + ``scale`` · byte. ``levels`` and ``index`` are
+    NumPy arrays ``(n,)``. Entries of the palette take 16 bytes in memory.
     """
 
-    def __init__(self, nodes, levels, density_bits, density_range, index, index_bits, palette, scale, offset):
+    def __init__(self, nodes: Nodes, stored: dict, density_bits: int, index_bits: int):
         super().__init__(nodes, {})
         types = nodes.types
-        self.density_bits, self.index_bits, self.density_range = density_bits, index_bits, density_range
-        self.words = types.UInt32(node_words(levels, density_bits, index, index_bits))
-        entries = np.zeros((len(palette), 16), np.uint8)
-        entries[:, :12] = palette
+        self.density_bits, self.index_bits, self.density_range = density_bits, index_bits, stored["density_range"]
+        self.words = types.UInt32(node_words(stored["levels"], density_bits, stored["index"], index_bits))
+        entries = np.zeros((len(stored["palette"]), 16), np.uint8)
+        entries[:, :12] = stored["palette"]
         self.palette = types.UInt32(entries.view("<u4").reshape(-1))
-        self.scale, self.offset = [float(v) for v in scale], [float(v) for v in offset]
+        self.scale, self.offset = ([float(v) for v in stored[name]] for name in ("scale", "offset"))
 
     @property
     def nbytes(self) -> int:

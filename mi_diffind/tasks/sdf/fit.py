@@ -163,7 +163,12 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
         lines = []
         if request.preset == "sparse":
             sampled = search_grid(distances, nbytes, request.options["bits"])
-            lines += thin_parts(sampled)
+            if sampled.missed > THIN:
+                lines.append(
+                    f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no "
+                    f"change of sign: parts may be thinner than a cell, 1/{1 / sampled.structure.spacing:.0f} of the "
+                    f"longest side: more --bytes help"
+                )
             table, result, field = fit_sparse(distances, sampled, request, held_out)
         else:
             table, result, field = fit_pair(distances, nbytes, request, samples, held_out)
@@ -236,17 +241,6 @@ def coded_bytes(sampled: encoding.SampledNodes, bits: int) -> int:
 def entries_for(sampled: encoding.SampledNodes, bits: int) -> int:
     """Return the size of the cascaded array: as many entries as pointers can name, and at most one per node."""
     return max(1, min(2**bits, sampled.structure.nodes))
-
-
-def thin_parts(sampled: encoding.SampledNodes) -> list[str]:
-    """Return a sentence if parts of the solid may be thinner than a cell."""
-    if sampled.missed <= THIN:
-        return []
-    return [
-        f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of "
-        f"sign: parts may be thinner than a cell, 1/{1 / sampled.structure.spacing:.0f} of the longest side: more "
-        f"--bytes help"
-    ]
 
 
 def fit_sparse(distances: Distances, sampled: encoding.SampledNodes, request: FitRequest, held_out: int = HELD_OUT):

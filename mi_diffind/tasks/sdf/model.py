@@ -183,11 +183,16 @@ class SdfModel(Model):
         ``resolution`` is the number of cells along the longest side, by default finer than the field's cells.
         """
         from .extraction import extract
+        from .grids import grid
 
         resolution = resolution or min(1024, round(1.5 / self.field.spacing))
         suffix = output.suffix.lower()
         if suffix == ".npz":
-            return [self._decode_grid(output, resolution)]
+            values, lower, upper = grid(self.field, resolution)
+            lower, upper = (p * self.scale + np.array(self.centre) for p in (lower, upper))
+            with replacing(output) as temporary, open(temporary, "wb") as stream:
+                np.savez_compressed(stream, distance=values * np.float32(self.scale), lower=lower, upper=upper)
+            return [(output, f"{' x '.join(map(str, values.shape))} distances (z, y, x) in units of the mesh")]
         if suffix not in MESHES:
             allowed = ", ".join((*MESHES, ".npz"))
             raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are {allowed}')
@@ -201,16 +206,6 @@ class SdfModel(Model):
         return [
             (output, f"{len(mesh.faces):,} triangles at {resolution} cells along the longest side, {seconds:.1f} s")
         ]
-
-    def _decode_grid(self, output: Path, resolution: int):
-        from .grids import grid
-
-        values, lower, upper = grid(self.field, resolution)
-        lower, upper = (p * self.scale + np.array(self.centre) for p in (lower, upper))
-        with replacing(output) as temporary, open(temporary, "wb") as stream:
-            np.savez_compressed(stream, distance=values * np.float32(self.scale), lower=lower, upper=upper)
-        shape = " x ".join(map(str, values.shape))
-        return output, f"{shape} distances (z, y, x) in units of the mesh"
 
 
 MODEL = SdfModel

@@ -87,13 +87,14 @@ def fit(request: FitRequest) -> Fitted:
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
     lines += [f"left out: {effect} ({reason})" for effect, reason in reasons.items()]
-    lines += [f"not shaded: {name} ({reason})" for name, reason in material.left_out(pyramid.layout).items()]
+    not_shaded = material.left_out(pyramid.layout)
+    lines += [f"not shaded: {name} ({reason})" for name, reason in not_shaded.items()]
     figures = {
         "source_bytes": source.nbytes,
         "compression": source.nbytes / table.nbytes,
         "effects_in_use": list(effects.names),
         "effects_left_out": reasons,
-        "maps_not_shaded": material.left_out(pyramid.layout),
+        "maps_not_shaded": not_shaded,
         "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
         "bits": {name: a.bits for name, a in table.arrays.items()},
     }

@@ -74,11 +74,7 @@ class ShadingProblem(textures.TextureProblem):
         surface = surface_of(self.pyramid, net.filtered(u, v, level))
         limit = None if recipe.clip is None else recipe.clip * recipe.share / size
         value = shaded(self.decoder, surface, wi, wo, self.effects, limit)
-        return self.differences(value, truth)
-
-    def differences(self, value, truth):
-        """Return the error of shaded values, the mean over colours."""
-        bounded = _bounded if self.shading.bounded else (lambda x: x)
+        bounded = _bounded if recipe.bounded else (lambda x: x)
         errors = [bounded(a) - bounded(b) for a, b in zip(value, truth, strict=True)]
         squared = self.settings.loss == "mse"
         return sum(dr.square(e) if squared else dr.abs(e) for e in errors) / 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 import drjit as dr
@@ -137,13 +138,9 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
         if isinstance(structure, PaperStructure):
             settings["arrays"] = {"kind": "paper", "axis": "side"}
         else:
-            layers = [
-                {"level": x.level, "until": x.until, "bits": x.bits, "scale": list(x.scale), "paged": x.paged}
-                for x in structure.layers
-            ]
             settings["arrays"] = {
                 "kind": "layers", "skip": structure.skip, "bits": structure.bits, "base": structure.base,
-                "border": list(texture.border), "layers": layers,
+                "border": list(texture.border), "layers": list(map(asdict, structure.layers)),
             }  # fmt: skip
     return Table("texture", stored, settings=settings)
 
