@@ -61,12 +61,10 @@ class PairField(DistanceField):
         # Opaque, no literal: a new value must not compile the kernels of rays again
         self._bound = dr.opaque(self.types.Float, self.slope)
 
-    def _coordinates(self, p):
-        return [(x - a) / (b - a) for x, a, b in zip(p, self.lower, self.upper, strict=True)]
-
     def value(self, p, active=True):
         active = self.inside(p) & active
-        value = dr.fma(self.net(self._coordinates(p), active)[0], 2 * self.band, -self.band)
+        coordinates = [(x - a) / (b - a) for x, a, b in zip(p, self.lower, self.upper, strict=True)]
+        value = dr.fma(self.net(coordinates, active)[0], 2 * self.band, -self.band)
         return dr.select(active, value, self.band)
 
     def gradient(self, p, active=True):

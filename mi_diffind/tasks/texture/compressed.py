@@ -20,7 +20,7 @@ from ...maps.model import MapsModel, allocate_maps, page_entries
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
 from ...tables import PAGES, Table, TableError, load_table, stored_arrays
-from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure, coarse_texels
+from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
 #: Names of the paper's arrays.
 PAPER = ("primary0", "primary1", "cascaded")
@@ -227,7 +227,7 @@ def _layered_shapes(table: Table, layout: Layout, structure: LayeredStructure, l
             raise TableError(f'{table.path}: array "{name}" has {layer.channels} channels, its pointers have {dims}')
         size = structure.sizes[layer.level]
         shapes[name] = (*((page_entries(table, name, size),) if layer.paged else size), layer.channels)
-    shapes["coarse"] = (coarse_texels(structure), dims)
+    shapes["coarse"] = (sum(map(math.prod, structure.sizes[structure.skip :])), dims)
     shapes["cascaded"] = (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,)
     return shapes
 

@@ -242,8 +242,3 @@ class LayeredNet(nn.Module):
                 entry, weight = self.coarse.entry(offset + row * columns + column, active), a * b
                 total = weighted_sum(weight, entry, total)
         return total
-
-
-def coarse_texels(structure: LayeredStructure) -> int:
-    """Return the number of texels of all levels from ``structure.skip`` on."""
-    return sum(math.prod(size) for size in structure.sizes[structure.skip :])
