@@ -82,22 +82,6 @@ class CapturedViews:
         """Positions of the cameras, ``(V, 3)``."""
         return self.poses[:, :3, 3]
 
-    def rays(self, view, x, y) -> tuple[np.ndarray, np.ndarray]:
-        """Return origins and unit directions ``(…, 3)``, float64, of the rays through the centres of pixels.
-
-        ``view`` names the images, ``x`` and ``y`` the columns and rows, counted from 0 at the upper left; fractions are
-        allowed.
-        """
-        view = np.asarray(view)
-        fx, fy = np.moveaxis(self.focal[view], -1, 0)
-        cx, cy = np.moveaxis(self.centre[view], -1, 0)
-        u, v = (np.asarray(x) + 0.5 - cx) / fx, -(np.asarray(y) + 0.5 - cy) / fy
-        local = np.stack(np.broadcast_arrays(u, v, -1.0), axis=-1)
-        pose = self.poses[view]
-        directions = np.einsum("...ij,...j->...i", pose[..., :3, :3], local)
-        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        return np.broadcast_to(pose[..., :3, 3], directions.shape), directions
-
 
 def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews:
     """Read the views of a ``split``: "train", "test" or "val".
