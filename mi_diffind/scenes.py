@@ -90,13 +90,17 @@ class ParsedScene:
                 raise RuntimeError(f"{self.path}: holds a {type(loaded).__name__}, a scene is expected")
             return loaded
 
+    def _copy(self):
+        """Return a copy of the parsed state to read: Mitsuba takes a parameter that was read once for a known one."""
+        return compat.copy_parsed(self._state)[1]
+
     def path_integrator(self) -> tuple[str, int]:
         """Return the plugin name and the ``max_depth`` of the integrator that follows the scene's paths.
 
         It may be nested in others, like ``aov``. A scene with none of :data:`MAX_DEPTHS`, or with several, is an error.
         """
         with self._errors():
-            props = _path_integrator(self._state)
+            props = _path_integrator(self._copy())
             name = props.plugin_name()
             return name, int(props.get("max_depth", MAX_DEPTHS[name]))
 
@@ -106,7 +110,7 @@ class ParsedScene:
         With ``against``, of all plugins that have the counterpart of this name.
         """
         with self._errors():
-            return [plugin.described(props) for props, plugin in _replaceable(self._state, against)]
+            return [plugin.described(props) for props, plugin in _replaceable(self._copy(), against)]
 
     def tables(self, learned: list[dict]) -> dict[tuple[str, str], object]:
         """Return the distinct tables of learned plugins: ``(file, storage)`` → :class:`~mi_diffind.tables.Table`.
@@ -133,8 +137,9 @@ class ParsedScene:
     def files(self) -> list[Path]:
         """Return the files that the scene consists of: itself, the files that it includes and those that it names."""
         with self._errors():
-            files = [Path(file).resolve() for file in compat.parsed_files(self._state)]
-            for props in compat.properties_of(self._state):
+            state = self._copy()
+            files = [Path(file).resolve() for file in compat.parsed_files(state)]
+            for props in compat.properties_of(state):
                 texts = (props[k] for k in props if compat.property_kind(props, k) == "text")
                 for file in (self.path.resolve().parent / text for text in texts if text):
                     with contextlib.suppress(OSError, ValueError):  # most texts are no names of files

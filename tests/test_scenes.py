@@ -112,7 +112,7 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
         ),
         ("neural_ggx", "", "principled", 'names no plugin that "principled" can stand for (disney, neural_disney)'),
         ("disney", "", "plastic", '"plastic": no plugin has this counterpart; there are principled'),
-        ("disney", '<texture name="specular" type="checkerboard"/>', "principled", '"specular": is a texture, and'),
+        ("disney", '<texture name="specular" type="checkerboard"/>', "principled", '"specular": is a texture, but'),
     ],
 )
 def test_what_cannot_be_compared(mi_rgb, tmp_path, plugin, parameters, against, sentence):

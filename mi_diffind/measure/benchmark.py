@@ -76,7 +76,7 @@ def measure(
     key = {
         "settings": asdict(settings),
         "machine": machine(plan.variant),
-        "sources": fingerprint([*sources(), *plan.sources]),
+        "sources": fingerprint(sources()),
         "details": plan.details,
         "candidates": [c.name for c in plan.candidates],
         "cases": [c.name for c in plan.cases],

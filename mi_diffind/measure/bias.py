@@ -143,11 +143,7 @@ def describe(relative: Estimate, displayed: Estimate) -> dict:
     ``rmse_standard_error`` and ``rounding_only`` (no more than the rounding of 32-bit floats), or the bound
     ``rmse_below``; ``psnr_db``, or the bound ``psnr_db_above``.
     """
-    bias = {
-        "measured": relative.measured,
-        "mse": relative.square,
-        "mse_standard_error": relative.standard_error,
-    }
+    bias = {"measured": relative.measured, "mse": relative.square, "mse_standard_error": relative.standard_error}
     if relative.measured:
         rmse = math.sqrt(relative.square)
         bias |= {"rmse": rmse, "rmse_standard_error": relative.standard_error / (2 * rmse)}

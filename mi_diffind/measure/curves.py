@@ -21,10 +21,12 @@ def curves(axes, candidates: Iterable[dict], styles: Styles, place: Callable[[di
                       markerfacecolor="white" if line == ":" else colour)  # fmt: skip
 
 
-def against_time(axes, result: dict, timings: Mapping, styles: Styles, error: str, axis: str) -> list[plot.Label]:
+def against_time(
+    axes, result: dict, timings: Mapping, styles: Styles, error: str, x_label: str, y_label: str
+) -> list[plot.Label]:
     """Draw an ``error`` of candidates against their times; references are vertical lines.
 
-    ``axis`` is the label of the time axis. Returns the labels of points, for :func:`.plot.place_labels`.
+    Returns the labels of points, for :func:`.plot.place_labels`.
     """
     labels = []
     for name, t in timings.items():
@@ -44,7 +46,8 @@ def against_time(axes, result: dict, timings: Mapping, styles: Styles, error: st
         low, high = axes.get_xlim()
         axes.set_xlim(low / 1.5, high * 1.5)
         plot.log_ticks(axes.xaxis, low / 1.5, high * 1.5, plot.plain)
-    axes.set_xlabel(axis, fontsize=8)
+    axes.set_xlabel(x_label, fontsize=8)
+    finish(axes, y_label)
     return labels
 
 

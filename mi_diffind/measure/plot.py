@@ -18,14 +18,9 @@ from ..files import replacing
 
 #: Colour and marker of each representation, in order of appearance; markers differ for prints without colour.
 STYLES = (
-    ("#b2182b", "o"),
-    ("#2166ac", "s"),
-    ("#c47a00", "D"),
-    ("#1b7837", "^"),
-    ("#762a83", "v"),
-    ("#4d4d4d", "P"),
+    ("#b2182b", "o"), ("#2166ac", "s"), ("#c47a00", "D"), ("#1b7837", "^"), ("#762a83", "v"), ("#4d4d4d", "P"),
     ("#12908e", "X"),
-)
+)  # fmt: skip
 
 #: Distances from an anchor to the nearest edge of its label that are tried, in points (1/72 inch).
 RADII = (6, 9, 12, 18, 26, 36, 48, 62, 80)
@@ -130,6 +125,12 @@ def image_panel(axes, image: np.ndarray, title: str = "", label: str = "") -> No
     axes.set_ylabel(label, fontsize=7.5)
     axes.set_xticks([])
     axes.set_yticks([])
+
+
+def crop_to(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of the smallest rectangle that holds a ``mask``, all of them if it is empty."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else (slice(None),) * 2
 
 
 def plain(value: float) -> str:

@@ -123,13 +123,19 @@ class Case:
     of_passes: bool = False
 
 
+def _current_variant() -> str:
+    import mitsuba as mi  # a declaration of a study does not need it
+
+    return mi.variant()
+
+
 @dataclass
 class Plan:
     """Plan of a measurement: candidates, cases, jobs, and the reports of a study.
 
     ``accuracy`` names the error of pictures and of the Pareto front; larger is better, as for a PSNR. ``ratios`` are
-    pairs of candidates whose times are divided. Partial results are continued only if ``details`` and the fingerprint
-    of ``sources`` (files beside those of this package) are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is.
+    pairs of candidates whose times are divided. Partial results are continued only if ``details`` and the files
+    of this package are unchanged, models of ``jobs`` if ``jobs_fingerprint`` is.
     ``panels``: quantities that the accuracy of all candidates is drawn against (``"bytes"``, ``"training_seconds"``);
     ``bytes_by_case``: also against bytes, for the candidates of each case. ``table(result)`` returns lines to print
     before the times, ``conclusions(result)`` lines after them. ``pictures`` maps further names to functions of the
@@ -138,14 +144,12 @@ class Plan:
 
     study: str
     title: str
-    variant: str
     candidates: list[Candidate]
     cases: list[Case]
     queries: tuple[str, ...]
     accuracy: str
     accuracy_label: str
     ratios: list[tuple[str, str]] = field(default_factory=list)
-    sources: tuple[str, ...] = ()
     details: dict = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     jobs: list[Job] = field(default_factory=list)
@@ -156,6 +160,7 @@ class Plan:
     sampled: bool = True
     table: Callable[[dict], list[str]] = lambda result: []
     conclusions: Callable[[dict], list[str]] = lambda result: []
+    variant: str = field(default_factory=_current_variant)
 
     def resolved(self, case: Case) -> Case:
         """Return ``case`` with the names of its candidates and queries."""

@@ -18,6 +18,7 @@ import numpy as np
 from .. import task
 from ..files import replacing
 from ..measure.study import Candidate, Job
+from ..runtime import array_module
 
 
 def add_without_option(parser: argparse.ArgumentParser) -> None:
@@ -41,6 +42,23 @@ def combinations(
     """Return the pairs ``(method, budget)`` to train; those in ``first_only`` are trained at the first budget only."""
     methods = [method for method in methods if method not in without]
     return [(m, budget) for budget in budgets for m in methods if budget == budgets[0] or m not in first_only]
+
+
+class StudyContext:
+    """Base class of what the contenders of a study share."""
+
+    @functools.cached_property
+    def types(self):
+        """The module of Dr.Jit types of the current variant."""
+        import mitsuba as mi
+
+        return array_module(mi.variant())
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays that :meth:`Contender.save_arrays` wrote."""
+    with np.load(path, allow_pickle=False) as data:
+        return dict(data)
 
 
 @dataclass
@@ -107,10 +125,7 @@ class Contender(Job):
 
 
 class PresetContender(Contender):
-    """A contender that a task trains by one of its presets, as ``mi-diffind fit`` does.
-
-    The context has ``types``, the module of Dr.Jit types.
-    """
+    """A contender that a task trains by one of its presets, as ``mi-diffind fit`` does."""
 
     #: Name of the task.
     task_name: ClassVar[str]

@@ -253,12 +253,8 @@ def astc_material(
             cache[key] = _encode(rounded[name], *options, quality)
         return cache[key]
 
-    choices = _choices(rounded, normals, settings, nbytes, size, error)
-    allowed = [[setting] for setting in settings] if uniform else [settings]
-    best = min((choice for group in allowed for choice in _front(choices, nbytes, group)), key=_error, default=None)
-    if best is None:
-        raise CodecError(f"ASTC cannot store {', '.join(maps)} in {nbytes:,} bytes")
-    result = {part[0]: encoded(*part) for part in best[2]}
+    groups = [[setting] for setting in settings] if uniform else [settings]
+    result = {part[0]: encoded(*part) for part in _least_error(rounded, normals, groups, nbytes, size, error)}
     return result, sum(e.nbytes for e in result.values())
 
 
@@ -306,12 +302,8 @@ def astc_levels(
         return _squared(rounded[name][0], read(name, 0, coded(name, drop, normal, block, choose), drop))
 
     finest = {name: levels[0] for name, levels in rounded.items()}
-    choices = _choices(finest, normals, list(itertools.product(ASTC_BLOCKS, dropped)), nbytes, size, error)
-    front = _front(choices, nbytes)
-    if not front:
-        raise CodecError(f"ASTC cannot store {', '.join(maps)} with mip maps in {nbytes:,} bytes")
-    result = {}
-    for name, normal, block, drop in min(front, key=_error)[2]:
+    groups, result = [list(itertools.product(ASTC_BLOCKS, dropped))], {}
+    for name, normal, block, drop in _least_error(finest, normals, groups, nbytes, size, error, " with mip maps"):
         stored = [coded(name, i, normal, block, quality) for i in range(drop, len(rounded[name]))]
         levels = [*(read(name, i, stored[0], drop) for i in range(drop)), *(e.image for e in stored)]
         codec = stored[0].codec + (f" from level {drop} on" if drop else "")
@@ -319,41 +311,31 @@ def astc_levels(
     return result, sum(e.nbytes for e in result.values())
 
 
-def _choices(
-    images: Mapping[str, np.ndarray],
-    normals: Collection[str],
-    settings: Iterable[tuple[str, int]],
-    nbytes: int,
-    size: Callable,
-    error: Callable,
-) -> dict[str, list[AstcChoice]]:
-    """Return, for each map, the choices at all ``settings`` that fit into ``nbytes`` alone."""
-    choices = {}
-    for name, image in images.items():
-        both = (False, True) if name in normals and image.shape[2] == 3 else (False,)
-        options = [(size(name, *setting), normal, setting) for normal in both for setting in settings]
-        choices[name] = [(n, error(name, w, *s), ((name, w, *s),)) for n, w, s in options if n <= nbytes]
-    return choices
+def _least_error(
+    images: Mapping[str, np.ndarray], normals: Collection[str], groups: Sequence[Sequence[tuple[str, int]]],
+    nbytes: int, size: Callable, error: Callable, extent: str = "",
+) -> tuple:  # fmt: skip
+    """Return the parts of the choice with the least error that fits; all maps have settings of one of the ``groups``.
 
-
-def _front(
-    choices: Mapping[str, list[AstcChoice]], nbytes: int, settings: Collection | None = None
-) -> list[AstcChoice]:
-    """Return the joint choices for all maps that no other choice beats in bytes and error; only of ``settings``."""
-    front: list[AstcChoice] = [(0, 0.0, ())]
-    for options in choices.values():
-        allowed = [choice for choice in options if settings is None or choice[2][0][2:] in settings]
-        joined = [(a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in itertools.product(front, allowed)]
-        front, least = [], math.inf
-        for choice in sorted((c for c in joined if c[0] <= nbytes), key=lambda c: c[:2]):
-            if choice[1] < least:
-                front.append(choice)
-                least = choice[1]
-    return front
-
-
-def _error(choice: AstcChoice) -> float:
-    return choice[1]
+    Raises :class:`CodecError` if none fits.
+    """
+    joint: list[AstcChoice] = []
+    for settings in groups:
+        front: list[AstcChoice] = [(0, 0.0, ())]  # choices that no other beats in bytes and error
+        for name, image in images.items():
+            both = (False, True) if name in normals and image.shape[2] == 3 else (False,)
+            options = [(size(name, *setting), normal, setting) for normal in both for setting in settings]
+            choices = [(n, error(name, w, *s), ((name, w, *s),)) for n, w, s in options if n <= nbytes]
+            joined = [(a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in itertools.product(front, choices)]
+            front, least = [], math.inf
+            for choice in sorted((c for c in joined if c[0] <= nbytes), key=lambda c: c[:2]):
+                if choice[1] < least:
+                    front.append(choice)
+                    least = choice[1]
+        joint += front
+    if not joint:
+        raise CodecError(f"ASTC cannot store {', '.join(images)}{extent} in {nbytes:,} bytes")
+    return min(joint, key=lambda choice: choice[1])[2]
 
 
 def _encode(image: np.ndarray, normal: bool, block: str, reduce: int, quality) -> Encoded:

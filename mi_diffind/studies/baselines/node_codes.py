@@ -50,6 +50,11 @@ class QuantisationSteps:
         return QuantisationSteps(low.astype(np.float32), step.astype(np.float32), np.full(len(low), levels))
 
     @staticmethod
+    def between(low: float, high: float) -> QuantisationSteps:
+        """Return 256 steps of one channel, the same for all values, from ``low`` to ``high``."""
+        return QuantisationSteps(np.float32([low]), np.float32([(high - low) / 255]), np.array([256]))
+
+    @staticmethod
     def of_width(values: np.ndarray, width: np.ndarray, most: int = 256) -> QuantisationSteps:
         """Return steps of a given ``width`` (C,), wider where ``values`` would need more than ``most`` steps."""
         low, high = (np.asarray(f(values, axis=0), np.float64) for f in (np.min, np.max))
@@ -101,12 +106,9 @@ class Neighbours:
         number[1:, 1:, 1:][stored] = np.arange(np.count_nonzero(stored))
         place = np.argwhere(stored)
         self.before = np.stack([number[tuple((place + 1 - np.eye(3, dtype=int)[axis]).T)] for axis in range(3)])
-        # Previous nodes have a lower sum of places
-        total = place.sum(axis=1)
-        order = np.argsort(total, kind="stable")
-        self.waves = np.split(order, np.flatnonzero(np.diff(total[order])) + 1)
 
-    def _predicted(self, codes: np.ndarray, prediction: str, nodes) -> np.ndarray:
+    def predicted(self, codes: np.ndarray, prediction: str, nodes) -> np.ndarray:
+        """Return the predicted codes of the ``nodes`` (numbers) from the codes of all nodes."""
         if prediction == "none":
             return np.zeros(len(nodes), np.int64)
         before = self.before[2:, nodes] if prediction == "before" else self.before[:, nodes]
@@ -120,18 +122,10 @@ class Neighbours:
         codes, attempts = codes.astype(np.int64), []
         everything = np.arange(len(codes))
         for prediction in PREDICTIONS:
-            rest = (codes - self._predicted(codes, prediction, everything)).astype(np.uint8).tobytes()
+            rest = (codes - self.predicted(codes, prediction, everything)).astype(np.uint8).tobytes()
             attempts.append((len(zlib.compress(rest, 6)), prediction, rest))
         _, prediction, rest = min(attempts)
         return deflated(rest), prediction
-
-    def unpacked(self, data: bytes, prediction: str) -> np.ndarray:
-        """Return the codes of :meth:`packed`, uint8 ``(n,)``."""
-        rest = np.frombuffer(zlib.decompress(data), np.uint8).astype(np.int64)
-        codes = np.zeros_like(rest)
-        for wave in self.waves:
-            codes[wave] = (rest[wave] + self._predicted(codes, prediction, wave)) & 255
-        return codes.astype(np.uint8)
 
 
 def coded_bytes(stored: np.ndarray, channels: np.ndarray, predict: bool = True) -> int:

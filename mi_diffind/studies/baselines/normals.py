@@ -3,7 +3,7 @@
 Each filter takes the maps of a material at every level of detail, uncompressed, and returns a reader, as in
 :mod:`mi_diffind.tasks.shading.evaluation`: ``(u, v, level, wi, wo) → Array3f`` of shaded values.
 
-- :func:`filtered`: filtered parameters with normals brought to length 1, as a mip map does;
+- ``reader``, that of the same module: filtered parameters with normals brought to length 1, as a mip map does;
 - :func:`toksvig`: roughness increased by the length of the mean normal (Toksvig, *Mipmapping Normal Maps*, 2005);
 - :func:`lean`: first and second moments of slopes, filtered linearly, make an anisotropic lobe (Olano and Baker, *LEAN
   Mapping*, 2010), a GGX one in place of their Beckmann's (Dupuy et al., *Linear Efficient Antialiased Displacement and
@@ -134,11 +134,6 @@ def means(base: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-def filtered(pyramid: Pyramid, effects: Effects) -> ShadedReader:
-    """Return the reader that shades filtered parameters."""
-    return reader(pyramid, effects)
-
-
 def toksvig_alpha2(alpha2, length):
     """Return α² of a GGX lobe whose normals have a mean of ``length`` (0, 1].
 
@@ -153,7 +148,7 @@ def toksvig_alpha2(alpha2, length):
 def toksvig(source: Source, pyramid: Pyramid, effects: Effects) -> ShadedReader:
     """Return the reader whose roughness is :func:`toksvig_alpha2` of the length of the mean normal."""
     if unit_normals(source) is None:
-        return filtered(pyramid, effects)
+        return reader(pyramid, effects)
     moments = _moments(lambda n, r: n, source, pyramid, False)
 
     def read(u, v, level, wi, wo):
@@ -188,7 +183,7 @@ def lean(source: Source, pyramid: Pyramid, effects: Effects, smooth: bool = Fals
     (:func:`interpolated`), as in the truth.
     """
     if unit_normals(source) is None:
-        return filtered(pyramid, effects)
+        return reader(pyramid, effects)
     moments = _moments(lambda n, r: np.concatenate([slope_moments(n, r), n], axis=-1), source, pyramid, smooth)
     rest = tuple(lobe for lobe in effects.lobes if lobe != "specular")
     Array3f = pyramid.types.Array3f

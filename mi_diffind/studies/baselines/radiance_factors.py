@@ -180,9 +180,8 @@ class PlanesFit:
         """Round numbers to 8 bits of their current range from now on."""
         self.steps = []
         for k in (0, 1):
-            low, high = (float(f(self._scaled(self.net, k).numpy())) for f in (np.min, np.max))
-            step = (high - low) / 255
-            self.steps.append(QuantisationSteps(np.float32([low]), np.float32([step]), np.array([256])))
+            values = self._scaled(self.net, k).numpy()
+            self.steps.append(QuantisationSteps.between(float(values.min()), float(values.max())))
 
     def field_of(self, net) -> PlanesField:
         """Return the field of the trained parameters, after :meth:`round` rounded as they are stored."""

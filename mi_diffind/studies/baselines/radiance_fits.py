@@ -193,7 +193,8 @@ class NodesFit:
         fixed = HEADER + sum(state[n].nbytes for n in state if n.endswith(("_low", "_step")) or n == "matrix")
         if rows is None:
             return fixed + coded_bytes(stored, np.concatenate([density, colour], axis=1), predict)
-        packed = min(len(deflated(bits_of(rows, len(colour)))), len(deflated(rows.astype("<u2").tobytes())))
+        bits = pack_bits(rows, max(1, (len(colour) - 1).bit_length()))
+        packed = min(len(deflated(bits.tobytes())), len(deflated(rows.astype("<u2").tobytes())))
         return fixed + coded_bytes(stored, density, predict) + packed + len(deflated(colour.tobytes()))
 
 
@@ -212,19 +213,13 @@ def nodes_of(types, state: dict) -> Nodes:
     return Nodes(types, state["lower"], float(state["spacing"]), state["shape"], state.get("stored"))
 
 
-def bits_of(numbers: np.ndarray, count: int) -> bytes:
-    """Return numbers below ``count``, packed in as few bits each as they need."""
-    return pack_bits(numbers, max(1, int(count - 1).bit_length())).tobytes()
-
-
-def density_steps() -> QuantisationSteps:
-    """Return the 256 steps of raw densities over :data:`.radiance.RAW`."""
-    return QuantisationSteps(np.float32([RAW[0]]), np.float32([(RAW[1] - RAW[0]) / 255]), np.array([256]))
+#: Steps of raw densities.
+DENSITY_STEPS = QuantisationSteps.between(*RAW)
 
 
 def plain(grid: WeightedGrid, levels: int = 256) -> NodesFit:
     """Return the fit of thirteen numbers a node, those of colour in ``levels`` uniform steps."""
-    steps = density_steps(), QuantisationSteps.over(grid.colour, levels, grid.seen + LEAST, 1e-3)
+    steps = DENSITY_STEPS, QuantisationSteps.over(grid.colour, levels, grid.seen + LEAST, 1e-3)
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), grid.colour, steps)
 
 
@@ -248,7 +243,7 @@ def components(grid: WeightedGrid, width: float, count: int = 12) -> NodesFit:
     values, vectors = np.linalg.eigh(np.cov(centred.T, aweights=seen))
     vectors = vectors[:, np.argsort(values)[::-1][:count]]
     values = centred @ vectors
-    steps = density_steps(), QuantisationSteps.of_width(values, np.full(count, width))
+    steps = DENSITY_STEPS, QuantisationSteps.of_width(values, np.full(count, width))
     matrix = np.concatenate([vectors.T / scale, mean[None]])
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), values, steps, matrix)
 
@@ -258,7 +253,7 @@ def codebook(grid: WeightedGrid, count: int) -> NodesFit:
     scale = display(grid)
     centres, rows = k_means((grid.colour * scale).astype(np.float32), grid.seen + LEAST, count)
     colour = centres / scale
-    steps = density_steps(), QuantisationSteps.over(colour)
+    steps = DENSITY_STEPS, QuantisationSteps.over(colour)
     return NodesFit(grid.nodes, np.clip(grid.density, *RAW), colour, steps, None, rows)
 
 

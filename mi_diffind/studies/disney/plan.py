@@ -24,17 +24,9 @@ from .conclusions import PAPER, conclusions
 
 #: Parameters of a material that uses every part of the model, and of one with the two lobes that most materials have.
 ALL_LOBES = {
-    "roughness": 0.43,
-    "anisotropic": 0.5,
-    "metallic": 0.3,
-    "specular": 0.6,
-    "spec_tint": 0.4,
-    "sheen": 0.5,
-    "sheen_tint": 0.6,
-    "flatness": 0.3,
-    "clearcoat": 0.7,
-    "clearcoat_gloss": 0.63,
-}
+    "roughness": 0.43, "anisotropic": 0.5, "metallic": 0.3, "specular": 0.6, "spec_tint": 0.4, "sheen": 0.5,
+    "sheen_tint": 0.6, "flatness": 0.3, "clearcoat": 0.7, "clearcoat_gloss": 0.63,
+}  # fmt: skip
 DIFFUSE_SPECULAR = {"roughness": 0.43, "specular": 0.6}
 BASE_COLOR = (0.8, 0.3, 0.2)
 
@@ -77,7 +69,6 @@ def plan(quick: bool = False) -> Plan:
     return Plan(
         study="disney",
         title="Disney BRDF: accuracy against time",
-        variant=mi.variant(),
         candidates=candidates,
         cases=cases,
         queries=QUERIES,

@@ -102,7 +102,6 @@ def plan(quick: bool = False, quick_steps: int = QUICK_STEPS) -> Plan:
     return Plan(
         study="ggx",
         title="GGX distribution of normals: accuracy against time and bytes",
-        variant=mi.variant(),
         candidates=builder.candidates,
         cases=cases,
         queries=("read",),

@@ -15,7 +15,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 
 import drjit as dr
@@ -26,10 +25,9 @@ from ... import metrics
 from ...maps.compressed import decibel
 from ...maps.source import Source
 from ...measure.study import FLOOR, Candidate, Case, Plan
-from ...runtime import array_module
 from ...tasks.image.presets import IMPROVEMENTS
 from ..baselines import codecs
-from ..equal_memory import Contender, PresetContender
+from ..equal_memory import Contender, PresetContender, StudyContext
 from ..maps import source_details
 from .conclusions import conclusions, table
 
@@ -57,16 +55,12 @@ class ImageStudySettings:
 
 
 @dataclass
-class ImageStudyContext:
-    """The source, the file ``name`` that it was read from, the settings, and the module of Dr.Jit ``types``."""
+class ImageStudyContext(StudyContext):
+    """The source, the file ``name`` that it was read from, and the settings."""
 
     source: Source
     name: str
     settings: ImageStudySettings
-
-    @cached_property
-    def types(self):
-        return array_module(mi.variant())
 
 
 def plan(source: Source, name: str, settings: ImageStudySettings) -> Plan:
@@ -98,7 +92,6 @@ def plan(source: Source, name: str, settings: ImageStudySettings) -> Plan:
     return Plan(
         study="image",
         title=f"Compressed image: {Path(name).stem}",
-        variant=mi.variant(),
         candidates=candidates,
         cases=cases,
         queries=("read",),

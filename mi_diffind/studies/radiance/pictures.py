@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from ...measure import plot
 from ...measure.curves import against_time, curves, finish
-from ...measure.formatting import machine_line, state
+from ...measure.formatting import figure_caption
 from ...tasks.radiance.training import displayed
 from ..equal_memory import candidates_by_budget
 from .conclusions import FOREGROUND, WHITE, ratio_text, references
@@ -24,11 +22,6 @@ STYLES = {
 }  # fmt: skip
 
 
-def of(context) -> dict[str, Callable[[dict], object]]:
-    """Return the figures of a plan by name: ``views``."""
-    return {"views": lambda result: views(context, result)}
-
-
 def views(context, result: dict):
     """Return the figure of a result.
 
@@ -39,14 +32,11 @@ def views(context, result: dict):
     first = result["details"]["first"]
     jobs = [job for job in context.jobs.values() if job.budget == first and job.method in STYLES]
     columns = max(4, len(jobs) + 1)
-    caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
     truth = context.session.held_out.images[0]
-    covered = truth[..., 3] > 0
-    rows, cols = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
-    crop = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)) if len(rows) else (slice(None),) * 2
-    reference = displayed(truth)
+    crop, reference = plot.crop_to(truth[..., 3] > 0), displayed(truth)
     tall = 1.6 * reference[crop].shape[0] / reference[crop].shape[1]
-    figure = plot.figure(f"{result['title']}, {ratio_text(first)} above", caption, 1.6 * columns, 2 * tall + 4.6)
+    title = f"{result['title']}, {ratio_text(first)} above"
+    figure = plot.figure(title, figure_caption(result), 1.6 * columns, 2 * tall + 4.6)
     grid = figure.add_gridspec(3, 2 * columns, height_ratios=[tall, tall, 3.8])
     for k, job in enumerate([None, *jobs]):
         axes = figure.add_subplot(grid[0, 2 * k : 2 * k + 2])
@@ -74,7 +64,9 @@ def views(context, result: dict):
         bar.ax.tick_params(labelsize=6)
     _curves(figure.add_subplot(grid[2, :columns]), result)
     axes = figure.add_subplot(grid[2, columns:])
-    labels = _against_time(axes, result)
+    timings = result["cases"].get("reads", {}).get("passes", {}).get("render", {})
+    x_label = f"ms a picture of {result['details']['request']['film']}², {ratio_text(first)}"
+    labels = against_time(axes, result, timings, STYLES, FOREGROUND, x_label, "PSNR of the foreground, dB")
     plot.fix_layout(figure)
     plot.place_labels(axes, labels, [label.at for label in labels])
     return figure
@@ -94,13 +86,3 @@ def _curves(axes, result: dict) -> None:
     axes.set_xlabel("megabytes: ours and dense grids in memory, the others on disk, deflated", fontsize=8)
     axes.legend(fontsize=7, frameon=False, loc="lower right")
     finish(axes, "PSNR of the foreground, dB")
-
-
-def _against_time(axes, result: dict) -> list[plot.Label]:
-    """Plot the PSNR of the foreground against the time of a picture at the first budget; return the labels."""
-    timings = result["cases"].get("reads", {}).get("passes", {}).get("render", {})
-    side = result["details"]["request"]["film"]
-    axis = f"ms a picture of {side}², {ratio_text(result['details']['first'])}"
-    labels = against_time(axes, result, timings, STYLES, FOREGROUND, axis)
-    finish(axes, "PSNR of the foreground, dB")
-    return labels

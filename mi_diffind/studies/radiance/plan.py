@@ -25,10 +25,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from ...files import replacing
 from ...fitting import FitSettings, fit
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
@@ -47,16 +45,10 @@ from .conclusions import conclusions, ratio_text, table
 
 #: Method → its label. Those of :data:`ONCE` are trained at the first budget only.
 KINDS = {
-    "dense": "dense grid, 8 bits",
-    "sparse": "sparse grid, 8 bits",
-    "sparse6": "sparse grid, 6-bit colours",
-    "components": "principal components",
-    "codebook": "codebook",
-    "planes": "planes and lines",
-    "hash": "hash grid + network",
-    "paper": "paper",
-    "ours": "ours",
-}
+    "dense": "dense grid, 8 bits", "sparse": "sparse grid, 8 bits", "sparse6": "sparse grid, 6-bit colours",
+    "components": "principal components", "codebook": "codebook", "planes": "planes and lines",
+    "hash": "hash grid + network", "paper": "paper", "ours": "ours",
+}  # fmt: skip
 ONCE = ("dense", "planes", "hash")
 
 #: Method → the group that it belongs to in pictures.
@@ -199,7 +191,6 @@ def plan(session: FieldSession, source: str, settings: RadianceStudySettings) ->
     return Plan(
         study="field",
         title=f"Radiance field: {Path(source).name}",
-        variant=mi.variant(),
         candidates=candidates,
         cases=cases,
         queries=("density",),
@@ -216,7 +207,7 @@ def plan(session: FieldSession, source: str, settings: RadianceStudySettings) ->
         ],
         jobs=list(jobs.values()),
         jobs_fingerprint=fingerprint(sources) + views.digest[:16],
-        pictures=pictures.of(context),
+        pictures={"views": functools.partial(pictures.views, context)},
         sampled=False,
         table=table,
         conclusions=conclusions,
@@ -291,16 +282,13 @@ class TrainedOnReference(GridReference):
         if fit(problem, settings, progress=progress, title=self.name).interrupted:
             return None
         grid = problem.trained()
-        if self.file:
-            with replacing(self.file) as temporary, open(temporary, "wb") as stream:
-                np.savez(stream, density=grid.density, colour=grid.colour)
+        self.save_arrays(density=grid.density, colour=grid.colour)
         self.model = grid.field()
         nbytes = 52 * grid.nodes.count
         return self.record(nbytes, nbytes, time.perf_counter() - start, steps=steps)
 
     def load(self, path: Path) -> VolumeField:
-        with np.load(path) as data:
-            return grids.NodeGrid(self.context.node_grid.nodes, data["density"], data["colour"]).field()
+        return grids.NodeGrid(self.context.node_grid.nodes, **equal_memory.load_arrays(path)).field()
 
 
 class BaselineContender(RadianceContender):
@@ -311,16 +299,13 @@ class BaselineContender(RadianceContender):
     def finish(self, trained_fit, seconds: float, **details) -> dict:
         """Store a trained fit, set the model and return the record."""
         state = trained_fit.state()
-        if self.file:
-            with replacing(self.file) as temporary, open(temporary, "wb") as stream:
-                np.savez_compressed(stream, **state)
+        self.save_arrays(**state)
         self.model = self.CLASS.field(self.context.types, state)
         details["deflated_bytes"] = self.CLASS.file_bytes(state, False)
         return self.record(self.model.nbytes, self.CLASS.file_bytes(state), seconds, **details)
 
     def load(self, path: Path) -> VolumeField:
-        with np.load(path) as data:
-            return self.CLASS.field(self.context.types, {name: data[name] for name in data})
+        return self.CLASS.field(self.context.types, equal_memory.load_arrays(path))
 
 
 class NodesContender(BaselineContender):

@@ -26,33 +26,20 @@ from .conclusions import size_text
 
 #: Method → its label. Methods in :data:`FIRST_ONLY` are trained at the first budget only.
 METHODS = {
-    "dense": "dense grid",
-    "dense-trained": "dense grid, trained",
-    "bricks8": "8³ bricks",
-    "bricks4": "4³ bricks",
-    "bricks4-shared": "4³ bricks, shared nodes",
-    "distances": "sparse distances",
-    "distances-trained": "sparse distances, trained",
-    "ours": "ours",
-    "indirection": "indirection",
-    "paper": "paper",
+    "dense": "dense grid", "dense-trained": "dense grid, trained", "bricks8": "8³ bricks", "bricks4": "4³ bricks",
+    "bricks4-shared": "4³ bricks, shared nodes", "distances": "sparse distances",
+    "distances-trained": "sparse distances, trained", "ours": "ours", "indirection": "indirection", "paper": "paper",
     "hash": "hash grid + network",
-}
+}  # fmt: skip
 FIRST_ONLY = ("indirection", "paper", "hash")
 
 #: Method → its label, for the ablation: ours, and ours with parts left out or changed.
 PARTS = {
-    "ours": "ours",
-    "bits6": "6 bits a pointer",
-    "bits8": "8 bits a pointer",
-    "bits16": "16 bits a pointer",
-    "untrained": "not trained",
-    "direct": "16 bits a node, no indirection",
-    "direct-untrained": "16 bits a node, not trained",
-    "distances-trained": "sparse distances, trained",
-    "paper": "paper",
-    "paper-constant": "paper, from a constant",
-}
+    "ours": "ours", "bits6": "6 bits a pointer", "bits8": "8 bits a pointer", "bits16": "16 bits a pointer",
+    "untrained": "not trained", "direct": "16 bits a node, no indirection",
+    "direct-untrained": "16 bits a node, not trained", "distances-trained": "sparse distances, trained",
+    "paper": "paper", "paper-constant": "paper, from a constant",
+}  # fmt: skip
 
 #: Method → group of methods, for pictures.
 FAMILIES = {

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...measure import plot
 from ...measure.curves import against_time, curves, finish
-from ...measure.formatting import machine_line, state
+from ...measure.formatting import figure_caption
 from ..equal_memory import candidates_by_budget
 from .conclusions import size_text
 from .contenders import DistanceContender, DistanceStudyContext
@@ -44,12 +44,11 @@ def shapes(context: DistanceStudyContext, jobs: dict[str, DistanceContender], vi
     methods = {job.method: job for job in jobs.values()}
     shown = [methods[m] for m in SHOWN if m in methods]
     columns = max(3, len(shown) + 1)
-    caption = f"{' '.join(result['notes'])} {machine_line(result)}{state(result)}"
-    figure = plot.figure(f"{result['title']}, {size_text(first)} above", caption, 2.6 * columns, 6.4)
+    title = f"{result['title']}, {size_text(first)} above"
+    figure = plot.figure(title, figure_caption(result), 2.6 * columns, 6.4)
     grid = figure.add_gridspec(2, 6 * columns, height_ratios=[1, 1.25])
     truth, hit = _mesh_normals(view)
-    rows, cols = np.flatnonzero(hit.any(axis=1)), np.flatnonzero(hit.any(axis=0))
-    crop = (slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)) if len(rows) else (slice(None),) * 2
+    crop = plot.crop_to(hit)
     for k, job in enumerate([None, *shown]):
         axes = figure.add_subplot(grid[0, 6 * k : 6 * k + 6])
         if job is None:
@@ -69,10 +68,15 @@ def shapes(context: DistanceStudyContext, jobs: dict[str, DistanceContender], vi
     for k, (key, label, missing) in enumerate(CURVES):
         _curves(figure.add_subplot(grid[1, third * k : third * (k + 1)]), result, key, label, missing)
     axes = figure.add_subplot(grid[1, 2 * third :])
-    labels = _against_time(axes, result)
+    timings = result["cases"].get("rays", {}).get("queries", {}).get("ray", {})
+    x_label = f"ns a primary ray, {size_text(first)}"
+    labels = against_time(axes, result, timings, STYLES, "normal_deg", x_label, "normals, mean error in degrees")
     figure.get_layout_engine().set(hspace=0.16)
     plot.fix_layout(figure)
-    _legend(figure, axes.get_position().y1)
+    handles, names = figure.axes[-3].get_legend_handles_labels()
+    place = (0.5, axes.get_position().y1 + 0.01)  # two lines above the curves
+    figure.legend(handles, names, loc="lower center", bbox_to_anchor=place, ncols=-(-len(names) // 2), fontsize=7.5,
+                  frameon=False)  # fmt: skip
     plot.place_labels(axes, labels, [label.at for label in labels])
     return figure
 
@@ -125,21 +129,3 @@ def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
     axes.xaxis.set_major_formatter(lambda value, _: size_text(round(value)))
     axes.set_xlabel("memory", fontsize=8)
     finish(axes, label)
-
-
-def _legend(figure, above: float) -> None:
-    """Name the methods, in two lines above the curves, whose upper end is at ``above``."""
-    handles, labels = figure.axes[-3].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="lower center", bbox_to_anchor=(0.5, above + 0.01), ncols=-(-len(labels) // 2),
-        fontsize=7.5, frameon=False,
-    )  # fmt: skip
-
-
-def _against_time(axes, result: dict) -> list[plot.Label]:
-    """Draw the error of normals against the time of a ray; the mesh and ``sdfgrid`` are vertical lines."""
-    timings = result["cases"].get("rays", {}).get("queries", {}).get("ray", {})
-    axis = f"ns a primary ray, {size_text(result['details']['first'])}"
-    labels = against_time(axes, result, timings, STYLES, "normal_deg", axis)
-    finish(axes, "normals, mean error in degrees")
-    return labels

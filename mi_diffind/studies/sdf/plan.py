@@ -103,7 +103,6 @@ def plan(mesh: Mesh, name: str, settings: DistanceStudySettings, before: dict[st
     return Plan(
         study="sdf",
         title=f"Signed distance field: {Path(name).stem}" + ", parts of ours" * settings.ablation,
-        variant=mi.variant(),
         candidates=candidates,
         cases=cases,
         queries=("value",),

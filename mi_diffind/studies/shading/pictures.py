@@ -23,18 +23,12 @@ LEVEL, CROP = 3, 48
 
 def pictures_of(contexts: dict) -> dict[str, Callable[[dict], object]]:
     """Return the figures of a plan by name, functions of the result."""
-    figures = {"png": figure_2, "levels": levels, "strip": crops, "zoom": zoom}
-    return {name: lambda result, draw=draw: draw(contexts, result) for name, draw in figures.items()}
-
-
-def figure_2(contexts: dict, result: dict):
-    """Draw, for each material, PSNR against C and P over λ for all remedies, with bars over seeds."""
-    return _grid(result, "", 3.5, _draw_lambdas)
-
-
-def levels(contexts: dict, result: dict):
-    """Draw PSNR by level of detail of λ = 0, the best λ and classical filters."""
-    return _grid(result, ": levels of detail", 3.3, _draw_levels)
+    return {
+        "png": lambda result: _grid(result, "", 3.5, _draw_lambdas),
+        "levels": lambda result: _grid(result, ": levels of detail", 3.3, _draw_levels),
+        "strip": lambda result: crops(contexts, result),
+        "zoom": lambda result: zoom(contexts, result),
+    }
 
 
 def _grid(result: dict, title: str, height: float, draw: Callable):
@@ -53,6 +47,7 @@ def _grid(result: dict, title: str, height: float, draw: Callable):
 
 
 def _draw_lambdas(axes, material: MaterialCurves, letter: str) -> None:
+    """Draw PSNR over λ for all remedies, with bars over seeds."""
     shares = sorted({s for _, s in material.runs})
     position = {s: i for i, s in enumerate(shares)}
     for i, remedy in enumerate(material.remedies):
@@ -79,6 +74,7 @@ def _draw_lambdas(axes, material: MaterialCurves, letter: str) -> None:
 
 
 def _draw_levels(axes, material: MaterialCurves, letter: str) -> None:
+    """Draw PSNR by level of detail of λ = 0, the best λ and classical filters."""
     for i, (label, style) in enumerate(CLASSICAL.items()):
         if label in material.classical:
             axes.plot(material.classical[label][letter]["psnr_db"], linestyle=style, color=f"{0.12 * i}", linewidth=1.0,

@@ -29,7 +29,6 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 
 from ... import task
@@ -39,7 +38,6 @@ from ...maps.pyramid import Pyramid
 from ...maps.source import Source, SourceError, load_source
 from ...measure.store import file_name
 from ...measure.study import Candidate, Plan
-from ...runtime import array_module
 from ...settings import FitSettings, FittingError
 from ...tables import Table, save_table
 from ...tasks.shading import presets
@@ -51,7 +49,7 @@ from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
 from ...tasks.texture.fit import size_of
 from ..baselines import normals
-from ..equal_memory import Contender
+from ..equal_memory import Contender, StudyContext, load_arrays
 from . import pictures
 from .conclusions import conclusions, table
 from .materials import MATERIALS, generated_source
@@ -132,17 +130,13 @@ class CachedEvaluation(ShadedEvaluation):
 
 
 @dataclass
-class ShadingStudyContext:
+class ShadingStudyContext(StudyContext):
     """A material, the data that its contenders share, and their jobs by name."""
 
     name: str
     source: Source
     settings: ShadingStudySettings
     jobs: dict[str, ShadingContender] = field(default_factory=dict)
-
-    @cached_property
-    def types(self):
-        return array_module(mi.variant())
 
     @cached_property
     def recipe(self):
@@ -365,7 +359,6 @@ def plan(sources: dict[str, Source], settings: ShadingStudySettings) -> Plan:
     return Plan(
         study="shading",
         title="Textures trained for their shading",
-        variant=mi.variant(),
         candidates=candidates,
         cases=[],
         queries=(),
@@ -399,8 +392,7 @@ def _jobs(context: ShadingStudyContext) -> list[ShadingContender]:
             levels = bake(None)
             with replacing(file) as temporary, open(temporary, "wb") as stream:
                 np.savez(stream, *levels)
-        with np.load(file, allow_pickle=False) as data:
-            return [data[f"arr_{i}"] for i in range(len(data.files))]
+        return list(load_arrays(file).values())
 
     def biased(build: Callable[[Path | None], ShadedReader]) -> Callable[[Path | None], ShadedReader]:
         """Return the filter read at the levels of detail with the smallest error."""
@@ -412,21 +404,17 @@ def _jobs(context: ShadingStudyContext) -> list[ShadingContender]:
         return build_biased
 
     def filtered(folder: Path | None) -> ShadedReader:
-        return normals.filtered(context.pyramid, context.effects)
-
-    def toksvig(folder: Path | None) -> ShadedReader:
-        return normals.toksvig(source, context.pyramid, context.effects)
-
-    def lean(folder: Path | None, smooth: bool = False) -> ShadedReader:
-        return normals.lean(source, context.pyramid, context.effects, smooth)
+        return normals.reader(context.pyramid, context.effects)
 
     def baked(folder: Path | None) -> ShadedReader:
         return normals.roughness_reader(context.pyramid, context.effects, bake(folder))
 
     classical = [
-        ("filtered", filtered, 0), ("kernel", biased(filtered), 0), ("Toksvig", toksvig, 0), ("LEAN", lean, 6),
-        ("LEAN, kernel", biased(lambda folder: lean(folder, True)), 6), ("baked", baked, 0),
-        *([] if settings.quick else [("baked, kernel", biased(baked), 0)]),
+        ("filtered", filtered, 0), ("kernel", biased(filtered), 0),
+        ("Toksvig", lambda folder: normals.toksvig(source, context.pyramid, context.effects), 0),
+        ("LEAN", lambda folder: normals.lean(source, context.pyramid, context.effects), 6),
+        ("LEAN, kernel", biased(lambda folder: normals.lean(source, context.pyramid, context.effects, True)), 6),
+        ("baked", baked, 0), *([] if settings.quick else [("baked, kernel", biased(baked), 0)]),
     ]  # fmt: skip
     roughness = {"Toksvig, compressed": lambda folder: normals.toksvig_levels(source, context.pyramid)}
     if not settings.quick:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -17,12 +17,6 @@ def shown(candidates: Iterable) -> list[str]:
     first = [next((n for n in names if n.startswith(s) and n.endswith("anisotropic, centred")), "")
              for s in ("mipmap", "ours", "ASTC")]  # fmt: skip
     return [n for n in ("bitmap, 1 spp", "bitmap, 64 spp", *first) if n in names]
-
-
-def pictures_of(context, readers: dict[str, Callable]) -> dict[str, Callable[[dict], object]]:
-    """Return the figures of a plan by name, functions of the result."""
-    figures = {"crops": crops, "zoom": zoom, "levels": levels}
-    return {name: lambda result, draw=draw: draw(context, readers, result) for name, draw in figures.items()}
 
 
 def crops(context, readers: dict, result: dict):
@@ -105,3 +99,7 @@ def _busiest(image: np.ndarray, side: int) -> tuple[int, int]:
     parts = (image[top : top + side, left : left + side] for top, left in places)
     variances = [np.nan_to_num(part.var(axis=(0, 1)).sum(), nan=-1) for part in parts]
     return places[int(np.argmax(variances))] if places else (0, 0)
+
+
+#: Name → figure of a plan: a function of the context, of readers by name, and of the result.
+FIGURES = {"crops": crops, "zoom": zoom, "levels": levels}

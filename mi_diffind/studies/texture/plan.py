@@ -32,11 +32,10 @@ from ...maps.source import Source
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Job, Plan
 from ...plugins.support.image_files import PYRAMIDS
-from ...runtime import array_module
 from ...scenes import footprint
 from ...tables import Table
 from ..baselines import codecs
-from ..equal_memory import Contender, PresetContender
+from ..equal_memory import Contender, PresetContender, StudyContext, load_arrays
 from ..maps import source_details
 from . import levels, pictures, test_scenes
 from .conclusions import BASE, conclusions, table
@@ -142,10 +141,10 @@ def plan(
         "PSNR of displayed values. Bytes are those of all maps, with mip maps but for bitmaps."
     )
     digests, candidates, readers = [fingerprint([t.path]) for t in tables], builder.candidates, builder.readers
+    shown = {name: readers[name] for name in pictures.shown(candidates)}
     return Plan(
         study="texture",
         title=f"Filtered texture: {Path(name).stem}",
-        variant=mi.variant(),
         candidates=candidates,
         cases=[_case(context, scene, candidates, readers) for scene in context.scenes.values()],
         queries=("read",),
@@ -162,7 +161,7 @@ def plan(
         notes=[note, *codecs.install_notes(["astc"])],
         jobs=builder.jobs,
         jobs_fingerprint=f"{source.digest} {asdict(settings)} {digests}",
-        pictures=pictures.pictures_of(context, {n: readers[n] for n in pictures.shown(candidates)}),
+        pictures={name: functools.partial(draw, context, shown) for name, draw in pictures.FIGURES.items()},
         sampled=False,
         table=table,
         conclusions=conclusions,
@@ -170,7 +169,7 @@ def plan(
 
 
 @dataclass
-class TextureStudyContext:
+class TextureStudyContext(StudyContext):
     """The source, read from the file ``name``, the scenes of the stills, and their truths, which jobs render."""
 
     source: Source
@@ -178,10 +177,6 @@ class TextureStudyContext:
     settings: TextureStudySettings
     scenes: dict[str, TextureScene]
     truths: dict[str, TextureTruth] = field(default_factory=dict)
-
-    @cached_property
-    def types(self):
-        return array_module(mi.variant())
 
     @cached_property
     def zoom(self) -> TextureZoom:
@@ -259,8 +254,7 @@ class TextureTruth(Contender):
         return {"seconds": time.perf_counter() - start}
 
     def load(self, path: Path) -> np.ndarray:
-        with np.load(path, allow_pickle=False) as arrays:
-            return arrays["truth"]
+        return load_arrays(path)["truth"]
 
 
 @dataclass
@@ -340,9 +334,8 @@ class EncodedTexture(TextureContender):
         return self.level_record(nbytes, None, self.model, how=names, encoding_seconds=time.perf_counter() - start)
 
     def load(self, path: Path) -> dict[str, list[np.ndarray]]:
-        pyramid = self.context.pyramid
-        with np.load(path, allow_pickle=False) as arrays:
-            return {n: [arrays[f"{n}_{i}"] for i in range(pyramid.levels)] for n in pyramid.layout.names}
+        pyramid, arrays = self.context.pyramid, load_arrays(path)
+        return {n: [arrays[f"{n}_{i}"] for i in range(pyramid.levels)] for n in pyramid.layout.names}
 
     def reader(self, filter_name: str, centred: bool) -> TextureReader:
         context = self.context
@@ -381,14 +374,11 @@ class TextureCandidates:
         context = self.context
         spp = {**dict.fromkeys(context.scenes, context.settings.truth_spp), "zoom": ZOOM_SPP}
         for name, samples in spp.items():
-            context.truths[name] = TextureTruth("truth", samples, context, f"truth, {name}", render=self._truth(name))
+            render = functools.partial(context.render, scene=context.scenes.get(name), seed=_TRUTH_SEED)
+            if name == "zoom":
+                render = lambda reader: context.zoom.render(reader, _TRUTH_SEED >> 12)  # noqa: E731
+            context.truths[name] = TextureTruth("truth", samples, context, f"truth, {name}", render=render)
         self.jobs += context.truths.values()
-
-    def _truth(self, name: str) -> Callable[[TextureReader], np.ndarray]:
-        context = self.context
-        if name == "zoom":
-            return lambda reader: context.zoom.render(reader, _TRUTH_SEED >> 12)
-        return lambda reader: context.render(reader, context.scenes[name], _TRUTH_SEED)
 
     def add_references(self) -> None:
         """Register bitmaps and the uncompressed pyramid."""

@@ -118,10 +118,7 @@ class TextureScene:
 
 def _plane(half: float) -> dict:
     """Return a horizontal square, ``2 half`` wide."""
-    return {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale([half, half, 1]),
-    }
+    return {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale([half, half, 1])}
 
 
 def still_scenes() -> dict[str, TextureScene]:

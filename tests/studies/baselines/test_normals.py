@@ -62,7 +62,7 @@ def test_flat_normals_change_nothing(types, rng):
     source = material(np.zeros((SIDE, SIDE, 2)))
     pyramid, effects = prepared(source, types)
     place = lanes(types, rng.random(200), rng.random(200), 5 * rng.random(200))
-    expected = values(normals.filtered(pyramid, effects)(*place))
+    expected = values(normals.reader(pyramid, effects)(*place))
     for make in (normals.toksvig, normals.lean):
         np.testing.assert_allclose(values(make(source, pyramid, effects)(*place)), expected, rtol=1e-3, atol=1e-5)
 
@@ -73,11 +73,11 @@ def test_level_0_is_the_material(types, rng):
     pyramid, effects = prepared(source, types)
     centres = [(rng.integers(0, SIDE, 200) + 0.5) / SIDE for _ in range(2)]
     place = lanes(types, *centres, 0)
-    expected = values(normals.filtered(pyramid, effects)(*place))
+    expected = values(normals.reader(pyramid, effects)(*place))
     for make in (normals.toksvig, normals.lean):
         np.testing.assert_allclose(values(make(source, pyramid, effects)(*place)), expected, rtol=3e-3, atol=1e-4)
     coarse = lanes(types, *centres, 3)
-    expected = values(normals.filtered(pyramid, effects)(*coarse))
+    expected = values(normals.reader(pyramid, effects)(*coarse))
     for make in (normals.toksvig, normals.lean):
         assert np.abs(values(make(source, pyramid, effects)(*coarse)) - expected).mean() > 0.005
 
@@ -178,7 +178,7 @@ def test_lean_is_the_mean_of_what_it_filters(types, rng, sigmas):
         expected.append(np.pi * np.mean(disney_formulas.brdf(np.ones_like(n), m, *local)[:, 0] * local[1][:, 2]))
     place = lanes(types, np.full(len(wo), 0.5), 0.5, 7, wi, wo)
     found = values(normals.lean(source, pyramid, effects)(*place))[:, 0]
-    plain = values(normals.filtered(pyramid, effects)(*place))[:, 0]
+    plain = values(normals.reader(pyramid, effects)(*place))[:, 0]
     error, without = (np.abs(x - expected).mean() / np.mean(expected) for x in (found, plain))
     print(f"LEAN errs by {error:.3f}, filtered parameters by {without:.3f}")
     assert error < 0.1 and error < 0.5 * without
@@ -219,7 +219,7 @@ def test_biases(types, rng):
     pyramid, effects = prepared(source, types)
     place, finer = (lanes(types, rng.random(50), rng.random(50), level) for level in (2, 1.5))
     finer = (*place[:2], finer[2], *place[3:])
-    plain = normals.filtered(pyramid, effects)
+    plain = normals.reader(pyramid, effects)
     np.testing.assert_array_equal(values(normals.biased(plain, [0] * 5)(*place)), values(plain(*place)))
     biased = normals.biased(plain, [0, 0, -0.5, 0, 0])
     np.testing.assert_allclose(values(biased(*place)), values(plain(*finer)), atol=1e-5)
@@ -232,7 +232,7 @@ def test_a_bias_that_is_known_is_found(types, rng):
     """A reader that is a quarter of a level off, of a surface on which each level looks different."""
     source = material(rng.normal(0, 0.02, (32, 32, 2)))
     pyramid, effects = prepared(source, types)
-    plain = normals.filtered(pyramid, effects)
+    plain = normals.reader(pyramid, effects)
     own = normals.choose_biases(plain, pyramid, effects, 2**10)
     shifted = normals.choose_biases(
         lambda u, v, level, wi, wo: plain(u, v, level + 0.25, wi, wo), pyramid, effects, 2**10
@@ -268,5 +268,5 @@ def test_mean_cosine(types, rng):
     n = normals.unit_normals(source)
     place = lanes(types, [0.5], 0.5, 6, [0, 0, 1], [0, 0, 1])
     lean, plain = (values(make)[0] for make in (normals.lean(source, pyramid, effects)(*place),
-                                                normals.filtered(pyramid, effects)(*place)))  # fmt: skip
+                                                normals.reader(pyramid, effects)(*place)))  # fmt: skip
     assert lean / plain == pytest.approx(n[..., 2].mean(), rel=0.02) and n[..., 2].mean() < 0.94
