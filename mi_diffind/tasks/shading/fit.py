@@ -10,6 +10,7 @@ from ...errors import UsageError
 from ...maps.arguments import preview_path, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
+from ...tables import Table
 from ...task import FitRequest, Fitted
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
@@ -61,9 +62,7 @@ def fit(request: FitRequest) -> Fitted:
     if not pyramid.layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
     if options["start"] is not None:
-        start, result = TEXTURE.load(options["start"]), None
-        if start.settings.get("source", source.digest) != source.digest:
-            raise UsageError(f"{options['start']}: was made from another source than {options['source']}")
+        start, result = started(options["start"], source, request), None
     else:
         start, result = pretrained(source, pyramid, recipe, request)
     if result is None or not result.interrupted:
@@ -99,6 +98,14 @@ def fit(request: FitRequest) -> Fitted:
         "bits": {name: a.bits for name, a in table.arrays.items()},
     }
     return Fitted(table, result, lines, figures)
+
+
+def started(path, source, request: FitRequest) -> Table:
+    """Return the texture to start from. Raises :class:`UsageError` for a texture of another source."""
+    table = TEXTURE.load(path)
+    if table.settings.get("source", source.digest) != source.digest:
+        raise UsageError(f"{path}: was made from another source than {request.options['source']}")
+    return table
 
 
 def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequest) -> tuple:
