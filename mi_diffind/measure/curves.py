@@ -46,14 +46,14 @@ def against_time(
         low, high = axes.get_xlim()
         axes.set_xlim(low / 1.5, high * 1.5)
         plot.log_ticks(axes.xaxis, low / 1.5, high * 1.5, plot.plain)
-    axes.set_xlabel(x_label, fontsize=8)
-    finish(axes, y_label)
+    finish(axes, x_label, y_label)
     return labels
 
 
-def finish(axes, label: str) -> None:
-    """Label the vertical axis and add a light grid."""
-    axes.set_ylabel(label, fontsize=8)
+def finish(axes, x_label: str, y_label: str) -> None:
+    """Label both axes and add a light grid."""
+    axes.set_xlabel(x_label, fontsize=8)
+    axes.set_ylabel(y_label, fontsize=8)
     axes.tick_params(labelsize=7)
     axes.minorticks_off()
     axes.grid(color="0.92", linewidth=0.5)

@@ -130,10 +130,8 @@ class PresetContender(Contender):
     #: Name of the task.
     task_name: ClassVar[str]
 
-    @property
-    def preset(self) -> str:
-        """The task's preset; "" is its default."""
-        raise NotImplementedError
+    #: The task's preset; "" is its default.
+    preset: str = ""
 
     def arguments(self) -> dict:
         """Return the training settings and the task's own arguments, those of :func:`mi_diffind.task.fit`."""

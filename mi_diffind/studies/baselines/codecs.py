@@ -204,7 +204,11 @@ def at_bytes(codec: str, image: np.ndarray, nbytes: int) -> Encoded:
         return bc7(image) if codec == "bc7" else bicubic(image, nbytes)
     encode = {"jpeg": jpeg, "webp": webp}[codec]
     _, qualities, tries = _FILES[codec]
-    results = [_highest_quality(lambda q, o=o: encode(image, q, **o), qualities, nbytes) for o in tries]
+    results = []
+    for options in tries:
+        coded = functools.cache(functools.partial(encode, image, **options))
+        last = qualities[-1] + 1
+        results.append(coded(largest_fitting(lambda q, coded=coded: coded(q).nbytes <= nbytes, qualities[0], last)))
     fitting = [e for e in results if e.nbytes <= nbytes] or [min(results, key=lambda e: e.nbytes)]
     reference = _texels(image) / np.float32(255)
     return min(fitting, key=lambda e: _squared(reference, e.image))
@@ -344,12 +348,6 @@ def _encode(image: np.ndarray, normal: bool, block: str, reduce: int, quality) -
         return astc(image, block, quality, normal, reduce)
     coded = astc(image[..., :1], block, quality, False, reduce)
     return replace(coded, image=np.repeat(coded.image, 3, -1))
-
-
-def _highest_quality(encode: Callable[[int], Encoded], qualities: range, nbytes: int) -> Encoded:
-    """Encode at the highest quality that takes at most ``nbytes``, else at the lowest."""
-    coded = functools.cache(encode)
-    return coded(largest_fitting(lambda quality: coded(quality).nbytes <= nbytes, qualities[0], qualities[-1] + 1))
 
 
 def _files(codec: str, image: np.ndarray, quality: int, **options) -> Encoded:

@@ -89,12 +89,12 @@ def halved(net: Network) -> None:
 class HashProblem(Problem):
     """Training of a :class:`Network` on a ``pool`` of points with distances, measured on another (:func:`pool`)."""
 
-    def __init__(self, net: Network, types, mesh: Mesh, pool: tuple, held: tuple, seed: int = 1):
-        self.net, self.types = net.alloc(types.TensorXf, 3, dr.rng(seed=seed)), types
+    def __init__(self, net: Network, types, mesh: Mesh, pool: tuple, held: tuple):
+        self.net, self.types = net.alloc(types.TensorXf, 3, dr.rng(seed=1)), types
         self.field = HashDistanceField(types, self.net, mesh)
         self.pool, self.held = self._arrays(*pool), self._arrays(*held)
         self.count = len(pool[1])
-        self.identity = {"mesh": mesh.digest, "count": self.count, "seed": seed}
+        self.identity = {"mesh": mesh.digest, "count": self.count, "seed": 1}
 
     def _arrays(self, points: np.ndarray, distances: np.ndarray):
         points = [self.types.Float(np.ascontiguousarray(x)) for x in points.T]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import drjit as dr
 from drjit import nn
 
@@ -28,8 +30,7 @@ class Network(nn.Module):
         self.is_cooperative = False
 
     def _alloc(self, dtype, size=-1, rng=None):
-        result = Network(self.inputs, self.width, self.layers, self.grid, self.table_size)
-        size = self.inputs
+        result, size = copy.copy(self), self.inputs
         if self.grid:
             Float = module_of(dtype).Float
             result.encoding = nn.HashGridEncoding(Float, self.inputs, rng=rng, **self.grid)
@@ -61,9 +62,7 @@ class Network(nn.Module):
 
     def cooperative(self) -> Network:
         """Return a copy in cooperative vectors, for inference only."""
-        result = Network(self.inputs, self.width, self.layers, self.grid, self.table_size)
-        for name in ("entries", "table", "encoding"):
-            setattr(result, name, getattr(self, name))
+        result = copy.copy(self)
         result.mlp, result.is_cooperative = nn.pack(self.mlp, layout="inference"), True
         return result
 

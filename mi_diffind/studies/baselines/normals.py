@@ -155,14 +155,11 @@ def toksvig(source: Source, pyramid: Pyramid, effects: Effects) -> ShadedReader:
         surface = surface_of(pyramid, pyramid.filtered(u, v, level))
         mean = pyramid.types.Array3f(moments.filtered(u, v, level))
         length = clamp(dr.norm(mean), 1e-3, 1.0)
-        alpha2 = toksvig_alpha2(_alpha2(surface.roughness, type(u)), length)
+        alpha = dr.maximum(dr.square(type(u)(surface.roughness)), ALPHA_MIN)
+        alpha2 = toksvig_alpha2(dr.square(alpha), length)
         return shaded(None, replace(surface, roughness=dr.sqrt(dr.sqrt(alpha2))), wi, wo, effects)
 
     return read
-
-
-def _alpha2(roughness, Float):
-    return dr.square(dr.maximum(dr.square(Float(roughness)), ALPHA_MIN))
 
 
 def _moments(function: Callable, source: Source, pyramid: Pyramid, smooth: bool) -> Pyramid:
@@ -292,7 +289,8 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndar
             n, m = dr.opaque(UInt32, columns), dr.opaque(UInt32, rows)
             u, v = (Float(index % n) + 0.5) / Float(n), (Float(index // n) + 0.5) / Float(m)
             detail = dr.opaque(Float, level, count)
-            texel, trial = _outer(UInt32, count, tried)
+            pair, n = dr.arange(UInt32, count * tried), dr.opaque(UInt32, tried)
+            texel, trial = pair // n, pair - pair // n * n
             surface = surface_of(pyramid, pyramid.filtered(*(dr.gather(Float, x, texel) for x in (u, v, detail))))
             roughness = dr.lerp(Float(surface.roughness), 1, dr.gather(Float, shares, trial))
             surface = replace(surface, roughness=roughness)
@@ -317,12 +315,6 @@ def _side(level: int) -> int:
     With one, all samples might lie at centres of texels, or all at corners, where normals vary less.
     """
     return min(max(8, 2 << level), 128)
-
-
-def _outer(UInt32, count: int, tried: int) -> tuple:
-    """Return, for ``count × tried`` lanes, the index of each lane in the first and in the second range."""
-    lane, n = dr.arange(UInt32, count * tried), dr.opaque(UInt32, tried)
-    return lane // n, lane - lane // n * n
 
 
 def _wide(count: int, *directions) -> list:

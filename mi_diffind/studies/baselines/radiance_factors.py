@@ -88,7 +88,9 @@ class PlanesField(OccupancyField):
     def __init__(self, nodes: Nodes, shape, arrays: dict, ranks, occupancy: Occupancy, steps=None):
         super().__init__(nodes, arrays, occupancy)
         self.shape, self.ranks, self.steps = tuple(shape), tuple(ranks), steps
-        self.starts = starts_of(self.shape)
+        # The first row of each plane and line
+        sizes = [shape[a] * shape[b] for (a, b), _ in PLANES] + [shape[c] for _, c in PLANES]
+        self.starts = [0, *np.cumsum(sizes).tolist()][:6]
 
     def _cell(self, p):
         cell = []
@@ -132,12 +134,6 @@ class PlanesField(OccupancyField):
     def radiance_at(self, point_data, p, d, active=True):
         products = itertools.chain.from_iterable(self._products(1, self._cell(p), active))
         return colour_of(transformed(self.types, self.arrays["matrix"].array, products, active), d)
-
-
-def starts_of(shape) -> list[int]:
-    """Return the first row of each plane and line."""
-    sizes = [shape[a] * shape[b] for (a, b), _ in PLANES] + [shape[c] for _, c in PLANES]
-    return [0, *np.cumsum(sizes).tolist()][:6]
 
 
 def sides_of(nodes: Nodes, spacing: float) -> list[int]:

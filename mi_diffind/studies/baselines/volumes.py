@@ -87,10 +87,17 @@ def structure_arrays(structure: Structure) -> dict:
     return {f"structure_{f.name}": getattr(structure, f.name) for f in dataclasses.fields(structure)}
 
 
-def save(path: Path | str, field: DistanceField) -> None:
-    """Write a field's ``state``, the arguments of its class without ``types``; :func:`load` reads it."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(_compressed(field))
+def save(path: Path | str | None, field: DistanceField) -> int:
+    """Write a field's ``state``, the arguments of its class without ``types``, unless ``path`` is ``None``.
+
+    :func:`load` reads the file. Returns its size; the arrays are compressed (zlib).
+    """
+    file = io.BytesIO()
+    np.savez_compressed(file, class_name=type(field).__name__, **field.state)
+    if path:
+        with replacing(path) as temporary:
+            temporary.write_bytes(file.getvalue())
+    return len(file.getvalue())
 
 
 def load(path: Path | str, types, *more: type[DistanceField]) -> DistanceField:
@@ -103,17 +110,6 @@ def load(path: Path | str, types, *more: type[DistanceField]) -> DistanceField:
         parts = {name.removeprefix("structure_"): v for name, v in parts.items()}
         state["structure"] = Structure(**{**parts, "lower": tuple(parts["lower"].tolist())})
     return field_class(types, **state)
-
-
-def file_bytes(field: DistanceField) -> int:
-    """Return the size of a field's file, whose arrays are compressed (zlib)."""
-    return len(_compressed(field))
-
-
-def _compressed(field: DistanceField) -> bytes:
-    file = io.BytesIO()
-    np.savez_compressed(file, class_name=type(field).__name__, **field.state)
-    return file.getvalue()
 
 
 def fit_bytes(make: Callable[[float], DistanceField], nbytes: int) -> DistanceField:

@@ -100,11 +100,8 @@ def _candidates(quick: bool) -> tuple[list[Candidate], dict]:
 
     def errors(decoder):
         def measure_errors(samples: int) -> dict[str, float]:
-            values = {}
-            for distribution in ("training", "uniform"):
-                m = measure(decoder, types, samples, distribution)
-                values |= {f"psnr_db_{distribution}": m["psnr_db"], f"mae_{distribution}": m["mae"]}
-            return values
+            measured = {d: measure(decoder, types, samples, d) for d in ("training", "uniform")}
+            return {f"{error}_{d}": m[error] for d, m in measured.items() for error in ("psnr_db", "mae")}
 
         return measure_errors
 

@@ -83,6 +83,6 @@ def _curves(axes, result: dict) -> None:
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     plot.log_ticks(axes.xaxis, low, high, plot.plain)
-    axes.set_xlabel("megabytes: ours and dense grids in memory, the others on disk, deflated", fontsize=8)
     axes.legend(fontsize=7, frameon=False, loc="lower right")
-    finish(axes, "PSNR of the foreground, dB")
+    x_label = "megabytes: ours and dense grids in memory, the others on disk, deflated"
+    finish(axes, x_label, "PSNR of the foreground, dB")

@@ -34,17 +34,14 @@ def draw(result: dict, caption: str):
     axes = figure.add_subplot()
     axes.set_xlabel("seconds of a render (kernels)", fontsize=9)
     axes.set_ylabel("relative RMS error", fontsize=9)
-    curves = {name: _curve(result, name) for name in VERSIONS}
+    points = [p for p in result["points"] if p["timed"] and p["rmse"] > 0]
+    curves = {name: [p for p in points if p["version"] == name] for name in VERSIONS}
     _limits(axes, result, curves)
     labels = _draw(axes, result, curves)
     _legend(axes, curves)
     plot.fix_layout(figure)
     plot.place_labels(axes, labels, [(p["seconds"], p["rmse"]) for curve in curves.values() for p in curve])
     return figure
-
-
-def _curve(result: dict, name: str) -> list[dict]:
-    return [p for p in result["points"] if p["version"] == name and p["timed"] and p["rmse"] > 0]
 
 
 def _floor(result: dict) -> float:

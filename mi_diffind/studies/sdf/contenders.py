@@ -190,9 +190,7 @@ class VolumeContender(DistanceContender):
 
     def run(self, folder: Path | None, progress: bool) -> dict:
         model, seconds = self.build()
-        if self.file:
-            volumes.save(self.file, model)
-        return self.record(model, model.nbytes, seconds, volumes.file_bytes(model))
+        return self.record(model, model.nbytes, seconds, volumes.save(self.file, model))
 
     def load(self, path: Path) -> DistanceField:
         return volumes.load(path, self.context.types)

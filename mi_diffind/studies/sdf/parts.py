@@ -70,10 +70,8 @@ class DirectContender(DistanceContender):
                 return None
         coding.encode(problem.values())
         model = coding.field(types)
-        if self.file:
-            volumes.save(self.file, model)
-        seconds = time.perf_counter() - start
-        return self.record(model, model.nbytes, seconds, volumes.file_bytes(model), steps=result.steps)
+        file_bytes = volumes.save(self.file, model)
+        return self.record(model, model.nbytes, time.perf_counter() - start, file_bytes, steps=result.steps)
 
     def load(self, path: Path) -> DirectNodes:
         return volumes.load(path, self.context.types, DirectNodes)

@@ -127,5 +127,4 @@ def _curves(axes, result: dict, key: str, label: str, missing: bool) -> None:
     low, high = axes.get_ylim()
     plot.log_ticks(axes.yaxis, low, high, lambda v: f"{v:.2g}")
     axes.xaxis.set_major_formatter(lambda value, _: size_text(round(value)))
-    axes.set_xlabel("memory", fontsize=8)
-    finish(axes, label)
+    finish(axes, "memory", label)

@@ -99,6 +99,7 @@ def plan(mesh: Mesh, name: str, settings: DistanceStudySettings, before: dict[st
         )  # fmt: skip
         compared += [MESH, grid]
         drawn = {"shapes": lambda result: pictures.shapes(context, first_jobs, view(), result)}
+    warnings = [w.removeprefix(f"{mesh.path}: ") for w in (*mesh.warnings, *context.distances.warnings)]
     models_fingerprint = f"{fingerprint(_model_sources())}{mesh.digest[:16]}"
     return Plan(
         study="sdf",
@@ -116,7 +117,7 @@ def plan(mesh: Mesh, name: str, settings: DistanceStudySettings, before: dict[st
         notes=[
             f"{Path(name).name}, {len(mesh.faces):,} triangles. IoU near: within 0.01 of the longest side. Bytes are "
             "those of all that a read needs.",
-            *(_sentence(warning, mesh) for warning in (*mesh.warnings, *context.distances.warnings)),
+            *(f"{w[:1].upper()}{w[1:]}." for w in warnings),
         ],
         jobs=list(jobs.values()),
         jobs_fingerprint=f"{models_fingerprint}-{settings.steps}-{settings.hash_steps[-1]}-{settings.points}",
@@ -124,12 +125,6 @@ def plan(mesh: Mesh, name: str, settings: DistanceStudySettings, before: dict[st
         table=table,
         conclusions=conclusions,
     )  # fmt: skip
-
-
-def _sentence(warning: str, mesh: Mesh) -> str:
-    """Return a warning about ``mesh`` as a sentence without its path."""
-    warning = warning.removeprefix(f"{mesh.path}: ")
-    return f"{warning[:1].upper()}{warning[1:]}."
 
 
 def _model_sources() -> list[Path]:

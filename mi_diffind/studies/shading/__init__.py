@@ -15,6 +15,19 @@ from ...measure.study import Plan, Study
 LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 
 
+#: Options with a positive number → help.
+_NUMBERS = {
+    "--seeds": "number of seeds of each training (default: 3; --quick: 1)",
+    "--seconds": "seconds of training for shading (default: 15; --quick: 1)",
+    "--pretrain-seconds": "seconds of training as a texture before (default: 20; --quick: 1)",
+    "--steps": "steps of training for shading in place of seconds, independent of the machine's speed; needs "
+    "--pretrain-steps",
+    "--pretrain-steps": "steps of training as a texture",
+    "--side": "texels on a side of generated materials (default: 512; --quick: 64)",
+    "--frames": "frames of the zoom (default: 60; --quick: 4)",
+}
+
+
 class ShadingStudy(Study):
     """Quality of shaded images against the weight of the shading loss, with and without its remedies."""
 
@@ -30,26 +43,13 @@ class ShadingStudy(Study):
         parser.add_argument("--lambda", action="append", type=fraction, dest="lambdas", metavar="X",
                             help="weight of the shading loss; may be repeated; 0 is always among them (default: "
                             "0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1; --quick: 0, 0.9)")  # fmt: skip
-        parser.add_argument("--seeds", type=positive, metavar="N",
-                            help="number of seeds of each training (default: 3; --quick: 1)")  # fmt: skip
-        parser.add_argument("--seconds", type=positive, metavar="N",
-                            help="seconds of training for shading (default: 15; --quick: 1)")  # fmt: skip
-        parser.add_argument("--pretrain-seconds", type=positive, metavar="N",
-                            help="seconds of training as a texture before (default: 20; --quick: 1)")  # fmt: skip
-        parser.add_argument("--steps", type=positive, metavar="N",
-                            help="steps of training for shading in place of seconds, independent of the machine's "
-                            "speed; needs --pretrain-steps")  # fmt: skip
-        parser.add_argument("--pretrain-steps", type=positive, metavar="N",
-                            help="steps of training as a texture")  # fmt: skip
+        for option, text in _NUMBERS.items():
+            parser.add_argument(option, type=positive, metavar="N", help=text)
         parser.add_argument("--compression", default="12x", metavar="N",
                             help="compression ratio of all trainings (default: 12x)")  # fmt: skip
         parser.add_argument("--remedies", choices=("all", "both", "on"), default="all",
                             help="clipped derivatives and a falling rate: all four combinations, both or none, or both "
                             "only (default: all)")  # fmt: skip
-        parser.add_argument("--side", type=positive, metavar="N",
-                            help="texels on a side of generated materials (default: 512; --quick: 64)")  # fmt: skip
-        parser.add_argument("--frames", type=positive, metavar="N",
-                            help="frames of the zoom (default: 60; --quick: 4)")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check the options and load the materials; raise as :func:`.load_source` does."""

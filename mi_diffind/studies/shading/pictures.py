@@ -21,17 +21,20 @@ CLASSICAL = {"filtered": ":", "kernel": (0, (1, 3)), "Toksvig": (0, (5, 1)), "LE
 LEVEL, CROP = 3, 48
 
 
+_LAMBDA_LABEL = "λ, weight of the shading loss (× : runs in trouble, and their number)"
+
+
 def pictures_of(contexts: dict) -> dict[str, Callable[[dict], object]]:
     """Return the figures of a plan by name, functions of the result."""
     return {
-        "png": lambda result: _grid(result, "", 3.5, _draw_lambdas),
-        "levels": lambda result: _grid(result, ": levels of detail", 3.3, _draw_levels),
+        "png": lambda result: _grid(result, "", 3.5, _draw_lambdas, _LAMBDA_LABEL),
+        "levels": lambda result: _grid(result, ": levels of detail", 3.3, _draw_levels, "level of detail"),
         "strip": lambda result: crops(contexts, result),
         "zoom": lambda result: zoom(contexts, result),
     }
 
 
-def _grid(result: dict, title: str, height: float, draw: Callable):
+def _grid(result: dict, title: str, height: float, draw: Callable, x_label: str):
     """Return a figure with a row for each material and a column for each truth."""
     materials = curves(result)
     figure = plot.figure(result["title"] + title, figure_caption(result), 12.0, height * len(materials))
@@ -40,7 +43,7 @@ def _grid(result: dict, title: str, height: float, draw: Callable):
             axes = figure.add_subplot(len(materials), 2, 2 * row + column + 1)
             draw(axes, material, letter)
             axes.set_title(f"{material.name}, against {truth} ({letter})", fontsize=9)
-            finish(axes, "PSNR of shaded values, dB")
+            finish(axes, x_label, "PSNR of shaded values, dB")
             if row == column == 0:
                 axes.legend(fontsize=6.5, ncols=2)
     return figure
@@ -70,7 +73,6 @@ def _draw_lambdas(axes, material: MaterialCurves, letter: str) -> None:
     for label, d in material.compressed.items():
         axes.plot([0], [d[letter]["mean_db"]], marker="*", markersize=8, linestyle="", color="0.3", label=label)
     axes.set_xticks(range(len(shares)), [f"{s:g}" for s in shares])
-    axes.set_xlabel("λ, weight of the shading loss (× : runs in trouble, and their number)", fontsize=8)
 
 
 def _draw_levels(axes, material: MaterialCurves, letter: str) -> None:
@@ -82,7 +84,6 @@ def _draw_levels(axes, material: MaterialCurves, letter: str) -> None:
     for (colour, marker), (remedy, share) in zip(plot.STYLES, _shown(material), strict=False):
         axes.plot(material.levels(remedy, share, letter), color=colour, marker=marker, markersize=4, linewidth=1.3,
                   label=f"λ {share:g}")  # fmt: skip
-    axes.set_xlabel("level of detail", fontsize=8)
 
 
 def crops(contexts: dict, result: dict):

@@ -64,7 +64,8 @@ def levels(context, readers: dict, result: dict):
         axes = figure.add_subplot(1, 2, 1)
         for i, (name, shares) in enumerate(histograms(count).items()):
             axes.bar(np.arange(count) + 0.27 * (i - 1), 100 * shares, 0.25, label=name, color=plot.STYLES[i][0])
-        _finish(axes, "nearest level of detail", "% of the samples of a training")
+        axes.legend(fontsize=7.5)
+        finish(axes, "nearest level of detail", "% of the samples of a training")
     axes = figure.add_subplot(1, 1 + compared, 1 + compared)
     jobs = {n: r["details"] for n, r in result["jobs"].items() if "levels" in r.get("details", {})}
     for i, (name, details) in enumerate(jobs.items()):
@@ -72,7 +73,8 @@ def levels(context, readers: dict, result: dict):
         line = {"ASTC with mip maps": ":", "ours": "-"}.get(details["kind"], "--")
         axes.plot(details["levels"]["all"], color=colour, marker=marker, markersize=4, linestyle=line, linewidth=1.1,
                   label=name)  # fmt: skip
-    _finish(axes, "level of detail", "PSNR of all maps at texel centres, dB")
+    axes.legend(fontsize=7.5)
+    finish(axes, "level of detail", "PSNR of all maps at texel centres, dB")
     return figure
 
 
@@ -82,12 +84,6 @@ def histograms(count: int) -> dict[str, np.ndarray]:
 
     ours = {"by level (ours)": training.shares(count)}
     return ours | {name: sampling.footprint_histogram(name, count) for name in sampling.FOOTPRINTS}
-
-
-def _finish(axes, x_label: str, y_label: str) -> None:
-    axes.set_xlabel(x_label, fontsize=8)
-    axes.legend(fontsize=7.5)
-    finish(axes, y_label)
 
 
 def _busiest(image: np.ndarray, side: int) -> tuple[int, int]:
