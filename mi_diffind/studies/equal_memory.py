@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import functools
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -127,8 +127,9 @@ class Contender(Job):
 class PresetContender(Contender):
     """A contender that a task trains by one of its presets, as ``mi-diffind fit`` does."""
 
-    #: Name of the task.
+    #: Name of the task, and the attribute of its models that the study measures.
     task_name: ClassVar[str]
+    model_part: ClassVar[str] = "field"
 
     #: The task's preset; "" is its default.
     preset: str = ""
@@ -157,7 +158,7 @@ class PresetContender(Contender):
             return None
         save_table(self.file, fitted.table)
         task_model = self.open(self.file)
-        self.model = self.representation(task_model)
+        self.model = getattr(task_model, self.model_part)
         return self.fit_record(task_model, fitted, time.perf_counter() - start)
 
     def fit_record(self, task_model: task.Model, fitted: task.Fitted, seconds: float) -> dict:
@@ -168,12 +169,8 @@ class PresetContender(Contender):
         """Return the task's model of a table file."""
         return task.tasks()[self.task_name].open(self.context.types.TensorXf, str(path))
 
-    def representation(self, task_model: task.Model):
-        """Return the part of the task's model that the study measures: ``field``, unless a study overrides it."""
-        return task_model.field
-
     def load(self, path: Path):
-        return self.representation(self.open(path))
+        return getattr(self.open(path), self.model_part)
 
 
 def candidates_by_budget(result: dict) -> dict[Any, dict[str, dict]]:
@@ -184,6 +181,14 @@ def candidates_by_budget(result: dict) -> dict[Any, dict[str, dict]]:
         if budget and candidate["errors"]:
             groups.setdefault(budget, {})[name] = candidate
     return dict(sorted(groups.items()))
+
+
+def ours_and_others(result: dict) -> Iterator[tuple[Any, dict, dict[str, tuple[str, dict]]]]:
+    """Yield each budget that has both with the errors of ours, and the names and errors of the others by method."""
+    for budget, candidates in candidates_by_budget(result).items():
+        methods = {c["details"]["kind"]: (name, c["errors"]) for name, c in candidates.items()}
+        if "ours" in methods and len(methods) > 1:
+            yield budget, methods.pop("ours")[1], methods
 
 
 def name_of_ours(result: dict) -> str:

@@ -174,8 +174,6 @@ def bricks(types, distances: Distances, spacing: float, side: int, apron: bool =
             present[tuple((near_bricks[part][ends.any(axis=(1, 2, 3))] + corner).T)] = True
     near = np.zeros(grid, bool)
     near[tuple(near_bricks.T)] = True
-    if (present & ~near).any():
-        raise AssertionError("a stored brick is not near the surface")
     negative = _inside(distances, lower, side * spacing, ~near)
     # A brick near the surface that is not stored has one sign, that of any of its nodes
     negative[tuple(near_bricks.T)] = values[:, 0, 0, 0] < 0

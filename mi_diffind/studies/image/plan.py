@@ -137,7 +137,7 @@ class ImageContender(Contender):
 class TrainedImage(PresetContender, ImageContender):
     """Indirection, trained for ``seconds`` by a preset of ``fit image`` with further ``options``."""
 
-    task_name = "image"
+    task_name, model_part = "image", "image"
     preset: str = ""
     seconds: float = 0.0
     options: dict | None = None
@@ -145,9 +145,6 @@ class TrainedImage(PresetContender, ImageContender):
     def arguments(self) -> dict:
         context = self.context
         return {"source": context.name, "compression": self.budget, "seconds": self.seconds, **(self.options or {})}
-
-    def representation(self, task_model):
-        return task_model.image
 
     def fit_record(self, task_model, fitted, seconds: float) -> dict:
         table, result, image = fitted.table, fitted.result, task_model.image

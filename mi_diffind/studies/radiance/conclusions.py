@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ...measure.benchmark import PASS
 from ...measure.formatting import duration, enumeration, grid
-from ..equal_memory import candidates_by_budget, name_of_ours, ratio_phrases
+from ..equal_memory import candidates_by_budget, name_of_ours, ours_and_others, ratio_phrases
 
 #: The two figures that are always given together.
 FOREGROUND, WHITE = "psnr_foreground_db", "psnr_white_db"
@@ -49,16 +49,13 @@ def conclusions(result: dict) -> list[str]:
     """Return verdicts of ours against the grid, the sparse grid and the best other candidate, and about times."""
     lines = []
     longer = next((c["errors"] for name, c in references(result).items() if c["details"]["kind"] == "longer"), None)
-    for ratio, candidates in candidates_by_budget(result).items():
-        methods = {c["details"]["kind"]: (name, c) for name, c in candidates.items()}
-        if "ours" not in methods or len(methods) < 2:
-            continue
-        ours = methods.pop("ours")[1]["errors"]
-        best = max(methods.values(), key=lambda f: f[1]["errors"][FOREGROUND])
-        verdict = "ahead of all others" if ours[FOREGROUND] > best[1]["errors"][FOREGROUND] else "not ahead"
-        texts = [f"best of the others: {_against(ours, best[1]['errors'])} ({_label(best[0], ratio)})"]
+    for ratio, ours, methods in ours_and_others(result):
+        name, best = max(methods.values(), key=lambda method: method[1][FOREGROUND])
+        verdict = "ahead of all others" if ours[FOREGROUND] > best[FOREGROUND] else "not ahead"
+        label = name.removesuffix(f" {ratio_text(ratio)}")
+        texts = [f"best of the others: {_against(ours, best)} ({label})"]
         if "sparse" in methods:
-            texts.append(f"sparse grid, 8 bits, after zlib: {_against(ours, methods['sparse'][1]['errors'])}")
+            texts.append(f"sparse grid, 8 bits, after zlib: {_against(ours, methods['sparse'][1])}")
         if longer is not None:
             texts.append(f"the grid, trained as long: {_against(ours, longer)}")
         lines.append(
@@ -72,10 +69,6 @@ def _against(ours: dict, other: dict) -> str:
     """Return the figures of another candidate, and the gains of ours."""
     gains = [ours[key] - other[key] for key in (WHITE, FOREGROUND)]
     return f"{other[WHITE]:.2f} / {other[FOREGROUND]:.2f} dB, {gains[0]:+.2f} / {gains[1]:+.2f}"
-
-
-def _label(name: str, ratio: float) -> str:
-    return name.removesuffix(f" {ratio_text(ratio)}")
 
 
 def _times(result: dict) -> list[str]:

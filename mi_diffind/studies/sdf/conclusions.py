@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ...measure.benchmark import PASS
 from ...measure.formatting import enumeration, grid
-from ..equal_memory import candidates_by_budget, name_of_ours, ratio_phrases
+from ..equal_memory import candidates_by_budget, name_of_ours, ours_and_others, ratio_phrases
 
 #: Measures of the sentences: label, error, format, and whether more is better.
 MEASURES = (
@@ -49,14 +49,10 @@ def _error_text(errors: dict, key: str, form: str) -> str:
 def conclusions(result: dict) -> list[str]:
     """Return sentences: ours against the best other method at each budget; times against the mesh and others."""
     lines = []
-    for size, candidates in candidates_by_budget(result).items():
-        methods = {c["details"]["kind"]: (name, c["errors"]) for name, c in candidates.items()}
-        if "ours" not in methods or len(methods) < 2:
-            continue
-        ours, others = methods.pop("ours")[1], methods.values()
+    for size, ours, others in ours_and_others(result):
         texts, behind = [], []
         for label, key, form, more in MEASURES:
-            values = [(e[key], name) for name, e in others if e.get(key) is not None]
+            values = [(e[key], name) for name, e in others.values() if e.get(key) is not None]
             if ours.get(key) is None or not values:
                 continue
             best, name = (max if more else min)(values)

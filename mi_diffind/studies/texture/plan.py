@@ -273,7 +273,7 @@ class TextureContender(Contender):
 class TrainedTexture(PresetContender, TextureContender):
     """A texture trained by a preset of ``fit texture``, or by other ``footprint_samples`` than the preset's."""
 
-    task_name = "texture"
+    task_name, model_part = "texture", "image"
     preset: str = ""
     footprint_samples: str | None = None
 
@@ -282,9 +282,6 @@ class TrainedTexture(PresetContender, TextureContender):
             "source": self.context.name, "compression": self.budget, "seconds": self.context.settings.seconds,
             "footprint_samples": self.footprint_samples, "border": "repeat",  # as the scenes repeat it
         }  # fmt: skip
-
-    def representation(self, task_model):
-        return task_model.image
 
     def fit_record(self, task_model, fitted, seconds: float) -> dict:
         return self.table_record(task_model, fitted.result.seconds)
