@@ -266,6 +266,43 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
         raise TableError(f"{path}: cannot be read ({reason(e)})") from None
 
 
+def load_layout(path: str | os.PathLike, task: str, layouts: dict[str, dict[str, tuple[int, int]]]) -> Table:
+    """Read and check a table file whose setting ``layout`` names one of several sets of arrays.
+
+    ``layouts`` maps a layout to its arrays: name → number of dimensions, and channels. Raises :class:`TableError`.
+    """
+    table = load_table(path, task)
+    layout = table.settings.get("layout")
+    if not isinstance(layout, str) or layout not in layouts:
+        raise TableError(f"{path}: has the layout {layout!r}, allowed are {', '.join(layouts)}")
+    for name, (dims, channels) in layouts[layout].items():
+        array = table.arrays.get(name)
+        if array is None or len(array.shape) != dims + 1 or array.shape[-1] != channels:
+            fault = "is missing" if array is None else f"has the shape {array.shape}"
+            raise TableError(
+                f'{path}: the array "{name}" {fault}, expected {dims} dimension(s) and {channels} channel(s)'
+            )
+    return table
+
+
+def check_numbers(table: Table, name: str, count: int, positive: bool = False, whole: bool = False) -> None:
+    """Raise :class:`TableError` unless a setting is ``count`` finite numbers (a list, if more than one)."""
+    value = table.settings.get(name)
+    values = [value] if count == 1 else value
+    types = (int,) if whole else (int, float)
+    valid = isinstance(values, list) and len(values) == count
+    if not valid or not all(isinstance(v, types) and math.isfinite(v) and (v > 0 or not positive) for v in values):
+        number = f"{'positive' if positive else 'finite'} {'whole ' if whole else ''}number"
+        allowed = f"a {number}" if count == 1 else f"{count} {number}s"
+        raise TableError(f'{table.path}: its setting "{name}" is {value!r}, expected {allowed}')
+
+
+def byte_array(values: np.ndarray, scale: float = 1.0, offset: float = 0.0) -> StoredArray:
+    """Return bytes ``(…, c)`` that stand for ``offset`` + ``scale`` · byte as an array of a file."""
+    channels = values.shape[-1]
+    return StoredArray(np.ascontiguousarray(values, np.uint8), (), (scale,) * channels, (offset,) * channels)
+
+
 def _read(archive: zipfile.ZipFile, path: Path, task, shapes) -> Table:
     members = {}
     total = 0

@@ -76,9 +76,15 @@ class FitRequest:
             problem, self.settings, self.checkpoint, self.resume, self.progress, title=title, seconds=self.seconds
         )
 
-    def recorded(self) -> dict:
-        """Return the settings in the form in which a table file keeps them."""
-        return {**asdict(self.settings), **({"seconds": self.seconds} if self.seconds is not None else {})}
+    def recorded(self, result: FitResult | None = None) -> dict:
+        """Return the settings as a table file keeps them: with a limit of time, the steps are those of the result."""
+        limited = {} if self.seconds is None else {"seconds": self.seconds}
+        steps = {} if self.seconds is None or result is None else {"steps": result.steps}
+        return {**asdict(self.settings), **steps, **limited}
+
+    def relative(self, path: str | os.PathLike) -> str:
+        """Return a path relative to the folder of the output, as a table file keeps it."""
+        return os.path.relpath(Path(path).resolve(), (self.output or Path("x")).resolve().parent)
 
 
 @dataclass
@@ -95,14 +101,15 @@ class Model:
     """Base class of the content of a table file, ready to be evaluated.
 
     ``table`` is what was read and checked, ``arrays`` its arrays by name, allocated for the tensor type ``dtype``. A
-    task's own class builds from them what can be evaluated (:meth:`build`).
+    task's own class builds from them what can be evaluated (:meth:`build`). ``form`` is the requested storage form, ""
+    for the file's own.
     """
 
     #: Storage forms that ``inspect --measure`` compares; "" means the file's own.
     forms: tuple[str, ...] = ("",)
 
-    def __init__(self, table: Table, arrays: dict[str, DifferentiableArray], dtype):
-        self.table, self.arrays, self.dtype = table, arrays, dtype
+    def __init__(self, table: Table, arrays: dict[str, DifferentiableArray], dtype, form: str = ""):
+        self.table, self.arrays, self.dtype, self.form = table, arrays, dtype, form
         self.build()
 
     @property
@@ -112,7 +119,8 @@ class Model:
 
     def copy(self) -> Model:
         """Return another model that shares the memory of this one's arrays."""
-        return type(self)(self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype)
+        arrays = {name: array.copy() for name, array in self.arrays.items()}
+        return type(self)(self.table, arrays, self.dtype, self.form)
 
     def build(self) -> None:
         """Build what can be evaluated from ``arrays``."""
@@ -181,10 +189,16 @@ class Task:
     decode_arguments: tuple[Argument, ...] = ()
     #: The module of the task's package that reads its table files.
     files: str = "files"
+    #: Number of measurements during a training; 0: as the settings of the preset say.
+    measurements: int = 0
 
     def settings(self, preset: str, given: Mapping, options: Mapping) -> FitSettings:
         """Return the settings of a preset with the ``given`` ones in place; ``options`` are the task's own."""
-        return dataclasses.replace(self.presets[preset], **given)
+        defaults = self.presets[preset]
+        if self.measurements:
+            steps = given.get("steps", defaults.steps)
+            defaults = dataclasses.replace(defaults, measure_every=max(1, steps // self.measurements))
+        return dataclasses.replace(defaults, **given)
 
     def check(self, request: FitRequest) -> None:
         """Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
@@ -213,9 +227,7 @@ class Task:
         result = request.train(problem)
         table = self.table(problem, request)
         table.preset, table.seed = request.preset, request.settings.seed
-        table.settings = {**request.recorded(), **table.settings}
-        if request.seconds is not None:
-            table.settings["steps"] = result.steps
+        table.settings = {**request.recorded(result), **table.settings}
         table = table.to(request.storage) if request.storage else table
         measured = self.model(table, request.types.TensorXf).measure()
         table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
@@ -257,7 +269,7 @@ class Task:
 
     def model(self, table: Table, dtype, storage: str = "") -> Model:
         """Return the model of a checked table. Raises :class:`~mi_diffind.tables.TableError`."""
-        return self.model_class()(table, self.allocate(table, dtype, storage), dtype)
+        return self.model_class()(table, self.allocate(table, dtype, storage), dtype, storage)
 
     def file(self, filename: str | os.PathLike = "", preset: str = "") -> Path:
         """Return the path ``filename``, or of the file that ships for ``preset`` ("": the default).

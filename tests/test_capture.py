@@ -5,6 +5,7 @@ import json
 import threading
 from pathlib import Path
 
+import captures
 import numpy as np
 import pytest
 from PIL import Image
@@ -78,7 +79,7 @@ def test_images_show_what_rays_of_their_poses_meet(mi_rgb, scene, tmp_path, caps
         views = load_views(folder, split)
         assert len(views) == count and views.has_alpha and (views.height, views.width) == (24, 24)
         edges = np.arange(25) - 0.5
-        numbers = np.stack([nearest(*views.rays(v, *np.meshgrid(edges, edges))) for v in range(count)])
+        numbers = np.stack([nearest(*captures.rays_of(views, v, *np.meshgrid(edges, edges))) for v in range(count)])
         corners = np.stack([numbers[:, :-1, :-1], numbers[:, 1:, :-1], numbers[:, :-1, 1:], numbers[:, 1:, 1:]])
         same = (corners == corners[0]).all(axis=0)
         for i in range(3):  # the colour that a sphere is of is the largest, nowhere else
@@ -188,7 +189,7 @@ def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
         away = centre - matrix[:3, 3]
         assert -matrix[:3, 2] == pytest.approx(away / np.linalg.norm(away), abs=1e-6)
         assert -50 < np.degrees(np.arcsin(-away[1] / np.linalg.norm(away))) < 60
-        origin, direction = views.rays(i, *np.meshgrid(np.arange(32), np.arange(32)))
+        origin, direction = captures.rays_of(views, i, *np.meshgrid(np.arange(32), np.arange(32)))
         beside = np.linalg.norm(np.cross(direction, centre - origin), axis=-1)
         assert (views.images[i, ..., 3][beside < 0.27] > 0.99).all()  # half a pixel within
         assert not views.images[i][beside > 0.33].any()

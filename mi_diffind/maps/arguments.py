@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from .. import units
@@ -63,12 +62,6 @@ def requested_bytes(options, source: Source) -> int:
 def requested_border(options) -> tuple[str, str] | None:
     """Return the border along v and u of the options :data:`SOURCES`; ``None`` if it is chosen by the content."""
     return None if options["border"] == "auto" else (options["border"],) * 2
-
-
-def record_source(request, table) -> None:
-    """Store the path of the source in the settings of ``table``, relative to the folder of the output."""
-    folder = (request.output or Path("x")).resolve().parent
-    table.settings["source_path"] = os.path.relpath(Path(request.options["source"]).resolve(), folder)
 
 
 def size_figures(source: Source, table, requested: float | None) -> tuple[dict, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -103,9 +103,7 @@ class Layout:
             where = []
             vectors = filtered and m.role == "normal" and m.channels == 3
             keep = vectors and not all(m.values[..., c].min() == m.values[..., c].max() for c in range(3))
-            averaging = (
-                (m.color_space, shell.knee, shell.low, shell.high, m.name if vectors else "") if filtered else ()
-            )
+            averaging = (m.color_space, shell.knee, shell.low, shell.high, vectors and m.name) if filtered else ()
             for c in range(m.values.shape[-1]):
                 values = shell.encode(m.values[..., c])
                 low = float(values.min())
@@ -125,9 +123,7 @@ class Layout:
                     initial.append(_initial(m.role, c))
                     groups.append(m.name)
                 where.append(same[0])
-            maps.append(
-                MapLayout(m.name, m.role, m.color_space, m.depth, tuple(where), shell.low, shell.high, shell.knee)
-            )
+            maps.append(replace(shell, where=tuple(where)))
         return Layout(source.width, source.height, tuple(maps), tuple(initial), tuple(groups))
 
     @property

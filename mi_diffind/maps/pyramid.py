@@ -143,14 +143,10 @@ class Pyramid(FilteredMaps):
 
     def stored(self, u, v, active=True) -> list:
         """Return the stored channels at (u, v) in level 0, bilinear."""
-        if not self.layout.stored:
-            return []
         return self.encoded(self.interpolated(u, v, type(u)(0), active, whole=True))
 
     def filtered(self, u, v, level, active=True) -> list:
         """Return the stored channels at (u, v) and a level of detail, trilinear."""
-        if not self.layout.stored:
-            return []
         return self.encoded(self.interpolated(u, v, level, active))
 
     def interpolated(self, u, v, level, active=True, whole: bool = False) -> list:

@@ -12,8 +12,6 @@ shaded values without a scene.
 
 from __future__ import annotations
 
-import dataclasses
-
 from ..arguments import Argument, fraction
 from ..errors import UsageError
 from ..task import FitRequest, Fitted, Task
@@ -28,6 +26,7 @@ class SceneTraining(Task):
     section = "supplemental 1.5"
     presets = {"ours": SceneRecipe().settings}  # noqa: RUF012
     storages = ()
+    measurements = 10
     arguments = (
         Argument("source", metavar="SCENE.xml", help="a scene with a neural_texture, whose arrays are trained"),
         Argument(
@@ -36,10 +35,6 @@ class SceneTraining(Task):
         ),
         *SCENE_ARGUMENTS,
     )  # fmt: skip
-
-    def settings(self, preset, given, options):
-        steps = given.get("steps", self.presets[preset].steps)
-        return dataclasses.replace(self.presets[preset], measure_every=max(1, steps // 10), **given)
 
     def check(self, request: FitRequest) -> None:
         source = request.options["source"]

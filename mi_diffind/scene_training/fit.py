@@ -81,18 +81,12 @@ def fit_scene(
     )  # fmt: skip
     problem.identity |= {"views": dataclasses.asdict(views)}
     result = request.train(problem)
-    settings = {**request.recorded(), **{k: v for k, v in problem.identity.items() if k not in ("structure", "border")}}
-    settings["scene_path"] = _relative(parsed.path, request)
-    if request.seconds is not None:
-        settings["steps"] = result.steps
+    identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
+    settings = {**request.recorded(result), **identity, "scene_path": request.relative(parsed.path)}
     trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net)), settings)
-    trained_table.settings["source_path"] = _relative(source_path, request)
+    trained_table.settings["source_path"] = request.relative(source_path)
     trained_table.preset, trained_table.seed = request.preset, recipe.settings.seed
     errors = CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
     errors["psnr_scene_db"] = result.measured["psnr_db"]
     trained_table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
     return trained_table, result
-
-
-def _relative(path: str | os.PathLike, request: FitRequest) -> str:
-    return os.path.relpath(Path(path).resolve(), (request.output or Path("x")).resolve().parent)

@@ -19,6 +19,19 @@ def look_at(eye):
     return pose
 
 
+def rays_of(views, view, x, y):
+    """Origins and unit directions (…, 3), float64, of the rays through the centres of the pixels (x, y) of views."""
+    view = np.asarray(view)
+    fx, fy = np.moveaxis(views.focal[view], -1, 0)
+    cx, cy = np.moveaxis(views.centre[view], -1, 0)
+    u, v = (np.asarray(x) + 0.5 - cx) / fx, -(np.asarray(y) + 0.5 - cy) / fy
+    local = np.stack(np.broadcast_arrays(u, v, -1.0), axis=-1)
+    pose = views.poses[view]
+    directions = np.einsum("...ij,...j->...i", pose[..., :3, :3], local)
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return np.broadcast_to(pose[..., :3, 3], directions.shape), directions
+
+
 def picture(pose, side):
     """sRGB and alpha, uint8: a red ball with stripes, and a blue one."""
     focal = side / 2 / math.tan(ANGLE / 2)

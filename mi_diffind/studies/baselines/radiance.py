@@ -89,10 +89,8 @@ class ByteField(NodeVolume):
         def level(number, seen):
             return self.types.Float(dr.gather(self.types.UInt8, self.density, number, seen))
 
-        return self.interpolated_density(level, p, active)
-
-    def raw_density(self, interpolated):
-        return dr.fma(interpolated, float(self.density_steps.step[0]), float(self.density_steps.low[0]))
+        low, step = float(self.density_steps.low[0]), float(self.density_steps.step[0])
+        return self.interpolated_density(level, p, active, low, step)
 
     def radiance_at(self, point_data, p, d, active=True):
         types, UInt32 = self.types, self.types.UInt32

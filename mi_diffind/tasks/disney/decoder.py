@@ -129,22 +129,22 @@ class Decoder:
         g = geometry(wi, wo)
         total = 0
         if e.sheen or "specular" in lobes or "clearcoat" in lobes:
-            s = self.fresnel(g.cos_d, active)
+            s = schlick(g.cos_d)
         if "diffuse" in lobes:
             if e.diffuse or e.subsurface:
-                total = c["diffuse"]["albedo"] * self.diffuse(c, e, g, wi, wo, active)
+                total = c["diffuse"]["albedo"] * self.diffuse(c, e, g, wi, wo)
             if e.sheen:
                 total = c["sheen"]["colour"] * (s * wo.z) + total
         if "specular" in lobes:
             colour = dr.fma(c["f0"]["f0"], 1 - s, s) if "f0" in c else s
-            total = colour * self.specular(c, e, g, wi, wo, active) + total
+            total = colour * self.specular(c, g, wi, wo, active) + total
         if "clearcoat" in lobes and e.clearcoat:
-            total = self.clearcoat(c, e, g, s, wi, wo, active) + total
+            total = self.clearcoat(c, g, s, wi, wo) + total
         return total
 
-    def diffuse(self, c, e: Effects, g, wi, wo, active):
+    def diffuse(self, c, e: Effects, g, wi, wo):
         """Return base diffuse and subsurface approximation, mixed by flatness, times ``π wo.z``."""
-        fl, fv = self.fresnel(wo.z, active), self.fresnel(wi.z, active)
+        fl, fv = schlick(wo.z), schlick(wi.z)
         # (l·h)² = |h|²/4 without a root; the ratio is only needed for subsurface scattering
         ratio = wo.z / (wi.z + wo.z + TINY) if e.subsurface else 0
         base, flat = diffuse_factors(c["retro"]["roughness"], 0.25 * g.h2, fl + fv, fl * fv, ratio, wo.z)
@@ -152,7 +152,7 @@ class Decoder:
             return base
         return dr.lerp(base, flat, c["flatness"]["flatness"]) if e.diffuse else flat
 
-    def specular(self, c, e: Effects, g, wi, wo, active):
+    def specular(self, c, g, wi, wo, active):
         """Return ``D G wo.z / (4 (n·l)(n·v))``."""
         return (
             dr.square(g.h2 / (quadric(self.ggx(c)["q"], g) + TINY))
@@ -160,9 +160,10 @@ class Decoder:
             / (self.masking(c, wi, active) * self.masking(c, wo, active))
         )
 
-    def clearcoat(self, c, e: Effects, g, s, wi, wo, active):
+    def clearcoat(self, c, g, s, wi, wo):
         """Return the clearcoat lobe with its strength, times ``wo.z``."""
-        masked, denominator = self.coat_masking(wi.z, wo.z, active)
+        # Smith's masking for both directions
+        masked, denominator = 4 * wi.z * wo.z, coat_masking_denominator(wi.z) * coat_masking_denominator(wo.z)
         fresnel = dr.fma(1 - COAT_F0, s, COAT_F0)
         coat = self.coat(c)
         return coat["scale"] * g.h2 * fresnel * wo.z * masked / (coat_quadric(coat["a2"], g) * denominator)
@@ -175,17 +176,9 @@ class Decoder:
         """Return ``a2`` and ``scale`` of the clearcoat's GTR1."""
         return c["coat"]
 
-    def fresnel(self, cosine, active=True):
-        """Return Schlick's ``(1 − cosine)^5``."""
-        return schlick(cosine)
-
     def masking(self, c, w, active=True):
         """Return :func:`.model.masking_denominator` of one direction."""
         return masking(self.ggx(c)["alpha2"], w)
-
-    def coat_masking(self, cos_i, cos_o, active=True):
-        """Return numerator and denominator of Smith's masking of the clearcoat for both directions."""
-        return 4 * cos_i * cos_o, coat_masking_denominator(cos_i) * coat_masking_denominator(cos_o)
 
 
 def ggx_coefficients(ax, ay=None) -> dict:

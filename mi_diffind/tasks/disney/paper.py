@@ -55,14 +55,6 @@ class PaperArrays(DisneyArrays):
         "coat": (-16.0, 8.0),
     }
 
-    def ggx_coefficients(self, encoded, active=True) -> list:
-        """Return ``q`` of ``D = 1 / (q_x h_x² + q_y h_y² + q_z h_z²)²``, with a unit half vector, of a material."""
-        return [dr.exp(v) for v in self.bounded("ggx", self.ggx(encoded, active))]
-
-    def coat_coefficients(self, gloss, active=True) -> list:
-        """Return ``k`` of ``GTR1 = 1 / (k_0 sin² + k_1 cos²)``, of the material only."""
-        return [dr.exp(v) for v in self.bounded("coat", self.coat([gloss], active))]
-
     def masking_root(self, encoded_roughness, cos_product, active=True):
         """Return ``√(d(wi) d(wo))``, the root of the specular term's denominator, from the roughness and (n·l)(n·v)."""
         return self.bounded("masking", self.masking([encoded_roughness, dr.sqrt(cos_product + TINY)], active))[0]
@@ -70,8 +62,9 @@ class PaperArrays(DisneyArrays):
     def factors(self, material, wi, wo, encoded: dict, lobes, active=True) -> Factors:
         """Return the factors of :func:`.model.compose` for ``lobes``, from five reads; those of other lobes are 0.
 
-        ``encoded`` holds the coefficients of the material: ``roughness`` (encoded), ``q`` and, for the clearcoat,
-        ``k``.
+        ``encoded`` holds the coefficients of the material: ``roughness`` (encoded), ``q`` of
+        ``D = 1 / (q_x h_x² + q_y h_y² + q_z h_z²)²``, with a unit half vector, and, for the clearcoat, ``k`` of
+        ``GTR1 = 1 / (k_0 sin² + k_1 cos²)``.
         """
         g = geometry(wi, wo)
         specular = diffuse = flat = clearcoat = 0
@@ -190,10 +183,11 @@ class PaperDecoder(decoder.Decoder):
 
     def _encoded(self, p, e):
         coordinates = self.arrays.encode(p)
-        return {"roughness": coordinates[0], "q": tuple(self.arrays.ggx_coefficients(coordinates))}
+        logarithms = self.arrays.bounded("ggx", self.arrays.ggx(coordinates))
+        return {"roughness": coordinates[0], "q": tuple(map(dr.exp, logarithms))}
 
     def _encoded_coat(self, p, e):
-        return {"k": tuple(self.arrays.coat_coefficients(p.clearcoat_gloss))}
+        return {"k": tuple(map(dr.exp, self.arrays.bounded("coat", self.arrays.coat([p.clearcoat_gloss]))))}
 
     def value(self, c, e, lobes, p, wi, wo, active=True):
         lobes = tuple(lobe for lobe in lobes if lobe in e.lobes)

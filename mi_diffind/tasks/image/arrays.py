@@ -46,10 +46,7 @@ def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, st
     """
     k = values.shape[-1]
     mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
-    left, back = (
-        np.eye(k),
-        mean,
-    )  # projection onto remaining components; channels of the cascaded entries
+    left, back = np.eye(k), mean  # projection onto remaining components; channels of the cascaded entries
     primaries, axis = [], 0
     for i, (rows, columns, dims, _) in enumerate(size.primaries):
         last = i + 1 == len(size.primaries)

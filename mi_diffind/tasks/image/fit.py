@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from ...errors import UsageError
-from ...maps.arguments import record_source, requested_border, requested_bytes, size_figures
+from ...maps.arguments import requested_border, requested_bytes, size_figures
 from ...maps.source import Source, load_source
 from ...pages import most_entries
 from ...settings import FittingError
@@ -56,7 +56,7 @@ def fit(request: FitRequest) -> Fitted:
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
     fitted, requested = _train(request, source, recipe)
-    record_source(request, fitted.table)
+    fitted.table.settings["source_path"] = request.relative(options["source"])
     figures, line = size_figures(source, fitted.table, requested)
     fitted.lines.append(line)
     fitted.figures = {**figures, **fitted.figures}

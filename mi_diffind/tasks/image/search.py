@@ -99,8 +99,8 @@ def ratio_search(
         return result.interrupted
 
     def best() -> dict | None:
-        """Return the best training so far."""
-        return max(tried, key=_merit, default=None)
+        """Return the training with the best mean of the quality at texels and between them."""
+        return max(tried, key=lambda t: 0.5 * (t["psnr_db"] + t["psnr_between_db"]), default=None)
 
     start, interrupted = default_size(source, nbytes, recipe), False
     structure, recipe = structure_of(source, recipe, nbytes), dataclasses.replace(recipe, dims=start.dims)
@@ -114,11 +114,6 @@ def ratio_search(
     chosen = best()
     recipe = dataclasses.replace(recipe, structure=chosen["structure"], dims=chosen["dims"])
     return RatioSearch(sized(source, nbytes, recipe, chosen["cascaded"]), recipe, tried, tables[0], interrupted)
-
-
-def _merit(tried: dict) -> float:
-    """Return the mean of the quality at texels and between them, which the search compares."""
-    return 0.5 * (tried["psnr_db"] + tried["psnr_between_db"])
 
 
 def _candidates(recipe: ImageRecipe, structure: str, side: int, free: bool, best: Callable) -> Iterator[list]:

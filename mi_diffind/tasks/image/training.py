@@ -219,9 +219,7 @@ def fit_image(
     else:
         problem = problem_of(source, size, recipe, types, layout, border)
         result = request.train(problem, title)
-        settings = {**request.recorded(), **problem.identity, "ratio": size.ratio}
-        if request.seconds is not None:
-            settings["steps"] = result.steps
+        settings = {**request.recorded(result), **problem.identity, "ratio": size.ratio}
         settings["structure"] = recipe.structure if recipe.structure != "auto" else _name_of(size)
         table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), settings)
     table.preset, table.seed = request.preset, recipe.settings.seed

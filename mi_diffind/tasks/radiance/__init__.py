@@ -9,8 +9,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from ... import units
 from ...arguments import Argument, checked, decibels, positive
 from ...task import Task
@@ -25,6 +23,7 @@ class RadianceField(Task):
     section = "supplemental 1.7"
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
+    measurements = 2
     arguments = (
         Argument(
             "source", metavar="FOLDER",
@@ -50,23 +49,12 @@ class RadianceField(Task):
     )  # fmt: skip
     decode_arguments = (
         Argument(
-            "--resolution",
-            type=positive,
-            metavar="N",
-            help="nodes along the longest side (default: as the field)",
+            "--resolution", type=positive, metavar="N", help="nodes along the longest side (default: the field's)"
         ),
     )
 
-    def settings(self, preset, given, options):
-        settings = self.presets[preset]
-        steps = given.get("steps", settings.steps)
-        return dataclasses.replace(settings, measure_every=max(1, steps // 2), **given)
-
     def allocate(self, table, dtype, storage=""):
         return {}
-
-    def model(self, table, dtype, storage=""):
-        return self.model_class()(table, {}, dtype, storage)
 
 
 TASK = RadianceField()

@@ -17,7 +17,7 @@ from . import grid as grids
 from .grid import NodeGrid
 from .nodes import Nodes
 from .training import FieldSession, ImagesProblem, ViewImages
-from .volume_field import NodeField, PackedPaletteField
+from .volume_field import NodeField
 
 #: Raw densities of the first and the last density level: empty, and opaque.
 EMPTIEST, DENSEST = -7.0, 8.0
@@ -149,14 +149,6 @@ def byte_range(palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the quantisation step and the minimum of each column of a palette, as bytes store it."""
     low, high = palette.min(axis=0).astype(np.float64), palette.max(axis=0).astype(np.float64)
     return np.maximum((high - low) / 255, 1e-6), low
-
-
-def packed_field(nodes: Nodes, stored: dict, index_bits: int) -> PackedPaletteField:
-    """Return the field of what :meth:`PaletteProblem.stored` returned, on ``nodes`` with a packed index."""
-    return PackedPaletteField(
-        nodes, stored["levels"], DENSITY_BITS, stored["density_range"], stored["index"], index_bits, stored["palette"],
-        stored["scale"], stored["offset"],
-    )  # fmt: skip
 
 
 def packed_bytes(grid: NodeGrid, index_bits: int) -> int:

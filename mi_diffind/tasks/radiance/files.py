@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from ...indirection import Indirection
-from ...tables import StoredArray, Table, TableError, load_table
-from .compression import INDEX_BITS, LAST_LEVEL, packed_field
+from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout
+from .compression import DENSITY_BITS, INDEX_BITS, LAST_LEVEL
 from .nodes import Nodes
 from .paper import PairsField
-from .volume_field import NodeField, VolumeField
+from .volume_field import NodeField, PackedPaletteField, VolumeField
 
 #: Layout → name of an array → number of its dimensions, and channels.
 LAYOUTS = {
@@ -26,12 +26,6 @@ LAYOUTS = {
 
 #: Most nodes of a grid, counting those that are not stored.
 MOST_NODES = 2**28
-
-
-def byte_array(values: np.ndarray, scale: float = 1.0, offset: float = 0.0) -> StoredArray:
-    """Return bytes ``(n, c)`` that stand for ``offset`` + ``scale`` · byte as an array of a file."""
-    channels = values.shape[-1]
-    return StoredArray(np.ascontiguousarray(values, np.uint8), (), (scale,) * channels, (offset,) * channels)
 
 
 def stored_nodes(nodes: Nodes) -> tuple[dict[str, StoredArray], dict]:
@@ -69,24 +63,16 @@ def pairs_table(nodes: Nodes, arrays: dict, low, high) -> Table:
 
 def load(path) -> Table:
     """Read and check a table file of a radiance field. Raises :class:`~mi_diffind.tables.TableError`."""
-    table = load_table(path, "field")
-    layout = table.settings.get("layout")
-    if not isinstance(layout, str) or layout not in LAYOUTS:
-        raise TableError(f"{path}: has the layout {layout!r}, allowed are {', '.join(LAYOUTS)}")
+    table = load_layout(path, "field", LAYOUTS)
+    layout = table.settings["layout"]
     if "curve" in table.arrays:
         raise TableError(
             f"{path}: has a density curve, which this package no longer reads: make the file again with "
             f'"mi-diffind fit field FOLDER -o {Path(path).name}"'
         )
-    for name, (dims, channels) in LAYOUTS[layout].items():
-        array = table.arrays.get(name)
-        if array is None or len(array.shape) != dims + 1 or array.shape[-1] != channels:
-            fault = "is missing" if array is None else f"has the shape {array.shape}"
-            raise TableError(
-                f'{path}: the array "{name}" {fault}, expected {dims} dimension(s) and {channels} channel(s)'
-            )
-    for name, count, whole in (("lower", 3, False), ("spacing", 1, False), ("shape", 3, True)):
-        _numbers(table, name, count, whole, positive=name != "lower")
+    check_numbers(table, "lower", 3)
+    check_numbers(table, "spacing", 1, positive=True)
+    check_numbers(table, "shape", 3, positive=True, whole=True)
     shape = table.settings["shape"]
     if min(shape) < 2 or math.prod(shape) > MOST_NODES:
         raise TableError(f"{path}: is damaged: found a grid of {shape}, allowed are at most {MOST_NODES:,} nodes")
@@ -94,7 +80,7 @@ def load(path) -> Table:
         raise TableError(f'{path}: is damaged: the array "cells" is not that of a grid of {shape}')
     if layout == "pairs":
         for name in ("low", "high"):
-            _numbers(table, name, 13, False, False)
+            check_numbers(table, name, 13)
         return table
     entries = int(np.count_nonzero(stored_of(table))) + 1
     names = ("density", "index") if layout == "sparse" else ("density", "colour")
@@ -113,19 +99,6 @@ def load(path) -> Table:
         if density.storage != "uint8" or density.entries.max() > LAST_LEVEL:
             raise TableError(f"{path}: is damaged: found a density level that is not a number from 0 to {LAST_LEVEL}")
     return table
-
-
-def _numbers(table: Table, name: str, count: int, whole: bool, positive: bool) -> None:
-    """Check that a setting is ``count`` finite numbers."""
-    value = table.settings.get(name)
-    values = [value] if count == 1 else value
-    types = (int,) if whole else (int, float)
-    good = isinstance(values, list) and len(values) == count
-    good = good and all(isinstance(v, types) and math.isfinite(v) and (v > 0 or not positive) for v in values)
-    if not good:
-        number = "whole number" if whole else "number"
-        allowed = f"{count} {'positive ' if positive else 'finite '}{number}{'s' if count > 1 else ''}"
-        raise TableError(f'{table.path}: its setting "{name}" is {value!r}, expected {allowed}')
 
 
 def stored_of(table: Table) -> np.ndarray:
@@ -165,4 +138,4 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
         "levels": density.entries[:, 0], "density_range": (density.offset[0], density.scale[0]), "index": index,
         "palette": palette.entries, "scale": palette.scale, "offset": palette.offset,
     }  # fmt: skip
-    return packed_field(nodes, stored, settings["index_bits"])
+    return PackedPaletteField(nodes, stored, DENSITY_BITS, settings["index_bits"])

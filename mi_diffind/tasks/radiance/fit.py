@@ -90,16 +90,11 @@ class FieldFit:
             table, result, field = (self.sparse if layout == "sparse" else self.pairs)(grid, stopped)
         measured = session.held_out_images.evaluate(field)
         table.preset, table.seed = request.preset, request.settings.seed
-        folder = (request.output or Path("x")).resolve().parent
-
-        def relative(path) -> str:
-            return os.path.relpath(Path(path).resolve(), folder)
-
         table.settings = {
             **request.recorded(),
             "source": session.views.digest,
-            "capture_path": relative(options["source"]),
-            **({"grid_path": relative(options["grid"])} if options["grid"] else {}),
+            "capture_path": request.relative(options["source"]),
+            **({"grid_path": request.relative(options["grid"])} if options["grid"] else {}),
             "warnings": warnings,
             **table.settings,
         }

@@ -18,18 +18,8 @@ PIXELS = 96
 class RadianceFieldModel(Model):
     """Radiance field of a file: ``field`` (:class:`.volume_field.VolumeField`), in the coordinates of its capture."""
 
-    #: Requested storage form; "" means that of the file.
-    form = ""
-
-    def __init__(self, table, arrays, dtype, form: str = ""):
-        self.form = form
-        super().__init__(table, arrays, dtype)
-
     def build(self):
         self.field = field_of(self.table, self.types, self.form)
-
-    def copy(self):
-        return type(self)(self.table, {}, self.dtype, self.form)
 
     @property
     def storage(self):
@@ -47,20 +37,15 @@ class RadianceFieldModel(Model):
             return nbytes
         return self.field.nodes.nbytes + sum(4 * math.prod(a.shape) for a in self.field.arrays.values())
 
-    @property
-    def dense_nbytes(self) -> int:
-        """Bytes of a grid of 13 float32 numbers at every node of the box, to which ratios refer."""
-        return dense_bytes(self.table.settings["shape"])
-
     def describe(self):
         field, settings = self.field, self.table.settings
         file_bytes = self.table.path.stat().st_size if self.table.path is not None else None
-        counts = self.counts()
+        counts, dense = self.counts(), dense_bytes(settings["shape"])
         figures = {
             "layout": settings["layout"],
             "memory_bytes": self.memory_nbytes,
             "file_bytes": file_bytes,
-            "dense_bytes": self.dense_nbytes,
+            "dense_bytes": dense,
             "box": [list(field.lower), list(field.upper)],
             "voxel": field.voxel,
             "shape": list(settings["shape"]),
@@ -70,12 +55,12 @@ class RadianceFieldModel(Model):
         shape = " x ".join(map(str, settings["shape"]))
         share = 100 * field.nodes.count / math.prod(settings["shape"])
         lines = [
-            f"{self.memory_nbytes:,} bytes in memory, {self.dense_nbytes / self.memory_nbytes:.0f} times less than the "
+            f"{self.memory_nbytes:,} bytes in memory, {dense / self.memory_nbytes:.0f} times less than the "
             f"dense grid of float32",
             f"{field.nodes.count:,} of {shape} nodes ({share:.0f}%), voxels of {field.voxel:.4g}",
         ]
         if file_bytes:
-            lines.append(f"{file_bytes:,} bytes on disk, {self.dense_nbytes / file_bytes:.0f} times less")
+            lines.append(f"{file_bytes:,} bytes on disk, {dense / file_bytes:.0f} times less")
         steps, looks = max(1, counts["steps"]), max(1, counts["looks"])
         skipped, hidden = (100 * counts[name] / steps for name in ("skipped", "hidden"))
         lines.append(

@@ -82,22 +82,6 @@ class CapturedViews:
         """Positions of the cameras, ``(V, 3)``."""
         return self.poses[:, :3, 3]
 
-    def rays(self, view, x, y) -> tuple[np.ndarray, np.ndarray]:
-        """Return origins and unit directions ``(…, 3)``, float64, of the rays through the centres of pixels.
-
-        ``view`` names the images, ``x`` and ``y`` the columns and rows, counted from 0 at the upper left; fractions are
-        allowed.
-        """
-        view = np.asarray(view)
-        fx, fy = np.moveaxis(self.focal[view], -1, 0)
-        cx, cy = np.moveaxis(self.centre[view], -1, 0)
-        u, v = (np.asarray(x) + 0.5 - cx) / fx, -(np.asarray(y) + 0.5 - cy) / fy
-        local = np.stack(np.broadcast_arrays(u, v, -1.0), axis=-1)
-        pose = self.poses[view]
-        directions = np.einsum("...ij,...j->...i", pose[..., :3, :3], local)
-        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        return np.broadcast_to(pose[..., :3, 3], directions.shape), directions
-
 
 def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews:
     """Read the views of a ``split``: "train", "test" or "val".
@@ -116,10 +100,16 @@ def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews
         raise ViewsError(f'{file}: has no views for the split "{split}"')
     cameras = [_camera(file, content, frame) for frame in frames]
     names, images, has_alpha = [], None, True
-    for i, (camera, frame) in enumerate(zip(cameras, frames, strict=True)):
+    for i, ((_, numbers), frame) in enumerate(zip(cameras, frames, strict=True)):
         path = _image_file(file, frame["file_path"])
         image, alpha = _read(path)
-        camera.check_size(path, image.shape[1], image.shape[0])
+        height, width = image.shape[:2]
+        expected = numbers.get("w", width), numbers.get("h", height)
+        if expected != (width, height):
+            raise ViewsError(
+                f"{path}: has {width} × {height} pixels, {file} says {expected[0]:g} × {expected[1]:g}, to which its "
+                f"focal lengths refer"
+            )
         if images is None:
             images = np.empty((len(frames), *image.shape), np.float32)
         elif image.shape != images.shape[1:]:
@@ -128,10 +118,9 @@ def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews
         images[i] = image
         names.append(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
         has_alpha &= alpha
-    height, width = images.shape[1:3]
-    focal = np.array([c.focal(width, height) for c in cameras])
-    centre = np.array([c.centre(width, height) for c in cameras])
-    poses, box = np.stack([c.pose for c in cameras]), _box(file, content)
+    focal = np.array([_focal(numbers, width, height) for _, numbers in cameras])
+    centre = np.array([(numbers.get("cx", width / 2), numbers.get("cy", height / 2)) for _, numbers in cameras])
+    poses, box = np.stack([pose for pose, _ in cameras]), _box(file, content)
     digest = hashlib.sha256(json.dumps([split, images.shape, names, has_alpha]).encode())
     for array in (images, poses, focal, centre, *([] if box is None else [box])):
         digest.update(np.ascontiguousarray(array))
@@ -206,38 +195,16 @@ def _box(file: Path, content: dict) -> np.ndarray | None:
     return box
 
 
-@dataclass(frozen=True)
-class _PinholeCamera:
-    """Pinhole camera of a frame: its ``pose`` ``(4, 4)``, camera to world, and the ``numbers`` that the file gives."""
-
-    file: str
-    pose: np.ndarray
-    numbers: dict[str, float]
-
-    def check_size(self, path: Path, width: int, height: int) -> None:
-        """Raise :class:`ViewsError` if the image is not of the size that the camera was described for."""
-        size = self.numbers.get("w", width), self.numbers.get("h", height)
-        if size != (width, height):
-            raise ViewsError(
-                f"{path}: has {width} × {height} pixels, {self.file} says {size[0]:g} × {size[1]:g}, "
-                f"to which its focal lengths refer"
-            )
-
-    def focal(self, width: int, height: int) -> tuple[float, float]:
-        """Return the focal lengths along x and y in pixels of an image of this size."""
-        n = self.numbers
-        fx = n["fl_x"] if "fl_x" in n else width / 2 / np.tan(n["camera_angle_x"] / 2)
-        if "fl_y" in n:
-            return fx, n["fl_y"]
-        return fx, height / 2 / np.tan(n["camera_angle_y"] / 2) if "camera_angle_y" in n and "fl_x" not in n else fx
-
-    def centre(self, width: int, height: int) -> tuple[float, float]:
-        """Return the principal point in pixels of an image of this size."""
-        return self.numbers.get("cx", width / 2), self.numbers.get("cy", height / 2)
+def _focal(numbers: dict[str, float], width: int, height: int) -> tuple[float, float]:
+    """Return the focal lengths along x and y in pixels of an image of this size."""
+    fx = numbers["fl_x"] if "fl_x" in numbers else width / 2 / np.tan(numbers["camera_angle_x"] / 2)
+    if "fl_y" in numbers or "fl_x" in numbers or "camera_angle_y" not in numbers:
+        return fx, numbers.get("fl_y", fx)
+    return fx, height / 2 / np.tan(numbers["camera_angle_y"] / 2)
 
 
-def _camera(file: Path, content: dict, frame: dict) -> _PinholeCamera:
-    """Return the camera of a frame, from its entries and those of the file."""
+def _camera(file: Path, content: dict, frame: dict) -> tuple[np.ndarray, dict[str, float]]:
+    """Return the pose of a frame, ``(4, 4)``, camera to world, and the numbers of its pinhole that the file gives."""
     where = f'{file}: frame "{frame["file_path"]}"'
     entries = {**{k: v for k, v in content.items() if k != "frames"}, **frame}
     model = entries.get("camera_model", "PINHOLE")
@@ -260,13 +227,14 @@ def _camera(file: Path, content: dict, frame: dict) -> _PinholeCamera:
             raise ViewsError(f'{where} has a distortion ("{name}" is {numbers[name]:g}): undistort the images first')
     if not {"fl_x", "camera_angle_x"} & set(numbers):
         raise ViewsError(f'{where} has no focal length: neither "camera_angle_x" nor "fl_x" is given')
-    for name in ("fl_x", "fl_y", "w", "h"):
-        if name in numbers and numbers[name] <= 0:
-            raise ViewsError(f'{where} has the "{name}" {numbers[name]:g}, expected a number > 0')
-    for name in ("camera_angle_x", "camera_angle_y"):
-        if name in numbers and not 0 < numbers[name] < np.pi:
-            raise ViewsError(f'{where} has the "{name}" {numbers[name]:g}, expected radians between 0 and π')
-    return _PinholeCamera(str(file), _pose(where, frame.get("transform_matrix")), numbers)
+    for names, limit, allowed in (
+        (("fl_x", "fl_y", "w", "h"), np.inf, "a number > 0"),
+        (("camera_angle_x", "camera_angle_y"), np.pi, "radians between 0 and π"),
+    ):
+        for name in names:
+            if name in numbers and not 0 < numbers[name] < limit:
+                raise ViewsError(f'{where} has the "{name}" {numbers[name]:g}, expected {allowed}')
+    return _pose(where, frame.get("transform_matrix")), numbers
 
 
 def _pose(where: str, matrix) -> np.ndarray:
@@ -309,7 +277,15 @@ def _image_file(file: Path, name: str) -> Path:
 
 def _read(path: Path) -> tuple[np.ndarray, bool]:
     """Return an image ``(height, width, 4)``, linear and multiplied by alpha, and whether the file has alpha."""
-    values, encoded = (_read_exr(path), False) if path.suffix.lower() == ".exr" else (_read_bytes(path), True)
+    encoded = path.suffix.lower() != ".exr"
+    try:
+        values = _read_bytes(path) if encoded else _read_exr(path)
+    except (ViewsError, ImportError):
+        raise
+    except Exception as e:  # each decoder raises errors of its own for a damaged file
+        raise ViewsError(
+            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
+        ) from None
     has_alpha = values.shape[2] in (2, 4)
     colour, alpha = (values[..., :-1], values[..., -1:]) if has_alpha else (values, None)
     if encoded:
@@ -334,21 +310,14 @@ def _read_bytes(path: Path) -> np.ndarray:
     """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
     from PIL import Image
 
-    try:
-        with Image.open(path) as image:
-            if image.mode not in ("RGB", "RGBA", "L", "LA"):
-                if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
-                    raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
-                image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-            elif image.mode in ("RGB", "L") and image.has_transparency_data:
-                image = image.convert("RGBA")
-            values = np.array(image)
-    except ViewsError:
-        raise
-    except Exception as e:  # each decoder raises errors of its own for a damaged file
-        raise ViewsError(
-            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
-        ) from None
+    with Image.open(path) as image:
+        if image.mode not in ("RGB", "RGBA", "L", "LA"):
+            if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
+                raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
+            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+        elif image.mode in ("RGB", "L") and image.has_transparency_data:
+            image = image.convert("RGBA")
+        values = np.array(image)
     return values.reshape(*values.shape[:2], -1)
 
 
@@ -356,13 +325,8 @@ def _read_exr(path: Path) -> np.ndarray:
     """Return an EXR image, ``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
     import OpenEXR
 
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except Exception as e:  # OpenEXR raises errors of its own for a damaged file
-        raise ViewsError(
-            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
-        ) from None
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
     colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(planes)), None)
     if colours is None:
         raise ViewsError(f"{path}: has the channels {', '.join(sorted(planes))}, expected R, G, B or Y, and A")

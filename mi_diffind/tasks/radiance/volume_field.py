@@ -72,21 +72,19 @@ class NodeVolume(VolumeField):
     def free_distance(self, p, d, active=True):
         return self.nodes.free_distance(p, d, active)
 
-    def interpolated_density(self, node_density, p, active) -> tuple:
+    def interpolated_density(self, node_density, p, active, low=None, step=None) -> tuple:
         """Return what :meth:`density_at` does, from ``node_density(number, active)``, the raw density of a node.
 
-        The data of a point are its eight weights and then its eight node numbers.
+        With ``low`` and ``step``, it is a level that stands for the raw density ``low`` + ``step`` · level. The data of
+        a point are its eight weights and then its eight node numbers.
         """
         corners, active = self.nodes.corners(p, active)
         raw = self.types.Float(0)
         for weight, number in corners:
             raw = dr.fma(weight, node_density(number, active), raw)
-        density = dr.select(active, density_of(self.raw_density(raw), self.per_voxel), 0)
+        raw = raw if step is None else dr.fma(raw, step, low)
+        density = dr.select(active, density_of(raw, self.per_voxel), 0)
         return density, [w for w, _ in corners] + [n for _, n in corners]
-
-    def raw_density(self, interpolated):
-        """Return the raw density that an interpolated number stands for: the number itself by default."""
-        return interpolated
 
 
 def density_of(raw, per_voxel):
@@ -173,21 +171,23 @@ class DenseVolumeField(NodeField):
 class PackedPaletteField(NodeVolume):
     """Compressed field in its form for rendering: a word of ``density_bits`` + ``index_bits`` bits at each node.
 
-    The low bits of a node are a density level, which stands for the raw density ``density_range[0]`` + level ·
-    ``density_range[1]``. The high bits are an index into ``palette`` ``(P, 12)``, uint8, whose bytes stand for
-    ``offset`` + ``scale`` · byte. ``levels`` and ``index`` are NumPy arrays ``(n,)``. Entries of the palette take 16
-    bytes in memory.
+    ``stored`` is that of :meth:`.compression.PaletteProblem.stored`. The low bits of a node are a density level, which
+    stands for the raw density ``density_range[0]`` + level · ``density_range[1]``. The high bits are an index into
+    ``palette`` ``(P, 12)``, uint8, whose bytes stand for ``offset`` + ``scale`` · byte. ``levels`` and ``index`` are
+    NumPy arrays ``(n,)``. Entries of the palette take 16 bytes in memory.
     """
 
-    def __init__(self, nodes, levels, density_bits, density_range, index, index_bits, palette, scale, offset):
+    def __init__(self, nodes: Nodes, stored: dict, density_bits: int, index_bits: int):
         super().__init__(nodes, {})
         types = nodes.types
-        self.density_bits, self.index_bits, self.density_range = density_bits, index_bits, density_range
-        self.words = types.UInt32(node_words(levels, density_bits, index, index_bits))
-        entries = np.zeros((len(palette), 16), np.uint8)
-        entries[:, :12] = palette
+        self.density_bits, self.index_bits, self.density_range = density_bits, index_bits, stored["density_range"]
+        # Level and index of each node without gaps, and one more word
+        joined = stored["levels"].astype(np.uint32) | (stored["index"].astype(np.uint32) << density_bits)
+        self.words = types.UInt32(as_words(pack_bits(joined, density_bits + index_bits), spare=1))
+        entries = np.zeros((len(stored["palette"]), 16), np.uint8)
+        entries[:, :12] = stored["palette"]
         self.palette = types.UInt32(entries.view("<u4").reshape(-1))
-        self.scale, self.offset = [float(v) for v in scale], [float(v) for v in offset]
+        self.scale, self.offset = ([float(v) for v in stored[name]] for name in ("scale", "offset"))
 
     @property
     def nbytes(self) -> int:
@@ -207,12 +207,8 @@ class PackedPaletteField(NodeVolume):
             indices.append((word >> self.density_bits) & (2**self.index_bits - 1))
             return self.types.Float(word & (2**self.density_bits - 1))
 
-        density, point_data = self.interpolated_density(level, p, active)
+        density, point_data = self.interpolated_density(level, p, active, *self.density_range)
         return density, point_data[:8] + indices
-
-    def raw_density(self, interpolated):
-        low, step = self.density_range
-        return dr.fma(interpolated, step, low)
 
     def radiance_at(self, point_data, p, d, active=True):
         types = self.types
@@ -225,9 +221,3 @@ class PackedPaletteField(NodeVolume):
                 number = dr.reinterpret_array(types.Float, (byte & 0x7F8000) | 0x3F800000)
                 sums[k] = dr.fma(weight, number, sums[k])
         return colour_of([dr.fma(s - 1, 256 * a, b) for s, a, b in zip(sums, self.scale, self.offset, strict=True)], d)
-
-
-def node_words(levels: np.ndarray, density_bits: int, index: np.ndarray, index_bits: int) -> np.ndarray:
-    """Return 32-bit words that hold the level and the index of each node without gaps, and one more word."""
-    joined = levels.astype(np.uint32) | (index.astype(np.uint32) << density_bits)
-    return as_words(pack_bits(joined, density_bits + index_bits), spare=1)

@@ -10,8 +10,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from ... import units
 from ...arguments import Argument, between, checked, positive
 from ...settings import FitSettings
@@ -42,6 +40,7 @@ class Sdf(Task):
         "paper": PAIR_SETTINGS,
     }
     storages = ()
+    measurements = 4
     files = "model"
     arguments = (
         Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
@@ -69,16 +68,8 @@ class Sdf(Task):
         ),
     )  # fmt: skip
 
-    def settings(self, preset, given, options):
-        defaults = self.presets[preset]
-        steps = given.get("steps", defaults.steps)
-        return dataclasses.replace(defaults, measure_every=max(1, steps // 4), **given)
-
     def allocate(self, table, dtype, storage=""):
         return super().allocate(table, dtype, storage) if table.settings["layout"] == "pair" else {}
-
-    def model(self, table, dtype, storage=""):
-        return self.model_class()(table, self.allocate(table, dtype, storage), dtype, storage)
 
 
 TASK = Sdf()

@@ -19,11 +19,7 @@ class DistanceField:
     that it returns. ``types`` is the module of Dr.Jit types to compute with.
     """
 
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
     slope: float = 1.0
-    spacing: float
-    band: float
     #: Whether rays march from cell to cell (:mod:`.marching`); otherwise they are sphere-traced by :meth:`safe_step`.
     marched = False
 

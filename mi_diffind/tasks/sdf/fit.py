@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -165,7 +163,12 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
         lines = []
         if request.preset == "sparse":
             sampled = search_grid(distances, nbytes, request.options["bits"])
-            lines += thin_parts(sampled)
+            if sampled.missed > THIN:
+                lines.append(
+                    f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no "
+                    f"change of sign: parts may be thinner than a cell, 1/{1 / sampled.structure.spacing:.0f} of the "
+                    f"longest side: more --bytes help"
+                )
             table, result, field = fit_sparse(distances, sampled, request, held_out)
         else:
             table, result, field = fit_pair(distances, nbytes, request, samples, held_out)
@@ -176,18 +179,15 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
         count = distances.surface.components
         lines.append(f"{lost} of {count} pieces of the mesh are too small for the field: more --bytes help")
     table.preset, table.seed = request.preset, request.settings.seed
-    folder = (request.output or Path("x")).resolve().parent
     table.settings = {
-        **request.recorded(),
+        **request.recorded(result),
         "source": mesh.digest,
-        "mesh_path": os.path.relpath(Path(request.options["source"]).resolve(), folder),
+        "mesh_path": request.relative(request.options["source"]),
         "scale": mesh.scale,
         "centre": list(mesh.centre),
         "warnings": warnings,
         **table.settings,
     }
-    if request.seconds is not None:
-        table.settings["steps"] = result.steps
     table.measured = {k: float(f"{v:.6g}") for k, v in errors.items()}
     triangles = 12 * (len(mesh.vertices) + len(mesh.faces))
     lines.append(f"{prepared:.1f} s for distances and samples, {result.seconds:.1f} s of training")
@@ -241,17 +241,6 @@ def coded_bytes(sampled: encoding.SampledNodes, bits: int) -> int:
 def entries_for(sampled: encoding.SampledNodes, bits: int) -> int:
     """Return the size of the cascaded array: as many entries as pointers can name, and at most one per node."""
     return max(1, min(2**bits, sampled.structure.nodes))
-
-
-def thin_parts(sampled: encoding.SampledNodes) -> list[str]:
-    """Return a sentence if parts of the solid may be thinner than a cell."""
-    if sampled.missed <= THIN:
-        return []
-    return [
-        f"{100 * sampled.missed:.0f}% of the cells that the surface comes through or near to show no change of "
-        f"sign: parts may be thinner than a cell, 1/{1 / sampled.structure.spacing:.0f} of the longest side: more "
-        f"--bytes help"
-    ]
 
 
 def fit_sparse(distances: Distances, sampled: encoding.SampledNodes, request: FitRequest, held_out: int = HELD_OUT):

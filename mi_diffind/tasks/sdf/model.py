@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from ...errors import UsageError
 from ...files import replacing
 from ...indirection import Indirection
-from ...tables import StoredArray, Table, TableError, load_table
+from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout
 from ...task import Model
 from . import codes
 from .field import DistanceField
@@ -34,48 +33,28 @@ def _word_bytes(words: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(words, "<u4").view(np.uint8).reshape(len(words), -1)
 
 
-def _byte_array(raw: np.ndarray) -> StoredArray:
-    channels = raw.shape[-1]
-    return StoredArray(raw, (), (1.0,) * channels, (0.0,) * channels)
-
-
 def sparse_arrays(structure: Structure, frames, pointers, entries) -> dict[str, StoredArray]:
     """Return the arrays of a sparse field: words of frames (B,) and pointers, and the entries (K, 3), float32."""
     blocks = [_word_bytes(structure.block_masks), structure.block_signs[:, None], _word_bytes(frames[:, None])]
     masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
     return {
-        "regions": _byte_array(structure.regions[..., None]),
-        "region_masks": _byte_array(_word_bytes(masks)),
-        "blocks": _byte_array(np.concatenate(blocks, axis=1)),
-        "pointers": _byte_array(_word_bytes(pointers[:, None])),
+        "regions": byte_array(structure.regions[..., None]),
+        "region_masks": byte_array(_word_bytes(masks)),
+        "blocks": byte_array(np.concatenate(blocks, axis=1)),
+        "pointers": byte_array(_word_bytes(pointers[:, None])),
         "entries": StoredArray(np.ascontiguousarray(entries, np.float32)),
     }
 
 
 def load(path) -> Table:
     """Read and check a file. Raises :class:`~mi_diffind.tables.TableError`."""
-    table = load_table(path, "sdf")
-    layout = table.settings.get("layout")
-    if layout not in LAYOUTS:
-        raise TableError(f'{path}: has the layout {layout!r}, allowed are "sparse" and "pair"')
-    for name, (dims, channels) in LAYOUTS[layout].items():
-        array = table.arrays.get(name)
-        if array is None or len(array.shape) != dims + 1 or array.shape[-1] != channels:
-            fault = "is missing" if array is None else f"has the shape {array.shape}"
-            raise TableError(
-                f'{path}: the array "{name}" {fault}, expected {dims} dimension(s) and {channels} channels'
-            )
-    vectors = ["lower", "centre", *(["upper"] if layout == "pair" else [])]
-    numbers = ["scale", "slope", *(["spacing", "bits", "nodes"] if layout == "sparse" else ["band"])]
-    for name in (*vectors, *numbers):
-        value = table.settings.get(name)
-        values = value if name in vectors else [value]
-        valid = isinstance(values, list) and len(values) == (3 if name in vectors else 1)
-        valid = valid and all(isinstance(v, (int, float)) and math.isfinite(v) for v in values)
-        if not valid or (name in numbers and values[0] <= 0):
-            allowed = "a positive number" if name in numbers else "3 finite numbers"
-            raise TableError(f'{path}: its setting "{name}" is {value!r}, expected {allowed}')
-    if layout == "sparse":
+    table = load_layout(path, "sdf", LAYOUTS)
+    sparse = table.settings["layout"] == "sparse"
+    for name in ("lower", "centre", *(() if sparse else ("upper",))):
+        check_numbers(table, name, 3)
+    for name in ("scale", "slope", *(("spacing", "bits", "nodes") if sparse else ("band",))):
+        check_numbers(table, name, 1, positive=True)
+    if sparse:
         structure_of(table)
     return table
 
@@ -135,23 +114,14 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceFi
 class SdfModel(Model):
     """Distance field of a file: ``field`` (:class:`.field.DistanceField`), in the unit frame.
 
-    A point of the mesh's file is ``scale`` · p + ``centre``. ``form`` is the requested storage form, "" for the file's.
+    A point of the mesh's file is ``scale`` · p + ``centre``.
     """
-
-    def __init__(self, table, arrays, dtype, form: str = ""):
-        self.form = form
-        super().__init__(table, arrays, dtype)
 
     def build(self):
         settings = self.table.settings
         self.sparse = settings["layout"] == "sparse"
         self.field = field_of(self.table, self.arrays, self.types, self.form)
         self.scale, self.centre = float(settings["scale"]), tuple(settings["centre"])
-
-    def copy(self):
-        return type(self)(
-            self.table, {name: array.copy() for name, array in self.arrays.items()}, self.dtype, self.form
-        )
 
     @property
     def storage(self):
@@ -213,11 +183,16 @@ class SdfModel(Model):
         ``resolution`` is the number of cells along the longest side, by default finer than the field's cells.
         """
         from .extraction import extract
+        from .grids import grid
 
         resolution = resolution or min(1024, round(1.5 / self.field.spacing))
         suffix = output.suffix.lower()
         if suffix == ".npz":
-            return [self._decode_grid(output, resolution)]
+            values, lower, upper = grid(self.field, resolution)
+            lower, upper = (p * self.scale + np.array(self.centre) for p in (lower, upper))
+            with replacing(output) as temporary, open(temporary, "wb") as stream:
+                np.savez_compressed(stream, distance=values * np.float32(self.scale), lower=lower, upper=upper)
+            return [(output, f"{' x '.join(map(str, values.shape))} distances (z, y, x) in units of the mesh")]
         if suffix not in MESHES:
             allowed = ", ".join((*MESHES, ".npz"))
             raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are {allowed}')
@@ -231,16 +206,6 @@ class SdfModel(Model):
         return [
             (output, f"{len(mesh.faces):,} triangles at {resolution} cells along the longest side, {seconds:.1f} s")
         ]
-
-    def _decode_grid(self, output: Path, resolution: int):
-        from .grids import grid
-
-        values, lower, upper = grid(self.field, resolution)
-        lower, upper = (p * self.scale + np.array(self.centre) for p in (lower, upper))
-        with replacing(output) as temporary, open(temporary, "wb") as stream:
-            np.savez_compressed(stream, distance=values * np.float32(self.scale), lower=lower, upper=upper)
-        shape = " x ".join(map(str, values.shape))
-        return output, f"{shape} distances (z, y, x) in units of the mesh"
 
 
 MODEL = SdfModel

@@ -15,7 +15,7 @@ import numpy as np
 
 from . import codes
 from .field import DistanceField
-from .structure import ACTIVE, BLOCK, Structure
+from .structure import ACTIVE, BLOCK, Structure, first_ranks
 
 #: Largest distance that a field returns, in spacings.
 BAND = 2.0
@@ -50,8 +50,8 @@ class SparseNodes(DistanceField):
         self._regions = UInt32(regions)
         masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
         self._region_masks = UInt32(masks.reshape(-1).astype(np.uint32))
-        self._first_blocks = UInt32(structure.first_blocks)
-        words = structure.block_signs.astype(np.uint32) << np.uint32(24) | structure.first_nodes
+        self._first_blocks = UInt32(first_ranks(structure.region_masks))
+        words = structure.block_signs.astype(np.uint32) << np.uint32(24) | first_ranks(structure.block_masks)
         frame_words = np.zeros(structure.blocks, np.uint32) if frames is None else frames
         blocks = np.stack([*structure.block_masks.T, words, frame_words], axis=1)
         self._blocks = UInt32(np.ascontiguousarray(blocks.reshape(-1).astype(np.uint32)))
@@ -81,7 +81,7 @@ class SparseNodes(DistanceField):
         masks = dr.gather(dr.uint32_array_t(self.types.Array4f), self._region_masks, word, has)
         bit = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
         in_mask, rank = _bit_and_rank(masks[0], masks[1], bit)
-        inside = dr.select(has, _bit(masks[2], masks[3], bit), (word & 1) == 1)
+        inside = dr.select(has, _bit_and_rank(masks[2], masks[3], bit)[0], (word & 1) == 1)
         has_nodes = has & in_mask
         number = dr.gather(UInt32, self._first_blocks, word, has_nodes) + rank
         return number, has_nodes, inside
@@ -244,14 +244,8 @@ def coded_field(types, structure: Structure, slope: float, frames, pointers, bit
     )  # fmt: skip
 
 
-def _bit(low, high, bit):
-    """Return whether a bit of a 64-bit mask, given as two words, is set."""
-    word = dr.select(bit < 32, low, high)
-    return (word >> (bit & 31) & 1) == 1
-
-
 def _bit_and_rank(low, high, bit):
-    """Return whether a bit of a 64-bit mask is set, and how many bits below it are."""
+    """Return whether a bit of a 64-bit mask, given as two words, is set, and how many bits below it are."""
     upper = bit >= 32
     word = dr.select(upper, high, low)
     rank = dr.popcnt(word & ((type(low)(1) << (bit & 31)) - 1)) + dr.select(upper, dr.popcnt(low), 0)

@@ -61,12 +61,10 @@ class PairField(DistanceField):
         # Opaque, no literal: a new value must not compile the kernels of rays again
         self._bound = dr.opaque(self.types.Float, self.slope)
 
-    def _coordinates(self, p):
-        return [(x - a) / (b - a) for x, a, b in zip(p, self.lower, self.upper, strict=True)]
-
     def value(self, p, active=True):
         active = self.inside(p) & active
-        value = dr.fma(self.net(self._coordinates(p), active)[0], 2 * self.band, -self.band)
+        coordinates = [(x - a) / (b - a) for x, a, b in zip(p, self.lower, self.upper, strict=True)]
+        value = dr.fma(self.net(coordinates, active)[0], 2 * self.band, -self.band)
         return dr.select(active, value, self.band)
 
     def gradient(self, p, active=True):
@@ -108,9 +106,10 @@ def resolutions(nbytes: int, ratio: float, extent) -> tuple[tuple[int, ...], tup
 def initial(start: str, primary, cascaded, grid_distance, samples, distances, band: float) -> Indirection:
     """Return the arrays at the start of the training.
 
-    ``start`` is ``"ramp"``: pointers are a ramp, the cascaded array has the distance of the nearest of the ``samples``
-    in [0, 1]³ (n, 3), whose distances are ``distances`` (n,); or ``"distance"``: the first pointer is the truncated
-    distance, which the function ``grid_distance`` returns at the entries of an array of some resolution.
+    ``start`` is ``"ramp"`` or ``"constant"``: pointers are a ramp, the cascaded array has the distance of the nearest
+    of the ``samples`` in [0, 1]³ (n, 3), whose distances are ``distances`` (n,); or ``"distance"``: the first pointer
+    is the truncated distance, which the function ``grid_distance`` returns at the entries of an array of some
+    resolution.
     """
     pointers = ramp(primary, 3, ("clamp",) * 3)
     if start == "distance":
@@ -237,11 +236,8 @@ def fit_pair(distances: Distances, nbytes: int, request: FitRequest, samples: in
         return distances.signed(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)).reshape(resolution)
 
     start = "constant" if options["constant"] else STARTS[request.preset]
-    if start == "constant":  # all entries have the one sample's distance, 0
-        net = initial("ramp", primary, cascaded, grid_distance, unit[:1], np.zeros(1), band)
-    else:
-        net = initial(start, primary, cascaded, grid_distance, unit, d, band)
-    net = net.alloc(request.types.TensorXf)
+    known = (unit[:1], np.zeros(1)) if start == "constant" else (unit, d)  # constant: the one sample's distance, 0
+    net = initial(start, primary, cascaded, grid_distance, *known, band).alloc(request.types.TensorXf)
     field = PairField(request.types, net, lower, upper, band, 1.0)
     held = HeldOut(distances, request.types, spacing / 2, count=held_out)
     problem = PairProblem(field, mesh, unit, d, held)

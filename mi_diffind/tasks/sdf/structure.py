@@ -69,16 +69,6 @@ class Structure:
         return tuple(a + self.spacing * (n - 1) for a, n in zip(self.lower, self.shape, strict=True))
 
     @property
-    def first_blocks(self) -> np.ndarray:
-        """First block of each region with nodes, ``(R,)`` uint32."""
-        return _before(self.region_masks)
-
-    @property
-    def first_nodes(self) -> np.ndarray:
-        """First node of each block, ``(B,)`` uint32."""
-        return _before(self.block_masks)
-
-    @property
     def nodes(self) -> int:
         """Number of stored nodes."""
         return int(mask_flags(self.block_masks).sum())
@@ -191,7 +181,7 @@ _GROUPS = np.array([
 ])  # fmt: skip
 
 
-def _before(words: np.ndarray) -> np.ndarray:
+def first_ranks(words: np.ndarray) -> np.ndarray:
     """Return the number of bits set in all masks before each one, ``(n,)`` uint32."""
     counts = mask_flags(words).sum(axis=1)
     return (np.cumsum(counts) - counts).astype(np.uint32)

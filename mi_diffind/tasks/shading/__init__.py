@@ -12,8 +12,6 @@ Training through renders of a scene is :mod:`mi_diffind.scene_training`.
 
 from __future__ import annotations
 
-import dataclasses
-
 from ...arguments import Argument, fraction, positive_or_none
 from ...maps.arguments import PREVIEW, SIZES, SOURCES
 from ...task import Task
@@ -28,6 +26,7 @@ class Shading(Task):
     section = "supplemental 1.5"
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
+    measurements = 10
     arguments = (
         Argument(
             "source", metavar="MATERIAL.json", help="a manifest of the maps of a material",
@@ -55,11 +54,6 @@ class Shading(Task):
         *SOURCES,
         PREVIEW,
     )  # fmt: skip
-
-    def settings(self, preset, given, options):
-        settings = PRESETS[preset].settings
-        steps = given.get("steps", settings.steps)
-        return dataclasses.replace(settings, measure_every=max(1, steps // 10), **given)
 
 
 TASK = Shading()

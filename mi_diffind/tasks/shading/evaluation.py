@@ -94,11 +94,9 @@ class ShadedEvaluation:
 
     def _truth(self, pattern: str, level: int) -> np.ndarray:
         lanes, shape = self._lanes(level)
-        side = (
-            int(np.clip(PER_TEXEL << level, SAMPLES_PER_SIDE[pattern], LARGEST))
-            if pattern == "converged"
-            else SAMPLES_PER_SIDE[pattern]
-        )
+        side = SAMPLES_PER_SIDE[pattern]
+        if pattern == "converged":
+            side = int(np.clip(PER_TEXEL << level, side, LARGEST))
         return _image(reference(pattern, self.pyramid, *lanes, self.effects, side=side), shape)
 
     def images(self, read: ShadedReader, level: int, pairs=None) -> np.ndarray:

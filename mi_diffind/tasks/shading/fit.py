@@ -7,7 +7,7 @@ import math
 import os
 
 from ...errors import UsageError
-from ...maps.arguments import preview_path, record_source, requested_border, requested_bytes
+from ...maps.arguments import preview_path, requested_border, requested_bytes
 from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ...tables import Table
@@ -81,18 +81,19 @@ def fit(request: FitRequest) -> Fitted:
         table, result = training.fit_shading(source, net, recipe, shading_request, pyramid, evaluation, preview)
     else:
         table = start
-    record_source(request, table)
+    table.settings["source_path"] = request.relative(options["source"])
     lines = [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
     lines += [f"left out: {effect} ({reason})" for effect, reason in reasons.items()]
-    lines += [f"not shaded: {name} ({reason})" for name, reason in material.left_out(pyramid.layout).items()]
+    not_shaded = material.left_out(pyramid.layout)
+    lines += [f"not shaded: {name} ({reason})" for name, reason in not_shaded.items()]
     figures = {
         "source_bytes": source.nbytes,
         "compression": source.nbytes / table.nbytes,
         "effects_in_use": list(effects.names),
         "effects_left_out": reasons,
-        "maps_not_shaded": material.left_out(pyramid.layout),
+        "maps_not_shaded": not_shaded,
         "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
         "bits": {name: a.bits for name, a in table.arrays.items()},
     }

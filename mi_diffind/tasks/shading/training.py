@@ -74,11 +74,7 @@ class ShadingProblem(textures.TextureProblem):
         surface = surface_of(self.pyramid, net.filtered(u, v, level))
         limit = None if recipe.clip is None else recipe.clip * recipe.share / size
         value = shaded(self.decoder, surface, wi, wo, self.effects, limit)
-        return self.differences(value, truth)
-
-    def differences(self, value, truth):
-        """Return the error of shaded values, the mean over colours."""
-        bounded = _bounded if self.shading.bounded else (lambda x: x)
+        bounded = _bounded if recipe.bounded else (lambda x: x)
         errors = [bounded(a) - bounded(b) for a, b in zip(value, truth, strict=True)]
         squared = self.settings.loss == "mse"
         return sum(dr.square(e) if squared else dr.abs(e) for e in errors) / 3
@@ -139,9 +135,7 @@ def fit_shading(
     result = request.train(problem, "shading")
     kept = any(before[name] > result.measured[name] for name in list(before)[:1])
     identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
-    settings = {**request.recorded(), **identity}
-    if request.seconds is not None:
-        settings["steps"] = result.steps
+    settings = {**request.recorded(result), **identity}
     if kept:
         settings["kept_start"] = True
     texture = CompressedTexture(pyramid.layout, first if kept else textures.stored_form(problem.net))

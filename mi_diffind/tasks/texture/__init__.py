@@ -10,25 +10,18 @@ Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffi
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
-
-from ...arguments import Argument, natural, positive
+from ...arguments import Argument, checked, natural, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
 from ...task import Task
 from .presets import PRESETS
 
 
-def _structure(text: str) -> str:
-    """Return a structure of arrays. Raises ``ArgumentTypeError``."""
+def _parse_structure(text: str) -> None:
+    """Raise ``ValueError`` for a text that names no structure of arrays."""
     from .memory_budget import parse_structure
 
-    try:
-        if text not in ("auto", "pages"):
-            parse_structure(text)
-    except ValueError as e:
-        raise argparse.ArgumentTypeError(str(e)) from None
-    return text
+    if text not in ("auto", "pages"):
+        parse_structure(text)
 
 
 class Texture(Task):
@@ -40,11 +33,12 @@ class Texture(Task):
     section = "supplemental 1.4"
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
+    measurements = 10
     arguments = (
         SOURCE,
         *(size for size in SIZES if size.name != "psnr"),
         Argument(
-            "--structure", type=_structure, metavar="L:C:B,…",
+            "--structure", type=checked(_parse_structure), metavar="L:C:B,…",
             help="pages, or level, channels and bits of each fine array, as in 0:1:2,1:2:4 (default: auto)",
         ),
         Argument(
@@ -64,11 +58,6 @@ class Texture(Task):
         *DECODED,
         Argument("--level", type=natural, metavar="N", help="level of detail (default: 0, the source's)"),
     )
-
-    def settings(self, preset, given, options):
-        defaults = PRESETS[preset].settings
-        steps = given.get("steps", defaults.steps)
-        return dataclasses.replace(defaults, measure_every=max(1, steps // 10), **given)
 
 
 TASK = Texture()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 import drjit as dr
@@ -19,7 +20,7 @@ from ...maps.model import MapsModel, allocate_maps, page_entries
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
 from ...tables import PAGES, Table, TableError, load_table, stored_arrays
-from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure, coarse_texels
+from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
 #: Names of the paper's arrays.
 PAPER = ("primary0", "primary1", "cascaded")
@@ -137,13 +138,9 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
         if isinstance(structure, PaperStructure):
             settings["arrays"] = {"kind": "paper", "axis": "side"}
         else:
-            layers = [
-                {"level": x.level, "until": x.until, "bits": x.bits, "scale": list(x.scale), "paged": x.paged}
-                for x in structure.layers
-            ]
             settings["arrays"] = {
                 "kind": "layers", "skip": structure.skip, "bits": structure.bits, "base": structure.base,
-                "border": list(texture.border), "layers": layers,
+                "border": list(texture.border), "layers": list(map(asdict, structure.layers)),
             }  # fmt: skip
     return Table("texture", stored, settings=settings)
 
@@ -230,7 +227,7 @@ def _layered_shapes(table: Table, layout: Layout, structure: LayeredStructure, l
             raise TableError(f'{table.path}: array "{name}" has {layer.channels} channels, its pointers have {dims}')
         size = structure.sizes[layer.level]
         shapes[name] = (*((page_entries(table, name, size),) if layer.paged else size), layer.channels)
-    shapes["coarse"] = (coarse_texels(structure), dims)
+    shapes["coarse"] = (sum(map(math.prod, structure.sizes[structure.skip :])), dims)
     shapes["cascaded"] = (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,)
     return shapes
 

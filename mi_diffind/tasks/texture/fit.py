@@ -6,7 +6,7 @@ import dataclasses
 
 from ...errors import UsageError
 from ...maps import components
-from ...maps.arguments import record_source, requested_border, requested_bytes, size_figures
+from ...maps.arguments import requested_border, requested_bytes, size_figures
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from ...tables import MAX_BYTES
@@ -57,7 +57,7 @@ def fit(request: FitRequest) -> Fitted:
     if pyramid.layout.stored:
         size = size_of(source, pyramid, requested, recipe, options)
     table, result = training.fit_texture(source, size, recipe, request, pyramid)
-    record_source(request, table)
+    table.settings["source_path"] = request.relative(options["source"])
     figures, line = size_figures(source, table, requested)
     lines = [line]
     if size is not None and abs(size.nbytes / requested - 1) > memory_budget.TOLERANCE:

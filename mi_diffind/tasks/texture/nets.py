@@ -146,14 +146,15 @@ class LayeredNet(nn.Module):
         "coarse": DifferentiableArray,
         "cascaded": DifferentiableArray,
         "structure": object,
-        "along": tuple,
+        "border": tuple,
     }
 
     def __init__(
         self, fine=(), coarse=None, cascaded=None, structure: LayeredStructure | None = None, border=("clamp", "clamp")
     ):
         self.fine, self.coarse, self.cascaded, self.structure = tuple(fine), coarse, cascaded, structure
-        self.along = tuple(border)
+        #: The border of the texture along v and u
+        self.border = tuple(border)
 
     @property
     def arrays(self) -> dict[str, DifferentiableArray]:
@@ -161,16 +162,11 @@ class LayeredNet(nn.Module):
         fine = {f"level{x.level}": a for x, a in zip(self.structure.layers, self.fine, strict=True)}
         return {**fine, "coarse": self.coarse, "cascaded": self.cascaded}
 
-    @property
-    def border(self) -> tuple[str, str]:
-        """The border of the texture along v and u."""
-        return self.along
-
     def changed(self, change) -> LayeredNet:
         """Return a copy with ``change(array, bits)`` in place of each array."""
         structure = self.structure
         fine = [change(a, x.bits) for a, x in zip(self.fine, structure.layers, strict=True)]
-        return LayeredNet(fine, change(self.coarse, structure.bits), change(self.cascaded, 8), structure, self.along)
+        return LayeredNet(fine, change(self.coarse, structure.bits), change(self.cascaded, 8), structure, self.border)
 
     def filtered(self, u, v, level, active=True) -> list:
         """Return the channels at (u, v) and a level of detail from 0 to the last level."""
@@ -224,7 +220,7 @@ class LayeredNet(nn.Module):
         if isinstance(array, PagedArray):
             return [v, u]
         place = []
-        for x, n, border in zip((v, u), array.resolution, self.along, strict=True):
+        for x, n, border in zip((v, u), array.resolution, self.border, strict=True):
             place.append(x - 0.5 / n if border == "repeat" else (x * n - 0.5) * (1 / max(1, n - 1)))
         return place
 
@@ -241,13 +237,8 @@ class LayeredNet(nn.Module):
                 start += math.prod(size)
                 offset = dr.select(level > structure.skip + i, start, offset)
         total = None
-        for row, a in around(v, rows, self.along[0]):
-            for column, b in around(u, columns, self.along[1]):
+        for row, a in around(v, rows, self.border[0]):
+            for column, b in around(u, columns, self.border[1]):
                 entry, weight = self.coarse.entry(offset + row * columns + column, active), a * b
                 total = weighted_sum(weight, entry, total)
         return total
-
-
-def coarse_texels(structure: LayeredStructure) -> int:
-    """Return the number of texels of all levels from ``structure.skip`` on."""
-    return sum(math.prod(size) for size in structure.sizes[structure.skip :])

@@ -188,9 +188,7 @@ def fit_texture(
         problem = problem_of(source, size, recipe, pyramid)
         result = request.train(problem)
         identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
-        settings = {**request.recorded(), **identity}
-        if request.seconds is not None:
-            settings["steps"] = result.steps
+        settings = {**request.recorded(result), **identity}
         table = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net)), settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
     errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)

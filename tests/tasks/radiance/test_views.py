@@ -2,11 +2,14 @@
 
 import json
 
+import captures
+import drjit.llvm.ad as llvm
 import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
 
+from mi_diffind.tasks.radiance.training import ViewImages
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
 
 SIZE = (6, 8)  # height, width
@@ -117,13 +120,17 @@ def test_rays_go_through_the_middles_of_pixels(blender):
     change(blender, fl_x=9.0, fl_y=7.0, cx=3.5, cy=2.5, camera_angle_x=None)
     views = load_views(blender)
     x, y = np.meshgrid(np.arange(8), np.arange(6))
-    origin, direction = views.rays(np.full(x.shape, 1), x, y)
+    origin, direction = captures.rays_of(views, np.full(x.shape, 1), x, y)
     assert np.allclose(np.linalg.norm(direction, axis=-1), 1) and np.allclose(origin, turn[:3, 3])
     local = np.linalg.inv(turn) @ np.concatenate([origin + 3 * direction, np.ones((6, 8, 1))], -1)[..., None]
     local = local[..., 0]
     assert (local[..., 2] < 0).all()  # in front, which is −z
     assert np.allclose(3.5 + 9 * local[..., 0] / -local[..., 2], x + 0.5)
     assert np.allclose(2.5 - 7 * local[..., 1] / -local[..., 2], y + 0.5)  # y is up, rows go down
+    place = (llvm.UInt32(np.uint32(v).ravel()) for v in (x, y))
+    for actual, expected in zip(ViewImages(llvm, views).rays(llvm.UInt32(1), *place), (origin, direction), strict=True):
+        expected = expected.reshape(-1, 3)
+        np.testing.assert_allclose(np.broadcast_to(actual.numpy().T, expected.shape), expected, atol=1e-6)
 
 
 def test_without_test_views_every_eighth_is_one(blender):
