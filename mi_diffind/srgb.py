@@ -29,8 +29,11 @@ def from_linear(values, fused: bool = True):
     return dr.select(values <= 0.0031308, 12.92 * values, curve)
 
 
-def to_linear(values):
-    """Decode ``values``, the inverse of :func:`from_linear`. Values outside [0, 1] are not clipped."""
+def to_linear(values, fused: bool = True):
+    """Decode ``values``, the inverse of :func:`from_linear`. Values outside [0, 1] are not clipped.
+
+    For Dr.Jit arrays, ``fused`` rounds the scaled sum once, not twice; trainings differ in that.
+    """
     if type(values) is float:
         return float(to_linear(np.float64(values)))
     if isinstance(values, (np.ndarray, np.generic)):
@@ -38,6 +41,9 @@ def to_linear(values):
         return np.where(values <= 0.04045, values / 12.92, power)
     import drjit as dr
 
+    if not fused:
+        root = dr.maximum((values + 0.055) / 1.055, 0.05)
+        return dr.select(values <= 0.04045, values / 12.92, root**2.4)
     power = dr.fma(dr.maximum(values, 0), 1 / 1.055, 0.055 / 1.055) ** 2.4
     return dr.select(values < 0.04045, values * (1 / 12.92), power)
 

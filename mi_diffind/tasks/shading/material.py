@@ -92,7 +92,7 @@ def linear(values, m: MapLayout):
     """Return linear channels of a map: decoded from sRGB if the map is encoded in it."""
     if m.color_space != "srgb":
         return values
-    return [srgb.to_linear(v) for v in values]
+    return [srgb.to_linear(v, fused=False) for v in values]
 
 
 def surface_of(maps: FilteredMaps, stored: list) -> SurfaceParameters:
