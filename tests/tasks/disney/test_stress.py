@@ -782,8 +782,10 @@ def test_chained_wrappers(mi_rgb):
     si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
     si.dp_du, si.dp_dv, si.n = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Normal3f(0, 0, 1)
     plain, wrapped = (mi.load_dict(bsdf) for bsdf in (inner(), chained()))
+    # Frames that wrappers rebuild turn directions by up to 5e-6 with AVX2, which near the horizon is much of a cosine
+    tolerance = 1e-3 + 1e-5 / np.abs([wi, wo])[..., 2].min(axis=0)
     for a, b in zip(plain.eval_pdf(ctx, si, vectors(mi, wo)), wrapped.eval_pdf(ctx, si, vectors(mi, wo)), strict=True):
-        assert close(b.numpy(), a.numpy(), 1e-3).all()
+        assert close(b.numpy(), a.numpy(), tolerance).all()
     bs, weight = wrapped.sample(ctx, si, *u)
     valid = (bs.pdf.numpy() > 0) & (bs.wo.z.numpy() > 0)
     value, pdf = plain.eval(ctx, si, bs.wo).numpy()[:, valid], plain.pdf(ctx, si, bs.wo).numpy()[valid]
