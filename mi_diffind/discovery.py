@@ -44,8 +44,9 @@ def load(
 ) -> dict:
     """Import :func:`modules` (or ``only`` some of them) and return name → the ``attribute`` that each declares.
 
-    A declaration is an instance of ``expected`` with that ``name``. A module of another package that cannot be imported
-    or lacks the attribute is left out with a warning; one of this package that lacks it declares nothing.
+    A declaration is an instance of ``expected``; its ``name`` counts, if it has one, and has to be that of the entry
+    point. A module of another package that cannot be imported, lacks the attribute or declares a name of this package
+    is left out with a warning; a module of this package that lacks the attribute declares nothing.
     """
     shipped, others, known = {}, {}, modules(package, ignored)
     for name in known if only is None else only:

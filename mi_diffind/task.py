@@ -168,8 +168,8 @@ class Model:
 class Task:
     """Base class of tasks. Class attributes describe the task, methods carry it out.
 
-    A task has to have a ``name`` (that of its package), a ``title`` (for help texts), its ``section`` in the paper,
-    ``presets`` (the first is the default), and either :meth:`problem` and :meth:`table` or a ``fit.py``.
+    A task has to have a ``name`` (that of its entry point, if any), a ``title`` (for help texts), its ``section`` in
+    the paper, ``presets`` (the first is the default), and either :meth:`problem` and :meth:`table` or a ``fit.py``.
     """
 
     #: The word that stands for it on the command line and in table files.

@@ -126,6 +126,13 @@ def test_a_name_that_is_taken(install):
     assert sum("is left out: mi_diffind.tasks has" in str(w.message) for w in caught) == 2
 
 
+def test_a_declared_name_that_is_taken(install):
+    """Also where the folder of this package's own task has another name."""
+    install({"field": "their_field"}, their_field=LINE.replace('"line"', '"field"'))
+    with pytest.warns(RuntimeWarning, match=r'^"field" \(their_field\) is left out: mi_diffind\.tasks has one'):
+        assert tuple(tasks()) == BUILT_IN and tasks()["field"].title == "a radiance field, from images of a scene"
+
+
 def test_the_same_entry_point_twice_is_no_conflict(install):
     """As of a package that is on the path twice, installed and as a checkout."""
     for _ in range(2):
