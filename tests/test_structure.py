@@ -145,10 +145,10 @@ def test_general_rooms_know_no_task():
         "discovery",
         "task",
         "scenes",
-        "capture",
+        "view_capture",
         "orbit",
         "comparison",
-        "regress",
+        "regression",
     }
     rooms |= {"depth", "measure"}
     general = [name for name in known if name.split(".")[1] in rooms]
