@@ -294,13 +294,16 @@ def _restart_llvm(path: str | None) -> None:
 def array_module(variant: str | None = None):
     """Return the module of differentiable Dr.Jit types to compute with outside of Mitsuba.
 
-    It is ``drjit.llvm.ad`` or ``drjit.cuda.ad``, that of a Mitsuba ``variant``; ``None`` means the GPU if there is one.
-    Raises :class:`~mi_diffind.errors.UsageError` if that cannot run here.
+    It is ``drjit.llvm.ad`` or ``drjit.cuda.ad``, that of a Mitsuba ``variant``. ``None`` means the variant that is set
+    if it is vectorised, else the GPU if there is one. Raises :class:`~mi_diffind.errors.UsageError` if that cannot run
+    here.
     """
     import drjit as dr
 
     has_cuda = dr.has_backend(dr.JitBackend.CUDA)
-    variant = variant or ("cuda" if has_cuda else "llvm")
+    if variant is None:
+        active = ("mitsuba" in sys.modules and sys.modules["mitsuba"].variant()) or ""
+        variant = active if active.startswith(("cuda", "llvm")) else "cuda" if has_cuda else "llvm"
     if variant.startswith("cuda"):
         if not has_cuda:
             raise UsageError(f'the variant "{variant}" needs an NVIDIA GPU and its driver, and none was found')

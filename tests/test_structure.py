@@ -20,6 +20,7 @@ FLOORS = (
     ("plugins",),
     (
         "poses",
+        "saving",
         "scenes",
         "view_capture",
         "orbit",
@@ -144,6 +145,7 @@ def test_general_rooms_know_no_task():
         "tables",
         "discovery",
         "task",
+        "saving",
         "scenes",
         "view_capture",
         "orbit",
