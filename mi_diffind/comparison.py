@@ -89,13 +89,13 @@ def compare(
     ``psnr_db``, ``flip``, ``mae`` of the image as written against the other one; ``brightness``, the ratio of their
     means; ``noise_db`` and ``psnr_without_noise_db`` (:func:`noise`); ``worst``, the window ``x``, ``y``, ``width``,
     ``height`` (:func:`worst_window`) of the largest ``mae`` of values clipped to [0, 1]; the median
-    ``seconds_per_pass`` of each. ``time_ratio``, written over the other at equal samples: ``median``, ``q1``, ``q3``, ``min`` and ``max`` over the ``pairs`` of
-    passes, rendered one after the other, in which neither side compiled a kernel. The median is ``None`` if there are
-    fewer than :data:`PAIRS` of them or ``q3`` exceeds :data:`WIDEST` times ``q1``. Quote the ratio rather than the
-    quotient of the two times: a slow phase of the machine slows both passes of a pair. ``replaced_plugins``: how many
-    were replaced; ``learned_plugins``: how many of these are learned; ``table_bytes``: bytes of the distinct tables
-    that the learned ones read. Ctrl-C ends the comparison after the current pair of passes; ``spp`` and ``passes`` then
-    state how many there were, and ``interrupted`` is true.
+    ``seconds_per_pass`` of each. ``time_ratio``, written over the other at equal samples: ``median``, ``q1``, ``q3``,
+    ``min`` and ``max`` over the ``pairs`` of passes, rendered one after the other, in which neither side compiled a
+    kernel. The median is ``None`` if there are fewer than :data:`PAIRS` of them or ``q3`` exceeds :data:`WIDEST` times
+    ``q1``. Quote the ratio rather than the quotient of the two times: a slow phase of the machine slows both passes of
+    a pair. ``replaced_plugins``: how many were replaced; ``learned_plugins``: how many of these are learned;
+    ``table_bytes``: bytes of the distinct tables that the learned ones read. Ctrl-C ends the comparison after the
+    current pair of passes; ``spp`` and ``passes`` then state how many there were, and ``interrupted`` is true.
 
     Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no plugin with such a counterpart.
     """

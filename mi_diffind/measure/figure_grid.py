@@ -23,8 +23,8 @@ def picture(title: str, image: np.ndarray, frame: tuple[int, int, int, int] | No
     def draw(figure, axes):
         if frame is not None:
             x, y, width, height = frame
-            corners = np.array([(0, 0), (width, 0), (width, height), (0, height), (0, 0)]) + (x - 0.5, y - 0.5)
-            axes.plot(*corners.T, color="yellow", linewidth=1.5)
+            left, right, top, bottom = x - 0.5, x + width - 0.5, y - 0.5, y + height - 0.5
+            axes.plot([left, right, right, left, left], [top, top, bottom, bottom, top], color="yellow", linewidth=1.5)
         axes.imshow(srgb.for_display(np.repeat(image, 3, -1) if image.shape[-1] == 1 else image))
         axes.set_title(title)
 
