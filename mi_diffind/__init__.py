@@ -30,6 +30,7 @@ _NAMES = {
     "load_dict": "scenes",
     "load_string": "scenes",
     "attach": "scenes",
+    "render": "rendering",
     # Building blocks of other networks
     "DifferentiableArray": "indirection",
     "Indirection": "indirection",

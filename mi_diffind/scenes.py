@@ -21,6 +21,7 @@ from .errors import DiffindError
 from .files import replacing
 from .measure.operations import bsdf_operations
 from .plugins.support import footprint
+from .runtime import use_variant
 from .task import tasks
 
 #: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
@@ -164,6 +165,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
     no integrator (another one may be meant), a warning says that such shapes stay invisible. Raises what
     ``mi.load_file`` raises.
     """
+    use_variant()
     if not Path(path).is_file():
         return mi.load_file(str(path))
     with _resolving(path):
@@ -174,6 +176,7 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
 
 def load_dict(scene: dict, parallel: bool = True, optimize: bool = True):
     """Load a scene or an object from a dictionary as ``mi.load_dict`` does, prepared as by :func:`load_file`."""
+    use_variant()
     config, state = compat.parse(scene)
     compat.build_as(config, parallel, optimize)
     return _build(config, state, _integrators(state), plugins.warn)
@@ -181,6 +184,7 @@ def load_dict(scene: dict, parallel: bool = True, optimize: bool = True):
 
 def load_string(text: str, parallel: bool = True, optimize: bool = True, **defines):
     """Load a scene from a text of XML as ``mi.load_string`` does, prepared as by :func:`load_file`."""
+    use_variant()
     config, state = compat.parse(text, defines)
     compat.build_as(config, parallel, optimize)
     return _build(config, state, _integrators(state), plugins.warn)

@@ -274,3 +274,41 @@ def test_nothing_to_save(mi_rgb, tmp_path):
         mi_diffind.save(scene, path)
     assert mi_diffind.save(scene, path, file=TILES.name).nbytes == mi_diffind.load_table(TILES).nbytes
     assert not path.with_suffix(".xml").exists()
+
+
+# -- rendering ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_rendering_is_that_of_mitsuba(mi_rgb, tmp_path):
+    """Of a dictionary, a loaded scene and a file; ``save`` and the picture of a notebook show its image."""
+    mi = mi_rgb
+    content = wall(mi, small(mi))
+    loaded = mi_diffind.load_dict(content)
+    expected = image(mi, loaded)
+    for scene in (content, loaded):
+        rendering = mi_diffind.render(scene, spp=16, seed=3, progress=False)
+        assert rendering.image.mean() == pytest.approx(expected.mean(), abs=0.02)
+        assert (rendering.figures["spp"], rendering.figures["width"], rendering.frames[0].shape) == (
+            16,
+            24,
+            (16, 24, 3),
+        )
+    np.testing.assert_array_equal(np.array(mi.Bitmap(str(rendering.save(tmp_path / "a.exr")))), rendering.image)
+    assert rendering._repr_png_().startswith(b"\x89PNG")
+    frames = mi_diffind.render(loaded, spp=1, orbit=3, progress=False)
+    assert len(frames.frames) == 3 and frames.image.shape == (16, 72, 3) and frames.figures["frames"] == 3
+
+
+def test_refused_renderings(mi_rgb, tmp_path):
+    scene = mi_diffind.load_dict(wall(mi_rgb, texture()))
+    for options, sentence in (
+        ({"centre": (0, 0, 0)}, "centre: given without orbit"),
+        ({"depth": 3}, "depth, defines: given with a scene in memory"),
+        ({"depth_tolerance": 0.1}, "depth_tolerance: given without depth"),
+    ):
+        with pytest.raises(UsageError, match=sentence):
+            mi_diffind.render(scene, **options)
+    with pytest.raises(UsageError, match=r"scene: found a .*, expected a scene, its file or its dictionary"):
+        mi_diffind.render({"type": "sphere"})
+    with pytest.raises(UsageError, match=r'output "a.webp": found the extension ".webp", allowed are .exr and .png'):
+        mi_diffind.render(scene, spp=1, progress=False).save("a.webp")

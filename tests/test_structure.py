@@ -22,6 +22,7 @@ FLOORS = (
     (
         "poses",
         "saving",
+        "rendering",
         "scenes",
         "view_capture",
         "orbit",
@@ -155,6 +156,7 @@ def test_general_rooms_know_no_task():
         "discovery",
         "task",
         "saving",
+        "rendering",
         "scenes",
         "view_capture",
         "orbit",
