@@ -549,6 +549,18 @@ def aligned(shape, dtype) -> np.ndarray:
     return memory[start : start + count * size].view(dtype).reshape(shape)
 
 
+def device_array(dtype, values) -> dr.ArrayBase:
+    """Return a flat Dr.Jit array of a 32-bit type with the numbers of a NumPy array, which are copied.
+
+    The copy is :func:`aligned`: Dr.Jit also compiles another kernel for every combination of aligned and other inputs,
+    and NumPy aligns at random.
+    """
+    values = np.asarray(values)
+    memory = aligned((values.size,), np.float32 if dr.is_float_v(dtype) else np.uint32)
+    memory.reshape(values.shape)[...] = values
+    return dtype(memory)
+
+
 def coordinates_of(x, default=None):
     """Return coordinates as a list of single-precision arrays, and whether they were a cooperative vector.
 

@@ -12,6 +12,7 @@ from drjit import nn
 from ... import units
 from ...errors import UsageError
 from ...fitting import Problem
+from ...indirection import device_array
 from ...settings import FittingError
 from ...tables import Table
 from ...task import FitRequest, Fitted
@@ -55,7 +56,7 @@ class SurfaceSampler:
         self.types, self.count = types, len(mesh.faces)
 
         def flat(v):
-            return types.Float(np.ascontiguousarray(v.reshape(-1), np.float32))
+            return device_array(types.Float, v)
 
         corners = mesh.corners
         self.sums = flat(np.cumsum(mesh.areas) / mesh.areas.sum())

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ...errors import UsageError
 from ...fitting import Problem
-from ...indirection import DifferentiableArray, Indirection, ramp, rounded, stored_form
+from ...indirection import DifferentiableArray, Indirection, device_array, ramp, rounded, stored_form
 from ...tables import StoredArray, Table
 from ...task import FitRequest
 from ...units import largest_fitting
@@ -180,7 +180,7 @@ class PairProblem(Problem):
         self.field, self.types, self.net = field, field.types, field.net
 
         def flat(v):
-            return self.types.Float(np.ascontiguousarray(v, np.float32))
+            return device_array(self.types.Float, v)
 
         self.points = [flat(v) for v in points.T]
         self.targets = flat(np.clip(distances / field.band, -1, 1) / 2 + 0.5)
