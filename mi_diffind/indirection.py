@@ -561,6 +561,11 @@ def device_array(dtype, values) -> dr.ArrayBase:
     return dtype(memory)
 
 
+def device_tensor(dtype, values) -> dr.ArrayBase:
+    """Return a Dr.Jit tensor of a 32-bit type with the numbers of a NumPy array, copied by :func:`device_array`."""
+    return dtype(device_array(dr.array_t(dtype), values), np.shape(values))
+
+
 def coordinates_of(x, default=None):
     """Return coordinates as a list of single-precision arrays, and whether they were a cooperative vector.
 

@@ -12,7 +12,7 @@ from drjit import nn
 from ... import units
 from ...errors import UsageError
 from ...fitting import Problem
-from ...indirection import device_array
+from ...indirection import device_array, device_tensor
 from ...settings import FittingError
 from ...tables import Table
 from ...task import FitRequest, Fitted
@@ -104,7 +104,7 @@ class NodeProblem(Problem):
         self.field, self.types, self.held_out = field, field.types, held_out
         self.surface = SurfaceSampler(mesh, self.types)
         start = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
-        self.net = NodeValues(self.types.TensorXf(np.ascontiguousarray(start, np.float32)))
+        self.net = NodeValues(device_tensor(self.types.TensorXf, start))
         self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": field.spacing, "bits": bits}
 
     def loss(self, net, rng, size: int):
