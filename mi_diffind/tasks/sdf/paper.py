@@ -50,15 +50,16 @@ class PairField(DistanceField):
         (primary,) = net.primary
         size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, primary.resolution, strict=True)]
         super().__init__(types, lower, upper, min(size), band)
-        self.net, self.slope, self._bound = net, float(slope), None
+        self.net, self.slope = net, float(slope)
+        # Opaque, no literal: a new value must not compile the kernels of rays again
+        self._bound = dr.opaque(types.Float, self.slope)
 
     @property
     def bound(self):
-        return self.slope if self._bound is None else self._bound
+        return self._bound
 
     def changed(self):
         self.slope = slope_of(self.net, self.lower, self.upper, self.band)
-        # Opaque, no literal: a new value must not compile the kernels of rays again
         self._bound = dr.opaque(self.types.Float, self.slope)
 
     def value(self, p, active=True):
