@@ -549,6 +549,17 @@ def aligned(shape, dtype) -> np.ndarray:
     return memory[start : start + count * size].view(dtype).reshape(shape)
 
 
+def aligned_copy(values, dtype=None) -> np.ndarray:
+    """Return a contiguous copy of ``values`` that starts at a multiple of 64 bytes (:func:`aligned`).
+
+    Dr.Jit compiles another kernel for each combination of aligned and other inputs, and NumPy aligns at random.
+    """
+    values = np.asarray(values, dtype)
+    copy = aligned(values.shape, values.dtype)
+    copy[...] = values
+    return copy
+
+
 def coordinates_of(x, default=None):
     """Return coordinates as a list of single-precision arrays, and whether they were a cooperative vector.
 
