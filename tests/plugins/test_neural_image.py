@@ -1130,7 +1130,7 @@ def test_unsupported_variants_and_leaks(file):
             texture = {{"type": "neural_image", "filename": {file!r}, "channels": "albedo", "storage": "float32"}}
             scene = mi.load_dict({{
                 "type": "scene",
-                "integrator": {{"type": "path", "max_depth": 3}},
+                "integrator": {{"type": "prb", "max_depth": 3}},
                 "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 8, "height": 8}}}},
                 "lamp": {{"type": "sphere", "center": [0, 0, 4],
                           "emitter": {{"type": "area", "radiance": texture}}}},
