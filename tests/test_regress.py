@@ -28,7 +28,7 @@ STORED = [
 
 @pytest.fixture
 def regress(mi_rgb):
-    from mi_diffind import regress
+    from mi_diffind import regression as regress
 
     return regress
 
@@ -120,7 +120,7 @@ SLOW = {
 def test_scene_renders_as_its_reference(path, variant):
     """If a change is meant, render the references again: scenes/README.md says how."""
     set_variant(variant)
-    from mi_diffind import regress
+    from mi_diffind import regression as regress
 
     result = regress.regress(path, progress=False)
     assert result["passed"], result

@@ -18,7 +18,18 @@ FLOORS = (
     ("maps",),
     ("tasks",),
     ("plugins",),
-    ("poses", "scenes", "capture", "orbit", "compare", "z_test", "reference_files", "regress", "depth", "measure"),
+    (
+        "poses",
+        "scenes",
+        "view_capture",
+        "orbit",
+        "comparison",
+        "z_test",
+        "reference_files",
+        "regression",
+        "depth",
+        "measure",
+    ),
     ("scene_training",),
     ("studies",),
     ("commands",),
@@ -134,10 +145,10 @@ def test_general_rooms_know_no_task():
         "discovery",
         "task",
         "scenes",
-        "capture",
+        "view_capture",
         "orbit",
-        "compare",
-        "regress",
+        "comparison",
+        "regression",
     }
     rooms |= {"depth", "measure"}
     general = [name for name in known if name.split(".")[1] in rooms]
@@ -248,5 +259,5 @@ def test_a_wrong_import_would_be_noticed(tmp_path):
     package.write_text("from .task import Task\nfrom .. import lookup\n")
     assert imports("mi_diffind.tasks", package, known, False) == direct
     assert floor("mi_diffind.lookup") < floor("mi_diffind.tasks.ggx.model") < floor("mi_diffind.plugins.support.tables")
-    assert floor("mi_diffind.plugins.disney") < floor("mi_diffind.compare") < floor("mi_diffind.studies.ggx")
+    assert floor("mi_diffind.plugins.disney") < floor("mi_diffind.comparison") < floor("mi_diffind.studies.ggx")
     assert floor("mi_diffind.studies") < floor("mi_diffind.commands.fit") < floor("mi_diffind.cli")
