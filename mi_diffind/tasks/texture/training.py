@@ -150,7 +150,7 @@ class TextureProblem(Problem):
                 actual = net.filtered(u, v, dr.opaque(types.Float, level, count))
                 expected = self.pyramid.texels(index + start)
                 squares = [dr.square(a - b) for a, b in zip(actual, expected, strict=True)]
-                dr.eval(squares)  # all channels at once: each mean evaluates its own, by a kernel
+                dr.eval(squares)  # one kernel in place of one for each channel
                 errors_by_level.append(sum(float(dr.mean(s)[0]) for s in squares) / len(squares))
         decibels = list(map(decibel, errors_by_level))
         return {"psnr_db": decibels[0], "psnr_worst_db": min(decibels)}
