@@ -1,4 +1,4 @@
-"""Stored renderings of scenes: the EXR files that :mod:`.regress` checks against, and partial renders of them.
+"""Stored renderings of scenes: the EXR files that :mod:`.regression` checks against, and partial renders of them.
 
 A reference is kept beside its scene, as ``references/SCENE.VARIANT.exr``: the image (``R``, ``G``, ``B``, or ``Y`` in
 mono variants), the variance of one sample (``variance.R``, …), and a header attribute with the settings of the render.

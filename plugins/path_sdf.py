@@ -150,7 +150,7 @@ def integrator() -> type:
                 with dr.resume_grad(when=not primal):
                     emitted = throughput * weight * ds.emitter.eval(fixed, shown)
 
-                # Light from an emitter
+                # Light from an emitter, and the next direction
                 going = active & si.is_valid() & (depth + 1 < self.max_depth)
                 lit = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
                 ds, emitter_weight = scene.sample_emitter_direction(fixed, sampler.next_2d(), True, lit)
@@ -174,13 +174,12 @@ def integrator() -> type:
                     if dr.hint(not primal, mode="scalar"):
                         value = scene.eval_emitter_direction(si, ds, lit) * dr.select(lit, dr.rcp(ds.pdf), 0)
                         emitter_weight = dr.replace_grad(emitter_weight, value) * factor
-                    bsdf_value, bsdf_pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), lit)
+                    # Together with the next direction: the textures of a material are read once
+                    bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
+                        context, si, si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(), going
+                    )
                     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
                     direct = dr.select(lit, throughput * weight * bsdf_value * emitter_weight, 0)
-
-                # Next direction
-                with dr.resume_grad(when=not primal):
-                    bs, bsdf_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), going)
                 bs = dr.detach(bs)
                 delta_next = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
                 L = L + emitted + direct if primal else L - dr.detach(emitted + direct)

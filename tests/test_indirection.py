@@ -3,6 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 from drjit import nn
 from drjit.opt import Adam
 from scipy.ndimage import map_coordinates
@@ -34,7 +35,7 @@ def triangle(x):
 
 
 def read(module, ad, x):
-    values = module([ad.Float(np.ascontiguousarray(v, np.float32)) for v in x.T])
+    values = module([ad.Float(aligned(v)) for v in x.T])
     dr.eval(values)
     return np.stack([np.broadcast_to(v.numpy(), len(x)) for v in values], axis=-1)
 
@@ -371,14 +372,15 @@ def test_what_remains_where_a_coordinate_is_known(ad, dims, channels, storage, b
     # Bytes are read at up to 1/64 of a step, and once more; the entries of a row are in single precision
     tolerance = 0.05 * max(array.scale) if storage == "uint8" else 2e-6
     for x in (0.0, 0.3, 0.5, 1.0, -0.2, 1.2, 0.999999, float("nan")):
-        row = array.at(ad.Float(x))
+        row = array.at(dr.opaque(ad.Float, x))
         assert row.resolution == array.resolution[:-1] and row.border == array.border[:-1]
         assert (row.channels, row.storage, row.folded) == (channels, "float32", False)
         everywhere = np.column_stack([rest, np.full(len(rest), x, np.float32)])
-        np.testing.assert_allclose(read(row, ad, rest), read(array, ad, everywhere), atol=tolerance)
+        values = read(row, ad, rest)
+        np.testing.assert_allclose(values, read(array, ad, everywhere), atol=tolerance)
         if border == "clamp":
             position = np.nan_to_num(everywhere)
-            np.testing.assert_allclose(read(row, ad, rest), interpolate(array.numpy(), position), atol=tolerance)
+            np.testing.assert_allclose(values, interpolate(array.numpy(), position), atol=tolerance)
 
 
 @pytest.mark.parametrize("storage", lookup.STORAGES)
@@ -422,22 +424,21 @@ def test_gradients_of_what_remains(ad, dims, border):
     rest, x = uniform(7, 30, dims - 1), 0.37
     weights = rng.uniform(-1, 1, (30, 3)).astype(np.float32)
 
+    inputs = [ad.Float(aligned(v)) for v in rest.T]
+    factors = [ad.Float(aligned(w)) for w in weights.T]
+
     def total(table, x):
-        array = DifferentiableArray.from_numpy(table, ad.TensorXf, border)
-        x = ad.Float(x)
+        array, x = DifferentiableArray.from_numpy(table, ad.TensorXf, border), dr.opaque(ad.Float, x)
         dr.enable_grad(array.data, x)
-        values = array.at(x)([ad.Float(np.ascontiguousarray(v)) for v in rest.T])
-        return (
-            array,
-            x,
-            sum(dr.sum(v * ad.Float(np.ascontiguousarray(w))) for v, w in zip(values, weights.T, strict=True)),
-        )
+        values = array.at(x)(inputs)
+        return array, x, dr.sum(sum(v * w for v, w in zip(values, factors, strict=True)))
 
     def number(table, x):
         return float(total(table, x)[2][0])
 
     array, coordinate, value = total(table, x)
     dr.backward(value)
+    dr.eval(array.data.grad, coordinate.grad)
     gradient = array.data.grad.numpy()
     assert not gradient[..., 3:].any()
     assert np.count_nonzero(gradient) > 0.1 * table.size

@@ -8,6 +8,7 @@ SciPy knows neither of our borders, so the reference does by hand what they mean
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 from scipy.interpolate import RegularGridInterpolator
 
 from mi_diffind import DifferentiableArray, lookup
@@ -68,7 +69,7 @@ def reference(table, x, border):
 
 def read(array, ad, x, **kwargs):
     x = np.asarray(x, np.float32)
-    values = array([ad.Float(x[:, k].copy()) for k in range(x.shape[1])], **kwargs)
+    values = array([ad.Float(aligned(v)) for v in x.T], **kwargs)
     dr.eval(values)  # one kernel, not one a channel
     return np.stack([np.broadcast_to(v.numpy(), len(x)) for v in values], axis=-1)
 
@@ -134,7 +135,7 @@ def test_one_entry_along_an_axis(ad, resolution, channels, storage):
         table = entries(rng, resolution, channels)
         array = DifferentiableArray.from_numpy(table, ad.TensorXf, border, storage)
         assert_interpolated(array, read(array, ad, x), x, border)
-        point = [ad.Float(x[:, k].copy()) for k in range(len(resolution))]
+        point = [ad.Float(aligned(x[:, k])) for k in range(len(resolution))]
         dr.enable_grad(point)
         dr.backward(sum(array(point)), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         for n, v in zip(resolution, point, strict=True):
@@ -249,7 +250,7 @@ def test_gradients_equal_central_differences(ad, dims, channels):
     for border in borders(dims) if channels <= 4 else borders(dims)[-1:]:
         x = inside(rng, 100, resolution, border)
         array = DifferentiableArray.from_numpy(table, ad.TensorXf, border)
-        point = [ad.Float(x[:, k].copy()) for k in range(dims)]
+        point = [ad.Float(aligned(x[:, k])) for k in range(dims)]
         dr.enable_grad(array.data, *point)
         dr.backward(sum(float(w) * v for w, v in zip(weight, array(point), strict=True)))
         dr.eval(array.data.grad, [v.grad for v in point])  # one kernel
@@ -278,7 +279,7 @@ def test_packed_reads_are_differentiable_in_the_coordinate(ad, dims, channels):
     border = borders(dims)[-1]
     array = DifferentiableArray.from_numpy(entries(rng, RESOLUTION[:dims], channels), ad.TensorXf, border, "uint8")
     x = inside(rng, 100, RESOLUTION[:dims], border)
-    point = [ad.Float(x[:, k].copy()) for k in range(dims)]
+    point = [ad.Float(aligned(x[:, k])) for k in range(dims)]
     dr.enable_grad(point)
     dr.backward(sum(array(point)))
     for k, v in enumerate(point):
@@ -336,7 +337,7 @@ def test_padding_has_no_influence_and_no_gradient(ad, channels, fold):
     np.testing.assert_array_equal(dirty.numpy(), clean.numpy())
     for array in (clean, dirty):
         dr.enable_grad(array.data)
-        dr.backward(sum(array([ad.Float(x[:, 0].copy()), ad.Float(x[:, 1].copy())])))
+        dr.backward(sum(array([ad.Float(aligned(x[:, 0])), ad.Float(aligned(x[:, 1]))])))
         gradient = array.data.grad.numpy()
         assert gradient[..., :channels].all() and not gradient[..., channels:].any()
 
@@ -447,7 +448,7 @@ def test_few_bits_equal_scipy(ad, bits, channels):
             x = rng.uniform(-1.2, 2.2, (100, dims)).astype(np.float32)
             x[:60] = np.mod(x[:60], 1)
             x[: len(SPECIAL), -1] = SPECIAL
-            cases.append((held, x, border, array([ad.Float(x[:, k].copy()) for k in range(dims)])))
+            cases.append((held, x, border, array([ad.Float(aligned(x[:, k])) for k in range(dims)])))
     dr.eval([values for *_, values in cases])  # one kernel
     for held, x, border, values in cases:
         found = np.stack([v.numpy() for v in values], axis=-1)
@@ -473,7 +474,7 @@ def test_few_bits_are_differentiable_in_the_coordinate(ad, bits, channels):
     border = (lookup.BORDERS[bits % 2],) * dims
     array, _, held = few_bits(ad, rng, RESOLUTION[:dims], channels, bits, border)
     x = inside(rng, 50, RESOLUTION[:dims], border)
-    point = [ad.Float(x[:, k].copy()) for k in range(dims)]
+    point = [ad.Float(aligned(x[:, k])) for k in range(dims)]
     dr.enable_grad(point)
     weight = rng.uniform(-1, 1, channels)
     dr.backward(sum(float(w) * v for w, v in zip(weight, array(point), strict=True)))

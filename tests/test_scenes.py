@@ -16,9 +16,9 @@ SMALL = {"width": 96, "height": 56}
 @pytest.mark.parametrize("name", [pytest.param("materials", marks=pytest.mark.slow), "still_life"])
 def test_scene_as_written_and_exact(mi_rgb, name):
     """The bound on the approximation: 77.8 and 77.2 dB are reached, FLIP of 0.0010 and 0.0014."""
-    from mi_diffind import compare
+    from mi_diffind import comparison
 
-    result = compare.compare(SCENES / f"{name}.xml", spp=32, passes=1, progress=False, defines=SMALL)
+    result = comparison.compare(SCENES / f"{name}.xml", spp=32, passes=1, progress=False, defines=SMALL)
     assert np.isfinite(result.written).all() and result.written.min() >= 0
     assert result.written.std() > 0.05
     assert not np.array_equal(result.written, result.reference)
@@ -84,19 +84,19 @@ PAIR = """
 @pytest.mark.parametrize("name", ["disney", "neural_disney"])
 def test_compare_against_principled(mi_rgb, tmp_path, name):
     """Another Fresnel term: a little darker than Mitsuba's model, in every parameter else the same."""
-    from mi_diffind import compare
+    from mi_diffind import comparison
 
     path, given = tmp_path / "scene.xml", {"subsurface": 0.8, "clearcoat": 0.5, "eta": 1.4}
     parameters = "".join(f'<float name="{k}" value="{v}"/>' for k, v in given.items())
     parameters += '<string name="effects" value="all"/>'
     path.write_text(PAIR.replace("PLUGIN", name).replace("PARAMETERS", parameters))
-    result = compare.compare(path, spp=32, passes=1, progress=False, against="principled")
+    result = comparison.compare(path, spp=32, passes=1, progress=False, against="principled")
     assert 0.96 < result.figures["brightness"] < 1 and result.figures["psnr_db"] > 30
     assert result.figures["replaced_plugins"] == 1 and result.figures["against"] == "principled"
     assert (result.figures["learned_plugins"], result.figures["table_bytes"]) == (
         (0, 0) if name == "disney" else (1, 384)
     )
-    paths = compare.write(result, tmp_path)
+    paths = comparison.write(result, tmp_path)
     assert paths["principled"].endswith("principled.exr") and Path(paths["figure"]).is_file()
 
 
@@ -116,32 +116,32 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
     ],
 )
 def test_what_cannot_be_compared(mi_rgb, tmp_path, plugin, parameters, against, sentence):
-    from mi_diffind import compare, scenes
+    from mi_diffind import comparison, scenes
 
     path = tmp_path / "scene.xml"
     path.write_text(PAIR.replace("PLUGIN", plugin).replace("PARAMETERS", parameters))
     with pytest.raises(scenes.SceneError) as caught:
-        compare.compare(path, spp=1, passes=1, progress=False, against=against)
+        comparison.compare(path, spp=1, passes=1, progress=False, against=against)
     assert sentence in str(caught.value)
 
 
 def test_times_of_a_comparison_do_not_contradict_each_other(mi_rgb):
     """The ratio is the median over pairs, which the ratio of two medians is not; so one time is shown, not two."""
-    from mi_diffind import compare
+    from mi_diffind import comparison
 
     seconds = {"written": 3.0, "exact": 2.0}
     ratio = {"median": 1.25, "min": 1.0, "max": 2.0, "pairs": 4}
     figures = {"scene": "a.xml", "variant": "v", "width": 4, "height": 3, "spp": 5, "spp_requested": 5, "passes": 5}
     figures |= {"replaced_plugins": 1, "learned_plugins": 1, "table_bytes": 9, "interrupted": False}
     figures |= {"psnr_db": 50, "flip": 0, "mae": 0, "against": "exact", "brightness": 1.0}
-    lines = compare.summary({**figures, "seconds_per_pass": seconds, "time_ratio": ratio})
+    lines = comparison.summary({**figures, "seconds_per_pass": seconds, "time_ratio": ratio})
     assert lines[-2:] == [
         "time        1.25 times that of exact (2 s a pass)",
         "            median of 4 pairs of passes in turn, 1.00 to 2.00",
     ]
     assert not any("3.0" in line or "1.50" in line for line in lines)
     alone = {**figures, "seconds_per_pass": seconds, "time_ratio": {**ratio, "pairs": 1}, "passes": 1}
-    assert compare.summary(alone)[-1] == "            of one pair of passes, compilation included"
+    assert comparison.summary(alone)[-1] == "            of one pair of passes, compilation included"
 
 
 @pytest.mark.parametrize("name", ["materials", "still_life"])

@@ -57,13 +57,13 @@ def add(commands) -> None:
 def run(arguments) -> dict:
     """Render the views that are missing and return what is printed.
 
-    After Ctrl-C, the result lists the views that exist. Raises :class:`UsageError`, and as :mod:`mi_diffind.capture`
-    does.
+    After Ctrl-C, the result lists the views that exist. Raises :class:`UsageError`, and as
+    :mod:`mi_diffind.view_capture` does.
     """
     require_scene(arguments.scene)
     writable_folder(Path(arguments.output).parent)
     set_variant(arguments.variant)
-    from .. import capture
+    from .. import view_capture
 
     given = {
         name: getattr(arguments, name)
@@ -71,13 +71,13 @@ def run(arguments) -> dict:
     }
     tuples = {name: getattr(arguments, name) for name in ("centre", "elevation", "up", "objects")}
     given |= {name: value if value is None else tuple(value) for name, value in tuples.items()}
-    settings = capture.CaptureSettings(**given)
+    settings = view_capture.CaptureSettings(**given)
     try:
         settings.check()
     except ValueError as e:
         raise UsageError(f"--{e}") from None
-    captured = capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
-    print("\n".join(capture.lines(captured)))
+    captured = view_capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
+    print("\n".join(view_capture.lines(captured)))
     return {
         "interrupted": len(captured.files) < captured.total,
         "scene": arguments.scene,

@@ -26,14 +26,14 @@ def add(commands) -> None:
 def run(arguments) -> dict:
     """Render the scene twice, write the pictures, and return the figures and the ``files``.
 
-    Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.compare` does.
+    Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.comparison` does.
     """
     require_scene(arguments.scene)
     writable_folder(arguments.out, create=True)
     set_variant(arguments.variant)
-    from .. import compare
+    from .. import comparison
 
-    comparison = compare.compare(
+    result = comparison.compare(
         arguments.scene,
         arguments.spp,
         arguments.seed,
@@ -42,7 +42,7 @@ def run(arguments) -> dict:
         dict(arguments.defines),
         arguments.against,
     )
-    paths = compare.write(comparison, arguments.out)
-    print("\n".join(compare.summary(comparison.figures)))
+    paths = comparison.write(result, arguments.out)
+    print("\n".join(comparison.summary(result.figures)))
     print(f"picture     {paths['figure']}")
-    return {**comparison.figures, "files": paths}
+    return {**result.figures, "files": paths}

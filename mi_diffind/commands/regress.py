@@ -30,7 +30,7 @@ def run(arguments) -> dict:
     """Check each scene, or store its reference again.
 
     Returns the result of each in ``scenes`` and the number that ``failed``. Raises :class:`UsageError`, and as
-    :mod:`mi_diffind.regress` does.
+    :mod:`mi_diffind.regression` does.
     """
     for path in arguments.scenes:
         require_scene(path)
@@ -39,13 +39,13 @@ def run(arguments) -> dict:
         if stems.count(stem) > 1:
             raise UsageError(f'{len(stems)} scenes, and more than one is called "{stem}": check them one at a time')
     set_variant(arguments.variant)
-    from .. import regress
+    from .. import regression
 
     defines, results = dict(arguments.defines), []
     options = {"spp": arguments.spp, "seed": arguments.seed, "defines": defines}
     if arguments.update:
         for path in arguments.scenes:
-            results.append(regress.update_reference(path, arguments.references, **options))
+            results.append(regression.update_reference(path, arguments.references, **options))
             if results[-1]["interrupted"]:
                 if results[-1]["partial"]:
                     print("{partial}: {spp} samples a pixel are kept, the same command goes on".format(**results[-1]))
@@ -58,15 +58,15 @@ def run(arguments) -> dict:
         writable_folder(out if out.exists() else out.parent)
         options["seed"] = arguments.seed or 0
         for path in arguments.scenes:  # before the first is rendered
-            regress.read_reference(path, arguments.references)
+            regression.read_reference(path, arguments.references)
         try:
             for path in arguments.scenes:
-                results.append(regress.regress(path, arguments.references, out, **options))
+                results.append(regression.regress(path, arguments.references, out, **options))
                 if results[-1]["interrupted"]:
                     break
         finally:
             if results:
-                print("\n".join(regress.summary(results)))
+                print("\n".join(regression.summary(results)))
     return {
         "interrupted": results[-1]["interrupted"],
         "failed": sum(r.get("passed") is False for r in results),

@@ -23,7 +23,7 @@ from half_vectors import HalfVectorSampling
 from spheres import key_of, sphere_scene
 from variants import VARIANTS, set_variant
 
-from mi_diffind import compare, compat, scenes
+from mi_diffind import comparison, compat, scenes
 from mi_diffind.bounds import ValueBounds
 from mi_diffind.measure.operations import bsdf_operations
 from mi_diffind.tables import StoredArray, save_table
@@ -1507,7 +1507,7 @@ def test_a_scene_and_its_exact_counterpart(mi_rgb, scene_file):
 
 
 def test_comparison(mi_rgb, scene_file):
-    result = compare.compare(scene_file, spp=64, passes=2, progress=False)
+    result = comparison.compare(scene_file, spp=64, passes=2, progress=False)
     assert result.figures["psnr_db"] >= 60  # 62.7 is reached
     assert result.figures["flip"] < 0.007
     assert result.figures["learned_plugins"] == 3

@@ -1,7 +1,7 @@
 """Regression checks of scenes against stored renderings: changes that sampling noise does not explain.
 
 A reference shows the scene as written, learned plugins included. A check finds changes; the distance of an
-approximation from the truth is measured by :mod:`.compare`. Statistics: :mod:`.z_test`; files:
+approximation from the truth is measured by :mod:`.comparison`. Statistics: :mod:`.z_test`; files:
 :mod:`.reference_files`.
 """
 
