@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 import pytest
 import texture_scenes
-from arrays import aligned
+from arrays import aligned, numpy_of
 from texture_scenes import WRONG, linear
 
 from mi_diffind import compat, scenes
@@ -51,7 +51,7 @@ def make(path, source, preset="ours", border="repeat", **settings):
     net, rng = training.problem_of(source, size, recipe, pyramid).net, np.random.default_rng(7)
     if preset == "paper":
         for array in net.arrays.values():
-            array.data = types.TensorXf(rng.random(array.data.shape, dtype=np.float32))
+            array.data = types.TensorXf(aligned(rng.random(array.data.shape)))
     save_table(path, to_table(CompressedTexture(pyramid.layout, training.stored_form(net)), settings))
     return str(path)
 
@@ -94,7 +94,7 @@ def floats(mi, *arrays):
 def expected(mi, image, name, uv, level):
     """The channels of a map in its own color space."""
     u, v, level = floats(mi, *uv, level)
-    return np.stack([mi.Float(x).numpy() for x in image.maps(image.filtered(u, v, level), [name])[name]])
+    return numpy_of(map(mi.Float, image.maps(image.filtered(u, v, level), [name])[name])).T
 
 
 # -- what is read ------------------------------------------------------------------------------------------------------
@@ -107,12 +107,13 @@ def test_off_is_level_0_and_costs_no_footprint(mi_rgb, files, rng, preset):
     uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE)
     image, textures = opened(mi, files[preset]), {n: mi.load_dict(plugin(files[preset], n)) for n in FILTERS}
     stored = image.stored(*floats(mi, *uv))
-    truth = linear(np.stack([x.numpy() for x in image.maps(stored, ["albedo"])["albedo"]]))
-    si = texture_scenes.hits(mi, uv, ddx, ddy)
+    truth = linear(numpy_of(image.maps(stored, ["albedo"])["albedo"]).T)
+    si, magnified = texture_scenes.hits(mi, uv, ddx, ddy), texture_scenes.hits(mi, uv)
     np.testing.assert_allclose(textures["off"].eval(si).numpy(), truth, atol=1e-4)
-    for name in ("trilinear", "anisotropic", "stochastic"):  # and all are that where nothing is minified
-        found = textures[name].eval(texture_scenes.hits(mi, uv)).numpy()
-        np.testing.assert_allclose(found, truth, atol=3e-3 if preset == "paper" else 3e-4)
+    found = {n: textures[n].eval(magnified) for n in ("trilinear", "anisotropic", "stochastic")}
+    dr.eval(found)
+    for value in found.values():  # and all are that where nothing is minified
+        np.testing.assert_allclose(value.numpy(), truth, atol=3e-3 if preset == "paper" else 3e-4)
     reads = {name: count(lambda t=t: t.eval(si)) for name, t in textures.items()}
     u, v = floats(mi, *uv)
     dr.make_opaque(u, v)
@@ -154,7 +155,7 @@ def test_equals_a_mipmap_of_what_it_decodes_to(mi_rgb, files, rng, border, wrap_
         rows, columns = image.level_size(level)
         y, x = np.mgrid[0:rows, 0:columns]
         u, v, at = floats(mi, (x.ravel() + 0.5) / columns, (y.ravel() + 0.5) / rows, np.full(x.size, level))
-        levels.append(np.stack([c.numpy() for c in image.filtered(u, v, at)], -1).reshape(rows, columns, -1))
+        levels.append(numpy_of(image.filtered(u, v, at)).reshape(rows, columns, -1))
     image_files.PYRAMIDS["decoded"] = Pyramid(layout, levels, module_of(mi.TensorXf), along)
     try:
         ours = mi.load_dict(plugin(files[border], wrap_mode=wrap_mode))
@@ -163,7 +164,7 @@ def test_equals_a_mipmap_of_what_it_decodes_to(mi_rgb, files, rng, border, wrap_
             rows, columns = image.level_size(level)
             uv = [(rng.integers(-2 * n, 3 * n, 100) + 0.5) / n for n in (columns, rows)]
             si = texture_scenes.hits(mi, uv, (2**level / WIDTH, 0), (0, 2**level / HEIGHT))
-            a, b = (t.eval_1(si).numpy() for t in (ours, theirs))
+            a, b = numpy_of(t.eval_1(si) for t in (ours, theirs)).T
             np.testing.assert_allclose(a, b, atol=5e-4, err_msg=f"level {level}")
     finally:
         del image_files.PYRAMIDS["decoded"]
@@ -210,9 +211,11 @@ def test_any_footprint_gives_a_finite_value(mi_rgb, files, rng, preset):
     si = texture_scenes.hits(mi, uv, parts[:2], parts[2:])
     for name, wrap_mode in (("trilinear", "repeat"), ("anisotropic", "clamp"), ("stochastic", "mirror")):
         texture = mi.load_dict(plugin(files[preset], name, wrap_mode=wrap_mode))
-        found = texture.eval(si).numpy()
+        found, slope = texture.eval(si), texture.eval_1_grad(si)
+        dr.eval(found, slope)
+        found = found.numpy()
         assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1 + 1e-4, name
-        assert np.isfinite(texture.eval_1_grad(si).numpy()).all(), name
+        assert np.isfinite(slope.numpy()).all(), name
 
 
 @pytest.mark.parametrize("shape", [(1, 16), (7, 5)])
@@ -263,7 +266,7 @@ def test_gradients_against_finite_differences(mi_rgb, files, rng, preset):
 
     for key in keys:
         start = params[key].numpy() * 0.98 + 0.01  # away from the ends, where entries are folded
-        params[key] = mi.TensorXf(start)
+        params[key] = mi.TensorXf(aligned(start))
         params.update()
         dr.enable_grad(params[key])
         dr.backward(total())
@@ -276,12 +279,12 @@ def test_gradients_against_finite_differences(mi_rgb, files, rng, preset):
             for sign in (-1, 1):
                 moved = start.copy()
                 moved.ravel()[i] += sign * 1e-3
-                params[key] = mi.TensorXf(moved)
+                params[key] = mi.TensorXf(aligned(moved))
                 params.update()
                 values.append(float(total()[0]))
             largest = float(np.abs(gradient).max())
             assert gradient[i] == pytest.approx((values[1] - values[0]) / 2e-3, rel=0.05, abs=0.03 * largest), key
-        params[key] = mi.TensorXf(start)
+        params[key] = mi.TensorXf(aligned(start))
         params.update()
     dr.enable_grad(si.uv)
     dr.backward(dr.sum(texture.eval_1(si)))
@@ -412,7 +415,7 @@ def test_frozen_renders(mi_rgb, file, no_garbage_collection):
     from mi_diffind.plugins.support import footprint
 
     texture = plugin(file, storage="float32", to_uv=mi.ScalarTransform4f().scale(8))
-    loaded = texture_scenes.plane(mi, texture, size=16)
+    loaded = texture_scenes.plane(mi, texture, size=16, integrator={"type": "path", "max_depth": 1})
     footprint.attach(loaded)
     frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
     for seed in range(5):
