@@ -746,7 +746,7 @@ def optimise(mi, form, steps, start, target):
 
 
 @pytest.mark.parametrize(
-    "form, steps", [("disney", 100), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
+    "form, steps", [("disney", 80), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
 )
 def test_a_long_optimisation(mi_rgb, form, steps):
     """
