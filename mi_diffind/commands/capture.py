@@ -10,10 +10,12 @@ from .common import natural, positive, require_scene, scene_options, set_variant
 
 HELP = "render views of a scene from all sides, with their poses"
 
+EXAMPLE = "mi-diffind capture scene.xml -o views --objects statue --views 60"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "capture", run, HELP)
+    sub = verb(commands, "capture", run, HELP, EXAMPLE)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument(
         "-o", "--output", required=True, metavar="FOLDER", help="folder of the views; an unfinished one is completed"

@@ -9,10 +9,12 @@ from .common import UsageError, natural, positive, require_scene, scene_options,
 
 HELP = "check that scenes render as their stored references do"
 
+EXAMPLE = "mi-diffind regress scene.xml --references references"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "regress", run, HELP)
+    sub = verb(commands, "regress", run, HELP, EXAMPLE)
     sub.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     sub.add_argument("--update", action="store_true", help="render the references again and store them")
     sub.add_argument(

@@ -9,12 +9,15 @@ from .common import alternative, alternatives, require_scene, scene_options, set
 
 HELP = "measure time against accuracy, of all forms of a task or of a scene"
 
+EXAMPLE = "mi-diffind tradeoff ggx --quick --out out"
+
 
 def add(commands) -> None:
     """Add the verb and the studies that are found to ``commands``, the subparsers of the command line."""
-    parsers = alternatives(verb(commands, "tradeoff", run, HELP), "study")
+    parsers = alternatives(verb(commands, "tradeoff", run, HELP, EXAMPLE), "study")
     for name, study in studies().items():
-        sub = alternative(parsers, name, f"measure time against accuracy of {study.title}")
+        words = " ".join(filter(None, ("mi-diffind tradeoff", name, study.example, "--quick --out out")))
+        sub = alternative(parsers, name, f"measure time against accuracy of {study.title}", words)
         sub.add_argument("--out", default="out", metavar="DIR", help="folder for table and plot (default: out)")
         sub.add_argument("--quick", action="store_true", help="smoke run: less of everything, times not to be quoted")
         if study.of_scene:

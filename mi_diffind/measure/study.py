@@ -20,7 +20,8 @@ FLOOR = "floor"
 class Study:
     """Base class of studies.
 
-    ``name``: the word of the command and of the files (``tradeoff_NAME.…``); ``title``: a phrase for the help.
+    ``name``: the word of the command and of the files (``tradeoff_NAME.…``); ``title``: a phrase for the help;
+    ``example``: arguments of the example in the help.
 
     A study that compares candidates has a :meth:`plan`; any other study overrides :meth:`run`. A study ``of_scene``
     measures a scene file: its command has the argument ``scene`` and the options of scenes, and ``arguments.defines``
@@ -30,6 +31,7 @@ class Study:
 
     name = ""
     title = ""
+    example = ""
     of_scene = False
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

@@ -17,6 +17,7 @@ class SceneStudy(Study):
 
     name = "scene"
     title = "a scene, learned and exact, at several sample counts"
+    example = "scene.xml --spp 64"
     of_scene = True
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
