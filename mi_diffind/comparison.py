@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import compat, metrics, plugins, scenes
+from . import compat, conversion, metrics, plugins, scenes
 from .files import writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
@@ -76,6 +77,7 @@ def compare(
     progress: bool = True,
     defines: dict[str, str] | None = None,
     against: str | None = None,
+    learn: Sequence[str] = (),
 ) -> Comparison:
     """Render ``path`` as written and with counterparts, in turn, pass by pass, with the same random numbers.
 
@@ -84,6 +86,9 @@ def compare(
     plugins that declare several truths (``neural_texture``: ``mipmap``, which filters as it does, and ``exact``, a
     ``bitmap`` of 8 times the samples) is compared with each of them; other learned plugins are then replaced by their
     exact counterparts. At least two passes are rendered, unless there is only one sample.
+
+    ``learn`` names groups of Mitsuba's plugins (:func:`.conversion.words`) that are replaced by learned ones before the
+    scene is rendered "as written"; the scene of the file is then the truth ``stock``, in place of ``exact``.
 
     Figures: ``against``; ``counterparts``, the plugins that were put in, and ``truth_spp``, their samples a pixel;
     ``psnr_db``, ``flip``, ``mae`` of the image as written against the other one; ``brightness``, the ratio of their
@@ -94,8 +99,9 @@ def compare(
     kernel. The median is ``None`` if there are fewer than :data:`PAIRS` of them or ``q3`` exceeds :data:`WIDEST` times
     ``q1``. Quote the ratio rather than the quotient of the two times: a slow phase of the machine slows both passes of
     a pair. ``replaced_plugins``: how many were replaced; ``learned_plugins``: how many of these are learned;
-    ``table_bytes``: bytes of the distinct tables that the learned ones read. Ctrl-C ends the comparison after the
-    current pair of passes; ``spp`` and ``passes`` then state how many there were, and ``interrupted`` is true.
+    ``table_bytes``: bytes of the distinct tables that the learned ones read; ``conversions``: what became of Mitsuba's
+    plugins (:class:`.conversion.Conversion`). Ctrl-C ends the comparison after the current pair of passes; ``spp`` and
+    ``passes`` then state how many there were, and ``interrupted`` is true.
 
     Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no plugin with such a counterpart.
     """
@@ -103,18 +109,25 @@ def compare(
         others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
         raise scenes.SceneError(f'"{against}": no plugin has this counterpart; there are {", ".join(others)}')
     parsed = scenes.ParsedScene(path, defines)
+    conversions = conversion.convert(parsed, learn, progress=progress) if learn else []
+    for line in conversion.summary(conversions):
+        print(line, flush=True)
     replaced = parsed.learned_plugins(against or "exact")
     if not replaced:
         what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
         names = ", ".join(plugins.with_counterpart(against or "exact"))
         raise scenes.SceneError(f"{path}: names no {what} ({names}), so there is nothing to compare")
     learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
-    truths = {against: (against,)} if against else _default_truths(replaced)
+    truths, sides = {against: (against,)} if against else _default_truths(replaced), {}
     counterparts = {name: _counterparts(replaced, names) for name, names in truths.items()}
-    sides = {
-        name: _Side(parsed.load(exact=True, against=names), max(c.oversampling for c in counterparts[name]))
-        for name, names in truths.items()
-    }  # before the scene as written, since a counterpart may refuse
+    put_in = {name: list(dict.fromkeys(c.name for c in each)) for name, each in counterparts.items()}
+    for name, names in truths.items():  # before the scene as written, since a counterpart may refuse
+        oversampling = max(c.oversampling for c in counterparts[name])
+        if learn and not against and name == "exact":
+            name, put_in["stock"] = "stock", list(dict.fromkeys(c.stock for c in conversions if c.learned))
+            sides[name] = _Side(scenes.load(path, defines), oversampling)
+        else:
+            sides[name] = _Side(parsed.load(exact=True, against=names), oversampling)
     written = _Side(parsed.load())
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
     passes, done = max(1, min(max(passes, 2), spp)), 0
@@ -142,12 +155,13 @@ def compare(
         "replaced_plugins": len(replaced),
         "learned_plugins": len(learned),
         "table_bytes": parsed.table_bytes(learned),
+        "conversions": [vars(c) for c in conversions],
     }
     first, *further = (
         Comparison(written.image, side.image, {
             **common,
             "against": name,
-            "counterparts": list(dict.fromkeys(c.name for c in counterparts[name])),
+            "counterparts": put_in[name],
             "truth_spp": done * side.oversampling,
             **_errors(written, side),
             **_times(written, side, name),

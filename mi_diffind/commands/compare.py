@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..files import writable_folder
-from .common import positive, require_scene, scene_options, set_variant, verb
+from .common import learn_option, positive, require_scene, scene_options, set_variant, verb
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
 
@@ -22,6 +22,7 @@ def add(commands) -> None:
         help="compare with one counterpart: exact, or another one, such as Mitsuba's principled (default: those that "
         "the plugins declare as truths: exact, for filtered textures mipmap, too)",
     )
+    learn_option(sub, "none")
     scene_options(sub)
 
 
@@ -45,6 +46,7 @@ def run(arguments) -> dict:
         True,
         dict(arguments.defines),
         arguments.against,
+        arguments.learn,
     )
     paths = comparison.write(result, arguments.out)
     print("\n".join(comparison.summary(result)))

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..arguments import proper_fraction
 from ..files import writable_file
 from ..interrupt import interruptible
-from .common import UsageError, positive, require_scene, scene_options, set_variant, verb
+from .common import UsageError, learn_option, positive, require_scene, scene_options, set_variant, verb
 
 HELP = "render a scene that names learned plugins"
 
@@ -47,6 +47,7 @@ def add(commands) -> None:
         metavar="T",
         help="part of the scattered light that --depth auto may leave out (default: 0.005)",
     )
+    learn_option(sub, "none")
     scene_options(sub)
 
 
@@ -72,9 +73,12 @@ def run(arguments) -> dict:
     set_variant(arguments.variant)
     import mitsuba as mi
 
-    from .. import scenes
+    from .. import conversion, scenes
 
     parsed = scenes.ParsedScene(arguments.scene, dict(arguments.defines))
+    conversions = conversion.convert(parsed, arguments.learn) if arguments.learn else []
+    for line in conversion.summary(conversions):
+        print(line, flush=True)
     depth = _choose_depth(arguments, parsed)
     start = time.perf_counter()
     learned = parsed.learned_plugins()
@@ -106,6 +110,7 @@ def run(arguments) -> dict:
         "seconds_load": loaded - start,
         "seconds_render": rendered - loaded,
         "learned_plugins": learned,
+        "conversions": [vars(c) for c in conversions],
         "reports": scenes.reports(scene) if arguments.json is not None else [],
         "table_bytes": parsed.table_bytes(learned),
     }
