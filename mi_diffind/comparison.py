@@ -290,16 +290,17 @@ def _write_figure(comparison: Comparison, path: str) -> None:
     place, and a row with the figures.
     """
     learned = " (learned tables)" if comparison.figures["learned_plugins"] else ""
+    written = "learned plugins" if comparison.figures["conversions"] else f"as written{learned}"
     cells, everything = [], (comparison, *comparison.further)
     for one in everything:
         x, y, width, height = frame = tuple(one.figures["worst"][key] for key in ("x", "y", "width", "height"))
         inside, place = np.s_[y : y + height, x : x + width], f"{width} x {height} pixels from ({x}, {y})"
         label, zoomed = truth_label(one.figures), (one.written[inside], one.reference[inside])
         cells += [
-            figure_grid.picture(f"as written{learned}, {one.figures['spp']} spp", one.written, frame),
+            figure_grid.picture(f"{written}, {one.figures['spp']} spp", one.written, frame),
             figure_grid.picture(label, one.reference, frame),
             figure_grid.error_map(np.abs(one.written - one.reference).mean(axis=-1)),
-            figure_grid.picture(f"as written, worst place: {place}", zoomed[0]),
+            figure_grid.picture(f"{written}, worst place: {place}", zoomed[0]),
             figure_grid.picture(f"{label}, worst place", zoomed[1]),
             figure_grid.error_map(_clipped_error(*zoomed), "worst place, difference clipped to [0, 1]"),
         ]
@@ -350,7 +351,7 @@ def _noise_text(f: dict) -> str:
     if math.isinf(f["noise_db"]):
         return "none: both halves of the samples differ alike"
     without = f["psnr_without_noise_db"]
-    rest = "no difference beyond it" if without is None else f"{without:.2f} dB without it"
+    rest = "none measurable beyond it" if without is None else f"{without:.2f} dB without it"
     return f"{f['noise_db']:.2f} dB of it, {rest}"
 
 
@@ -364,7 +365,10 @@ def _time_lines(f: dict) -> list[str]:
         ]
     quartiles = f"{ratio['q1']:.2f} to {ratio['q3']:.2f}"
     if ratio["median"] is None:
-        return [f"time        not measurable here: quartiles {quartiles} of {ratio['pairs']} pairs of passes"]
+        return [
+            f"time        not measurable here: quartiles {quartiles}",
+            f"            of the ratios of {ratio['pairs']} pairs of passes",
+        ]
     return [
         f"time        {ratio['median']:.2f} times that of {name} at {f['spp']} spp"
         f" ({f['seconds_per_pass'][name]:.3g} s a pass)",

@@ -10,7 +10,7 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +48,7 @@ class Conversion:
 
     def __str__(self) -> str:
         if not self.learned:
-            return f'{self.stock} "{self.name}" stays: it {self.reason}'
+            return f'{self.stock} "{self.name}": {self.reason}'
         return f'{self.stock} "{self.name}" → {self.learned}{f", {self.reason}" if self.reason else ""}'
 
 
@@ -98,9 +98,9 @@ def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: b
         word, plugin = stock[before]
         if mi_type(plugin) != types[index]:
             continue
-        parents = [i for i, others in enumerate(references) if index in others]
-        named = [nodes[i].id() for i in parents if types[i] != mi.ObjectType.Scene]
-        name = next(filter(None, (props.id(), *named)), "") or compat.parsed_place(state, index)
+        around = list(_around(references, index))
+        name = next(filter(None, (nodes[i].id() for i in (index, *around))), "") or compat.parsed_place(state, index)
+        parents = [i for i in around if index in references[i]]
         fits: list[Path] = []
         node = StockNode(
             props, tuple(nodes[i] for i in parents), tuple((types[i], nodes[i]) for i in _below(references, index)),
@@ -124,6 +124,14 @@ def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: b
 def mi_type(plugin: plugins.Plugin) -> mi.ObjectType:
     """Return the ``mi.ObjectType`` of the objects of a plugin."""
     return getattr(mi.ObjectType, plugins.OBJECT_TYPES[plugin.object_type])
+
+
+def _around(references: list[list[int]], index: int) -> Iterator[int]:
+    """Yield the objects that refer to one, then those that refer to these, …; the scene has index 0 and is left out."""
+    level = [index]
+    while level:
+        level = [i for i, others in enumerate(references) if i and set(others) & set(level)]
+        yield from level
 
 
 def _below(references: list[list[int]], index: int) -> list[int]:
