@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from .files import writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
 from .measure.statistics import spread
+from .runtime import use_variant
 
 #: Pairs of passes that a ratio of times needs, and the largest ratio of its quartiles: beyond, none is given.
 PAIRS, WIDEST = 3, 1.5
@@ -40,6 +42,19 @@ class Comparison:
     reference: np.ndarray
     figures: dict
     further: tuple[Comparison, ...] = ()
+
+    def save(self, folder: str | os.PathLike) -> dict[str, str]:
+        """Write the pictures into a folder (:func:`write`), and return their paths."""
+        return write(self, folder)
+
+    def __str__(self) -> str:
+        return "\n".join(summary(self))
+
+    def _repr_png_(self) -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "comparison.png"
+            _write_figure(self, path)
+            return path.read_bytes()
 
 
 class _Side:
@@ -70,16 +85,17 @@ class _Side:
 
 
 def compare(
-    path: str | os.PathLike,
+    scene: str | os.PathLike,
     spp: int | None = None,
     seed: int = 0,
+    *,
     passes: int = 5,
-    progress: bool = True,
-    defines: dict[str, str] | None = None,
     against: str | None = None,
     learn: Sequence[str] = (),
+    defines: Mapping[str, object] | None = None,
+    progress: bool = True,
 ) -> Comparison:
-    """Render ``path`` as written and with counterparts, in turn, pass by pass, with the same random numbers.
+    """Render a scene file as written and with counterparts, in turn, pass by pass, with the same random numbers.
 
     Every learned plugin is replaced by its exact counterpart. ``against`` may name another counterpart, such as
     ``"principled"``: then every plugin that has it is replaced, learned or not. Without ``against``, a scene with
@@ -103,20 +119,22 @@ def compare(
     plugins (:class:`.conversion.Conversion`). Ctrl-C ends the comparison after the current pair of passes; ``spp`` and
     ``passes`` then state how many there were, and ``interrupted`` is true.
 
+    ``passes``: passes that the samples are split into; ``defines``: values of the file's ``<default>`` parameters. A
+    notebook shows the picture of :meth:`Comparison.save`, and ``print`` the figures.
+
     Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no plugin with such a counterpart.
     """
+    use_variant()
     if against and not plugins.with_counterpart(against):
         others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
         raise scenes.SceneError(f'"{against}": no plugin has this counterpart; there are {", ".join(others)}')
-    parsed = scenes.ParsedScene(path, defines)
-    conversions = conversion.convert(parsed, learn, progress=progress) if learn else []
-    for line in conversion.summary(conversions):
-        print(line, flush=True)
+    parsed = scenes.ParsedScene(scene, defines)
+    conversions = conversion.replace_stock(parsed, learn, progress=progress)
     replaced = parsed.learned_plugins(against or "exact")
     if not replaced:
         what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
         names = ", ".join(plugins.with_counterpart(against or "exact"))
-        raise scenes.SceneError(f"{path}: names no {what} ({names}), so there is nothing to compare")
+        raise scenes.SceneError(f"{scene}: names no {what} ({names}), so there is nothing to compare")
     learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
     truths, sides = {against: (against,)} if against else _default_truths(replaced), {}
     counterparts = {name: _counterparts(replaced, names) for name, names in truths.items()}
@@ -125,7 +143,7 @@ def compare(
         oversampling = max(c.oversampling for c in counterparts[name])
         if learn and not against and name == "exact":
             name, put_in["stock"] = "stock", list(dict.fromkeys(c.stock for c in conversions if c.learned))
-            sides[name] = _Side(scenes.load(path, defines), oversampling)
+            sides[name] = _Side(scenes.load(scene, defines), oversampling)
         else:
             sides[name] = _Side(parsed.load(exact=True, against=names), oversampling)
     written = _Side(parsed.load())
@@ -143,7 +161,7 @@ def compare(
                 break
 
     common = {
-        "scene": str(path),
+        "scene": str(scene),
         "variant": mi.variant(),
         "spp": done,
         "seed": seed,
@@ -283,7 +301,7 @@ def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
     return paths
 
 
-def _write_figure(comparison: Comparison, path: str) -> None:
+def _write_figure(comparison: Comparison, path: str | os.PathLike) -> None:
     """Write one picture.
 
     Two rows for each truth, the scene as written, the truth and their difference, above as a whole and below its worst
@@ -316,7 +334,9 @@ def truth_label(figures: dict) -> str:
 
 def summary(comparison: Comparison) -> list[str]:
     """Return the figures as lines of text."""
-    return [line for lines in _sections(comparison) for line in ("", *lines)][1:]
+    head, *blocks = _sections(comparison)
+    head += conversion.summary(comparison.figures["conversions"])
+    return [*head, *(line for lines in blocks for line in ("", *lines))]
 
 
 def _sections(comparison: Comparison) -> list[list[str]]:

@@ -10,7 +10,8 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +19,9 @@ import mitsuba as mi
 
 from . import compat, plugins
 from .errors import DiffindError, UsageError
-from .files import relative_path, replacing, writable_folder
+from .files import relative_path, replacing, writable_file, writable_folder
 from .plugins.support.stock import Kept, StockNode
+from .runtime import use_variant
 from .scenes import ParsedScene
 from .tables import save_table
 from .task import fit, tasks
@@ -68,6 +70,40 @@ def cache_folder() -> Path:
 
 
 def convert(
+    scene: str | os.PathLike,
+    output: str | os.PathLike,
+    *,
+    learn: Sequence[str] | None = None,
+    tables: str | os.PathLike | None = None,
+    defines: Mapping[str, object] | None = None,
+    progress: bool = True,
+) -> list[Conversion]:
+    """Write a scene with learned plugins in place of Mitsuba's: ``mi-diffind convert`` in Python.
+
+    - ``scene``: a scene file; ``output``: the scene file to write (:func:`write_scene`).
+    - ``learn``: groups of plugins to replace (:func:`words`; ``None``: all).
+    - ``tables``: folder of the table files (``None``: ``NEW_tables`` beside ``NEW.xml``).
+    - ``defines``: values of the file's ``<default>`` parameters.
+
+    Returns what was replaced and what was kept (:func:`replace_stock`, whose errors are raised, too).
+    """
+    output = Path(output)
+    if output.suffix.lower() != ".xml":
+        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed is .xml')
+    if output.resolve() == Path(scene).resolve():
+        raise UsageError(f'output "{output}": is the scene itself')
+    writable_file(output)
+    use_variant()
+    parsed = ParsedScene(scene, dict(defines or {}))
+    folder = Path(tables or output.with_name(f"{output.stem}_tables"))
+    conversions = replace_stock(parsed, list(words()) if learn is None else learn, folder, progress)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+    write_scene(parsed, output)
+    return conversions
+
+
+def replace_stock(
     parsed: ParsedScene, learn: Sequence[str], folder: str | os.PathLike | None = None, progress: bool = True
 ) -> list[Conversion]:
     """Replace the stock plugins of the groups ``learn`` (:func:`words`) in a parsed scene, and return what was done.
@@ -83,6 +119,8 @@ def convert(
     for word in learn:
         if word not in groups:
             raise UsageError(f'learn: found "{word}", allowed are {", ".join(groups)}')
+    if not learn:
+        return []
     folder = cache_folder() if folder is None else writable_folder(folder, create=True)
     return parsed.change(lambda state: _convert(state, {w: groups[w] for w in learn}, folder.resolve(), progress))
 
@@ -96,7 +134,7 @@ def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: b
         if (before := props.plugin_name()) not in stock:
             continue
         word, plugin = stock[before]
-        if mi_type(plugin) != types[index]:
+        if getattr(mi.ObjectType, plugins.OBJECT_TYPES[plugin.object_type]) != types[index]:
             continue
         around = list(_around(references, index))
         name = next(filter(None, (nodes[i].id() for i in (index, *around))), "") or compat.parsed_place(state, index)
@@ -119,11 +157,6 @@ def _convert(state, groups: dict[str, plugins.Plugin], folder: Path, progress: b
         if plugin.seen_by and any(c.learned == plugin.name for c in conversions):
             conversions += _trace_by(plugin.seen_by[0], compat.properties_of(state, mi.ObjectType.Integrator))
     return conversions
-
-
-def mi_type(plugin: plugins.Plugin) -> mi.ObjectType:
-    """Return the ``mi.ObjectType`` of the objects of a plugin."""
-    return getattr(mi.ObjectType, plugins.OBJECT_TYPES[plugin.object_type])
 
 
 def _around(references: list[list[int]], index: int) -> Iterator[int]:
@@ -163,7 +196,8 @@ def _fitted(folder: Path, progress: bool, fits: list[Path], task: str, source: P
     key = [task, sorted(options.items()), relative_path(source, folder)]  # the file records its source by that path
     path = folder / f"{source.stem}_{_digest(source, key)}.npz"
     if not path.is_file():
-        print(f"fit {task} to {source.name}: {path}", flush=True)
+        if progress:
+            print(f"fit {task} to {source.name}: {path}", file=sys.stderr, flush=True)
         try:
             fitted = fit(task, variant=mi.variant(), output=path, progress=progress, source=str(source), **options)
         except DiffindError as e:
@@ -210,8 +244,9 @@ def write_scene(parsed: ParsedScene, path: str | os.PathLike) -> None:
         temporary.write_text(content, encoding="utf-8")
 
 
-def summary(conversions: list[Conversion]) -> list[str]:
-    """Return what a conversion has replaced and kept, as lines of text; plugins that stay come last, by name."""
+def summary(conversions: Sequence[Conversion | Mapping]) -> list[str]:
+    """Return what was replaced and what was kept, by name, as lines of text; mappings hold the fields."""
+    conversions = [Conversion(**c) if isinstance(c, Mapping) else c for c in conversions]
     replaced = [c for c in conversions if c.learned]
     lines = []
     for stock, learned in dict.fromkeys((c.stock, c.learned) for c in replaced):

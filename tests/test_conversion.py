@@ -63,7 +63,7 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
         <string name="filter_type" value="bilinear"/></texture></bsdf></bsdf></shape>"""
     scene = parsed(folder, BALL.replace("MORE", "") + floor)
     stock = scenes.render(scene.load(), 16)[0]
-    conversions = conversion.convert(scene, ["principled", "bitmap", "mesh"], folder / "tables")
+    conversions = conversion.replace_stock(scene, ["principled", "bitmap", "mesh"], folder / "tables")
     assert [(c.stock, c.learned, c.name) for c in conversions] == [
         ("ply", "neural_sdf", "ball"), ("principled", "neural_disney", "ball"),
         ("principled", "neural_disney", "floor"), ("bitmap", "neural_texture", "floor"),
@@ -78,7 +78,7 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
     exact = scenes.load(folder / "other" / "new.xml", exact=True)
     assert "PLYMesh" in [shape.class_name() for shape in exact.shapes()]
     twice = parsed(folder, BALL.replace("MORE", "") + floor, "again.xml")
-    assert len(conversion.convert(twice, ["mesh", "bitmap"], folder / "tables")) == 3 and len(fits) == 2
+    assert len(conversion.replace_stock(twice, ["mesh", "bitmap"], folder / "tables")) == 3 and len(fits) == 2
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_what_stays_is_named_with_the_reason(mi_rgb, folder, group, objects, nam
     half.update_faces(half.triangles_center[:, 1] < 0)
     half.export(folder / "bowl.ply")
     scene = parsed(folder, objects)
-    (one,) = conversion.convert(scene, [group], folder / "tables")
+    (one,) = conversion.replace_stock(scene, [group], folder / "tables")
     assert one.learned == "" and reason in one.reason and name in str(one) and not fits
     assert conversion.summary([one]) == [f"kept        {one}"]
     stays = scene.change(lambda state: [node.props.plugin_name() for node in state.nodes])
@@ -116,14 +116,14 @@ def test_what_stays_is_named_with_the_reason(mi_rgb, folder, group, objects, nam
 
 def test_unknown_groups_are_refused(mi_rgb, folder):
     with pytest.raises(UsageError, match='found "glass", allowed are principled, mesh, bitmap'):
-        conversion.convert(parsed(folder[0], ""), ["glass"], folder[0])
+        conversion.replace_stock(parsed(folder[0], ""), ["glass"], folder[0])
 
 
 def test_misspelt_parameters_stay_errors(mi_rgb, folder):
     """Conversion reads the properties of the scene, which must not make them known to a plugin."""
     scene = parsed(folder[0], '<bsdf type="principled" id="a"><float name="rougness" value="0.9"/></bsdf>'
                    '<shape type="sphere"><ref id="a"/></shape>')  # fmt: skip
-    (one,) = conversion.convert(scene, ["principled"], folder[0])
+    (one,) = conversion.replace_stock(scene, ["principled"], folder[0])
     assert one.reason == 'has the parameter "rougness", which the learned plugin lacks'
     with pytest.raises(scenes.SceneError, match="rougness"):
         scene.load()

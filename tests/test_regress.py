@@ -98,6 +98,7 @@ SLOW = {
     ("field", "llvm_ad_mono"),
     ("field", "llvm_ad_spectral"),
     ("horizon", "llvm_ad_mono"),
+    ("materials", "llvm_ad_mono"),
     ("rust", "llvm_ad_mono"),
     ("rust", "llvm_ad_spectral"),
     ("solids", "llvm_ad_mono"),

@@ -42,13 +42,12 @@ def run(arguments) -> dict:
         arguments.scene,
         arguments.spp,
         arguments.seed,
-        arguments.passes,
-        True,
-        dict(arguments.defines),
-        arguments.against,
-        arguments.learn,
+        passes=arguments.passes,
+        against=arguments.against,
+        learn=arguments.learn,
+        defines=dict(arguments.defines),
     )
-    paths = comparison.write(result, arguments.out)
-    print("\n".join(comparison.summary(result)))
+    paths = result.save(arguments.out)
+    print(result)
     print(f"picture     {paths['figure']}")
     return {**result.figures, "further": [one.figures for one in result.further], "files": paths}

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from ..errors import UsageError
-from ..files import writable_file
-from .common import learn_option, require_scene, scene_options, set_variant, verb
+from .common import learn_option, print_conversions, require_scene, scene_options, set_variant, verb
 
 HELP = "write a scene with learned plugins in place of Mitsuba's, fitted to what they show"
 
@@ -27,20 +23,19 @@ def run(arguments) -> dict:
     Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.conversion` does.
     """
     require_scene(arguments.scene)
-    output = Path(arguments.output)
-    if output.suffix.lower() != ".xml":
-        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed is .xml')
-    if output.resolve() == Path(arguments.scene).resolve():
-        raise UsageError(f'output "{output}": is the scene itself')
-    writable_file(output)
     set_variant(arguments.variant)
-    from .. import conversion, scenes
+    from ..conversion import convert
 
-    parsed = scenes.ParsedScene(arguments.scene, dict(arguments.defines))
-    folder = Path(arguments.tables or output.with_name(f"{output.stem}_tables"))
-    conversions = conversion.convert(parsed, arguments.learn or list(conversion.words()), folder)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
-    conversion.write_scene(parsed, output)
-    print("\n".join([*conversion.summary(conversions), f"scene       {output}"]))
-    return {"output": str(output), "conversions": [vars(c) for c in conversions]}
+    conversions = [
+        vars(c)
+        for c in convert(
+            arguments.scene,
+            arguments.output,
+            learn=arguments.learn or None,
+            tables=arguments.tables,
+            defines=dict(arguments.defines),
+        )
+    ]
+    print_conversions(conversions)
+    print(f"scene       {arguments.output}")
+    return {"output": arguments.output, "conversions": conversions}

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 
+from ...indirection import device_array
 from ...task import Model
 from .files import field_of
 from .presets import dense_bytes
@@ -70,6 +72,9 @@ class RadianceFieldModel(Model):
         )
         return figures, lines
 
+    def entries(self) -> dict:
+        return {name: values for name, values in self.field.arrays.items() if dr.is_float_v(values)}
+
     def counts(self) -> dict[str, int]:
         """Return the counts (:class:`.march.RayCounts`) of parallel rays along the axes, in both directions."""
         from .march import count
@@ -83,7 +88,10 @@ class RadianceFieldModel(Model):
                 at = np.roll(place * [1, 1, 1] if sign > 0 else place * [1, 1, -2], axis + 1, axis=1)
                 origins.append(lower + at * (upper - lower))
                 directions.append(np.broadcast_to(sign * np.eye(3)[axis], at.shape))
-        o, d = (self.types.Array3f(np.float32(np.concatenate(v).T)) for v in (origins, directions))
+        o, d = (
+            self.types.Array3f(*(device_array(self.types.Float, x) for x in np.concatenate(v).T))
+            for v in (origins, directions)
+        )
         return count(self.field, o, d, 0, np.inf).asdict()
 
     def measure(self, capture=None):

@@ -73,6 +73,30 @@ def sample(distances: Distances, spacing: float) -> SampledNodes:
     )  # fmt: skip
 
 
+def encoded(structure: Structure, before: np.ndarray, values: np.ndarray, bits: int, seed: int = 0):
+    """Encode the nodes of a field again, with new ``values`` (n, 4): distances in spacings and unit normals.
+
+    ``before`` are the decoded nodes of the file (n, 4), whose signs state the side of each node. Returns the
+    :class:`NodeCoding` and the corners (K, 8) of the cells that are stored.
+    """
+    positions, block = structure.node_positions()
+    side = np.where(before[:, 0] < 0, -1.0, 1.0)
+    shape = np.array(structure.shape) + 1
+    keys = np.ravel_multi_index(np.asarray(positions, np.int64).T, shape)
+    order = np.argsort(keys)
+    steps = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    wanted = keys[:, None] + steps @ np.array([shape[1] * shape[2], shape[2], 1])
+    place = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(order) - 1)]
+    inside = side[place] < 0
+    cells = (keys[place] == wanted).all(axis=1) & inside.any(axis=1) & ~inside.all(axis=1)
+    corners = place[cells]
+    distances = side * np.maximum(np.abs(before[:, 0]), LEAST)
+    nodes = SampledNodes(structure, positions, block, distances, before[:, 1:], corners, len(corners), 0.0)
+    coding = NodeCoding(nodes, bits, seed)
+    coding.encode(values)
+    return coding, corners
+
+
 def node_frames(words: np.ndarray, block: np.ndarray):
     """Return the frames of nodes in the blocks ``block`` (n,): normal (three arrays), distance and scale."""
     n, d, scale = codes.frames(words)
@@ -151,9 +175,10 @@ class NodeCoding:
         self.entries = self._choose_entries(wanted)
         self.pointers = assign(wanted, self.entries)
         self._keep_sides(wanted, np.arange(len(wanted)))
-        before = None
+        before = lowest = None
         for _ in range(REPAIRS):
-            moved = self._hold_borders()
+            lowest = self._lowest_values(lowest, before)
+            moved = self._hold_borders(lowest)
             if before is not None and np.array_equal(moved, before):  # as far as their blocks let them
                 break
             self._keep_sides(wanted, moved)
@@ -230,14 +255,21 @@ class NodeCoding:
                 axes.append(np.full(len(alone), axis))
         return np.concatenate(cells), np.concatenate(axes)
 
-    def _hold_borders(self) -> np.ndarray:
-        """Raise the smallest distances of nodes at faces through which the surface leaves; return these nodes."""
+    def _lowest_values(self, known: np.ndarray | None, moved: np.ndarray | None) -> np.ndarray:
+        """Return the lowest value of each face of :attr:`_borders`, positive on the side of the face, ``(m,)``.
+
+        With the values that were ``known`` before nodes ``moved``, only those of faces with such a node are computed.
+        """
         cells, axes = self._borders
+        lowest, changed = np.empty(len(cells)), np.arange(len(cells))
+        if known is not None:
+            lowest, some = known.copy(), np.zeros(len(self.side), bool)
+            some[moved] = True
+            changed = np.flatnonzero(some[cells[:, 0]].any(axis=(1, 2)))
         values = self.values().astype(np.float64)
         u = np.linspace(0, 1, 9)
         lines = np.stack([1 - u, u])
-        lowest = np.empty(len(cells))
-        for part in np.array_split(np.arange(len(cells)), max(1, len(cells) // 2**14)):
+        for part in np.array_split(changed, max(1, len(changed) // 2**14)):
             face = cells[part][:, 0]  # (m, 2, 2)
             d, g = values[face, 0], values[face, 1:]
             others = np.array([[1, 2], [0, 2], [0, 1]])[axes[part]]
@@ -250,6 +282,11 @@ class NodeCoding:
                     )
                     total = total + lines[a][:, None] * lines[b] * (d[:, a, b, None, None] + offset)
             lowest[part] = (self.side[face[:, 0, 0], None, None] * total).min(axis=(1, 2))
+        return lowest
+
+    def _hold_borders(self, lowest: np.ndarray) -> np.ndarray:
+        """Raise the smallest distances of nodes at faces whose ``lowest`` value is too low; return these nodes."""
+        cells, _ = self._borders
         broken = lowest < 0.5 * LEAST
         nodes = cells[broken][:, 0].reshape(-1)
         short = np.repeat(LEAST - lowest[broken], 4)
