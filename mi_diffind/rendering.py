@@ -112,8 +112,10 @@ def render(
         changed = chosen["chosen"] != chosen["scene"]
         loaded = parsed.load(longest_path=chosen["chosen"] if changed else None)
     else:
-        if depth != "scene" or defines or learn:
-            raise UsageError("depth, defines, learn: given with a scene in memory, allowed are scene files")
+        if learn:
+            raise UsageError("learn: given with a scene in memory, allowed are scene files")
+        if depth != "scene" or defines:
+            raise UsageError("depth, defines: given with a scene in memory, allowed are scene files")
         chosen, conversions, loaded = None, [], scenes.load_dict(scene) if isinstance(scene, dict) else scene
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
