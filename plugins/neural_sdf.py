@@ -18,7 +18,7 @@ from mi_diffind.tasks.sdf import TASK
 
 from . import Counterpart, Plugin, reports_as, shown_as, warn
 from .support import properties, tables
-from .support.distance_shapes import CELL_BYTES, DistanceShape, Placement, crop_grid, finest, native_grid
+from .support.distance_shapes import CELL_BYTES, SEEN_BY, Placement, crop_grid, distance_shape, finest, native_grid
 from .support.sdf_meshes import to_mesh
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.
@@ -95,7 +95,7 @@ def sentence(report: dict) -> str:
     )
 
 
-class NeuralSDF(DistanceShape):
+class NeuralSDF(distance_shape(mi.Mesh)):
     r"""
     .. _shape-neural_sdf:
 
@@ -278,7 +278,7 @@ PLUGIN = Plugin(
     "shape",
     factory,
     task=TASK.name,
-    seen_by=DistanceShape.seen_by,
+    seen_by=SEEN_BY,
     otherwise=("trace", "grid"),
     exact=Counterpart("ply", ("normals", "trace", "resolution", "storage"), convert=to_mesh),
 )

@@ -163,6 +163,12 @@ def test_reports(mi_rgb, folder):
     json.dumps(list(result.values()))
 
 
+def test_each_variant_has_a_shape_of_its_own(mi_any, folder):
+    """One process may change the variant: a shape derived from the mesh of another variant is no shape there."""
+    loaded = mi_any.load_dict({"type": "scene", "solid": shape(folder, id="solid")})
+    assert loaded.shapes()[0].id() == "solid" and isinstance(loaded.shapes()[0], mi_any.Mesh)
+
+
 def test_shapes_of_one_file_share_its_arrays(mi_rgb, folder):
     loaded = scene(mi_rgb, {"a": shape(folder), "b": shape(folder)})
     a, b = (s for s in loaded.shapes() if isinstance(s, mi_rgb.Mesh))
