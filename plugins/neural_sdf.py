@@ -205,6 +205,9 @@ class NeuralSDF(distance_shape(mi.Mesh)):
             return {"nodes": field.nodes}
         return {name: array.data for name, array in tables.exposed(self.model.arrays).items()}
 
+    def optimisable(self) -> bool:
+        return bool(self.entries())
+
     def optimised(self) -> bool:
         return any(compat.has_gradient(values) for values in self.entries().values())
 

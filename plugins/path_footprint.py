@@ -10,7 +10,7 @@ import mitsuba as mi
 from mi_diffind import compat
 
 from . import Plugin
-from .support import footprint
+from .support import footprint, omissions
 from .support.differentials import Differentials
 
 #: ``max_depth`` where there is no limit.
@@ -137,6 +137,11 @@ def integrator() -> type:
                 f"PathFootprint[\n  max_depth = {depth},\n  rr_depth = {self.rr_depth},\n"
                 f"  jitter = {str(self.jitter).lower()}\n]"
             )
+
+        def render(self, scene, *args, **kwargs):
+            """Render as Mitsuba does, with a warning of what would be left out of the image."""
+            omissions.check(scene, self)
+            return super().render(scene, *args, **kwargs)
 
         def sample_rays(self, scene, sensor, sampler):
             """Sample rays as Mitsuba does, but with differentials of samples in place of pixels."""

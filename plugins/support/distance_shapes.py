@@ -23,6 +23,8 @@ import numpy as np
 from mi_diffind import compat
 from mi_diffind.tasks.sdf import tracing
 
+from . import omissions
+
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
 OFFSET = 3 * tracing.EPSILON
 
@@ -100,6 +102,7 @@ def distance_shape(mesh: type) -> type:
             self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
             self.ready = True
             self._place()
+            omissions.watch(self)
 
         def _place(self) -> None:
             """Store the placement as opaque numbers, so that another one compiles no new kernel."""
@@ -114,6 +117,26 @@ def distance_shape(mesh: type) -> type:
                 super().traverse(cb)
                 return
             cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
+
+        def omitted(self, integrators: list) -> str:
+            """Return a sentence if these integrators do not trace the shape; see :mod:`.omissions`."""
+            names = [compat.integrator_name(integrator) for integrator in integrators]
+            if any(hasattr(i, "sample_shapes") for i in integrators) and compat.INTERSECTING not in names:
+                return ""
+            name = compat.INTERSECTING if compat.INTERSECTING in names else names[-1]
+            decoded = (
+                ""
+                if self.optimisable()
+                else (', set its parameter trace="grid", or load the scene with mi_diffind.load_file, which decodes it')
+            )
+            return (
+                f'the shape "{self.id()}" ({omissions.plugin_of(self)}) is left out: the integrator {name} does not '
+                f"trace its arrays; render with the integrator {' or '.join(SEEN_BY)}{decoded}"
+            )
+
+        def optimisable(self) -> bool:
+            """Return whether the field's arrays are kept in a form that can be optimised."""
+            return False
 
         def optimised(self) -> bool:
             """Return whether derivatives with respect to the field are enabled."""
@@ -277,6 +300,7 @@ def interaction(shapes: list, hit: ShapeHit, ray, si, active=True):
         at.dp_du, at.dp_dv = at.sh_frame.s, at.sh_frame.t
         at.wi = at.sh_frame.to_local(-ray.d)
         at.shape = mi.ShapePtr(shape)
+        at.duv_dx, at.duv_dy = si.duv_dx, si.duv_dy
         si = dr.select(here, at, si)
     return si
 
