@@ -48,10 +48,11 @@ class FilteredTexture(MapTexture):
 
     def unfiltered(self) -> str:
         """Return a warning that the texture is not filtered."""
+        described = ", ".join(filter(None, (omissions.plugin_of(self), str(self._path or ""))))
         return (
-            f'the texture "{self.id()}" ({omissions.plugin_of(self)}, {self._path}) is not filtered: it does not know '
-            f"the sensor, and the integrator gives no footprints; load the scene with mi_diffind.load_file, call "
-            f"mi_diffind.attach(scene), or render with the integrator path_footprint"
+            f'the texture "{self.id()}" ({described}) is not filtered: it does not know the sensor, and the integrator '
+            f"gives no footprints; load the scene with mi_diffind.load_file, call mi_diffind.attach(scene), or render "
+            f"with the integrator path_footprint"
         )
 
     def _values(self, si):

@@ -451,8 +451,9 @@ def integrator(name, inner=""):
 
 EXPLICIT = '<string name="trace" value="arrays"/>'
 TRACED = integrator("path_sdf")
-STOCK = [integrator("path"), integrator("moment", integrator("path")), integrator("prb")]
-OURS = [TRACED, integrator("aov", '<string name="aovs" value="d:depth"/>' + TRACED), integrator("moment", TRACED)]
+CHANNELS = integrator("aov", '<string name="aovs" value="d:depth"/>' + TRACED)  # from rays of its own
+STOCK = [integrator("path"), integrator("moment", integrator("path")), integrator("prb"), CHANNELS]
+OURS = [TRACED, integrator("moment", TRACED)]
 
 
 @pytest.mark.parametrize("xml", STOCK)
