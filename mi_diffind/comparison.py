@@ -6,27 +6,66 @@ Mitsuba's ``principled``, by that.
 
 from __future__ import annotations
 
+import math
 import os
-import statistics
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import metrics, plugins, scenes
+from . import compat, metrics, plugins, scenes
 from .files import writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
+from .measure.statistics import spread
+
+#: Pairs of passes that a ratio of times needs, and the largest ratio of its quartiles: beyond, none is given.
+PAIRS, WIDEST = 3, 1.5
+
+#: Side of the zoomed window over the side of the picture, and its smallest width or height in pixels.
+ZOOM, SMALLEST = 1 / 8, 8
 
 
 @dataclass
 class Comparison:
-    """Both images (linear, ``(height, width, 3)``) and the measured figures (see :func:`compare`)."""
+    """Both images (linear, ``(height, width, 3)``) and the measured figures (see :func:`compare`).
+
+    ``further``: comparisons of the same image with further truths.
+    """
 
     written: np.ndarray
     reference: np.ndarray
     figures: dict
+    further: tuple[Comparison, ...] = ()
+
+
+class _Side:
+    """Scene, its passes so far and their times: ``oversampling`` times the samples of the scene as written."""
+
+    def __init__(self, scene, oversampling: int = 1):
+        self.scene, self.oversampling = scene, oversampling
+        self.halves, self.samples = [0.0, 0.0], [0, 0]
+        self.seconds: list[float] = []
+        self.compiled: list[bool] = []
+
+    def render(self, spp: int, seed: int, on_pass) -> None:
+        """Render one pass of ``spp`` samples, and further ones of as many where the side is oversampled."""
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            image, seconds = scenes.render(self.scene, spp * self.oversampling, seed, self.oversampling, on_pass)
+            self.compiled.append(compat.was_compiled(dr.kernel_history()))
+        image = image[..., :3].astype(np.float64)
+        half = len(self.seconds) % 2
+        self.halves[half] = self.halves[half] + spp * np.repeat(image, 3 // image.shape[-1], -1)
+        self.samples[half] += spp
+        self.seconds.append(seconds[0])
+
+    @property
+    def image(self) -> np.ndarray:
+        """Mean of all samples, float32."""
+        return (sum(self.halves) / sum(self.samples)).astype(np.float32)
 
 
 def compare(
@@ -36,130 +75,284 @@ def compare(
     passes: int = 5,
     progress: bool = True,
     defines: dict[str, str] | None = None,
-    against: str = "exact",
+    against: str | None = None,
 ) -> Comparison:
     """Render ``path`` as written and with counterparts, in turn, pass by pass, with the same random numbers.
 
     Every learned plugin is replaced by its exact counterpart. ``against`` may name another counterpart, such as
-    ``"principled"``: then every plugin that has it is replaced, learned or not.
+    ``"principled"``: then every plugin that has it is replaced, learned or not. Without ``against``, a scene with
+    plugins that declare several truths (``neural_texture``: ``mipmap``, which filters as it does, and ``exact``, a
+    ``bitmap`` of 8 times the samples) is compared with each of them; other learned plugins are then replaced by their
+    exact counterparts. At least two passes are rendered, unless there is only one sample.
 
-    Figures: ``against``; ``psnr_db``, ``flip``, ``mae`` of the image as written against the other one;
-    ``brightness``, the ratio of their means; the median seconds of a pass of each; ``time_ratio``, written over the
-    other: median, minimum and maximum over the ``pairs`` of passes, rendered one after the other. The first pair
-    compiles the kernels and counts only if there is no other. ``replaced_plugins``: how many were replaced;
-    ``learned_plugins``: how many of these are learned; ``table_bytes``: bytes of the distinct tables that the learned
-    ones read. Quote the ratio rather than the quotient of the two medians: a slow phase of the machine slows both
-    passes of a pair. Ctrl-C ends the comparison after the current pair of passes; ``spp`` and ``passes`` then state
-    how many there were, and ``interrupted`` is true.
+    Figures: ``against``; ``counterparts``, the plugins that were put in, and ``truth_spp``, their samples a pixel;
+    ``psnr_db``, ``flip``, ``mae`` of the image as written against the other one; ``brightness``, the ratio of their
+    means; ``noise_db`` and ``psnr_without_noise_db`` (:func:`noise`); ``worst``, the window ``x``, ``y``, ``width``,
+    ``height`` (:func:`worst_window`) of the largest ``mae`` of values clipped to [0, 1]; the median
+    ``seconds_per_pass`` of each. ``time_ratio``, written over the other at equal samples: ``median``, ``q1``, ``q3``,
+    ``min`` and ``max`` over the ``pairs`` of passes, rendered one after the other, in which neither side compiled a
+    kernel. The median is ``None`` if there are fewer than :data:`PAIRS` of them or ``q3`` exceeds :data:`WIDEST` times
+    ``q1``. Quote the ratio rather than the quotient of the two times: a slow phase of the machine slows both passes of
+    a pair. ``replaced_plugins``: how many were replaced; ``learned_plugins``: how many of these are learned;
+    ``table_bytes``: bytes of the distinct tables that the learned ones read. Ctrl-C ends the comparison after the
+    current pair of passes; ``spp`` and ``passes`` then state how many there were, and ``interrupted`` is true.
 
     Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no plugin with such a counterpart.
     """
-    names = plugins.with_counterpart(against)
-    if not names:
+    if against and not plugins.with_counterpart(against):
         others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
         raise scenes.SceneError(f'"{against}": no plugin has this counterpart; there are {", ".join(others)}')
     parsed = scenes.ParsedScene(path, defines)
-    replaced = parsed.learned_plugins(against)
+    replaced = parsed.learned_plugins(against or "exact")
     if not replaced:
-        what = "learned plugin" if against == "exact" else f'plugin that "{against}" can stand for'
-        raise scenes.SceneError(f"{path}: names no {what} ({', '.join(names)}), so there is nothing to compare")
+        what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
+        names = ", ".join(plugins.with_counterpart(against or "exact"))
+        raise scenes.SceneError(f"{path}: names no {what} ({names}), so there is nothing to compare")
     learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
-    reference = parsed.load(exact=True, against=against)  # before the other scene, since a counterpart may refuse
-    loaded = {"written": parsed.load(), against: reference}
-    spp = spp or reference.sensors()[0].sampler().sample_count()
-    passes = max(1, min(passes, spp))
-    images, seconds, done = dict.fromkeys(loaded, 0), {name: [] for name in loaded}, 0
-    with interruptible() as stop, scenes.progress_bar("render", 2 * passes, progress=progress) as bar:
+    truths = {against: (against,)} if against else _default_truths(replaced)
+    counterparts = {name: _counterparts(replaced, names) for name, names in truths.items()}
+    sides = {
+        name: _Side(parsed.load(exact=True, against=names), max(c.oversampling for c in counterparts[name]))
+        for name, names in truths.items()
+    }  # before the scene as written, since a counterpart may refuse
+    written = _Side(parsed.load())
+    spp = spp or written.scene.sensors()[0].sampler().sample_count()
+    passes, done = max(1, min(max(passes, 2), spp)), 0
+    turns = [written, *sides.values()]
+    total = passes * sum(side.oversampling for side in turns)
+    with interruptible() as stop, scenes.progress_bar("render", total, progress=progress) as bar:
         for i in range(passes):
             n = (i + 1) * spp // passes - done
-            for name in loaded if i % 2 == 0 else reversed(loaded):
-                image, pass_seconds = scenes.render(loaded[name], n, seed * passes + i)
-                images[name] = images[name] + n * image.astype(np.float64)
-                seconds[name] += pass_seconds
-                bar.update(1)
+            for side in turns if i % 2 == 0 else reversed(turns):
+                side.render(n, seed * passes + i, bar.update)
             done += n
             if stop.is_set():
                 break
 
-    requested, spp, passes = spp, done, len(seconds[against])
-    written, reference = ((image[..., :3] / spp).astype(np.float32) for image in images.values())
-    if written.shape[-1] == 1:
-        written, reference = np.repeat(written, 3, -1), np.repeat(reference, 3, -1)
-    timed = slice(1, None) if passes > 1 else slice(None)
-    ratios = [w / e for w, e in zip(seconds["written"][timed], seconds[against][timed], strict=True)]
-    ratio = {"median": statistics.median(ratios), "min": min(ratios), "max": max(ratios), "pairs": len(ratios)}
-    figures = {
+    common = {
         "scene": str(path),
         "variant": mi.variant(),
-        "spp": spp,
+        "spp": done,
         "seed": seed,
-        "width": written.shape[1],
-        "height": written.shape[0],
-        "against": against,
-        **metrics.compare(reference, written),
-        "brightness": float(written.mean(dtype=np.float64) / max(reference.mean(dtype=np.float64), 1e-30)),
-        "seconds_per_pass": {name: statistics.median(seconds[name][timed]) for name in loaded},
-        "seconds_first_pass": {name: seconds[name][0] for name in loaded},
-        "time_ratio": ratio,
-        "passes": passes,
-        "interrupted": done < requested,
-        "spp_requested": requested,
+        "width": written.image.shape[1],
+        "height": written.image.shape[0],
+        "passes": len(written.seconds),
+        "interrupted": done < spp,
+        "spp_requested": spp,
         "replaced_plugins": len(replaced),
         "learned_plugins": len(learned),
         "table_bytes": parsed.table_bytes(learned),
     }
-    return Comparison(written, reference, figures)
+    first, *further = (
+        Comparison(written.image, side.image, {
+            **common,
+            "against": name,
+            "counterparts": list(dict.fromkeys(c.name for c in counterparts[name])),
+            "truth_spp": done * side.oversampling,
+            **_errors(written, side),
+            **_times(written, side, name),
+        })
+        for name, side in sides.items()
+    )  # fmt: skip
+    first.further = tuple(further)
+    return first
+
+
+def _default_truths(learned: list[dict]) -> dict[str, tuple[str, ...]]:
+    """Return, by name, the counterparts that learned plugins are replaced by without a choice, ``exact`` last."""
+    names = dict.fromkeys(name for entry in learned for name in plugins.declared()[entry["plugin"]].truths)
+    return {name: tuple(dict.fromkeys((name, "exact"))) for name in sorted(names, key="exact".__eq__)}
+
+
+def _counterparts(replaced: list[dict], names: tuple[str, ...]) -> list:
+    return [plugins.declared()[entry["plugin"]].counterpart(names) for entry in replaced]
+
+
+def _errors(written: _Side, truth: _Side) -> dict:
+    """Return the errors of an image, the part of them that is noise, and the worst place."""
+    image, reference = written.image, truth.image
+    error = _clipped_error(image, reference)
+    x, y, width, height = worst_window(error)
+    return {
+        **metrics.compare(reference, image),
+        **noise(written.halves, truth.halves, written.samples),
+        "brightness": float(image.mean(dtype=np.float64) / max(reference.mean(dtype=np.float64), 1e-30)),
+        "worst": {
+            "x": x, "y": y, "width": width, "height": height,
+            "mae": float(error[y : y + height, x : x + width].mean(dtype=np.float64)),
+        },
+    }  # fmt: skip
+
+
+def _clipped_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the absolute difference of values clipped to [0, 1], the mean of the channels, ``(height, width)``."""
+    return np.abs(np.clip(image, 0, 1) - np.clip(reference, 0, 1)).mean(axis=-1)
+
+
+def noise(written: list, truth: list, samples: list[int]) -> dict[str, float | None]:
+    """Return the part of an error that is noise, from two independent halves of the samples of each side.
+
+    ``written`` and ``truth`` are the sums of the samples of each half, ``samples`` how many these are. Both sides are
+    rendered with the same random numbers, so the noise that they share is in neither image's error: noise is here what
+    remains of it in their *difference*. With the differences a and b of the halves, of m and n samples, the squared
+    noise of the mean difference is estimated by (a − b)² m n / (m + n)² and its squared expectation by a b, both
+    without bias. Only where one of the two means is outside of [0, 1], which the PSNR clips, are the halves clipped,
+    too.
+
+    ``noise_db``: PSNR that two scenes of equal expectation would reach at so many samples, infinite without noise;
+    ``psnr_without_noise_db``: PSNR of infinitely many samples, ``None`` if the difference of the images is below two
+    standard errors of this estimate. Both are ``None`` if there is only one half.
+    """
+    if min(samples) == 0:
+        return {"noise_db": None, "psnr_without_noise_db": None}
+    m, n = samples
+    means = [sum(side) / (m + n) for side in (written, truth)]
+    clipped = np.any([(mean < 0) | (mean > 1) for mean in means], axis=0)
+    halves = ((w / k, t / k) for w, t, k in zip(written, truth, samples, strict=True))
+    a, b = (np.where(clipped, np.clip(w, 0, 1) - np.clip(t, 0, 1), w - t) for w, t in halves)
+    squared = (a * b).mean(axis=-1)
+    bias, error = squared.mean(), squared.std() / math.sqrt(squared.size)
+    return {
+        "noise_db": _decibels(np.mean((a - b) ** 2) * m * n / (m + n) ** 2),
+        "psnr_without_noise_db": _decibels(bias) if bias > 2 * error or error == 0 else None,
+    }
+
+
+def _decibels(mse: float) -> float:
+    return -10 * math.log10(mse) if mse > 0 else math.inf
+
+
+def worst_window(error: np.ndarray) -> tuple[int, int, int, int]:
+    """Return ``x, y, width, height`` of the window with the largest mean of ``error`` ``(height, width)``.
+
+    Its sides are :data:`ZOOM` of the picture's, but at least :data:`SMALLEST` pixels where the picture has them.
+    """
+    height, width = (min(n, max(SMALLEST, round(n * ZOOM))) for n in error.shape)
+    sums = np.pad(error, ((1, 0), (1, 0))).cumsum(0, dtype=np.float64).cumsum(1)
+    means = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    y, x = np.unravel_index(int(means.argmax()), means.shape)
+    return int(x), int(y), width, height
+
+
+def _times(written: _Side, truth: _Side, name: str) -> dict:
+    """Return times of passes; pairs in which a kernel was compiled are left out of all but the first ones."""
+    sides = {"written": written, name: truth}
+    quiet = [i for i, both in enumerate(zip(written.compiled, truth.compiled, strict=True)) if not any(both)]
+    ratios = [written.seconds[i] / truth.seconds[i] for i in quiet]
+    ratio = {**spread(ratios), "min": min(ratios, default=None), "max": max(ratios, default=None), "pairs": len(quiet)}
+    if len(quiet) < PAIRS or ratio["q3"] > WIDEST * ratio["q1"]:
+        ratio["median"] = None
+    return {
+        "seconds_per_pass": {key: spread(side.seconds[i] for i in quiet)["median"] for key, side in sides.items()},
+        "seconds_first_pass": {key: side.seconds[0] for key, side in sides.items()},
+        "time_ratio": {key: None if value != value else value for key, value in ratio.items()},
+    }
 
 
 def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
     """Write ``comparison.png`` and EXR images into ``folder``, which is created if its parent exists; return the paths.
 
     The EXR images are ``written.exr``, ``exact.exr`` (or by the name of the other counterpart) and ``error.exr``
-    (absolute difference). Raises :class:`~mi_diffind.files.OutputError`.
+    (absolute difference; with several truths ``error_NAME.exr``). Raises :class:`~mi_diffind.files.OutputError`.
     """
     folder = writable_folder(folder, create=True)
-    error = np.abs(comparison.written - comparison.reference)
-    images = {"written": comparison.written, comparison.figures["against"]: comparison.reference, "error": error}
+    images, everything = {"written": comparison.written}, (comparison, *comparison.further)
+    for one in everything:
+        name = one.figures["against"]
+        images[name] = one.reference
+        images["error" if len(everything) == 1 else f"error_{name}"] = np.abs(one.written - one.reference)
     paths = {name: str(folder / f"{name}.exr") for name in images}
     for name, image in images.items():
         scenes.write_image(paths[name], image)
     paths["figure"] = str(folder / "comparison.png")
-    _write_figure(comparison, error.mean(axis=-1), paths["figure"])
+    _write_figure(comparison, paths["figure"])
     return paths
 
 
-def _write_figure(comparison: Comparison, error: np.ndarray, path: str) -> None:
-    """Write one picture: the scene as written, the other image, a map of their difference, and the figures."""
+def _write_figure(comparison: Comparison, path: str) -> None:
+    """Write one picture.
+
+    Two rows for each truth, the scene as written, the truth and their difference, above as a whole and below its worst
+    place, and a row with the figures.
+    """
     learned = " (learned tables)" if comparison.figures["learned_plugins"] else ""
-    cells = [
-        figure_grid.picture(f"as written{learned}", comparison.written),
-        figure_grid.picture(comparison.figures["against"], comparison.reference),
-        figure_grid.error_map(error),
-        figure_grid.text(summary(comparison.figures)),
-    ]
-    figure_grid.write(path, cells, 2, error.shape)
+    cells, everything = [], (comparison, *comparison.further)
+    for one in everything:
+        x, y, width, height = frame = tuple(one.figures["worst"][key] for key in ("x", "y", "width", "height"))
+        inside, place = np.s_[y : y + height, x : x + width], f"{width} x {height} pixels from ({x}, {y})"
+        label, zoomed = truth_label(one.figures), (one.written[inside], one.reference[inside])
+        cells += [
+            figure_grid.picture(f"as written{learned}, {one.figures['spp']} spp", one.written, frame),
+            figure_grid.picture(label, one.reference, frame),
+            figure_grid.error_map(np.abs(one.written - one.reference).mean(axis=-1)),
+            figure_grid.picture(f"as written, worst place: {place}", zoomed[0]),
+            figure_grid.picture(f"{label}, worst place", zoomed[1]),
+            figure_grid.error_map(_clipped_error(*zoomed), "worst place, difference clipped to [0, 1]"),
+        ]
+    head, *blocks = (figure_grid.text(lines) for lines in _sections(comparison))
+    figure_grid.write(path, [*cells, head, *blocks], 3, comparison.written.shape)
 
 
-def summary(f: dict) -> list[str]:
+def truth_label(figures: dict) -> str:
+    """Return the name of a truth, the plugins that it is rendered with, and its samples: ``exact (disney), 32 spp``."""
+    name, put_in = figures["against"], ", ".join(figures["counterparts"])
+    return f"{name}{'' if put_in == name else f' ({put_in})'}, {figures['truth_spp']} spp"
+
+
+def summary(comparison: Comparison) -> list[str]:
     """Return the figures as lines of text."""
-    ratio = f["time_ratio"]
-    pairs = f"median of {ratio['pairs']} pairs of passes in turn, {ratio['min']:.2f} to {ratio['max']:.2f}"
-    if ratio["pairs"] == 1:
-        pairs = "of one pair of passes" + (", compilation included" if f["passes"] == 1 else "")
+    return [line for lines in _sections(comparison) for line in ("", *lines)][1:]
+
+
+def _sections(comparison: Comparison) -> list[list[str]]:
+    """Return the lines about the scene, and those about each truth."""
+    f = comparison.figures
     replaced = "1 plugin" if f["replaced_plugins"] == 1 else f"{f['replaced_plugins']} plugins"
-    what = "learned" if f["against"] == "exact" else "replaced"
+    what = "learned" if f["learned_plugins"] == f["replaced_plugins"] else "replaced"
     spp = f"{f['spp']} of {f['spp_requested']} spp (interrupted)" if f["interrupted"] else f"{f['spp']} spp"
-    seconds = f["seconds_per_pass"][f["against"]]
-    return [
+    head = [
         f"scene       {Path(f['scene']).name}, {f['width']} x {f['height']}, {spp}",
         f"variant     {f['variant']}",
         f"{what:12}{replaced}, {f['table_bytes']:,} bytes of tables",
-        "",
+    ]
+    return [head, *(_truth_lines(one.figures) for one in (comparison, *comparison.further))]
+
+
+def _truth_lines(f: dict) -> list[str]:
+    return [
+        f"against     {truth_label(f)}",
         f"PSNR        {f['psnr_db']:.2f} dB   (linear, clipped to [0, 1])",
+        f"noise       {_noise_text(f)}",
         f"FLIP        {f['flip']:.4f}     (0 = equal to the eye)",
         f"MAE         {f['mae']:.5f}",
         f"brightness  {f['brightness']:.4f} of that of {f['against']}",
-        "",
-        f"time        {ratio['median']:.2f} times that of {f['against']} ({seconds:.3g} s a pass)",
-        f"            {pairs}",
+        *_time_lines(f),
+    ]
+
+
+def _noise_text(f: dict) -> str:
+    if f["noise_db"] is None:
+        return "not measured: it needs two samples a pixel"
+    if math.isinf(f["noise_db"]):
+        return "none: both halves of the samples differ alike"
+    without = f["psnr_without_noise_db"]
+    rest = "no difference beyond it" if without is None else f"{without:.2f} dB without it"
+    return f"{f['noise_db']:.2f} dB of it, {rest}"
+
+
+def _time_lines(f: dict) -> list[str]:
+    ratio, name = f["time_ratio"], f["against"]
+    if ratio["pairs"] < PAIRS:
+        pairs = "1 pair" if ratio["pairs"] == 1 else f"{ratio['pairs']} pairs"
+        return [
+            f"time        not measured: {pairs} of passes without compilation,",
+            f"            {PAIRS} are needed (--passes)",
+        ]
+    quartiles = f"{ratio['q1']:.2f} to {ratio['q3']:.2f}"
+    if ratio["median"] is None:
+        return [f"time        not measurable here: quartiles {quartiles} of {ratio['pairs']} pairs of passes"]
+    return [
+        f"time        {ratio['median']:.2f} times that of {name} at {f['spp']} spp"
+        f" ({f['seconds_per_pass'][name]:.3g} s a pass)",
+        f"            median of {ratio['pairs']} pairs of passes, quartiles {quartiles}",
     ]

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from . import compat
 from .files import replacing, writable_file
-from .indirection import unfolded
+from .indirection import aligned_copy, unfolded
 from .interrupt import interruptible
 from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
 
@@ -427,7 +427,7 @@ def _load_checkpoint(path, settings: dict, trainer: _Trainer) -> tuple[_State, d
         raise FittingError(f'the checkpoint "{path}" does not exist, there is nothing to resume')
     try:
         with np.load(path, allow_pickle=False) as data:
-            arrays = {k: data[k] for k in data.files}
+            arrays = {k: aligned_copy(data[k]) for k in data.files}
         meta = json.loads(arrays["meta"].tobytes())
         keys = list(trainer.optimizer)
         state = _State(

@@ -549,6 +549,27 @@ def aligned(shape, dtype) -> np.ndarray:
     return memory[start : start + count * size].view(dtype).reshape(shape)
 
 
+def aligned_copy(values, dtype=None) -> np.ndarray:
+    """Return a contiguous copy of ``values`` that starts at a multiple of 64 bytes (:func:`aligned`).
+
+    Dr.Jit compiles another kernel for each combination of aligned and other inputs, and NumPy aligns at random.
+    """
+    values = np.asarray(values, dtype)
+    copy = aligned(values.shape, values.dtype)
+    copy[...] = values
+    return copy
+
+
+def device_array(dtype, values) -> dr.ArrayBase:
+    """Return a flat Dr.Jit array of a 32-bit type with the numbers of a NumPy array, an :func:`aligned_copy`."""
+    return dtype(aligned_copy(values, np.float32 if dr.is_float_v(dtype) else np.uint32).reshape(-1))
+
+
+def device_tensor(dtype, values) -> dr.ArrayBase:
+    """Return a Dr.Jit tensor of a 32-bit type with the numbers of a NumPy array, copied by :func:`device_array`."""
+    return dtype(device_array(dr.array_t(dtype), values), np.shape(values))
+
+
 def coordinates_of(x, default=None):
     """Return coordinates as a list of single-precision arrays, and whether they were a cooperative vector.
 

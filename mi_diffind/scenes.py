@@ -59,13 +59,14 @@ class ParsedScene:
         self,
         exact: bool = False,
         longest_path: int | None = None,
-        against: str = "exact",
+        against: str | tuple[str, ...] = "exact",
         change: Callable[[object], object] | None = None,
         merge: bool = True,
     ):
         """Return a loaded scene, as :func:`load_file` does.
 
-        With ``exact``, every learned plugin is replaced by its exact counterpart, or by the one that ``against`` names.
+        With ``exact``, every learned plugin is replaced by its exact counterpart, or by the one that ``against`` names
+        (the first of several that it has).
         ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
         infinite). ``change(state)`` may change the parsed scene (``mi.parser.ParserState``) before anything else does.
         Without ``merge``, Mitsuba joins no meshes, and each keeps its id.
@@ -104,10 +105,10 @@ class ParsedScene:
             name = props.plugin_name()
             return name, int(props.get("max_depth", MAX_DEPTHS[name]))
 
-    def learned_plugins(self, against: str = "exact") -> list[dict]:
+    def learned_plugins(self, against: str | tuple[str, ...] = "exact") -> list[dict]:
         """Return the descriptions (:meth:`.plugins.Plugin.described`) of the learned plugins, in the file's order.
 
-        With ``against``, of all plugins that have the counterpart of this name.
+        With ``against``, of all plugins that have the counterpart of this name, or of one of these names.
         """
         with self._errors():
             return [plugin.described(props) for props, plugin in _replaceable(self._copy(), against)]
@@ -213,7 +214,7 @@ def nests_another(props) -> bool:
     return any(compat.property_kind(props, key) == "object" for key in props)
 
 
-def _replaceable(state, against: str) -> list[tuple]:
+def _replaceable(state, against: str | tuple[str, ...]) -> list[tuple]:
     """Return ``(properties, plugin)`` of all nodes whose plugin has the counterpart ``against``."""
     declared = plugins.declared()
     nodes = [(props, declared.get(props.plugin_name())) for props in compat.properties_of(state)]

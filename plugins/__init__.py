@@ -28,13 +28,14 @@ class Counterpart:
 
     The plugin called ``name`` takes the same parameters except ``learned_only``, and needs those of ``given`` in
     addition. If more has to change, ``convert(props)`` changes the properties (``mi.Properties``), or raises
-    ``RuntimeError``.
+    ``RuntimeError``. ``oversampling``: how many times the samples of the scene it needs to be a truth.
     """
 
     name: str
     learned_only: tuple[str, ...] = ()
     given: dict[str, Any] = field(default_factory=dict)
     convert: Callable[[Any], None] | None = None
+    oversampling: int = 1
 
     def replace(self, props) -> None:
         """Change the properties of the plugin, in place, to those of the counterpart."""
@@ -56,6 +57,7 @@ class Plugin:
     - ``factory(props)``: a class, or a function, which may return an object of one of Mitsuba's own classes;
     - ``task``: the task whose tables it reads; ``storage``: their default storage form ("": that of the file);
     - ``exact``: the exact counterpart, which makes the plugin a *learned* one; ``others``: further counterparts;
+      ``truths``: the counterparts that a comparison takes by default, in order;
     - ``seen_by``: for a shape that only some integrators see, these; ``otherwise``: the parameter and the value with
       which all others see it, too.
 
@@ -70,6 +72,7 @@ class Plugin:
     storage: str = ""
     exact: Counterpart | None = None
     others: tuple[Counterpart, ...] = ()
+    truths: tuple[str, ...] = ("exact",)
     seen_by: tuple[str, ...] = ()
     otherwise: tuple[str, str] | None = None
 
@@ -78,9 +81,13 @@ class Plugin:
             allowed = ", ".join(OBJECT_TYPES)
             raise ValueError(f'plugin "{self.name}": found the object type "{self.object_type}", allowed are {allowed}')
 
-    def counterpart(self, against: str = "exact") -> Counterpart | None:
-        """Return the exact counterpart, or another one by its name; ``None`` if there is none."""
-        return self.exact if against == "exact" else next((c for c in self.others if c.name == against), None)
+    def counterpart(self, against: str | tuple[str, ...] = "exact") -> Counterpart | None:
+        """Return the exact counterpart, or another one by its name; ``None`` if there is none.
+
+        Of several names, the first that the plugin has a counterpart of counts.
+        """
+        named = {**{c.name: c for c in self.others}, "exact": self.exact}
+        return next(filter(None, map(named.get, (against,) if isinstance(against, str) else against)), None)
 
     def described(self, props) -> dict:
         """Return a plain description of the properties (``mi.Properties``) of an instance.

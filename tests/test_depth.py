@@ -149,7 +149,9 @@ def test_same_seed_same_numbers(mi_rgb):
     assert first.shape == (5, 80, 128)  # 960 x 580 in tiles of 8 pixels
 
 
-@pytest.mark.parametrize("name", ["materials", pytest.param("still_life", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["tiles", *(pytest.param(name, marks=pytest.mark.slow) for name in ("materials", "still_life"))]
+)
 def test_left_out_is_what_a_render_lacks(mi_rgb, name):
     """The repository's scenes at 5%: the image to the chosen depth lacks what was announced, and less than allowed."""
     from mi_diffind import depth, scenes

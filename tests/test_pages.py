@@ -6,6 +6,7 @@ import math
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 from scipy.ndimage import map_coordinates
 
 from mi_diffind.indirection import DifferentiableArray, Indirection, unfolded
@@ -48,11 +49,11 @@ def reference(entries, sizes, x, shift, border):
     t = np.where(np.array(border) == "repeat", x - np.floor(x), x) * counts - shift
     t = np.where((np.array(border) == "repeat") & (t < 0), t + counts, np.clip(t, 0, counts))
     which = np.minimum(np.floor(t), counts - 1).astype(int)
-    found = np.empty((len(x), entries.shape[1]))
-    for i, (page, place) in enumerate(zip(which, t - which, strict=True)):
-        table = pages[np.ravel_multi_index(tuple(page), tuple(counts))]
-        position = (place * (np.array(table.shape[:-1]) - 1))[:, None]
-        found[i] = [map_coordinates(table[..., c], position, order=1)[0] for c in range(table.shape[-1])]
+    number, place, found = np.ravel_multi_index(which.T, counts), t - which, np.empty((len(x), entries.shape[1]))
+    for i in np.unique(number):
+        here, table = number == i, pages[i]
+        position = place[here].T * (np.array(table.shape[:-1]) - 1)[:, None]
+        found[here] = np.stack([map_coordinates(table[..., c], position, order=1) for c in range(table.shape[-1])], -1)
     return found
 
 
@@ -61,9 +62,14 @@ def places(dims, count=400, seed=1, low=-0.3, high=1.3):
     return np.random.default_rng(seed).uniform(low, high, (count, dims)).astype(np.float32)
 
 
-def read(array, ad, x):
-    values = array([ad.Float(np.ascontiguousarray(v, np.float32)) for v in x.T])
-    return np.stack([np.broadcast_to(v.numpy(), len(x)) for v in values], axis=-1)
+def read(arrays, ad, x):
+    """Values of one array, or of each of several, in one kernel: ``(len(x), channels)``."""
+    several = isinstance(arrays, list)
+    x = [ad.Float(aligned(v)) for v in x.T]
+    values = [array(x) for array in (arrays if several else [arrays])]
+    dr.eval(values)
+    found = [np.stack([np.broadcast_to(v.numpy(), len(x[0])) for v in channels], axis=-1) for channels in values]
+    return found if several else found[0]
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -78,12 +84,14 @@ def test_values(ad, dims, border):
         entries = np.random.default_rng(channels).random((sizes.prod(axis=-1).sum(), channels)).astype(np.float32)
         array = PagedArray(sizes, channels, entries, shift, border=border).alloc(ad.TensorXf)
         expected = reference(entries, sizes, x.astype(np.float64), shift, (border,) * dims)
-        np.testing.assert_allclose(read(array, ad, x), expected, atol=2e-5)
-        np.testing.assert_allclose(read(array.to("float16"), ad, x), expected, atol=2e-3)
-        for stored, steps in ((array.to("uint8"), 255), (array.quantised(6), 63), (array.quantised(3), 7)):
+        bits = [(array.to("uint8"), 255), (array.quantised(6), 63), (array.quantised(3), 7)]
+        single, half, *found = read([array, array.to("float16"), *(stored for stored, _ in bits)], ad, x)
+        np.testing.assert_allclose(single, expected, atol=2e-5)
+        np.testing.assert_allclose(half, expected, atol=2e-3)
+        for (stored, steps), values in zip(bits, found, strict=True):
             assert np.abs(stored.numpy() - entries).max() < 0.51 / steps
             rounded = reference(stored.numpy(), sizes, x.astype(np.float64), shift, (border,) * dims)
-            np.testing.assert_allclose(read(stored, ad, x), rounded, atol=2e-5)
+            np.testing.assert_allclose(values, rounded, atol=2e-5)
 
 
 def test_one_page_is_an_ordinary_array(ad):
@@ -124,10 +132,9 @@ def test_no_coordinate_leads_outside(ad, border):
     """Entries are read that exist, whatever the coordinate is: all are 1, what lies behind them is 0 or nothing."""
     special = [0, 1, -0.0, 1 - 2**-24, 2**-149, -(2**-149), 2, -1, 1e30, -1e30, math.inf, -math.inf, math.nan, 0.5]
     u, v = (g.ravel() for g in np.meshgrid(special, special))
-    for shift in (0.0, 0.03, 1.0):
-        array = PagedArray(random_sizes(2), 3, 1.0, shift, border=border).alloc(ad.TensorXf)
-        for form in (array, array.quantised(6)):
-            np.testing.assert_allclose(read(form, ad, np.stack([u, v], axis=1)), 1, atol=1e-6)
+    arrays = [PagedArray(random_sizes(2), 3, 1.0, s, border=border).alloc(ad.TensorXf) for s in (0.0, 0.03, 1.0)]
+    for values in read([*arrays, *(array.quantised(6) for array in arrays)], ad, np.stack([u, v], axis=1)):
+        np.testing.assert_allclose(values, 1, atol=1e-6)
 
 
 def test_masked_lanes_are_zero(ad):

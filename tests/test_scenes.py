@@ -125,25 +125,6 @@ def test_what_cannot_be_compared(mi_rgb, tmp_path, plugin, parameters, against, 
     assert sentence in str(caught.value)
 
 
-def test_times_of_a_comparison_do_not_contradict_each_other(mi_rgb):
-    """The ratio is the median over pairs, which the ratio of two medians is not; so one time is shown, not two."""
-    from mi_diffind import comparison
-
-    seconds = {"written": 3.0, "exact": 2.0}
-    ratio = {"median": 1.25, "min": 1.0, "max": 2.0, "pairs": 4}
-    figures = {"scene": "a.xml", "variant": "v", "width": 4, "height": 3, "spp": 5, "spp_requested": 5, "passes": 5}
-    figures |= {"replaced_plugins": 1, "learned_plugins": 1, "table_bytes": 9, "interrupted": False}
-    figures |= {"psnr_db": 50, "flip": 0, "mae": 0, "against": "exact", "brightness": 1.0}
-    lines = comparison.summary({**figures, "seconds_per_pass": seconds, "time_ratio": ratio})
-    assert lines[-2:] == [
-        "time        1.25 times that of exact (2 s a pass)",
-        "            median of 4 pairs of passes in turn, 1.00 to 2.00",
-    ]
-    assert not any("3.0" in line or "1.50" in line for line in lines)
-    alone = {**figures, "seconds_per_pass": seconds, "time_ratio": {**ratio, "pairs": 1}, "passes": 1}
-    assert comparison.summary(alone)[-1] == "            of one pair of passes, compilation included"
-
-
 @pytest.mark.parametrize("name", ["materials", "still_life"])
 def test_exact_scene_names_no_learned_plugin(mi_rgb, name):
     from mi_diffind import scenes

@@ -1,6 +1,7 @@
 """The plan of the house: imports that point down, no circles, short files, plain names, one meaning a class name."""
 
 import ast
+import functools
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,6 +47,7 @@ FORBIDDEN = {"told", "made", "found", "own", "said", "kind", "look", "course", "
 FACE = "mi_diffind"
 
 
+@functools.lru_cache
 def modules() -> dict[str, Path]:
     """Full name → file, of all modules of the library."""
     found = {}
@@ -55,6 +57,12 @@ def modules() -> dict[str, Path]:
             parts = parts[:-1] if parts[-1] == "__init__" else parts
             found[".".join((package, *parts))] = path
     return found
+
+
+@functools.lru_cache
+def tree(path: Path) -> ast.Module:
+    """The syntax tree of a file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def imports(name: str, path: Path, known: dict, deferred: bool) -> set[str]:
@@ -78,7 +86,7 @@ def imports(name: str, path: Path, known: dict, deferred: bool) -> set[str]:
         for child in ast.iter_child_nodes(node):
             visit(child)
 
-    visit(ast.parse(path.read_text(encoding="utf-8")))
+    visit(tree(path))
     return {other for other in found if other in known and other != name}
 
 
@@ -91,6 +99,7 @@ def floor(name: str) -> int:
     return max(places)[1]
 
 
+@functools.lru_cache
 def graph(deferred: bool) -> dict[str, set[str]]:
     known = modules()
     found = {name: imports(name, path, known, deferred) for name, path in known.items() if name != FACE}
@@ -205,10 +214,10 @@ def test_no_file_is_too_long():
     assert not long, "\n".join(long)
 
 
-def names_given(tree: ast.AST) -> list[tuple[str, int]]:
+def names_given(syntax: ast.AST) -> list[tuple[str, int]]:
     """The names that a file gives, with their lines: variables, attributes, parameters, functions and classes."""
     names = []
-    for node in ast.walk(tree):
+    for node in ast.walk(syntax):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
             names.append((node.name, node.lineno))
         elif isinstance(node, ast.arg):
@@ -223,7 +232,7 @@ def names_given(tree: ast.AST) -> list[tuple[str, int]]:
 def test_names_say_what_things_are():
     wrong = []
     for module, path in modules().items():
-        for name, line in names_given(ast.parse(path.read_text(encoding="utf-8"))):
+        for name, line in names_given(tree(path)):
             if name.strip("_").lower() in FORBIDDEN:
                 wrong.append(f"{module}, line {line}: {name}")
     assert not wrong, "\n".join(wrong)
@@ -235,7 +244,7 @@ def test_names_say_what_things_are():
 def test_a_class_name_has_one_meaning():
     places: dict[str, list[str]] = {}
     for module, path in modules().items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree(path)):
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name.strip("_"), []).append(f"{module}, line {node.lineno}")
     twice = [f"{name}: {'; '.join(where)}" for name, where in sorted(places.items()) if len(where) > 1]

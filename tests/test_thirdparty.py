@@ -21,17 +21,31 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(__file__).resolve().parent / "thirdparty" / "mi_profile"
 DATA = PACKAGE / "mi_profile" / "data" / "downlight.csv"
 
+#: Runs commands, and Python code, as they come: in one process, in which the package is installed.
 COMMANDS = """
-import json, sys
+import contextlib, io, json, os, sys, traceback
 from mi_diffind.cli import main
 
-codes = []
-for arguments in json.loads(sys.argv[1]):
+def python(code, *arguments):
+    sys.argv = ["-c", *arguments]
     try:
-        codes.append(main(arguments))
-    except SystemExit as e:
-        codes.append(e.code)
-print("codes", json.dumps(codes))
+        exec(code, {"__name__": "code"})
+    except Exception:
+        traceback.print_exc()
+        return 1
+    return 0
+
+for line in sys.stdin:
+    request = json.loads(line)
+    os.chdir(request["folder"])
+    codes = []
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        for arguments in request["commands"]:
+            try:
+                codes.append(python(*arguments[1:]) if arguments[0] == "python" else main(arguments))
+            except SystemExit as e:
+                codes.append(e.code)
+    print(json.dumps([codes, out.getvalue(), err.getvalue()]), flush=True)
 """
 
 
@@ -52,12 +66,17 @@ def site(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def python(site):
-    """A function that runs Python code where the package is installed."""
+def environ(site):
+    """The variables of a process in which the package is installed."""
     paths = [str(site), str(PACKAGE), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+@pytest.fixture(scope="module")
+def python(environ):
+    """A function that runs Python code where the package is installed."""
 
     def run(code, *arguments, cwd):
-        environ = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
         command = [sys.executable, "-c", code, *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=300, env=environ, cwd=cwd)
 
@@ -65,17 +84,38 @@ def python(site):
 
 
 @pytest.fixture(scope="module")
-def commands(python):
-    """A function that runs commands, one after the other, and returns their codes and what they printed."""
+def commands(environ, tmp_path_factory):
+    """A function that runs commands, one after the other, and returns their codes and what they printed.
 
-    def run(*commands, cwd):
-        done = python(COMMANDS, json.dumps([list(map(str, c)) for c in commands]), cwd=cwd)
-        assert done.returncode == 0, done.stderr
-        assert "RuntimeWarning" not in done.stderr, done.stderr
-        out, _, codes = done.stdout.rpartition("codes ")
-        return json.loads(codes), out, done.stderr
+    The command ``python`` runs code, with arguments.
+    """
+    errors = tmp_path_factory.mktemp("errors") / "stderr.txt"
+    with (
+        open(errors, "w") as stderr,
+        subprocess.Popen(
+            [sys.executable, "-c", COMMANDS],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+            env=environ,
+            cwd=errors.parent,
+        ) as process,
+    ):
 
-    return run
+        def run(*commands, cwd):
+            request = {"folder": str(cwd), "commands": [list(map(str, c)) for c in commands]}
+            process.stdin.write(json.dumps(request) + "\n")
+            process.stdin.flush()
+            answer = process.stdout.readline()
+            assert answer, errors.read_text()
+            codes, out, err = json.loads(answer)
+            assert "RuntimeWarning" not in err, err
+            return codes, out, err
+
+        yield run
+        process.stdin.close()
+    assert process.returncode == 0 and "RuntimeWarning" not in errors.read_text(), errors.read_text()
 
 
 VARIANT = ("--variant", "llvm_ad_rgb")
@@ -262,10 +302,10 @@ for options, sentence in (
 """
 
 
-def test_its_textures(python, scene):
+def test_its_textures(commands, scene):
     """Executed afresh for each variant, one built upon the other; against the interpolation of NumPy."""
-    done = python(TEXTURES, str(scene.parent), cwd=scene.parent)
-    assert done.returncode == 0, done.stderr
+    codes, _, err = commands(("python", TEXTURES, scene.parent), cwd=scene.parent)
+    assert codes == [0], err
 
 
 def test_tradeoff(commands, tmp_path):

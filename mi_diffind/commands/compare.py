@@ -13,18 +13,22 @@ def add(commands) -> None:
     sub = verb(commands, "compare", run, HELP)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("--out", default="out", metavar="DIR", help="folder for pictures (default: out)")
-    sub.add_argument("--passes", type=positive, default=5, help="passes to split the samples into (default: 5)")
+    sub.add_argument(
+        "--passes", type=positive, default=5, help="passes to split the samples into, at least 2 (default: 5)"
+    )
     sub.add_argument(
         "--against",
-        default="exact",
         metavar="NAME",
-        help="compare with another counterpart than the exact one, such as Mitsuba's principled",
+        help="compare with one counterpart: exact, or another one, such as Mitsuba's principled (default: those that "
+        "the plugins declare as truths: exact, for filtered textures mipmap, too)",
     )
     scene_options(sub)
 
 
 def run(arguments) -> dict:
-    """Render the scene twice, write the pictures, and return the figures and the ``files``.
+    """Render the scene twice or more, write the pictures, and return the figures and the ``files``.
+
+    ``further`` are the figures against further truths.
 
     Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.comparison` does.
     """
@@ -43,6 +47,6 @@ def run(arguments) -> dict:
         arguments.against,
     )
     paths = comparison.write(result, arguments.out)
-    print("\n".join(comparison.summary(result.figures)))
+    print("\n".join(comparison.summary(result)))
     print(f"picture     {paths['figure']}")
-    return {**result.figures, "files": paths}
+    return {**result.figures, "further": [one.figures for one in result.further], "files": paths}

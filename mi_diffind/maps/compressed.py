@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from .. import lookup
+from ..indirection import aligned_copy
 from .layout import Layout
 from .source import Source
 
@@ -64,6 +65,7 @@ class CompressedMaps:
                 u = (types.Float(index % columns) + 0.5) / types.Float(columns)
                 v = (types.Float(index // columns) + 0.5) / types.Float(rows)
                 values = self.maps(stored(u, v), names)
+                dr.eval(values)  # all channels at once: NumPy asks for one after the other, each a kernel
             for name, channels in values.items():
                 for c, value in enumerate(channels):
                     images[name][start : start + count, c] = value if isinstance(value, float) else value.numpy()
@@ -97,7 +99,8 @@ class CompressedMaps:
         if types is None:
             return 0.0
         u, v = np.random.default_rng(2023).random((2, count), dtype=np.float32)
-        read = self.read(types.Float(u), types.Float(v))
+        read = self.read(types.Float(aligned_copy(u)), types.Float(aligned_copy(v)))
+        dr.eval(read)
         border = self.border
         rows, columns = (taps(x, n, b) for x, n, b in ((v, source.height, border[0]), (u, source.width, border[1])))
         total, channels = 0.0, 0

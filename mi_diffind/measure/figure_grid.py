@@ -14,10 +14,17 @@ from . import plot
 Cell = Callable[[object, object], None]
 
 
-def picture(title: str, image: np.ndarray) -> Cell:
-    """Return a cell with a linear image, ``(height, width, 3)`` or ``(height, width, 1)``, as displayed."""
+def picture(title: str, image: np.ndarray, frame: tuple[int, int, int, int] | None = None) -> Cell:
+    """Return a cell with a linear image, ``(height, width, 3)`` or ``(height, width, 1)``, as displayed.
+
+    ``frame``: ``x, y, width, height`` of a window to mark, in pixels.
+    """
 
     def draw(figure, axes):
+        if frame is not None:
+            x, y, width, height = frame
+            left, right, top, bottom = x - 0.5, x + width - 0.5, y - 0.5, y + height - 0.5
+            axes.plot([left, right, right, left, left], [top, top, bottom, bottom, top], color="yellow", linewidth=1.5)
         axes.imshow(srgb.for_display(np.repeat(image, 3, -1) if image.shape[-1] == 1 else image))
         axes.set_title(title)
 
@@ -35,10 +42,9 @@ def colour_map(title: str, values: np.ndarray, extend: str = "neither", **option
     return draw
 
 
-def error_map(error: np.ndarray) -> Cell:
+def error_map(error: np.ndarray, title: str = "absolute difference, mean of the channels (linear)") -> Cell:
     """Draw an absolute difference ``(height, width)``, the mean of the channels, up to its 99.5% quantile."""
     top = max(float(np.quantile(error, 0.995)), 1e-6)
-    title = "absolute difference, mean of the channels (linear)"
     return colour_map(title, error, "max", cmap="magma", vmin=0, vmax=top)
 
 
@@ -46,7 +52,8 @@ def text(lines: Sequence[str]) -> Cell:
     """Return a cell with lines of text."""
 
     def draw(figure, axes):
-        axes.text(0.02, 0.95, "\n".join(lines), va="top", family="monospace", fontsize=12, transform=axes.transAxes)
+        options = {"va": "top", "family": "monospace", "fontsize": 12, "transform": axes.transAxes}
+        axes.text(0.02, 0.95, "\n".join(lines), **options).set_in_layout(False)  # long lines move no picture
 
     return draw
 

@@ -1,5 +1,6 @@
-"""NumPy arrays as inputs of kernels."""
+"""NumPy arrays as inputs of kernels, and as their results."""
 
+import drjit as dr
 import numpy as np
 
 
@@ -16,3 +17,14 @@ def aligned(values, dtype=np.float32) -> np.ndarray:
     copy = memory[start : start + values.nbytes].view(dtype).reshape(values.shape)
     copy[...] = values
     return copy
+
+
+def numpy_of(channels) -> np.ndarray:
+    """
+    Return Dr.Jit arrays as columns of one NumPy array, float64.
+
+    They are computed together: NumPy asks for one after the other, and each would be a kernel.
+    """
+    channels = list(channels)
+    dr.eval(channels)
+    return np.stack([np.asarray(c.numpy(), np.float64) for c in channels], axis=-1)

@@ -3,6 +3,11 @@
 import math
 
 import drjit as dr
+import numpy as np
+from arrays import aligned
+
+#: Coarse cells a side, and fine cells a side of each of them.
+COARSE_CELLS, BLOCK = 9, 6
 
 
 class HalfVectorSampling:
@@ -32,7 +37,9 @@ class HalfVectorSampling:
         h = dr.normalize(self.wi + dr.select(valid, bs.wo, self.wi))
         q = (dr.square(h.x) + dr.square(h.y)) / dr.square(1 + h.z)
         p = mi.Point2f(dr.atan2(h.y, h.x) / (2 * dr.pi) + 0.5, dr.log(1 + q / self.a2) / self.log)
-        return dr.select(valid, p, 0.5), dr.select(valid, mi.Float(1), 0)
+        points, weights = dr.select(valid, p, 0.5), dr.select(valid, mi.Float(1), 0)
+        dr.eval(points, weights)  # which the test reads twice
+        return points, weights
 
     def pdf(self, p):
         q = self.a2 * (dr.exp(p.y * self.log) - 1)
@@ -46,20 +53,28 @@ class HalfVectorSampling:
         jacobian = 2 * dr.pi * self.log * (self.a2 + q) * 2 / dr.square(1 + q) * 4 * wi_h
         return dr.select((wi_h > 0) & (wo.z > 0), pdf * jacobian, 0)
 
-    def test(self, pdf=None, res=51, ires=32):
+    def test(self, pdf, cells, points):
         from mitsuba.chi2 import ChiSquareTest, PlanarDomain
 
         domain = PlanarDomain(self.mi.ScalarBoundingBox2f([0, 0], [1, 1]))
-        return ChiSquareTest(domain, self.sample, pdf or self.pdf, 3, 1_000_000, res, ires)
+        return ChiSquareTest(domain, self.sample, pdf or self.pdf, 3, 1_000_000, cells, points)
 
     def faults(self, test_count, pdf=None):
         """
         Messages of the test in fine cells, which find what is wrong in a place, and in coarse ones, which find a little
-        that is wrong everywhere; none if both accept. Also the number of samples that are valid.
+        that is wrong everywhere; none if both accept. Also the number of samples that are valid. A coarse cell is a
+        block of fine ones: the same samples and the same integrals of the density.
         """
+        fine, coarse = self.test(pdf, COARSE_CELLS * BLOCK, 24), self.test(pdf, COARSE_CELLS, 2)
+        fine.tabulate_histogram()
+        fine.tabulate_pdf()
+        vars(coarse).update({k: v for k, v in vars(fine).items() if k not in vars(coarse)})
+        for name in ("histogram", "pdf"):
+            cells = getattr(fine, name).numpy().astype(np.float64)
+            blocks = cells.reshape(COARSE_CELLS, BLOCK, COARSE_CELLS, BLOCK).sum(axis=(1, 3))
+            setattr(coarse, name, self.mi.Float(aligned(blocks.ravel())))
         messages = ""
-        for res, ires in ((51, 32), (9, 128)):
-            test = self.test(pdf, res, ires)
+        for test in (fine, coarse):
             if not test.run(test_count=2 * test_count, quiet=True):
                 messages += test.messages
-        return messages, float(dr.sum(test.histogram)[0])
+        return messages, float(dr.sum(fine.histogram)[0])

@@ -14,7 +14,8 @@ class Ball(DistanceField):
 
     def __init__(self, types, r=0.4, centre=(0, 0, 0), half=0.5):
         super().__init__(types, (-half,) * 3, (half,) * 3, 0.01, 1.0)
-        self.r, self.centre = types.Float(r), centre
+        # Opaque: balls of other sizes and places use the same kernels
+        self.r, self.centre = dr.opaque(types.Float, r), dr.opaque(types.Array3f, centre)
 
     def value(self, p, active=True):
         return self.gradient(p, active)[0]
@@ -32,15 +33,17 @@ class Slab(DistanceField):
 
     def __init__(self, types, thickness, normal=(0.0, 0.0, 1.0)):
         super().__init__(types, (-0.5,) * 3, (0.5,) * 3, 0.01, 1.0)
-        self.thickness, self.axis = thickness, np.asarray(normal) / np.linalg.norm(normal)
+        self.axis = np.asarray(normal) / np.linalg.norm(normal)
+        # Opaque: other slabs use the same kernels
+        self.half, self.normals = dr.opaque(types.Float, thickness / 2), dr.opaque(types.Array3f, self.axis.tolist())
 
     def value(self, p, active=True):
-        along = sum(x * float(n) for x, n in zip(p, self.axis, strict=True))
-        return dr.select(self.inside(p) & active, dr.abs(along) - self.thickness / 2, self.band)
+        along = sum(x * n for x, n in zip(p, self.normals, strict=True))
+        return dr.select(self.inside(p) & active, dr.abs(along) - self.half, self.band)
 
     def gradient(self, p, active=True):
-        along = sum(x * float(n) for x, n in zip(p, self.axis, strict=True))
-        return self.value(p, active), self.types.Array3f(*map(float, self.axis)) * dr.sign(along)
+        along = sum(x * n for x, n in zip(p, self.normals, strict=True))
+        return self.value(p, active), self.normals * dr.sign(along)
 
 
 class Steps(Ball):
@@ -112,8 +115,8 @@ def torus(p):
     return length - 0.12, np.concatenate([flat, to[:, 1:] / length[:, None]], axis=1)
 
 
-def sparse_table(shape=torus, spacing=1 / 40, bits=8, scale=2.0, centre=(0.5, -1.0, 0.25)):
-    """The table of a formula's sparse field, as ``fit sdf`` would write it."""
+def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.5, -1.0, 0.25)):
+    """The table of a formula's sparse field, as ``fit sdf`` would write it; pointers have 8 bits."""
     from mi_diffind.tables import Table
     from mi_diffind.tasks.sdf import codes, encoding, model, nodes, structure
 
@@ -141,7 +144,7 @@ def sparse_table(shape=torus, spacing=1 / 40, bits=8, scale=2.0, centre=(0.5, -1
     sampled = encoding.SampledNodes(grid, positions, block, d / spacing, g, corners, len(cells), 0.0)
     frames = encoding.fit_frames(sampled)
     wanted = encoding.exact_entries(sampled, frames)
-    entries = encoding.cluster(wanted, 2**bits)
+    bits, entries = 8, encoding.cluster(wanted, entries)
     pointers = encoding.assign(wanted, entries)
     table = Table("sdf", model.sparse_arrays(grid, frames, codes.pointer_words(pointers, bits), entries))
     table.preset = "sparse"

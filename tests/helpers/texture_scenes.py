@@ -1,10 +1,17 @@
 """What tests of textures that filter themselves have in common: hits with footprints, scenes that minify."""
 
+import gc
 import math
+import subprocess
+import sys
+import textwrap
 
 import drjit as dr
 import numpy as np
+import pytest
 from arrays import aligned
+
+from mi_diffind import compat
 
 #: Components of a footprint that no render should produce, and some that are merely extreme.
 WRONG = (0.0, 1.0, -1.0, 1e-20, -0.0, 1e20, 3e38, -3e38, math.nan, math.inf, -math.inf)
@@ -65,6 +72,21 @@ def ellipse(ddx, ddy, size):
     return s[:, 0], s[:, 1], (u[:, :, 0] * s[:, :1] / np.reshape(size, (1, 2))).T
 
 
+def emission(mi) -> dict:
+    """An integrator that shows emitters alone, in the variant that is set: without a loop, it compiles fast."""
+
+    class Emission(mi.SamplingIntegrator):
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            si = scene.ray_intersect(ray, active)
+            return si.emitter(scene, active).eval(si, active), si.is_valid(), []
+
+        def to_string(self):
+            return "Emission[]"
+
+    mi.register_integrator("emission", Emission)
+    return {"type": "emission"}
+
+
 def plane(mi, texture, spp=1, sampler="stratified", size=48, sensor=None, shape=None, integrator=None):
     """A plane to the horizon that shines as its texture says, without any noise but that of the places in a pixel."""
     t = mi.ScalarTransform4f()
@@ -72,7 +94,7 @@ def plane(mi, texture, spp=1, sampler="stratified", size=48, sensor=None, shape=
     jitter = {"jitter": False} if sampler == "stratified" else {}
     return mi.load_dict({
         "type": "scene",
-        "integrator": integrator or {"type": "path", "max_depth": 1},
+        "integrator": integrator or emission(mi),
         "sensor": {
             "type": "perspective", "film": film,
             "sampler": {"type": sampler, "sample_count": spp, **jitter},
@@ -86,3 +108,71 @@ def plane(mi, texture, spp=1, sampler="stratified", size=48, sensor=None, shape=
 
 def psnr(a, b):
     return -10 * np.log10(np.mean((a - b) ** 2, dtype=np.float64))
+
+
+def scene_xml(content, size=16, depth=3):
+    """A scene file: a camera that looks along -z at the origin from 3 units away, and ``content``."""
+    return f"""<scene version="3.0.0">
+    <integrator type="path"><integer name="max_depth" value="{depth}"/></integrator>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0,0,3" target="0,0,0" up="0,1,0"/></transform>
+        <sampler type="independent"><integer name="sample_count" value="8"/></sampler>
+        <film type="hdrfilm"><integer name="width" value="{size}"/><integer name="height" value="{size}"/>
+            <rfilter type="box"/></film>
+    </sensor>
+    {content}
+</scene>"""
+
+
+def refused(mi, wrong):
+    """The sentence with which a plugin refuses its parameters."""
+    with pytest.raises(RuntimeError) as e:
+        mi.load_dict(wrong)
+    text = compat.one_sentence(e.value)
+    assert "Traceback" not in text and len(text) < 350, text
+    return text
+
+
+def alive(name):
+    """How many objects of a class there are."""
+    return [type(o).__name__ for o in gc.get_objects()].count(name)
+
+
+def check_process(texture, variants):
+    """
+    In a process of its own: a scalar variant refuses ``texture`` with a sentence; in ``variants``, a lamp and a ball
+    with it are rendered and optimised; and in the end nothing leaks that nanobind and Dr.Jit count.
+    """
+    script = f"""
+        import drjit as dr, mi_diffind, mitsuba as mi
+        mi.set_variant("scalar_rgb")
+        try:
+            mi.load_dict({texture!r})
+        except RuntimeError as e:
+            print(e)
+        for variant in {variants!r}:
+            mi.set_variant(variant)
+            from mi_diffind.plugins.support import footprint
+            texture = {texture!r}
+            scene = mi.load_dict({{
+                "type": "scene",
+                "integrator": {{"type": "prb", "max_depth": 3}},
+                "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 8, "height": 8}}}},
+                "lamp": {{"type": "sphere", "center": [0, 0, 4], "emitter": {{"type": "area", "radiance": texture}}}},
+                "ball": {{"type": "sphere", "center": [2, 0, 4],
+                         "bsdf": {{"type": "diffuse", "reflectance": texture}}}},
+            }})
+            footprint.attach(scene)
+            params = mi.traverse(scene)
+            key = next(k for k in params.keys() if k.endswith("tables.cascaded"))
+            dr.enable_grad(params[key])
+            params.update()
+            dr.backward(dr.sum(mi.render(scene, params, spp=2).array))
+            print("gradients", dr.width(dr.grad(params[key]).array) > 1)
+        del scene, params
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    refusal = f'"{texture["type"]}" does not run in the variant "scalar_rgb"; use one of llvm_ad_rgb'
+    assert refusal in done.stdout and done.stdout.count("gradients True") == len(variants), done.stdout
+    assert "leak" not in done.stderr.lower(), done.stderr

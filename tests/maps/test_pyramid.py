@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from arrays import aligned, numpy_of
 
 from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid, halved, level_sizes
@@ -14,18 +15,14 @@ def ad():
     return array_module("llvm")
 
 
-def numpy_of(channels) -> np.ndarray:
-    return np.stack([np.asarray(c.numpy(), np.float64) for c in channels], axis=-1)
-
-
 def filtered(pyramid, u, v, level) -> np.ndarray:
     Float = pyramid.types.Float
-    u, v, level = np.broadcast_arrays(*(np.float32(x) for x in (u, v, level)))
-    return numpy_of(pyramid.filtered(Float(u), Float(v), Float(level)))
+    u, v, level = (Float(aligned(x)) for x in np.broadcast_arrays(*np.atleast_1d(u, v, level)))
+    return numpy_of(pyramid.filtered(u, v, level))
 
 
 def stored(pyramid, u, v) -> np.ndarray:
-    return numpy_of(pyramid.stored(pyramid.types.Float(u), pyramid.types.Float(v)))
+    return numpy_of(pyramid.stored(*(pyramid.types.Float(aligned(x)) for x in (u, v))))
 
 
 def centres(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -251,8 +248,8 @@ def test_gradients_are_finite_and_right(ad, rng):
     import drjit as dr
 
     pyramid = Pyramid.of(from_arrays({"albedo": rng.integers(0, 256, (9, 8, 3), dtype=np.uint8)}), types=ad)
-    place = [ad.Float(rng.uniform(0.05, 0.95, 300).astype(np.float32)) for _ in range(2)]
-    place.append(ad.Float((rng.integers(0, 3, 300) + rng.uniform(0.05, 0.9, 300)).astype(np.float32)))
+    place = [ad.Float(aligned(rng.uniform(0.05, 0.95, 300))) for _ in range(2)]
+    place.append(ad.Float(aligned(rng.integers(0, 3, 300) + rng.uniform(0.05, 0.9, 300))))
     dr.enable_grad(place)
     dr.backward(sum(pyramid.filtered(*place), ad.Float(0)))
     found = [dr.grad(x).numpy() for x in place]

@@ -4,19 +4,16 @@ against the pyramid read at footprints that NumPy made something of, against man
 """
 
 import math
-import subprocess
-import sys
-import textwrap
 
 import drjit as dr
 import numpy as np
 import pytest
 import texture_scenes
-from arrays import aligned
+from arrays import aligned, numpy_of
 from texture_scenes import WRONG, linear
 from variants import set_variant
 
-from mi_diffind import compat, scenes
+from mi_diffind import scenes
 from mi_diffind.compat import module_of
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
@@ -55,7 +52,7 @@ def pyramid(mi, image, border="repeat", color_space="srgb"):
 def expected(mi, truth, uv, level):
     """Linear values of the truth."""
     u, v, level = (mi.Float(aligned(x)) for x in (*uv, level))
-    return linear(np.stack([x.numpy() for x in truth.filtered(u, v, level)]))
+    return linear(numpy_of(truth.filtered(u, v, level)).T)
 
 
 # -- what is read ------------------------------------------------------------------------------------------------------
@@ -67,11 +64,16 @@ def test_off_is_bitmap(mi_rgb, file, image, rng, wrap_mode):
     mi = mi_rgb
     si = texture_scenes.hits(mi, rng.uniform(-2, 3, (2, 500)))
     theirs = mi.load_dict({"type": "bitmap", "filename": file, "wrap_mode": wrap_mode})
-    for name in ("off", "trilinear", "anisotropic", "stochastic") if wrap_mode == "repeat" else ("off",):
-        ours = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode))
-        np.testing.assert_allclose(ours.eval(si).numpy(), theirs.eval(si).numpy(), atol=2e-5, err_msg=name)
-    ours = mi.load_dict(plugin(file, "off", wrap_mode=wrap_mode))
-    np.testing.assert_allclose(ours.eval_1_grad(si).numpy(), theirs.eval_1_grad(si).numpy(), atol=2e-2)
+    names = ("off", "trilinear", "anisotropic", "stochastic") if wrap_mode == "repeat" else ("off",)
+    textures = {name: mi.load_dict(plugin(file, name, wrap_mode=wrap_mode)) for name in names}
+    ours = textures["off"]
+    values = {name: t.eval(si) for name, t in textures.items()}
+    slopes = ours.eval_1_grad(si), theirs.eval_1_grad(si)
+    truth = theirs.eval(si)
+    dr.eval(values, slopes, truth)
+    for name, value in values.items():
+        np.testing.assert_allclose(value.numpy(), truth.numpy(), atol=2e-5, err_msg=name)
+    np.testing.assert_allclose(*(slope.numpy() for slope in slopes), atol=2e-2)
     assert list(ours.resolution()) == [WIDTH, HEIGHT] and ours.is_spatially_varying()
     assert float(ours.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-4)
     assert ours.max() == pytest.approx(linear(image.max() / 255), abs=1e-4)
@@ -116,9 +118,8 @@ def test_trilinear_is_the_pyramid_at_the_level_of_the_area(mi_any, file, image, 
             texture.eval_3(si)
         assert np.isfinite(texture.eval(si).numpy()).all()
         texture = mi.load_dict(plugin(file, wrap_mode=wrap_mode, raw=True))
-        truth = [x.numpy() for x in pyramid(mi, image, wrap_mode, "linear").filtered(
-            *map(mi.Float, uv.astype("f4")), mi.Float(aligned(texture_scenes.isotropic(ddx, ddy, SIZE)))
-        )]  # fmt: skip
+        place = [mi.Float(aligned(x)) for x in (*uv, texture_scenes.isotropic(ddx, ddy, SIZE))]
+        truth = numpy_of(pyramid(mi, image, wrap_mode, "linear").filtered(*place)).T
     np.testing.assert_allclose(texture.eval_3(si).numpy(), truth, atol=2e-4)
 
 
@@ -188,17 +189,21 @@ def test_to_uv(mi_rgb, file, rng, name):
 # -- hard cases --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["trilinear", "anisotropic", "stochastic"])
-@pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
+@pytest.mark.parametrize(
+    "name, wrap_mode",  # filters and wrap modes are apart: one chooses places, the other folds them
+    [("trilinear", "repeat"), ("anisotropic", "clamp"), ("stochastic", "mirror"), ("anisotropic", "repeat")],
+)
 def test_any_footprint_gives_a_finite_value(mi_rgb, file, rng, name, wrap_mode):
     mi = mi_rgb
     parts = np.stack(np.meshgrid(*[WRONG] * 4)).reshape(4, -1)
     uv = rng.choice([0, 1, 0.3, -7.5, 1e20, math.nan, math.inf], (2, parts.shape[1]))
     texture = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode))
     si = texture_scenes.hits(mi, uv, parts[:2], parts[2:])
-    found = texture.eval(si).numpy()
+    found, slope = texture.eval(si), texture.eval_1_grad(si)
+    dr.eval(found, slope)
+    found = found.numpy()
     assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
-    assert np.isfinite(texture.eval_1_grad(si).numpy()).all()
+    assert np.isfinite(slope.numpy()).all()
 
 
 def test_the_largest_footprint_is_the_mean(mi_rgb, file, image, rng):
@@ -236,9 +241,11 @@ def test_odd_sizes(mi_rgb, rng, shape):
     si = texture_scenes.hits(mi, rng.uniform(-1, 2, (2, 200)), *texture_scenes.footprints(rng, 200, shape[::-1], 6))
     for name in ("trilinear", "anisotropic"):
         texture = mi.load_dict({"type": "mipmap", "bitmap": mi.Bitmap(values), "filter": name})
-        found = texture.eval(si).numpy()
+        found, slope = texture.eval(si), texture.eval_1_grad(si)
+        dr.eval(found, slope)
+        found = found.numpy()
         assert np.isfinite(found).all() and linear(values.min() / 255) - 1e-4 <= found.min()
-        assert found.max() <= linear(values.max() / 255) + 1e-4 and np.isfinite(texture.eval_1_grad(si).numpy()).all()
+        assert found.max() <= linear(values.max() / 255) + 1e-4 and np.isfinite(slope.numpy()).all()
 
 
 # -- gradients ---------------------------------------------------------------------------------------------------------
@@ -411,7 +418,8 @@ def test_frozen_renders(mi_rgb, file, no_garbage_collection):
     mi = mi_rgb
     from mi_diffind.plugins.support import footprint
 
-    loaded = texture_scenes.plane(mi, plugin(file, to_uv=mi.ScalarTransform4f().scale(8)), size=16)
+    texture, path = plugin(file, to_uv=mi.ScalarTransform4f().scale(8)), {"type": "path", "max_depth": 1}
+    loaded = texture_scenes.plane(mi, texture, size=16, integrator=path)
 
     images = []
     for spp in (1, 64):
@@ -513,23 +521,15 @@ BAD = {
 def test_bad_parameters(mi_rgb, file, case):
     wrong, sentence = BAD[case]
     wrong = {k: file if v == "FILE" else v for k, v in wrong.items()}
-    with pytest.raises(RuntimeError) as e:
-        mi_rgb.load_dict({"type": "mipmap", **wrong})
-    text = compat.one_sentence(e.value)
-    assert sentence in text and "Traceback" not in text, text
+    assert sentence in texture_scenes.refused(mi_rgb, {"type": "mipmap", **wrong})
 
 
 def test_unsupported_variants_say_so(file):
-    script = f"""
-        import mi_diffind, mitsuba as mi
-        mi.set_variant("scalar_rgb")
-        try:
-            mi.load_dict({plugin(file)!r})
-        except RuntimeError as e:
-            print(e)
-    """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and '"mipmap" does not run in the variant "scalar_rgb"' in done.stdout, done.stderr
+    mi = set_variant("scalar_rgb")
+    with pytest.raises(RuntimeError, match='"mipmap" does not run in the variant "scalar_rgb"'):
+        mi.load_dict(plugin(file))
+    mi = set_variant("llvm_ad_rgb")
+    assert list(mi.load_dict(plugin(file)).resolution()) == [WIDTH, HEIGHT]
 
 
 def test_two_variants_in_turn(file, rng):

@@ -4,15 +4,11 @@ implementation, and under what scenes do to a texture.
 """
 
 import functools
-import gc
 import itertools
 import json
 import math
 import os
 import re
-import subprocess
-import sys
-import textwrap
 import threading
 from dataclasses import replace
 
@@ -21,19 +17,17 @@ import numpy as np
 import pytest
 from arrays import aligned
 from scipy.ndimage import map_coordinates
+from texture_scenes import alive, check_process, refused, scene_xml
 from variants import VARIANTS, set_variant
 
 from mi_diffind import comparison, compat, scenes
 from mi_diffind.maps.layout import Layout, MapLayout
-from mi_diffind.maps.source import from_arrays, load_source
+from mi_diffind.maps.source import load_source
 from mi_diffind.measure.operations import bsdf_operations, count
-from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, Table, load_table, save_table
-from mi_diffind.task import FitRequest
 from mi_diffind.tasks.ggx import TASK as GGX
-from mi_diffind.tasks.image import TASK, memory_budget, training
+from mi_diffind.tasks.image import TASK
 from mi_diffind.tasks.image.compressed import CompressedImage
-from mi_diffind.tasks.image.presets import PRESETS, replaced
 
 WIDTH, HEIGHT = 12, 10
 
@@ -57,6 +51,10 @@ ROUNDING = 1e-4
 
 USABLE = tuple(m.name for m in MAPS if m.channels != 2)
 WRAP_MODES = ("repeat", "mirror", "clamp")
+METHODS = ("eval", "eval_1", "eval_3", "eval_1_grad")
+
+#: Each colour mode once, polarised in one of them: a texture returns no Mueller matrix in any.
+RENDERED = [v for v in VARIANTS if v.endswith(("ad_rgb", "ad_mono", "ad_spectral_polarized"))]
 
 
 # -- helpers -----------------------------------------------------------------------------------------------------------
@@ -88,11 +86,16 @@ def single(kind, color_space="linear", channels=3):
     return Layout(WIDTH, HEIGHT, (one,), (0.5,) * channels, ("image",) * channels)
 
 
-def trained(source, size, batch):
-    """The table of a short training."""
-    recipe = replaced(PRESETS["ours"], steps=60, batch=batch, measure_every=60)
-    request = FitRequest("ours", recipe.settings, array_module("llvm"), progress=False)
-    return training.fit_image(source, size, recipe, request)[0]
+def tabulated(path, layout, values, **settings):
+    """A file whose primary is uv, and whose cascaded array has the channels ``values(y, x)`` of places in [0, 1]."""
+    y, x = np.mgrid[0:129, 0:129] / 128
+    ramp = np.stack(np.meshgrid([0, 255], [0, 255], indexing="ij"), axis=-1).astype(np.uint8)
+    table = Table("image", {}, settings={"layout": layout.to_json(), **settings})
+    for name, entries in (("primary", ramp), ("cascaded", np.rint(255 * values(y, x)).astype(np.uint8))):
+        scale, offset = (1 / 255,) * entries.shape[-1], (0.0,) * entries.shape[-1]
+        table.arrays[name] = StoredArray(entries, ("clamp", "clamp"), scale, offset, 8)
+    save_table(path, table)
+    return str(path)
 
 
 def layout_of(file):
@@ -106,15 +109,15 @@ def file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def smooth(tmp_path_factory):
-    """Three smooth colours, trained as a user would, and the image they were made from."""
-    folder = tmp_path_factory.mktemp("smooth")
-    y, x = np.mgrid[0:48, 0:64] / 64
-    waves = [0.5 + 0.3 * np.sin(2 * np.pi * (x + k * y / 2) + k) for k in range(3)]
-    image = np.rint(255 * np.stack(waves, axis=-1)).astype(np.uint8)
-    source = from_arrays({"image": image})
-    size = memory_budget.fit_bytes(10000, 3, 48, 64, 4, 4, 6)
-    save_table(folder / "smooth.npz", trained(source, size, 2**11))
-    return str(folder / "smooth.npz"), image
+    """Three smooth colours, and the image with 8 bits that they stand for."""
+    path = tmp_path_factory.mktemp("smooth") / "smooth.npz"
+
+    def waves(y, x):
+        return np.stack([0.5 + 0.3 * np.sin(2 * np.pi * (x + k * y / 2) + k) for k in range(3)], axis=-1)
+
+    y, x = np.mgrid[0:48, 0:64]
+    layout = replace(single("albedo", "srgb"), width=64, height=48)
+    return tabulated(path, layout, waves), np.rint(255 * waves((y + 0.5) / 48, (x + 0.5) / 64)).astype(np.uint8)
 
 
 def plugin(file, channels="albedo", **more):
@@ -136,9 +139,9 @@ def counterpart(mi, file, channels="albedo", **more):
 
 
 def interactions(mi, u, v):
-    u, v = (np.atleast_1d(np.asarray(x, np.float32)) for x in (u, v))
+    u, v = (np.atleast_1d(x) for x in (u, v))
     si = dr.zeros(mi.SurfaceInteraction3f, max(len(u), len(v)))
-    si.uv = mi.Point2f(mi.Float(u), mi.Float(v))
+    si.uv = mi.Point2f(mi.Float(aligned(u)), mi.Float(aligned(v)))
     if mi.is_spectral:
         wavelengths = np.random.default_rng(5).uniform(360, 830, (4, dr.width(si.uv)))
         si.wavelengths = type(si.wavelengths)(*[mi.Float(aligned(w)) for w in wavelengths])
@@ -152,18 +155,26 @@ def centres(rng, n, tiles=0):
     return (x + 0.5) / WIDTH, (y + 0.5) / HEIGHT
 
 
-def attempt(function, *args):
-    """What it returns, as NumPy has it, or that it raises."""
-    try:
-        return function(*args).numpy()
-    except RuntimeError:
-        return None
+def values_of(textures, si, methods=METHODS):
+    """Values as NumPy arrays by texture and method, ``None`` where the texture raises; computed by one kernel."""
+    values = {}
+    for (name, texture), method in itertools.product(textures.items(), methods):
+        try:
+            values[name, method] = getattr(texture, method)(si)
+        except RuntimeError:
+            values[name, method] = None
+    dr.eval([v for v in values.values() if v is not None])
+    return {key: None if v is None else v.numpy() for key, v in values.items()}
 
 
 def sentence(error):
     text = compat.one_sentence(error)
     assert "Traceback" not in text and len(text) < 350, text
     return text
+
+
+def lamp_place(mi):
+    return mi.ScalarTransform4f().translate([0, 1.2, 0.6]).rotate([1, 0, 0], 60).scale(0.6)
 
 
 def scene(mi, bsdf=None, emitter=None, size=16, **integrator):
@@ -177,47 +188,51 @@ def scene(mi, bsdf=None, emitter=None, size=16, **integrator):
     }
     if emitter is None:
         return mi.load_dict({**found, "sky": {"type": "constant"}})
-    lamp = mi.ScalarTransform4f().translate([0, 1.2, 0.6]).rotate([1, 0, 0], 60).scale(0.6)
-    return mi.load_dict({**found, "lamp": {"type": "rectangle", "to_world": lamp, "emitter": emitter}})
+    return mi.load_dict({**found, "lamp": {"type": "rectangle", "to_world": lamp_place(mi), "emitter": emitter}})
 
 
 # -- the same as a bitmap ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", USABLE)
-def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng, name):
-    """At texel centres, in every method; and where ``bitmap`` has no answer there is none."""
+def test_equals_a_bitmap_of_what_it_decodes_to(mi_any, file, rng):
+    """At texel centres, every map in every method; and where ``bitmap`` has no answer there is none."""
     mi = mi_any
-    ours, theirs = mi.load_dict(plugin(file, name)), mi.load_dict(counterpart(mi, file, name))
+    ours = {name: mi.load_dict(plugin(file, name)) for name in USABLE}
+    theirs = {name: mi.load_dict(counterpart(mi, file, name)) for name in USABLE}
     si = interactions(mi, *centres(rng, 400))
-    clipped = name == "glow" and mi.is_spectral  # both clamp, but only one of them at the same brightness
-    for method in ("eval", "eval_1", "eval_3", "eval_1_grad"):
-        a, b = (attempt(getattr(t, method), si) for t in (ours, theirs))
-        assert (a is None) == (b is None), method
+    found = values_of(ours, si)
+    for (name, method), b in values_of(theirs, si).items():
+        a = found[name, method]
+        assert (a is None) == (b is None), (name, method)
         if b is not None:
             steep = (WIDTH if method == "eval_1_grad" else 1) * max(1, np.abs(b).max())
-            np.testing.assert_allclose(np.broadcast_to(a, b.shape), b, atol=2 * ROUNDING * steep, err_msg=method)
-    assert list(ours.resolution()) == list(theirs.resolution()) == [WIDTH, HEIGHT]
-    assert ours.is_spatially_varying() == (name not in ("metallic", "flat"))
-    assert clipped or abs(float(ours.mean()[0]) - float(theirs.mean()[0])) < 2e-5
-    largest = dr.max(mi.traverse(mi.load_dict(counterpart(mi, file, name, raw=True)))["data"].array)[0]
-    if ours.raw or layout_of(file)[name].color_space == "linear":
-        assert ours.max() == pytest.approx(float(largest), rel=1e-5)
-    else:
-        assert ours.max() == pytest.approx(float(dr.srgb_to_linear(largest)), rel=1e-5)
+            a = np.broadcast_to(a, b.shape)
+            np.testing.assert_allclose(a, b, atol=2 * ROUNDING * steep, err_msg=f"{name}, {method}")
+    for name in USABLE:
+        a, b = ours[name], theirs[name]
+        assert list(a.resolution()) == list(b.resolution()) == [WIDTH, HEIGHT], name
+        assert a.is_spatially_varying() == (name not in ("metallic", "flat")), name
+        # Both clamp the spectra of bright colours, but only one of them at the same brightness
+        if not (name == "glow" and mi.is_spectral):
+            assert abs(float(a.mean()[0]) - float(b.mean()[0])) < 2e-5, name
+        largest = dr.max(mi.traverse(mi.load_dict(counterpart(mi, file, name, raw=True)))["data"].array)[0]
+        if not (a.raw or layout_of(file)[name].color_space == "linear"):
+            largest = dr.srgb_to_linear(largest)
+        assert a.max() == pytest.approx(float(largest), rel=1e-5), name
 
 
-@pytest.mark.parametrize("name", ["albedo", "grey", "stain", "glow"])
-def test_raw(mi_any, file, rng, name):
-    mi = mi_any
-    ours = mi.load_dict(plugin(file, name, raw=True))
-    theirs = mi.load_dict(counterpart(mi, file, name, raw=True))
+def test_raw(mi_any, file, rng):
+    mi, names = mi_any, ("albedo", "grey", "stain", "glow")
     si = interactions(mi, *centres(rng, 300))
-    for method in ("eval", "eval_1", "eval_3"):
-        a, b = (attempt(getattr(t, method), si) for t in (ours, theirs))
-        assert (a is None) == (b is None), method
+    ours, theirs = (
+        values_of({n: mi.load_dict(t(n)) for n in names}, si, METHODS[:3])
+        for t in (lambda n: plugin(file, n, raw=True), lambda n: counterpart(mi, file, n, raw=True))
+    )
+    for key, b in theirs.items():
+        a = ours[key]
+        assert (a is None) == (b is None), key
         if b is not None:
-            np.testing.assert_allclose(a, b, atol=ROUNDING * max(1, b.max()))
+            np.testing.assert_allclose(a, b, atol=ROUNDING * max(1, b.max()), err_msg=str(key))
 
 
 @pytest.mark.parametrize("border", [("repeat", "repeat"), ("clamp", "clamp"), ("clamp", "repeat")])
@@ -225,21 +240,22 @@ def test_raw(mi_any, file, rng, name):
 def test_wrap_modes(mi_rgb, tmp_path, rng, wrap_mode, border):
     mi = mi_rgb
     path = make(tmp_path / "a.npz", border=border)
-    ours = mi.load_dict(plugin(path, wrap_mode=wrap_mode))
-    theirs = mi.load_dict(counterpart(mi, path, wrap_mode=wrap_mode))
-    si = interactions(mi, *centres(rng, 1000, tiles=3))
-    np.testing.assert_allclose(ours.eval(si).numpy(), theirs.eval(si).numpy(), atol=ROUNDING)
-    found = [t.eval_1_grad(si).numpy() for t in (ours, theirs)]
+    more = {"wrap_mode": wrap_mode}
+    textures = [mi.load_dict(t) for t in (plugin(path, **more), counterpart(mi, path, **more))]
+    u, v = (rng.random(500) * 0.5 / n for n in (WIDTH, HEIGHT))
+    ends = [(u, v), (1 - u, v), (1 - u, 1 - v), (0 * u, 0 * v), (0 * u + 1, 0 * v), (0 * u + 1, 0 * v + 1)]
+    seam = [([0, 0.3], [0.4, 0]), ([1, 0.3], [0.4, 1])]
+    places = np.concatenate([np.array(p) for p in (centres(rng, 1000, tiles=3), *ends, *seam)], axis=1)
+    found = values_of(dict(enumerate(textures)), interactions(mi, *places), ("eval", "eval_1_grad"))
+    ours, theirs = found[0, "eval"], found[1, "eval"]
+    np.testing.assert_allclose(ours[:, :1000], theirs[:, :1000], atol=ROUNDING)
     if wrap_mode != "repeat" or border == ("repeat", "repeat"):  # elsewhere the outermost texels have other neighbours
-        np.testing.assert_allclose(*found, atol=WIDTH * ROUNDING)
+        a, b = (found[i, "eval_1_grad"][:, :1000] for i in (0, 1))
+        np.testing.assert_allclose(a, b, atol=WIDTH * ROUNDING)
     if wrap_mode != "repeat":  # nothing bleeds over the ends, whatever the arrays' borders
-        u, v = (rng.random(500) * 0.5 / n for n in (WIDTH, HEIGHT))
-        ends = [(u, v), (1 - u, v), (1 - u, 1 - v), (0 * u, 0 * v), (0 * u + 1, 0 * v), (0 * u + 1, 0 * v + 1)]
-        si = interactions(mi, *(np.concatenate(x) for x in zip(*ends, strict=True)))
-        np.testing.assert_allclose(ours.eval(si).numpy(), theirs.eval(si).numpy(), atol=ROUNDING)
+        np.testing.assert_allclose(ours[:, 1000:-4], theirs[:, 1000:-4], atol=ROUNDING)
     elif border == ("repeat", "repeat"):
-        a, b = (ours.eval(interactions(mi, *uv)).numpy() for uv in (([0, 0.3], [0.4, 0]), ([1, 0.3], [0.4, 1])))
-        np.testing.assert_allclose(a, b, atol=ROUNDING)
+        np.testing.assert_allclose(ours[:, -4:-2], ours[:, -2:], atol=ROUNDING)
 
 
 @pytest.mark.parametrize("wrap_mode", WRAP_MODES)
@@ -249,10 +265,12 @@ def test_two_primaries(mi_rgb, tmp_path, rng, border, wrap_mode):
     path = make(tmp_path / "a.npz", border=border, coarse=True)
     theirs = mi.load_dict(counterpart(mi, path, wrap_mode=wrap_mode))
     si = interactions(mi, *centres(rng, 500, tiles=2))
-    for storage in ("uint8", "float32"):
-        ours = mi.load_dict(plugin(path, wrap_mode=wrap_mode, storage=storage))
-        np.testing.assert_allclose(ours.eval(si).numpy(), theirs.eval(si).numpy(), atol=3 * ROUNDING)
-    assert sorted(mi.traverse(ours).keys()) == ["tables.cascaded", "tables.coarse", "tables.primary", "to_uv"]
+    textures = {s: mi.load_dict(plugin(path, wrap_mode=wrap_mode, storage=s)) for s in ("uint8", "float32")}
+    found = values_of({**textures, "bitmap": theirs}, si, ("eval",))
+    for storage in textures:
+        np.testing.assert_allclose(found[storage, "eval"], found["bitmap", "eval"], atol=3 * ROUNDING)
+    keys = sorted(mi.traverse(textures["float32"]).keys())
+    assert keys == ["tables.cascaded", "tables.coarse", "tables.primary", "to_uv"]
     bsdf = mi.load_dict(materials(lambda m: plugin(path, m, wrap_mode=wrap_mode))["principled"])
     one = mi.load_dict(materials(lambda m: plugin(path, m, wrap_mode=wrap_mode))["diffuse"])
     found = [bsdf_operations(b, ("eval",))["eval"].gathers for b in (bsdf, one)]
@@ -276,15 +294,17 @@ def test_reads_as_an_independent_implementation_does(mi_rgb, tmp_path, rng, bord
     si = interactions(mi, u, v)
     s = np.stack(stored[:3])
     albedo = np.where(s < 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(mi.load_dict(plugin(path)).eval(si).numpy(), albedo, atol=ROUNDING)
+    textures = {name: mi.load_dict(plugin(path, name)) for name in ("albedo", "normal", "glow")}
+    found = values_of(textures, si, ("eval", "eval_3"))
+    np.testing.assert_allclose(found["albedo", "eval"], albedo, atol=ROUNDING)
     n = 2 * np.stack(stored[3:5]) - 1
     z = np.sqrt(np.maximum(0, 1 - (n**2).sum(axis=0)))
-    found = mi.load_dict(plugin(path, "normal")).eval_3(si).numpy()
-    np.testing.assert_allclose(found[:2] * 2 - 1, n, atol=2 * ROUNDING)
-    np.testing.assert_allclose((found[2] * 2 - 1) ** 2, z**2, atol=1e-3)
+    normal = found["normal", "eval_3"]
+    np.testing.assert_allclose(normal[:2] * 2 - 1, n, atol=2 * ROUNDING)
+    np.testing.assert_allclose((normal[2] * 2 - 1) ** 2, z**2, atol=1e-3)
     glow = 0.5 * ((1 + 8 / 0.5) ** s[::-1] - 1)
-    np.testing.assert_allclose(mi.load_dict(plugin(path, "glow")).eval(si).numpy(), glow, rtol=1e-3, atol=1e-3)
-    assert found.max() <= 1 + 1e-6 and glow.max() > 1
+    np.testing.assert_allclose(found["glow", "eval"], glow, rtol=1e-3, atol=1e-3)
+    assert normal.max() <= 1 + 1e-6 and glow.max() > 1
 
 
 TRANSFORMS = {
@@ -304,9 +324,10 @@ def test_to_uv(mi_rgb, file, rng, name):
     m = np.array([[float(to_uv.matrix[i, j]) for j in (0, 1, 3)] for i in (0, 1)] + [[0, 0, 1]])
     uv = np.linalg.solve(m, np.stack([u, v, np.ones_like(u)]))
     si = interactions(mi, uv[0], uv[1])
-    np.testing.assert_allclose(ours.eval(si).numpy(), theirs.eval(si).numpy(), atol=2 * ROUNDING)
+    found = values_of({"ours": ours, "theirs": theirs}, si, ("eval", "eval_1_grad"))
+    np.testing.assert_allclose(found["ours", "eval"], found["theirs", "eval"], atol=2 * ROUNDING)
     if name in ("scale", "flip"):  # of others ``bitmap`` takes width for height
-        a, b = (t.eval_1_grad(si).numpy() for t in (ours, theirs))
+        a, b = (found[t, "eval_1_grad"] for t in ("ours", "theirs"))
         np.testing.assert_allclose(a, b, atol=2e-3 * np.abs(b).max())
 
 
@@ -332,13 +353,19 @@ def test_any_coordinate_gives_a_finite_value(variant, file, wrap_mode):
     bad = [math.nan, math.inf, -math.inf, 3e38, -3e38, 1e20, 2**31, -(2**31), 2**24 + 1, 1e-45, -1e-45, 0, 1, -0.0]
     u, v = (x.ravel() for x in np.meshgrid(bad, bad))
     si = interactions(mi, u, v)
-    for name, storage in itertools.product(("albedo", "normal", "roughness", "glow"), ("uint8", "float32")):
-        texture = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode, storage=storage))
-        for method in ("eval", "eval_1", "eval_3", "eval_1_grad"):
-            found = attempt(getattr(texture, method), si)
-            assert found is None or np.isfinite(found).all(), (name, storage, method)
-        density = texture.pdf_position(si.uv).numpy()
-        assert np.isfinite(density).all() and density.min() >= 0, (name, storage)
+    # Wrapping comes before all maps, reading before the colours of a variant: all maps where both are the first ones
+    first = wrap_mode == "repeat" and mi.is_rgb
+    for storage in ("uint8", "float32") if mi.is_rgb else ("uint8",):
+        names = ("albedo", "normal", "roughness", "glow") if first else ("albedo", "glow")
+        more = {"wrap_mode": wrap_mode, "storage": storage}
+        textures = {name: mi.load_dict(plugin(file, name, **more)) for name in names}
+        for methods in (METHODS[:3], METHODS[3:]):
+            for key, value in values_of(textures, si, methods).items():
+                assert value is None or np.isfinite(value).all(), (key, storage)
+        densities = {name: texture.pdf_position(si.uv) for name, texture in textures.items()}
+        dr.eval(densities)
+        for name, density in densities.items():
+            assert np.isfinite(density.numpy()).all() and density.numpy().min() >= 0, (name, storage)
 
 
 WRONG = (math.nan, math.inf, -math.inf, 1e30, -1e30)
@@ -356,12 +383,12 @@ def test_tables_of_anything(mi_rgb, file, rng):
         for wrong, share in [(math.nan, 1), *((wrong, 0.3) for wrong in WRONG)]:
             params[key] = mi.TensorXf(aligned(np.where(rng.random(before.shape) < share, np.float32(wrong), before)))
             params.update()
+            found = values_of(textures, si, ("eval", "eval_1", "eval_1_grad"))
+            assert all(np.isfinite(v).all() for v in found.values()), (key, wrong, share)
             for name, texture in textures.items():
-                found = [texture.eval(si), texture.eval_1(si), texture.eval_1_grad(si), texture.mean()]
-                found = [v.numpy() for v in found] + [np.array(texture.max())]
-                assert all(np.isfinite(v).all() for v in found), (name, key, wrong, share)
-                low, high = (0, 1) if name != "glow" else (0, 9)
-                assert low <= found[0].min() and found[0].max() <= high + 1e-4, (name, key, wrong, share)
+                assert np.isfinite([texture.mean()[0], texture.max()]).all(), (name, key, wrong, share)
+                (low, high), values = (0, 1) if name != "glow" else (0, 9), found[name, "eval"]
+                assert low <= values.min() and values.max() <= high + 1e-4, (name, key, wrong, share)
             uv, pdf = textures["albedo"].sample_position(mi.Point2f(si.uv - dr.floor(si.uv)))
             assert np.isfinite(uv.numpy()).all() and np.isfinite(pdf.numpy()).all() and pdf.numpy().min() > 0
             image = mi.render(loaded, spp=1).numpy()
@@ -374,18 +401,17 @@ def test_tables_of_anything(mi_rgb, file, rng):
 def test_gradients_of_wrong_tables_are_finite(mi_rgb, file, rng, wrong):
     mi = mi_rgb
     si = interactions(mi, *rng.random((2, 200)))
-    for name in ("albedo", "normal", "glow"):
-        texture = mi.load_dict(plugin(file, name, storage="float32"))
-        params = mi.traverse(texture)
-        keys = ("tables.primary", "tables.cascaded")
-        for key in keys:
-            entries = params[key].numpy()
-            params[key] = mi.TensorXf(aligned(np.where(rng.random(entries.shape) < 0.1, np.float32(wrong), entries)))
-            dr.enable_grad(params[key])
-        params.update()
-        dr.backward(sum(dr.sum(channel) for channel in texture.eval_3(si)))
-        for key in keys:
-            assert np.isfinite(params[key].grad.numpy()).all(), (name, key)
+    textures = [mi.load_dict(plugin(file, name, storage="float32")) for name in ("albedo", "normal", "glow")]
+    params = mi.traverse(textures[0])  # which all of them share
+    keys = ("tables.primary", "tables.cascaded")
+    for key in keys:
+        entries = params[key].numpy()
+        params[key] = mi.TensorXf(aligned(np.where(rng.random(entries.shape) < 0.1, np.float32(wrong), entries)))
+        dr.enable_grad(params[key])
+    params.update()
+    dr.backward(sum(dr.sum(channel) for texture in textures for channel in texture.eval_3(si)))
+    for key in keys:
+        assert np.isfinite(params[key].grad.numpy()).all(), key
 
 
 @pytest.mark.parametrize("wrap_mode", WRAP_MODES)
@@ -396,10 +422,14 @@ def test_positions_of_samples_that_are_none(mi_rgb, file, wrap_mode, transformed
     more = {"to_uv": TRANSFORMS["turn"](mi.ScalarTransform4f())} if transformed else {}
     bad = [math.nan, math.inf, -math.inf, -1, -1e-9, 0, 1, 1 + 1e-6, 2, 1e30, 3e38, 1 - 2**-24]
     u, v = (mi.Float(aligned(x.ravel())) for x in np.meshgrid(bad, bad))
+    found = {}
     for name in ("albedo", "roughness", "glow", "flat"):
         texture = mi.load_dict(plugin(file, name, wrap_mode=wrap_mode, **more))
         uv, pdf = texture.sample_position(mi.Point2f(u, v))
-        pdf, again = np.broadcast_to(pdf.numpy(), len(bad) ** 2), texture.pdf_position(uv).numpy()
+        found[name] = uv, pdf, texture.pdf_position(uv)
+    dr.eval(found)
+    for name, (uv, pdf, again) in found.items():
+        pdf, again = np.broadcast_to(pdf.numpy(), len(bad) ** 2), again.numpy()
         assert np.isfinite(pdf).all() and pdf.min() > 0 and np.isfinite(again).all(), name
         if name != "flat":  # of one colour: the sample is the position
             assert np.isfinite(uv.numpy()).all() and uv.numpy().min() >= 0 and uv.numpy().max() <= 1, name
@@ -408,9 +438,12 @@ def test_positions_of_samples_that_are_none(mi_rgb, file, wrap_mode, transformed
 def test_storage_forms_agree(mi_any, file, rng):
     mi = mi_any
     si = interactions(mi, *rng.random((2, 1000)))
-    for name in ("albedo", "glow", "stain"):
-        a, b = (mi.load_dict(plugin(file, name, storage=s)).eval(si).numpy() for s in ("uint8", "float32"))
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=2e-4)
+    names, storages = ("albedo", "glow", "stain"), ("uint8", "float32")
+    textures = {(n, s): mi.load_dict(plugin(file, n, storage=s)) for n in names for s in storages}
+    found = values_of(textures, si, ("eval",))
+    for name in names:
+        a, b = (found[(name, s), "eval"] for s in storages)
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=2e-4, err_msg=name)
 
 
 def test_gradient_of_the_image(mi_rgb, file, rng):
@@ -473,7 +506,7 @@ def test_upsampling_is_mitsubas(rng):
     special += [(1e-7, 2e-7, 0), (0.3, 0.3, 0.1), (0.1, 0.3, 0.3), (0.3, 0.1, 0.3), (1, 1, 0.999999)]
     colours = np.concatenate([colours, np.transpose(special)], axis=1).astype(np.float32)
     wavelengths = np.float32([380, 470, 560, 700])
-    rgb = [mi.Float(c) for c in colours]
+    rgb = [mi.Float(aligned(c)) for c in colours]
     dr.enable_grad(rgb)
     found = upsampling.spectrum(rgb, mi.UnpolarizedSpectrum(*[float(w) for w in wavelengths]))
     expected = []
@@ -490,7 +523,7 @@ def test_upsampling_is_mitsubas(rng):
         assert np.isfinite(gradient).all()
         step, values = 1e-3, []
         for sign in (-1, 1):
-            moved = [mi.Float(c + (sign * step if i == k else 0)) for i, c in enumerate(colours)]
+            moved = [mi.Float(aligned(c + (sign * step if i == k else 0))) for i, c in enumerate(colours)]
             values.append(sum(upsampling.spectrum(moved, mi.UnpolarizedSpectrum(*wavelengths.tolist())).numpy()))
         difference = (values[1] - values[0]) / (2 * step)
         inside = (colours[:, :n].min(axis=0) > 0.1) & (colours[:, :n].max(axis=0) < 0.95)
@@ -523,16 +556,25 @@ def test_sampled_positions_have_their_density(mi_rgb, file, rng, name, wrap_mode
         assert np.corrcoef(brightness, density.ravel())[0, 1] > 0.8
 
 
-@pytest.mark.parametrize("name", ["albedo", "glow", "flat", "stain"])
-def test_area_emitters(mi_any, file, name):
+@pytest.mark.parametrize("variant", RENDERED)
+def test_area_emitters(variant, file):
     """As with a bitmap, to what the values between texels differ, and by less noise than if all places were alike."""
-    mi = mi_any
-    images = []
-    for texture in (plugin(file, name), counterpart(mi, file, name)):
-        loaded = scene(mi, emitter={"type": "area", "radiance": texture}, size=4)
-        images.append(mi.render(loaded, spp=512).numpy())
-    assert images[0].mean() > 0
-    assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.2 if name == "glow" else 0.05)
+    mi = set_variant(variant)
+    names, images = ("albedo", "glow", "flat", "stain"), []
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    for t in (lambda n: plugin(file, n), lambda n: counterpart(mi, file, n)):
+        found = {"type": "scene", "integrator": {"type": "path", "max_depth": 3}}
+        for i, name in enumerate(names):  # each before a wall of its own, out of sight of the others
+            place = mi.ScalarTransform4f().translate([1000 * i, 0, 0])
+            seen = place @ mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+            emitter = {"type": "area", "radiance": t(name)}
+            found[f"sensor{i}"] = {"type": "perspective", "fov": 35, "to_world": seen, "film": film}
+            found[f"wall{i}"] = {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse"}}
+            found[f"lamp{i}"] = {"type": "rectangle", "to_world": place @ lamp_place(mi), "emitter": emitter}
+        loaded = mi.load_dict(found)
+        images.append([mi.render(loaded, sensor=i, spp=2048).numpy() for i in range(len(names))])
+    for name, a, b in zip(names, *images, strict=True):
+        assert a.mean() > 0 and a.mean() == pytest.approx(b.mean(), rel=0.2 if name == "glow" else 0.05), name
 
 
 def test_emitters_of_any_transformation(mi_rgb, file):
@@ -550,9 +592,10 @@ def test_emitters_of_any_transformation(mi_rgb, file):
         assert means[0] == pytest.approx(means[1], rel=0.02), name
 
 
-def test_particle_tracer(mi_any, file):
+@pytest.mark.parametrize("variant", RENDERED)
+def test_particle_tracer(variant, file):
     """Asks for a wavelength and a ray from the emitter."""
-    mi = mi_any
+    mi = set_variant(variant)
     emitter = {"type": "area", "radiance": plugin(file)}
     image = mi.render(scene(mi, emitter=emitter, size=4, type="ptracer", max_depth=3), spp=2**13).numpy()
     expected = mi.render(scene(mi, emitter=emitter, size=4), spp=2**10).numpy()
@@ -590,9 +633,10 @@ def materials(t):
     }
 
 
-def test_renders_as_with_bitmaps(mi_any, tmp_path):
+@pytest.mark.parametrize("variant", RENDERED)
+def test_renders_as_with_bitmaps(variant, tmp_path):
     """Of arrays that are smooth enough for both to agree between texels; all materials in one scene, side by side."""
-    mi = mi_any
+    mi = set_variant(variant)
     path = make(tmp_path / "a.npz", spread=(110, 140))
     names, images = list(materials(lambda m: m)), []
     for t in (lambda m: plugin(path, m), lambda m: counterpart(mi, path, m)):
@@ -686,7 +730,7 @@ def test_gradients_against_finite_differences(mi_any, file, rng, method):
 
     for key in ("tables.primary", "tables.cascaded"):
         start = params[key].numpy() * 0.98 + 0.01  # away from the ends, where entries are folded
-        params[key] = mi.TensorXf(start)
+        params[key] = mi.TensorXf(aligned(start))
         params.update()
         dr.enable_grad(params[key])
         dr.backward(total())
@@ -699,12 +743,12 @@ def test_gradients_against_finite_differences(mi_any, file, rng, method):
             for sign in (-1, 1):
                 moved = start.copy()
                 moved.ravel()[i] += sign * 1e-3
-                params[key] = mi.TensorXf(moved)
+                params[key] = mi.TensorXf(aligned(moved))
                 params.update()
                 values.append(float(total()[0]))
             difference = (values[1] - values[0]) / 2e-3
             assert gradient[i] == pytest.approx(difference, rel=0.05, abs=0.02 * float(np.abs(gradient).max()))
-        params[key] = mi.TensorXf(start)
+        params[key] = mi.TensorXf(aligned(start))
         params.update()
 
 
@@ -778,26 +822,27 @@ def test_bytes_have_no_parameters_but_the_transformation(mi_rgb, file):
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def test_no_arrays(mi_any, tmp_path, rng):
+@pytest.mark.parametrize("variant", RENDERED)
+def test_no_arrays(variant, tmp_path, rng):
     """An image of one colour is a few numbers."""
-    mi = mi_any
+    mi = set_variant(variant)
     one = MapLayout("image", "albedo", "srgb", 1, (("constant", 0.5), ("constant", 0.2), ("constant", 0.7)))
     path = make(tmp_path / "a.npz", Layout(WIDTH, HEIGHT, (one,), (), ()))
+    theirs = mi.load_dict(counterpart(mi, path, "image"))
+    si = interactions(mi, *rng.random((2, 30)))
+    expected = values_of({"": theirs}, si)
     for storage in ("uint8", "float32"):
         texture = mi.load_dict({"type": "neural_image", "filename": path, "storage": storage})
-        theirs = mi.load_dict(counterpart(mi, path, "image"))
-        si = interactions(mi, *rng.random((2, 30)))
-        for method in ("eval", "eval_1", "eval_3", "eval_1_grad"):
-            a, b = (attempt(getattr(t, method), si) for t in (texture, theirs))
+        for key, a in values_of({"": texture}, si).items():
+            b = expected[key]
             assert (a is None) == (b is None)
             if a is not None:
                 np.testing.assert_allclose(np.broadcast_to(a, b.shape), b, atol=2e-5)
         assert not texture.is_spatially_varying()
         assert float(texture.mean()[0]) == pytest.approx(float(theirs.mean()[0]), abs=1e-5)
-        image = mi.render(scene(mi, {"type": "diffuse", "reflectance": {**plugin(path, "image")}}), spp=4).numpy()
-        assert image.mean() > 0
-        lamp = {"type": "area", "radiance": plugin(path, "image", storage=storage)}
-        assert mi.render(scene(mi, emitter=lamp), spp=4).numpy().mean() > 0
+        t = plugin(path, "image", storage=storage)
+        lit = scene(mi, {"type": "diffuse", "reflectance": t}, {"type": "area", "radiance": t})
+        assert mi.render(lit, spp=4).numpy().mean() > 0
 
 
 def test_the_only_map_need_not_be_named(mi_rgb, file, tmp_path, rng):
@@ -866,9 +911,7 @@ BAD = {
 @pytest.mark.parametrize("case", list(BAD))
 def test_bad_parameters(mi_any, file, case):
     wrong, expected = BAD[case]
-    with pytest.raises(RuntimeError) as e:
-        mi_any.load_dict(wrong(file))
-    assert expected in sentence(e.value)
+    assert expected in refused(mi_any, wrong(file))
 
 
 def test_several_maps_and_none_named(mi_rgb, tmp_path):
@@ -877,36 +920,12 @@ def test_several_maps_and_none_named(mi_rgb, tmp_path):
         mi_rgb.load_dict({"type": "neural_image", "filename": path})
 
 
-def test_unsupported_variants_say_so(file):
-    script = f"""
-        import mi_diffind, mitsuba as mi
-        mi.set_variant("scalar_rgb")
-        try:
-            mi.load_dict({plugin(file)!r})
-        except RuntimeError as e:
-            print(e)
-        mi.set_variant("llvm_ad_rgb")
-        print(mi.load_dict({plugin(file)!r}).resolution())
-    """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert '"neural_image" does not run in the variant "scalar_rgb"; use one of llvm_ad_rgb' in done.stdout
-    assert f"[{WIDTH}, {HEIGHT}]" in done.stdout
-
-
 # -- the exact counterpart ---------------------------------------------------------------------------------------------
 
-SCENE = """<scene version="3.0.0">
-    <integrator type="path"><integer name="max_depth" value="3"/></integrator>
-    <sensor type="perspective">
-        <transform name="to_world"><lookat origin="0,0,3" target="0,0,0" up="0,1,0"/></transform>
-        <sampler type="independent"><integer name="sample_count" value="8"/></sampler>
-        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
-            <rfilter type="box"/></film>
-    </sensor>
-    <emitter type="constant"/>
-    <shape type="rectangle"><bsdf type="{bsdf}">{textures}</bsdf></shape>
-</scene>"""
+
+def wall_xml(bsdf, textures):
+    content = f'<shape type="rectangle"><bsdf type="{bsdf}">{textures}</bsdf></shape>'
+    return scene_xml(f'<emitter type="constant"/>{content}')
 
 
 def texture_xml(slot, filename, more="", **strings):
@@ -916,31 +935,37 @@ def texture_xml(slot, filename, more="", **strings):
 
 @pytest.fixture(scope="module")
 def material(tmp_path_factory):
-    """A material that was compressed from files, a scene of it, and the images."""
+    """A compressed material with the files that it stands for, a scene of it, and the images."""
     import mitsuba as mi
 
     folder = tmp_path_factory.mktemp("material")
-    y, x = np.mgrid[0:16, 0:16] / 16
-    wave = 0.5 + 0.4 * np.sin(2 * np.pi * np.stack([x, y, x + y], axis=-1))
-    albedo, orm = (np.rint(255 * v).astype(np.uint8) for v in (wave, wave[..., ::-1] * 0.8))
+
+    def wave(y, x):
+        return 0.5 + 0.4 * np.sin(2 * np.pi * np.stack([x, y, x + y], axis=-1))
+
+    def stored(y, x):
+        values = wave(y, x)
+        return np.concatenate([values, 0.8 * values[..., 1:2]], axis=-1)
+
+    image = wave(*(np.mgrid[0:16, 0:16] + 0.5) / 16)
+    albedo, orm = (np.rint(255 * v).astype(np.uint8) for v in (image, image[..., ::-1] * 0.8))
     mi.Bitmap(albedo).write(str(folder / "albedo.png"))
     mi.Bitmap(orm).write(str(folder / "orm.png"))
     maps = {"albedo": "albedo.png", "roughness": {"file": "orm.png", "channels": "g"}}
     (folder / "wall.json").write_text(json.dumps(maps))
-    source = load_source(folder / "wall.json")
-    table = trained(source, memory_budget.fit_bytes(2300, 4, 16, 16, 4, 4, 6), 2**10)
-    table.settings["source_path"] = "wall.json"
-    save_table(folder / "wall.npz", table)
+    layout = Layout.of(load_source(folder / "wall.json"))
+    tabulated(folder / "wall.npz", layout, stored, source_path="wall.json")
     textures = texture_xml("base_color", "wall.npz", channels="albedo") + texture_xml(
         "roughness", "wall.npz", channels="roughness", wrap_mode="mirror"
     )
-    (folder / "scene.xml").write_text(SCENE.format(bsdf="principled", textures=textures))
+    (folder / "scene.xml").write_text(wall_xml("principled", textures))
     return folder, albedo, orm
 
 
-def test_exact_counterpart(mi_any, material):
+@pytest.mark.parametrize("variant", RENDERED)
+def test_exact_counterpart(variant, material):
     """The same scene as with the images themselves, where there is a file for each; and it can be compared."""
-    mi = mi_any
+    mi = set_variant(variant)
     folder, _, orm = material
     exact = scenes.load(folder / "scene.xml", exact=True)
     mi.Bitmap(np.ascontiguousarray(orm[..., 1:2])).write(str(folder / "roughness.png"))
@@ -949,14 +974,14 @@ def test_exact_counterpart(mi_any, material):
         '<texture type="bitmap" name="roughness"><string name="filename" value="roughness.png"/>'
         '<boolean name="raw" value="true"/><string name="wrap_mode" value="mirror"/></texture>'
     )
-    (folder / "stock.xml").write_text(SCENE.format(bsdf="principled", textures=textures))
+    (folder / "stock.xml").write_text(wall_xml("principled", textures))
     stock = scenes.load(folder / "stock.xml")
     np.testing.assert_array_equal(mi.render(exact, spp=8).numpy(), mi.render(stock, spp=8).numpy())
-    if mi.is_polarized:
+    if not mi.is_rgb:
         return
 
     result = comparison.compare(folder / "scene.xml", spp=8, passes=1, progress=False)
-    assert result.figures["psnr_db"] > 40  # 43 to 47 dB are reached
+    assert result.figures["psnr_db"] > 40
     assert result.figures["learned_plugins"] == 2
     assert result.figures["table_bytes"] == load_table(folder / "wall.npz").nbytes
 
@@ -967,7 +992,7 @@ def test_exact_counterpart_of_a_given_source(mi_rgb, material, rng):
     folder, albedo, _ = material
     for source, raw in (("albedo.png", ""), ("wall.json", ""), ("albedo.png", '<boolean name="raw" value="true"/>')):
         xml = texture_xml("reflectance", "wall.npz", raw, channels="albedo", source=source)
-        (folder / "b.xml").write_text(SCENE.format(bsdf="diffuse", textures=xml))
+        (folder / "b.xml").write_text(wall_xml("diffuse", xml))
         exact = scenes.load(folder / "b.xml", exact=True).shapes()[0].bsdf()
         bitmap = mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(albedo), "raw": bool(raw)})
         si = interactions(mi, *rng.random((2, 100)))
@@ -990,7 +1015,7 @@ def test_exact_counterpart_without_a_source(mi_rgb, material, tmp_path):
         save_table(tmp_path / "wall.npz", table)
         more = {} if given is None else {"source": given}
         xml = texture_xml("alpha", "wall.npz", channels="roughness", **more)
-        (tmp_path / "s.xml").write_text(SCENE.format(bsdf="roughconductor", textures=xml))
+        (tmp_path / "s.xml").write_text(wall_xml("roughconductor", xml))
         scenes.load(tmp_path / "s.xml")  # as written it needs none
         with pytest.raises(scenes.SceneError) as e:
             scenes.load(tmp_path / "s.xml", exact=True)
@@ -1045,64 +1070,36 @@ def test_frozen_renders(mi_rgb, file, no_garbage_collection, storage):
     mi = mi_rgb
     bsdf = materials(lambda m: plugin(file, m, storage=storage))["principled"]
     lamp = {"type": "area", "radiance": plugin(file, "glow", storage=storage)}
-    for loaded in (scene(mi, bsdf), scene(mi, bsdf, lamp)):
-        params = mi.traverse(loaded)
+    loaded = scene(mi, bsdf, lamp)
+    params = mi.traverse(loaded)
 
-        @dr.freeze
-        def frozen(loaded, seed):
-            return mi.render(loaded, spp=4, seed=seed)
+    @dr.freeze
+    def frozen(loaded, seed):
+        return mi.render(loaded, spp=4, seed=seed)
 
-        dr.eval(mi.render(loaded, spp=1))
-        for step in range(4):
-            if storage == "float32" and step == 2:
-                key = next(k for k in params.keys() if k.endswith("tables.cascaded"))
-                params[key] = params[key] * 0.5
-                params.update()
-                dr.eval(mi.render(loaded, spp=1))
-            image = frozen(loaded, mi.UInt32(step)).numpy()
-            expected = mi.render(loaded, spp=4, seed=mi.UInt32(step)).numpy()
-            np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-5)
+    dr.eval(mi.render(loaded, spp=4))
+    for step in range(4):
+        if storage == "float32" and step == 2:
+            key = next(k for k in params.keys() if k.endswith("tables.cascaded"))
+            params[key] = params[key] * 0.5
+            params.update()
+            dr.eval(mi.render(loaded, spp=4))
+        image = frozen(loaded, mi.UInt32(step)).numpy()
+        expected = mi.render(loaded, spp=4, seed=mi.UInt32(step)).numpy()
+        np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_textures_die_with_their_scene(mi_rgb, file, no_garbage_collection):
     mi = mi_rgb
-
-    def alive():
-        return [type(o).__name__ for o in gc.get_objects()].count("NeuralImage")
-
-    before = alive()
+    before = alive("NeuralImage")
     lamp = {"type": "area", "radiance": plugin(file, "glow")}
     loaded = scene(mi, materials(lambda m: plugin(file, m))["principled"], lamp)
     mi.render(loaded, spp=1)
-    assert alive() == before + 4
+    assert alive("NeuralImage") == before + 4
     del loaded
-    assert alive() == before
+    assert alive("NeuralImage") == before
 
 
-def test_nothing_leaks(file):
-    """Of what nanobind and Dr.Jit count, at the end of a process that has loaded, rendered and optimised."""
-    script = f"""
-        import drjit as dr, mi_diffind, mitsuba as mi
-        for variant in ("llvm_ad_rgb", "llvm_ad_spectral"):
-            mi.set_variant(variant)
-            texture = {{"type": "neural_image", "filename": {file!r}, "channels": "albedo", "storage": "float32"}}
-            scene = mi.load_dict({{
-                "type": "scene",
-                "integrator": {{"type": "path", "max_depth": 3}},
-                "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 8, "height": 8}}}},
-                "lamp": {{"type": "sphere", "center": [0, 0, 4],
-                          "emitter": {{"type": "area", "radiance": texture}}}},
-                "ball": {{"type": "sphere", "center": [2, 0, 4],
-                          "bsdf": {{"type": "diffuse", "reflectance": texture}}}},
-            }})
-            params = mi.traverse(scene)
-            key = next(k for k in params.keys() if k.endswith("tables.cascaded"))
-            dr.enable_grad(params[key])
-            params.update()
-            dr.backward(dr.sum(mi.render(scene, params, spp=2).array))
-            assert dr.width(dr.grad(params[key]).array) > 1
-        del scene, params
-    """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert "leak" not in done.stderr.lower(), done.stderr
+def test_unsupported_variants_and_leaks(file):
+    """A sentence in a scalar variant; nothing is left of textures that were rendered and optimised."""
+    check_process(plugin(file, storage="float32"), ("llvm_ad_rgb", "llvm_ad_spectral"))

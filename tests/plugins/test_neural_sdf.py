@@ -8,6 +8,7 @@ from weakref import WeakValueDictionary
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 from sdf_fields import sparse_table, torus
 
 from mi_diffind import compat, plugins, scenes
@@ -70,7 +71,7 @@ def analytic(o, d):
 
 def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     """From cell to cell, hits are those of sphere tracing through the same field, and near the torus itself."""
-    from mi_diffind.tasks.sdf import TASK, tracing
+    from mi_diffind.tasks.sdf import TASK, grids, tracing
 
     mi = mi_rgb
     field = TASK.open(mi.TensorXf, folder / "torus.npz").field
@@ -78,13 +79,14 @@ def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     within = rng.random(len(o)) < 0.3  # some start in the tube
     angle = rng.uniform(0, 2 * np.pi, len(o))
     o[within] = np.stack([0.38 * np.cos(angle), 0.38 * np.sin(angle), 0.05 * np.sin(9 * angle)], 1)[within]
-    p, v = mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32))
+    p, v = (mi.Vector3f(*(mi.Float(aligned(x)) for x in values.T)) for values in (o, d))
     hit = tracing.intersect(field, p, v, dr.inf)
+    dr.eval(hit)  # at once: each result of its own would be another kernel
     t, result = np.array(hit.t), np.array(hit.hit)
     near, far, active = tracing.enter(field, p, v, mi.Float(dr.inf))
     start = dr.clip(dr.fma(v, near, p), mi.Vector3f(*field.lower), mi.Vector3f(*field.upper))
     other, slow, _ = tracing.sphere_trace(field, start, v, far - near, near == 0, active)
-    slow = np.where(other, np.array(near + slow), np.inf)
+    slow = np.array(dr.select(other, near + slow, dr.inf))
     assert (np.array(hit.leaving) == within).all() and result[within].all()
     assert np.isclose(t, slow, rtol=0, atol=2e-4).mean() > 0.995
     expected = analytic(o[~within], d[~within])
@@ -92,7 +94,7 @@ def test_sparse_grids_are_traced_where_their_surface_is(mi_rgb, folder, rng):
     assert (np.isfinite(expected) == result[~within]).mean() > 0.995 and both.mean() > 0.3
     assert np.median(np.abs(t[~within][both] - expected[both])) < 1e-3
     where = np.array(hit.p).T[result]
-    assert np.abs(np.array(field.value(mi.Point3f(where.T)))).max() < 5e-5
+    assert np.abs(grids.point_values(field, where)).max() < 5e-5
 
 
 def test_axis_aligned_rays_through_cells(mi_rgb, folder):
@@ -114,9 +116,11 @@ def test_axis_aligned_rays_through_cells(mi_rgb, folder):
                         origin[1:] = at[1:] if offset == 0 else 0
                         side = np.hypot(*[0.5, 0]) if offset else 0.38 + np.sqrt(0.12**2 - at[2] ** 2)
                     o.append(origin), d.append(direction), expected.append(distance - side)
-    t, result = tracing.trace(field, mi.Point3f(np.float32(o).T), mi.Vector3f(np.float32(d).T), dr.inf)
-    assert np.array(result).all()
-    assert np.abs(np.array(t) - expected).max() < 3e-3
+    o, d = (mi.Vector3f(*(mi.Float(aligned(x)) for x in np.transpose(values))) for values in (o, d))
+    hit = tracing.intersect(field, o, d, dr.inf)
+    dr.eval(hit)
+    assert np.array(hit.hit).all()
+    assert np.abs(np.array(hit.t) - expected).max() < 3e-3
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -219,11 +223,11 @@ def test_derivatives_reach_the_nodes(mi_rgb, folder):
     step[:, 0] = 0.02  # spacings
     images = []
     for sign in (1, -1):
-        params[key] = mi.TensorXf(flat + sign * step)
+        params[key] = mi.TensorXf(aligned(flat + sign * step))
         params.update()
         images.append(np.array(mi.render(loaded, spp=16, seed=2, integrator=integrator)))
     differences = (images[0] - images[1]).sum() / 0.04
-    params[key] = mi.TensorXf(flat)
+    params[key] = mi.TensorXf(aligned(flat))
     dr.enable_grad(params[key])
     params.update()
     image = mi.render(loaded, params, spp=16, seed=2, integrator=integrator)

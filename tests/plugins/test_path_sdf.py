@@ -13,10 +13,12 @@ BSDFS = {
 }
 
 
-def scene(mi, shapes: dict, size=(32, 24), view=((0, -5, 2.5), (0, 0, 0)), **more):
-    """Shapes on a floor, with a lamp, a point light and a sky."""
+def scene(mi, shapes: dict, size=(32, 24), view=((0, -5, 2.5), (0, 0, 0)), passes=1, **more):
+    """Shapes on a floor, with a lamp, a point light and a sky; ``passes`` images of one view beside each other."""
     at = mi.ScalarTransform4f
-    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}}
+    film = {"type": "hdrfilm", "width": passes * size[0], "height": size[1], "rfilter": {"type": "box"}}
+    view = {"type": "perspective", "fov": 45, "to_world": at().look_at(*view, [0, 0, 1])}
+    sensor = view if passes == 1 else {"type": "batch", **{f"pass_{i}": dict(view) for i in range(passes)}}
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": 8.0}}
     return mi.load_dict({
         "type": "scene",
@@ -24,13 +26,7 @@ def scene(mi, shapes: dict, size=(32, 24), view=((0, -5, 2.5), (0, 0, 0)), **mor
         "lamp": {"type": "rectangle", "to_world": at().translate([0, 1, 4]).scale([1, 1, -1]), "emitter": lamp},
         "point": {"type": "point", "position": [-3, -2, 1], "intensity": 4.0},
         "sky": {"type": "constant", "radiance": 0.3},
-        "sensor": {
-            "type": "perspective",
-            "fov": 45,
-            "to_world": at().look_at(*view, [0, 0, 1]),
-            "film": film,
-            "sampler": {"type": "independent"},
-        },
+        "sensor": {**sensor, "film": film, "sampler": {"type": "independent"}},
         **shapes,
         **more,
     })  # fmt: skip
@@ -56,9 +52,14 @@ def solid(mi, name, scale=2.5, **more):
     return {"type": "test_solid", "field": name, "to_world": mi.ScalarTransform4f().scale(scale), **more}
 
 
-def same_light(one, other, passes=16):
-    """``one(seed)`` and ``other(seed)`` are images with the same mean, as far as their noise lets one see."""
-    a, b = (np.stack([make(seed) for seed in range(k, k + passes)]) for k, make in ((0, one), (100, other)))
+def same_light(mi, actual: dict, expected: dict, view=((0, -5, 2.5), (0, 0, 0)), passes=16, **options):
+    """
+    Scenes of these shapes, traced by ``path_sdf`` and by ``path``, have images with the same mean, as far as the noise
+    of as many passes, all in one render, lets one see.
+    """
+    a, b = (scene(mi, shapes, view=view, passes=passes) for shapes in (actual, expected))
+    a, b = (render(mi, *v, **options) for v in ((a, "path_sdf", 16, 0), (b, "path", 16, 100)))
+    a, b = (np.stack(np.split(v, passes, axis=1)) for v in (a, b))
     assert np.isfinite(a).all() and np.isfinite(b).all()
     a, b = (np.minimum(v, 20).mean(-1) for v in (a, b))
     a, b = (v.reshape(passes, v.shape[1] // 4, 4, v.shape[2] // 4, 4).mean((2, 4)) for v in (a, b))
@@ -85,10 +86,9 @@ def test_balls_are_spheres(mi_rgb, fields, names):
     mi, (first, second) = mi_rgb, (BSDFS[name] for name in names)
     other = {"other": {"type": "sphere", "center": [1.6, 1.0, -0.4], "radius": 0.6, "bsdf": BSDFS["diffuse"]}}
     beside = {"to_world": mi.ScalarTransform4f().translate([-1.4, -1.2, 0.2]).scale(2.0), "bsdf": second}
-    actual = scene(mi, {"ball": solid(mi, "ball", bsdf=first), "beside": {**solid(mi, "ball"), **beside}, **other})
+    actual = {"ball": solid(mi, "ball", bsdf=first), "beside": {**solid(mi, "ball"), **beside}, **other}
     sphere = {"type": "sphere", "center": [-1.4, -1.2, 0.2], "radius": 0.8, "bsdf": second}
-    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": first}, "beside": sphere, **other})
-    same_light(lambda seed: render(mi, actual, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+    same_light(mi, actual, {"ball": {"type": "sphere", "bsdf": first}, "beside": sphere, **other})
 
 
 def test_several_solids_turned_scaled_and_overlapping(mi_rgb, fields):
@@ -107,8 +107,7 @@ def test_several_solids_turned_scaled_and_overlapping(mi_rgb, fields):
         centre = np.array(turn.matrix)[:3] @ [0.15, 0.1, -0.05, 1]
         radius = 0.3 * np.cbrt(abs(np.linalg.det(np.array(turn.matrix)[:3, :3])))
         spheres[name] = {"type": "sphere", "center": centre.tolist(), "radius": radius, "bsdf": bsdfs[name]}
-    actual, expected = scene(mi, {**solids, **block}), scene(mi, {**spheres, **block})
-    same_light(lambda seed: render(mi, actual, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+    same_light(mi, {**solids, **block}, {**spheres, **block})
 
 
 @pytest.mark.parametrize("place", ["within glass", "behind glass", "in the box"])
@@ -123,20 +122,15 @@ def test_where_the_camera_is(mi_rgb, fields, place):
     pane = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, -2, 0]).scale([1.5, 0.1, 1.5])}
     panes = {"pane": {**pane, "bsdf": BSDFS["glass"]}} if place == "behind glass" else {}
     bsdf = BSDFS["diffuse" if place == "behind glass" else shape]
-    actual = scene(mi, {"ball": solid(mi, "ball", bsdf=bsdf), **panes}, view=view)
-    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": bsdf}, **panes}, view=view)
-    same_light(lambda seed: render(mi, actual, seed=seed), lambda seed: render(mi, expected, "path", seed=seed))
+    actual, expected = {"ball": solid(mi, "ball", bsdf=bsdf)}, {"ball": {"type": "sphere", "bsdf": bsdf}}
+    same_light(mi, {**actual, **panes}, {**expected, **panes}, view)
 
 
 @pytest.mark.parametrize("options", [{"max_depth": 1}, {"max_depth": 2, "hide_emitters": True}, {"rr_depth": 1}])
 def test_depths_and_hidden_emitters(mi_rgb, fields, options):
     mi, view = mi_rgb, ((0, -5, 8.0), (0, 0, 1))
-    actual = scene(mi, {"ball": solid(mi, "ball", bsdf=BSDFS["rough"])}, view=view)
-    expected = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS["rough"]}}, view=view)
-    same_light(
-        lambda seed: render(mi, actual, seed=seed, **options),
-        lambda seed: render(mi, expected, "path", seed=seed, **options),
-    )
+    actual, expected = solid(mi, "ball", bsdf=BSDFS["rough"]), {"type": "sphere", "bsdf": BSDFS["rough"]}
+    same_light(mi, {"ball": actual}, {"ball": expected}, view, **options)
 
 
 def test_solids_are_not_hit_by_other_rays(mi_rgb, fields):
@@ -192,15 +186,15 @@ def interior(mi):
 def both_modes(mi, loaded, ball, depth, spp=64, seed=3):
     """The image's derivative with respect to the radius, and its sum as it comes backward."""
     integrator = mi.load_dict({"type": "path_sdf", "max_depth": depth})
-    ball.r = r = mi.Float(0.4)
+    ball.r = r = dr.opaque(mi.Float, 0.4)
     dr.enable_grad(r)
     dr.set_grad(r, 1.0)
     forward = np.array(integrator.render_forward(loaded, None, spp=spp, seed=seed))
-    ball.r = r = mi.Float(0.4)
+    ball.r = r = dr.opaque(mi.Float, 0.4)
     dr.enable_grad(r)
     integrator.render_backward(loaded, None, dr.ones(mi.TensorXf, forward.shape), spp=spp, seed=seed)
     backward = np.array(dr.grad(r))
-    ball.r = mi.Float(0.4)
+    ball.r = dr.opaque(mi.Float, 0.4)
     assert backward == pytest.approx(forward.sum(), rel=1e-3)
     return forward, backward
 
@@ -214,7 +208,7 @@ def test_derivatives_are_those_of_prb(mi_rgb, fields, name, depth):
     actual, _ = both_modes(mi, loaded, fields["ball"], depth)
     loaded = scene(mi, {"ball": {"type": "sphere", "bsdf": BSDFS[name]}, **other}, **interior(mi))
     params = mi.traverse(loaded)
-    r = mi.Float(0.4)
+    r = dr.opaque(mi.Float, 0.4)
     dr.enable_grad(r)
     params["ball.to_world"] = mi.AffineTransform4f().scale(2.5 * r)
     params.update()
@@ -237,7 +231,7 @@ def test_derivatives_against_differences(mi_rgb, fields):
     integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
     images = []
     for r in (0.399, 0.401):
-        ball.r = mi.Float(r)
+        ball.r = dr.opaque(mi.Float, r)
         images.append(np.array(mi.render(loaded, spp=64, seed=3, integrator=integrator)))
     differences = (images[1] - images[0]) / 2e-3
     forward, _ = both_modes(mi, loaded, ball, 2)

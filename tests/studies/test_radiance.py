@@ -15,6 +15,7 @@ from mi_diffind.measure import benchmark
 from mi_diffind.studies.baselines import node_codes, radiance_factors, radiance_fits
 from mi_diffind.studies.radiance import conclusions
 from mi_diffind.studies.radiance import plan as plans
+from mi_diffind.tasks.radiance import visual_hull
 from mi_diffind.tasks.radiance.nodes import Nodes, cells_of, corners_of
 from mi_diffind.tasks.radiance.training import FieldSession
 from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField
@@ -260,6 +261,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         small = benchmark.BenchmarkSettings(2**10, 2, 1, 2**10, True)
         patch.setattr(benchmark.BenchmarkSettings, "choose", classmethod(lambda cls, variant, quick=False: small))
+        patch.setattr(visual_hull, "SEARCH", 32)
         assert main([*command(folder), "--json", str(folder / "r.json")]) == 0
     return folder
 

@@ -226,6 +226,7 @@ def small(tmp_path, monkeypatch):
     """A material, whose trainings are all one training of :data:`STEPS` steps."""
     import mitsuba as mi
 
+    import mi_diffind.commands.fit  # noqa: F401  (or it would import the replacement, and keep it)
     from mi_diffind import task
 
     mi.set_variant("llvm_ad_rgb")
@@ -253,7 +254,7 @@ def test_what_is_written(small):
     from mi_diffind.studies.texture.test_scenes import still_scenes
 
     folder, requests = small
-    settings = plans.TextureStudySettings("albedo", (12.0,), 3.0, "fast", "fast", (24, 16), (12, 8), 2, 64, 1)
+    settings = plans.TextureStudySettings("albedo", (12.0,), 3.0, "fast", "fast", FILM, FILM, 2, 64, 1)
     path, scenes = folder / "m.json", {"plane": still_scenes()["plane"]}
     plan = plans.plan(load_source(path), str(path), settings, reads=plans.READS[:1], more_reads=(), scenes=scenes)
     result, summary = quick_result(plan, folder / "out")

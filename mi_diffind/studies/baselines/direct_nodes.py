@@ -95,7 +95,7 @@ class DirectCoding(encoding.NodeCoding):
         self._write(nodes, values[:, 0], to_octahedral(values[:, 1:]))
         self._keep_sides(values, nodes)
         for _ in range(encoding.REPAIRS):
-            self._keep_sides(values, self._hold_borders())
+            self._keep_sides(values, self._hold_borders(self._lowest_values(None, None)))
 
     def _write(self, nodes: np.ndarray, distances: np.ndarray, normals: np.ndarray) -> None:
         d = np.floor(distances * (LEVELS / 2 / NEAREST)) + LEVELS // 2

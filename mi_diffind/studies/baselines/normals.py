@@ -24,6 +24,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 
+from ...indirection import aligned_copy
 from ...lookup import clamp
 from ...maps.layout import FROM_NORMAL, Layout, MapLayout
 from ...maps.pyramid import Pyramid, halved, level_sizes
@@ -276,7 +277,7 @@ def bake(pyramid: Pyramid, effects: Effects, pairs: int = PAIRS) -> list[np.ndar
     baked_levels = [np.array(filtered_levels[0])]
     Float, UInt32 = types.Float, types.UInt32
     view_lights, tried = directions(types, pairs), len(TRIED)
-    shares = Float(TRIED.astype(np.float32))
+    shares = Float(aligned_copy(TRIED, np.float32))
     for level, texels in enumerate(pyramid.values[1:], 1):
         rows, columns, _ = texels.shape
         side = _side(level)
@@ -382,7 +383,7 @@ def biased(read: ShadedReader, biases: Sequence[float]) -> ShadedReader:
 
     def at(u, v, level, wi, wo):
         Float = type(u)
-        table = Float(np.append(biases, biases[-1]).astype(np.float32))
+        table = Float(aligned_copy(np.append(biases, biases[-1]), np.float32))
         position = clamp(level, 0.0, float(len(biases) - 1))
         lower = dr.uint32_array_t(Float)(position)
         a, b = dr.gather(Float, table, lower), dr.gather(Float, table, lower + 1)
@@ -399,13 +400,14 @@ def choose_biases(read: ShadedReader, pyramid: Pyramid, effects: Effects, places
     """
     types, chosen = pyramid.types, []
     rng = np.random.default_rng(SEED)
-    numbers = [types.Float(x) for x in rng.random((6, places), dtype=np.float32)]
+    numbers = [types.Float(aligned_copy(x)) for x in rng.random((6, places), dtype=np.float32)]
     u, v = numbers[:2]
     view_light = [uniform_hemisphere(types, numbers[i], numbers[i + 1]) for i in (2, 4)]
     dr.eval(view_light)
     for level in range(min(BIASED, pyramid.levels)):
         detail = dr.opaque(types.Float, level, places)
         truth = dr.clip(reference("converged", pyramid, u, v, detail, *view_light, effects, side=_side(level)), 0, 1)
+        dr.eval(truth)
         errors = []
         for bias in BIASES:
             value = read(u, v, dr.opaque(types.Float, max(level + bias, 0), places), *view_light)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ...indirection import device_array
 from ...tasks.radiance.nodes import Nodes
 from ...tasks.radiance.volume_field import NodeField, NodeVolume, colour_of
 from .node_codes import QuantisationSteps
@@ -72,11 +73,11 @@ class ByteField(NodeVolume):
         self.words = -(-self.channels // 4)
         table = colour if rows is not None else np.pad(colour, ((first, 0), (0, 0)))
         table = np.pad(table, ((0, 0), (0, 4 * self.words - self.channels)))
-        self.table = types.UInt32(np.ascontiguousarray(table).view("<u4").reshape(-1))
+        self.table = device_array(types.UInt32, np.ascontiguousarray(table).view("<u4"))
         self.row_words = self.matrix = None
         if rows is not None:
             numbers = np.pad(rows.astype("<u2"), (first, 0))
-            self.row_words = types.UInt32(np.pad(numbers, (0, len(numbers) % 2)).view("<u4"))
+            self.row_words = device_array(types.UInt32, np.pad(numbers, (0, len(numbers) % 2)).view("<u4"))
         if matrix is not None:
             scaled = np.asarray(matrix, np.float64).copy()
             scaled[-1] += self.colour_steps.low @ scaled[:-1]

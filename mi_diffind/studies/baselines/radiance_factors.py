@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 from drjit import nn
 
+from ...indirection import device_array, device_tensor
 from ...tasks.radiance.nodes import COARSE, FARTHEST, Nodes, cells_of, chessboard_distances, corners_of
 from ...tasks.radiance.volume_field import VolumeField, colour_of, density_of
 from .node_codes import QuantisationSteps, deflated, mask_bytes
@@ -162,10 +163,10 @@ class PlanesFit:
         self.net = {}
         for name, rank in zip(TABLES, ranks, strict=True):
             begin = rng.normal(scale=0.1, size=(rows, rank))
-            self.net[name] = self.types.TensorXf(begin.astype(np.float32))
+            self.net[name] = device_tensor(self.types.TensorXf, begin)
         mean = np.average(grid.colour, axis=0, weights=grid.seen + 1e-9)
         mixed = rng.normal(scale=0.3 / math.sqrt(ranks[1]), size=(3 * ranks[1], 12))
-        self.net["matrix"] = self.types.TensorXf(np.concatenate([mixed, mean[None]]).astype(np.float32))
+        self.net["matrix"] = device_tensor(self.types.TensorXf, np.concatenate([mixed, mean[None]]))
         self.steps = None
 
     def _scaled(self, net, index: int):
@@ -200,11 +201,11 @@ class PlanesFit:
         """Return the field that reads what :meth:`state` returned."""
         nodes = nodes_of(types, state)
         occupancy = Occupancy(nodes)
-        matrix = types.TensorXf(np.ascontiguousarray(state["matrix"], np.float32))
+        matrix = device_tensor(types.TensorXf, state["matrix"])
         steps = [QuantisationSteps(state[f"{n}_low"], state[f"{n}_step"], np.array([256])) for n in TABLES]
         shape, ranks = map(tuple, (state["sides"].tolist(), state["ranks"].tolist()))
         field = PlanesField(nodes, shape, {"matrix": matrix}, ranks, occupancy, steps)
-        field.words = [types.UInt32(np.ascontiguousarray(state[n]).view("<u4").reshape(-1)) for n in TABLES]
+        field.words = [device_array(types.UInt32, np.ascontiguousarray(state[n]).view("<u4")) for n in TABLES]
         field.nbytes = 4 * (sum(map(dr.width, field.words)) + dr.width(matrix)) + occupancy.nbytes
         return field
 
@@ -274,7 +275,7 @@ class HashVolumeFit:
     def field(types, state: dict) -> HashVolumeField:
         """Return the field of what :meth:`state` returned, which computes in single precision."""
         nodes = nodes_of(types, state)
-        arrays = {name: types.TensorXf(state[name].astype(np.float32)) for name in ("entries", "weights")}
+        arrays = {name: device_tensor(types.TensorXf, state[name]) for name in ("entries", "weights")}
         encoding, network = modules(types, int(state["sizes"][0]), float(state["sizes"][1]), 1)
         field = HashVolumeField(nodes, arrays, encoding, network, Occupancy(nodes))
         field.nbytes = state["entries"].nbytes + state["weights"].nbytes + field.occupancy.nbytes

@@ -13,6 +13,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from ...bits import pack_bits
+from ...indirection import device_array, device_tensor
 from ...tasks.radiance.grid import DENSITY_SCALE
 from ...tasks.radiance.march import march, replay
 from ...tasks.radiance.nodes import Nodes, cells_of, corners_of
@@ -140,15 +141,17 @@ class NodesFit:
         padded = [np.pad(steps[1].low, (0, spare)), np.pad(steps[1].step, (0, spare), **ones)]
         self.rounding = QuantisationSteps(*padded, np.pad(steps[1].levels, (0, spare), **ones))
         self.net = {
-            "density": types.TensorXf(np.pad(density, (self.first, 0)).astype(np.float32)[:, None] / DENSITY_SCALE),
-            "colour": types.TensorXf(colour.astype(np.float32)),
+            "density": device_tensor(
+                types.TensorXf, np.pad(density, (self.first, 0)).astype(np.float32)[:, None] / DENSITY_SCALE
+            ),
+            "colour": device_tensor(types.TensorXf, colour),
         }
         if matrix is not None:
             grown = np.insert(matrix, [self.channels] * spare, 0.0, axis=0)
-            self.net["matrix"] = types.TensorXf(grown.astype(np.float32))
+            self.net["matrix"] = device_tensor(types.TensorXf, grown)
         self.numbers = None
         if rows is not None:
-            self.numbers = types.UInt32(np.pad(rows, (self.first, 0)).astype(np.uint32))
+            self.numbers = device_array(types.UInt32, np.pad(rows, (self.first, 0)))
 
     def field_of(self, net) -> CoefficientField:
         """Return the field of the trained parameters, rounded as they are stored."""

@@ -36,6 +36,9 @@ FORMULAS = "formulas"
 #: Presets of ``neural_disney`` that are measured.
 PRESETS = ("tables", "paper")
 
+#: Candidates of a quick study that are rendered, and measured with textured materials.
+QUICK = ("principled", "disney", "tables")
+
 _PRINCIPLED_NOTE = "another model (full Fresnel terms, no flatness without `thin`): no error against this one"
 _FORMULAS_NOTE = "the formulas alone, without a plugin's checks of directions and selection of lobes"
 
@@ -48,14 +51,14 @@ def plan(quick: bool = False) -> Plan:
     if quick:
         combinations = [("constant", "all lobes"), ("textured", "diffuse + specular")]
         for candidate in candidates:
-            candidate.in_passes &= candidate.setting in ("", "float32")
+            candidate.in_passes &= candidate.name in QUICK
     rendered = {c.name: plugins[c.name] for c in candidates if c.in_passes}
     cases = []
     for material, name in combinations:
         parameters = lobes[name]
         names = [*plugins, *([FORMULAS] if material == "constant" and mi.is_rgb else [])]
         if quick and cases:
-            names = ["principled", "disney", "tables"]
+            names = list(QUICK)
         timed = {n: plugins[n] for n in names if n in plugins}
         cases.append(
             Case(

@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 
 from ... import srgb
+from ...indirection import aligned_copy
 from ...maps.pyramid import Pyramid
 from ...measure.flicker import POINTS, MovingView
 from ...tasks.disney.effects import Effects
@@ -50,11 +51,12 @@ class ShadedZoom(MovingView):
         view = np.stack([-x, -y, np.full_like(x, distance)])
         view /= np.linalg.norm(view, axis=0)
         u, v = 0.5 + x * spacing / layout.width, 0.5 + y * spacing / layout.height
-        u, v = (types.Float((a - np.floor(a)).astype(np.float32)) for a in (u, v))
+        u, v = (types.Float(aligned_copy(a - np.floor(a), np.float32)) for a in (u, v))
         light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
         wo = types.Array3f(*(dr.opaque(types.Float, float(c), len(x)) for c in light))
         level = dr.opaque(types.Float, float(np.log2(spacing)), len(x))
-        lanes = (u, v, level, types.Array3f(*(types.Float(c.astype(np.float32)) for c in view)), wo)
+        wi = types.Array3f(*(types.Float(aligned_copy(c, np.float32)) for c in view))
+        lanes = (u, v, level, wi, wo)
         dr.eval(lanes)
         return lanes
 

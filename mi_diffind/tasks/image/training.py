@@ -15,7 +15,7 @@ import numpy as np
 
 from ... import lookup
 from ...fitting import FitResult, Problem
-from ...indirection import rounded, stored_form
+from ...indirection import aligned, aligned_copy, rounded, stored_form
 from ...maps import components
 from ...maps.compressed import decibel
 from ...maps.layout import Layout
@@ -99,8 +99,9 @@ class ImageProblem(Problem):
         self.height, self.width, self.channels = values.shape
         self.texels = self.height * self.width
         stored = lookup.padded_channels(self.channels)
-        padded = np.zeros((self.height, self.width, stored), np.float32)
+        padded = aligned((self.height, self.width, stored), np.float32)
         padded[..., : self.channels] = values
+        padded[..., self.channels :] = 0
         self.values = types.TensorXf(padded)
         self.groups = layout.channels_by_map()
         self.weights = {name: len(channels) / self.channels for name, channels in self.groups.items()}
@@ -123,7 +124,7 @@ class ImageProblem(Problem):
         if size not in self._stretches:
             edges = np.arange(size + 1, dtype=np.uint64) * self.texels // size
             counts = np.maximum(np.diff(edges), 1).astype(np.uint32)
-            self._stretches[size] = UInt32(edges[:-1].astype(np.uint32)), UInt32(counts)
+            self._stretches[size] = UInt32(aligned_copy(edges[:-1], np.uint32)), UInt32(aligned_copy(counts))
         first, count = self._stretches[size]
         return first + dr.minimum(UInt32(rng.random(Float, size) * Float(count)), count - 1)
 
@@ -176,8 +177,9 @@ class ImageProblem(Problem):
             index = self._texel(rng, size)
             x, y = self.types.Float(index % self.width) + 0.5, self.types.Float(index // self.width) + 0.5
             outputs = rounded(net, self.bits)([y / self.height, x / self.width])
-            errors = [dr.mean(dr.square(a - b)) for a, b in zip(outputs, self._texels(index), strict=True)]
-        return {"psnr_db": decibel(sum(float(e[0]) for e in errors) / self.channels)}
+            squares = [dr.square(a - b) for a, b in zip(outputs, self._texels(index), strict=True)]
+            dr.eval(squares)  # one kernel in place of one for each channel
+        return {"psnr_db": decibel(sum(float(dr.mean(s)[0]) for s in squares) / self.channels)}
 
 
 def problem_of(

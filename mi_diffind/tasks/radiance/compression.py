@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...indirection import fold
+from ...indirection import device_array, device_tensor, fold
 from . import grid as grids
 from .grid import NodeGrid
 from .nodes import Nodes
@@ -101,8 +101,9 @@ class PaletteProblem(ImagesProblem):
 
     def __init__(self, coding: PaletteCoding, session: FieldSession):
         types = coding.nodes.types
-        self.coding, self.index = coding, types.UInt32(coding.index)
-        net = {"density": types.TensorXf(coding.levels), "palette": types.TensorXf(np.float32(coding.palette))}
+        self.coding, self.index = coding, device_array(types.UInt32, coding.index)
+        net = {"density": coding.levels, "palette": coding.palette}
+        net = {name: device_tensor(types.TensorXf, values) for name, values in net.items()}
         super().__init__(session, net, self.field_of)
         self._set_range()
 
@@ -126,7 +127,7 @@ class PaletteProblem(ImagesProblem):
         return ""
 
     def _set_range(self) -> None:
-        self.range = [self.session.types.Float(np.float32(v)) for v in byte_range(self.net["palette"].numpy())]
+        self.range = [device_array(self.session.types.Float, v) for v in byte_range(self.net["palette"].numpy())]
 
     def stored(self) -> dict[str, np.ndarray]:
         """Return what is stored: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...indirection import Indirection
+from ...indirection import Indirection, device_array, device_tensor
 from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout
 from .compression import DENSITY_BITS, INDEX_BITS, LAST_LEVEL
 from .nodes import Nodes
@@ -124,7 +124,9 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
     nodes = Nodes(types, settings["lower"], settings["spacing"], settings["shape"], stored_of(table), packed=not floats)
     tensor = types.TensorXf
     if layout == "grid":
-        return NodeField(nodes, tensor(arrays["density"].values[:, 0]), tensor(arrays["colour"].values))
+        return NodeField(
+            nodes, *(device_tensor(tensor, v) for v in (arrays["density"].values[:, 0], arrays["colour"].values))
+        )
     if layout == "pairs":
         allocated = {name: arrays[name].allocate(tensor, storage) for name in PairsField.NAMES}
         density, colour = (
@@ -133,7 +135,8 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
         return PairsField(nodes, density, colour, settings["low"], settings["high"])
     palette, density, index = arrays["palette"], arrays["density"], index_of(table)
     if floats:
-        return NodeField(nodes, tensor(density.values[:, 0]), tensor(palette.values), types.UInt32(index))
+        return NodeField(nodes, *(device_tensor(tensor, v) for v in (density.values[:, 0], palette.values)),
+                         device_array(types.UInt32, index))  # fmt: skip
     stored = {
         "levels": density.entries[:, 0], "density_range": (density.offset[0], density.scale[0]), "index": index,
         "palette": palette.entries, "scale": palette.scale, "offset": palette.offset,

@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 from scipy.ndimage import binary_dilation, map_coordinates
 
+from ...indirection import device_array, device_tensor
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
 from .training import FieldSession, ImagesProblem, ViewImages
@@ -43,7 +44,7 @@ class NodeGrid:
     def field(self) -> NodeField:
         """Return the grid as a field."""
         tensor = self.nodes.types.TensorXf
-        return NodeField(self.nodes, tensor(np.float32(self.density)), tensor(np.float32(self.colour)))
+        return NodeField(self.nodes, *(device_tensor(tensor, values) for values in (self.density, self.colour)))
 
 
 class GridProblem(ImagesProblem):
@@ -55,9 +56,10 @@ class GridProblem(ImagesProblem):
     def __init__(self, grid: NodeGrid, session: FieldSession):
         self.nodes, types = grid.nodes, grid.nodes.types
         tensor = types.TensorXf
-        net = {"density": tensor(np.float32(grid.density / DENSITY_SCALE)), "colour": tensor(np.float32(grid.colour))}
+        net = {"density": grid.density / DENSITY_SCALE, "colour": grid.colour}
+        net = {name: device_tensor(tensor, values) for name, values in net.items()}
         self.count = dr.opaque(types.UInt32, grid.nodes.count)
-        self.neighbours = types.UInt32(neighbours(grid.nodes).reshape(-1))
+        self.neighbours = device_array(types.UInt32, neighbours(grid.nodes))
         super().__init__(session, net, self.field_of)
 
     def field_of(self, net) -> NodeField:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...indirection import device_array
 from ...task import Model
 from .files import field_of
 from .presets import dense_bytes
@@ -83,7 +84,10 @@ class RadianceFieldModel(Model):
                 at = np.roll(place * [1, 1, 1] if sign > 0 else place * [1, 1, -2], axis + 1, axis=1)
                 origins.append(lower + at * (upper - lower))
                 directions.append(np.broadcast_to(sign * np.eye(3)[axis], at.shape))
-        o, d = (self.types.Array3f(np.float32(np.concatenate(v).T)) for v in (origins, directions))
+        o, d = (
+            self.types.Array3f(*(device_array(self.types.Float, x) for x in np.concatenate(v).T))
+            for v in (origins, directions)
+        )
         return count(self.field, o, d, 0, np.inf).asdict()
 
     def measure(self, capture=None):

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
 from ...bits import mask_words
+from ...indirection import device_array
 
 #: Cells along a side of a cell of the coarser grid of distances.
 COARSE = 2
@@ -44,14 +45,14 @@ class Nodes:
         self.index = self.columns = self.filled = self.distances = None
         if stored is not None:
             self.coarse_distances = chessboard_distances(cells_of(stored))
-            self.distances = types.UInt32(nibbles(self.coarse_distances))
+            self.distances = device_array(types.UInt32, nibbles(self.coarse_distances))
             self._coarse = dr.opaque(types.Array3u, self.coarse_distances.shape)
             if packed:
                 filled, columns = column_words(stored)
                 self._columns = dr.opaque(types.UInt32, columns_of(self.shape[2]))
-                self.filled, self.columns = types.UInt32(filled.reshape(-1)), types.UInt32(columns.reshape(-1))
+                self.filled, self.columns = (device_array(types.UInt32, v) for v in (filled, columns))
             else:
-                self.index = types.UInt32(numbered(stored).reshape(-1))
+                self.index = device_array(types.UInt32, numbered(stored))
 
     @property
     def nbytes(self) -> int:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ... import srgb
 from ...fitting import Problem
+from ...indirection import device_array
 from .march import differentiable, march
 from .views import CapturedViews, ViewsError, load_views
 from .volume_field import VolumeField
@@ -28,9 +29,9 @@ class ViewImages:
 
     def __init__(self, types, views: CapturedViews):
         self.types, self.views = types, views
-        self.pixels = types.Float(np.ascontiguousarray(views.images, np.float32).reshape(-1))
+        self.pixels = device_array(types.Float, views.images)
         cameras = np.concatenate([views.poses[:, :3, :].reshape(-1, 12), views.focal, views.centre], axis=1)
-        self.cameras = types.Float(np.ascontiguousarray(cameras, np.float32).reshape(-1))
+        self.cameras = device_array(types.Float, cameras)
 
     def rays(self, view, x, y) -> tuple:
         """Return origins and unit directions of the rays through the centres of pixels."""

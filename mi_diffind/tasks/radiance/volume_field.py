@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 
 from ...bits import as_words, pack_bits
+from ...indirection import device_array, device_tensor
 from .nodes import Nodes
 
 #: Optical depth of a voxel below which its density counts as zero.
@@ -165,7 +166,8 @@ class DenseVolumeField(NodeField):
         colour = np.ascontiguousarray(colour, np.float32)
         nodes = Nodes(types, lower, voxel, density.shape)
         tensor = types.TensorXf
-        super().__init__(nodes, tensor(density.reshape(-1)), tensor(colour.reshape(-1, 12)))
+        values = density.reshape(-1), colour.reshape(-1, 12)
+        super().__init__(nodes, *(device_tensor(tensor, v) for v in values))
 
 
 class PackedPaletteField(NodeVolume):
@@ -183,10 +185,10 @@ class PackedPaletteField(NodeVolume):
         self.density_bits, self.index_bits, self.density_range = density_bits, index_bits, stored["density_range"]
         # Level and index of each node without gaps, and one more word
         joined = stored["levels"].astype(np.uint32) | (stored["index"].astype(np.uint32) << density_bits)
-        self.words = types.UInt32(as_words(pack_bits(joined, density_bits + index_bits), spare=1))
+        self.words = device_array(types.UInt32, as_words(pack_bits(joined, density_bits + index_bits), spare=1))
         entries = np.zeros((len(stored["palette"]), 16), np.uint8)
         entries[:, :12] = stored["palette"]
-        self.palette = types.UInt32(entries.view("<u4").reshape(-1))
+        self.palette = device_array(types.UInt32, entries.view("<u4"))
         self.scale, self.offset = ([float(v) for v in stored[name]] for name in ("scale", "offset"))
 
     @property

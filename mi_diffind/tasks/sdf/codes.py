@@ -153,7 +153,7 @@ def entries(words, offset, step, Float=np.float64):
     """Unpack the entries of words: three arrays; types as in :func:`frames`."""
     parts = words & 1023, words >> 10 & 2047, words >> 21
     fma = _functions(words).fma
-    return [fma(Float(p), float(s), float(o)) for p, s, o in zip(parts, step, offset, strict=True)]
+    return [fma(Float(p), s, o) for p, s, o in zip(parts, step, offset, strict=True)]
 
 
 def pointer_words(pointers: np.ndarray, bits: int) -> np.ndarray:

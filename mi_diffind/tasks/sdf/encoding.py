@@ -151,9 +151,10 @@ class NodeCoding:
         self.entries = self._choose_entries(wanted)
         self.pointers = assign(wanted, self.entries)
         self._keep_sides(wanted, np.arange(len(wanted)))
-        before = None
+        before = lowest = None
         for _ in range(REPAIRS):
-            moved = self._hold_borders()
+            lowest = self._lowest_values(lowest, before)
+            moved = self._hold_borders(lowest)
             if before is not None and np.array_equal(moved, before):  # as far as their blocks let them
                 break
             self._keep_sides(wanted, moved)
@@ -230,14 +231,21 @@ class NodeCoding:
                 axes.append(np.full(len(alone), axis))
         return np.concatenate(cells), np.concatenate(axes)
 
-    def _hold_borders(self) -> np.ndarray:
-        """Raise the smallest distances of nodes at faces through which the surface leaves; return these nodes."""
+    def _lowest_values(self, known: np.ndarray | None, moved: np.ndarray | None) -> np.ndarray:
+        """Return the lowest value of each face of :attr:`_borders`, positive on the side of the face, ``(m,)``.
+
+        With the values that were ``known`` before nodes ``moved``, only those of faces with such a node are computed.
+        """
         cells, axes = self._borders
+        lowest, changed = np.empty(len(cells)), np.arange(len(cells))
+        if known is not None:
+            lowest, some = known.copy(), np.zeros(len(self.side), bool)
+            some[moved] = True
+            changed = np.flatnonzero(some[cells[:, 0]].any(axis=(1, 2)))
         values = self.values().astype(np.float64)
         u = np.linspace(0, 1, 9)
         lines = np.stack([1 - u, u])
-        lowest = np.empty(len(cells))
-        for part in np.array_split(np.arange(len(cells)), max(1, len(cells) // 2**14)):
+        for part in np.array_split(changed, max(1, len(changed) // 2**14)):
             face = cells[part][:, 0]  # (m, 2, 2)
             d, g = values[face, 0], values[face, 1:]
             others = np.array([[1, 2], [0, 2], [0, 1]])[axes[part]]
@@ -250,6 +258,11 @@ class NodeCoding:
                     )
                     total = total + lines[a][:, None] * lines[b] * (d[:, a, b, None, None] + offset)
             lowest[part] = (self.side[face[:, 0, 0], None, None] * total).min(axis=(1, 2))
+        return lowest
+
+    def _hold_borders(self, lowest: np.ndarray) -> np.ndarray:
+        """Raise the smallest distances of nodes at faces whose ``lowest`` value is too low; return these nodes."""
+        cells, _ = self._borders
         broken = lowest < 0.5 * LEAST
         nodes = cells[broken][:, 0].reshape(-1)
         short = np.repeat(LEAST - lowest[broken], 4)

@@ -11,6 +11,7 @@ import math
 import drjit as dr
 import numpy as np
 
+from ...indirection import device_array
 from .distances import Distances
 from .extraction import OFF_NODE, components, march, trimesh_of
 from .field import DistanceField
@@ -39,7 +40,9 @@ class HeldOut:
         near = sample_near(mesh, count, width, seed).astype(np.float32)
         self.inside = distances.inside(near)
         points, self.normals = sample_surface(mesh, count, seed + 1)
-        self.near, self.points = (types.Array3f(*np.ascontiguousarray(v.T, np.float32)) for v in (near, points))
+        self.near, self.points = (
+            types.Array3f(*(device_array(types.Float, column) for column in v.T)) for v in (near, points)
+        )
 
     def measure(self, field) -> dict[str, float]:
         """Return ``agree``, the share of points near the surface whose sign is right, and ``normal_deg``.

@@ -9,6 +9,7 @@ from __future__ import annotations
 from types import ModuleType
 
 import drjit as dr
+import numpy as np
 
 
 class DistanceField:
@@ -16,7 +17,8 @@ class DistanceField:
 
     ``lower`` and ``upper`` are the corners of the field's box; everything beyond it is outside. ``slope`` is a bound
     Λ ≥ |∇f| wherever the field is continuous, ``spacing`` the side of its finest cells, ``band`` the largest distance
-    that it returns. ``types`` is the module of Dr.Jit types to compute with.
+    that it returns. ``types`` is the module of Dr.Jit types to compute with. Kernels read these numbers from the opaque
+    arrays ``box``, ``cell`` (the spacing), ``cells_per_unit`` and ``largest`` (the band).
     """
 
     slope: float = 1.0
@@ -27,6 +29,12 @@ class DistanceField:
         self.types = types
         self.lower, self.upper = tuple(map(float, lower)), tuple(map(float, upper))
         self.spacing, self.band = float(spacing), float(band)
+        # Opaque: fields of other meshes and sizes use the same kernels
+        self.box = tuple(dr.opaque(types.Array3f, corner) for corner in (self.lower, self.upper))
+        self.cell, self.cells_per_unit = (
+            dr.opaque(types.Float, float(v)) for v in (self.spacing, np.float32(1) / np.float32(spacing))
+        )
+        self.largest = dr.opaque(types.Float, self.band)
 
     @property
     def bound(self):
@@ -39,7 +47,7 @@ class DistanceField:
     def inside(self, p):
         """Return whether points lie in the box; false for NaN."""
         x, y, z = p
-        (a, b, c), (d, e, f) = self.lower, self.upper
+        (a, b, c), (d, e, f) = self.box
         return (x >= a) & (x <= d) & (y >= b) & (y <= e) & (z >= c) & (z <= f)
 
     def value(self, p, active=True):

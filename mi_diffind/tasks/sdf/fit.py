@@ -12,6 +12,7 @@ from drjit import nn
 from ... import units
 from ...errors import UsageError
 from ...fitting import Problem
+from ...indirection import device_array, device_tensor
 from ...settings import FittingError
 from ...tables import Table
 from ...task import FitRequest, Fitted
@@ -55,7 +56,7 @@ class SurfaceSampler:
         self.types, self.count = types, len(mesh.faces)
 
         def flat(v):
-            return types.Float(np.ascontiguousarray(v.reshape(-1), np.float32))
+            return device_array(types.Float, v)
 
         corners = mesh.corners
         self.sums = flat(np.cumsum(mesh.areas) / mesh.areas.sum())
@@ -103,7 +104,7 @@ class NodeProblem(Problem):
         self.field, self.types, self.held_out = field, field.types, held_out
         self.surface = SurfaceSampler(mesh, self.types)
         start = np.concatenate([sampled.distances[:, None], sampled.normals], axis=1)
-        self.net = NodeValues(self.types.TensorXf(np.ascontiguousarray(start, np.float32)))
+        self.net = NodeValues(device_tensor(self.types.TensorXf, start))
         self.identity = {"source": mesh.digest, "nodes": len(start), "spacing": field.spacing, "bits": bits}
 
     def loss(self, net, rng, size: int):

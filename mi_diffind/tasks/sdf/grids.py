@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 
 from ...errors import UsageError
+from ...indirection import device_array
 from .field import DistanceField
 from .sampling import CORNERS
 from .structure import BLOCK as NODES
@@ -99,14 +100,23 @@ def node_values(field: DistanceField, lower, spacing: float, shape, where=None) 
     With ``where``, numbers of nodes in that shape, the result is ``(N,)``, otherwise it has the shape.
     """
     t = field.types
+    # Opaque: all grids of all fields use the same kernel
+    first, step = dr.opaque(t.Array3f, list(map(float, lower))), dr.opaque(t.Float, spacing)
+    inverse = dr.opaque(t.Float64, 1 / shape[2]), dr.opaque(t.Float64, 1 / shape[1])
+    sides = dr.opaque(t.Array3u, [int(n) for n in shape])
     count, values = math.prod(shape) if where is None else len(where), [np.zeros(0, np.float32)]
     with dr.suspend_grad():
         for start in range(0, count, CHUNK):
             last = min(start + CHUNK, count)
-            n = dr.arange(t.UInt32, start, last) if where is None else t.UInt32(where[start:last].astype(np.uint32))
-            k, n = n % shape[2], n // shape[2]
-            index = (n // shape[1], n % shape[1], k)
-            p = [dr.fma(t.Float(i), spacing, float(a)) for i, a in zip(index, lower, strict=True)]
+            if where is None:
+                n = dr.arange(t.UInt32, last - start) + dr.opaque(t.UInt32, start)
+            else:
+                n = device_array(t.UInt32, where[start:last])
+            # In double precision, the product is never rounded up to the next whole number
+            rows = t.UInt32((t.Float64(n) + 0.5) * inverse[0])
+            layer = t.UInt32((t.Float64(rows) + 0.5) * inverse[1])
+            index = layer, rows - layer * sides.y, n - rows * sides.z
+            p = [dr.fma(t.Float(i), step, a) for i, a in zip(index, first, strict=True)]
             values.append(field.value(t.Array3f(*p)).numpy())
     return np.concatenate(values).reshape(shape if where is None else count)
 
@@ -245,4 +255,4 @@ def point_values(field: DistanceField, points: np.ndarray) -> np.ndarray:
 
 def point_array(field: DistanceField, points: np.ndarray):
     """Return points ``(N, 3)`` as an ``Array3f`` of the field's types."""
-    return field.types.Array3f(np.ascontiguousarray(points.T, dtype=np.float32))
+    return field.types.Array3f(*(device_array(field.types.Float, column) for column in points.T))

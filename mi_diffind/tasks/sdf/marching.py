@@ -18,6 +18,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
 from ...bits import mask_flags, mask_words
+from ...indirection import device_array
 from . import codes
 from .nodes import CORNERS, MIDDLE, bernstein
 from .structure import ACTIVE, BLOCK, place_of
@@ -167,13 +168,13 @@ class Marcher:
         regions, blocks = empty_space_words(structure, cells)
         masks = np.concatenate([mask_words(cells.crossed), mask_words(cells.inside)], axis=1)
         self.cells, self.beside, self.regions, self.words = (
-            UInt32(np.ascontiguousarray(v, np.uint32).reshape(-1)) for v in (masks, cells.beside, regions, blocks)
+            device_array(UInt32, v) for v in (masks, cells.beside, regions, blocks)
         )
         self.slabs, nodes = None, field.decoded()
         if nodes is not None:
             frames = field.frames()
             slabs = np.stack([frames, slab_words(cells, nodes, frames)], axis=1)
-            self.slabs = UInt32(slabs.reshape(-1))
+            self.slabs = device_array(UInt32, slabs)
 
     @property
     def nbytes(self) -> int:
@@ -190,8 +191,9 @@ class Marcher:
         i, j, k = cell = ray.cell(t)
         types = self.field.types
         UInt32, Int32 = types.UInt32, types.Int32
-        _, ny, nz = self.field.structure.regions.shape
-        region = dr.gather(UInt32, self.regions, UInt32(((i >> 4) * ny + (j >> 4)) * nz + (k >> 4)), active)
+        _, ny, nz = self.field.region_sides
+        number = (UInt32(i >> 4) * ny + UInt32(j >> 4)) * nz + UInt32(k >> 4)
+        region = dr.gather(UInt32, self.regions, number, active)
         wide = region >= EMPTY
         place = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
         word = dr.gather(UInt32, self.words, region * 64 + place, active & ~wide)
@@ -337,7 +339,7 @@ class GridRay:
     """Ray ``o + t·d`` in a grid, with the reciprocals of its direction."""
 
     def __init__(self, field, o, d):
-        self.types, self.last = field.types, [n - 2 for n in field.structure.shape]
+        self.types, self.last = field.types, field.last_cell
         self.o, self.d = list(o), list(d)
         still = [dr.abs(v) < TINY for v in d]
         self.inverse = [dr.rcp(dr.select(s, TINY, v)) for s, v in zip(still, d, strict=True)]

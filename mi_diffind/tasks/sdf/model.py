@@ -9,7 +9,7 @@ import numpy as np
 
 from ...errors import UsageError
 from ...files import replacing
-from ...indirection import Indirection
+from ...indirection import Indirection, device_tensor
 from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout
 from ...task import Model
 from . import codes
@@ -107,7 +107,7 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceFi
     if storage == "float32":
         pointers = codes.pointers_of(words, settings["bits"], structure.nodes)
         nodes = decoded_nodes(structure, frames, entries[pointers])
-        return SparseNodes(types, structure, settings["slope"], nodes=types.TensorXf(nodes))
+        return SparseNodes(types, structure, settings["slope"], nodes=device_tensor(types.TensorXf, nodes))
     return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ...indirection import device_array
 from . import codes
 from .field import DistanceField
 from .structure import ACTIVE, BLOCK, Structure, first_ranks
@@ -47,27 +48,31 @@ class SparseNodes(DistanceField):
         # A region with nodes: its number. Any other: the highest bit, and its sign in the lowest
         regions[~active] |= np.uint32(1 << 31)
         regions[active] = np.arange(active.sum(), dtype=np.uint32)
-        self._regions = UInt32(regions)
+        self._regions = device_array(UInt32, regions)
         masks = np.concatenate([structure.region_masks, structure.region_signs], axis=1)
-        self._region_masks = UInt32(masks.reshape(-1).astype(np.uint32))
-        self._first_blocks = UInt32(first_ranks(structure.region_masks))
+        self._region_masks = device_array(UInt32, masks)
+        self._first_blocks = device_array(UInt32, first_ranks(structure.region_masks))
         words = structure.block_signs.astype(np.uint32) << np.uint32(24) | first_ranks(structure.block_masks)
         frame_words = np.zeros(structure.blocks, np.uint32) if frames is None else frames
         blocks = np.stack([*structure.block_masks.T, words, frame_words], axis=1)
-        self._blocks = UInt32(np.ascontiguousarray(blocks.reshape(-1).astype(np.uint32)))
+        self._blocks = device_array(UInt32, blocks)
         self.nodes = nodes
         self.bits = bits
-        self._pointers = None if pointers is None else UInt32(pointers)
-        self._entries = None if entries is None else UInt32(entries)
+        self._pointers = None if pointers is None else device_array(UInt32, pointers)
+        self._entries = None if entries is None else device_array(UInt32, entries)
         self._affine = None if offset is None else (tuple(map(float, offset)), tuple(map(float, step)))
+        self._scale = self._affine and [dr.opaque(types.Array3f, v) for v in self._affine]
+        # Opaque, like those of the base class: numbers of regions along the axes, and the last cell
+        self.region_sides = dr.opaque(types.Array3u, structure.regions.shape)
+        self.last_cell = dr.opaque(types.Array3i, [n - 2 for n in structure.shape])
 
     def _grid(self, p):
         """Return the cell of points, as whole numbers of its lowest corner, and the place within it."""
         Int32 = self.types.Int32
         cell, place = [], []
-        for x, a, n in zip(p, self.structure.lower, self.structure.shape, strict=True):
-            t = (x - a) / self.spacing
-            i = dr.clip(Int32(dr.floor(dr.detach(t))), 0, n - 2)
+        for x, a, last in zip(p, self.box[0], self.last_cell, strict=True):
+            t = (x - a) * self.cells_per_unit
+            i = dr.clip(Int32(dr.floor(dr.detach(t))), 0, last)
             cell.append(i)
             place.append(t - self.types.Float(i))
         return cell, place
@@ -75,8 +80,8 @@ class SparseNodes(DistanceField):
     def _block(self, i, j, k, active):
         """Return the number of the block of node (i, j, k), whether it has nodes, and its sign if it has none."""
         UInt32 = self.types.UInt32
-        _, ny, nz = self.structure.regions.shape
-        word = dr.gather(UInt32, self._regions, UInt32(((i >> 4) * ny + (j >> 4)) * nz + (k >> 4)), active)
+        _, ny, nz = self.region_sides
+        word = dr.gather(UInt32, self._regions, (UInt32(i >> 4) * ny + UInt32(j >> 4)) * nz + UInt32(k >> 4), active)
         has = active & (word < 2**31)
         masks = dr.gather(dr.uint32_array_t(self.types.Array4f), self._region_masks, word, has)
         bit = UInt32((i >> 2 & 3) * 16 + (j >> 2 & 3) * 4 + (k >> 2 & 3))
@@ -104,7 +109,7 @@ class SparseNodes(DistanceField):
             return distance, gradient
         Float = self.types.Float
         pointer = codes.pointer_at(self._pointers, number, self.bits, active)
-        entry = codes.entries(dr.gather(self.types.UInt32, self._entries, pointer, active), *self._affine, Float)
+        entry = codes.entries(dr.gather(self.types.UInt32, self._entries, pointer, active), *self._scale, Float)
         n, d, scale = codes.frames(record[3], Float)
         offset = [Float(v & 3) - MIDDLE for v in (i, j, k)]
         return codes.decode_nodes(entry, n, d, scale, offset)
@@ -207,12 +212,12 @@ class SparseNodes(DistanceField):
         sign = dr.select(inside, -1.0, 1.0)
         # In a cell that no surface crosses the sign is that of its corners, whatever their extrapolation gives
         short = dr.select(some, dr.minimum(dr.maximum(sign * value, 1e-3), BAND), BAND)
-        value = dr.select(complete, dr.minimum(dr.maximum(value, -BAND), BAND), sign * short) * self.spacing
+        value = dr.select(complete, dr.minimum(dr.maximum(value, -BAND), BAND), sign * short) * self.cell
 
         def vector(v):
             return self.types.Array3f(*(dr.select(active & some, x, 0) for x in v))
 
-        return dr.select(active, value, self.band), vector(slope), vector(smooth)
+        return dr.select(active, value, self.largest), vector(slope), vector(smooth)
 
     def frames(self) -> np.ndarray:
         """Return the words of the blocks' frames, ``(B,)``."""

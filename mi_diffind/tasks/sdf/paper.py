@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from ...errors import UsageError
 from ...fitting import Problem
-from ...indirection import DifferentiableArray, Indirection, ramp, rounded, stored_form
+from ...indirection import DifferentiableArray, Indirection, device_array, ramp, rounded, stored_form
 from ...tables import StoredArray, Table
 from ...task import FitRequest
 from ...units import largest_fitting
@@ -50,15 +50,16 @@ class PairField(DistanceField):
         (primary,) = net.primary
         size = [(b - a) / (n - 1) for a, b, n in zip(lower, upper, primary.resolution, strict=True)]
         super().__init__(types, lower, upper, min(size), band)
-        self.net, self.slope, self._bound = net, float(slope), None
+        self.net, self.slope = net, float(slope)
+        # Opaque, no literal: a new value must not compile the kernels of rays again
+        self._bound = dr.opaque(types.Float, self.slope)
 
     @property
     def bound(self):
-        return self.slope if self._bound is None else self._bound
+        return self._bound
 
     def changed(self):
         self.slope = slope_of(self.net, self.lower, self.upper, self.band)
-        # Opaque, no literal: a new value must not compile the kernels of rays again
         self._bound = dr.opaque(self.types.Float, self.slope)
 
     def value(self, p, active=True):
@@ -180,7 +181,7 @@ class PairProblem(Problem):
         self.field, self.types, self.net = field, field.types, field.net
 
         def flat(v):
-            return self.types.Float(np.ascontiguousarray(v, np.float32))
+            return device_array(self.types.Float, v)
 
         self.points = [flat(v) for v in points.T]
         self.targets = flat(np.clip(distances / field.band, -1, 1) / 2 + 0.5)

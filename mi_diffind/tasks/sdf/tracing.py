@@ -54,7 +54,7 @@ def enter(field, o, d, maxt, active=True):
     """
     Float = field.types.Float
     active = field.types.Bool(active)
-    near, far, active = box_interval(o, d, field.lower, field.upper, Float(0), Float(maxt), active)
+    near, far, active = box_interval(o, d, *field.box, Float(0), Float(maxt), active)
     active &= near <= far  # false for NaN
     return near, far, active
 
@@ -70,13 +70,13 @@ def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
         o, d, maxt = Point(dr.detach(o)), Point(dr.detach(d)), Float(dr.detach(maxt))
         near, far, active = enter(field, o, d, maxt, active)
         # From here on, numbers are small. Rounding must not leave a ray outside of the box
-        start = Point(dr.clip(dr.fma(d, near, o), Point(*field.lower), Point(*field.upper)))
+        start = Point(dr.clip(dr.fma(d, near, o), *field.box))
         length = far - near
         if field.marched:
-            h = field.spacing
-            origin = [(x - a) / h for x, a in zip(start, field.lower, strict=True)]
-            hit, t, leaving = marching.march(marching.marcher_of(field), origin, d, length / h, near == 0, active)
-            t = t * h
+            scale = field.cells_per_unit
+            origin = [(x - a) * scale for x, a in zip(start, field.box[0], strict=True)]
+            hit, t, leaving = marching.march(marching.marcher_of(field), origin, d, length * scale, near == 0, active)
+            t = t * field.cell
         else:
             hit, t, leaving = sphere_trace(field, start, d, length, near == 0, active, exact)
         # A solid that reaches the side of the box ends there
@@ -98,7 +98,7 @@ def sphere_trace(field, start, d, length, fresh, active, exact: bool = True):
         active, hit = Bool(active), Bool(False)
         leaving = Bool(fresh) & (field.value(start, active) < 0)
 
-        reach = RELAXATION * field.spacing
+        reach = RELAXATION * field.cell
         t, safe = Float(0), Float(0)
         low, high = Float(0), Float(dr.inf)  # the last place with the sign at the start, the first one with the other
         low_value, high_value = Float(0), Float(0)

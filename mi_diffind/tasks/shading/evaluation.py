@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 
 from ... import metrics
+from ...indirection import aligned_copy
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.pyramid import Pyramid
 from ..disney.decoder import Decoder
@@ -85,10 +86,10 @@ class ShadedEvaluation:
         u = (np.arange(columns)[None, None, :] + origins[:, 1, None, None]) / whole[1]
         u, v = (np.broadcast_to(x, shape).astype(np.float32).ravel() for x in (u, v))
         numbers = np.array([self.directions[p] for p in pairs], np.float32).repeat(rows * columns, axis=0)
-        a, b, c, d = (types.Float(np.ascontiguousarray(n)) for n in numbers.T)
+        a, b, c, d = (types.Float(aligned_copy(n)) for n in numbers.T)
         wi, wo = uniform_hemisphere(types, a, b), uniform_hemisphere(types, c, d)
         level = dr.opaque(types.Float, level, len(u))
-        lanes = (types.Float(u), types.Float(v), level, wi, wo)
+        lanes = (types.Float(aligned_copy(u)), types.Float(aligned_copy(v)), level, wi, wo)
         dr.eval(lanes)
         return lanes, shape
 

@@ -60,17 +60,18 @@ def _averaged(pattern, pyramid: Pyramid, u, v, level, wi, wo, effects: Effects, 
     types, layout, samples = pyramid.types, pyramid.layout, side * side
     Float, UInt32, size = types.Float, types.UInt32, dr.width(u)
     lane = dr.arange(UInt32, size * samples)
-    # Power of two: shifts and masks in place of divisions
-    shift, mask = round(math.log2(side)), side - 1
+    # Power of two: shifts and masks in place of divisions. Opaque, so that one kernel serves all numbers of samples
+    shift = round(math.log2(side))
     if side != 1 << shift:
         raise ValueError(f"samples along a side: found {side}, allowed are powers of two")
-    place, sample = lane >> (2 * shift), lane & (samples - 1)
+    shift, mask, count, width = (dr.opaque(UInt32, n) for n in (shift, side - 1, samples - 1, side))
+    place, sample, width = lane >> (2 * shift), lane & count, Float(width)
     x, y = Float(sample & mask), Float(sample >> shift)
     x, y = (x + (0.5 if rng is None else rng.random(Float, size * samples)) for x in (x, y))
     u, v, level, wi, wo = (dr.gather(type(a), a, place) for a in (u, v, level, wi, wo))
     extent = dr.exp2(level)
-    u = dr.fma((x / side - 0.5) * extent, 1 / layout.width, u)
-    v = dr.fma((y / side - 0.5) * extent, 1 / layout.height, v)
+    u = dr.fma((x / width - 0.5) * extent, 1 / layout.width, u)
+    v = dr.fma((y / width - 0.5) * extent, 1 / layout.height, v)
     u, v = (_inside(x, border) for x, border in zip((u, v), reversed(pyramid.border), strict=True))
     finer = dr.maximum(level - FINER, 0)
     stored = pyramid.filtered(u, v, finer) if pattern == "prefiltered" else pyramid.stored(u, v)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...compat import module_of
 from ...errors import UsageError
-from ...indirection import DifferentiableArray
+from ...indirection import DifferentiableArray, aligned_copy
 from ...lookup import BORDERS
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
@@ -101,10 +101,12 @@ class CompressedTexture(FilteredMaps):
         if self.types is None:
             return 0.0
         Float, rng = self.types.Float, np.random.default_rng(2023)
-        u, v = (Float(x) for x in rng.random((2, count), dtype=np.float32))
-        level = Float(np.maximum(0, rng.random(count, dtype=np.float32) * 2 - 1) * (self.levels - 1))
+        u, v = rng.random((2, count), dtype=np.float32)
+        level = np.maximum(0, rng.random(count, dtype=np.float32) * 2 - 1) * (self.levels - 1)
+        place = [Float(aligned_copy(x, np.float32)) for x in (u, v, level)]
         with dr.suspend_grad():
-            pairs = zip(self.filtered(u, v, level), pyramid.filtered(u, v, level), strict=True)
+            pairs = [*zip(self.filtered(*place), pyramid.filtered(*place), strict=True)]
+            dr.eval(pairs)  # all channels at once: NumPy asks for one after the other, each a kernel
             return float(np.mean([np.mean((a.numpy() - b.numpy()) ** 2, dtype=np.float64) for a, b in pairs]))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ... import lookup
 from ...fitting import FitResult, Problem
-from ...indirection import unfolded
+from ...indirection import aligned_copy, unfolded
 from ...maps.compressed import decibel
 from ...maps.layout import Layout
 from ...maps.pyramid import Pyramid
@@ -88,7 +88,7 @@ class TextureProblem(Problem):
                 start = int(self.starts[level])
                 parts.append((level * ones, edges[:-1], widths, columns * ones, rows * ones, start * ones))
             merged = (np.concatenate(part).astype(np.uint32) for part in zip(*parts, strict=True))
-            self._stretches = {size: tuple(map(self.types.UInt32, merged))}
+            self._stretches = {size: tuple(self.types.UInt32(aligned_copy(part)) for part in merged)}
             dr.eval(self._stretches)
         return self._stretches[size]
 
@@ -142,15 +142,16 @@ class TextureProblem(Problem):
                 texels = rows * columns
                 count = min(texels, 2**16)
                 index = np.random.default_rng(level).choice(texels, count, replace=False) if count < texels else None
-                index = types.UInt32(np.arange(texels, dtype=np.uint32) if index is None else index.astype(np.uint32))
+                index = types.UInt32(aligned_copy(np.arange(texels) if index is None else index, np.uint32))
                 # Opaque, so that one kernel reads all levels
                 start, rows, columns = (dr.opaque(types.UInt32, int(n)) for n in (self.starts[level], rows, columns))
                 u = (types.Float(index % columns) + 0.5) / types.Float(columns)
                 v = (types.Float(index // columns) + 0.5) / types.Float(rows)
                 actual = net.filtered(u, v, dr.opaque(types.Float, level, count))
                 expected = self.pyramid.texels(index + start)
-                errors = [dr.mean(dr.square(a - b)) for a, b in zip(actual, expected, strict=True)]
-                errors_by_level.append(sum(float(e[0]) for e in errors) / len(errors))
+                squares = [dr.square(a - b) for a, b in zip(actual, expected, strict=True)]
+                dr.eval(squares)  # one kernel in place of one for each channel
+                errors_by_level.append(sum(float(dr.mean(s)[0]) for s in squares) / len(squares))
         decibels = list(map(decibel, errors_by_level))
         return {"psnr_db": decibels[0], "psnr_worst_db": min(decibels)}
 

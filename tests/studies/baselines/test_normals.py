@@ -4,6 +4,7 @@ import disney_formulas
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned, numpy_of
 
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
@@ -45,26 +46,22 @@ def prepared(source, types):
 
 
 def lanes(types, u, v, level, wi=WI, wo=WO):
-    wide = [types.Float(np.asarray(x, np.float32)) for x in np.broadcast_arrays(u, v, level)]
+    wide = [types.Float(aligned(x)) for x in np.broadcast_arrays(u, v, level)]
     ways = []
     for w in (wi, wo):
         w = np.atleast_2d(np.asarray(w, float)).T
         w = np.broadcast_to(w / np.linalg.norm(w, axis=0), (3, dr.width(wide[0])))
-        ways.append(types.Array3f([types.Float(np.ascontiguousarray(c, np.float32)) for c in w]))
+        ways.append(types.Array3f([types.Float(aligned(c)) for c in w]))
     return (*wide, *ways)
-
-
-def values(found):
-    return np.stack([c.numpy() for c in found], axis=-1)
 
 
 def test_flat_normals_change_nothing(types, rng):
     source = material(np.zeros((SIDE, SIDE, 2)))
     pyramid, effects = prepared(source, types)
     place = lanes(types, rng.random(200), rng.random(200), 5 * rng.random(200))
-    expected = values(normals.reader(pyramid, effects)(*place))
+    expected = numpy_of(normals.reader(pyramid, effects)(*place))
     for make in (normals.toksvig, normals.lean):
-        np.testing.assert_allclose(values(make(source, pyramid, effects)(*place)), expected, rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(numpy_of(make(source, pyramid, effects)(*place)), expected, rtol=1e-3, atol=1e-5)
 
 
 def test_level_0_is_the_material(types, rng):
@@ -73,13 +70,13 @@ def test_level_0_is_the_material(types, rng):
     pyramid, effects = prepared(source, types)
     centres = [(rng.integers(0, SIDE, 200) + 0.5) / SIDE for _ in range(2)]
     place = lanes(types, *centres, 0)
-    expected = values(normals.reader(pyramid, effects)(*place))
+    expected = numpy_of(normals.reader(pyramid, effects)(*place))
     for make in (normals.toksvig, normals.lean):
-        np.testing.assert_allclose(values(make(source, pyramid, effects)(*place)), expected, rtol=3e-3, atol=1e-4)
+        np.testing.assert_allclose(numpy_of(make(source, pyramid, effects)(*place)), expected, rtol=3e-3, atol=1e-4)
     coarse = lanes(types, *centres, 3)
-    expected = values(normals.reader(pyramid, effects)(*coarse))
+    expected = numpy_of(normals.reader(pyramid, effects)(*coarse))
     for make in (normals.toksvig, normals.lean):
-        assert np.abs(values(make(source, pyramid, effects)(*coarse)) - expected).mean() > 0.005
+        assert np.abs(numpy_of(make(source, pyramid, effects)(*coarse)) - expected).mean() > 0.005
 
 
 def test_toksvig_of_gaussian_slopes(types, rng):
@@ -103,9 +100,9 @@ def test_lobe_of_slopes_along_one_direction(types, angle):
     ax, ay, s_axis, t_axis = normals.lobe(covariance, alpha**2 * one, *axes)
     assert ax[0] == pytest.approx(np.sqrt(alpha**2 + 2 * variance), rel=1e-4)
     assert ay[0] == pytest.approx(alpha, rel=1e-4)
-    found = values([s_axis.x, s_axis.y, s_axis.z])[0]
+    found = numpy_of([s_axis.x, s_axis.y, s_axis.z])[0]
     assert abs(found @ [c, s, 0]) == pytest.approx(1, abs=1e-4)
-    assert values(dr.cross(s_axis, t_axis))[0] @ [0, 0, 1] == pytest.approx(1, abs=1e-4)
+    assert numpy_of(dr.cross(s_axis, t_axis))[0] @ [0, 0, 1] == pytest.approx(1, abs=1e-4)
 
 
 def test_slopes_about_a_tilted_normal(types, rng):
@@ -126,7 +123,7 @@ def test_slopes_about_a_tilted_normal(types, rng):
     assert [ax[0] ** 2 / 2, ay[0] ** 2 / 2] == pytest.approx(list(large), rel=0.05)
     direction = np.linalg.eigh(expected)[1][:, 1]
     world = direction[0] * s + direction[1] * t
-    assert abs(values([s_axis.x, s_axis.y, s_axis.z])[0] @ world) == pytest.approx(1, abs=5e-3)
+    assert abs(numpy_of([s_axis.x, s_axis.y, s_axis.z])[0] @ world) == pytest.approx(1, abs=5e-3)
 
 
 def test_specular_lobe(types, rng):
@@ -147,7 +144,7 @@ def test_specular_lobe(types, rng):
     _, effects = prepared(material(np.zeros((4, 4, 2)), metallic=1.0), types)
     albedo = types.Array3f([types.Float(c.astype(np.float32)) for c in colour.T])
     alphas = [types.Float(x) for x in (roughness**2 / aspect, roughness**2 * aspect)]
-    found = values(normals.specular(given, albedo, *alphas, a, b, effects))
+    found = numpy_of(normals.specular(given, albedo, *alphas, a, b, effects))
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-5)
 
 
@@ -177,8 +174,8 @@ def test_lean_is_the_mean_of_what_it_filters(types, rng, sigmas):
         local = [np.stack([s @ w, t @ w, n @ w], axis=-1) for w in (wi, o)]
         expected.append(np.pi * np.mean(disney_formulas.brdf(np.ones_like(n), m, *local)[:, 0] * local[1][:, 2]))
     place = lanes(types, np.full(len(wo), 0.5), 0.5, 7, wi, wo)
-    found = values(normals.lean(source, pyramid, effects)(*place))[:, 0]
-    plain = values(normals.reader(pyramid, effects)(*place))[:, 0]
+    found = numpy_of(normals.lean(source, pyramid, effects)(*place))[:, 0]
+    plain = numpy_of(normals.reader(pyramid, effects)(*place))[:, 0]
     error, without = (np.abs(x - expected).mean() / np.mean(expected) for x in (found, plain))
     print(f"LEAN errs by {error:.3f}, filtered parameters by {without:.3f}")
     assert error < 0.1 and error < 0.5 * without
@@ -207,11 +204,11 @@ def test_another_roughness_is_stored(types, rng):
         place = lanes(types, rng.random(20), rng.random(20), 2)[:3]
         before, after = (surface_of(p, p.filtered(*place)) for p in (pyramid, changed))
         np.testing.assert_allclose(after.roughness.numpy(), 0.4, atol=1e-5)
-        np.testing.assert_allclose(values(after.albedo), values(before.albedo), atol=1e-5)
+        np.testing.assert_allclose(numpy_of(after.albedo), numpy_of(before.albedo), atol=1e-5)
         read = normals.roughness_reader(pyramid, effects_of(pyramid.layout)[0], levels)
         also = reader(changed, effects_of(changed.layout)[0])
         place = lanes(types, rng.random(20), rng.random(20), 3 * rng.random(20))
-        np.testing.assert_allclose(values(read(*place)), values(also(*place)), atol=1e-4)
+        np.testing.assert_allclose(numpy_of(read(*place)), numpy_of(also(*place)), atol=1e-4)
 
 
 def test_biases(types, rng):
@@ -220,12 +217,12 @@ def test_biases(types, rng):
     place, finer = (lanes(types, rng.random(50), rng.random(50), level) for level in (2, 1.5))
     finer = (*place[:2], finer[2], *place[3:])
     plain = normals.reader(pyramid, effects)
-    np.testing.assert_array_equal(values(normals.biased(plain, [0] * 5)(*place)), values(plain(*place)))
+    np.testing.assert_array_equal(numpy_of(normals.biased(plain, [0] * 5)(*place)), numpy_of(plain(*place)))
     biased = normals.biased(plain, [0, 0, -0.5, 0, 0])
-    np.testing.assert_allclose(values(biased(*place)), values(plain(*finer)), atol=1e-5)
+    np.testing.assert_allclose(numpy_of(biased(*place)), numpy_of(plain(*finer)), atol=1e-5)
     between = lanes(types, rng.random(50), rng.random(50), 1.5), lanes(types, rng.random(50), rng.random(50), 1.25)
     between = [(*place[:2], lane[2], *place[3:]) for lane in between]
-    np.testing.assert_allclose(values(biased(*between[0])), values(plain(*between[1])), atol=1e-5)
+    np.testing.assert_allclose(numpy_of(biased(*between[0])), numpy_of(plain(*between[1])), atol=1e-5)
 
 
 def test_a_bias_that_is_known_is_found(types, rng):
@@ -252,7 +249,7 @@ def test_moments_of_what_is_interpolated(types, rng, border):
     fine = 16
     x = (np.arange(8 * fine) + 0.5) / (8 * fine)
     v, u = (types.Float(a.ravel().astype(np.float32)) for a in np.meshgrid(x, x, indexing="ij"))
-    read = values(surface_of(pyramid, pyramid.stored(u, v)).normal).reshape(8, fine, 8, fine, 3)
+    read = numpy_of(surface_of(pyramid, pyramid.stored(u, v)).normal).reshape(8, fine, 8, fine, 3)
     b = read[..., :2] / read[..., 2:]
     expected = np.concatenate([b, b**2, b[..., :1] * b[..., 1:]], axis=-1).mean(axis=(1, 3))
     np.testing.assert_allclose(found[..., :5], expected, atol=0.015)
@@ -267,6 +264,6 @@ def test_mean_cosine(types, rng):
     pyramid, effects = prepared(source, types)
     n = normals.unit_normals(source)
     place = lanes(types, [0.5], 0.5, 6, [0, 0, 1], [0, 0, 1])
-    lean, plain = (values(make)[0] for make in (normals.lean(source, pyramid, effects)(*place),
+    lean, plain = (numpy_of(make)[0] for make in (normals.lean(source, pyramid, effects)(*place),
                                                 normals.reader(pyramid, effects)(*place)))  # fmt: skip
     assert lean / plain == pytest.approx(n[..., 2].mean(), rel=0.02) and n[..., 2].mean() < 0.94

@@ -33,7 +33,7 @@ def decoder_of(preset, storage=""):
 def to_drjit(case):
     color, m, wi, wo = case
     material = Material(**{k: ad.Float(aligned(m[k])) for k in PARAMETERS})
-    return material, *(ad.Array3f(v.T.astype(np.float32)) for v in (color, wi, wo))
+    return material, *(ad.Array3f(aligned(v.T)) for v in (color, wi, wo))
 
 
 def shaded(decoder, case, effects=Effects()):  # noqa: B008
@@ -216,7 +216,7 @@ def test_training_distributions(rng):
 @pytest.mark.parametrize("preset", list(LAYOUTS))
 def test_fit_improves_and_is_repeatable(preset, few_samples):
     def run(seed):
-        short = {"steps": 60, "batch": 4096, "measure_every": 30, "seed": seed}
+        short = {"steps": 30, "batch": 4096, "measure_every": 15, "seed": seed}
         return fit_task("disney", preset, "llvm", progress=False, **short).table
 
     layout, decoder = LAYOUTS[preset]

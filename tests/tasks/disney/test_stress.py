@@ -91,7 +91,8 @@ def test_chi2_on_the_sphere(mi_rgb, tmp_path, monkeypatch):
     )
     for angle in (5, 60, 89):
         theta = np.radians(angle)
-        sample, pdf = BSDFAdapter("neural_disney", properties, wi=[float(np.sin(theta)), 0.0, float(np.cos(theta))])
+        wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])  # one kernel for all
+        sample, pdf = BSDFAdapter("neural_disney", properties, wi=wi)
         test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=1_000_000, res=101, ires=64)
         assert test.run(test_count=3, quiet=True), test.messages
 
@@ -271,7 +272,7 @@ def check_equal_to_unculled(mi, rng, form, materials, effects=None):
                 assert near.mean() > 0.998, (what, materials[i])  # but for rounding of directions next to a peak
 
 
-@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.slow)])
 def test_what_is_left_out_changes_nothing(mi_rgb, rng, every):
     found = distinct_effects()
     assert len(found) > 200
@@ -282,7 +283,7 @@ def test_what_is_left_out_changes_nothing(mi_rgb, rng, every):
 def test_what_is_left_out_changes_nothing_in_tables(mi_rgb, rng, form):
     """Some of the sets, since what differs between presets is the factors and not what they are used for."""
     found = list(distinct_effects().items())
-    chosen = [found[i] for i in rng.choice(len(found), 16, replace=False)]
+    chosen = [found[i] for i in rng.choice(len(found), 8, replace=False)]
     check_equal_to_unculled(mi_rgb, rng, form, [m for _, m in chosen], [e for e, _ in chosen])
 
 
@@ -352,10 +353,10 @@ def switch(mi, params, kind, on):
 def test_updated_parameters_show_in_the_next_image(mi_rgb, form, kind):
     """Off, on, off: each image is that of a scene loaded so, and on each sphere it is another."""
     mi = mi_rgb
+    # One after the other: another kernel would be compiled while a second scene is alive
+    images = {on: mi.render(switch_scene(mi, form, kind, on), spp=4).numpy() for on in (False, True)}
     scene = switch_scene(mi, form, kind, False)
-    params, images = mi.traverse(scene), {}
-    for on in (False, True):
-        images[on] = mi.render(switch_scene(mi, form, kind, on), spp=4).numpy()
+    params = mi.traverse(scene)
     for i, name in enumerate(SWITCHES):
         where = np.s_[8 * (i // 3) : 8 * (i // 3) + 8, 8 * (i % 3) : 8 * (i % 3) + 8]
         assert images_differ(images[False], images[True], where), name
@@ -370,6 +371,10 @@ def test_updated_parameters_show_in_frozen_renders(mi_rgb, no_garbage_collection
     that leave nothing out just as well.
     """
     mi = mi_rgb
+    seed = mi.UInt32(0)
+    expected = {
+        on: mi.render(switch_scene(mi, "disney", "number", on), spp=4, seed=seed).numpy() for on in (False, True)
+    }
     scene = switch_scene(mi, "disney", "number", False)
     params = mi.traverse(scene)
 
@@ -377,10 +382,6 @@ def test_updated_parameters_show_in_frozen_renders(mi_rgb, no_garbage_collection
     def frozen(scene, seed):
         return mi.render(scene, spp=4, seed=seed)
 
-    seed = mi.UInt32(0)
-    expected = {
-        on: mi.render(switch_scene(mi, "disney", "number", on), spp=4, seed=seed).numpy() for on in (False, True)
-    }
     for on in (False, False, True, True, False, True):
         switch(mi, params, "number", on)
         assert equal_images(frozen(scene, seed).numpy(), expected[on]), on
@@ -392,9 +393,11 @@ def test_parameters_updated_inside_a_frozen_function(mi_rgb, no_garbage_collecti
     def load(value):
         return sphere_scene(mi, plugin(mi, "disney", {**SWITCHES["clearcoat"][1], "clearcoat": value}))
 
+    seed = mi.UInt32(0)
+    expected = {value: mi.render(load(value), spp=4, seed=seed).numpy() for value in (0.0, 0.5, 0.7, 1.0)}
     scene = load(0.0)
     params = mi.traverse(scene)
-    key, seed = key_of(params, "clearcoat.value"), mi.UInt32(0)
+    key = key_of(params, "clearcoat.value")
 
     @dr.freeze
     def frozen(scene, params, value, seed):
@@ -404,13 +407,13 @@ def test_parameters_updated_inside_a_frozen_function(mi_rgb, no_garbage_collecti
 
     for value in (0.0, 0.0, 0.5, 0.0, 1.0):
         image = frozen(scene, params, dr.opaque(mi.Float, value), seed).numpy()
-        assert equal_images(image, mi.render(load(value), spp=4, seed=seed).numpy()), value
+        assert equal_images(image, expected[value]), value
     # Outside of it again
     for value in (0.0, 0.7):
         params[key] = mi.Float(value)
         params.update()
         image = mi.render(scene, params, spp=4, seed=seed).numpy()
-        assert equal_images(image, mi.render(load(value), spp=4, seed=seed).numpy()), value
+        assert equal_images(image, expected[value]), value
 
 
 def one_value(mi, bsdf, wi, wo, **si_fields):
@@ -533,21 +536,23 @@ def test_a_texture_shared_by_materials(mi_rgb):
         f'<float name="roughness" value="{r}"/><ref name="clearcoat" id="coat"/></bsdf></shape>'
         for x, r in ((-1.5, 0.3), (1.5, 0.6))
     )
-    scenes = [
-        mi.load_string(
+
+    def image(value, update=None):
+        scene = mi.load_string(
             '<scene version="3.0.0"><integrator type="direct"/><sensor type="perspective"><transform '
             'name="to_world"><lookat origin="0,0,9" target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm">'
             '<integer name="width" value="16"/><integer name="height" value="8"/><rfilter type="box"/></film></sensor>'
             '<emitter type="constant"/><texture type="uniform" id="coat">'
-            f'<float name="value" value="{v}"/></texture>{described}</scene>'
+            f'<float name="value" value="{value}"/></texture>{described}</scene>'
         )
-        for v in (0, 1)
-    ]
-    params = mi.traverse(scenes[0])
-    params["coat.value"] = mi.Float(1.0)
-    params.update()
-    images = [mi.render(scene, spp=4).numpy() for scene in scenes]
-    assert equal_images(*images)
+        if update is not None:
+            params = mi.traverse(scene)
+            params["coat.value"] = mi.Float(update)
+            params.update()
+        return mi.render(scene, spp=4).numpy()
+
+    del scene, params
+    assert equal_images(image(0, update=1), image(1))
 
 
 def test_materials_die_with_their_scene(mi_rgb, no_garbage_collection):
@@ -604,7 +609,7 @@ def test_gradients_at_the_ends_against_finite_differences(mi_rgb, rng, form, eve
     si = interactions(mi, vectors(mi, wi[lane]), np.repeat(np.arange(count), n), count)
     values = textured(mi, form, shifted).eval(mi.BSDFContext(), si, vectors(mi, wo[lane])).numpy()
     totals = values.astype(np.float64).sum(axis=0).reshape(len(cases), 3, n)
-    si, wo_ = interactions(mi, vectors(mi, wi)), vectors(mi, wo)
+    si, wo_, zeros = interactions(mi, vectors(mi, wi)), vectors(mi, wo), dr.opaque(mi.Float, 0, n)
     gradients = []
     for i, (name, m, _) in enumerate(cases):
         bsdf = mi.load_dict(plugin(mi, form, m))
@@ -613,9 +618,12 @@ def test_gradients_at_the_ends_against_finite_differences(mi_rgb, rng, form, eve
         dr.enable_grad(params[key])
         if i % 2:
             params.update()
+        # Repeated for each lane: gradients are summed by NumPy and not by a kernel for each
+        params[key] = dr.detach(params[key]) + zeros
+        dr.enable_grad(params[key])
         value = bsdf.eval(mi.BSDFContext(), si, wo_)
         # A tint of nothing may well have no gradient at all
-        dr.backward(dr.sum(value.x + value.y + value.z), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        dr.backward(value.x + value.y + value.z, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         gradients.append(params[key].grad)
     dr.eval(gradients)
     for (name, m, sign), (at, near, far), gradient in zip(cases, totals, gradients, strict=True):
@@ -674,10 +682,11 @@ def test_tables_keep_their_gradients_where_material_is_constant(mi_rgb, rng, for
                 params.update()
             si.uv = mi.Point2f(0.5, 0.5)
             value = bsdf.eval(mi.BSDFContext(), si, wo)
-            dr.backward(dr.sum(value.x + value.y + value.z))
-            gradients.append({key: params[key].grad.numpy() for key in keys})
+            dr.backward(value.x + value.y + value.z)
+            gradients.append({key: params[key].grad for key in keys})
+            dr.eval(gradients)
         for key, expected in gradients[1].items():
-            found = gradients[0][key]
+            found, expected = gradients[0][key].numpy(), expected.numpy()
             assert np.isfinite(found).all() and np.abs(expected).max() > 0, key
             assert np.allclose(found, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max()), key
 
@@ -737,7 +746,7 @@ def optimise(mi, form, steps, start, target):
 
 
 @pytest.mark.parametrize(
-    "form, steps", [("disney", 120), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
+    "form, steps", [("disney", 80), *(pytest.param(f, 500, marks=pytest.mark.slow) for f in FORMS)]
 )
 def test_a_long_optimisation(mi_rgb, form, steps):
     """
@@ -864,7 +873,7 @@ def test_two_hundred_materials(mi_rgb, rng):
     """Materials of all forms with different effects: some of them against scenes in which they are alone."""
     mi, count, columns = mi_rgb, 200, 15
     # Kinds, since each set of effects is code of its own: some of them analytic, some with tables
-    kinds = [(("disney", "disney", "tables", "paper")[i % 4], rng.random(len(SCALARS)) < 0.5) for i in range(20)]
+    kinds = [(("disney", "disney", "tables", "paper")[i % 4], rng.random(len(SCALARS)) < 0.5) for i in range(10)]
     materials = []
     for i in range(count):
         form, on = kinds[i % len(kinds)]
@@ -880,6 +889,7 @@ def test_two_hundred_materials(mi_rgb, rng):
         kernels = {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
         mi.render(scene, spp=4, seed=1).numpy()
         assert {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT} <= kernels
+    del scene  # or the code of its materials would be compiled with that of those that follow
     black = mi.load_dict({"type": "diffuse", "reflectance": 0.0})
     for i in (2, 199):
         alone = [plugin(mi, *materials[i]) if j == i else black for j in range(count)]

@@ -6,6 +6,7 @@ import itertools
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned, numpy_of
 from scipy.ndimage import map_coordinates
 from variants import BACKENDS
 
@@ -68,11 +69,7 @@ def psnr(a, b):
 
 def texel_centres(ad, height, width):
     v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
-    return [ad.Float(x.astype(np.float32).ravel()) for x in (v, u)]
-
-
-def numpy_of(channels):
-    return np.stack([np.asarray(c.numpy()) for c in channels], axis=-1)
+    return [ad.Float(aligned(x.ravel())) for x in (v, u)]
 
 
 # -- initial arrays ---------------------------------------------------------------------------------------------------
@@ -289,7 +286,7 @@ def test_targets_are_bilinear(ad, border, channels):
         for c in range(channels)
     ]
     with dr.suspend_grad():
-        targets = found.target(ad.Float(y.astype(np.float32)), ad.Float(x.astype(np.float32)))
+        targets = found.target(ad.Float(aligned(y)), ad.Float(aligned(x)))
     np.testing.assert_allclose(numpy_of(targets), np.stack(expected, axis=-1), atol=1e-5)
 
 
@@ -354,7 +351,7 @@ def random_net(ad, dims=3, primaries=1, channels=3, low=-1.5, high=2.5):
 
 
 def random_places(ad, count=300):
-    return [ad.Float(x) for x in np.random.default_rng(9).random((2, count), dtype=np.float32)]
+    return [ad.Float(aligned(x)) for x in np.random.default_rng(9).random((2, count), dtype=np.float32)]
 
 
 @pytest.mark.parametrize("bits, dims", [((1,), 3), ((3,), 4), ((6,), 3), ((7,), 4), ((2, 6), 3), ((4, 7), 4)])
@@ -523,7 +520,7 @@ def test_the_quality_between_texels(ad):
         size = ImageBudget(8, 8, 4, 3, 3, 6)
         table, _ = trained(source, size, recipe, border=(border,) * 2)
         u, v = np.random.default_rng(1).random((2, 50_000), dtype=np.float32)
-        read = CompressedImage.of(table, ad.TensorXf).read(ad.Float(u), ad.Float(v))["image"]
+        read = CompressedImage.of(table, ad.TensorXf).read(ad.Float(aligned(u)), ad.Float(aligned(v)))["image"]
         place = [v.astype(np.float64) * 15 - 0.5, u.astype(np.float64) * 13 - 0.5]
         expected = np.stack([map_coordinates(values[..., c], place, order=1, mode=mode) for c in range(3)], axis=-1)
         assert table.measured["psnr_between_db"] == pytest.approx(psnr(numpy_of(read), expected), abs=0.3)
@@ -656,7 +653,7 @@ def test_no_seam(ad):
     t = np.linspace(0, 1, 50, dtype=np.float32)
     for storage in ("uint8", "float32"):
         image = CompressedImage.of(table, ad.TensorXf, storage)
-        read = lambda u, v, image=image: numpy_of(image.read(ad.Float(u), ad.Float(v))["image"])  # noqa: E731
+        read = lambda u, v, image=image: numpy_of(image.read(ad.Float(aligned(u)), ad.Float(aligned(v)))["image"])  # noqa: E731
         for k in (1, -3, 17):
             np.testing.assert_allclose(read(0 * t, t), read(0 * t + k, t), atol=1e-6)
             np.testing.assert_allclose(read(t, 0 * t), read(t, 0 * t + k), atol=1e-6)

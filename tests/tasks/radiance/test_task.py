@@ -39,6 +39,7 @@ def short_grids():
     short = type(grid)(grid.layout, FitSettings(**{**vars(grid.settings), "steps": 60, "batch": 1024}))
     patch.setitem(field_fit.PRESETS, "grid", short)
     patch.setattr(field_fit, "VALUE_STEPS", 20)
+    patch.setattr(visual_hull, "SEARCH", 32)
     yield
     patch.undo()
 
@@ -283,7 +284,8 @@ def test_files_with_a_density_curve_are_refused(folder, tmp_path):
 # -- the parts --------------------------------------------------------------------------------------------------------
 
 
-def test_hull_and_box(folder):
+def test_hull_and_box(folder, monkeypatch):
+    monkeypatch.setattr(visual_hull, "SEARCH", 64)
     views = load_views(folder, "train")
     lower, upper = visual_hull.box_of(views)
     assert np.all(lower < [-0.3, -0.5, -0.5]) and np.all(upper > [0.7, 0.5, 0.5])

@@ -258,7 +258,7 @@ def test_resolutions_that_are_none(resolution):
 def test_grid():
     """The field at its nodes, z first, on cubic cells that begin at the box's lower corner."""
     field = Ball(0.3, (0.1, 0, 0), band=0.2)
-    field.lower, field.upper = (-0.5, -0.4, -0.33), (0.5, 0.4, 0.3)
+    DistanceField.__init__(field, T, (-0.5, -0.4, -0.33), (0.5, 0.4, 0.3), 0.01, 0.2)
     values, lower, upper = grids.grid(field, 50)
     assert values.shape == (32 + 1, 40 + 1, 50 + 1) and values.dtype == np.float32
     assert np.allclose(lower, field.lower) and np.allclose(upper, (0.5, 0.4, 0.31))

@@ -1,10 +1,14 @@
 """Where rays meet a signed distance field, against formulas and a slow march."""
 
+import functools
+
+import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned
 from sdf_fields import Ball, Slab, Steps, TrilinearField, sparse_table, torus
 
-from mi_diffind.tasks.sdf import codes, marching, model, tracing
+from mi_diffind.tasks.sdf import codes, grids, marching, model, tracing
 from mi_diffind.tasks.sdf.nodes import MIDDLE
 
 COUNT = 4096
@@ -21,15 +25,20 @@ def unit(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
+def rays(types, o, d, maxt=np.inf):
+    """Origins, directions and lengths as arrays that are alike in all tests, so that they share kernels."""
+    o, d = np.broadcast_arrays(o, d)
+    maxt = types.Float(aligned(np.broadcast_to(maxt, len(o))))
+    return *(types.Array3f(*(types.Float(aligned(x)) for x in v.T)) for v in (o, d)), maxt
+
+
 def trace(field, o, d, maxt=np.inf):
     """Distances, hits, places and whether the ray came from within, as NumPy arrays."""
-    types = field.types
-    o, d = (types.Array3f(np.array(v, np.float32).T) for v in np.broadcast_arrays(o, d))
-    hit = tracing.intersect(field, o, d, types.Float(maxt))
-    t, is_hit = tracing.trace(field, o, d, types.Float(maxt))
-    assert (np.array(is_hit) == np.array(hit.hit)).all()
-    assert (np.array(tracing.occluded(field, o, d, types.Float(maxt))) == np.array(is_hit)).all()
-    return np.array(t), np.array(is_hit), np.array(hit.p).T, np.array(hit.leaving)
+    ray = rays(field.types, o, d, maxt)
+    hit, occluded = tracing.intersect(field, *ray), tracing.occluded(field, *ray)
+    dr.eval(hit, occluded)  # at once: each result of its own would be another kernel
+    assert (occluded.numpy() == hit.hit.numpy()).all()
+    return hit.t.numpy(), hit.hit.numpy(), hit.p.numpy().T, hit.leaving.numpy()
 
 
 def sphere(o, d, r):
@@ -94,8 +103,12 @@ def test_from_a_thousand_times_its_size(types, rng):
 def test_length_of_rays(types):
     """A ray ends where it is said to end: before the surface it finds nothing."""
     o, d = np.array([[0, 0, -2.0]] * 4), np.array([[0, 0, 1.0]] * 4)
-    _, is_hit, _, _ = trace(Ball(types), o, d, np.array([1.0, 1.599, 1.601, 9], np.float32))
+    maxt = np.array([1.0, 1.599, 1.601, 9], np.float32)
+    t, is_hit, _, _ = trace(Ball(types), o, d, maxt)
     assert is_hit.tolist() == [False, False, True, True]
+    short = tracing.trace(Ball(types), *rays(types, o, d, maxt))
+    dr.eval(short)
+    assert np.array_equal(short[0].numpy(), t) and np.array_equal(short[1].numpy(), is_hit)
 
 
 def test_what_is_no_ray_ends(types):
@@ -154,7 +167,7 @@ def test_grids_against_a_slow_march(types, rng):
     t, is_hit, _, _ = trace(field, o, d)
     steps = np.arange(0, 2, 2e-4, dtype=np.float32)
     p = (o[:, None] + steps[None, :, None] * d[:, None]).reshape(-1, 3).astype(np.float32)
-    inside = np.array(field.value(types.Array3f(p.T)) < 0).reshape(count, -1)
+    inside = (grids.point_values(field, p) < 0).reshape(count, -1)
     first = np.where(inside.any(1), steps[inside.argmax(1)], np.inf)
     agree = np.isclose(t, first, rtol=0, atol=4e-4)
     # A ray may touch a bump for less than a step, which either of the two may see
@@ -168,11 +181,15 @@ def shell(p):
     return np.abs(r[:, 0] - 0.4) - 0.016, p / np.maximum(r, 1e-9) * np.sign(r - 0.4)
 
 
-@pytest.fixture(params=[(torus, 4), (torus, 8), (shell, 8)], ids=lambda v: f"{v[0].__name__}-{v[1]}")
+@functools.cache
+def table_of(shape, entries):
+    return sparse_table(shape, entries=entries)
+
+
+@pytest.fixture(params=[(torus, 16), (torus, 256), (shell, 256)], ids=lambda v: f"{v[0].__name__}-{v[1]}")
 def coded(types, request):
     """The sparse field of a torus, well coded or badly, and of a thin wall."""
-    shape, bits = request.param
-    return model.field_of(sparse_table(shape, bits=bits), {}, types)
+    return model.field_of(table_of(*request.param), {}, types)
 
 
 def test_signs_beyond_slabs(coded, rng):
@@ -186,7 +203,7 @@ def test_signs_beyond_slabs(coded, rng):
     block = rng.choice(np.flatnonzero(full), 50 * COUNT)
     place = rng.uniform(0, 4, (len(block), 3))
     p = np.array(structure.lower) + structure.spacing * (structure.block_positions()[block] + place)
-    inside = np.array(coded.value(coded.types.Array3f(p.T.astype(np.float32)))) < 0
+    inside = grids.point_values(coded, p) < 0
     height = middles[block] + np.sum(normals[block] * (place - MIDDLE), axis=1)
     above, below = height > high[block], height < low[block]
     assert not inside[above].any() and inside[below].all()
@@ -236,11 +253,12 @@ def test_rays_along_the_plane_of_a_block(coded, rng):
     aside = unit(np.cross(normals[block], rng.normal(size=(COUNT, 3))))
     middle = structure.block_positions()[block] + MIDDLE
     height = rng.uniform(-4, 4, COUNT) - middles[block]
-    o = types.Array3f((middle + height[:, None] * normals[block]).T.astype(np.float32))
-    ray = marching.GridRay(coded, o, types.Array3f(aside.T.astype(np.float32)))
-    number, t = types.UInt32(block.astype(np.uint32)), types.Float(0)
-    cell = [types.Int32(v) for v in (structure.block_positions()[block].T + 1).astype(np.int32)]
+    o, aside, _ = rays(types, middle + height[:, None] * normals[block], aside)
+    ray = marching.GridRay(coded, o, aside)
+    number, t = types.UInt32(aligned(block, np.uint32)), types.Float(0)
+    cell = [types.Int32(aligned(v, np.int32)) for v in structure.block_positions()[block].T + 1]
     first, last, below = marcher.slab(ray, t, number, cell, True)
+    dr.eval(first, last, below)
     assert np.abs(np.array(first)).max() < 2**31 and np.abs(np.array(last)).max() < 2**31
     low = (np.array(marcher.slabs)[1::2] & 0xFFFF)[block] * (2 * marching.SLAB / marching.STEPS) - marching.SLAB
     off = (np.array(first) > 0) | (np.array(last) < 0)

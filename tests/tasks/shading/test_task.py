@@ -9,6 +9,7 @@ import re
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import numpy_of
 
 from mi_diffind.cli import main
 from mi_diffind.errors import UsageError
@@ -56,10 +57,6 @@ def pyramid_of(maps, ad):
 def directions(ad, rng, n):
     u = [ad.Float(x) for x in rng.random((4, n), dtype=np.float32)]
     return uniform_hemisphere(ad, u[0], u[1]), uniform_hemisphere(ad, u[2], u[3])
-
-
-def numpy_of(value) -> np.ndarray:
-    return np.stack([c.numpy() for c in value], axis=-1).astype(np.float64)
 
 
 # -- limited derivatives ----------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ import dataclasses
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned, numpy_of
 
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
@@ -78,18 +79,18 @@ def test_reading_against_numpy(table):
     cascaded = texture.arrays["cascaded"]
     rng = np.random.default_rng(1)
     for level in (0.0, 1.0, 1.25, 2.0):
-        u, v = rng.random((2, 40)).astype(np.float32)
+        u, v = aligned(rng.random((2, 40)))
         fine = np.stack([page_read(table, "level0", 64, *p) for p in zip(u, v, strict=True)])
         coarse = np.stack([page_read(table, "level2", 16, *p) for p in zip(u, v, strict=True)])
         share = min(max(level - 1, 0), 1)
         pointer = (1 - share) * fine + share * coarse
-        expected = cascaded([TYPES.Float(level / 4), *(TYPES.Float(p) for p in pointer.T)])
-        got = texture.filtered(TYPES.Float(u), TYPES.Float(v), TYPES.Float(level))
-        for a, b in zip(got, expected, strict=True):
-            np.testing.assert_allclose(a.numpy(), b.numpy(), atol=2e-3)
+        place = [np.full(40, level / 4), *pointer.T]
+        expected = numpy_of(cascaded([TYPES.Float(aligned(x)) for x in place]))
+        u, v, levels = (TYPES.Float(aligned(x)) for x in (u, v, np.full(40, level)))
+        got = numpy_of(texture.filtered(u, v, levels))
+        np.testing.assert_allclose(got, expected, atol=2e-3)
         if level == 0:
-            stored = texture.stored(TYPES.Float(u), TYPES.Float(v))
-            np.testing.assert_allclose([s.numpy() for s in stored], [g.numpy() for g in got], atol=1e-5)
+            np.testing.assert_allclose(numpy_of(texture.stored(u, v)), got, atol=1e-5)
 
 
 def test_levels_are_continuous_and_any_is_allowed(table):
@@ -97,7 +98,8 @@ def test_levels_are_continuous_and_any_is_allowed(table):
     u, v = np.random.default_rng(2).random((2, 64)).astype(np.float32)
 
     def read(level):
-        return np.stack([c.numpy() for c in texture.filtered(TYPES.Float(u), TYPES.Float(v), TYPES.Float(level))])
+        levels = TYPES.Float(aligned(np.full(64, level)))
+        return numpy_of(texture.filtered(TYPES.Float(aligned(u)), TYPES.Float(aligned(v)), levels))
 
     for level in (1, 2, 3, 4, 5):
         np.testing.assert_allclose(read(level - 1e-4), read(level + 1e-4), atol=2e-3)
@@ -108,10 +110,10 @@ def test_levels_are_continuous_and_any_is_allowed(table):
 
 def test_gradients_reach_every_array(table):
     texture = CompressedTexture.of(table, TYPES.TensorXf, "float32")
-    u, v = (TYPES.Float(x.astype(np.float32)) for x in np.random.default_rng(3).random((2, 4096)))
+    u, v = (TYPES.Float(aligned(x)) for x in np.random.default_rng(3).random((2, 4096)))
     data = [array.data for array in texture.arrays.values()]
     dr.enable_grad(*data, u, v)
-    dr.backward(sum(texture.filtered(u, v, TYPES.Float(np.linspace(0, 6, 4096)))))
+    dr.backward(sum(texture.filtered(u, v, TYPES.Float(aligned(np.linspace(0, 6, 4096))))))
     for value in (*(d.array for d in map(dr.grad, data)), dr.grad(u), dr.grad(v)):
         found = value.numpy()
         assert np.isfinite(found).all() and np.abs(found).max() > 0

@@ -9,6 +9,7 @@ import re
 import drjit as dr
 import numpy as np
 import pytest
+from arrays import aligned, numpy_of
 
 from mi_diffind.cli import main
 from mi_diffind.errors import UsageError
@@ -80,14 +81,10 @@ def texture_of(source, steps=2, fine="0:1:2,1:2:4", skip=2, storage="", **reques
     return CompressedTexture.of(table, array_module("llvm").TensorXf, storage), table
 
 
-def numpy_of(channels) -> np.ndarray:
-    return np.stack([np.asarray(c.numpy(), np.float64) for c in channels], axis=-1)
-
-
 def read(texture, u, v, level) -> np.ndarray:
     Float = texture.types.Float
-    u, v, level = np.broadcast_arrays(*(np.float32(x) for x in (u, v, level)))
-    return numpy_of(texture.filtered(Float(u), Float(v), Float(level)))
+    u, v, level = (Float(aligned(x)) for x in np.broadcast_arrays(*np.atleast_1d(u, v, level)))
+    return numpy_of(texture.filtered(u, v, level))
 
 
 # -- equations --------------------------------------------------------------------------------------------------------
@@ -263,7 +260,7 @@ def test_level_0_is_what_stored_says(made, rng):
     u, v = 3 * rng.random((2, 500), dtype=np.float32) - 1
     for texture in made[1:3]:
         Float = texture.types.Float
-        stored = numpy_of(texture.stored(Float(u), Float(v)))
+        stored = numpy_of(texture.stored(Float(aligned(u)), Float(aligned(v))))
         np.testing.assert_allclose(read(texture, u, v, 0), stored, atol=1e-4)
     np.testing.assert_allclose(read(made[1], u, v, 1.3), read(made[2], u, v, 1.3), atol=2e-3)  # bytes and floats
 
@@ -308,8 +305,8 @@ def test_borders(made, rng):
 def test_gradients_are_finite(made, rng):
     _, _, texture, _ = made
     types = texture.types
-    u, v = (types.Float(x) for x in rng.random((2, 400), dtype=np.float32))
-    level = types.Float(rng.uniform(0, texture.levels - 1, 400).astype(np.float32))
+    u, v = (types.Float(aligned(x)) for x in rng.random((2, 400)))
+    level = types.Float(aligned(rng.uniform(0, texture.levels - 1, 400)))
     level[0], u[1] = 0, 0
     dr.enable_grad(u, v, level, [a.data for a in texture.arrays.values()])
     dr.backward(sum(texture.filtered(u, v, level), types.Float(0)))
@@ -319,7 +316,7 @@ def test_gradients_are_finite(made, rng):
     # Along u: against finite differences at places where it is smooth
     eps = 1e-3
     with dr.suspend_grad():
-        high, low = (sum(texture.filtered(u + e, v, level), types.Float(0)).numpy() for e in (eps, -eps))
+        high, low = (sum(texture.filtered(u + dr.opaque(types.Float, e), v, level)).numpy() for e in (eps, -eps))
     slope = (high - low) / (2 * eps)
     assert np.median(np.abs(slope - dr.grad(u).numpy())) < 0.1 * np.median(np.abs(slope))
     dr.disable_grad([a.data for a in texture.arrays.values()])
@@ -330,8 +327,7 @@ def test_masked_lanes_read_nothing(made):
     for t in (texture, single):
         types = t.types
         places = [types.Float([0.2, 0.7]), types.Float([0.1, 0.9]), types.Float([0.5, 2])]
-        all_of_them = numpy_of(t.filtered(*places))
-        some = numpy_of(t.filtered(*places, active=types.Bool([True, False])))
+        all_of_them, some = (numpy_of(t.filtered(*places, active=types.Bool([True, a]))) for a in (True, False))
         np.testing.assert_array_equal(some[0], all_of_them[0])
         assert np.isfinite(some).all()
 
@@ -398,12 +394,13 @@ def test_the_papers_arrays(samples, tmp_path, ad, rng):
     assert table.arrays["primary0"].shape[-1] == 3 and table.arrays["primary1"].shape == (4 * size.lods, 1)
     assert table.arrays["cascaded"].shape == (size.lods, *[size.cascaded] * 3, 5) and table.nbytes == size.nbytes
     save_table(tmp_path / "t.npz", table)
-    u, v = (ad.Float(x) for x in rng.random((2, 100), dtype=np.float32))
+    u, v = (ad.Float(aligned(x)) for x in rng.random((2, 100)))
     for storage in ("", "float32"):
         texture = CompressedTexture.of(TASK.load(tmp_path / "t.npz"), ad.TensorXf, storage)
         stored = numpy_of(texture.stored(u, v))
-        np.testing.assert_allclose(stored, numpy_of(texture.filtered(u, v, ad.Float(0))), atol=1e-4)
-        assert np.abs(stored - numpy_of(texture.filtered(u, v, ad.Float(4)))).max() > 0
+        first, last = (numpy_of(texture.filtered(u, v, dr.opaque(ad.Float, level, 100))) for level in (0, 4))
+        np.testing.assert_allclose(stored, first, atol=1e-4)
+        assert np.abs(stored - last).max() > 0
         assert np.isfinite(read(texture, 0.3, 0.4, np.float32([np.nan, np.inf, -np.inf, 77]))).all()
 
 

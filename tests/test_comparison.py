@@ -1,0 +1,125 @@
+"""Comparisons of scenes: the noise in an error, the worst place, the truths, and refusals to state a time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_diffind import comparison, metrics
+
+ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
+
+
+def halves(rng, mean, shared, deviation, samples):
+    """Sums of the samples of each half: an image, noise that both sides share, and noise of one side."""
+    return [n * mean + np.sqrt(n) * s + np.sqrt(n) * rng.normal(0, deviation, mean.shape)
+            for n, s in zip(samples, shared, strict=True)]  # fmt: skip
+
+
+@pytest.mark.parametrize("samples", [[32, 32], [48, 16]])
+@pytest.mark.parametrize("bias", [0.0, 0.01])
+def test_noise_of_a_difference(rng, samples, bias):
+    """Of known parts: 0.1 a sample on each side makes sqrt(2/64) 0.1; what both sides share is no error at all."""
+    mean = rng.uniform(0.3, 0.6, (80, 60, 3))
+    shared = [rng.normal(0, 0.3, mean.shape) for _ in samples]
+    written = halves(rng, mean + bias, shared, 0.1, samples)
+    truth = halves(rng, mean, shared, 0.1, samples)
+    found = comparison.noise(written, truth, samples)
+    assert found["noise_db"] == pytest.approx(-10 * np.log10(2 * 0.1**2 / sum(samples)), abs=0.15)
+    if bias:
+        assert found["psnr_without_noise_db"] == pytest.approx(-20 * np.log10(bias), abs=0.3)
+    else:
+        assert found["psnr_without_noise_db"] is None
+    # Together they are the error of the image, since no mean leaves [0, 1]
+    parts = 10 ** (-found["noise_db"] / 10) + bias**2
+    assert metrics.psnr(sum(truth) / 64, sum(written) / 64) == pytest.approx(-10 * np.log10(parts), abs=0.15)
+
+
+def test_noise_where_nothing_is_random_or_visible(rng):
+    mean = rng.uniform(0.3, 0.6, (8, 8, 3))
+    still = comparison.noise([4 * mean, 4 * mean], [4 * mean - 0.04, 4 * mean - 0.04], [4, 4])
+    assert still["noise_db"] > 200 and still["psnr_without_noise_db"] == pytest.approx(40)
+    bright = [rng.uniform(2, 3, (8, 8, 3)) for _ in range(4)]
+    assert comparison.noise(bright[:2], bright[2:], [1, 1]) == {"noise_db": np.inf, "psnr_without_noise_db": np.inf}
+    assert set(comparison.noise([mean, 0], [mean, 0], [1, 0]).values()) == {None}
+
+
+@pytest.mark.parametrize("shape", [(40, 90), (5, 30), (8, 8)])
+def test_worst_window(rng, shape):
+    error = rng.random(shape) ** 20
+    x, y, width, height = comparison.worst_window(error)
+    assert (width, height) == (min(shape[1], max(8, round(shape[1] / 8))), min(shape[0], 8))
+    windows = np.lib.stride_tricks.sliding_window_view(error, (height, width)).mean(axis=(-1, -2))
+    assert windows[y, x] == pytest.approx(windows.max())
+
+
+TEXTURED = """
+<scene version="3.0.0">
+    <integrator type="direct"/>
+    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="24"/>
+        <integer name="height" value="16"/><rfilter type="box"/></film>
+        <transform name="to_world"><lookat origin="0,-2,0.4" target="0,0,0" up="0,0,1"/></transform></sensor>
+    <emitter type="constant"/>
+    <shape type="rectangle"><transform name="to_world"><scale value="9"/></transform>
+        <bsdf type="neural_disney"><texture name="base_color" type="neural_texture">
+            <string name="filename" value="FILE"/><string name="channels" value="albedo"/></texture></bsdf></shape>
+</scene>
+"""
+
+
+def test_a_filtered_texture_has_two_truths(mi_rgb, tmp_path):
+    """The mip map at equal samples and the bitmap at eight times as many; other learned plugins are exact in both."""
+    from mi_diffind import scenes
+
+    path = tmp_path / "scene.xml"
+    path.write_text(TEXTURED.replace("FILE", str(ASSETS / "tiles_filtered.npz")))
+    first = comparison.compare(path, spp=8, passes=2, progress=False)
+    (second,) = first.further
+    assert [comparison.truth_label(one.figures) for one in (first, second)] == [
+        "mipmap (disney, mipmap), 8 spp", "exact (disney, bitmap), 64 spp",
+    ]  # fmt: skip
+    exact = scenes.load(path, exact=True)
+    np.testing.assert_allclose(second.reference, scenes.render(exact, 2048)[0], atol=0.15)
+    assert second.figures["noise_db"] < first.figures["noise_db"]  # other random numbers: all of the noise is there
+    text = comparison.summary(first)
+    assert "against     mipmap (disney, mipmap), 8 spp" in text
+    assert "against     exact (disney, bitmap), 64 spp" in text
+    paths = comparison.write(first, tmp_path / "out")
+    assert sorted(paths) == ["error_exact", "error_mipmap", "exact", "figure", "mipmap", "written"]
+    alone = comparison.compare(path, spp=2, passes=1, progress=False, against="mipmap")
+    assert alone.figures["counterparts"] == ["mipmap"] and alone.further == ()
+    assert alone.figures["replaced_plugins"] == 1 and alone.figures["passes"] == 2
+
+
+def side(seconds, compiled):
+    it = comparison._Side(None)
+    it.seconds, it.compiled = seconds, compiled
+    return it
+
+
+@pytest.mark.parametrize(
+    "written, compiled, lines",
+    [
+        ([9, 1.1, 1.2, 1.3, 1.4, 1.5], [1], [
+            "time        1.30 times that of exact at 8 spp (1 s a pass)",
+            "            median of 5 pairs of passes, quartiles 1.20 to 1.40",
+        ]),
+        ([9, 1.2], [1], [
+            "time        not measured: 1 pair of passes without compilation,",
+            "            3 are needed (--passes)",
+        ]),
+        ([9, 1.2, 1.4, 1.3], [1, 0, 1], [
+            "time        not measured: 2 pairs of passes without compilation,",
+            "            3 are needed (--passes)",
+        ]),
+        ([9, 40, 126, 200], [1], ["time        not measurable here: quartiles 83.00 to 163.00 of 3 pairs of passes"]),
+    ],
+)  # fmt: skip
+def test_times_that_say_nothing_are_refused(written, compiled, lines):
+    """Compilation on one side only, too few pairs, and quartiles as wide as their median."""
+    count = len(written)
+    flags = [bool(i < len(compiled) and compiled[i]) for i in range(count)]
+    times = comparison._times(side(written, flags), side([1.0] * count, [False] * count), "exact")
+    assert (times["time_ratio"]["median"] is None) == ("not" in lines[0])
+    assert times["seconds_first_pass"] == {"written": 9, "exact": 1.0}
+    assert comparison._time_lines({**times, "against": "exact", "spp": 8}) == lines
