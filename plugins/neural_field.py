@@ -18,6 +18,7 @@ from .path_footprint import relative
 from .support import distance_shapes as sdf
 from .support import omissions, properties
 from .support.differentials import Differentials
+from .support.manual import shared_parts
 from .support.placed_fields import PlacedField, VariantLight, to_grid
 
 #: Properties that the default integrator of surfaces takes.
@@ -106,7 +107,10 @@ emitters; any other inner integrator is constant, and so is the geometry.
 
 The base classes of Mitsuba write an alpha of 0 or 1, and they fail with AOVs in the backward pass, since they multiply
 AOVs, which are numbers, by the weight of the ray, which is a spectrum. This integrator has render passes of its
-own. Inside another integrator, such as :monosp:`aov`, alpha is 0 or 1.
+own. Inside another integrator, such as :monosp:`aov`, alpha is 0 or 1. If :monosp:`mi.render` is given an integrator
+without a field for a scene with one, it warns once.
+
+{executable}
 
 .. tabs::
     .. code-tab:: xml
@@ -214,6 +218,7 @@ def with_holes(scene: mi.Scene) -> list[str]:
 def integrator() -> type:
     """Return the class of the plugin in the current variant."""
 
+    @shared_parts
     class NeuralField(compat.replay_integrator()):
         __doc__ = MANUAL
 

@@ -65,6 +65,8 @@ class NeuralTexture(FilteredTexture):
 
     {gradient}
 
+    {executable}
+
     .. tabs::
         .. code-tab:: xml
             :name: neural_texture

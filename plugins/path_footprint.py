@@ -12,6 +12,7 @@ from mi_diffind import compat
 from . import Plugin
 from .support import footprint, omissions
 from .support.differentials import Differentials
+from .support.manual import shared_parts
 
 #: ``max_depth`` where there is no limit.
 INFINITE = 0xFFFFFFFF
@@ -67,6 +68,8 @@ Replay Backpropagation*, SIGGRAPH 2021). This includes smooth mirrors, except fo
 is sampled. Footprints and geometry are constants: for derivatives of shapes, use :monosp:`prb_projective`. Polarised
 variants are not supported.
 
+{executable}
+
 .. tabs::
     .. code-tab:: xml
         :name: path_footprint
@@ -113,6 +116,7 @@ def relative(value):
 def integrator() -> type:
     """Return the class for the variant that is set; its base class exists only after Mitsuba loaded this file."""
 
+    @shared_parts
     class PathFootprint(compat.replay_integrator()):
         __doc__ = MANUAL
 
