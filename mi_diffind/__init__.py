@@ -18,8 +18,20 @@ _here = _Path(__file__).resolve().parent
 if not (_here / "plugins").is_dir():  # a checkout has the folder `plugins` beside this one, an installation inside
     __path__.append(str(_here.parent))
 
-#: Name → module that holds it.
+#: Public name → the module that holds it, and its name there if it is another one.
 _NAMES = {
+    # Training, table files
+    "fit": "task",
+    "open": "task:open_model",
+    "save": "saving",
+    "from_arrays": "maps.source",
+    # Scenes
+    "load_file": "scenes",
+    "load_dict": "scenes",
+    "load_string": "scenes",
+    "attach": "scenes",
+    "render": "rendering",
+    # Building blocks of other networks
     "DifferentiableArray": "indirection",
     "Indirection": "indirection",
     "PagedArray": "pages",
@@ -29,8 +41,6 @@ _NAMES = {
     "TableError": "tables",
     "load_table": "tables",
     "save_table": "tables",
-    "fit": "task",
-    "load_file": "scenes",
     "load_model": "task",
 }
 
@@ -38,9 +48,10 @@ __all__ = ["DiffindError", "__version__", *_NAMES]
 
 
 def __getattr__(name: str):
-    if name in _NAMES:
-        return getattr(_importlib.import_module(f".{_NAMES[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _NAMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, other = _NAMES[name].partition(":")
+    return getattr(_importlib.import_module(f".{module}", __name__), other or name)
 
 
 def __dir__():

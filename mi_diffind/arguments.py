@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
+from .errors import UsageError
+
 
 class Argument:
     """Argument of ``fit`` or ``decode`` that a task adds.
@@ -25,6 +27,23 @@ class Argument:
     def default(self):
         """Value if the argument is not given."""
         return self.options.get("default", False if self.options.get("action") == "store_true" else None)
+
+    def parsed(self, value):
+        """Return a value from Python as the command line would pass it on.
+
+        Text and numbers are checked by the option's parser and its choices; other objects stay as they are. Raises
+        :class:`~mi_diffind.errors.UsageError`.
+        """
+        choices = self.options.get("choices")
+        if choices and value not in (self.default, *choices) and not isinstance(value, (list, tuple)):
+            raise UsageError(f"{self.name}: found {value!r}, allowed are {', '.join(map(str, choices))}")
+        parse, plain = self.options.get("type"), isinstance(value, (str, int, float)) and not isinstance(value, bool)
+        if parse is None or not plain or value in (self.default, math.inf):
+            return value
+        try:
+            return parse(str(value))
+        except (argparse.ArgumentTypeError, ValueError) as e:
+            raise UsageError(f"{self.name}: {e}") from None
 
 
 def add_arguments(parser: argparse.ArgumentParser, arguments: tuple[Argument, ...]) -> None:

@@ -415,7 +415,12 @@ def objects_of(scene) -> list:
     """
     import mitsuba as mi
 
-    return list({id(node): node for node in mi.traverse(scene).hierarchy}.values())
+    return nodes_of(mi.traverse(scene))
+
+
+def nodes_of(params) -> list:
+    """Return all objects that ``params`` (``mi.SceneParameters``) traverse, each once."""
+    return list({id(node): node for node in params.hierarchy}.values())
 
 
 def is_instance(shape) -> bool:
@@ -447,6 +452,16 @@ def parse_file(path: str | os.PathLike, defines: dict[str, str] | None = None) -
     return config, mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in (defines or {}).items()})
 
 
+def parse(scene: dict | str, defines: dict[str, str] | None = None) -> tuple:
+    """Return the configuration and the state of a scene that is a dictionary or a text of XML."""
+    import mitsuba as mi
+
+    config = mi.parser.ParserConfig(mi.variant())
+    if isinstance(scene, dict):
+        return config, mi.parser.parse_dict(config, scene)
+    return config, mi.parser.parse_string(config, scene, **{k: str(v) for k, v in (defines or {}).items()})
+
+
 def copy_parsed(state) -> tuple:
     """Return a configuration and a copy of a parsed scene's state, since :func:`instantiate` changes the state."""
     import mitsuba as mi
@@ -472,12 +487,17 @@ def build_as(config, parallel: bool, optimize: bool) -> None:
     config.parallel, config.merge_equivalent, config.merge_meshes = parallel, optimize, optimize
 
 
-def properties_of(state, object_type=None) -> list:
+def properties_of(state, object_type=None, names=()) -> list:
     """Return the properties (``mi.Properties``) of all objects of a parsed scene, or of one ``mi.ObjectType``.
 
-    Changing them changes the scene.
+    Changing them changes the scene. In dictionaries, Mitsuba does not know the type of plugins that are written in
+    Python: ``names`` are those of this type.
     """
-    return [node.props for node in state.nodes if object_type is None or node.type == object_type]
+
+    def wanted(node) -> bool:
+        return object_type is None or node.type == object_type or node.props.plugin_name() in names
+
+    return [node.props for node in state.nodes if wanted(node)]
 
 
 def parsed_files(state) -> list[str]:

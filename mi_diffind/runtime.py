@@ -291,16 +291,45 @@ def _restart_llvm(path: str | None) -> None:
     core.init(core.CUDA)
 
 
+def use_variant(name: str | None = None) -> str:
+    """Set the Mitsuba variant ``name`` and return its name.
+
+    ``None`` keeps the variant that is set; if none is set, it is the RGB variant of the GPU if there is one, else of
+    the CPU. Raises :class:`~mi_diffind.errors.UsageError` if the variant cannot run here.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    has_cuda = dr.has_backend(dr.JitBackend.CUDA)
+    name = name or mi.variant() or ("cuda_ad_rgb" if has_cuda else "llvm_ad_rgb")
+    if name == mi.variant():
+        return name
+    if name not in mi.variants():
+        raise UsageError(f'the variant "{name}" does not exist; available are {", ".join(mi.variants())}')
+    if name.startswith("llvm") and llvm_problem():
+        raise UsageError(llvm_problem())
+    if name.startswith("cuda") and not has_cuda:
+        raise UsageError(f'the variant "{name}" needs an NVIDIA GPU and its driver, and none was found')
+    try:
+        mi.set_variant(name)
+    except ImportError as e:
+        raise UsageError(f'the variant "{name}" cannot run here: {e}') from None
+    return name
+
+
 def array_module(variant: str | None = None):
     """Return the module of differentiable Dr.Jit types to compute with outside of Mitsuba.
 
-    It is ``drjit.llvm.ad`` or ``drjit.cuda.ad``, that of a Mitsuba ``variant``; ``None`` means the GPU if there is one.
-    Raises :class:`~mi_diffind.errors.UsageError` if that cannot run here.
+    It is ``drjit.llvm.ad`` or ``drjit.cuda.ad``, that of a Mitsuba ``variant``. ``None`` means the variant that is set
+    if it is vectorised, else the GPU if there is one. Raises :class:`~mi_diffind.errors.UsageError` if that cannot run
+    here.
     """
     import drjit as dr
 
     has_cuda = dr.has_backend(dr.JitBackend.CUDA)
-    variant = variant or ("cuda" if has_cuda else "llvm")
+    if variant is None:
+        active = ("mitsuba" in sys.modules and sys.modules["mitsuba"].variant()) or ""
+        variant = active if active.startswith(("cuda", "llvm")) else "cuda" if has_cuda else "llvm"
     if variant.startswith("cuda"):
         if not has_cuda:
             raise UsageError(f'the variant "{variant}" needs an NVIDIA GPU and its driver, and none was found')

@@ -21,6 +21,7 @@ from .errors import DiffindError
 from .files import replacing
 from .measure.operations import bsdf_operations
 from .plugins.support import footprint, omissions
+from .runtime import use_variant
 from .task import tasks
 
 #: Integrators that follow paths to a ``max_depth``, and the depth of each where the scene gives none (-1: infinite).
@@ -164,12 +165,44 @@ def load_file(path: str | os.PathLike, parallel: bool = True, optimize: bool = T
     no integrator (another one may be meant), a warning says that such shapes stay invisible. Raises what
     ``mi.load_file`` raises.
     """
+    use_variant()
     if not Path(path).is_file():
         return mi.load_file(str(path))
     with _resolving(path):
         config, state = compat.parse_file(path, defines)
         compat.build_as(config, parallel, optimize)
         return _build(config, state, _integrators(state), plugins.warn)
+
+
+def load_dict(scene: dict, parallel: bool = True, optimize: bool = True):
+    """Load a scene or an object from a dictionary as ``mi.load_dict`` does, prepared as by :func:`load_file`."""
+    use_variant()
+    config, state = compat.parse(scene)
+    compat.build_as(config, parallel, optimize)
+    return _build(config, state, _integrators(state), plugins.warn)
+
+
+def load_string(text: str, parallel: bool = True, optimize: bool = True, **defines):
+    """Load a scene from a text of XML as ``mi.load_string`` does, prepared as by :func:`load_file`."""
+    use_variant()
+    config, state = compat.parse(text, defines)
+    compat.build_as(config, parallel, optimize)
+    return _build(config, state, _integrators(state), plugins.warn)
+
+
+def attach(scene, sensor=0, spp: int | None = None):
+    """Prepare a scene that Mitsuba itself loaded, and return it.
+
+    Textures that filter themselves learn which ``sensor`` of the scene sees them (a number or a ``mi.Sensor``), at
+    ``spp`` samples per pixel (default: those of its sampler). Call this again after a change of the sensor. A warning
+    names shapes whose stored arrays the scene's integrator cannot trace; :func:`load_dict` and :func:`load_file` decode
+    them. Raises :class:`SceneError` if there is no such sensor.
+    """
+    if isinstance(sensor, int) and not 0 <= sensor < len(scene.sensors()) and footprint.textures(scene):
+        raise SceneError(f"sensor: found {sensor}, the scene has {len(scene.sensors())}")
+    footprint.attach(scene, sensor, spp)
+    omissions.check(scene)
+    return scene
 
 
 def _build(config, state, integrators: list[str], report: Callable[[str], None]):
@@ -192,12 +225,18 @@ def _refuse(sentence: str):
 
 def _integrators(state) -> list[str]:
     """Return the plugin names of all integrators of a parsed scene, nested ones included."""
-    return [props.plugin_name() for props in compat.properties_of(state, mi.ObjectType.Integrator)]
+    return [props.plugin_name() for props in _integrator_properties(state)]
+
+
+def _integrator_properties(state) -> list:
+    """Return the properties of all integrators of a parsed scene, nested ones included."""
+    names = {name for name, plugin in plugins.declared().items() if plugin.object_type == "integrator"}
+    return compat.properties_of(state, mi.ObjectType.Integrator, names)
 
 
 def _path_integrator(state):
     """Return the properties of the one integrator that follows the paths of a parsed scene."""
-    integrators = compat.properties_of(state, mi.ObjectType.Integrator)
+    integrators = _integrator_properties(state)
     following = [
         props for props in integrators if props.plugin_name() in MAX_DEPTHS
         # A radiance field leaves the paths to the integrator that is nested in it

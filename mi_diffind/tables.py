@@ -138,6 +138,26 @@ def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArra
     }
 
 
+def restored(table: Table, arrays: dict[str, DifferentiableArray], storage: str = "") -> Table:
+    """Return a table whose ``arrays`` (by name, in single precision) were optimised, in a storage form.
+
+    ``storage`` "" is the form of the table, with its bits. Other arrays, settings and the preset are kept; measurements
+    are dropped, since they are no longer those of the arrays.
+    """
+    stored = dict(table.arrays)
+    for name, array in arrays.items():
+        before = table.arrays[name]
+        form = storage or before.storage
+        bits = before.bits if before.storage == "uint8" else 8
+        if form == "uint8" and before.storage == "uint8" and before.is_pointer:
+            stored |= stored_arrays(name, array.quantised(bits))
+        elif form == "uint8":
+            stored |= {name: StoredArray.of(array).to("uint8")}
+        else:
+            stored |= stored_arrays(name, array.to(form))
+    return replace(table, arrays=stored, settings={**table.settings, "optimised": True}, measured={}, path=None)
+
+
 def allocate_pages(
     entries: StoredArray, pages: StoredArray, dtype, shift=0.0, storage: str = "", fold: bool = False
 ) -> PagedArray:

@@ -9,7 +9,7 @@ Code that needs them lies in other modules of the task's package, where :class:`
 
 =============  =====================================================================================
 ``fit.py``     ``check(request)`` and ``fit(request)``
-``files.py``   ``load(path)``, ``allocate(table, dtype, storage)``, ``MODEL``
+``files.py``   ``load(path)``, ``allocate(table, dtype, storage)``, ``stored(table, entries, storage)``, ``MODEL``
 ``model.py``   ``MODEL``, the class of the task's :class:`Model`, if ``files.py`` has none
 =============  =====================================================================================
 
@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 
 #: Storage forms that a training may end in (:data:`.lookup.STORAGES`, without importing Dr.Jit).
 STORAGES = ("float32", "float16", "uint8")
+
+#: End of the name of a figure → its unit, for people.
+UNITS = {"_db": " dB", "_deg": "°"}
 
 #: The folder of the tables that ship.
 DATA = Path(__file__).resolve().parent / "data"
@@ -82,19 +85,105 @@ class FitRequest:
         steps = {} if self.seconds is None or result is None else {"steps": result.steps}
         return {**asdict(self.settings), **steps, **limited}
 
-    def relative(self, path: str | os.PathLike) -> str:
-        """Return a path relative to the folder of the output, as a table file keeps it."""
-        return os.path.relpath(Path(path).resolve(), (self.output or Path("x")).resolve().parent)
+    @property
+    def folder(self) -> Path:
+        """Folder of the output, by default the current one."""
+        return (self.output or Path("x")).resolve().parent
+
+    def paths(self, **sources) -> dict[str, str]:
+        """Return those of the ``sources`` that are files, as a table file keeps them: relative to :attr:`folder`.
+
+        Arrays, meshes and other objects in memory are left out.
+        """
+        files = {name: file for name, file in sources.items() if isinstance(file, (str, os.PathLike))}
+        return {name: os.path.relpath(Path(file).resolve(), self.folder) for name, file in files.items()}
 
 
 @dataclass
 class Fitted:
-    """Result of a training: the ``table``, the record, further lines to print and figures for ``--json``."""
+    """Result of a training, as :func:`fit` returns it.
+
+    The ``table`` holds the arrays, ``result`` is the record of the training, ``lines`` are remarks to print and
+    ``figures`` further numbers of the :attr:`report`. ``request`` is the request that was carried out.
+    """
 
     table: Table
     result: FitResult
     lines: list[str] = field(default_factory=list)
     figures: dict = field(default_factory=dict)
+    request: FitRequest | None = None
+
+    @functools.cached_property
+    def model(self) -> Model:
+        """Model of the result, ready to be evaluated, measured and decoded."""
+        return task_of(self.table).model(self.table, self.request.types.TensorXf)
+
+    @property
+    def history(self) -> list[dict]:
+        """Figures of all measurements during the training, with the step and the loss."""
+        return self.result.history
+
+    @property
+    def report(self) -> dict:
+        """All figures of the result, as ``mi-diffind fit --json`` writes them."""
+        table, result = self.table, self.result
+        return {
+            "interrupted": result.interrupted,
+            "task": table.task,
+            "preset": table.preset,
+            "bytes": table.nbytes,
+            "storage": table.storage,
+            "settings": table.settings,
+            "measured": table.measured,
+            "step": result.step,
+            "seconds": result.seconds,
+            "restarts": result.restarts,
+            "history": result.history,
+            **self.figures,
+        }
+
+    def save(self, path: str | os.PathLike) -> Path:
+        """Write the table file ``path`` (``.npz``) and return its path.
+
+        Files that the table names, such as its source, are named relative to the new file's folder. Raises
+        :class:`~mi_diffind.errors.UsageError` for another extension and :class:`~mi_diffind.files.OutputError`.
+        """
+        from .tables import save_table
+
+        path, table = table_path(path), self.table
+        if self.request is not None:
+            before, after = self.request.folder, path.resolve().parent
+            files = {key: value for key, value in table.settings.items() if key.endswith("_path")}
+            moved = {key: os.path.relpath(before / value, after) for key, value in files.items()}
+            table = dataclasses.replace(table, settings={**table.settings, **moved})
+        save_table(path, table)
+        return path
+
+    def summary(self, path: str | os.PathLike = "FILE.npz") -> list[str]:
+        """Return the result as lines of text: bytes, accuracy, remarks, and how a scene names the file ``path``."""
+        table = self.table
+        lines = [f"{path}: {table.nbytes:,} bytes as {table.storage}; {self.result.outcome}"]
+        width = max(map(len, table.measured), default=0)
+        for name, value in table.measured.items():
+            unit = next((unit for unit in UNITS if name.endswith(unit)), "")
+            label = name.removesuffix(unit).replace("_", " ")
+            lines.append(f"  {label:{width}}  {format(value, '.4g')}{UNITS.get(unit, '')}")
+        lines += [f"  {line}" for line in self.lines]
+        usage = tasks()[table.task].usage(table, Path(path).name) if table.task in tasks() else []
+        return [*lines, *(["in a scene:"] if usage else []), *(f"  {line}" for line in usage)]
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(chr(10).join(self.summary()))}</pre>"
+
+
+def table_path(path: str | os.PathLike) -> Path:
+    """Return the path of a table file to write. Raises :class:`UsageError` if its extension is not ``.npz``."""
+    path = Path(path)
+    if path.suffix.lower() != ".npz":
+        raise UsageError(f'output "{path}": found the extension "{path.suffix}", allowed is .npz')
+    return path
 
 
 class Model:
@@ -139,6 +228,10 @@ class Model:
     def memory_nbytes(self) -> int:
         """Bytes in memory, with padding and repeated entries."""
         return sum(array.memory_nbytes for array in self.arrays.values())
+
+    def entries(self) -> dict:
+        """Return what can be optimised, by name: arrays in single precision, or tensors."""
+        return {name: array for name, array in self.arrays.items() if array.storage == "float32"}
 
     def describe(self) -> tuple[dict, list[str]]:
         """Return figures for ``--json``, and lines of text, beyond the arrays and the training."""
@@ -191,6 +284,8 @@ class Task:
     files: str = "files"
     #: Number of measurements during a training; 0: as the settings of the preset say.
     measurements: int = 0
+    #: Object type and name of the plugin that reads the tables ("texture", "neural_image"); none: no plugin does.
+    plugin: tuple[str, str] | None = None
 
     def settings(self, preset: str, given: Mapping, options: Mapping) -> FitSettings:
         """Return the settings of a preset with the ``given`` ones in place; ``options`` are the task's own."""
@@ -199,6 +294,18 @@ class Task:
             steps = given.get("steps", defaults.steps)
             defaults = dataclasses.replace(defaults, measure_every=max(1, steps // self.measurements))
         return dataclasses.replace(defaults, **given)
+
+    def usage(self, table: Table, file: str) -> list[str]:
+        """Return the lines of XML by which a scene reads the table file ``file``; none if no plugin does."""
+        if self.plugin is None:
+            return []
+        tag, name = self.plugin
+        layout = table.settings.get("layout")
+        maps = [entry["name"] for entry in layout["maps"]] if isinstance(layout, dict) else []
+        lines = [f'    <string name="filename" value="{file}"/>']
+        if len(maps) > 1:
+            lines.append(f'    <string name="channels" value="{maps[0]}"/>  <!-- or {", ".join(maps[1:])} -->')
+        return [f'<{tag} type="{name}">', *lines, f"</{tag}>"]
 
     def check(self, request: FitRequest) -> None:
         """Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
@@ -255,6 +362,15 @@ class Task:
         if allocate := self._implementation("allocate", self.files):
             return allocate(table, dtype, storage)
         return {name: array.allocate(dtype, storage) for name, array in table.arrays.items()}
+
+    def stored(self, table: Table, entries: dict, storage: str = "") -> Table:
+        """Return a table with optimised ``entries`` (name → array) in a storage form ("": that of the table).
+
+        Calls ``stored`` of ``files.py`` if there is one. Raises ``ValueError`` for a form that the task does not have.
+        """
+        from .tables import restored
+
+        return (self._implementation("stored", self.files) or restored)(table, entries, storage)
 
     def _implementation(self, name: str, *modules: str) -> Any:
         """Return ``name`` of the first of the package's ``modules`` that has it, ``None`` if none has."""
@@ -345,8 +461,25 @@ def load_model(path: str | os.PathLike, dtype, storage: str = "") -> Model:
     return task.model(task.load(path), dtype, storage)
 
 
+def open_model(path: str | os.PathLike, storage: str = "") -> Model:
+    """Open a table file of any task: ``mi_diffind.open(path)``.
+
+    The model describes itself (``describe()``), has its size (``nbytes``), measures its errors against what it was
+    fitted to (``measure()``) and turns into ordinary files (``decode(output)``). ``storage`` is the storage form of its
+    arrays, ``"float32"``, ``"float16"`` or ``"uint8"`` ("": the file's own). It computes on the device of the Mitsuba
+    variant that is set. Raises :class:`~mi_diffind.tables.TableError` and ``ValueError``.
+    """
+    from .runtime import array_module
+
+    if storage and storage not in STORAGES:
+        raise UsageError(f'storage: found "{storage}", allowed are {", ".join(STORAGES)}')
+    return load_model(path, array_module().TensorXf, storage)
+
+
 def fit(
-    name: str,
+    task: str,
+    source: Any = None,
+    *,
     preset: str = "",
     variant: str | None = None,
     storage: str = "",
@@ -357,37 +490,56 @@ def fit(
     output: str | os.PathLike | None = None,
     **given,
 ) -> Fitted:
-    """Train the tables of the task ``name`` by one of its presets ("": the default).
+    """Train the tables of a ``task`` (``"texture"``, ``"sdf"``, …): ``mi-diffind fit`` in Python.
 
-    ``given`` are settings of the training (``steps``, ``lr``, …, see :class:`~mi_diffind.settings.FitSettings`) and the
-    task's own arguments, in place of the preset's. Nothing is written but the ``checkpoint``; ``output`` only says
-    where the table will go.
+    - ``source``: what the tables are fitted to, as a file or as an object in memory. Of ``image``, ``texture`` and
+      ``shading``: an image file or a manifest, an array ``(height, width, channels)``, a ``mi.Bitmap``, or a dictionary
+      of such maps by name. Of ``sdf``: a mesh file, a ``trimesh.Trimesh`` or a ``mi.Mesh``. Of ``field``: a folder of
+      views. Of ``scene``: a scene file. ``ggx`` and ``disney`` have none.
+    - ``preset``: layout and training ("": the task's default).
+    - ``variant``: variant of Mitsuba on whose device to train (``None``: the one that is set; the GPU if none is set
+      and there is one).
+    - ``storage``: storage form of the result ("": the task's default).
+    - ``seconds``: duration of the training, in place of ``steps``.
+    - ``checkpoint``: file that keeps the state of the training, with which ``resume`` continues it.
+    - ``progress``: show a progress bar in a terminal.
+    - ``output``: file in which the table will be saved; nothing is written there.
+    - ``given``: the other options of the command line as keywords (``mi-diffind fit TASK --help``): settings of the
+      training (``steps``, ``lr``, ``batch``, ``seed``, …) and the task's own (``compression=12``).
 
     Raises :class:`~mi_diffind.errors.UsageError` for an unknown name or value, and as the training does.
     """
     from .runtime import array_module
 
-    if name not in tasks():
-        raise UsageError(f'found the task "{name}", installed are {", ".join(tasks())}')
-    task = tasks()[name]
-    preset = preset or next(iter(task.presets))
-    if preset not in task.presets:
-        raise UsageError(f'{name}: found the preset "{preset}", allowed are {", ".join(task.presets)}')
-    if storage and storage not in task.storages:
-        raise UsageError(f'{name}: found the storage "{storage}", allowed are {", ".join(task.storages) or "none"}')
-    options = {argument.name: argument.default for argument in task.arguments}
+    if task not in tasks():
+        raise UsageError(f'found the task "{task}", installed are {", ".join(tasks())}')
+    chosen = tasks()[task]
+    preset = preset or next(iter(chosen.presets))
+    if preset not in chosen.presets:
+        raise UsageError(f'{task}: found the preset "{preset}", allowed are {", ".join(chosen.presets)}')
+    if storage and storage not in chosen.storages:
+        raise UsageError(f'{task}: found the storage "{storage}", allowed are {", ".join(chosen.storages) or "none"}')
+    if source is not None:
+        given["source"] = source
+    arguments = {argument.name: argument for argument in chosen.arguments}
+    options = {key: argument.default for key, argument in arguments.items()}
     fields = {f.name for f in dataclasses.fields(FitSettings)}
-    for key in given:
+    for key, value in given.items():
+        if key == "source" and key not in options:
+            raise UsageError(f"{task}: found a source, but this task has none")
         if key not in options and key not in fields:
             allowed = ", ".join(sorted({*options, *fields}))
-            raise UsageError(f'{name}: found the argument "{key}", allowed are {allowed}')
-    options |= {k: v for k, v in given.items() if k in options}
-    settings = task.settings(preset, {k: v for k, v in given.items() if k in fields}, options)
-    request = FitRequest(preset, settings, None, storage or next(iter(task.storages), ""), options, seconds)
+            raise UsageError(f'{task}: found the argument "{key}", allowed are {allowed}')
+        if key in options:
+            options[key] = arguments[key].parsed(value)
+    settings = chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options)
+    request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options, seconds)
     request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
-    request.output = None if output is None else Path(output)
+    request.output = None if output is None else table_path(output)
     if resume and seconds is not None:
         raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
-    task.check(request)
+    chosen.check(request)
     request.types = array_module(variant)
-    return task.fit(request)
+    fitted = chosen.fit(request)
+    fitted.request = request
+    return fitted

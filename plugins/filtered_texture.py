@@ -51,8 +51,8 @@ class FilteredTexture(MapTexture):
         described = ", ".join(filter(None, (omissions.plugin_of(self), str(self._path or ""))))
         return (
             f'the texture "{self.id()}" ({described}) is not filtered: it does not know the sensor, and the integrator '
-            f"gives no footprints; load the scene with mi_diffind.load_file, call mi_diffind.attach(scene), or render "
-            f"with the integrator path_footprint"
+            f"gives no footprints; load the scene with mi_diffind.load_file or load_dict, call "
+            f"mi_diffind.attach(scene), or render with the integrator path_footprint"
         )
 
     def _values(self, si):

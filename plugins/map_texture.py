@@ -54,6 +54,10 @@ class MapTexture(mi.Texture):
         tables.traverse(cb, self._shared.tables)
         cb.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
 
+    def trained(self) -> tuple:
+        """Return the table of the file (``None`` without one), and the arrays that can be optimised, by name."""
+        return self._shared.table, self._shared.tables
+
     def parameters_changed(self, keys: list[str] = ()):
         tables.check_shapes(self._shared.tables)
         self._update_transformation()

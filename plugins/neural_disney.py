@@ -94,7 +94,7 @@ class NeuralDisney(Disney):
 
     def _set_up(self, props):
         opened = tables.open_tables(props, TASK, STORAGE)
-        self.decoder, self.preset = opened.decoder, opened.table.preset
+        self.decoder, self.preset, self._table = opened.decoder, opened.table.preset, opened.table
 
     def _arrays(self) -> dict:
         return {name: getattr(self.decoder.arrays, name) for name in self.decoder.arrays.SHAPES}
@@ -102,6 +102,10 @@ class NeuralDisney(Disney):
     def _tables(self) -> dict:
         """Return the tables that are exposed."""
         return tables.exposed(self._arrays())
+
+    def trained(self) -> tuple:
+        """Return the table of the file, and the arrays that can be optimised, by name."""
+        return self._table, self._tables()
 
     def _is_constant(self, group):
         reads_tables = group not in GROUPS

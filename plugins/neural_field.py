@@ -293,6 +293,10 @@ def integrator() -> type:
                 cb.put(f"tables.{name}", values, mi.ParamFlags.Differentiable)
             cb.put("surfaces", self.nested, mi.ParamFlags.Differentiable)
 
+        def trained(self) -> tuple:
+            """Return the table of the file (``None`` without one), and the tensors that can be optimised, by name."""
+            return (self.model.table if self.model else None), self.placed.exposed
+
         def parameters_changed(self, keys=()) -> None:
             for name, values in self.placed.exposed.items():
                 shape, expected = tuple(values.shape), self._shapes[name]

@@ -140,7 +140,7 @@ class NeuralGGX(mi.BSDF):
         self.specular_reflectance = props.get_texture("specular_reflectance") if has_factor else None
 
         opened = tables.open_tables(props, TASK)
-        self.distribution, self.preset = opened.distribution, opened.table.preset
+        self.distribution, self.preset, self._table = opened.distribution, opened.table.preset, opened.table
 
         self._tracked_alpha = TrackedParameter(self.alpha)
         self._tracked_ior = [TrackedParameter(self.eta, colour=True), TrackedParameter(self.k, colour=True)]
@@ -168,6 +168,10 @@ class NeuralGGX(mi.BSDF):
     def _tables(self) -> dict:
         """Return the arrays that are exposed."""
         return tables.exposed(self._arrays())
+
+    def trained(self) -> tuple:
+        """Return the table of the file, and the arrays that can be optimised, by name."""
+        return self._table, self._tables()
 
     def traverse(self, cb: mi.TraversalCallback):
         discontinuous = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous

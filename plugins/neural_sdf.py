@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from weakref import WeakValueDictionary
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -205,10 +206,11 @@ class NeuralSDF(distance_shape(mi.Mesh)):
 
     def entries(self) -> dict:
         """Return the tensors that can be optimised, by name."""
-        field = self.model.field
-        if getattr(field, "nodes", None) is not None:
-            return {"nodes": field.nodes}
-        return {name: array.data for name, array in tables.exposed(self.model.arrays).items()}
+        return {name: v if dr.is_tensor_v(v) else v.data for name, v in self.model.entries().items()}
+
+    def trained(self) -> tuple:
+        """Return the table of the file, and the entries that can be optimised, by name."""
+        return self.model.table, self.model.entries()
 
     def optimisable(self) -> bool:
         return bool(self.entries())

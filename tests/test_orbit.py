@@ -78,11 +78,11 @@ def test_films_and_strips(mi_rgb, path, tmp_path, capsys):
 
 
 def test_an_interrupted_orbit_keeps_its_frames(mi_rgb, path, tmp_path, monkeypatch, capsys):
-    from mi_diffind.commands import render
+    from mi_diffind import rendering
 
     stop = threading.Event()
     stop.set()
-    monkeypatch.setattr(render, "interruptible", lambda: contextlib.nullcontext(stop))
+    monkeypatch.setattr(rendering, "interruptible", lambda: contextlib.nullcontext(stop))
     assert cli.main(["render", str(path), "--orbit", "5", "--spp", "1", "-o", str(tmp_path / "strip.png")]) == 130
     assert "interrupted, kept 1 of 5 frames" in capsys.readouterr().out
     with Image.open(tmp_path / "strip.png") as strip:

@@ -21,6 +21,8 @@ FLOORS = (
     ("plugins",),
     (
         "poses",
+        "saving",
+        "rendering",
         "scenes",
         "view_capture",
         "orbit",
@@ -153,6 +155,8 @@ def test_general_rooms_know_no_task():
         "tables",
         "discovery",
         "task",
+        "saving",
+        "rendering",
         "scenes",
         "view_capture",
         "orbit",

@@ -83,7 +83,7 @@ def test_tasks_of_others_are_found(install):
     assert tuple(tasks()) == (*BUILT_IN, "line") and tasks()["line"].title == "a straight line"
     assert sys.modules["their_line"].TASK is tasks()["line"]
     with pytest.raises(UsageError, match='line: found the preset "best", allowed are default'):
-        fit("line", "best")
+        fit("line", preset="best")
 
 
 def test_an_object_in_a_module_is_as_good(install):
@@ -243,8 +243,8 @@ def line(monkeypatch):
     return task
 
 
-def run(*arguments, **options):
-    return fit("line", *arguments, variant="llvm", progress=False, **options)
+def run(**options):
+    return fit("line", variant="llvm", progress=False, **options)
 
 
 def test_fit(line, tmp_path):
@@ -258,14 +258,14 @@ def test_fit(line, tmp_path):
     # Measured in the storage form that is written, in five digits
     score = -float(np.abs(table.arrays["line"].values[:, 0] - [0, 0.5, 1]).max())
     assert table.measured == {"score": float(f"{score:.5g}")} and score > -0.1
-    assert run("short").table.settings["steps"] == 5 and run(steep=True) and line.request.options["steep"]
+    assert run(preset="short").table.settings["steps"] == 5 and run(steep=True) and line.request.options["steep"]
     assert run().table.storage == "float32"
 
 
 def test_models_of_any_task(line, tmp_path):
     """Read by the file alone, and by the task, which reads a file once."""
     dtype, path = array_module("llvm").TensorXf, tmp_path / "line.npz"
-    save_table(path, run("short").table)
+    save_table(path, run(preset="short").table)
     model = load_model(path, dtype)
     assert type(model) is LineModel and model.table.path == path and model.types is array_module("llvm")
     assert model.storage == "float32" and model.nbytes == 12 <= model.memory_nbytes
@@ -284,7 +284,7 @@ def test_models_of_any_task(line, tmp_path):
 def test_tables_that_ship_with_others(line, tmp_path):
     """Anywhere: the path is that of their package."""
     path = tmp_path / "line.npz"
-    save_table(path, run("short").table)
+    save_table(path, run(preset="short").table)
     line.shipped = {"short": str(path)}
     assert line.file() == line.file(preset="short") == path
     assert line.open(array_module("llvm").TensorXf).table.preset == "short"
@@ -305,7 +305,7 @@ def test_what_a_model_leaves_out_is_refused(method, tmp_path):
 
 REFUSED = {
     "task": (("nothing",), {}, 'found the task "nothing", installed are line'),
-    "preset": (("line", "best"), {}, 'line: found the preset "best", allowed are default, short'),
+    "preset": (("line",), {"preset": "best"}, 'line: found the preset "best", allowed are default, short'),
     "storage": (("line",), {"storage": "int4"}, 'line: found the storage "int4", allowed are float32, float16, uint8'),
     "argument": (("line",), {"stepz": 3}, 'line: found the argument "stepz", allowed are batch, check_every, '),
     "own argument": (("line",), {"slope": 2.0}, "slope: found 2, allowed is 1"),
@@ -329,7 +329,7 @@ def test_a_task_without_storage_forms(line):
     line.storages = ()
     with pytest.raises(UsageError, match='line: found the storage "uint8", allowed are none'):
         run(storage="uint8")
-    assert run("short").table.storage == "float32" and line.request.storage == ""
+    assert run(preset="short").table.storage == "float32" and line.request.storage == ""
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------

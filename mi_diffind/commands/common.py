@@ -64,18 +64,7 @@ def set_variant(name: str | None) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    if name is None:
-        name = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
-    if name not in mi.variants():
-        raise UsageError(f'the variant "{name}" does not exist; available are {", ".join(mi.variants())}')
-    if name.startswith("llvm") and runtime.llvm_problem():
-        raise UsageError(runtime.llvm_problem())
-    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
-        raise UsageError(f'the variant "{name}" needs an NVIDIA GPU and its driver, and none was found')
-    try:
-        mi.set_variant(name)
-    except ImportError as e:
-        raise UsageError(f'the variant "{name}" cannot run here: {e}') from None
+    runtime.use_variant(name or ("cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"))
     mi.set_log_level(mi.LogLevel.Error)
 
 

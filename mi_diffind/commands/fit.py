@@ -8,7 +8,7 @@ from ..arguments import add_arguments, natural, positive
 from ..errors import UsageError
 from ..files import writable_file
 from ..settings import LOSSES, SCHEDULES, FittingError
-from ..task import Task, fit, tasks
+from ..task import Task, fit, table_path, tasks
 from .common import alternative, alternatives, set_variant, variant_option, verb
 
 #: Settings of a training that every task has: what they are, and the options of their parsers.
@@ -68,9 +68,7 @@ def run(arguments) -> dict:
     After Ctrl-C, these are of the best state so far. Raises :class:`UsageError`,
     :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.
     """
-    output = Path(arguments.output)
-    if output.suffix.lower() != ".npz":
-        raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed is .npz')
+    output = table_path(arguments.output)
     if arguments.checkpoint is not None and Path(arguments.checkpoint).resolve() == output.resolve():
         raise UsageError(f'"{output}" cannot be the output and the checkpoint')
     writable_file(output)
@@ -79,33 +77,14 @@ def run(arguments) -> dict:
     given = {name: value for name, value in given.items() if value is not None}
     given |= {argument.name: getattr(arguments, argument.name) for argument in task.arguments}
     set_variant(arguments.variant)
-    from ..tables import save_table
-
     try:
         fitted = fit(
-            task.name, arguments.preset, arguments.variant, getattr(arguments, "storage", ""), arguments.seconds,
-            arguments.checkpoint, arguments.resume, output=output, deterministic=not arguments.all_cores, **given,
+            task.name, preset=arguments.preset, storage=getattr(arguments, "storage", ""), seconds=arguments.seconds,
+            checkpoint=arguments.checkpoint, resume=arguments.resume, output=output,
+            deterministic=not arguments.all_cores, **given,
         )  # fmt: skip
     except RuntimeError as e:
         raise FittingError(str(e)) from e
-    table, result = fitted.table, fitted.result
-    save_table(output, table)
-    measured = ", ".join(f"{k} {v}" for k, v in table.measured.items())
-    print(f"{output}: {table.nbytes:,} bytes as {table.storage}; {result.outcome}; {measured}")
-    for line in fitted.lines:
-        print(f"  {line}")
-    return {
-        "interrupted": result.interrupted,
-        "output": str(output),
-        "task": task.name,
-        "preset": table.preset,
-        "bytes": table.nbytes,
-        "storage": table.storage,
-        "settings": table.settings,
-        "measured": table.measured,
-        "step": result.step,
-        "seconds": result.seconds,
-        "restarts": result.restarts,
-        "history": result.history,
-        **fitted.figures,
-    }
+    fitted.save(output)
+    print("\n".join(fitted.summary(output)))
+    return {"output": str(output), **fitted.report}

@@ -15,7 +15,7 @@ from ..pages import SIDE_BITS, page_counts, page_shift
 from ..tables import PAGES, Table, TableError, allocate_pages, page_sides
 from ..task import Model
 from .compressed import CompressedMaps
-from .source import Source, load_source
+from .source import load_source
 
 
 def allocate_maps(
@@ -63,7 +63,8 @@ class MapsModel(Model):
         """Path of the source when it was compressed. Raises :class:`TableError` if the file has none."""
         recorded = self.table.settings.get("source_path")
         if recorded is None:
-            raise TableError(f"{self.table.path}: does not name the image that it was made from, so it has no errors")
+            where = self.table.path or "the tables"
+            raise TableError(f"{where}: no source file is recorded, so errors need a source: measure(source)")
         return Path(self.table.path or "").parent / str(recorded)
 
     def describe(self):
@@ -82,9 +83,14 @@ class MapsModel(Model):
         figures = {"width": layout.width, "height": layout.height, "source_bytes": layout.source_nbytes}
         return {**figures, "memory_bytes": self.memory_nbytes, "compression": ratio, "maps": maps}, lines
 
-    def measure(self, source: Source | None = None) -> dict[str, float]:
-        """Return the errors of :meth:`.CompressedMaps.measure` against ``source`` (default: the recorded file)."""
-        if source is None:
+    def measure(self, source=None) -> dict[str, float]:
+        """Return the errors of :meth:`.CompressedMaps.measure` against ``source`` (default: the recorded file).
+
+        ``source`` is a file or maps in memory, as :func:`.source.load_source` takes them.
+        """
+        if source is not None:
+            source = load_source(source, nonfinite="clean")
+        else:
             path = self.source_path
             source = load_source(path, nonfinite="clean")  # cleaned values change the digest
             if source.digest != self.table.settings.get("source", source.digest):

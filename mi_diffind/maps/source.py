@@ -98,8 +98,11 @@ class Source:
         return self.texels * sum(m.channels * m.depth for m in self.maps)
 
 
-def load_source(path: str | os.PathLike, nonfinite: str = "error") -> Source:
-    """Read an image or a manifest (``.json``).
+def load_source(source, nonfinite: str = "error") -> Source:
+    """Read an image or a manifest (``.json``), or take the maps that ``source`` holds in memory.
+
+    In memory, ``source`` is a :class:`Source`, an image (an array ``(height, width, channels)`` or a ``mi.Bitmap``), or
+    a dictionary of such images and of image files by the name of the map (:func:`from_arrays`).
 
     An image is a map called ``"image"`` and, if it has an alpha channel, a map ``"alpha"``. It is sRGB if it is grey or
     RGB of 8 or 16 bits, else linear. A map of a manifest is by default sRGB if it is an albedo of 8 or 16 bits and 1 or
@@ -109,26 +112,31 @@ def load_source(path: str | os.PathLike, nonfinite: str = "error") -> Source:
     NaN and infinite values are an error. With ``nonfinite="clean"`` NaN becomes 0 and infinity the largest (negative:
     the smallest) finite value of the channel, 0 if there is none. Raises :class:`SourceError`.
     """
-    path = Path(path)
     _check_nonfinite(nonfinite)
-    if path.suffix.lower() == ".json":
+    if isinstance(source, Source):
+        return source
+    if isinstance(source, dict):
+        return from_arrays(source, nonfinite=nonfinite)
+    if not isinstance(source, (str, os.PathLike)):
+        image, where = _in_memory(source, "the image"), "the image"
+    elif (path := Path(source)).suffix.lower() == ".json":
         return _load_manifest(path, nonfinite)
-    image = _read(path)
-    role = "albedo" if image.named else "other"
-    maps = [_RawMap("image", image.values[:, :, : image.colors], role, str(path))]
+    else:
+        image, where = _read(path), path
+    role, file = "albedo" if image.named else "other", str(where) if where is not None else ""
+    maps = [_RawMap("image", image.values[:, :, : image.colors], role, file, image.color_space)]
     if image.has_alpha:
-        maps.append(_RawMap("alpha", image.values[:, :, image.colors :], "other", str(path)))
-    return _assemble(maps, path, nonfinite)
+        maps.append(_RawMap("alpha", image.values[:, :, image.colors :], "other", file))
+    return _assemble(maps, where, nonfinite)
 
 
-def from_arrays(
-    arrays: dict[str, np.ndarray], color_spaces: dict[str, str] | None = None, nonfinite: str = "error"
-) -> Source:
-    """Return a source of arrays by name, ``(height, width)`` or ``(height, width, channels)``.
+def from_arrays(arrays: dict, color_spaces: dict[str, str] | None = None, nonfinite: str = "error") -> Source:
+    """Return a source of maps by name: arrays ``(height, width)`` or ``(height, width, channels)``, or images.
 
-    Types are 8- or 16-bit unsigned integers and floats. ``color_spaces`` (name → ``"srgb"`` or ``"linear"``) replaces
-    the defaults, which are a manifest's; ``"image"`` of 1 or 3 channels counts as an albedo. No channel counts as
-    alpha. ``nonfinite`` is that of :func:`load_source`. Raises :class:`SourceError`.
+    Arrays are of NumPy or Dr.Jit, of 8- or 16-bit unsigned integers or floats. An image is a ``mi.Bitmap`` or an image
+    file, and must not be transparent. ``color_spaces`` (name → ``"srgb"`` or ``"linear"``) replaces the defaults, which
+    are a manifest's, or those that a bitmap states; ``"image"`` of 1 or 3 channels counts as an albedo. ``nonfinite``
+    is that of :func:`load_source`. Raises :class:`SourceError`.
     """
     _check_nonfinite(nonfinite)
     color_spaces = dict(color_spaces or {})
@@ -136,20 +144,12 @@ def from_arrays(
     for name, array in arrays.items():
         where = f'array "{name}"'
         _check_name("arrays", name)
-        values = np.asarray(array)
-        if values.dtype.name not in _DEPTHS or values.dtype.name == "uint32":
-            raise SourceError(
-                f"{where}: has the type {values.dtype}, allowed are uint8, uint16 and floats up to float64"
-            )
-        if values.ndim not in (2, 3) or values.size == 0:
-            raise SourceError(
-                f"{where}: has the shape {values.shape}, expected (height, width, channels), none of them 0"
-            )
-        values = values.reshape(*values.shape[:2], -1)
+        image = _read(Path(array)) if isinstance(array, (str, os.PathLike)) else _in_memory(array, where)
+        values = image.opaque(where)
         role = role_of(name)
         if name == "image" and values.shape[2] in (1, 3):
             role = "albedo"
-        color_space = color_spaces.pop(name, None)
+        color_space = color_spaces.pop(name, image.color_space)
         if color_space is not None and color_space not in COLOR_SPACES:
             raise SourceError(f'{where}: has the color space "{color_space}", allowed are {COLOR_SPACES}')
         maps.append(_RawMap(name, _one_of_equal(values, role), role, "", color_space))
@@ -231,6 +231,7 @@ class _ImageFile:
     colors: int
     has_alpha: bool
     named: bool  # grey or RGB, not the channels of a multi-channel EXR
+    color_space: str | None = None  # if the image states it
 
     def select(self, channels, where: str) -> np.ndarray:
         """Return the values of ``channels`` of a manifest; grey is red, green and blue at once."""
@@ -288,6 +289,26 @@ def _read(path: Path) -> _ImageFile:
     has_alpha = pixels in (formats.YA, formats.RGBA)
     named = has_alpha or pixels in (formats.Y, formats.RGB)
     return _ImageFile(values, values.shape[2] - has_alpha, has_alpha, named)
+
+
+def _in_memory(array, where: str) -> _ImageFile:
+    """Return an array or a ``mi.Bitmap`` as the content of an image file. Raises :class:`SourceError`."""
+    pixels = array.pixel_format() if hasattr(array, "pixel_format") else None
+    values = array.numpy() if hasattr(array, "numpy") and pixels is None else np.array(array)
+    if values.dtype.name not in _DEPTHS or values.dtype.name == "uint32":
+        raise SourceError(f"{where}: has the type {values.dtype}, allowed are uint8, uint16 and floats up to float64")
+    if values.ndim not in (2, 3) or values.size == 0:
+        raise SourceError(f"{where}: has the shape {values.shape}, expected (height, width, channels), none of them 0")
+    values = values.reshape(*values.shape[:2], -1)
+    if pixels is None:
+        return _ImageFile(values, values.shape[2], False, values.shape[2] in (1, 3))
+    formats = type(pixels)
+    has_alpha = pixels in (formats.YA, formats.RGBA)
+    color_space = "linear"
+    if array.srgb_gamma() and values.dtype.name in _ENCODED:
+        color_space = None  # bitmaps of 8 bits are sRGB unless somebody says otherwise: the map's name decides
+    named = has_alpha or pixels in (formats.Y, formats.RGB)
+    return _ImageFile(values, values.shape[2] - has_alpha, has_alpha, named, color_space)
 
 
 def _read_bytes(path: Path) -> bytes:

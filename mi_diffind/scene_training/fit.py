@@ -82,9 +82,9 @@ def fit_scene(
     problem.identity |= {"views": dataclasses.asdict(views)}
     result = request.train(problem)
     identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
-    settings = {**request.recorded(result), **identity, "scene_path": request.relative(parsed.path)}
+    settings = {**request.recorded(result), **identity, **request.paths(scene_path=parsed.path)}
     trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net)), settings)
-    trained_table.settings["source_path"] = request.relative(source_path)
+    trained_table.settings |= request.paths(source_path=source_path)
     trained_table.preset, trained_table.seed = request.preset, recipe.settings.seed
     errors = CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
     errors["psnr_scene_db"] = result.measured["psnr_db"]

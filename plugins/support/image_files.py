@@ -18,7 +18,7 @@ from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import Source, SourceError, from_arrays, load_source
-from mi_diffind.tables import TableError
+from mi_diffind.tables import Table, TableError
 from mi_diffind.task import Task, stamp
 
 from . import properties
@@ -39,13 +39,19 @@ _lock = threading.RLock()  # a thread that waits for a kernel may enter another 
 class SharedMaps:
     """Maps and their arrays (name → ``DifferentiableArray``), shared by all textures that read them.
 
-    Equal reads are merged by Dr.Jit only if textures share their variables.
+    ``table`` is the table that they were read from, if any. Equal reads are merged by Dr.Jit only if textures share
+    their variables.
     """
 
-    def __init__(self, image: CompressedMaps, arrays: dict, preset: str):
-        self.image, self.arrays, self.preset = image, arrays, preset
+    def __init__(self, image: CompressedMaps, arrays: dict, table: Table | None = None):
+        self.image, self.arrays, self.table = image, arrays, table
         self._loaded = self.state()
         self._transforms = {}
+
+    @property
+    def preset(self) -> str:
+        """Preset of the table, "" without one."""
+        return self.table.preset if self.table else ""
 
     @property
     def tables(self) -> dict:
@@ -84,7 +90,7 @@ def open_file(task: Task, path: str | Path, storage: str) -> SharedMaps:
 
     def load():
         model = task.model(task.load(path), mi.TensorXf, storage)
-        return SharedMaps(model.image, model.arrays, model.table.preset)
+        return SharedMaps(model.image, model.arrays, model.table)
 
     return shared((task.name, str(path.resolve()), *stamp(path), storage, mi.TensorXf), load)
 
@@ -131,14 +137,14 @@ def open_uncompressed(props: mi.Properties, wrap_mode: str) -> tuple[SharedMaps,
         pyramid = PYRAMIDS[name]
         if pyramid.types is not types:
             pyramid = Pyramid(pyramid.layout, pyramid.values, types, pyramid.border)
-        return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {}, "")), ""
+        return shared(("pyramid", id(pyramid)), lambda: SharedMaps(pyramid, {})), ""
 
     def load() -> SharedMaps:
         source = load_source(path, nonfinite="clean") if path else _source_of(props["bitmap"])
         if raw:
             maps = tuple(dataclasses.replace(m, color_space="linear") for m in source.maps)
             source = dataclasses.replace(source, maps=maps)
-        return SharedMaps(Pyramid.of(source, types=types, border=border), {}, "")
+        return SharedMaps(Pyramid.of(source, types=types, border=border), {})
 
     path = properties.filename(props)
     try:

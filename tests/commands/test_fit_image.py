@@ -654,7 +654,7 @@ def test_inspect_measures_against_the_source(folder, capsys, name):
 
 def test_inspect_measures_nothing_without_a_source(folder, capsys):
     make_file("t.npz")
-    assert "t.npz: does not name the image" in refused(capsys, "inspect", "t.npz", "--measure")
+    assert "t.npz: no source file is recorded" in refused(capsys, "inspect", "t.npz", "--measure")
 
 
 def test_candidates_of_a_search_are_structures_that_exist():

@@ -21,6 +21,7 @@ class DisneyTask(Task):
     name = "disney"
     title = "the Disney BRDF"
     section = "supplemental 1.2"
+    plugin = ("bsdf", "neural_disney")
     #: Tables of one coordinate start close to their optimum: ten times the rate costs 15 dB (75 in place of 90 dB).
     presets = {  # noqa: RUF012
         "tables": FitSettings(steps=2000, batch=65536, lr=3e-4, schedule="cosine", seed=1),

@@ -25,6 +25,7 @@ class GGX(Task):
     name = "ggx"
     title = "the GGX distribution of normals"
     section = "supplemental 1.1"
+    plugin = ("bsdf", "neural_ggx")
     presets = {  # noqa: RUF012
         "tables": FitSettings(steps=4000, batch=65536, lr=1e-2, schedule="cosine", seed=1),
         "paper": FitSettings(steps=3000, batch=65536, lr=1e-3, schedule="constant", seed=1),

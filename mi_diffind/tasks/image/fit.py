@@ -56,7 +56,7 @@ def fit(request: FitRequest) -> Fitted:
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
     fitted, requested = _train(request, source, recipe)
-    fitted.table.settings["source_path"] = request.relative(options["source"])
+    fitted.table.settings |= request.paths(source_path=options["source"])
     figures, line = size_figures(source, fitted.table, requested)
     fitted.lines.append(line)
     fitted.figures = {**figures, **fitted.figures}

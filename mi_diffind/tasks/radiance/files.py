@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ...indirection import Indirection, device_array, device_tensor
-from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout
-from .compression import DENSITY_BITS, INDEX_BITS, LAST_LEVEL
+from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout, restored
+from .compression import DENSITY_BITS, INDEX_BITS, LAST_LEVEL, byte_range
 from .nodes import Nodes
 from .paper import PairsField
 from .volume_field import NodeField, PackedPaletteField, VolumeField
@@ -99,6 +100,32 @@ def load(path) -> Table:
         if density.storage != "uint8" or density.entries.max() > LAST_LEVEL:
             raise TableError(f"{path}: is damaged: found a density level that is not a number from 0 to {LAST_LEVEL}")
     return table
+
+
+def stored(table: Table, entries: dict, storage: str = "") -> Table:
+    """Return a table with optimised ``entries``: ``density`` and ``colour`` of its nodes, or of its palette."""
+    layout, arrays = table.settings["layout"], dict(table.arrays)
+    if layout == "pairs":
+        allocated = {name: table.arrays[name].allocate(type(values), "float32") for name, values in entries.items()}
+        for name, array in allocated.items():
+            array.data = entries[name]
+        return restored(table, allocated, storage)
+    if storage and not (layout == "grid" and storage != "uint8"):
+        allowed = "float16 and float32" if layout == "grid" else "none: levels and a palette of bytes"
+        raise ValueError(f'storage: found "{storage}", allowed of the layout {layout} are {allowed}')
+    density, colour = entries["density"].numpy(), entries["colour"].numpy()
+    if layout == "grid":
+        for name, values in (("density", density[:, None]), ("colour", colour)):
+            form = storage or table.arrays[name].storage
+            arrays[name] = StoredArray(values.astype(np.float32)).to(form)
+    else:
+        levels, palette = table.arrays["density"], colour.reshape(-1, table.arrays["palette"].shape[-1])
+        codes = np.clip(np.rint((density - levels.offset[0]) / levels.scale[0]), 0, LAST_LEVEL)
+        arrays["density"] = replace(levels, entries=codes.astype(np.uint8)[:, None])
+        scale, offset = byte_range(palette)
+        codes = np.clip(np.rint((palette - offset) / scale), 0, 255).astype(np.uint8)
+        arrays["palette"] = StoredArray(codes, (), tuple(scale.tolist()), tuple(offset.tolist()))
+    return replace(table, arrays=arrays, settings={**table.settings, "optimised": True}, measured={}, path=None)
 
 
 def stored_of(table: Table) -> np.ndarray:

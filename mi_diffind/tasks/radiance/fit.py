@@ -93,8 +93,7 @@ class FieldFit:
         table.settings = {
             **request.recorded(),
             "source": session.views.digest,
-            "capture_path": request.relative(options["source"]),
-            **({"grid_path": request.relative(options["grid"])} if options["grid"] else {}),
+            **request.paths(capture_path=options["source"], grid_path=options["grid"] or None),
             "warnings": warnings,
             **table.settings,
         }

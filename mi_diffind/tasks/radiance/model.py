@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 
 from ...indirection import device_array
@@ -70,6 +71,9 @@ class RadianceFieldModel(Model):
             f"{100 * (1 - counts['colours'] / looks):.0f}% read no colour"
         )
         return figures, lines
+
+    def entries(self) -> dict:
+        return {name: values for name, values in self.field.arrays.items() if dr.is_float_v(values)}
 
     def counts(self) -> dict[str, int]:
         """Return the counts (:class:`.march.RayCounts`) of parallel rays along the axes, in both directions."""

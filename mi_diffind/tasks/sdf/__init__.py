@@ -32,6 +32,7 @@ class Sdf(Task):
     name = "sdf"
     title = "the signed distance field of a mesh"
     section = "supplemental 1.6"
+    plugin = ("shape", "neural_sdf")
     presets = {  # noqa: RUF012
         "sparse": FitSettings(
             steps=250, batch=2**18, lr=2e-2, schedule="cosine", loss="mae", measure_every=50, deterministic=True

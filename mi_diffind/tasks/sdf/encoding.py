@@ -73,6 +73,30 @@ def sample(distances: Distances, spacing: float) -> SampledNodes:
     )  # fmt: skip
 
 
+def encoded(structure: Structure, before: np.ndarray, values: np.ndarray, bits: int, seed: int = 0):
+    """Encode the nodes of a field again, with new ``values`` (n, 4): distances in spacings and unit normals.
+
+    ``before`` are the decoded nodes of the file (n, 4), whose signs state the side of each node. Returns the
+    :class:`NodeCoding` and the corners (K, 8) of the cells that are stored.
+    """
+    positions, block = structure.node_positions()
+    side = np.where(before[:, 0] < 0, -1.0, 1.0)
+    shape = np.array(structure.shape) + 1
+    keys = np.ravel_multi_index(np.asarray(positions, np.int64).T, shape)
+    order = np.argsort(keys)
+    steps = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    wanted = keys[:, None] + steps @ np.array([shape[1] * shape[2], shape[2], 1])
+    place = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(order) - 1)]
+    inside = side[place] < 0
+    cells = (keys[place] == wanted).all(axis=1) & inside.any(axis=1) & ~inside.all(axis=1)
+    corners = place[cells]
+    distances = side * np.maximum(np.abs(before[:, 0]), LEAST)
+    nodes = SampledNodes(structure, positions, block, distances, before[:, 1:], corners, len(corners), 0.0)
+    coding = NodeCoding(nodes, bits, seed)
+    coding.encode(values)
+    return coding, corners
+
+
 def node_frames(words: np.ndarray, block: np.ndarray):
     """Return the frames of nodes in the blocks ``block`` (n,): normal (three arrays), distance and scale."""
     n, d, scale = codes.frames(words)

@@ -183,7 +183,7 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
     table.settings = {
         **request.recorded(result),
         "source": mesh.digest,
-        "mesh_path": request.relative(request.options["source"]),
+        **request.paths(mesh_path=request.options["source"]),
         "scale": mesh.scale,
         "centre": list(mesh.centre),
         "warnings": warnings,

@@ -108,17 +108,33 @@ class Mesh:
         return points * self.scale + np.array(self.centre)
 
 
-def load_mesh(path: str | os.PathLike) -> Mesh:
-    """Read a mesh file; the meshes of a scene file are joined where its transforms place them.
+def load_mesh(mesh) -> Mesh:
+    """Read a mesh file, or take a ``trimesh.Trimesh``, a ``trimesh.Scene``, a ``mi.Mesh`` or ``(vertices, faces)``.
 
-    Equal vertices are merged, degenerate triangles left out, and triangles wound against their neighbours or around
-    their solid the wrong way are turned. Raises :class:`MeshError`.
+    The meshes of a scene file are joined where its transforms place them. Equal vertices are merged, degenerate
+    triangles left out, and triangles wound against their neighbours or around their solid the wrong way are turned.
+    Raises :class:`MeshError`.
     """
-    path = Path(path)
+    if not isinstance(mesh, (str, os.PathLike)):
+        return make_mesh(*_in_memory(mesh))
+    path = Path(mesh)
     if not path.is_file():
         raise MeshError(f"{path}: {'is a folder' if path.is_dir() else 'there is no such file'}, expected a mesh")
     vertices, faces = _read(path)
     return make_mesh(vertices, faces, str(path))
+
+
+def _in_memory(mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and faces of a mesh in memory. Raises :class:`MeshError` for an object that is none."""
+    if hasattr(mesh, "vertex_positions_buffer"):  # mi.Mesh
+        return (b.numpy().reshape(-1, 3) for b in (mesh.vertex_positions_buffer(), mesh.faces_buffer()))
+    if hasattr(mesh, "to_geometry"):  # trimesh.Scene
+        mesh = mesh.to_geometry()
+    if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if isinstance(mesh, (tuple, list)) and len(mesh) == 2:
+        return np.asarray(mesh[0]), np.asarray(mesh[1])
+    raise MeshError(f"mesh: found a {type(mesh).__name__}, expected a file, a trimesh.Trimesh or a mi.Mesh")
 
 
 def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Mesh:

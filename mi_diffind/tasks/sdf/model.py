@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from ...compat import module_of
 from ...errors import UsageError
 from ...files import replacing
 from ...indirection import Indirection, device_tensor
-from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout
+from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout, restored
 from ...task import Model
 from . import codes
 from .field import DistanceField
-from .nodes import SparseNodes, coded_field, decoded_nodes
+from .nodes import SparseNodes, coded_field, decoded_nodes, slope_bound
 from .paper import PairField
 from .structure import ACTIVE, Structure, StructureError
 
@@ -111,6 +114,27 @@ def field_of(table: Table, arrays: dict, types, storage: str = "") -> DistanceFi
     return coded_field(types, structure, settings["slope"], frames, words, settings["bits"], entries)
 
 
+def stored(table: Table, entries: dict, storage: str = "") -> Table:
+    """Return a table with optimised entries: the ``nodes`` (n, 4) of a sparse field, encoded again, or the pair's."""
+    if "nodes" not in entries:
+        return restored(table, entries, storage)
+    from .encoding import encoded
+
+    if storage not in ("", "uint8"):
+        raise ValueError(f'storage: found "{storage}", allowed is uint8: the nodes of a sparse field are coded')
+    values, settings = entries["nodes"].numpy().astype(np.float64), table.settings
+    values[:, 1:] /= np.maximum(np.linalg.norm(values[:, 1:], axis=1, keepdims=True), 1e-9)
+    structure, bits = structure_of(table), settings["bits"]
+    before = field_of(table, {}, module_of(entries["nodes"]), "float32").nodes.numpy().astype(np.float64)
+    coding, corners = encoded(structure, before, values, bits, table.seed)
+    decoded = coding.values().astype(np.float64)
+    words = codes.pointer_words(coding.pointers, bits)
+    arrays = sparse_arrays(structure, coding.frames, words, coding.entries)
+    slope = slope_bound(decoded[:, 0], decoded[:, 1:], corners)
+    settings = {**settings, "slope": slope, "optimised": True}
+    return replace(table, arrays=arrays, settings=settings, measured={}, path=None)
+
+
 class SdfModel(Model):
     """Distance field of a file: ``field`` (:class:`.field.DistanceField`), in the unit frame.
 
@@ -158,22 +182,29 @@ class SdfModel(Model):
             lines.append(f"{structure.nodes:,} nodes in {structure.blocks:,} blocks, {bits:.1f} bits a node in all")
         return figures, lines
 
-    def measure(self, mesh=None, count: int = 2**18):
-        """Return errors against the mesh in the file ``mesh``, by default the one that was fitted.
+    def entries(self) -> dict:
+        nodes = getattr(self.field, "nodes", None)
+        return super().entries() if nodes is None else {"nodes": nodes}
 
-        ``count`` is the number of held-out points.
+    def measure(self, mesh=None, count: int = 2**18):
+        """Return errors against a ``mesh``, by default that of the file that was fitted.
+
+        ``mesh`` is a file or a mesh in memory, as :func:`.mesh.load_mesh` takes them. ``count`` is the
+        number of held-out points.
         """
         from .distances import Distances
         from .evaluation import SurfaceEvaluation
         from .mesh import load_mesh
 
         settings, folder = self.table.settings, (self.table.path or Path("x")).resolve().parent
-        path = Path(mesh) if mesh is not None else folder / settings.get("mesh_path", "")
-        if not path.is_file():
+        if mesh is None and not settings.get("mesh_path"):
+            self._refuse("was fitted to a mesh in memory, which is not in the file: measure(mesh)")
+        path = folder / settings["mesh_path"] if mesh is None else mesh
+        if isinstance(path, (str, os.PathLike)) and not Path(path).is_file():
             self._refuse(f"was fitted to the mesh {path}, which is not there")
         loaded = load_mesh(path)
         if loaded.digest != settings.get("source"):
-            self._refuse(f"was fitted to another mesh than {path} is now")
+            self._refuse(f"was fitted to another mesh than {loaded.path} is now")
         with Distances(loaded) as distances:
             return SurfaceEvaluation(loaded, distances, count).measure(self.field)
 

@@ -81,7 +81,7 @@ def fit(request: FitRequest) -> Fitted:
         table, result = training.fit_shading(source, net, recipe, shading_request, pyramid, evaluation, preview)
     else:
         table = start
-    table.settings["source_path"] = request.relative(options["source"])
+    table.settings |= request.paths(source_path=options["source"])
     lines = [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")

@@ -57,7 +57,7 @@ def fit(request: FitRequest) -> Fitted:
     if pyramid.layout.stored:
         size = size_of(source, pyramid, requested, recipe, options)
     table, result = training.fit_texture(source, size, recipe, request, pyramid)
-    table.settings["source_path"] = request.relative(options["source"])
+    table.settings |= request.paths(source_path=options["source"])
     figures, line = size_figures(source, table, requested)
     lines = [line]
     if size is not None and abs(size.nbytes / requested - 1) > memory_budget.TOLERANCE:

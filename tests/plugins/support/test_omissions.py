@@ -79,6 +79,26 @@ def test_shapes_that_the_integrator_does_not_trace(mi_rgb, warned):
     assert "path_sdf" in line and "grid" not in line  # which float32 cannot become
 
 
+def test_scenes_that_were_prepared(mi_rgb, warned):
+    """``mi_diffind.load_dict`` decodes and attaches, ``mi_diffind.attach`` warns: either way, renders are silent."""
+    mi = mi_rgb
+    solid = {"type": "neural_sdf", "filename": SOLID}
+    content = {"solid": {**solid, "resolution": 24}, "integrator": {"type": "direct"}, **textured(mi)}
+    loaded = mi_diffind.load_dict(scene(mi, **content))
+    assert ["decoded to a grid" in line for line in warned()] == [True]
+    render(mi, loaded)
+    assert not warned()
+    loaded = mi.load_dict(scene(mi, **{**content, "solid": solid}))
+    assert mi_diffind.attach(loaded) is loaded
+    assert ['"solid" (neural_sdf)' in line for line in warned()] == [True]
+    render(mi, loaded)
+    assert not warned()
+    loaded = mi.load_dict(scene(mi, solid=solid))
+    mi_diffind.attach(loaded)  # without an integrator: any may render it
+    render(mi, loaded, "path_sdf", max_depth=2)
+    assert not warned()
+
+
 def test_integrators_around_the_one_that_traces(mi_rgb, warned):
     """Channels of ``aov`` come from rays of its own."""
     mi = mi_rgb

@@ -217,7 +217,7 @@ def test_training_distributions(rng):
 def test_fit_improves_and_is_repeatable(preset, few_samples):
     def run(seed):
         short = {"steps": 30, "batch": 4096, "measure_every": 15, "seed": seed}
-        return fit_task("disney", preset, "llvm", progress=False, **short).table
+        return fit_task("disney", preset=preset, variant="llvm", progress=False, **short).table
 
     layout, decoder = LAYOUTS[preset]
     start = measure(decoder(layout().alloc(ad.TensorXf)), ad, 2**16)["psnr_db"]

@@ -481,7 +481,7 @@ def test_indirection_beats_a_single_table_of_equal_bytes():
 
 
 def run(preset, storage="float32", **changes):
-    return fit_task("ggx", preset, "llvm", storage, progress=False, **changes)
+    return fit_task("ggx", preset=preset, variant="llvm", storage=storage, progress=False, **changes)
 
 
 def test_bad_choices_are_refused_before_training():

@@ -1,0 +1,161 @@
+"""Rendering of a scene or of an orbit around it: ``mi_diffind.render``, with the path depth that the scene needs."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from . import depth as depths
+from . import orbit as orbits
+from . import scenes
+from .errors import UsageError
+from .interrupt import interruptible
+from .runtime import use_variant
+
+#: Samples per pixel of a pass, after each of which Ctrl-C may end the rendering.
+PASS = 16
+
+
+@dataclass
+class Rendering:
+    """Rendered ``frames``, linear ``(height, width, channels)`` float32: one image, or the frames of an orbit.
+
+    ``figures`` are those of ``mi-diffind render --json``: ``spp``, ``seed``, ``variant``, ``seconds_render``, ``depth``
+    and, of a scene that was given as a file, its ``learned_plugins`` and ``table_bytes``.
+    """
+
+    frames: list[np.ndarray]
+    figures: dict
+    scene: object
+
+    @property
+    def image(self) -> np.ndarray:
+        """The image, or all frames side by side."""
+        return self.frames[0] if len(self.frames) == 1 else orbits.strip(self.frames)
+
+    def save(self, path: str | os.PathLike) -> Path:
+        """Write the image (``.exr``, ``.png``) or a film of the frames (``.webp``, ``.gif``), and return the path.
+
+        Raises :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.files.OutputError`.
+        """
+        path = image_path(path, len(self.frames) > 1)
+        if path.suffix.lower() == ".png" and self.image.shape[2] > 4:
+            raise UsageError(f'output "{path}": the image has {self.image.shape[2]} channels, PNG holds 4: use .exr')
+        if len(self.frames) > 1:
+            orbits.write(path, self.frames)
+        else:
+            scenes.write_image(path, self.frames[0])
+        return path
+
+    def _repr_png_(self) -> bytes:
+        from PIL import Image
+
+        stream = io.BytesIO()
+        Image.fromarray(orbits.displayed(self.image)).save(stream, "PNG")
+        return stream.getvalue()
+
+
+def image_path(path: str | os.PathLike, film: bool = False) -> Path:
+    """Return the path of a picture, or with ``film`` of a film. Raises :class:`~mi_diffind.errors.UsageError`."""
+    path, allowed = Path(path), (".exr", ".png", *(orbits.FILMS if film else ()))
+    if path.suffix.lower() not in allowed:
+        names = ", ".join(allowed) if film else " and ".join(allowed)
+        raise UsageError(f'output "{path}": found the extension "{path.suffix}", allowed are {names}')
+    return path
+
+
+def render(
+    scene,
+    spp: int | None = None,
+    seed: int = 0,
+    *,
+    depth: int | str = "scene",
+    depth_tolerance: float | None = None,
+    orbit: int | None = None,
+    centre: Sequence[float] | None = None,
+    defines: Mapping[str, object] | None = None,
+    progress: bool = True,
+) -> Rendering:
+    """Render a scene: ``mi-diffind render`` in Python, in the variant that is set.
+
+    - ``scene``: a scene file, a dictionary, or a loaded ``mi.Scene``.
+    - ``spp``: samples per pixel (``None``: the scene's); ``seed``: seed of the random numbers.
+    - ``depth``: longest path, counted as ``max_depth``: a number, ``"scene"``, or ``"auto"``, the smallest depth that
+      leaves out less than ``depth_tolerance`` of the scattered light (of a scene file; :mod:`mi_diffind.depth`).
+    - ``orbit``: number of frames of a camera that goes once around ``centre`` (``None``: the middle of the scene).
+    - ``defines``: values of the file's ``<default>`` parameters.
+
+    Ctrl-C ends the rendering after a pass or a frame and keeps what there is; ``figures["interrupted"]`` is then true.
+    Raises :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.errors.UsageError`.
+    """
+    use_variant()
+    if centre is not None and not orbit:
+        raise UsageError("centre: given without orbit, whose middle it is")
+    if depth_tolerance is not None and depth != "auto":
+        raise UsageError('depth_tolerance: given without depth="auto"')
+    start = time.perf_counter()
+    parsed = None
+    if isinstance(scene, (str, os.PathLike)):
+        parsed = scenes.ParsedScene(scene, dict(defines or {}))
+        chosen = _chosen_depth(parsed, depth, depth_tolerance, seed)
+        changed = chosen["chosen"] != chosen["scene"]
+        loaded = parsed.load(longest_path=chosen["chosen"] if changed else None)
+    else:
+        if depth != "scene" or defines:
+            raise UsageError("depth, defines: given with a scene in memory, allowed are scene files")
+        chosen, loaded = None, scenes.load_dict(scene) if isinstance(scene, dict) else scene
+        if not isinstance(loaded, mi.Scene):
+            raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
+    if not loaded.sensors():
+        raise scenes.SceneError(f"{parsed.path if parsed else 'scene'}: has no sensor")
+    ready = time.perf_counter()
+    spp = spp or loaded.sensors()[0].sampler().sample_count()
+    if orbit:
+        with interruptible() as stop, scenes.progress_bar("orbit", orbit, "frame", progress) as bar:
+            frames = orbits.orbit(loaded, orbit, centre, spp=spp, seed=seed, on_frame=bar.update, stop=stop)
+        interrupted, done = len(frames) < orbit, spp
+    else:
+        passes = max(1, spp // PASS)
+        with interruptible() as stop, scenes.progress_bar("render", passes, "pass", progress) as bar:
+            image, seconds = scenes.render(loaded, spp, seed, passes, bar.update, stop)
+        frames, done = [image], len(seconds) * spp // passes
+        interrupted = done < spp
+    figures = {
+        "interrupted": interrupted,
+        "scene": str(parsed.path) if parsed else None,
+        "variant": mi.variant(),
+        "width": frames[0].shape[1],
+        "height": frames[0].shape[0],
+        "spp": done,
+        "spp_requested": spp,
+        "seed": seed,
+        "depth": chosen,
+        "seconds_load": ready - start,
+        "seconds_render": time.perf_counter() - ready,
+    }
+    if orbit:
+        figures |= {"frames": len(frames), "frames_requested": orbit}
+    elif parsed:
+        learned = parsed.learned_plugins()
+        figures |= {"learned_plugins": learned, "table_bytes": parsed.table_bytes(learned)}
+    return Rendering(frames, figures, loaded)
+
+
+def _chosen_depth(parsed: scenes.ParsedScene, requested, tolerance: float | None, seed: int) -> dict:
+    """Choose the depth to render to and say why; what was not measured is ``None``."""
+    if requested == "auto":
+        return {"requested": "auto", **depths.auto_depth(parsed, tolerance or depths.TOLERANCE, seed)}
+    scene_depth = None
+    with contextlib.suppress(scenes.SceneError):  # no integrator with a depth: fine, unless one is asked for
+        scene_depth = parsed.path_integrator()[1]
+    chosen = scene_depth if requested == "scene" else requested
+    unknown = ("tolerance", "shares", "left_out", "left_out_in_a_tile", "probe_seconds")
+    return {"requested": requested, "chosen": chosen, "scene": scene_depth, **dict.fromkeys(unknown)}
