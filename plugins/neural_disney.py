@@ -10,12 +10,14 @@ from mi_diffind.tasks.disney.decoder import GROUPS
 from . import Counterpart, Plugin, Stock
 from .disney import ETA_MAX, PRINCIPLED, Disney
 from .support import properties, tables
+from .support.manual import shared_parts
 from .support.stock import Kept, StockNode
 
 #: Default storage form: the fastest to read, and within 82 dB of the formulas.
 STORAGE = "uint8"
 
 
+@shared_parts
 class NeuralDisney(Disney):
     r"""
     .. _bsdf-neural_disney:
@@ -65,6 +67,8 @@ class NeuralDisney(Disney):
 
     **``paper`` gains energy** at the horizon, where its masking is inaccurate: at roughness 0.2, ``anisotropic`` 1 and
     an angle of 89° the mean weight of a sample reaches 2.44, where the exact one stays below 1. ``tables`` does not.
+
+    {executable}
 
     .. tabs::
         .. code-tab:: xml

@@ -67,6 +67,8 @@ class NeuralTexture(FilteredTexture):
 
     {gradient}
 
+    {executable}
+
     .. tabs::
         .. code-tab:: xml
             :name: neural_texture
