@@ -135,7 +135,7 @@ def wall(mi, texture):
     return {
         "type": "scene", "integrator": {"type": "direct"}, "light": {"type": "constant"},
         "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 1, 6], [0, 0, 0], [0, 1, 0]),
-                   "film": {"type": "hdrfilm", "width": 24, "height": 16}},
+                   "film": {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}}},
         "wall": {"type": "rectangle", "to_world": away, "bsdf": {"type": "diffuse", "reflectance": texture}},
     }  # fmt: skip
 
