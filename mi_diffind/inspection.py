@@ -55,8 +55,8 @@ class Inspection:
 def inspect(file_or_scene, measure: bool = False, *, defines: Mapping[str, object] | None = None) -> Inspection:
     """Describe a table file, or the plugins of this package in a scene, in the variant that is set.
 
-    - ``file_or_scene``: a table file (``.npz``), a scene file (``.xml``), a dictionary, a loaded ``mi.Scene`` or another
-      object of Mitsuba.
+    - ``file_or_scene``: a table file (``.npz``), a scene file (``.xml``), a dictionary, a loaded ``mi.Scene`` or
+      another object of Mitsuba.
     - ``measure``: measure the accuracy of a table file in each storage form, against the truth that it was fitted to.
     - ``defines``: values of a scene file's ``<default>`` parameters.
 

@@ -51,7 +51,7 @@ def titled(picture: np.ndarray, titles: Sequence[str]) -> np.ndarray:
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    height, width = picture.shape[:2]
+    width = picture.shape[1]
     strip = Image.new("RGB", (width, TITLE), "white")
     font = ImageFont.load_default(size=11)
     for i, title in enumerate(titles):
