@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
-import itertools
 import os
 import re
 import struct
@@ -422,41 +421,6 @@ def objects_of(scene) -> list:
 def nodes_of(params) -> list:
     """Return all objects that ``params`` (``mi.SceneParameters``) traverse, each once."""
     return list({id(node): node for node in params.hierarchy}.values())
-
-
-def paths_of(scene) -> dict[str, object]:
-    """Return all objects of a loaded scene, each once, by the path of its parameters in ``mi.traverse``.
-
-    The scene's own path is "". Mitsuba names objects without an id ``object_…``, by their address.
-    """
-    import mitsuba as mi
-
-    paths, visited = {"": scene}, {scene}
-
-    class Paths(mi.TraversalCallback):
-        def __init__(self, prefix: str):
-            super().__init__()
-            self.prefix = prefix
-
-        def put(self, name, value, flags, cpptype=None):
-            if isinstance(value, mi.Object):
-                self.put_object(name, value, flags)
-
-        def put_value(self, name, value, flags, cpptype):
-            pass
-
-        def put_object(self, name, value, flags):
-            if value is None or value in visited:
-                return
-            visited.add(value)
-            path = f"{self.prefix}{name}"
-            numbered = (f"{path}_{i}" for i in itertools.count(1))
-            path = next(p for p in itertools.chain([path], numbered) if p not in paths)
-            paths[path] = value
-            value.traverse(Paths(f"{path}."))
-
-    scene.traverse(Paths(""))
-    return paths
 
 
 def is_instance(shape) -> bool:

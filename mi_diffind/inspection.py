@@ -12,7 +12,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from . import compat, plugins, scenes
+from . import plugins, scenes
 from .errors import UsageError
 from .runtime import array_module, use_variant
 from .tables import gathers_of, load_table
@@ -67,7 +67,7 @@ def inspect(file_or_scene, measure: bool = False, *, defines: Mapping[str, objec
     is_file = isinstance(file_or_scene, (str, os.PathLike))
     is_scene_file = is_file and Path(file_or_scene).suffix.lower() == ".xml"
     if defines and not is_scene_file:
-        raise UsageError(f"{file_or_scene if is_file else 'defines'}: -D (defines) needs a scene file (.xml)")
+        raise UsageError(f"{file_or_scene if is_file else 'defines'}: -D needs a scene file (.xml)")
     if is_file and not is_scene_file:
         return _inspect_table(file_or_scene, measure)
     if measure:
@@ -80,7 +80,7 @@ def inspect(file_or_scene, measure: bool = False, *, defines: Mapping[str, objec
     reports = _reports(loaded)
     tables = {
         (r.get("filename") or r.get("preset", ""), r.get("storage", "")): r["table_bytes"]
-        for r in reports if r.get("table_bytes")
+        for r in reports if r["learned"] and r.get("table_bytes")
     }  # fmt: skip
     return _scene_inspection(None, reports, [plugins.origin(i) for i in scenes.learned_instances(loaded)], tables)
 
@@ -104,13 +104,46 @@ def _scene_inspection(file: str | None, reports: list[dict], learned: list[dict]
 
 def _reports(scene) -> list[dict]:
     """Return the report on each plugin of this package, with the ``owner`` of its parameters."""
-    paths, learned = compat.paths_of(scene), plugins.with_counterpart()
+    paths, learned = _paths(scene), plugins.with_counterpart()
     owners, reports = _owners(paths), []
     for path, node in paths.items():
         if plugins.origin(node) is not None:
             report = scenes.report_of(node, scene)
             reports.append({"owner": owners[path], "learned": report["plugin"] in learned, **report})
     return reports
+
+
+def _paths(scene) -> dict[str, object]:
+    """Return all objects of a loaded scene, each once, by the path of its parameters in ``mi.traverse``.
+
+    The scene's own path is "". Mitsuba names objects without an id ``object_…``, by their address.
+    """
+    paths, visited = {"": scene}, {scene}
+
+    class Paths(mi.TraversalCallback):
+        def __init__(self, prefix: str):
+            super().__init__()
+            self.prefix = prefix
+
+        def put(self, name, value, flags, cpptype=None):
+            if isinstance(value, mi.Object):
+                self.put_object(name, value, flags)
+
+        def put_value(self, name, value, flags, cpptype):
+            pass
+
+        def put_object(self, name, value, flags):
+            if value is None or value in visited:
+                return
+            visited.add(value)
+            path = f"{self.prefix}{name}"
+            numbered = (f"{path}_{i}" for i in itertools.count(1))
+            path = next(p for p in itertools.chain([path], numbered) if p not in paths)
+            paths[path] = value
+            value.traverse(Paths(f"{path}."))
+
+    scene.traverse(Paths(""))
+    return paths
 
 
 def _owners(paths: dict[str, object]) -> dict[str, str]:
@@ -128,7 +161,7 @@ def _owners(paths: dict[str, object]) -> dict[str, str]:
         elif parent:
             owners[path] = f"{owners[parent]}.{name}"
         else:
-            label = scenes.plugin_name(node)
+            label = plugins.origin(node)["plugin"] if plugins.origin(node) else node.class_name()
             numbered = (f"({label} {i})" for i in itertools.count(2))
             owners[path] = next(o for o in itertools.chain([f"({label})"], numbered) if o not in owners.values())
     return owners
