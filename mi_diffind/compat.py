@@ -500,6 +500,39 @@ def properties_of(state, object_type=None, names=()) -> list:
     return [node.props for node in state.nodes if wanted(node)]
 
 
+def parsed_types(state) -> list:
+    """Return the ``mi.ObjectType`` of all objects of a parsed scene, in the order of :func:`properties_of`."""
+    return [node.type for node in state.nodes]
+
+
+def parsed_references(state) -> list[list[int]]:
+    """Return for each object of a parsed scene, in the order of :func:`properties_of`, those it nests or refers to.
+
+    They are indices in that order. References are resolved only when a scene is built.
+    """
+    import mitsuba as mi
+
+    types, result = mi.Properties.Type, []
+    for props in properties_of(state):
+        values = [props[key] for key in props if props.type(key) in (types.Reference, types.ResolvedReference)]
+        result.append([v.index() if hasattr(v, "index") else state.id_to_index[v.id()] for v in values])
+    return result
+
+
+def parsed_place(state, index: int) -> str:
+    """Return the file, line and column of an object of a parsed scene."""
+    import mitsuba as mi
+
+    return mi.parser.file_location(state, state.nodes[index])
+
+
+def scene_xml(state) -> str:
+    """Return a parsed scene as XML, without comments. Mitsuba's writer is new in 3.8."""
+    import mitsuba as mi
+
+    return '<?xml version="1.0" encoding="utf-8"?>\n' + mi.parser.write_string(state)
+
+
 def parsed_files(state) -> list[str]:
     """Return the files that were parsed: the scene and the files that it includes."""
     return [str(file) for file in state.files]

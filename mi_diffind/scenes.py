@@ -92,6 +92,11 @@ class ParsedScene:
                 raise RuntimeError(f"{self.path}: holds a {type(loaded).__name__}, a scene is expected")
             return loaded
 
+    def change(self, change: Callable[[object], object]):
+        """Change the parsed scene (``mi.parser.ParserState``) for good by ``change(state)``, and return its result."""
+        with self._errors():
+            return change(self._state)
+
     def _copy(self):
         """Return a copy of the parsed state to read: Mitsuba takes a parameter that was read once for a known one."""
         return compat.copy_parsed(self._state)[1]

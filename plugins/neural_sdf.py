@@ -17,11 +17,12 @@ from mi_diffind.tables import TableError
 from mi_diffind.task import stamp
 from mi_diffind.tasks.sdf import TASK
 
-from . import Counterpart, Plugin, reports_as, shown_as, warn
+from . import Counterpart, Plugin, Stock, reports_as, shown_as, warn
 from .support import properties, tables
 from .support.distance_shapes import CELL_BYTES, SEEN_BY, Placement, crop_grid, distance_shape, finest, native_grid
 from .support.manual import shared_parts
-from .support.sdf_meshes import to_mesh
+from .support.sdf_meshes import closed_mesh_of, to_mesh
+from .support.stock import Kept, StockNode
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()
@@ -283,6 +284,35 @@ def factory(props: mi.Properties):
     return shape
 
 
+#: Bytes of the field that a scene's mesh gets without a file of its own.
+BYTES = 2**18
+
+
+def _from_mesh(node: StockNode) -> None:
+    """Replace a mesh of a file by its distance field."""
+    props = node.props
+    if any(parent.plugin_name() == "shapegroup" for parent in node.parents):
+        raise Kept("is in a shapegroup, which distance fields do not support")
+    if node.nested_types(mi.ObjectType.Emitter):
+        raise Kept("emits light, distance fields emit none")
+    if "interior" in props or "exterior" in props:
+        raise Kept("borders on a medium, distance fields hold none")
+    if textures := node.nested_types(mi.ObjectType.Texture):
+        raise Kept(f"has a material with textures ({', '.join(textures)}), distance fields have no texture coordinates")
+    if props.get("flip_normals", False) is True:
+        raise Kept("has flipped normals, those of distance fields point outwards")
+    node.allow("filename", "shape_index", "face_normals", "flip_normals", "flip_tex_coords", "to_world", "bsdf")
+    try:
+        Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
+    except RuntimeError as e:
+        raise Kept(f"cannot be placed: {e}") from None
+    source = closed_mesh_of(node.file(), node.folder, props.get("shape_index", 0))
+    props["filename"] = str(node.fit(TASK.name, source, bytes=BYTES))
+    for name in ("shape_index", "face_normals", "flip_normals", "flip_tex_coords"):
+        if name in props:
+            del props[name]
+
+
 PLUGIN = Plugin(
     "neural_sdf",
     "shape",
@@ -290,5 +320,6 @@ PLUGIN = Plugin(
     task=TASK.name,
     seen_by=SEEN_BY,
     otherwise=("trace", "grid"),
+    stock=Stock("mesh", ("ply", "obj", "serialized"), _from_mesh),
     exact=Counterpart("ply", ("normals", "trace", "resolution", "storage"), convert=to_mesh),
 )

@@ -464,3 +464,22 @@ def test_integrators_in_python(mi_rgb):
         channels = mi_rgb.load_dict({"type": "aov", "aovs": "d:depth", "inner": {"type": "prb"}})
         names = [compat.integrator_name(integrator) for integrator in compat.objects_of(channels)]
         assert names == [compat.INTERSECTING, "PRBIntegrator"]
+
+
+def test_parsed_scenes_as_graphs_and_as_xml(mi_rgb, tmp_path):
+    """Which object refers to which, by nesting and by id, where it stands, and the same scene written again."""
+    text = (
+        '<scene version="3.0.0">\n<bsdf type="twosided" id="a">\n<bsdf type="diffuse"/></bsdf>'
+        '<shape type="sphere"><ref id="a"/><float name="radius" value="2"/></shape></scene>'
+    )
+    (tmp_path / "a.xml").write_text(text)
+    _, state = compat.parse_file(tmp_path / "a.xml")
+    names = [props.plugin_name() for props in compat.properties_of(state)]
+    assert names == ["scene", "twosided", "diffuse", "sphere"]
+    assert [str(t).rpartition(".")[2] for t in compat.parsed_types(state)] == ["Scene", "BSDF", "BSDF", "Shape"]
+    assert compat.parsed_references(state) == [[1, 3], [2], [], [1]]
+    assert compat.parsed_place(state, 2).endswith("a.xml (line 3, col 2)")
+    (tmp_path / "b.xml").write_text(compat.scene_xml(state))
+    _, again = compat.parse_file(tmp_path / "b.xml")
+    assert compat.parsed_references(again) == [[1, 3], [2], [], [1]]
+    assert compat.properties_of(again)[3]["radius"] == 2
