@@ -96,6 +96,5 @@ def plugin_of(instance) -> str:
     return type(instance).__name__ if described is None else described["plugin"]
 
 
-compat.before_render(
-    check
-)  # once in a process: packages of plugins are executed anew for each variant, this one is not
+# Once in a process: plugins are executed anew for each variant, this module is not
+compat.before_render(check)
