@@ -30,6 +30,8 @@ _NAMES = {
     "load_dict": "scenes",
     "load_string": "scenes",
     "attach": "scenes",
+    "compare": "comparison",
+    "convert": "conversion",
     "render": "rendering",
     # Errors between images, and images as displayed
     "metrics": "",

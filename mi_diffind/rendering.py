@@ -13,9 +13,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from . import conversion, scenes
 from . import depth as depths
 from . import orbit as orbits
-from . import scenes
 from .errors import UsageError
 from .interrupt import interruptible
 from .runtime import use_variant
@@ -82,6 +82,7 @@ def render(
     orbit: int | None = None,
     centre: Sequence[float] | None = None,
     defines: Mapping[str, object] | None = None,
+    learn: Sequence[str] = (),
     progress: bool = True,
 ) -> Rendering:
     """Render a scene: ``mi-diffind render`` in Python, in the variant that is set.
@@ -92,6 +93,7 @@ def render(
       leaves out less than ``depth_tolerance`` of the scattered light (of a scene file; :mod:`mi_diffind.depth`).
     - ``orbit``: number of frames of a camera that goes once around ``centre`` (``None``: the middle of the scene).
     - ``defines``: values of the file's ``<default>`` parameters.
+    - ``learn``: groups of Mitsuba's plugins that learned ones replace (:mod:`.conversion`), fitted if need be.
 
     Ctrl-C ends the rendering after a pass or a frame and keeps what there is; ``figures["interrupted"]`` is then true.
     Raises :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.errors.UsageError`.
@@ -105,13 +107,16 @@ def render(
     parsed = None
     if isinstance(scene, (str, os.PathLike)):
         parsed = scenes.ParsedScene(scene, dict(defines or {}))
+        conversions = conversion.replace_stock(parsed, learn, progress=progress)
         chosen = _chosen_depth(parsed, depth, depth_tolerance, seed)
         changed = chosen["chosen"] != chosen["scene"]
         loaded = parsed.load(longest_path=chosen["chosen"] if changed else None)
     else:
+        if learn:
+            raise UsageError("learn: given with a scene in memory, allowed are scene files")
         if depth != "scene" or defines:
             raise UsageError("depth, defines: given with a scene in memory, allowed are scene files")
-        chosen, loaded = None, scenes.load_dict(scene) if isinstance(scene, dict) else scene
+        chosen, conversions, loaded = None, [], scenes.load_dict(scene) if isinstance(scene, dict) else scene
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
     if not loaded.sensors():
@@ -138,6 +143,7 @@ def render(
         "spp_requested": spp,
         "seed": seed,
         "depth": chosen,
+        "conversions": [vars(c) for c in conversions],
         "seconds_load": ready - start,
         "seconds_render": time.perf_counter() - ready,
     }

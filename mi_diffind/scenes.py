@@ -20,7 +20,7 @@ from . import compat, plugins
 from .errors import DiffindError
 from .files import replacing
 from .measure.operations import bsdf_operations
-from .plugins.support import footprint
+from .plugins.support import footprint, omissions
 from .runtime import use_variant
 from .task import tasks
 
@@ -91,6 +91,11 @@ class ParsedScene:
             if not isinstance(loaded, mi.Scene):
                 raise RuntimeError(f"{self.path}: holds a {type(loaded).__name__}, a scene is expected")
             return loaded
+
+    def change(self, change: Callable[[object], object]):
+        """Change the parsed scene (``mi.parser.ParserState``) for good by ``change(state)``, and return its result."""
+        with self._errors():
+            return change(self._state)
 
     def _copy(self):
         """Return a copy of the parsed state to read: Mitsuba takes a parameter that was read once for a known one."""
@@ -200,17 +205,9 @@ def attach(scene, sensor=0, spp: int | None = None):
     """
     if isinstance(sensor, int) and not 0 <= sensor < len(scene.sensors()) and footprint.textures(scene):
         raise SceneError(f"sensor: found {sensor}, the scene has {len(scene.sensors())}")
-    names = [plugin_name(node) for node in compat.objects_of(scene) if isinstance(node, mi.Integrator)]
-    if unseen := _unseen(scene, names):
-        plugins.warn(unseen)
     footprint.attach(scene, sensor, spp)
+    omissions.check(scene)
     return scene
-
-
-def plugin_name(node) -> str:
-    """Return the name of the plugin that created an object: of the package's plugins as in a scene, else its class."""
-    description = plugins.origin(node)
-    return description["plugin"] if description else node.class_name()
 
 
 def _build(config, state, integrators: list[str], report: Callable[[str], None]):
@@ -221,6 +218,7 @@ def _build(config, state, integrators: list[str], report: Callable[[str], None])
         unseen = _unseen(loaded, integrators)
         if unseen:
             report(unseen)
+            omissions.settle(instance for instance in instances(loaded) if hasattr(instance, "seen_by"))
         _warn_of_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
     return loaded
@@ -275,13 +273,18 @@ def _decode_unseen(state, integrators: list[str]) -> list[str]:
     ids = []
     for props in compat.properties_of(state):
         plugin = plugins.declared().get(props.plugin_name())
-        if plugin is None or plugin.otherwise is None or set(plugin.seen_by) & set(integrators):
+        if plugin is None or plugin.otherwise is None or _sees(integrators, plugin.seen_by):
             continue
         key, value = plugin.otherwise
         if key not in props and not ("storage" in props and props["storage"] == "float32"):
             props[key] = value
             ids.append(props.id())
     return ids
+
+
+def _sees(integrators: list[str], seen_by: tuple[str, ...]) -> bool:
+    """Return whether integrators see a shape that those called ``seen_by`` see; ``aov`` intersects rays itself."""
+    return bool(set(seen_by) & set(integrators)) and "aov" not in integrators
 
 
 def _warn_of_decoded(scene, ids: list[str], integrators: list[str]) -> None:
@@ -297,7 +300,7 @@ def _unseen(scene, integrators: list[str]) -> str:
     """Return a sentence about a shape that none of the ``integrators`` traces, "" if there is none."""
     for instance in instances(scene):
         seen_by = getattr(instance, "seen_by", None)
-        if seen_by and not set(seen_by) & set(integrators):
+        if seen_by and not _sees(integrators, seen_by):
             allowed = " or ".join(f'"{name}"' for name in seen_by)
             present = ", ".join(f'"{name}"' for name in integrators) or "none"
             return (

@@ -308,6 +308,9 @@ def _only(inner, shapes: list):
     replays = compat.samples_in_python(inner)
 
     class ObjectsOnly(mi.SamplingIntegrator):
+        def traverse(self, cb):
+            cb.put("inner", inner, mi.ParamFlags.Differentiable)
+
         def sample(self, scene, sampler, ray, medium=None, active=True):
             ray, hit = mi.Ray3f(ray), mi.Bool(False)
             left = mi.Bool(active)

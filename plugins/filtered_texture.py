@@ -5,10 +5,11 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
+from mi_diffind import compat
 from mi_diffind.lookup import clamp
 
 from .map_texture import MapTexture
-from .support import footprint
+from .support import footprint, omissions
 from .support.filtering import Filter, anisotropic, cone_of, in_texels, isotropic, offsets, random
 from .support.footprint import Cone
 from .support.textures import luminance
@@ -28,10 +29,31 @@ class FilteredTexture(MapTexture):
         self._cone_of_parameters = cone_of(props)
         self.cone = self._cone_of_parameters
         super().__init__(props)
+        if self.filter.name != "off":
+            omissions.watch(self)
 
     def set_cone(self, cone: Cone | None) -> None:
         """Set the sensor that sees the texture; ``None``: the one that the parameters describe, if any."""
         self.cone = cone or self._cone_of_parameters
+
+    def omitted(self, integrators: list) -> str:
+        """Return a sentence if these integrators carry no footprints to the texture; see :mod:`.omissions`.
+
+        Of most integrators, only :func:`.omissions.reading` knows.
+        """
+        names = [compat.integrator_name(integrator) for integrator in integrators]
+        if self.cone is not None or not self.is_spatially_varying() or not set(names) & set(compat.CARRYING):
+            return ""
+        return self.unfiltered()
+
+    def unfiltered(self) -> str:
+        """Return a warning that the texture is not filtered."""
+        described = ", ".join(filter(None, (omissions.plugin_of(self), str(self._path or ""))))
+        return (
+            f'the texture "{self.id()}" ({described}) is not filtered: it does not know the sensor, and the integrator '
+            f"gives no footprints; load the scene with mi_diffind.load_file or load_dict, call "
+            f"mi_diffind.attach(scene), or render with the integrator path_footprint"
+        )
 
     def _values(self, si):
         if self.filter.name == "off" or not self.is_spatially_varying():
@@ -54,6 +76,8 @@ class FilteredTexture(MapTexture):
 
     def _footprint(self, si) -> tuple:
         """Return the footprint in texels of the image, with ``to_uv`` applied."""
+        if self.cone is None:
+            omissions.reading(self, si)
         with dr.suspend_grad():
             ddx, ddy = footprint.footprint(si, self.cone)
             if self._transform is not None:

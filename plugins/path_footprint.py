@@ -10,8 +10,9 @@ import mitsuba as mi
 from mi_diffind import compat
 
 from . import Plugin
-from .support import footprint
+from .support import footprint, omissions
 from .support.differentials import Differentials
+from .support.manual import shared_parts
 
 #: ``max_depth`` where there is no limit.
 INFINITE = 0xFFFFFFFF
@@ -67,6 +68,8 @@ Replay Backpropagation*, SIGGRAPH 2021). This includes smooth mirrors, except fo
 is sampled. Footprints and geometry are constants: for derivatives of shapes, use :monosp:`prb_projective`. Polarised
 variants are not supported.
 
+{executable}
+
 .. tabs::
     .. code-tab:: xml
         :name: path_footprint
@@ -113,6 +116,7 @@ def relative(value):
 def integrator() -> type:
     """Return the class for the variant that is set; its base class exists only after Mitsuba loaded this file."""
 
+    @shared_parts
     class PathFootprint(compat.replay_integrator()):
         __doc__ = MANUAL
 
@@ -137,6 +141,11 @@ def integrator() -> type:
                 f"PathFootprint[\n  max_depth = {depth},\n  rr_depth = {self.rr_depth},\n"
                 f"  jitter = {str(self.jitter).lower()}\n]"
             )
+
+        def render(self, scene, *args, **kwargs):
+            """Render as Mitsuba does, with a warning of what would be left out of the image."""
+            omissions.check(scene, self)
+            return super().render(scene, *args, **kwargs)
 
         def sample_rays(self, scene, sensor, sampler):
             """Sample rays as Mitsuba does, but with differentials of samples in place of pixels."""

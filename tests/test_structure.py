@@ -27,6 +27,7 @@ FLOORS = (
         "view_capture",
         "orbit",
         "comparison",
+        "conversion",
         "z_test",
         "reference_files",
         "regression",
@@ -161,6 +162,7 @@ def test_general_rooms_know_no_task():
         "view_capture",
         "orbit",
         "comparison",
+        "conversion",
         "regression",
     }
     rooms |= {"depth", "measure"}

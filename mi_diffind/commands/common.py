@@ -56,6 +56,26 @@ def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
         sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
 
 
+def learn_option(sub: argparse.ArgumentParser, default: str) -> None:
+    """Add ``--learn`` (``learn``: a list of groups of stock plugins, empty without the option)."""
+    sub.add_argument(
+        "--learn",
+        type=lambda text: text.split(","),
+        default=[],
+        metavar="GROUP,…",
+        help="replace Mitsuba's plugins of these groups by learned ones, fitted if need be and kept for the next time: "
+        f"principled, bitmap, mesh (default: {default})",
+    )
+
+
+def print_conversions(conversions: list[dict]) -> None:
+    """Print what was replaced and what was kept."""
+    from .. import conversion
+
+    for line in conversion.summary(conversions):
+        print(line)
+
+
 def set_variant(name: str | None) -> None:
     """Set the Mitsuba variant ``name``; ``None``: the RGB variant of the GPU if there is one, else of the CPU.
 

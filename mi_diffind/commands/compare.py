@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..files import writable_folder
-from .common import positive, require_scene, scene_options, set_variant, verb
+from .common import learn_option, positive, require_scene, scene_options, set_variant, verb
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
 
@@ -22,6 +22,7 @@ def add(commands) -> None:
         help="compare with one counterpart: exact, or another one, such as Mitsuba's principled (default: those that "
         "the plugins declare as truths: exact, for filtered textures mipmap, too)",
     )
+    learn_option(sub, "none")
     scene_options(sub)
 
 
@@ -41,12 +42,12 @@ def run(arguments) -> dict:
         arguments.scene,
         arguments.spp,
         arguments.seed,
-        arguments.passes,
-        True,
-        dict(arguments.defines),
-        arguments.against,
+        passes=arguments.passes,
+        against=arguments.against,
+        learn=arguments.learn,
+        defines=dict(arguments.defines),
     )
-    paths = comparison.write(result, arguments.out)
-    print("\n".join(comparison.summary(result)))
+    paths = result.save(arguments.out)
+    print(result)
     print(f"picture     {paths['figure']}")
     return {**result.figures, "further": [one.figures for one in result.further], "files": paths}

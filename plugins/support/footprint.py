@@ -21,6 +21,8 @@ import numpy as np
 
 from mi_diffind import compat
 
+from . import omissions
+
 #: Limit of the components of a footprint in uv: larger than any texture, and its fourth power is finite.
 LARGEST = 2.0**20
 
@@ -349,6 +351,7 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
             cone = Cone.of(scene.sensors()[sensor], spp)
     except RuntimeError as e:
         mi.Log(mi.LogLevel.Warn, f"textures are not filtered: {e}")
+        omissions.settle(filtering)
     for texture in filtering:
         texture.set_cone(cone)
     return len(filtering)

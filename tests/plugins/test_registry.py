@@ -1,8 +1,10 @@
 """Plugins that declare themselves: found here and in other packages, checked, and known by what they were made from."""
 
+import re
 import sys
 import textwrap
 from importlib import metadata
+from pathlib import Path
 
 import drjit as dr
 import pytest
@@ -154,6 +156,18 @@ def test_plugins_of_this_package_say_what_they_are(mi_rgb):
     )
     assert plugins.with_counterpart("mipmap") == ("neural_texture",)
     assert plugins.with_counterpart("principled") == ("disney", "neural_disney")
+
+
+def test_manual_pages_are_complete(mi_rgb):
+    """Shared parts are filled in; each page names the program that cannot load the plugin, and the one that can."""
+    folder = Path(plugins.__file__).parent
+    for name, plugin in plugins.declared().items():
+        parts = sys.modules[f"{plugins.__name__}.{name}"]
+        classes = [v for v in vars(parts).values() if isinstance(v, type) and v.__module__ == parts.__name__]
+        classes += [parts.integrator()] if hasattr(parts, "integrator") else []
+        (page,) = [c.__doc__ for c in classes if f"-{name}:" in (c.__doc__ or "")]
+        assert "``mitsuba``" in page and "mi-diffind render" in page and (folder / f"{name}.py").is_file()
+        assert not re.search(r"^ *\{\w+\}$", page, re.MULTILINE), plugin.name
 
 
 def test_each_variant_has_classes_of_its_own():

@@ -44,7 +44,7 @@ class Sdf(Task):
     measurements = 4
     files = "model"
     arguments = (
-        Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
+        Argument("source", metavar="MESH", help="a mesh: ply, obj, stl, off, glb, serialized, …"),
         Argument(
             "--bytes", type=checked(units.parse_bytes), metavar="N",
             help="size in memory, as in 256k or 1.5M (default: 1M)",
