@@ -228,8 +228,8 @@ def noise(written: list, truth: list, samples: list[int]) -> dict[str, float | N
     rendered with the same random numbers, so the noise that they share is in neither image's error: noise is here what
     remains of it in their *difference*. With the differences a and b of the halves, of m and n samples, the squared
     noise of the mean difference is estimated by (a − b)² m n / (m + n)² and its squared expectation by a b, both
-    without bias. Only where one of the two means is outside of [0, 1], which the PSNR clips, are the halves clipped,
-    too.
+    without bias. Where the PSNR clips the two means to [0, 1] and sees a part of their difference, that part of a and b
+    counts. For halves of equal size, the two squares add up to the squared error.
 
     ``noise_db``: PSNR that two scenes of equal expectation would reach at so many samples, infinite without noise;
     ``psnr_without_noise_db``: PSNR of infinitely many samples, ``None`` if the difference of the images is below two
@@ -238,10 +238,11 @@ def noise(written: list, truth: list, samples: list[int]) -> dict[str, float | N
     if min(samples) == 0:
         return {"noise_db": None, "psnr_without_noise_db": None}
     m, n = samples
-    means = [sum(side) / (m + n) for side in (written, truth)]
-    clipped = np.any([(mean < 0) | (mean > 1) for mean in means], axis=0)
-    halves = ((w / k, t / k) for w, t, k in zip(written, truth, samples, strict=True))
-    a, b = (np.where(clipped, np.clip(w, 0, 1) - np.clip(t, 0, 1), w - t) for w, t in halves)
+    mean, reference = (sum(side) / (m + n) for side in (written, truth))
+    difference = mean - reference
+    shown = np.clip(mean, 0, 1) - np.clip(reference, 0, 1)
+    share = np.where(shown == difference, 1, shown / np.where(difference == 0, 1, difference))
+    a, b = ((w - t) / k * share for w, t, k in zip(written, truth, samples, strict=True))
     squared = (a * b).mean(axis=-1)
     bias, error = squared.mean(), squared.std() / math.sqrt(squared.size)
     return {
@@ -371,8 +372,10 @@ def _noise_text(f: dict) -> str:
     if math.isinf(f["noise_db"]):
         return "none: both halves of the samples differ alike"
     without = f["psnr_without_noise_db"]
-    rest = "none measurable beyond it" if without is None else f"{without:.2f} dB without it"
-    return f"{f['noise_db']:.2f} dB of it, {rest}"
+    rest = (
+        ": all of the error, as far as the samples tell" if without is None else f" of it, {without:.2f} dB without it"
+    )
+    return f"{f['noise_db']:.2f} dB{rest}"
 
 
 def _time_lines(f: dict) -> list[str]:

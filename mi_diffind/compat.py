@@ -243,7 +243,7 @@ def on_variant_change(callback) -> None:
 
 
 def before_render(callback) -> None:
-    """Have ``mi.render`` call ``callback(scene, integrator)`` first, with the integrator given to it, or ``None``.
+    """Have ``mi.render`` call ``callback(scene, integrator, sensor)`` first, with the arguments given to it.
 
     Mitsuba tells plugins nothing of renders: scenes, sensors and shapes have no method in Python that one calls. The
     function is the same in all variants, under two names. It stays as it is for everything else: its arguments, errors,
@@ -256,7 +256,7 @@ def before_render(callback) -> None:
 
     @functools.wraps(render)
     def checked_render(scene, params=None, sensor=0, integrator=None, *args, **kwargs):
-        callback(scene, integrator)
+        callback(scene, integrator, sensor)
         return render(scene, params, sensor, integrator, *args, **kwargs)
 
     util.render = mi.render = checked_render

@@ -45,6 +45,7 @@ class ParsedScene:
     def __init__(self, path: str | os.PathLike, defines: dict[str, str] | None = None):
         self.path = Path(path)
         self.defines = {name: str(value) for name, value in (defines or {}).items()}
+        self._resolver = None  # parsing adds the folders of <path> to it
         with self._errors():
             if not self.path.is_file():
                 raise RuntimeError(f"{path}: no such scene file")
@@ -55,7 +56,7 @@ class ParsedScene:
     @contextlib.contextmanager
     def _errors(self):
         """Resolve file names beside the scene, and turn errors into a :class:`SceneError`."""
-        with scene_errors(self.path), _resolving(self.path):
+        with scene_errors(self.path), _resolving(self.path, self._resolver) as self._resolver:
             yield
 
     def load(
@@ -418,14 +419,18 @@ def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
 
 
 @contextlib.contextmanager
-def _resolving(path):
-    """Look for relative file names beside the scene, as ``mi.load_file`` does."""
+def _resolving(path, resolver=None):
+    """Look for relative file names beside the scene, as ``mi.load_file`` does; yield the resolver.
+
+    ``resolver``: an earlier one for the same scene.
+    """
     before = mi.file_resolver()
-    resolver = mi.FileResolver(before)
-    resolver.prepend(str(Path(path).resolve().parent))
+    if resolver is None:
+        resolver = mi.FileResolver(before)
+        resolver.prepend(str(Path(path).resolve().parent))
     mi.set_file_resolver(resolver)
     try:
-        yield
+        yield resolver
     finally:
         mi.set_file_resolver(before)
 

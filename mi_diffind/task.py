@@ -237,8 +237,11 @@ class Model:
         """
         self._refuse("cannot be measured")
 
-    def decode(self, output: Path, **options) -> list[tuple[Path, str]]:
+    def decode(self, output: str | os.PathLike | None = None, **options):
         """Write the content in an ordinary format, and return each file with a line about it.
+
+        Without an ``output``, the content is returned: of maps a dictionary of arrays, of a distance field a
+        ``trimesh.Trimesh``.
 
         Raises :class:`~mi_diffind.tables.TableError` if there is no such format, and
         :class:`~mi_diffind.errors.UsageError` for bad options.
@@ -456,8 +459,8 @@ def load_model(path: str | os.PathLike, dtype, storage: str = "") -> Model:
     return task.model(task.load(path), dtype, storage)
 
 
-def open_model(path: str | os.PathLike, storage: str = "") -> Model:
-    """Open a table file of any task: ``mi_diffind.open(path)``.
+def open_model(path: str | os.PathLike = "", storage: str = "", *, task: str = "", preset: str = "") -> Model:
+    """Open a table file of any task, or the tables that ship for a ``task`` and its ``preset``: ``mi_diffind.open``.
 
     The model describes itself (``describe()``), has its size (``nbytes``), measures its errors against what it was
     fitted to (``measure()``) and turns into ordinary files (``decode(output)``). ``storage`` is the storage form of its
@@ -468,6 +471,11 @@ def open_model(path: str | os.PathLike, storage: str = "") -> Model:
 
     if storage and storage not in STORAGES:
         raise UsageError(f'storage: found "{storage}", allowed are {", ".join(STORAGES)}')
+    if not str(path):
+        shipping = [name for name, known in tasks().items() if known.shipped]
+        if task not in shipping:
+            raise UsageError(f'open: found no file and the task "{task}", tables ship for {", ".join(shipping)}')
+        path = tasks()[task].file("", preset)
     return load_model(path, array_module().TensorXf, storage)
 
 

@@ -36,24 +36,35 @@ class FilteredTexture(MapTexture):
         """Set the sensor that sees the texture; ``None``: the one that the parameters describe, if any."""
         self.cone = cone or self._cone_of_parameters
 
-    def omitted(self, integrators: list) -> str:
-        """Return a sentence if these integrators carry no footprints to the texture; see :mod:`.omissions`.
+    def omitted(self, integrators: list, sensor) -> str:
+        """Return a sentence if no footprints reach the texture, or those of another sensor; see :mod:`.omissions`.
 
-        Of most integrators, only :func:`.omissions.reading` knows.
+        Whether an integrator gives footprints is known of a few only, and of all others to :func:`.omissions.reading`.
         """
         names = [compat.integrator_name(integrator) for integrator in integrators]
-        if self.cone is not None or not self.is_spatially_varying() or not set(names) & set(compat.CARRYING):
+        attached, name = footprint.attached_sensor(self)
+        if not self.is_spatially_varying() or any(hasattr(i, "gives_footprints") for i in integrators):
             return ""
-        return self.unfiltered()
+        if self.cone is None:
+            return self.unfiltered() if set(names) & set(compat.CARRYING) else ""
+        if sensor is None or attached in (0, id(sensor)):
+            return ""
+        return (
+            f'{self._title()} is filtered for the sensor "{name}", found "{sensor.id()}": call '
+            f"mi_diffind.attach(scene, sensor) before a render of another sensor"
+        )
 
     def unfiltered(self) -> str:
         """Return a warning that the texture is not filtered."""
-        described = ", ".join(filter(None, (omissions.plugin_of(self), str(self._path or ""))))
         return (
-            f'the texture "{self.id()}" ({described}) is not filtered: it does not know the sensor, and the integrator '
-            f"gives no footprints; load the scene with mi_diffind.load_file or load_dict, call "
-            f"mi_diffind.attach(scene), or render with the integrator path_footprint"
+            f"{self._title()} is not filtered: it does not know the sensor, and the integrator gives no footprints; "
+            f"load the scene with mi_diffind.load_file or load_dict, call mi_diffind.attach(scene), or render with the "
+            f"integrator path_footprint"
         )
+
+    def _title(self) -> str:
+        described = ", ".join(filter(None, (omissions.plugin_of(self), str(self._path or ""))))
+        return f'the texture "{self.id()}" ({described})'
 
     def _values(self, si):
         if self.filter.name == "off" or not self.is_spatially_varying():

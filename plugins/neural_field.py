@@ -362,7 +362,7 @@ def integrator() -> type:
             film.put_block(block)
             return film.develop()
 
-        def omitted(self, integrators: list) -> str:
+        def omitted(self, integrators: list, sensor) -> str:
             """Return a sentence if no integrator among these renders a radiance field; see :mod:`.omissions`."""
             if any(isinstance(integrator, NeuralField) for integrator in integrators):
                 return ""
@@ -375,7 +375,7 @@ def integrator() -> type:
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             if not develop:
                 raise RuntimeError("neural_field: found develop=False, allowed is develop=True")
-            omissions.check(scene, self)
+            omissions.check(scene, self, sensor)
             with dr.suspend_grad():
                 film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
                 light, alpha, aovs, _ = self.primal(scene, sampler, ray)

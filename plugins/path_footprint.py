@@ -120,6 +120,9 @@ def integrator() -> type:
     class PathFootprint(compat.replay_integrator()):
         __doc__ = MANUAL
 
+        #: Rays carry differentials, from which textures get footprints (:mod:`.filtered_texture`).
+        gives_footprints = True
+
         def __init__(self, props: mi.Properties):
             for name, low in (("max_depth", -1), ("rr_depth", 1)):
                 if name in props and (props.type(name) != mi.Properties.Type.Integer or props[name] < low):
@@ -142,10 +145,10 @@ def integrator() -> type:
                 f"  jitter = {str(self.jitter).lower()}\n]"
             )
 
-        def render(self, scene, *args, **kwargs):
+        def render(self, scene, sensor=0, *args, **kwargs):
             """Render as Mitsuba does, with a warning of what would be left out of the image."""
-            omissions.check(scene, self)
-            return super().render(scene, *args, **kwargs)
+            omissions.check(scene, self, sensor)
+            return super().render(scene, sensor, *args, **kwargs)
 
         def sample_rays(self, scene, sensor, sampler):
             """Sample rays as Mitsuba does, but with differentials of samples in place of pixels."""

@@ -39,6 +39,10 @@ def test_noise_where_nothing_is_random_or_visible(rng):
     mean = rng.uniform(0.3, 0.6, (8, 8, 3))
     still = comparison.noise([4 * mean, 4 * mean], [4 * mean - 0.04, 4 * mean - 0.04], [4, 4])
     assert still["noise_db"] > 200 and still["psnr_without_noise_db"] == pytest.approx(40)
+    wide = [rng.exponential(0.8, (9, 7, 3)) for _ in range(4)]  # many values are clipped
+    found = comparison.noise(wide[:2], wide[2:], [1, 1])
+    error = 10 ** (-metrics.psnr(sum(wide[2:]) / 2, sum(wide[:2]) / 2) / 10)
+    assert 0.5 * error < 10 ** (-found["noise_db"] / 10) < 2 * error
     bright = [rng.uniform(2, 3, (8, 8, 3)) for _ in range(4)]
     assert comparison.noise(bright[:2], bright[2:], [1, 1]) == {"noise_db": np.inf, "psnr_without_noise_db": np.inf}
     assert set(comparison.noise([mean, 0], [mean, 0], [1, 0]).values()) == {None}

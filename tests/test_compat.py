@@ -207,7 +207,7 @@ def test_callback_of_renders(mi_rgb, monkeypatch):
         tracer = mi.load_dict({"type": "depth"})
         for arguments, more in (((scene, None, 0, tracer, 3), {}), ((), {"integrator": tracer, "scene": scene})):
             assert mi.render(*arguments, spp=1, **more).shape == (576, 768, 3)
-            assert calls.pop() == (scene, tracer) and not calls
+            assert calls.pop() == (scene, tracer, 0) and not calls
         here = mi.render
         try:
             mi.set_variant("llvm_ad_mono")

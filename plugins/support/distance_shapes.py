@@ -118,7 +118,7 @@ def distance_shape(mesh: type) -> type:
                 return
             cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
 
-        def omitted(self, integrators: list) -> str:
+        def omitted(self, integrators: list, sensor) -> str:
             """Return a sentence if these integrators do not trace the shape; see :mod:`.omissions`."""
             names = [compat.integrator_name(integrator) for integrator in integrators]
             if any(hasattr(i, "sample_shapes") for i in integrators) and compat.INTERSECTING not in names:

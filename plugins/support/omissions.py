@@ -1,4 +1,4 @@
-"""Warnings of what a render would leave out in silence: a shape that no integrator sees, a texture without footprint.
+"""Warnings of what a render would do wrong in silence: leave out a shape that no integrator sees, or filter no texture.
 
 Scenes that ``mi_diffind`` loads are prepared, or refused. Those of ``mi.load_file``, ``mi.load_dict`` and
 ``mi.load_string`` are checked when they are rendered: by ``mi.render`` (:func:`mi_diffind.compat.before_render`), by
@@ -22,20 +22,25 @@ _watched: weakref.WeakSet = weakref.WeakSet()
 #: Instance → those of its plugin in the scene that was checked last.
 _mates: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
 
-#: Pairs of ids, of a scene and an integrator, that were checked since the last instance was watched.
-_checked: set[tuple[int, int]] = set()
+#: Ids of a scene, an integrator and a sensor that were checked together since the last instance was watched.
+_checked: set[tuple[int, int, int]] = set()
 
-#: Largest number of pairs that are remembered.
+#: Largest number of these that are remembered.
 MOST = 1024
 
 
 def watch(instance) -> None:
     """Have a plugin's instance checked before renders.
 
-    Its method ``omitted(integrators)`` returns a sentence if none of these integrators, nested ones included, renders
-    it, else "".
+    Its method ``omitted(integrators, sensor)`` returns a sentence if none of these integrators, nested ones included,
+    renders it as it should be, else "".
     """
     _watched.add(instance)
+    recheck()
+
+
+def recheck() -> None:
+    """Check all scenes again at their next render; instances that were warned of stay unwatched."""
     _checked.clear()
 
 
@@ -45,17 +50,22 @@ def settle(instances) -> None:
         _watched.discard(instance)
 
 
-def check(scene, integrator=None) -> None:
-    """Warn of watched instances in a scene that an integrator (default: the scene's) leaves out."""
+def check(scene, integrator=None, sensor=0) -> None:
+    """Warn of watched instances in a scene that an integrator (default: the scene's) leaves out.
+
+    ``sensor`` is the number of one of the scene's, or a sensor.
+    """
     if not _watched or not isinstance(scene, mi.Scene):
         return
     integrator = scene.integrator() if integrator is None else integrator
-    pair = id(scene), id(integrator)
-    if pair in _checked or not isinstance(integrator, mi.Integrator):
+    if isinstance(sensor, int):
+        sensor = scene.sensors()[sensor] if 0 <= sensor < len(scene.sensors()) else None
+    ids = id(scene), id(integrator), id(sensor)
+    if ids in _checked or not isinstance(integrator, mi.Integrator):
         return
     if len(_checked) >= MOST:
         _checked.clear()
-    _checked.add(pair)
+    _checked.add(ids)
     integrators = compat.objects_of(integrator)
     groups: dict[str, list] = {}
     for instance in compat.objects_of(scene):
@@ -64,7 +74,7 @@ def check(scene, integrator=None) -> None:
     for instances in groups.values():
         mates = weakref.WeakSet(instances)
         _mates.update(dict.fromkeys(instances, mates))
-        sentences = [sentence for instance in instances if (sentence := instance.omitted(integrators))]
+        sentences = [sentence for instance in instances if (sentence := instance.omitted(integrators, sensor))]
         if sentences:
             settle(instances)
             warn(f"{sentences[0]} ({len(sentences) - 1} more likewise)" if len(sentences) > 1 else sentences[0])
@@ -86,6 +96,5 @@ def plugin_of(instance) -> str:
     return type(instance).__name__ if described is None else described["plugin"]
 
 
-compat.before_render(
-    check
-)  # once in a process: packages of plugins are executed anew for each variant, this one is not
+# Once in a process: plugins are executed anew for each variant, this module is not
+compat.before_render(check)

@@ -54,7 +54,7 @@ class Image(Task):
     def settings(self, preset, given, options):
         defaults = without(PRESETS[preset], options["without"]).settings
         steps = given.get("steps", defaults.steps)
-        return dataclasses.replace(defaults, measure_every=max(1, steps // 10), **given)
+        return dataclasses.replace(defaults, **{"measure_every": max(1, steps // 10), **given})
 
 
 TASK = Image()

@@ -190,6 +190,30 @@ def test_scenes_without_a_sensor(mi_rgb, warned, tmp_path):
     assert not warned()
 
 
+def test_sensors_that_textures_do_not_know(mi_rgb, warned):
+    """A loop over sensors has to attach each; ``path_footprint`` knows them all."""
+    mi = mi_rgb
+    content = scene(mi, **textured(mi))
+    content |= {
+        "left": content.pop("sensor"),
+        "right": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4}},
+    }
+    loaded, direct = mi_diffind.load_dict(content), mi.load_dict({"type": "direct"})
+    left, right = loaded.sensors()
+    mi.render(loaded, sensor=1, integrator=mi.load_dict({"type": "path_footprint", "max_depth": 2}), spp=1)
+    for sensor in (0, left):
+        mi.render(loaded, sensor=sensor, integrator=direct, spp=1)
+    for i, sensor in enumerate((left, right)):
+        mi_diffind.attach(loaded, i)
+        mi.render(loaded, sensor=sensor, integrator=direct, spp=1)
+    assert not warned()
+    mi.render(loaded, sensor=0, integrator=direct, spp=1)
+    (line,) = warned()
+    assert 'for the sensor "right", found "left"' in line and "mi_diffind.attach(scene, sensor)" in line
+    mi.render(loaded, sensor=0, integrator=direct, spp=1)
+    assert not warned()
+
+
 def test_fields_that_another_integrator_leaves_out(mi_rgb, warned):
     mi = mi_rgb
     register_field(mi, {"fog": Fog(compat.module_of(mi.Float))})
