@@ -30,9 +30,14 @@ _NAMES = {
     "load_dict": "scenes",
     "load_string": "scenes",
     "attach": "scenes",
+    "capture": "view_capture",
     "compare": "comparison",
     "convert": "conversion",
+    "inspect": "inspection",
+    "regress": "regression",
     "render": "rendering",
+    # Measurements
+    "tradeoff": "tradeoffs",
     # Errors between images, and images as displayed
     "metrics": "",
     "srgb": "",

@@ -49,6 +49,8 @@ class ParsedScene:
         with self._errors():
             if not self.path.is_file():
                 raise RuntimeError(f"{path}: no such scene file")
+            if self.path.suffix.lower() == ".npz":
+                raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
 
     @contextlib.contextmanager
@@ -335,17 +337,20 @@ def reports(scene) -> list[dict]:
     (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance field, how many
     steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.march.RayCounts`).
     """
-    descriptions = []
-    for instance in learned_instances(scene):
-        counts = bsdf_operations(instance) if isinstance(instance, mi.BSDF) else {}
-        descriptions.append({
-            **plugins.origin(instance),
-            "id": instance.id(),
-            **(plugins.report(instance) or {}),
-            "operations": {method: n.asdict() for method, n in counts.items()},
-            **({"rays": instance.counts(scene)} if hasattr(instance, "counts") and scene.sensors() else {}),
-        })  # fmt: skip
-    return descriptions
+    return [report_of(instance, scene) for instance in learned_instances(scene)]
+
+
+def report_of(instance, scene) -> dict:
+    """Return the report (:func:`reports`) on one of the :func:`instances` of a loaded scene, or of another object."""
+    counts = bsdf_operations(instance) if isinstance(instance, mi.BSDF) else {}
+    counted = hasattr(instance, "counts") and isinstance(scene, mi.Scene) and scene.sensors()
+    return {
+        **plugins.origin(instance),
+        "id": instance.id(),
+        **(plugins.report(instance) or {}),
+        "operations": {method: n.asdict() for method, n in counts.items()},
+        **({"rays": instance.counts(scene)} if counted else {}),
+    }
 
 
 def film_size(scene) -> tuple[int, int]:

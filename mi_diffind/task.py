@@ -35,6 +35,7 @@ from .arguments import Argument
 from .compat import module_of
 from .errors import UsageError
 from .settings import FitSettings
+from .units import labelled
 
 if TYPE_CHECKING:
     from .fitting import FitResult, Problem
@@ -43,9 +44,6 @@ if TYPE_CHECKING:
 
 #: Storage forms that a training may end in (:data:`.lookup.STORAGES`, without importing Dr.Jit).
 STORAGES = ("float32", "float16", "uint8")
-
-#: End of the name of a figure → its unit, for people.
-UNITS = {"_db": " dB", "_deg": "°"}
 
 #: The folder of the tables that ship.
 DATA = Path(__file__).resolve().parent / "data"
@@ -163,12 +161,7 @@ class Fitted:
         """Return the result as lines of text: bytes, accuracy, remarks, and how a scene names the file ``path``."""
         table = self.table
         lines = [f"{path}: {table.nbytes:,} bytes as {table.storage}; {self.result.outcome}"]
-        width = max(map(len, table.measured), default=0)
-        for name, value in table.measured.items():
-            unit = next((unit for unit in UNITS if name.endswith(unit)), "")
-            label = name.removesuffix(unit).replace("_", " ")
-            lines.append(f"  {label:{width}}  {format(value, '.4g')}{UNITS.get(unit, '')}")
-        lines += [f"  {line}" for line in self.lines]
+        lines += [f"  {line}" for line in (*labelled(table.measured), *self.lines)]
         usage = tasks()[table.task].usage(table, Path(path).name) if table.task in tasks() else []
         return [*lines, *(["in a scene:"] if usage else []), *(f"  {line}" for line in usage)]
 
@@ -274,6 +267,8 @@ class Task:
     title: str
     #: Where the paper describes it.
     section: str = ""
+    #: Source and options of the example in the help of ``fit``.
+    example: str = ""
     #: Named ways to lay out and train its tables; the first is the default.
     presets: Mapping[str, FitSettings]
     #: Preset → the table file that ships, relative to ``mi_diffind/data`` unless absolute.

@@ -32,10 +32,12 @@ FLOORS = (
         "reference_files",
         "regression",
         "depth",
+        "inspection",
         "measure",
     ),
     ("scene_training",),
     ("studies",),
+    ("tradeoffs",),
     ("commands",),
     ("cli",),
 )
@@ -165,7 +167,7 @@ def test_general_rooms_know_no_task():
         "conversion",
         "regression",
     }
-    rooms |= {"depth", "measure"}
+    rooms |= {"depth", "inspection", "measure"}
     general = [name for name in known if name.split(".")[1] in rooms]
     general += ["mi_diffind.plugins", "mi_diffind.studies"]
     wrong = [

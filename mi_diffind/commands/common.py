@@ -10,9 +10,12 @@ from ..arguments import define, natural, positive
 from ..errors import UsageError
 
 
-def verb(commands, name: str, run, help: str) -> argparse.ArgumentParser:
-    """Add a verb to ``commands`` and return its parser; ``--json`` writes what ``run(arguments)`` returns."""
-    sub = commands.add_parser(name, help=help, description=help)
+def verb(commands, name: str, run, help: str, example: str) -> argparse.ArgumentParser:
+    """Add a verb to ``commands`` and return its parser; ``--json`` writes what ``run(arguments)`` returns.
+
+    The help ends in the ``example``.
+    """
+    sub = commands.add_parser(name, help=help, description=help, epilog=f"example: {example}")
     sub.set_defaults(run=run)
     _json_option(sub, None)
     return sub
@@ -23,9 +26,9 @@ def alternatives(sub: argparse.ArgumentParser, name: str):
     return sub.add_subparsers(dest=name, required=True, metavar=name.upper())
 
 
-def alternative(parsers, name: str, help: str) -> argparse.ArgumentParser:
-    """Add the parser of one task or study to those of a verb."""
-    sub = parsers.add_parser(name, help=help, description=help)
+def alternative(parsers, name: str, help: str, example: str) -> argparse.ArgumentParser:
+    """Add the parser of one task or study to those of a verb; the help ends in the ``example``."""
+    sub = parsers.add_parser(name, help=help, description=help, epilog=f"example: {example}")
     _json_option(sub, argparse.SUPPRESS)  # a default would replace what was given before the task
     return sub
 
@@ -89,6 +92,11 @@ def set_variant(name: str | None) -> None:
 
 
 def require_scene(path: str) -> None:
-    """Raise :class:`UsageError` if there is no file ``path``."""
+    """Raise :class:`UsageError` if there is no file ``path``, or if it is a table file."""
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such scene file")
+    if Path(path).suffix.lower() == ".npz":
+        raise UsageError(
+            f'{path}: found a table file, a scene (.xml) is needed; "mi-diffind inspect {path}" prints the lines by '
+            f"which a scene reads it"
+        )

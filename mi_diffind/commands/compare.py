@@ -7,10 +7,12 @@ from .common import learn_option, positive, require_scene, scene_options, set_va
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
 
+EXAMPLE = "mi-diffind compare scene.xml --spp 64 --out out"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "compare", run, HELP)
+    sub = verb(commands, "compare", run, HELP, EXAMPLE)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("--out", default="out", metavar="DIR", help="folder for pictures (default: out)")
     sub.add_argument(

@@ -23,10 +23,12 @@ FILMS = (".webp", ".gif")
 
 HELP = "render a scene that names learned plugins"
 
+EXAMPLE = "mi-diffind render scene.xml -o image.png --spp 64"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "render", run, HELP)
+    sub = verb(commands, "render", run, HELP, EXAMPLE)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument(
         "-o", "--output", metavar="FILE",
@@ -89,6 +91,7 @@ def run(arguments) -> dict:
         orbit=arguments.orbit,
         centre=arguments.centre,
         defines=dict(arguments.defines),
+        output=output,
         learn=arguments.learn,
     )
     figures = rendering.figures

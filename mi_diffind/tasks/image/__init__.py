@@ -24,6 +24,7 @@ class Image(Task):
     title = "an image or the maps of a material"
     files = "compressed"
     section = "supplemental 1.3"
+    example = "material.json --compression 12x"
     plugin = ("texture", "neural_image")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()

@@ -32,6 +32,7 @@ class Sdf(Task):
     name = "sdf"
     title = "the signed distance field of a mesh"
     section = "supplemental 1.6"
+    example = "mesh.ply --bytes 200k"
     plugin = ("shape", "neural_sdf")
     presets = {  # noqa: RUF012
         "sparse": FitSettings(

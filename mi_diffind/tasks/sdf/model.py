@@ -171,8 +171,9 @@ class SdfModel(Model):
             "centre": list(self.centre),
         }
         size = " x ".join(f"{self.scale * (b - a):.4g}" for a, b in zip(field.lower, field.upper, strict=True))
+        centre = ", ".join(f"{x:.4g}" for x in self.centre)
         lines = [
-            f"{self.memory_nbytes:,} bytes in memory, box of {size} units around {self.centre}",
+            f"{self.memory_nbytes:,} bytes in memory, box of {size} units around ({centre})",
             f"cells of 1/{1 / field.spacing:.0f} of the longest side, slope at most {field.slope:.2f}",
         ]
         if self.sparse:
