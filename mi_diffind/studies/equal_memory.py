@@ -143,7 +143,7 @@ class PresetContender(Contender):
         import mitsuba as mi
 
         return task.fit(
-            self.task_name, self.preset, mi.variant(), progress=progress, output=self.file, deterministic=False,
+            self.task_name, preset=self.preset, variant=mi.variant(), progress=progress, output=self.file, deterministic=False,
             **self.arguments(),
         )  # fmt: skip
 
