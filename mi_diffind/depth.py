@@ -34,6 +34,7 @@ import numpy as np
 
 from . import scenes
 from .interrupt import interruptible
+from .progress import progress_bar
 
 #: Part of the scattered light that may be left out, and the multiple of it that a single tile may lose of its light.
 TOLERANCE, IN_A_TILE = 0.005, 10
@@ -235,7 +236,7 @@ def auto_depth(parsed: scenes.ParsedScene, tolerance: float = TOLERANCE, seed: i
         )
     scene = parsed.load()
     start = time.perf_counter()
-    with interruptible() as stop, scenes.progress_bar("probe", PASSES, progress=progress) as bar:
+    with interruptible() as stop, progress_bar("probe", PASSES, progress=progress) as bar:
         shares = bounces(probe(scene, max_depth, seed=seed, on_pass=bar.update, stop=stop))
     seconds = time.perf_counter() - start
     chosen = choose(shares, max_depth, tolerance)
