@@ -18,7 +18,7 @@ _here = _Path(__file__).resolve().parent
 if not (_here / "plugins").is_dir():  # a checkout has the folder `plugins` beside this one, an installation inside
     __path__.append(str(_here.parent))
 
-#: Public name → the module that holds it, and its name there if it is another one.
+#: Public name → the module that holds it, and its name there if it is another one; "" if it is a module.
 _NAMES = {
     # Training, table files
     "fit": "task",
@@ -30,7 +30,17 @@ _NAMES = {
     "load_dict": "scenes",
     "load_string": "scenes",
     "attach": "scenes",
+    "capture": "view_capture",
+    "compare": "comparison",
+    "convert": "conversion",
+    "inspect": "inspection",
+    "regress": "regression",
     "render": "rendering",
+    # Measurements
+    "tradeoff": "tradeoffs",
+    # Errors between images, and images as displayed
+    "metrics": "",
+    "srgb": "",
     # Building blocks of other networks
     "DifferentiableArray": "indirection",
     "Indirection": "indirection",
@@ -51,6 +61,8 @@ def __getattr__(name: str):
     if name not in _NAMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, other = _NAMES[name].partition(":")
+    if not module:
+        return _importlib.import_module(f".{name}", __name__)
     return getattr(_importlib.import_module(f".{module}", __name__), other or name)
 
 

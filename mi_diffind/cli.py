@@ -15,7 +15,7 @@ from .errors import DiffindError
 from .files import writable_file, write_json
 
 #: In the order of the help.
-VERBS = ("render", "capture", "compare", "regress", "inspect", "tradeoff", "decode", "fit")
+VERBS = ("render", "capture", "compare", "convert", "regress", "inspect", "tradeoff", "decode", "fit")
 
 
 def main(argv: list[str] | None = None) -> int:

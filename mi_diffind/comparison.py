@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 import os
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +17,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import compat, metrics, plugins, scenes
+from . import compat, conversion, metrics, plugins, scenes
 from .files import writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
 from .measure.statistics import spread
 from .progress import progress_bar
+from .runtime import use_variant
 
 #: Pairs of passes that a ratio of times needs, and the largest ratio of its quartiles: beyond, none is given.
 PAIRS, WIDEST = 3, 1.5
@@ -40,6 +43,19 @@ class Comparison:
     reference: np.ndarray
     figures: dict
     further: tuple[Comparison, ...] = ()
+
+    def save(self, folder: str | os.PathLike) -> dict[str, str]:
+        """Write the pictures into a folder (:func:`write`), and return their paths."""
+        return write(self, folder)
+
+    def __str__(self) -> str:
+        return "\n".join(summary(self))
+
+    def _repr_png_(self) -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "comparison.png"
+            _write_figure(self, path)
+            return path.read_bytes()
 
 
 class _Side:
@@ -70,21 +86,26 @@ class _Side:
 
 
 def compare(
-    path: str | os.PathLike,
+    scene: str | os.PathLike,
     spp: int | None = None,
     seed: int = 0,
+    *,
     passes: int = 5,
-    progress: bool = True,
-    defines: dict[str, str] | None = None,
     against: str | None = None,
+    learn: Sequence[str] = (),
+    defines: Mapping[str, object] | None = None,
+    progress: bool = True,
 ) -> Comparison:
-    """Render ``path`` as written and with counterparts, in turn, pass by pass, with the same random numbers.
+    """Render a scene file as written and with counterparts, in turn, pass by pass, with the same random numbers.
 
     Every learned plugin is replaced by its exact counterpart. ``against`` may name another counterpart, such as
     ``"principled"``: then every plugin that has it is replaced, learned or not. Without ``against``, a scene with
     plugins that declare several truths (``neural_texture``: ``mipmap``, which filters as it does, and ``exact``, a
     ``bitmap`` of 8 times the samples) is compared with each of them; other learned plugins are then replaced by their
     exact counterparts. At least two passes are rendered, unless there is only one sample.
+
+    ``learn`` names groups of Mitsuba's plugins (:func:`.conversion.words`) that are replaced by learned ones before the
+    scene is rendered "as written"; the scene of the file is then the truth ``stock``, in place of ``exact``.
 
     Figures: ``against``; ``counterparts``, the plugins that were put in, and ``truth_spp``, their samples a pixel;
     ``psnr_db``, ``flip``, ``mae`` of the image as written against the other one; ``brightness``, the ratio of their
@@ -95,27 +116,37 @@ def compare(
     kernel. The median is ``None`` if there are fewer than :data:`PAIRS` of them or ``q3`` exceeds :data:`WIDEST` times
     ``q1``. Quote the ratio rather than the quotient of the two times: a slow phase of the machine slows both passes of
     a pair. ``replaced_plugins``: how many were replaced; ``learned_plugins``: how many of these are learned;
-    ``table_bytes``: bytes of the distinct tables that the learned ones read. Ctrl-C ends the comparison after the
-    current pair of passes; ``spp`` and ``passes`` then state how many there were, and ``interrupted`` is true.
+    ``table_bytes``: bytes of the distinct tables that the learned ones read; ``conversions``: what became of Mitsuba's
+    plugins (:class:`.conversion.Conversion`). Ctrl-C ends the comparison after the current pair of passes; ``spp`` and
+    ``passes`` then state how many there were, and ``interrupted`` is true.
+
+    ``passes``: passes that the samples are split into; ``defines``: values of the file's ``<default>`` parameters. A
+    notebook shows the picture of :meth:`Comparison.save`, and ``print`` the figures.
 
     Raises :class:`~mi_diffind.scenes.SceneError`, also if the scene names no plugin with such a counterpart.
     """
+    use_variant()
     if against and not plugins.with_counterpart(against):
         others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
         raise scenes.SceneError(f'"{against}": no plugin has this counterpart; there are {", ".join(others)}')
-    parsed = scenes.ParsedScene(path, defines)
+    parsed = scenes.ParsedScene(scene, defines)
+    conversions = conversion.replace_stock(parsed, learn, progress=progress)
     replaced = parsed.learned_plugins(against or "exact")
     if not replaced:
         what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
         names = ", ".join(plugins.with_counterpart(against or "exact"))
-        raise scenes.SceneError(f"{path}: names no {what} ({names}), so there is nothing to compare")
+        raise scenes.SceneError(f"{scene}: names no {what} ({names}), so there is nothing to compare")
     learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
-    truths = {against: (against,)} if against else _default_truths(replaced)
+    truths, sides = {against: (against,)} if against else _default_truths(replaced), {}
     counterparts = {name: _counterparts(replaced, names) for name, names in truths.items()}
-    sides = {
-        name: _Side(parsed.load(exact=True, against=names), max(c.oversampling for c in counterparts[name]))
-        for name, names in truths.items()
-    }  # before the scene as written, since a counterpart may refuse
+    put_in = {name: list(dict.fromkeys(c.name for c in each)) for name, each in counterparts.items()}
+    for name, names in truths.items():  # before the scene as written, since a counterpart may refuse
+        oversampling = max(c.oversampling for c in counterparts[name])
+        if learn and not against and name == "exact":
+            name, put_in["stock"] = "stock", list(dict.fromkeys(c.stock for c in conversions if c.learned))
+            sides[name] = _Side(scenes.load(scene, defines), oversampling)
+        else:
+            sides[name] = _Side(parsed.load(exact=True, against=names), oversampling)
     written = _Side(parsed.load())
     spp = spp or written.scene.sensors()[0].sampler().sample_count()
     passes, done = max(1, min(max(passes, 2), spp)), 0
@@ -131,7 +162,7 @@ def compare(
                 break
 
     common = {
-        "scene": str(path),
+        "scene": str(scene),
         "variant": mi.variant(),
         "spp": done,
         "seed": seed,
@@ -143,12 +174,13 @@ def compare(
         "replaced_plugins": len(replaced),
         "learned_plugins": len(learned),
         "table_bytes": parsed.table_bytes(learned),
+        "conversions": [vars(c) for c in conversions],
     }
     first, *further = (
         Comparison(written.image, side.image, {
             **common,
             "against": name,
-            "counterparts": list(dict.fromkeys(c.name for c in counterparts[name])),
+            "counterparts": put_in[name],
             "truth_spp": done * side.oversampling,
             **_errors(written, side),
             **_times(written, side, name),
@@ -197,8 +229,8 @@ def noise(written: list, truth: list, samples: list[int]) -> dict[str, float | N
     rendered with the same random numbers, so the noise that they share is in neither image's error: noise is here what
     remains of it in their *difference*. With the differences a and b of the halves, of m and n samples, the squared
     noise of the mean difference is estimated by (a − b)² m n / (m + n)² and its squared expectation by a b, both
-    without bias. Only where one of the two means is outside of [0, 1], which the PSNR clips, are the halves clipped,
-    too.
+    without bias. Where the PSNR clips the two means to [0, 1] and sees a part of their difference, that part of a and b
+    counts. For halves of equal size, the two squares add up to the squared error.
 
     ``noise_db``: PSNR that two scenes of equal expectation would reach at so many samples, infinite without noise;
     ``psnr_without_noise_db``: PSNR of infinitely many samples, ``None`` if the difference of the images is below two
@@ -207,10 +239,11 @@ def noise(written: list, truth: list, samples: list[int]) -> dict[str, float | N
     if min(samples) == 0:
         return {"noise_db": None, "psnr_without_noise_db": None}
     m, n = samples
-    means = [sum(side) / (m + n) for side in (written, truth)]
-    clipped = np.any([(mean < 0) | (mean > 1) for mean in means], axis=0)
-    halves = ((w / k, t / k) for w, t, k in zip(written, truth, samples, strict=True))
-    a, b = (np.where(clipped, np.clip(w, 0, 1) - np.clip(t, 0, 1), w - t) for w, t in halves)
+    mean, reference = (sum(side) / (m + n) for side in (written, truth))
+    difference = mean - reference
+    shown = np.clip(mean, 0, 1) - np.clip(reference, 0, 1)
+    share = np.where(shown == difference, 1, shown / np.where(difference == 0, 1, difference))
+    a, b = ((w - t) / k * share for w, t, k in zip(written, truth, samples, strict=True))
     squared = (a * b).mean(axis=-1)
     bias, error = squared.mean(), squared.std() / math.sqrt(squared.size)
     return {
@@ -270,23 +303,24 @@ def write(comparison: Comparison, folder: str | os.PathLike) -> dict[str, str]:
     return paths
 
 
-def _write_figure(comparison: Comparison, path: str) -> None:
+def _write_figure(comparison: Comparison, path: str | os.PathLike) -> None:
     """Write one picture.
 
     Two rows for each truth, the scene as written, the truth and their difference, above as a whole and below its worst
     place, and a row with the figures.
     """
     learned = " (learned tables)" if comparison.figures["learned_plugins"] else ""
+    written = "learned plugins" if comparison.figures["conversions"] else f"as written{learned}"
     cells, everything = [], (comparison, *comparison.further)
     for one in everything:
         x, y, width, height = frame = tuple(one.figures["worst"][key] for key in ("x", "y", "width", "height"))
         inside, place = np.s_[y : y + height, x : x + width], f"{width} x {height} pixels from ({x}, {y})"
         label, zoomed = truth_label(one.figures), (one.written[inside], one.reference[inside])
         cells += [
-            figure_grid.picture(f"as written{learned}, {one.figures['spp']} spp", one.written, frame),
+            figure_grid.picture(f"{written}, {one.figures['spp']} spp", one.written, frame),
             figure_grid.picture(label, one.reference, frame),
             figure_grid.error_map(np.abs(one.written - one.reference).mean(axis=-1)),
-            figure_grid.picture(f"as written, worst place: {place}", zoomed[0]),
+            figure_grid.picture(f"{written}, worst place: {place}", zoomed[0]),
             figure_grid.picture(f"{label}, worst place", zoomed[1]),
             figure_grid.error_map(_clipped_error(*zoomed), "worst place, difference clipped to [0, 1]"),
         ]
@@ -302,7 +336,9 @@ def truth_label(figures: dict) -> str:
 
 def summary(comparison: Comparison) -> list[str]:
     """Return the figures as lines of text."""
-    return [line for lines in _sections(comparison) for line in ("", *lines)][1:]
+    head, *blocks = _sections(comparison)
+    head += conversion.summary(comparison.figures["conversions"])
+    return [*head, *(line for lines in blocks for line in ("", *lines))]
 
 
 def _sections(comparison: Comparison) -> list[list[str]]:
@@ -337,8 +373,10 @@ def _noise_text(f: dict) -> str:
     if math.isinf(f["noise_db"]):
         return "none: both halves of the samples differ alike"
     without = f["psnr_without_noise_db"]
-    rest = "no difference beyond it" if without is None else f"{without:.2f} dB without it"
-    return f"{f['noise_db']:.2f} dB of it, {rest}"
+    rest = (
+        ": all of the error, as far as the samples tell" if without is None else f" of it, {without:.2f} dB without it"
+    )
+    return f"{f['noise_db']:.2f} dB{rest}"
 
 
 def _time_lines(f: dict) -> list[str]:
@@ -351,7 +389,10 @@ def _time_lines(f: dict) -> list[str]:
         ]
     quartiles = f"{ratio['q1']:.2f} to {ratio['q3']:.2f}"
     if ratio["median"] is None:
-        return [f"time        not measurable here: quartiles {quartiles} of {ratio['pairs']} pairs of passes"]
+        return [
+            f"time        not measurable here: quartiles {quartiles}",
+            f"            of the ratios of {ratio['pairs']} pairs of passes",
+        ]
     return [
         f"time        {ratio['median']:.2f} times that of {name} at {f['spp']} spp"
         f" ({f['seconds_per_pass'][name]:.3g} s a pass)",

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import os
 import re
 import struct
@@ -246,6 +247,51 @@ def on_variant_change(callback) -> None:
     mi.detail.add_variant_callback(callback)
 
 
+def before_render(callback) -> None:
+    """Have ``mi.render`` call ``callback(scene, integrator, sensor)`` first, with the arguments given to it.
+
+    Mitsuba tells plugins nothing of renders: scenes, sensors and shapes have no method in Python that one calls. The
+    function is the same in all variants, under two names. It stays as it is for everything else: its arguments, errors,
+    documentation and signature.
+    """
+    import mitsuba as mi
+    from mitsuba.python import util
+
+    render = util.render
+
+    @functools.wraps(render)
+    def checked_render(scene, params=None, sensor=0, integrator=None, *args, **kwargs):
+        callback(scene, integrator, sensor)
+        return render(scene, params, sensor, integrator, *args, **kwargs)
+
+    util.render = mi.render = checked_render
+
+
+def is_recording() -> bool:
+    """Return whether Dr.Jit records a loop or a call symbolically, as integrators do while they trace a scene."""
+    import drjit as dr
+
+    return dr.flag(dr.JitFlag.SymbolicScope)
+
+
+def is_zero(*values) -> bool:
+    """Return whether Dr.Jit knows of each of these arrays, without an evaluation, that it is zero in all lanes.
+
+    Within a recorded call, inputs stay known if the caller computed them outside of the state of a loop; which ones do
+    is not promised.
+    """
+    import drjit as dr
+
+    return all(value.state == dr.VarState.Literal and value[0] == 0 for value in values)
+
+
+#: Mitsuba's classes of integrators that carry interactions in the state of a loop, of which :func:`is_zero` knows none.
+CARRYING = ("VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator")
+
+#: Mitsuba's class of integrators that intersect rays with the scene beside their nested integrators.
+INTERSECTING = "AOVIntegrator"
+
+
 #: Mitsuba's classes of textures whose values are those of their parameters, wherever they are read. Others may call
 #: themselves constant and not be, as ``mesh_attribute`` does. ``is_spatially_varying`` would do if all told the truth.
 CONSTANT_TEXTURES = ("UniformSpectrum", "SRGBReflectanceSpectrum")
@@ -334,6 +380,13 @@ def written_in_python(integrator) -> bool:
     import mitsuba as mi
 
     return isinstance(integrator, mi.CppADIntegrator)
+
+
+def integrator_name(integrator) -> str:
+    """Return the name of an integrator's class, in Python or C++."""
+    if type(integrator).__module__ == "mitsuba":
+        return integrator.class_name()
+    return type(integrator).__name__
 
 
 def replays_paths(integrator) -> bool:
@@ -450,6 +503,39 @@ def properties_of(state, object_type=None, names=()) -> list:
         return object_type is None or node.type == object_type or node.props.plugin_name() in names
 
     return [node.props for node in state.nodes if wanted(node)]
+
+
+def parsed_types(state) -> list:
+    """Return the ``mi.ObjectType`` of all objects of a parsed scene, in the order of :func:`properties_of`."""
+    return [node.type for node in state.nodes]
+
+
+def parsed_references(state) -> list[list[int]]:
+    """Return for each object of a parsed scene, in the order of :func:`properties_of`, those it nests or refers to.
+
+    They are indices in that order. References are resolved only when a scene is built.
+    """
+    import mitsuba as mi
+
+    types, result = mi.Properties.Type, []
+    for props in properties_of(state):
+        values = [props[key] for key in props if props.type(key) in (types.Reference, types.ResolvedReference)]
+        result.append([v.index() if hasattr(v, "index") else state.id_to_index[v.id()] for v in values])
+    return result
+
+
+def parsed_place(state, index: int) -> str:
+    """Return the file, line and column of an object of a parsed scene."""
+    import mitsuba as mi
+
+    return mi.parser.file_location(state, state.nodes[index])
+
+
+def scene_xml(state) -> str:
+    """Return a parsed scene as XML, without comments. Mitsuba's writer is new in 3.8."""
+    import mitsuba as mi
+
+    return '<?xml version="1.0" encoding="utf-8"?>\n' + mi.parser.write_string(state)
 
 
 def parsed_files(state) -> list[str]:

@@ -32,15 +32,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import scenes
+from . import compat, scenes
 from .interrupt import interruptible
+from .plugins.support import distance_shapes as sdf
 from .progress import progress_bar
 
 #: Part of the scattered light that may be left out, and the multiple of it that a single tile may lose of its light.
 TOLERANCE, IN_A_TILE = 0.005, 10
 
-#: Integrators whose light the probe computes; integrators for media follow other paths.
-INTEGRATORS = ("path", "prb", "prb_basic", "prb_projective", "ptracer")
+#: Integrators that follow light through media, which the probe does not.
+MEDIA = ("volpath", "volpathmis", "prbvolpath")
 
 #: Settings of the probe: tiles along the longer side of the image, pixels along the side of a tile, paths per pixel,
 #: passes.
@@ -90,7 +91,8 @@ def probe(
     as well, and the last entry sums them.
 
     The path tracer samples emitters and uses multiple importance sampling, as Mitsuba's ``path``: surfaces only,
-    without polarisation, and with the emitters that ``hide_emitters`` hides. Spectral variants scale all by one factor.
+    without polarisation, and with the emitters that ``hide_emitters`` hides. Distance fields are traced as by
+    ``path_sdf``; radiance fields are left out. Spectral variants scale all by one factor.
     ``spp`` paths start in each pixel, in ``passes``; ``on_pass()`` is called after each. The same seed gives the same
     numbers. Raises :class:`~mi_diffind.scenes.SceneError`, and ``KeyboardInterrupt`` after a pass if ``stop`` is set.
     """
@@ -126,20 +128,30 @@ def _pass(scene, sensor, width: int, height: int, spp: int, seed: int, max_depth
     ray, weight = sensor.sample_ray(moment, sampler.next_1d(), position, sampler.next_2d())
     light = dr.zeros(mi.Float, depths * paths)  # each path adds to its own entries: the same sums each time
     limits = [dr.opaque(mi.UInt32, n) for n in (paths, depths - 1, 0xFFFFFFFF if max_depth < 0 else max_depth)]
-    _follow(scene, sampler, mi.Ray3f(ray), mi.unpolarized_spectrum(weight), light, path, *limits)
+    shapes = sdf.distance_shapes_in(scene)
+    _follow(scene, shapes, sampler, mi.Ray3f(ray), mi.unpolarized_spectrum(weight), light, path, *limits)
     return dr.block_sum(light, spp)
 
 
 @dr.syntax
-def _follow(scene, sampler, ray, β, light, path, paths, deepest, limit):
-    """Follow paths as ``mi.ad.integrators.prb`` does; add luminance of depth ``k + 1`` to ``light[k·paths + path]``."""
+def _follow(scene, shapes, sampler, ray, β, light, path, paths, deepest, limit):
+    """Follow paths as ``mi.ad.integrators.prb`` does; add luminance of depth ``k + 1`` to ``light[k·paths + path]``.
+
+    ``shapes`` are distance fields, which Mitsuba's rays do not meet.
+    """
     context = mi.BSDFContext()
     depth, η, active = mi.UInt32(0), mi.Float(1), mi.Bool(True)
     si_prev = dr.zeros(mi.SurfaceInteraction3f)
     pdf_prev, delta_prev = mi.Float(1), mi.Bool(True)
 
     while active:
-        si = scene.ray_intersect(ray, active)
+        pi = scene.ray_intersect_preliminary(ray, active=active)
+        if dr.hint(bool(shapes), mode="scalar"):
+            hit = sdf.intersect(shapes, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active)
+            pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        if dr.hint(bool(shapes), mode="scalar"):
+            si = sdf.interaction(shapes, hit, ray, si, active)
         bsdf = si.bsdf(ray)
 
         # Emission at this vertex
@@ -153,6 +165,12 @@ def _follow(scene, sampler, ray, β, light, path, paths, deepest, limit):
         lit = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
         lit &= ds.pdf != 0
+        if dr.hint(bool(shapes), mode="scalar"):
+            start = sdf.spawn(shapes, hit, si, ds.d)
+            distance = dr.norm(ds.p - start)
+            lit &= ~sdf.occluded(
+                shapes, start, (ds.p - start) / distance, distance * (1 - mi.math.ShadowEpsilon), lit
+            )  # fmt: skip
         value, pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), lit)
         mis = dr.select(ds.delta, 1, _mis(ds.pdf, pdf))
         Lr = β * mis * mi.unpolarized_spectrum(value) * mi.unpolarized_spectrum(weight)
@@ -163,6 +181,8 @@ def _follow(scene, sampler, ray, β, light, path, paths, deepest, limit):
         β *= mi.unpolarized_spectrum(weight)
         η *= bs.eta
         ray = si.spawn_ray(si.to_world(bs.wo))
+        if dr.hint(bool(shapes), mode="scalar"):
+            ray.o = sdf.spawn(shapes, hit, si, ray.d)
         si_prev, pdf_prev, delta_prev = si, bs.pdf, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         survival = dr.minimum(dr.max(β) * η * η, 0.95)
         survival = dr.select(depth >= ROULETTE, survival, 1)
@@ -224,17 +244,16 @@ def auto_depth(parsed: scenes.ParsedScene, tolerance: float = TOLERANCE, seed: i
     depth: ``depth``, ``light``, and the figures of a :class:`Bounce`), ``left_out`` and ``left_out_in_a_tile``
     (``rest`` and ``rest_in_a_tile`` of the chosen depth), ``probe_seconds`` (with compilation). Ctrl-C ends the probe
     after the current pass with ``KeyboardInterrupt``. Raises :class:`~mi_diffind.scenes.SceneError`, also if the
-    scene's integrator is not in :data:`INTEGRATORS`, and ``ValueError`` as :func:`choose`.
+    scene's integrator follows light through media that the scene has, and ``ValueError`` as :func:`choose`.
     """
     check_tolerance(tolerance)
     integrator, max_depth = parsed.path_integrator()
-    if integrator not in INTEGRATORS:
-        names = ", ".join(INTEGRATORS)
-        raise scenes.SceneError(
-            f'{parsed.path}: the integrator "{integrator}" also follows light through media, and bounces can be '
-            f"measured for {names} alone; a number sets its depth"
-        )
     scene = parsed.load()
+    if integrator in MEDIA and any(isinstance(node, mi.Medium) for node in compat.objects_of(scene)):
+        raise scenes.SceneError(
+            f'{parsed.path}: the integrator "{integrator}" also follows light through media, and only bounces on '
+            f"surfaces can be measured; a number sets its depth"
+        )
     start = time.perf_counter()
     with interruptible() as stop, progress_bar("probe", PASSES, progress=progress) as bar:
         shares = bounces(probe(scene, max_depth, seed=seed, on_pass=bar.update, stop=stop))

@@ -78,3 +78,10 @@ def write_json(path: str | os.PathLike, content) -> None:
     """Write ``content`` as indented JSON, in one piece."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def relative_path(file: str | os.PathLike, folder: str | os.PathLike) -> str:
+    """Return the path of a file from a folder, or an absolute one if the two share no more than the root."""
+    file, folder = os.path.abspath(file), os.path.abspath(folder)
+    shared = os.path.commonpath([file, folder])
+    return file if shared == os.path.dirname(shared) else os.path.relpath(file, folder)

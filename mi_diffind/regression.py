@@ -11,15 +11,18 @@ import contextlib
 import math
 import os
 import statistics
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
 from . import __version__, compat, scenes
+from .errors import UsageError
 from .files import writable_file, writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
@@ -34,6 +37,7 @@ from .reference_files import (
     write_partial,
     write_reference,
 )
+from .runtime import use_variant
 from .z_test import REQUIRED, VARIANCE_FLOOR, PassMoments, ZTest, pixel_threshold, z_test
 
 #: Samples of the whole image in a check, by default.
@@ -285,42 +289,80 @@ def _facts(path, reference: str, width: int, height: int, seed: int, defines: di
     }  # fmt: skip
 
 
+@dataclass
+class Regression:
+    """Result of :func:`regress`: its ``figures``, and ``images``, linear ``(height, width, channels)``.
+
+    The images of a check are ``image``, ``reference``, ``error`` (absolute difference) and ``p_value``; of an
+    interrupted check, or of an update of a reference, there are none.
+    """
+
+    figures: dict
+    images: dict[str, np.ndarray] = field(default_factory=dict)
+    test: ZTest | None = None
+
+    @property
+    def passed(self) -> bool | None:
+        """Whether the check passed; ``None`` without a verdict."""
+        return self.figures.get("passed")
+
+    def __str__(self) -> str:
+        return "\n".join(update_summary(self.figures) if "budget" in self.figures else summary([self.figures]))
+
+    def _repr_png_(self) -> bytes | None:
+        if self.test is None:
+            return None
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "check.png"
+            _write_figure(str(path), self.images, self.test, self.figures)
+            return path.read_bytes()
+
+
 def regress(
-    path: str | os.PathLike,
+    scene: str | os.PathLike,
+    *,
+    update: bool = False,
     references: str | os.PathLike | None = None,
     out: str | os.PathLike | None = None,
     spp: int | None = None,
-    seed: int = 0,
+    seed: int | None = None,
+    defines: Mapping[str, object] | None = None,
     progress: bool = True,
-    defines: dict[str, str] | None = None,
-) -> dict:
-    """Render the scene file ``path`` in the current variant and test it against its reference (:func:`.z_test.z_test`).
+) -> Regression:
+    """Render the file ``scene`` in the variant that is set and test it against its reference (:func:`.z_test.z_test`).
 
-    ``spp`` and ``defines`` are the reference's unless given. Every ``seed`` is independent of the reference. If the
-    check fails and ``out`` names a folder, the images are written there (:func:`write_failure`).
+    ``spp`` and ``defines`` are the reference's unless given, ``seed`` is 0; every seed is independent of the reference.
+    If the check fails and ``out`` names a folder, the images are written there (:func:`write_failure`). With
+    ``update``, the reference is rendered again instead and stored (:func:`update_reference`).
 
-    Returns ``scene``, ``reference`` (the file's name), ``variant``, ``width``, ``height``, ``spp``, ``reference_spp``,
-    ``seed``, ``passed``, ``failing_pixels``, ``fraction`` (of pixels that pass), ``smallest_p``, ``alpha``,
-    ``defines``, ``seconds``, ``files`` (written paths) and ``interrupted``: after Ctrl-C there is no verdict, and
-    ``passed`` is ``None``. Raises :class:`~mi_diffind.scenes.SceneError`, among them :class:`BadReference`, and
-    :class:`~mi_diffind.files.OutputError`.
+    The figures are ``scene``, ``reference`` (the file's name), ``variant``, ``width``, ``height``, ``spp``,
+    ``reference_spp``, ``seed``, ``passed``, ``failing_pixels``, ``fraction`` (of pixels that pass), ``smallest_p``,
+    ``alpha``, ``defines``, ``seconds``, ``files`` (written paths) and ``interrupted``: after Ctrl-C there is no
+    verdict, and ``passed`` is ``None``. Raises :class:`~mi_diffind.scenes.SceneError`, among them
+    :class:`BadReference`, :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.files.OutputError`.
     """
+    use_variant()
+    path, seed_of_check = scene, seed or 0
+    if not isinstance(path, (str, os.PathLike)):
+        raise UsageError(f"scene: found a {type(path).__name__}, a scene file is needed")
+    if update:
+        return Regression(update_reference(path, references, spp, seed, progress, dict(defines or {})))
     reference = read_reference(path, references)
     about = reference.about
     parsed = scenes.ParsedScene(path, {**about["defines"], **(defines or {})})
-    scene = parsed.load()
-    width, height = scenes.film_size(scene)
+    loaded = parsed.load()
+    width, height = scenes.film_size(loaded)
     _check_size(path, reference, height, width)
     spp, start = spp or about["budget"], time.perf_counter()
     with interruptible() as stop:
-        image = _render_check(scene, spp, seed, Path(path).stem, progress, stop)
+        image = _render_check(loaded, spp, seed_of_check, Path(path).stem, progress, stop)
     result = {
-        **_facts(path, f"{about['scene']}.{about['variant']}.exr", width, height, seed, parsed.defines),
+        **_facts(path, f"{about['scene']}.{about['variant']}.exr", width, height, seed_of_check, parsed.defines),
         "spp": spp, "reference_spp": about["spp"], "seconds": time.perf_counter() - start,
         "interrupted": stop.is_set(), "passed": None, "files": {},
     }  # fmt: skip
     if result["interrupted"]:
-        return result
+        return Regression(result)
     _check_size(path, reference, *image.shape)
     test = z_test(image, reference.image, reference.variance, spp, about["spp"])
     result |= {
@@ -329,7 +371,12 @@ def regress(
     }  # fmt: skip
     if not test.passed and out is not None:
         result["files"] = write_failure(out, image, reference, test, result)
-    return result
+    return Regression(result, _images(image, reference, test), test)
+
+
+def _images(image: np.ndarray, reference: Reference, test: ZTest) -> dict[str, np.ndarray]:
+    error = np.abs(image - reference.image)
+    return {"image": image, "reference": reference.image, "error": error, "p_value": test.p_values}
 
 
 def _check_size(path, reference: Reference, height: int, width: int, channels: int | None = None) -> None:
@@ -352,8 +399,7 @@ def write_failure(
     """
     folder = writable_folder(folder, create=True)
     stem = f"{Path(result['scene']).stem}.{result['variant']}"
-    error = np.abs(image - reference.image)
-    images = {"image": image, "reference": reference.image, "error": error, "p_value": test.p_values}
+    images = _images(image, reference, test)
     paths = {name: str(folder / f"{stem}.{name}.exr") for name in images}
     for name, content in images.items():
         scenes.write_image(paths[name], content)
@@ -381,6 +427,15 @@ def summary(results: list[dict]) -> list[str]:
         if r["files"]:
             lines.append(f"{'':11} {'':{width}}  see {r['files']['figure']}")
     return lines
+
+
+def update_summary(result: dict) -> list[str]:
+    """Return the result of :func:`update_reference` as lines of text."""
+    if result["interrupted"]:
+        text = "{partial}: {spp} samples a pixel are kept, the same command goes on"
+        return [text.format(**result)] if result["partial"] else []
+    text = "{reference}: {width} x {height}, {spp} spp, {bytes:,} bytes; "
+    return [(text + "failing pixels in a check at {budget} spp: {failing_pixels}").format(**result)]
 
 
 def _write_figure(path: str, images: dict[str, np.ndarray], test: ZTest, result: dict) -> None:

@@ -13,9 +13,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from . import conversion, scenes
 from . import depth as depths
 from . import orbit as orbits
-from . import scenes
 from .errors import UsageError
 from .interrupt import interruptible
 from .progress import progress_bar
@@ -48,8 +48,7 @@ class Rendering:
         Raises :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.files.OutputError`.
         """
         path = image_path(path, len(self.frames) > 1)
-        if path.suffix.lower() == ".png" and self.image.shape[2] > 4:
-            raise UsageError(f'output "{path}": the image has {self.image.shape[2]} channels, PNG holds 4: use .exr')
+        _check_channels(path, self.image.shape[2])
         if len(self.frames) > 1:
             orbits.write(path, self.frames)
         else:
@@ -62,6 +61,20 @@ class Rendering:
         stream = io.BytesIO()
         Image.fromarray(orbits.displayed(self.image)).save(stream, "PNG")
         return stream.getvalue()
+
+
+def _check_channels(path: Path, channels: int) -> None:
+    if path.suffix.lower() != ".exr" and channels > 4:
+        form = path.suffix[1:].upper()
+        raise UsageError(f'output "{path}": the image has {channels} channels, {form} holds 4: use .exr')
+
+
+def channels_of(scene) -> int:
+    """Return the number of channels of the images of a scene: those of its film, and further ones of its integrator."""
+    names = scene.integrator().aov_names() if scene.integrator() else []
+    images = {name.removesuffix(".A") for name in names if name.endswith(".A")}  # nested in aov, in the film's format
+    further = [name for name in names if name.rpartition(".")[0] not in images]
+    return scene.sensors()[0].film().base_channels_count() + len(further)
 
 
 def image_path(path: str | os.PathLike, film: bool = False) -> Path:
@@ -83,6 +96,8 @@ def render(
     orbit: int | None = None,
     centre: Sequence[float] | None = None,
     defines: Mapping[str, object] | None = None,
+    output: str | os.PathLike | None = None,
+    learn: Sequence[str] = (),
     progress: bool = True,
 ) -> Rendering:
     """Render a scene: ``mi-diffind render`` in Python, in the variant that is set.
@@ -93,6 +108,9 @@ def render(
       leaves out less than ``depth_tolerance`` of the scattered light (of a scene file; :mod:`mi_diffind.depth`).
     - ``orbit``: number of frames of a camera that goes once around ``centre`` (``None``: the middle of the scene).
     - ``defines``: values of the file's ``<default>`` parameters.
+    - ``output``: file in which the image will be saved; nothing is written there, but one that cannot hold the image
+      is refused before it is rendered.
+    - ``learn``: groups of Mitsuba's plugins that learned ones replace (:mod:`.conversion`), fitted if need be.
 
     Ctrl-C ends the rendering after a pass or a frame and keeps what there is; ``figures["interrupted"]`` is then true.
     Raises :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.errors.UsageError`.
@@ -106,17 +124,22 @@ def render(
     parsed = None
     if isinstance(scene, (str, os.PathLike)):
         parsed = scenes.ParsedScene(scene, dict(defines or {}))
+        conversions = conversion.replace_stock(parsed, learn, progress=progress)
         chosen = _chosen_depth(parsed, depth, depth_tolerance, seed)
         changed = chosen["chosen"] != chosen["scene"]
         loaded = parsed.load(longest_path=chosen["chosen"] if changed else None)
     else:
+        if learn:
+            raise UsageError("learn: given with a scene in memory, allowed are scene files")
         if depth != "scene" or defines:
             raise UsageError("depth, defines: given with a scene in memory, allowed are scene files")
-        chosen, loaded = None, scenes.load_dict(scene) if isinstance(scene, dict) else scene
+        chosen, conversions, loaded = None, [], scenes.load_dict(scene) if isinstance(scene, dict) else scene
         if not isinstance(loaded, mi.Scene):
             raise UsageError(f"scene: found a {type(loaded).__name__}, expected a scene, its file or its dictionary")
     if not loaded.sensors():
         raise scenes.SceneError(f"{parsed.path if parsed else 'scene'}: has no sensor")
+    if output is not None:
+        _check_channels(image_path(output, bool(orbit)), channels_of(loaded))
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
     if orbit:
@@ -139,6 +162,7 @@ def render(
         "spp_requested": spp,
         "seed": seed,
         "depth": chosen,
+        "conversions": [vars(c) for c in conversions],
         "seconds_load": ready - start,
         "seconds_render": time.perf_counter() - ready,
     }

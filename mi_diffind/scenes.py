@@ -19,7 +19,7 @@ from . import compat, plugins
 from .errors import DiffindError
 from .files import replacing
 from .measure.operations import bsdf_operations
-from .plugins.support import footprint
+from .plugins.support import footprint, omissions
 from .runtime import use_variant
 from .task import tasks
 
@@ -44,15 +44,18 @@ class ParsedScene:
     def __init__(self, path: str | os.PathLike, defines: dict[str, str] | None = None):
         self.path = Path(path)
         self.defines = {name: str(value) for name, value in (defines or {}).items()}
+        self._resolver = None  # parsing adds the folders of <path> to it
         with self._errors():
             if not self.path.is_file():
                 raise RuntimeError(f"{path}: no such scene file")
+            if self.path.suffix.lower() == ".npz":
+                raise RuntimeError(f"{path}: found a table file, a scene is needed: mi_diffind.inspect shows its use")
             _, self._state = compat.parse_file(path, self.defines)
 
     @contextlib.contextmanager
     def _errors(self):
         """Resolve file names beside the scene, and turn errors into a :class:`SceneError`."""
-        with scene_errors(self.path), _resolving(self.path):
+        with scene_errors(self.path), _resolving(self.path, self._resolver) as self._resolver:
             yield
 
     def load(
@@ -90,6 +93,11 @@ class ParsedScene:
             if not isinstance(loaded, mi.Scene):
                 raise RuntimeError(f"{self.path}: holds a {type(loaded).__name__}, a scene is expected")
             return loaded
+
+    def change(self, change: Callable[[object], object]):
+        """Change the parsed scene (``mi.parser.ParserState``) for good by ``change(state)``, and return its result."""
+        with self._errors():
+            return change(self._state)
 
     def _copy(self):
         """Return a copy of the parsed state to read: Mitsuba takes a parameter that was read once for a known one."""
@@ -199,17 +207,9 @@ def attach(scene, sensor=0, spp: int | None = None):
     """
     if isinstance(sensor, int) and not 0 <= sensor < len(scene.sensors()) and footprint.textures(scene):
         raise SceneError(f"sensor: found {sensor}, the scene has {len(scene.sensors())}")
-    names = [plugin_name(node) for node in compat.objects_of(scene) if isinstance(node, mi.Integrator)]
-    if unseen := _unseen(scene, names):
-        plugins.warn(unseen)
     footprint.attach(scene, sensor, spp)
+    omissions.check(scene)
     return scene
-
-
-def plugin_name(node) -> str:
-    """Return the name of the plugin that created an object: of the package's plugins as in a scene, else its class."""
-    description = plugins.origin(node)
-    return description["plugin"] if description else node.class_name()
 
 
 def _build(config, state, integrators: list[str], report: Callable[[str], None]):
@@ -220,6 +220,7 @@ def _build(config, state, integrators: list[str], report: Callable[[str], None])
         unseen = _unseen(loaded, integrators)
         if unseen:
             report(unseen)
+            omissions.settle(instance for instance in instances(loaded) if hasattr(instance, "seen_by"))
         _warn_of_decoded(loaded, decoded, integrators)
         footprint.attach(loaded)
     return loaded
@@ -274,13 +275,18 @@ def _decode_unseen(state, integrators: list[str]) -> list[str]:
     ids = []
     for props in compat.properties_of(state):
         plugin = plugins.declared().get(props.plugin_name())
-        if plugin is None or plugin.otherwise is None or set(plugin.seen_by) & set(integrators):
+        if plugin is None or plugin.otherwise is None or _sees(integrators, plugin.seen_by):
             continue
         key, value = plugin.otherwise
         if key not in props and not ("storage" in props and props["storage"] == "float32"):
             props[key] = value
             ids.append(props.id())
     return ids
+
+
+def _sees(integrators: list[str], seen_by: tuple[str, ...]) -> bool:
+    """Return whether integrators see a shape that those called ``seen_by`` see; ``aov`` intersects rays itself."""
+    return bool(set(seen_by) & set(integrators)) and "aov" not in integrators
 
 
 def _warn_of_decoded(scene, ids: list[str], integrators: list[str]) -> None:
@@ -296,7 +302,7 @@ def _unseen(scene, integrators: list[str]) -> str:
     """Return a sentence about a shape that none of the ``integrators`` traces, "" if there is none."""
     for instance in instances(scene):
         seen_by = getattr(instance, "seen_by", None)
-        if seen_by and not set(seen_by) & set(integrators):
+        if seen_by and not _sees(integrators, seen_by):
             allowed = " or ".join(f'"{name}"' for name in seen_by)
             present = ", ".join(f'"{name}"' for name in integrators) or "none"
             return (
@@ -330,17 +336,20 @@ def reports(scene) -> list[dict]:
     (:class:`~mi_diffind.measure.operations.Operations`, by name); for the integrator of a radiance field, how many
     steps of ``rays`` are taken, skipped, … (:class:`~mi_diffind.tasks.radiance.march.RayCounts`).
     """
-    descriptions = []
-    for instance in learned_instances(scene):
-        counts = bsdf_operations(instance) if isinstance(instance, mi.BSDF) else {}
-        descriptions.append({
-            **plugins.origin(instance),
-            "id": instance.id(),
-            **(plugins.report(instance) or {}),
-            "operations": {method: n.asdict() for method, n in counts.items()},
-            **({"rays": instance.counts(scene)} if hasattr(instance, "counts") and scene.sensors() else {}),
-        })  # fmt: skip
-    return descriptions
+    return [report_of(instance, scene) for instance in learned_instances(scene)]
+
+
+def report_of(instance, scene) -> dict:
+    """Return the report (:func:`reports`) on one of the :func:`instances` of a loaded scene, or of another object."""
+    counts = bsdf_operations(instance) if isinstance(instance, mi.BSDF) else {}
+    counted = hasattr(instance, "counts") and isinstance(scene, mi.Scene) and scene.sensors()
+    return {
+        **plugins.origin(instance),
+        "id": instance.id(),
+        **(plugins.report(instance) or {}),
+        "operations": {method: n.asdict() for method, n in counts.items()},
+        **({"rays": instance.counts(scene)} if counted else {}),
+    }
 
 
 def film_size(scene) -> tuple[int, int]:
@@ -404,14 +413,18 @@ def write_image(path: str | os.PathLike, image: np.ndarray) -> None:
 
 
 @contextlib.contextmanager
-def _resolving(path):
-    """Look for relative file names beside the scene, as ``mi.load_file`` does."""
+def _resolving(path, resolver=None):
+    """Look for relative file names beside the scene, as ``mi.load_file`` does; yield the resolver.
+
+    ``resolver``: an earlier one for the same scene.
+    """
     before = mi.file_resolver()
-    resolver = mi.FileResolver(before)
-    resolver.prepend(str(Path(path).resolve().parent))
+    if resolver is None:
+        resolver = mi.FileResolver(before)
+        resolver.prepend(str(Path(path).resolve().parent))
     mi.set_file_resolver(resolver)
     try:
-        yield
+        yield resolver
     finally:
         mi.set_file_resolver(before)
 

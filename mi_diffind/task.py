@@ -36,6 +36,7 @@ from .compat import module_of
 from .deadline import Deadline
 from .errors import UsageError
 from .settings import FitSettings
+from .units import labelled
 
 if TYPE_CHECKING:
     from .fitting import FitResult, Problem
@@ -44,9 +45,6 @@ if TYPE_CHECKING:
 
 #: Storage forms that a training may end in (:data:`.lookup.STORAGES`, without importing Dr.Jit).
 STORAGES = ("float32", "float16", "uint8")
-
-#: End of the name of a figure → its unit, for people.
-UNITS = {"_db": " dB", "_deg": "°"}
 
 #: The folder of the tables that ship.
 DATA = Path(__file__).resolve().parent / "data"
@@ -196,12 +194,7 @@ class Fitted:
         """Return the result as lines of text: bytes, accuracy, remarks, and how a scene names the file ``path``."""
         table = self.table
         lines = [f"{path}: {table.nbytes:,} bytes as {table.storage}; {self.result.outcome}"]
-        width = max(map(len, table.measured), default=0)
-        for name, value in table.measured.items():
-            unit = next((unit for unit in UNITS if name.endswith(unit)), "")
-            label = name.removesuffix(unit).replace("_", " ")
-            lines.append(f"  {label:{width}}  {format(value, '.4g')}{UNITS.get(unit, '')}")
-        lines += [f"  {line}" for line in self.lines]
+        lines += [f"  {line}" for line in (*labelled(table.measured), *self.lines)]
         usage = tasks()[table.task].usage(table, Path(path).name) if table.task in tasks() else []
         return [*lines, *(["in a scene:"] if usage else []), *(f"  {line}" for line in usage)]
 
@@ -277,8 +270,11 @@ class Model:
         """
         self._refuse("cannot be measured")
 
-    def decode(self, output: Path, **options) -> list[tuple[Path, str]]:
+    def decode(self, output: str | os.PathLike | None = None, **options):
         """Write the content in an ordinary format, and return each file with a line about it.
+
+        Without an ``output``, the content is returned: of maps a dictionary of arrays, of a distance field a
+        ``trimesh.Trimesh``.
 
         Raises :class:`~mi_diffind.tables.TableError` if there is no such format, and
         :class:`~mi_diffind.errors.UsageError` for bad options.
@@ -304,6 +300,8 @@ class Task:
     title: str
     #: Where the paper describes it.
     section: str = ""
+    #: Source and options of the example in the help of ``fit``.
+    example: str = ""
     #: Named ways to lay out and train its tables; the first is the default.
     presets: Mapping[str, FitSettings]
     #: Preset → the table file that ships, relative to ``mi_diffind/data`` unless absolute.
@@ -498,8 +496,8 @@ def load_model(path: str | os.PathLike, dtype, storage: str = "") -> Model:
     return task.model(task.load(path), dtype, storage)
 
 
-def open_model(path: str | os.PathLike, storage: str = "") -> Model:
-    """Open a table file of any task: ``mi_diffind.open(path)``.
+def open_model(path: str | os.PathLike = "", storage: str = "", *, task: str = "", preset: str = "") -> Model:
+    """Open a table file of any task, or the tables that ship for a ``task`` and its ``preset``: ``mi_diffind.open``.
 
     The model describes itself (``describe()``), has its size (``nbytes``), measures its errors against what it was
     fitted to (``measure()``) and turns into ordinary files (``decode(output)``). ``storage`` is the storage form of its
@@ -510,6 +508,11 @@ def open_model(path: str | os.PathLike, storage: str = "") -> Model:
 
     if storage and storage not in STORAGES:
         raise UsageError(f'storage: found "{storage}", allowed are {", ".join(STORAGES)}')
+    if not str(path):
+        shipping = [name for name, known in tasks().items() if known.shipped]
+        if task not in shipping:
+            raise UsageError(f'open: found no file and the task "{task}", tables ship for {", ".join(shipping)}')
+        path = tasks()[task].file("", preset)
     return load_model(path, array_module().TensorXf, storage)
 
 

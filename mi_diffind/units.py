@@ -1,12 +1,20 @@
-"""Sizes as users write them: bytes, compression ratios, bits per texel; and the search for the largest that fits."""
+"""Sizes as users write them (bytes, compression ratios, bits per texel), and figures as people read them."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 _NUMBER = r"(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
+#: End of the name of a figure → its unit and the digits after the point.
+_FIGURE_UNITS = {"_db": (" dB", 2), "_deg": ("°", 2)}
+#: Word in the name of a figure → text.
+_WORDS = {
+    "psnr": "PSNR", "mae": "MAE", "brdf": "BRDF", "iou": "IoU", "flip": "FLIP", "between": "between texels",
+    "worst": "worst level", "shaded": "PSNR shaded,", "converged": "converged truth",
+    "prefiltered": "prefiltered truth",
+}  # fmt: skip
 _UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 
 
@@ -77,3 +85,20 @@ def largest_fitting(fits: Callable[[float], bool], low: float, high: float, step
         low, high = (middle, high) if fits(middle) else (low, middle)
         steps = None if steps is None else steps - 1
     return low
+
+
+def labelled(figures: Mapping[str, float]) -> list[str]:
+    """Return figures as lines of a table for people: ``psnr_albedo_db``, 42.4 → ``PSNR albedo  42.40 dB``.
+
+    Figures of levels of detail (``psnr_l0_db``, ``psnr_l1_db``, …) share a line.
+    """
+    rows: dict[tuple[str, str], list[str]] = {}
+    for name, value in figures.items():
+        end = next((end for end in _FIGURE_UNITS if name.endswith(end)), "")
+        unit, digits = _FIGURE_UNITS.get(end, ("", None))
+        words = ["of levels" if re.fullmatch(r"l\d+", word) else word for word in name.removesuffix(end).split("_")]
+        label = " ".join(_WORDS.get(word, word) for word in words)
+        label = re.sub(r"(\d[\d.]*) (\d[\d.]*)$", r"\1 to \2", label)  # a range
+        rows.setdefault((label, unit), []).append(f"{value:.4g}" if digits is None else f"{value:.{digits}f}")
+    width = max((len(label) for label, _ in rows), default=0)
+    return [f"{label:{width}}  {', '.join(values)}{unit}" for (label, unit), values in rows.items()]

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import itertools
 import json
 import math
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,12 +24,13 @@ import mitsuba as mi
 import numpy as np
 
 from . import __version__, compat, scenes, srgb
-from .errors import DiffindError, reason
+from .errors import DiffindError, UsageError, reason
 from .files import replacing, writable_folder, write_json
 from .interrupt import interruptible
 from .plugins.support import footprint
 from .poses import frame_of, orbit_directions, pose, sphere_directions
 from .progress import progress_bar
+from .runtime import use_variant
 
 #: Shapes of the camera path.
 PATHS = ("sphere", "orbit")
@@ -45,6 +48,9 @@ THROUGH = 8
 
 #: Largest number of a half float, the type of the colours of an EXR.
 LARGEST = 65504.0
+
+#: Number of views of a contact sheet.
+SHOWN = 24
 
 #: File that records the settings of a folder.
 RECORD = "capture.json"
@@ -121,8 +127,9 @@ class CaptureSettings:
 class Captured:
     """State of a folder after a capture.
 
-    ``files`` of images and their ``total`` once complete; the number ``rendered`` now, in ``seconds``; ``radius``,
-    ``centre`` and ``box`` ``(2, 3)`` of the cameras' target; ``opaque``: no rendered pixel has alpha below 1.
+    ``files`` of images (relative to ``folder``) and their ``total`` once complete; the number ``rendered`` now, in
+    ``seconds``; ``radius``, ``centre`` and ``box`` ``(2, 3)`` of the cameras' target; ``opaque``: no rendered pixel has
+    alpha below 1.
     """
 
     folder: Path
@@ -135,22 +142,84 @@ class Captured:
     box: np.ndarray
     opaque: bool
 
+    @property
+    def interrupted(self) -> bool:
+        """Whether views are missing."""
+        return len(self.files) < self.total
+
+    @property
+    def figures(self) -> dict:
+        """Figures of ``mi-diffind capture --json``."""
+        return {
+            "interrupted": self.interrupted,
+            "output": str(self.folder),
+            "files": self.files,
+            "views": self.total,
+            "rendered": self.rendered,
+            "seconds": self.seconds,
+            "radius": self.radius,
+            "centre": self.centre.tolist(),
+            "box": self.box.tolist(),
+        }
+
+    @property
+    def poses(self) -> np.ndarray:
+        """Camera-to-world matrices ``(views, 4, 4)`` of all ``files``, in this order; cameras look along −z."""
+        matrices = {}
+        for path in self.folder.glob("transforms_*.json"):
+            for frame in json.loads(path.read_text(encoding="utf-8"))["frames"]:
+                matrices[frame["file_path"].removeprefix("./")] = frame["transform_matrix"]
+        return np.array([matrices[name] for name in self.files], np.float64).reshape(-1, 4, 4)
+
+    @property
+    def images(self) -> list[np.ndarray]:
+        """Images of all ``files``, ``(height, width, 4)``, read when asked for: uint8, or of EXR linear floats."""
+        return [np.array(mi.Bitmap(str(self.folder / name))) for name in self.files]
+
+    def __str__(self) -> str:
+        return "\n".join(lines(self))
+
+    def _repr_png_(self) -> bytes:
+        """Return a contact sheet of at most :data:`SHOWN` views on white, evenly chosen."""
+        from PIL import Image
+
+        chosen = np.unique(np.linspace(0, len(self.files) - 1, min(SHOWN, len(self.files))).round().astype(int))
+        columns, side = min(8, max(1, len(chosen))), 128
+        sheet = Image.new("RGB", (columns * side, max(1, -(-len(chosen) // columns)) * side), "white")
+        for i, number in enumerate(chosen):
+            image = np.array(mi.Bitmap(str(self.folder / self.files[number])))
+            if image.dtype != np.uint8:  # linear, multiplied by alpha
+                straight = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
+                shown = np.concatenate([srgb.for_display(straight), np.clip(image[..., 3:], 0, 1)], axis=-1)
+                image = np.rint(255 * shown).astype(np.uint8)
+            thumbnail = Image.fromarray(image).resize((side, side))
+            sheet.paste(thumbnail, (i % columns * side, i // columns * side), thumbnail)
+        stream = io.BytesIO()
+        sheet.save(stream, "PNG")
+        return stream.getvalue()
+
 
 def capture(
     scene: str | os.PathLike,
     folder: str | os.PathLike,
-    settings: CaptureSettings = CaptureSettings(),
-    defines: dict[str, str] | None = None,
+    *,
+    defines: Mapping[str, object] | None = None,
     progress: bool = True,
+    **given,
 ) -> Captured:
     """Render the views of a scene file into ``folder``, in the variant that is set.
 
-    The folder is created if its parent exists. Views of an earlier capture with the same settings of the same scene are
-    kept; after Ctrl-C the current view is the last. Raises :class:`CaptureError`, also for a folder with other
-    settings, ``ValueError`` for bad settings, and :class:`~mi_diffind.scenes.SceneError` and
+    ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
+    ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters. The folder is
+    created if its parent exists. Views of an earlier capture with the same settings of the same scene are kept; after
+    Ctrl-C the current view is the last. Raises :class:`~mi_diffind.errors.UsageError` for bad settings,
+    :class:`CaptureError`, also for a folder with other settings, :class:`~mi_diffind.scenes.SceneError` and
     :class:`~mi_diffind.files.OutputError`.
     """
-    settings.check()
+    use_variant()
+    settings = _settings(given)
+    if not isinstance(scene, (str, os.PathLike)):
+        raise UsageError(f"scene: found a {type(scene).__name__}, a scene file is needed")
     folder = writable_folder(folder, create=True)
     parsed = scenes.ParsedScene(scene, defines)
     record = _record(parsed, settings)
@@ -182,6 +251,22 @@ def capture(
     seconds = time.perf_counter() - start
     files = _write_lists(folder, settings, splits, box)
     return Captured(folder, files, total, rendered, seconds, radius, centre, box, opaque)
+
+
+def _settings(given: dict) -> CaptureSettings:
+    """Return the settings with the ``given`` fields. Raises :class:`~mi_diffind.errors.UsageError`."""
+    allowed = [f.name for f in dataclasses.fields(CaptureSettings)]
+    for name in given:
+        if name not in allowed:
+            raise UsageError(f'capture: found the argument "{name}", allowed are {", ".join(allowed)}')
+    names = ("centre", "elevation", "up", "objects")
+    tuples = {name: tuple(given[name]) for name in names if given.get(name) is not None}
+    settings = CaptureSettings(**{**given, **tuples})
+    try:
+        settings.check()
+    except ValueError as e:
+        raise UsageError(str(e)) from None
+    return settings
 
 
 def shapes_of(scene, objects: tuple[str, ...] = ()) -> list:
@@ -309,6 +394,9 @@ def _only(inner, shapes: list):
     replays = compat.samples_in_python(inner)
 
     class ObjectsOnly(mi.SamplingIntegrator):
+        def traverse(self, cb):
+            cb.put("inner", inner, mi.ParamFlags.Differentiable)
+
         def sample(self, scene, sampler, ray, medium=None, active=True):
             ray, hit = mi.Ray3f(ray), mi.Bool(False)
             left = mi.Bool(active)

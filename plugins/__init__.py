@@ -50,6 +50,20 @@ class Counterpart:
 
 
 @dataclass(frozen=True)
+class Stock:
+    """Plugins of Mitsuba that a learned plugin can stand for, fitted to what they show if need be.
+
+    ``word``: the name of all of them for users; ``names``: their types in a scene. ``convert(node)`` changes the
+    properties of a :class:`~mi_diffind.plugins.support.stock.StockNode`, without the type, or raises
+    :class:`~mi_diffind.plugins.support.stock.Kept`.
+    """
+
+    word: str
+    names: tuple[str, ...]
+    convert: Callable[[Any], None]
+
+
+@dataclass(frozen=True)
 class Plugin:
     """Declaration of a plugin.
 
@@ -57,7 +71,8 @@ class Plugin:
     - ``factory(props)``: a class, or a function, which may return an object of one of Mitsuba's own classes;
     - ``task``: the task whose tables it reads; ``storage``: their default storage form ("": that of the file);
     - ``exact``: the exact counterpart, which makes the plugin a *learned* one; ``others``: further counterparts;
-      ``truths``: the counterparts that a comparison takes by default, in order;
+      ``truths``: the counterparts that a comparison takes by default, in order; ``stock``: the plugins of Mitsuba that
+      it can stand for;
     - ``seen_by``: for a shape that only some integrators see, these; ``otherwise``: the parameter and the value with
       which all others see it, too.
 
@@ -73,6 +88,7 @@ class Plugin:
     exact: Counterpart | None = None
     others: tuple[Counterpart, ...] = ()
     truths: tuple[str, ...] = ("exact",)
+    stock: Stock | None = None
     seen_by: tuple[str, ...] = ()
     otherwise: tuple[str, str] | None = None
 

@@ -12,6 +12,7 @@ from mi_diffind.tasks.disney.model import LOBES
 
 from . import Counterpart, Plugin
 from .support import properties, tables
+from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
 
 _DIFFERENTIABLE = mi.ParamFlags.Differentiable
@@ -25,6 +26,7 @@ ETA_MAX = 3.0
 _SMALLEST_DENSITY = 1e-12
 
 
+@shared_parts
 class Disney(mi.BSDF):
     r"""
     .. _bsdf-disney:
@@ -137,6 +139,8 @@ class Disney(mi.BSDF):
     Values and gradients are finite for every input: grazing directions, roughness 0, black albedo. Sampling is
     detached: gradients flow through the value of a sample, not through its position or density, which keeps them
     unbiased where the choice of a lobe depends on a parameter.
+
+    {executable}
 
     .. tabs::
         .. code-tab:: xml

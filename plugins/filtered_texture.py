@@ -5,10 +5,11 @@ from __future__ import annotations  # Delayed parsing of type annotations
 import drjit as dr
 import mitsuba as mi
 
+from mi_diffind import compat
 from mi_diffind.lookup import clamp
 
 from .map_texture import MapTexture
-from .support import footprint
+from .support import footprint, omissions
 from .support.filtering import Filter, anisotropic, cone_of, in_texels, isotropic, offsets, random
 from .support.footprint import Cone
 from .support.textures import luminance
@@ -28,10 +29,42 @@ class FilteredTexture(MapTexture):
         self._cone_of_parameters = cone_of(props)
         self.cone = self._cone_of_parameters
         super().__init__(props)
+        if self.filter.name != "off":
+            omissions.watch(self)
 
     def set_cone(self, cone: Cone | None) -> None:
         """Set the sensor that sees the texture; ``None``: the one that the parameters describe, if any."""
         self.cone = cone or self._cone_of_parameters
+
+    def omitted(self, integrators: list, sensor) -> str:
+        """Return a sentence if no footprints reach the texture, or those of another sensor; see :mod:`.omissions`.
+
+        Whether an integrator gives footprints is known of a few only, and of all others to :func:`.omissions.reading`.
+        """
+        names = [compat.integrator_name(integrator) for integrator in integrators]
+        attached, name = footprint.attached_sensor(self)
+        if not self.is_spatially_varying() or any(hasattr(i, "gives_footprints") for i in integrators):
+            return ""
+        if self.cone is None:
+            return self.unfiltered() if set(names) & set(compat.CARRYING) else ""
+        if sensor is None or attached in (0, id(sensor)):
+            return ""
+        return (
+            f'{self._title()} is filtered for the sensor "{name}", found "{sensor.id()}": call '
+            f"mi_diffind.attach(scene, sensor) before a render of another sensor"
+        )
+
+    def unfiltered(self) -> str:
+        """Return a warning that the texture is not filtered."""
+        return (
+            f"{self._title()} is not filtered: it does not know the sensor, and the integrator gives no footprints; "
+            f"load the scene with mi_diffind.load_file or load_dict, call mi_diffind.attach(scene), or render with the "
+            f"integrator path_footprint"
+        )
+
+    def _title(self) -> str:
+        described = ", ".join(filter(None, (omissions.plugin_of(self), str(self._path or ""))))
+        return f'the texture "{self.id()}" ({described})'
 
     def _values(self, si):
         if self.filter.name == "off" or not self.is_spatially_varying():
@@ -54,6 +87,8 @@ class FilteredTexture(MapTexture):
 
     def _footprint(self, si) -> tuple:
         """Return the footprint in texels of the image, with ``to_uv`` applied."""
+        if self.cone is None:
+            omissions.reading(self, si)
         with dr.suspend_grad():
             ddx, ddy = footprint.footprint(si, self.cone)
             if self._transform is not None:

@@ -68,6 +68,8 @@ class MipMap(FilteredTexture):
 
     {gradient}
 
+    {executable}
+
     .. tabs::
         .. code-tab:: xml
             :name: mipmap

@@ -7,14 +7,17 @@ import mitsuba as mi
 from mi_diffind.tasks.disney import TASK
 from mi_diffind.tasks.disney.decoder import GROUPS
 
-from . import Counterpart, Plugin
-from .disney import PRINCIPLED, Disney
-from .support import tables
+from . import Counterpart, Plugin, Stock
+from .disney import ETA_MAX, PRINCIPLED, Disney
+from .support import properties, tables
+from .support.manual import shared_parts
+from .support.stock import Kept, StockNode
 
 #: Default storage form: the fastest to read, and within 82 dB of the formulas.
 STORAGE = "uint8"
 
 
+@shared_parts
 class NeuralDisney(Disney):
     r"""
     .. _bsdf-neural_disney:
@@ -64,6 +67,8 @@ class NeuralDisney(Disney):
 
     **``paper`` gains energy** at the horizon, where its masking is inaccurate: at roughness 0.2, ``anisotropic`` 1 and
     an angle of 89° the mean weight of a sample reaches 2.44, where the exact one stays below 1. ``tables`` does not.
+
+    {executable}
 
     .. tabs::
         .. code-tab:: xml
@@ -116,6 +121,18 @@ class NeuralDisney(Disney):
         super().parameters_changed(keys)
 
 
+def _from_principled(node: StockNode) -> None:
+    """Check whether a ``principled`` is within the model, whose parameters have the same names."""
+    props = node.props
+    if "spec_trans" in props and not (properties.is_number(props, "spec_trans") and float(props["spec_trans"]) == 0):
+        raise Kept("transmits light (spec_trans), which the Disney BRDF does not")
+    unit = ("base_color", *Disney.DEFAULTS, "specular")
+    node.allow(*unit, "eta", "spec_trans", *Disney.RATES.values())
+    for name, low, high in (*((name, 0, 1) for name in unit), ("eta", 1, ETA_MAX)):
+        if name in props and properties.is_number(props, name) and not low <= float(props[name]) <= high:
+            raise Kept(f'has the parameter "{name}" {float(props[name]):g}, the Disney BRDF allows {low} to {high:g}')
+
+
 PLUGIN = Plugin(
     "neural_disney",
     "bsdf",
@@ -124,4 +141,5 @@ PLUGIN = Plugin(
     storage=STORAGE,
     exact=Counterpart("disney", ("preset", "filename", "storage")),
     others=(PRINCIPLED,),
+    stock=Stock("principled", ("principled",), _from_principled),
 )

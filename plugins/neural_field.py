@@ -16,8 +16,9 @@ from . import Counterpart, Plugin, warn
 from .path_footprint import integrator as path_footprint
 from .path_footprint import relative
 from .support import distance_shapes as sdf
-from .support import properties
+from .support import omissions, properties
 from .support.differentials import Differentials
+from .support.manual import shared_parts
 from .support.placed_fields import PlacedField, VariantLight, to_grid
 
 #: Properties that the default integrator of surfaces takes.
@@ -106,7 +107,10 @@ emitters; any other inner integrator is constant, and so is the geometry.
 
 The base classes of Mitsuba write an alpha of 0 or 1, and they fail with AOVs in the backward pass, since they multiply
 AOVs, which are numbers, by the weight of the ray, which is a spectrum. This integrator has render passes of its
-own. Inside another integrator, such as :monosp:`aov`, alpha is 0 or 1.
+own. Inside another integrator, such as :monosp:`aov`, alpha is 0 or 1. If :monosp:`mi.render` is given an integrator
+without a field for a scene with one, it warns once.
+
+{executable}
 
 .. tabs::
     .. code-tab:: xml
@@ -198,11 +202,6 @@ def in_order(fields: list, entered: list) -> list:
     return pairs
 
 
-def named(integrator) -> str:
-    """Return the name of an integrator's class, in Python or C++."""
-    return type(integrator).__name__ if compat.written_in_python(integrator) else integrator.class_name()
-
-
 def with_holes(scene: mi.Scene) -> list[str]:
     """Return the names of shapes whose material has holes, such as a ``mask``."""
     names = []
@@ -219,6 +218,7 @@ def with_holes(scene: mi.Scene) -> list[str]:
 def integrator() -> type:
     """Return the class of the plugin in the current variant."""
 
+    @shared_parts
     class NeuralField(compat.replay_integrator()):
         __doc__ = MANUAL
 
@@ -253,6 +253,7 @@ def integrator() -> type:
                         "the boxes of two nested fields overlap, allowed are boxes without a common volume"
                     )
             self._warned = False
+            omissions.watch(self)
             self._shapes = {name: tuple(values.shape) for name, values in self.placed.exposed.items()}
 
         @staticmethod
@@ -269,14 +270,12 @@ def integrator() -> type:
                 raise RuntimeError(f"found {len(given)} nested integrators, allowed is one, for the surfaces")
             if parameters:
                 raise RuntimeError(f'parameter "{parameters[0]}": belongs to the nested integrator')
-            inner = given[0]
+            inner, name = given[0], compat.integrator_name(given[0])
             if not isinstance(inner, mi.SamplingIntegrator):
-                raise RuntimeError(
-                    f"the nested integrator {named(inner)}: does not follow rays from a camera, as path does"
-                )
+                raise RuntimeError(f"the nested integrator {name}: does not follow rays from a camera, as path does")
             if inner.aov_names():
                 raise RuntimeError(
-                    f"the nested integrator {named(inner)}: has AOVs of its own, which are not passed on; nest "
+                    f"the nested integrator {name}: has AOVs of its own, which are not passed on; nest "
                     f"neural_field in it instead"
                 )
             return inner
@@ -309,7 +308,10 @@ def integrator() -> type:
 
         def report(self) -> dict:
             field = self.placed.field
-            report = {"voxel": field.voxel * self.placed.placement.size, "surfaces": named(self.surfaces)}
+            report = {
+                "voxel": field.voxel * self.placed.placement.size,
+                "surfaces": compat.integrator_name(self.surfaces),
+            }
             if self.model is None:
                 return report
             return {
@@ -360,9 +362,20 @@ def integrator() -> type:
             film.put_block(block)
             return film.develop()
 
+        def omitted(self, integrators: list, sensor) -> str:
+            """Return a sentence if no integrator among these renders a radiance field; see :mod:`.omissions`."""
+            if any(isinstance(integrator, NeuralField) for integrator in integrators):
+                return ""
+            name = compat.integrator_name(integrators[-1])
+            return (
+                f"the radiance field of the scene's integrator (neural_field) is left out: the integrator {name} does "
+                f"not render it; nest {name} in a neural_field"
+            )
+
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             if not develop:
                 raise RuntimeError("neural_field: found develop=False, allowed is develop=True")
+            omissions.check(scene, self, sensor)
             with dr.suspend_grad():
                 film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
                 light, alpha, aovs, _ = self.primal(scene, sampler, ray)

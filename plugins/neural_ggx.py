@@ -10,9 +10,11 @@ from mi_diffind.tasks.ggx.model import Roughness
 
 from . import Counterpart, Plugin
 from .support import properties, tables
+from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
 
 
+@shared_parts
 class NeuralGGX(mi.BSDF):
     r"""
     .. _bsdf-neural_ggx:
@@ -100,6 +102,8 @@ class NeuralGGX(mi.BSDF):
     **Only the effects in use are computed.** If ``alpha`` is constant, all terms that depend on it are evaluated once,
     and the primary array is reduced to one row, read at one coordinate. Without a metal (``eta`` 0, ``k`` 1) no Fresnel
     term is traced, and without ``specular_reflectance`` no factor.
+
+    {executable}
 
     .. tabs::
         .. code-tab:: xml

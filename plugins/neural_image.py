@@ -78,6 +78,8 @@ class NeuralImage(MapTexture):
     does not map the unit square to itself. For this, for ``mean`` and for ``max``, images of more than 2²² texels are
     reduced.
 
+    {executable}
+
     .. tabs::
         .. code-tab:: xml
             :name: neural_image

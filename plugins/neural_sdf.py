@@ -17,10 +17,12 @@ from mi_diffind.tables import TableError
 from mi_diffind.task import stamp
 from mi_diffind.tasks.sdf import TASK
 
-from . import Counterpart, Plugin, reports_as, shown_as, warn
+from . import Counterpart, Plugin, Stock, reports_as, shown_as, warn
 from .support import properties, tables
-from .support.distance_shapes import CELL_BYTES, DistanceShape, Placement, crop_grid, finest, native_grid
-from .support.sdf_meshes import to_mesh
+from .support.distance_shapes import CELL_BYTES, SEEN_BY, Placement, crop_grid, distance_shape, finest, native_grid
+from .support.manual import shared_parts
+from .support.sdf_meshes import closed_mesh_of, to_mesh
+from .support.stock import Kept, StockNode
 
 #: Models whose arrays cannot be optimised, shared by all shapes of a file.
 _shared: WeakValueDictionary = WeakValueDictionary()
@@ -96,7 +98,8 @@ def sentence(report: dict) -> str:
     )
 
 
-class NeuralSDF(DistanceShape):
+@shared_parts
+class NeuralSDF(distance_shape(mi.Mesh)):
     r"""
     .. _shape-neural_sdf:
 
@@ -161,8 +164,9 @@ class NeuralSDF(DistanceShape):
     This shape is therefore a mesh without area, and only :monosp:`path_sdf` sees it. For other integrators, commands of
     ``mi-diffind`` and ``mi_diffind.load_file`` decode it to a grid, unless ``trace`` is given or ``storage`` is
     ``float32``: then commands refuse the scene, and ``mi_diffind.load_file`` warns. ``mi.load_file`` and
-    ``mi.load_dict`` do not decode: other integrators render the scene without the shape. Several shapes of one file
-    share its arrays. Texture coordinates are 0; emitters, media and :monosp:`shapegroup` are not supported.
+    ``mi.load_dict`` do not decode: other integrators render the scene without the shape, and :monosp:`mi.render` warns
+    once. The integrator :monosp:`aov` is one of these, since its channels come from rays of its own. Several shapes of
+    one file share its arrays. Texture coordinates are 0; emitters, media and :monosp:`shapegroup` are not supported.
 
     **With** ``grid``, the resolution is chosen when the scene is loaded: grids are evaluated at 4096 places on the
     surface, and the coarsest one is taken whose mean distance to the arrays' surface is at most the arrays' mean
@@ -172,6 +176,8 @@ class NeuralSDF(DistanceShape):
     a coarser grid. Where 512 cells or 3.2 GB do not suffice, a warning states the errors; ``mi-diffind inspect`` states
     them for any scene. Each shape has its own grid. A rotated grid is an instance; derivatives and parameters are those
     of :monosp:`sdfgrid`.
+
+    {executable}
 
     .. tabs::
         .. code-tab:: xml
@@ -206,6 +212,9 @@ class NeuralSDF(DistanceShape):
     def trained(self) -> tuple:
         """Return the table of the file, and the entries that can be optimised, by name."""
         return self.model.table, self.model.entries()
+
+    def optimisable(self) -> bool:
+        return bool(self.entries())
 
     def optimised(self) -> bool:
         return any(compat.has_gradient(values) for values in self.entries().values())
@@ -275,12 +284,42 @@ def factory(props: mi.Properties):
     return shape
 
 
+#: Bytes of the field that a scene's mesh gets without a file of its own.
+BYTES = 2**18
+
+
+def _from_mesh(node: StockNode) -> None:
+    """Replace a mesh of a file by its distance field."""
+    props = node.props
+    if any(parent.plugin_name() == "shapegroup" for parent in node.parents):
+        raise Kept("is in a shapegroup, which distance fields do not support")
+    if node.nested_types(mi.ObjectType.Emitter):
+        raise Kept("emits light, distance fields emit none")
+    if "interior" in props or "exterior" in props:
+        raise Kept("borders on a medium, distance fields hold none")
+    if textures := node.nested_types(mi.ObjectType.Texture):
+        raise Kept(f"has a material with textures ({', '.join(textures)}), distance fields have no texture coordinates")
+    if props.get("flip_normals", False) is True:
+        raise Kept("has flipped normals, those of distance fields point outwards")
+    node.allow("filename", "shape_index", "face_normals", "flip_normals", "flip_tex_coords", "to_world", "bsdf")
+    try:
+        Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
+    except RuntimeError as e:
+        raise Kept(f"cannot be placed: {e}") from None
+    source = closed_mesh_of(node.file(), node.folder, props.get("shape_index", 0))
+    props["filename"] = str(node.fit(TASK.name, source, bytes=BYTES))
+    for name in ("shape_index", "face_normals", "flip_normals", "flip_tex_coords"):
+        if name in props:
+            del props[name]
+
+
 PLUGIN = Plugin(
     "neural_sdf",
     "shape",
     factory,
     task=TASK.name,
-    seen_by=DistanceShape.seen_by,
+    seen_by=SEEN_BY,
     otherwise=("trace", "grid"),
+    stock=Stock("mesh", ("ply", "obj", "serialized"), _from_mesh),
     exact=Counterpart("ply", ("normals", "trace", "resolution", "storage"), convert=to_mesh),
 )

@@ -8,11 +8,13 @@ import mitsuba as mi
 
 from mi_diffind.tasks.texture import TASK
 
-from . import Counterpart, Plugin
+from . import Counterpart, Plugin, Stock
 from .filtered_texture import FilteredTexture
 from .support.filtering import PROPERTIES as FILTERING
-from .support.image_files import SharedMaps, open_compressed, to_bitmap, to_mipmap
+from .support.filtering import TYPES
+from .support.image_files import SharedMaps, manifest_of, open_compressed, to_bitmap, to_mipmap
 from .support.manual import shared_parts
+from .support.stock import Kept, StockNode
 
 
 @shared_parts
@@ -65,6 +67,8 @@ class NeuralTexture(FilteredTexture):
 
     {gradient}
 
+    {executable}
+
     .. tabs::
         .. code-tab:: xml
             :name: neural_texture
@@ -93,6 +97,25 @@ def _to_bitmap(props: mi.Properties) -> None:
             del props[name]
 
 
+#: Steps of the fit that a scene's bitmap gets without a file of its own: within 2 dB of the default training.
+STEPS = 300
+
+
+def _from_bitmap(node: StockNode) -> None:
+    """Replace the image of a ``bitmap`` by a compressed one."""
+    props = node.props
+    node.allow("filename", "raw", "to_uv", "wrap_mode", "filter_type", "format", "accel")
+    if str(props.get("filter_type", "bilinear")) not in TYPES:
+        raise Kept(f'has the filter_type "{props["filter_type"]}", allowed are {", ".join(TYPES)}')
+    normal = any(parent.plugin_name() == "normalmap" for parent in node.parents)
+    source = manifest_of(node.file(), node.folder, props.get("raw", False) is True, normal)
+    border = "repeat" if str(props.get("wrap_mode", "repeat")) == "repeat" else "clamp"
+    props["filename"] = str(node.fit(TASK.name, source, steps=STEPS, border=border))
+    for name in ("filter_type", "format", "accel"):  # a bitmap's "bilinear" would switch filtering off
+        if name in props:
+            del props[name]
+
+
 PLUGIN = Plugin(
     "neural_texture",
     "texture",
@@ -101,4 +124,5 @@ PLUGIN = Plugin(
     exact=Counterpart("bitmap", ("filename", "channels", "storage", "source"), convert=_to_bitmap, oversampling=8),
     others=(Counterpart("mipmap", ("storage", "source"), convert=functools.partial(to_mipmap, TASK)),),
     truths=("mipmap", "exact"),
+    stock=Stock("bitmap", ("bitmap",), _from_bitmap),
 )

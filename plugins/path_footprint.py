@@ -10,8 +10,9 @@ import mitsuba as mi
 from mi_diffind import compat
 
 from . import Plugin
-from .support import footprint
+from .support import footprint, omissions
 from .support.differentials import Differentials
+from .support.manual import shared_parts
 
 #: ``max_depth`` where there is no limit.
 INFINITE = 0xFFFFFFFF
@@ -67,6 +68,8 @@ Replay Backpropagation*, SIGGRAPH 2021). This includes smooth mirrors, except fo
 is sampled. Footprints and geometry are constants: for derivatives of shapes, use :monosp:`prb_projective`. Polarised
 variants are not supported.
 
+{executable}
+
 .. tabs::
     .. code-tab:: xml
         :name: path_footprint
@@ -113,8 +116,12 @@ def relative(value):
 def integrator() -> type:
     """Return the class for the variant that is set; its base class exists only after Mitsuba loaded this file."""
 
+    @shared_parts
     class PathFootprint(compat.replay_integrator()):
         __doc__ = MANUAL
+
+        #: Rays carry differentials, from which textures get footprints (:mod:`.filtered_texture`).
+        gives_footprints = True
 
         def __init__(self, props: mi.Properties):
             for name, low in (("max_depth", -1), ("rr_depth", 1)):
@@ -137,6 +144,11 @@ def integrator() -> type:
                 f"PathFootprint[\n  max_depth = {depth},\n  rr_depth = {self.rr_depth},\n"
                 f"  jitter = {str(self.jitter).lower()}\n]"
             )
+
+        def render(self, scene, sensor=0, *args, **kwargs):
+            """Render as Mitsuba does, with a warning of what would be left out of the image."""
+            omissions.check(scene, self, sensor)
+            return super().render(scene, sensor, *args, **kwargs)
 
         def sample_rays(self, scene, sensor, sampler):
             """Sample rays as Mitsuba does, but with differentials of samples in place of pixels."""

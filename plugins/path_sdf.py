@@ -10,6 +10,7 @@ import mitsuba as mi
 from . import Plugin, path_footprint
 from .path_footprint import power_heuristic, relative
 from .support import distance_shapes as sdf
+from .support.manual import shared_parts
 
 MANUAL = r"""
 .. _integrator-path_sdf:
@@ -45,6 +46,8 @@ optimisation from images therefore learns from shading, not from silhouettes; ma
 to compensate. Ordinary shapes are constants, and so are places seen in smooth mirrors and through smooth glass.
 Polarised variants and media are not supported.
 
+{executable}
+
 .. tabs::
     .. code-tab:: xml
         :name: path_sdf
@@ -71,6 +74,7 @@ def solid_angle(origin, place, normal):
 def integrator() -> type:
     """Return the integrator's class in the current variant."""
 
+    @shared_parts
     class PathSDF(path_footprint.integrator()):
         __doc__ = MANUAL
 

@@ -95,7 +95,11 @@ def test_inspect_tables(tmp_path, capsys):
     report = tmp_path / "report.json"
     assert main(["inspect", str(shipped("disney", "paper")), "--json", str(report)]) == 0
     text = capsys.readouterr().out
-    assert "12,480 bytes" in text and "masking" in text and "psnr_db" in text
+    assert "12,480 bytes" in text and "PSNR" in text and '<bsdf type="neural_disney">' in text
+    assert not any(word in text for word in ("masking", "gathers a read", "trained with"))
+    assert main(["inspect", str(shipped("disney", "paper")), "--verbose"]) == 0
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("masking", "gathers a read", "trained with"))
     found = json.loads(report.read_text())
     assert found["task"] == "disney" and found["arrays"]["ggx"]["channels"] == 3
     assert sum(a["bytes"] for a in found["arrays"].values()) == found["bytes"]
@@ -113,7 +117,7 @@ def test_inspect_measures(tmp_path, capsys, few_samples):
         assert found["bytes"] == size * entries("disney") <= found["memory_bytes"] < 20_000
         assert min(found[f"psnr{kind}_db"] for kind in ("", "_uniform")) > 76
         assert min(found[f"psnr_brdf{kind}_db"] for kind in ("", "_uniform")) > 70
-        assert f"psnr_db                      {found['psnr_db']:.5g}" in text
+        assert f"PSNR               {found['psnr_db']:.2f} dB" in text
     assert measured["float32"]["psnr_db"] > 86
 
 
@@ -121,7 +125,7 @@ def test_inspect_scene(tmp_path, capsys):
     report = tmp_path / "report.json"
     assert main(["inspect", str(SCENES / "still_life.xml"), "--json", str(report)]) == 0
     text = capsys.readouterr().out
-    assert f"9 learned plugin(s), {entries('disney')} bytes" in text
+    assert f"9 learned plugins, {entries('disney')} bytes" in text
     wood = text[text.index("wood: neural_disney, effects used, base_color texture, roughness texture") :]
     assert "in use    diffuse, dielectric, clearcoat" in wood
     assert "sheen (sheen is 0)" in wood and "anisotropic (anisotropic is 0)" in wood
@@ -177,10 +181,10 @@ def test_fit_ggx(tmp_path, capsys, few_samples):
     assert table.storage == "float16" and table.settings["lr"] == 0.002 and table.preset == "paper"
     assert table.settings["schedule"] == "constant"  # of the preset that was asked for
     capsys.readouterr()
-    assert main(["inspect", str(out)]) == 0
+    assert main(["inspect", str(out), "--verbose"]) == 0
     text = capsys.readouterr().out
     assert 'tables for the task "ggx", preset "paper", 648 bytes as float16' in text
-    assert "lr 0.002" in text and "seed 1" in text and "psnr_db" in text
+    assert "lr 0.002" in text and "seed 1" in text and "PSNR" in text
 
 
 def test_fit_for_some_seconds(tmp_path, capsys, few_samples, monkeypatch):

@@ -196,6 +196,59 @@ def test_callback_of_variants(mi_rgb):
         assert seen == [(here, "scalar_rgb"), ("scalar_rgb", here)]
 
 
+def test_callback_of_renders(mi_rgb, monkeypatch):
+    """Under both names of ``mi.render``, which stays what it was, in another variant, too."""
+    mi, calls = mi_rgb, []
+    monkeypatch.setattr(mi.util, "render", mi.util.render)
+    monkeypatch.setattr(mi, "render", mi.render)
+    with hook("mi.render, mitsuba.python.util.render"):
+        compat.before_render(lambda *arguments: calls.append(arguments))
+        scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+        tracer = mi.load_dict({"type": "depth"})
+        for arguments, more in (((scene, None, 0, tracer, 3), {}), ((), {"integrator": tracer, "scene": scene})):
+            assert mi.render(*arguments, spp=1, **more).shape == (576, 768, 3)
+            assert calls.pop() == (scene, tracer, 0) and not calls
+        here = mi.render
+        try:
+            mi.set_variant("llvm_ad_mono")
+            assert mi.render is mi.util.render is here
+        finally:
+            mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.mark.parametrize("name", ["direct", "path", "prb", "ptracer", "volpath", "volpathmis", "prbvolpath"])
+def test_what_is_known_while_integrators_are_recorded(mi_rgb, name):
+    """Partial derivatives of uv are known to be zero, unless interactions are in the state of the integrator's loop."""
+    mi, known = mi_rgb, []
+
+    class Probe(mi.Texture):
+        def __init__(self, props):
+            mi.Texture.__init__(self, props)
+
+        def eval(self, si, active=True):
+            known.append((compat.is_recording(), compat.is_zero(*si.duv_dx, *si.duv_dy), compat.is_zero(si.uv.x)))
+            return mi.Color3f(0.5)
+
+        def mean(self):
+            return mi.Float(0.5)
+
+        def to_string(self):
+            return "Probe[]"
+
+    mi.register_texture("known_probe", Probe)
+    film = {"type": "hdrfilm", "width": 1, "height": 1}
+    scene = mi.load_dict({
+        "type": "scene", "sky": {"type": "constant"}, "sensor": {"type": "perspective", "film": film},
+        "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": {"type": "known_probe"}}},
+    })  # fmt: skip
+    integrator = mi.load_dict({"type": name})
+    with hook("dr.VarState, dr.JitFlag.SymbolicScope, names of integrators"):
+        mi.render(scene, integrator=integrator, spp=1)
+        carrying = compat.integrator_name(integrator) in compat.CARRYING
+        assert set(known) == {(True, not carrying, False)} and carrying == ("vol" in name)
+        assert not compat.is_recording() and not compat.is_zero(mi.Float(0.5))
+
+
 def test_classes_of_textures(mi_any):
     bitmap = {"type": "bitmap", "raw": True}
     uniform, colour, float_, bytes_, other = (
@@ -407,3 +460,26 @@ def test_integrators_in_python(mi_rgb):
     with hook("mi.ad.integrators.common"):
         assert compat.samples_in_python(mi_rgb.load_dict({"type": "prb"}))
         assert not compat.samples_in_python(mi_rgb.load_dict({"type": "path"}))
+    with hook("class_name of integrators"):
+        channels = mi_rgb.load_dict({"type": "aov", "aovs": "d:depth", "inner": {"type": "prb"}})
+        names = [compat.integrator_name(integrator) for integrator in compat.objects_of(channels)]
+        assert names == [compat.INTERSECTING, "PRBIntegrator"]
+
+
+def test_parsed_scenes_as_graphs_and_as_xml(mi_rgb, tmp_path):
+    """Which object refers to which, by nesting and by id, where it stands, and the same scene written again."""
+    text = (
+        '<scene version="3.0.0">\n<bsdf type="twosided" id="a">\n<bsdf type="diffuse"/></bsdf>'
+        '<shape type="sphere"><ref id="a"/><float name="radius" value="2"/></shape></scene>'
+    )
+    (tmp_path / "a.xml").write_text(text)
+    _, state = compat.parse_file(tmp_path / "a.xml")
+    names = [props.plugin_name() for props in compat.properties_of(state)]
+    assert names == ["scene", "twosided", "diffuse", "sphere"]
+    assert [str(t).rpartition(".")[2] for t in compat.parsed_types(state)] == ["Scene", "BSDF", "BSDF", "Shape"]
+    assert compat.parsed_references(state) == [[1, 3], [2], [], [1]]
+    assert compat.parsed_place(state, 2).endswith("a.xml (line 3, col 2)")
+    (tmp_path / "b.xml").write_text(compat.scene_xml(state))
+    _, again = compat.parse_file(tmp_path / "b.xml")
+    assert compat.parsed_references(again) == [[1, 3], [2], [], [1]]
+    assert compat.properties_of(again)[3]["radius"] == 2

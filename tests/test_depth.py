@@ -32,6 +32,12 @@ CONVEX = """
     <emitter type="constant"/>
     <shape type="sphere"><transform name="to_world"><translate z="4"/></transform><bsdf type="diffuse"/></shape>"""
 
+#: A sphere of fog.
+FOG = """
+    <emitter type="constant"/>
+    <shape type="sphere"><transform name="to_world"><translate z="4"/></transform><bsdf type="null"/>
+        <medium name="interior" type="homogeneous"><spectrum name="sigma_t" value="1"/></medium></shape>"""
+
 #: Glass, metal, a lamp in view, a point light, light from the floor: every kind of vertex.
 MIXED = """
     <emitter type="constant"><spectrum name="radiance" value="0.4"/></emitter>
@@ -85,6 +91,38 @@ def test_furnace(mi_rgb, tmp_path, albedo, max_depth, expected):
     shares = np.array([b.share for b in found])
     assert shares[0] == 0 and shares.sum() == pytest.approx(1) and np.allclose(1 - np.cumsum(shares), rest)
     assert depth.choose(found, max_depth) == expected
+
+
+@pytest.mark.parametrize("name", ["volpath", "path_footprint", "path_sdf", "neural_field"])
+def test_other_integrators(mi_rgb, tmp_path, name):
+    """The furnace is the same for all that follow paths; without a medium, there is no light through media."""
+    from mi_diffind import depth, scenes
+
+    file = "" if name != "neural_field" else f'<string name="filename" value="{SCENES / "assets/group.npz"}"/>'
+    integrator = f'<integrator type="{name}"><integer name="max_depth" value="$depth"/>{file}</integrator>'
+    parsed = scenes.ParsedScene(scene_file(tmp_path, FURNACE, integrator, depth=8))
+    found = depth.auto_depth(parsed, 0.05, progress=False)
+    assert (found["chosen"], found["scene"]) == (6, 8)
+    assert found["left_out"] == pytest.approx((0.5**5 - 0.5**7) / (1 - 0.5**7), rel=0.02)
+
+
+def test_distance_fields_are_met(mi_rgb, tmp_path):
+    """Each depth is that of a render by ``path_sdf``: light that bounces between a solid and the floor, and shadows."""
+    from mi_diffind import depth, scenes
+
+    solid = f"""
+    <emitter type="constant"/>
+    <emitter type="point"><point name="position" x="0" y="4" z="2"/><spectrum name="intensity" value="20"/></emitter>
+    <shape type="neural_sdf"><string name="filename" value="{SCENES / "assets/knot.npz"}"/>
+        <transform name="to_world"><scale value="1.5"/><translate z="4" y="-1"/></transform>
+        <bsdf type="diffuse"/></shape>
+    <shape type="rectangle"><transform name="to_world"><scale value="10"/><rotate x="1" angle="-90"/>
+        <translate y="-1"/></transform><bsdf type="diffuse"><spectrum name="reflectance" value="0.7"/></bsdf></shape>"""
+    file = scene_file(tmp_path, solid, PATH.replace('"path"', '"path_sdf"'), depth=3)
+    probed = depth.probe(scenes.load(file), 3, spp=32).mean((1, 2))
+    renders = [scenes.render(scenes.load(file, longest_path=d), 128)[0] for d in (1, 2, 3)]
+    path = np.diff([luminance(image) for image in renders], prepend=0)
+    assert np.allclose(probed, path, rtol=0.03), (probed, path)
 
 
 def test_deeper_than_the_bins(mi_rgb, tmp_path):
@@ -294,7 +332,8 @@ def test_the_scene_may_have_a_default_of_any_name(tmp_path):
     ],
 )
 def test_integrators_without_a_depth(tmp_path, capsys, integrator, request_, sentence):
-    file, out = scene_file(tmp_path, FURNACE, integrator), tmp_path / "image.exr"
+    content = FOG if "volpath" in integrator else FURNACE
+    file, out = scene_file(tmp_path, content, integrator), tmp_path / "image.exr"
     message = refused(capsys, "render", file, "-o", str(out), "--depth", request_)
     assert sentence in message and "scene.xml" in message
     assert not out.exists()

@@ -1,12 +1,15 @@
 """The package as Python sees it: training from memory, opening, loading, attaching and saving."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 import mi_diffind
+from mi_diffind.cli import VERBS, main
 from mi_diffind.errors import UsageError
 
 ASSETS = Path(__file__).resolve().parents[1] / "scenes" / "assets"
@@ -159,7 +162,7 @@ def test_every_way_to_load_tells_textures_their_sensor(mi_rgb, tmp_path):
     scene = wall(mi, small(mi))
     expected = image(mi, mi_diffind.load_dict(scene))
     assert np.abs(image(mi, mi.load_dict(scene)) - expected).mean() > 0.01
-    np.testing.assert_array_equal(image(mi, mi_diffind.attach(mi.load_dict(scene))), expected)
+    np.testing.assert_allclose(image(mi, mi_diffind.attach(mi.load_dict(scene))), expected, atol=1e-5)
     text = f"""<scene version="3.0.0"><integrator type="direct"/><emitter type="constant"/>
         <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/>
         </transform><film type="hdrfilm"><integer name="width" value="$width"/><integer name="height" value="16"/>
@@ -312,3 +315,135 @@ def test_refused_renderings(mi_rgb, tmp_path):
         mi_diffind.render({"type": "sphere"})
     with pytest.raises(UsageError, match=r'output "a.webp": found the extension ".webp", allowed are .exr and .png'):
         mi_diffind.render(scene, spp=1, progress=False).save("a.webp")
+
+
+# -- capture, regress, tradeoff ----------------------------------------------------------------------------------------
+
+BALL = """<scene version="3.0.0"><default name="light" value="1"/><integrator type="path"/>
+    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/>
+        <integer name="height" value="16"/><rfilter type="box"/></film></sensor>
+    <emitter type="constant"><spectrum name="radiance" value="$light"/></emitter>
+    <shape type="sphere"><transform name="to_world"><translate z="4"/></transform><bsdf type="diffuse"/></shape>
+    </scene>"""
+
+
+def test_captured_views(mi_rgb, tmp_path):
+    """Images and poses are those of the folder; what is there is kept; words of the command are keywords."""
+    (tmp_path / "ball.xml").write_text(BALL)
+    settings = {"views": 4, "test": 1, "resolution": 12, "spp": 4, "path": "orbit"}
+    captured = mi_diffind.capture(tmp_path / "ball.xml", tmp_path / "views", progress=False, **settings)
+    assert captured.rendered == captured.total == 5 == len(captured.images) and not captured.interrupted
+    assert captured.images[0].shape == (12, 12, 4) and captured.images[0].dtype == np.uint8
+    assert captured.poses.shape == (5, 4, 4)
+    for pose in captured.poses:  # cameras look along -z at the centre
+        to_centre = captured.centre - pose[:3, 3]
+        np.testing.assert_allclose(-pose[:3, 2], to_centre / captured.radius, atol=1e-6)
+    with Image.open(io.BytesIO(captured._repr_png_())) as sheet:
+        assert sheet.size == (5 * 128, 128)
+        np.testing.assert_allclose(np.array(sheet)[64, 64], captured.images[0][6, 6, :3], atol=12)
+    again = mi_diffind.capture(tmp_path / "ball.xml", tmp_path / "views", progress=False, **settings)
+    assert again.rendered == 0 and again.files == captured.files and "5 of 5 views, 0 rendered now" in str(again)
+    for bad, sentence in (
+        ({"view": 3}, 'found the argument "view", allowed are views'),
+        ({"fov": 200}, "fov: found 200"),
+    ):
+        with pytest.raises(UsageError, match=sentence):
+            mi_diffind.capture(tmp_path / "ball.xml", tmp_path / "views", **bad)
+    with pytest.raises(UsageError, match="scene: found a dict, a scene file is needed"):
+        mi_diffind.capture({"type": "scene"}, tmp_path / "views")
+
+
+def test_a_reference_and_its_checks(mi_rgb, tmp_path):
+    """A reference is stored; the same scene passes, a brighter one fails, and shows where."""
+    path = tmp_path / "ball.xml"
+    path.write_text(BALL)
+    stored = mi_diffind.regress(path, update=True, spp=16, progress=False)
+    assert Path(stored.figures["reference"]).is_file() and "failing pixels in a check at 16 spp" in str(stored)
+    assert stored.passed is None and stored.images == {} and stored._repr_png_() is None
+    check = mi_diffind.regress(path, seed=1, progress=False)
+    assert check.passed is True and check.figures["passed"] and str(check).startswith("passed")
+    np.testing.assert_allclose(check.images["error"], np.abs(check.images["image"] - check.images["reference"]))
+    brighter = mi_diffind.regress(path, defines={"light": 1.5}, out=tmp_path / "out", progress=False)
+    assert brighter.passed is False and brighter._repr_png_().startswith(b"\x89PNG")
+    assert Path(brighter.figures["files"]["figure"]).is_file()
+    assert brighter.images["image"].mean() == pytest.approx(1.5 * check.images["image"].mean(), rel=0.02)
+
+
+def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):
+    """They become the arguments of the command, checked by its parser; the result shows its picture."""
+    from mi_diffind import tradeoffs
+    from mi_diffind.measure.report import Tradeoff
+
+    asked = []
+
+    class Recorded(tradeoffs.studies()["image"].__class__):
+        def run(self, arguments):
+            asked.append(arguments)
+            picture = Path(arguments.out) / "tradeoff_image.png"
+            picture.write_bytes(b"\x89PNG")
+            return Tradeoff({"quick": arguments.quick}, ["a line"], {"png": str(picture), "csv": "a.csv"})
+
+    monkeypatch.setattr(tradeoffs, "studies", lambda: {"image": Recorded()})
+    source = tmp_path / "a.png"
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(source)
+    out = tmp_path / "out"
+    result = mi_diffind.tradeoff("image", source, out=out, quick=True, compression=["6x", "12x"], ablation=True)
+    (arguments,) = asked
+    assert arguments.compression == ["6x", "12x"] and arguments.ablation and arguments.source == str(source)
+    assert result.figures == {"quick": True} and result.pictures == {"png": str(out / "tradeoff_image.png")}
+    assert result._repr_png_() == b"\x89PNG" and str(result).startswith("a line\n")
+    with pytest.raises(UsageError, match="tradeoff image: unrecognized arguments: --ratio=6"):
+        mi_diffind.tradeoff("image", source, out=out, ratio=6)
+    with pytest.raises(UsageError, match='found the study "nerf", allowed are image'):
+        mi_diffind.tradeoff("nerf")
+    with pytest.raises(UsageError, match="tradeoff image: the following arguments are required: IMAGE"):
+        mi_diffind.tradeoff("image", out=out)
+
+
+# -- what people read --------------------------------------------------------------------------------------------------
+
+
+def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monkeypatch):
+    """The channels that are predicted are those of the render, for each format of the film."""
+    mi = mi_rgb
+    from mi_diffind import rendering
+
+    integrators = {
+        "path": {"type": "path"},
+        "aov": {"type": "aov", "aovs": "d:depth,n:sh_normal", "image": {"type": "path"}},
+        "moment": {"type": "moment", "image": {"type": "path"}},
+    }
+    for name, integrator in integrators.items():
+        for pixel_format in ("rgb", "rgba", "luminance"):
+            content = {**wall(mi, small(mi)), "integrator": integrator}
+            content["sensor"] = {"type": "perspective", "film": {
+                "type": "hdrfilm", "width": 4, "height": 4, "pixel_format": pixel_format}}  # fmt: skip
+            loaded = mi.load_dict(content)
+            if mi.is_rgb:
+                assert rendering.channels_of(loaded) == mi.render(loaded, spp=1).shape[2], (name, pixel_format)
+    monkeypatch.setattr(rendering.scenes, "render", None)  # not reached
+    with pytest.raises(UsageError, match=r"the image has 7 channels, PNG holds 4: use .exr"):
+        mi_diffind.render(loaded, spp=1, output="a.png", progress=False)
+
+
+def test_a_table_file_is_no_scene(mi_rgb, capsys):
+    with pytest.raises(mi_diffind.DiffindError, match="found a table file, a scene is needed"):
+        mi_diffind.render(TILES)
+    assert main(["render", str(TILES)]) == 2
+    assert "found a table file, a scene (.xml) is needed" in capsys.readouterr().err
+
+
+def test_a_normal_map_of_one_channel():
+    with pytest.raises(mi_diffind.DiffindError, match='arrays: the normal map "normal" has 1 channel, 3 are needed'):
+        mi_diffind.from_arrays({"normal": np.zeros((4, 4), np.uint8)})
+    assert mi_diffind.from_arrays({"normal": np.zeros((4, 4, 2), np.uint8)}).channels == 2
+
+
+@pytest.mark.parametrize(
+    "words", [[verb] for verb in VERBS] + [["fit", "sdf"], ["fit", "scene"], ["tradeoff", "scene"]]
+)
+def test_help_ends_with_an_example(words, capsys):
+    with pytest.raises(SystemExit):
+        main([*words, "--help"])
+    example = " ".join(capsys.readouterr().out.rpartition("example: ")[2].split())
+    assert example.startswith(" ".join(["mi-diffind", *words]))

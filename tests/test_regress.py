@@ -124,7 +124,7 @@ def test_scene_renders_as_its_reference(path, variant):
     set_variant(variant)
     from mi_diffind import regression as regress
 
-    result = regress.regress(path, progress=False)
+    result = regress.regress(path, progress=False).figures
     assert result["passed"], result
     assert result["reference_spp"] >= 16 * result["spp"] and result["spp"] > 200
 

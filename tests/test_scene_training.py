@@ -377,7 +377,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     history = [h["psnr_db"] for h in result.history]
     assert result.steps == 12 and result.restarts == 0 and history[1] > history[0] + 1
     preview = np.array(mi.Bitmap(str(tmp_path / "preview.png")))
-    assert preview.shape == (24, 72, 3) and np.ptp(preview[:, :48]) > 50
+    assert preview.shape == (16 + 24, 72, 3) and np.ptp(preview[16:, :48]) > 50  # titles above
 
     # Before another scene is loaded: kernels contain the materials of all scenes that are there
     gc.collect()

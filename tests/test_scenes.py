@@ -186,3 +186,19 @@ def test_metrics():
     assert metrics.psnr(a, np.where(a > 0.5, a + 7, a)) < 40  # clipped, yet seen
     assert metrics.psnr(np.full_like(a, 3), np.full_like(a, 9)) == np.inf  # both white
     assert 0.01 < metrics.flip(a, b) < 1
+
+
+def test_folders_of_a_scene_are_searched(mi_rgb, tmp_path):
+    """``<path>`` counts when the scene is built, not only while it is parsed."""
+    from mi_diffind import scenes
+
+    (tmp_path / "common" / "textures").mkdir(parents=True)
+    mi_rgb.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "common" / "textures" / "grey.exr"))
+    (tmp_path / "scenes").mkdir()
+    path = tmp_path / "scenes" / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><path value="../common"/><emitter type="envmap">'
+        '<string name="filename" value="textures/grey.exr"/></emitter></scene>'
+    )
+    assert len(scenes.load(path).emitters()) == 1
+    assert len(scenes.load_file(path).emitters()) == 1

@@ -27,14 +27,17 @@ FLOORS = (
         "view_capture",
         "orbit",
         "comparison",
+        "conversion",
         "z_test",
         "reference_files",
         "regression",
         "depth",
+        "inspection",
         "measure",
     ),
     ("scene_training",),
     ("studies",),
+    ("tradeoffs",),
     ("commands",),
     ("cli",),
 )
@@ -161,9 +164,10 @@ def test_general_rooms_know_no_task():
         "view_capture",
         "orbit",
         "comparison",
+        "conversion",
         "regression",
     }
-    rooms |= {"depth", "measure"}
+    rooms |= {"depth", "inspection", "measure"}
     general = [name for name in known if name.split(".")[1] in rooms]
     general += ["mi_diffind.plugins", "mi_diffind.studies"]
     wrong = [

@@ -259,7 +259,7 @@ def test_compare_and_inspect_a_scene(commands, scene, tmp_path):
     (said,) = found["learned_plugins"]
     assert (said["plugin"], said["id"], said["parameters"]["fov"]) == ("neural_profile", "lamp", 100)
     assert found["table_bytes"] == 160
-    assert "1 learned plugin(s), 160 bytes" in out and "lamp" in out
+    assert "1 learned plugin, 160 bytes" in out and "lamp" in out
 
 
 TEXTURES = """

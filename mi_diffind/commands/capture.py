@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import UsageError
 from ..files import writable_folder
 from .common import natural, positive, require_scene, scene_options, set_variant, verb
 
 HELP = "render views of a scene from all sides, with their poses"
 
+EXAMPLE = "mi-diffind capture scene.xml -o views --objects statue --views 60"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "capture", run, HELP)
+    sub = verb(commands, "capture", run, HELP, EXAMPLE)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument(
         "-o", "--output", required=True, metavar="FOLDER", help="folder of the views; an unfinished one is completed"
@@ -63,30 +64,10 @@ def run(arguments) -> dict:
     require_scene(arguments.scene)
     writable_folder(Path(arguments.output).parent)
     set_variant(arguments.variant)
-    from .. import view_capture
+    from ..view_capture import capture
 
-    given = {
-        name: getattr(arguments, name)
-        for name in ("views", "test", "resolution", "spp", "fov", "radius", "path", "seed", "format")
-    }
-    tuples = {name: getattr(arguments, name) for name in ("centre", "elevation", "up", "objects")}
-    given |= {name: value if value is None else tuple(value) for name, value in tuples.items()}
-    settings = view_capture.CaptureSettings(**given)
-    try:
-        settings.check()
-    except ValueError as e:
-        raise UsageError(f"--{e}") from None
-    captured = view_capture.capture(arguments.scene, arguments.output, settings, dict(arguments.defines))
-    print("\n".join(view_capture.lines(captured)))
-    return {
-        "interrupted": len(captured.files) < captured.total,
-        "scene": arguments.scene,
-        "output": str(captured.folder),
-        "files": captured.files,
-        "views": captured.total,
-        "rendered": captured.rendered,
-        "seconds": captured.seconds,
-        "radius": captured.radius,
-        "centre": captured.centre.tolist(),
-        "box": captured.box.tolist(),
-    }
+    names = ("views", "test", "resolution", "spp", "fov", "radius", "path", "seed", "format")
+    given = {name: getattr(arguments, name) for name in (*names, "centre", "elevation", "up", "objects")}
+    captured = capture(arguments.scene, arguments.output, defines=dict(arguments.defines), **given)
+    print(captured)
+    return {"scene": arguments.scene, **captured.figures}

@@ -10,9 +10,12 @@ from ..arguments import define, natural, positive
 from ..errors import UsageError
 
 
-def verb(commands, name: str, run, help: str) -> argparse.ArgumentParser:
-    """Add a verb to ``commands`` and return its parser; ``--json`` writes what ``run(arguments)`` returns."""
-    sub = commands.add_parser(name, help=help, description=help)
+def verb(commands, name: str, run, help: str, example: str) -> argparse.ArgumentParser:
+    """Add a verb to ``commands`` and return its parser; ``--json`` writes what ``run(arguments)`` returns.
+
+    The help ends in the ``example``.
+    """
+    sub = commands.add_parser(name, help=help, description=help, epilog=f"example: {example}")
     sub.set_defaults(run=run)
     _json_option(sub, None)
     return sub
@@ -23,9 +26,9 @@ def alternatives(sub: argparse.ArgumentParser, name: str):
     return sub.add_subparsers(dest=name, required=True, metavar=name.upper())
 
 
-def alternative(parsers, name: str, help: str) -> argparse.ArgumentParser:
-    """Add the parser of one task or study to those of a verb."""
-    sub = parsers.add_parser(name, help=help, description=help)
+def alternative(parsers, name: str, help: str, example: str) -> argparse.ArgumentParser:
+    """Add the parser of one task or study to those of a verb; the help ends in the ``example``."""
+    sub = parsers.add_parser(name, help=help, description=help, epilog=f"example: {example}")
     _json_option(sub, argparse.SUPPRESS)  # a default would replace what was given before the task
     return sub
 
@@ -56,6 +59,26 @@ def scene_options(sub: argparse.ArgumentParser, rendering: bool = True) -> None:
         sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
 
 
+def learn_option(sub: argparse.ArgumentParser, default: str) -> None:
+    """Add ``--learn`` (``learn``: a list of groups of stock plugins, empty without the option)."""
+    sub.add_argument(
+        "--learn",
+        type=lambda text: text.split(","),
+        default=[],
+        metavar="GROUP,…",
+        help="replace Mitsuba's plugins of these groups by learned ones, fitted if need be and kept for the next time: "
+        f"principled, bitmap, mesh (default: {default})",
+    )
+
+
+def print_conversions(conversions: list[dict]) -> None:
+    """Print what was replaced and what was kept."""
+    from .. import conversion
+
+    for line in conversion.summary(conversions):
+        print(line)
+
+
 def set_variant(name: str | None) -> None:
     """Set the Mitsuba variant ``name``; ``None``: the RGB variant of the GPU if there is one, else of the CPU.
 
@@ -69,6 +92,11 @@ def set_variant(name: str | None) -> None:
 
 
 def require_scene(path: str) -> None:
-    """Raise :class:`UsageError` if there is no file ``path``."""
+    """Raise :class:`UsageError` if there is no file ``path``, or if it is a table file."""
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such scene file")
+    if Path(path).suffix.lower() == ".npz":
+        raise UsageError(
+            f'{path}: found a table file, a scene (.xml) is needed; "mi-diffind inspect {path}" prints the lines by '
+            f"which a scene reads it"
+        )

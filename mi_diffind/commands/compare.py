@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from ..files import writable_folder
-from .common import positive, require_scene, scene_options, set_variant, verb
+from .common import learn_option, positive, require_scene, scene_options, set_variant, verb
 
 HELP = "render a scene as written and with exact plugins, and show the difference"
+
+EXAMPLE = "mi-diffind compare scene.xml --spp 64 --out out"
 
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "compare", run, HELP)
+    sub = verb(commands, "compare", run, HELP, EXAMPLE)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument("--out", default="out", metavar="DIR", help="folder for pictures (default: out)")
     sub.add_argument(
@@ -22,6 +24,7 @@ def add(commands) -> None:
         help="compare with one counterpart: exact, or another one, such as Mitsuba's principled (default: those that "
         "the plugins declare as truths: exact, for filtered textures mipmap, too)",
     )
+    learn_option(sub, "none")
     scene_options(sub)
 
 
@@ -41,12 +44,12 @@ def run(arguments) -> dict:
         arguments.scene,
         arguments.spp,
         arguments.seed,
-        arguments.passes,
-        True,
-        dict(arguments.defines),
-        arguments.against,
+        passes=arguments.passes,
+        against=arguments.against,
+        learn=arguments.learn,
+        defines=dict(arguments.defines),
     )
-    paths = comparison.write(result, arguments.out)
-    print("\n".join(comparison.summary(result)))
+    paths = result.save(arguments.out)
+    print(result)
     print(f"picture     {paths['figure']}")
     return {**result.figures, "further": [one.figures for one in result.further], "files": paths}

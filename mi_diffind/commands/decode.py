@@ -12,10 +12,12 @@ from .common import set_variant, variant_option, verb
 
 HELP = "turn a table file back into ordinary files, as images"
 
+EXAMPLE = "mi-diffind decode material.npz -o material.png"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "decode", run, HELP)
+    sub = verb(commands, "decode", run, HELP, EXAMPLE)
     sub.add_argument("file", metavar="FILE.npz")
     sub.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="file to write; several parts become OUT_NAME each"

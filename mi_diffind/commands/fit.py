@@ -23,13 +23,16 @@ SETTINGS = (
 
 HELP = "train tables"
 
+EXAMPLE = "mi-diffind fit image photo.png -o photo.npz"
+
 
 def add(commands) -> None:
     """Add the verb, its tasks and their options to ``commands``, the subparsers of the command line."""
-    parsers = alternatives(verb(commands, "fit", run, HELP), "task")
+    parsers = alternatives(verb(commands, "fit", run, HELP, EXAMPLE), "task")
     for task in tasks().values():
         section = f" ({task.section})" if task.section else ""
-        _add(alternative(parsers, task.name, f"train tables of {task.title}{section}"), task)
+        words = " ".join(filter(None, ("mi-diffind fit", task.name, task.example, f"-o {task.name}.npz")))
+        _add(alternative(parsers, task.name, f"train tables of {task.title}{section}", words), task)
 
 
 def _add(sub, task: Task) -> None:

@@ -9,10 +9,12 @@ from .common import UsageError, natural, positive, require_scene, scene_options,
 
 HELP = "check that scenes render as their stored references do"
 
+EXAMPLE = "mi-diffind regress scene.xml --references references"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "regress", run, HELP)
+    sub = verb(commands, "regress", run, HELP, EXAMPLE)
     sub.add_argument("scenes", nargs="+", metavar="SCENE.xml")
     sub.add_argument("--update", action="store_true", help="render the references again and store them")
     sub.add_argument(
@@ -41,32 +43,24 @@ def run(arguments) -> dict:
     set_variant(arguments.variant)
     from .. import regression
 
-    defines, results = dict(arguments.defines), []
-    options = {"spp": arguments.spp, "seed": arguments.seed, "defines": defines}
-    if arguments.update:
-        for path in arguments.scenes:
-            results.append(regression.update_reference(path, arguments.references, **options))
-            if results[-1]["interrupted"]:
-                if results[-1]["partial"]:
-                    print("{partial}: {spp} samples a pixel are kept, the same command goes on".format(**results[-1]))
-                break
-            text = "{reference}: {width} x {height}, {spp} spp, {bytes:,} bytes; "
-            text += "failing pixels in a check at {budget} spp: {failing_pixels}"
-            print(text.format(**results[-1]))
-    else:
+    results, options = [], {"spp": arguments.spp, "seed": arguments.seed, "defines": dict(arguments.defines)}
+    if not arguments.update:
         out = Path(arguments.out)
         writable_folder(out if out.exists() else out.parent)
-        options["seed"] = arguments.seed or 0
+        options["out"] = out
         for path in arguments.scenes:  # before the first is rendered
             regression.read_reference(path, arguments.references)
-        try:
-            for path in arguments.scenes:
-                results.append(regression.regress(path, arguments.references, out, **options))
-                if results[-1]["interrupted"]:
-                    break
-        finally:
-            if results:
-                print("\n".join(regression.summary(results)))
+    try:
+        for path in arguments.scenes:
+            result = regression.regress(path, update=arguments.update, references=arguments.references, **options)
+            results.append(result.figures)
+            if arguments.update and str(result):
+                print(result)
+            if result.figures["interrupted"]:
+                break
+    finally:
+        if results and not arguments.update:
+            print("\n".join(regression.summary(results)))
     return {
         "interrupted": results[-1]["interrupted"],
         "failed": sum(r.get("passed") is False for r in results),

@@ -7,17 +7,28 @@ from pathlib import Path
 
 from ..arguments import proper_fraction
 from ..files import writable_file
-from .common import UsageError, positive, require_scene, scene_options, set_variant, verb
+from .common import (
+    UsageError,
+    learn_option,
+    positive,
+    print_conversions,
+    require_scene,
+    scene_options,
+    set_variant,
+    verb,
+)
 
 #: Extensions of films (:data:`mi_diffind.orbit.FILMS`, without importing Mitsuba).
 FILMS = (".webp", ".gif")
 
 HELP = "render a scene that names learned plugins"
 
+EXAMPLE = "mi-diffind render scene.xml -o image.png --spp 64"
+
 
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
-    sub = verb(commands, "render", run, HELP)
+    sub = verb(commands, "render", run, HELP, EXAMPLE)
     sub.add_argument("scene", metavar="SCENE.xml")
     sub.add_argument(
         "-o", "--output", metavar="FILE",
@@ -47,6 +58,7 @@ def add(commands) -> None:
         metavar="T",
         help="part of the scattered light that --depth auto may leave out (default: 0.005)",
     )
+    learn_option(sub, "none")
     scene_options(sub)
 
 
@@ -79,8 +91,11 @@ def run(arguments) -> dict:
         orbit=arguments.orbit,
         centre=arguments.centre,
         defines=dict(arguments.defines),
+        output=output,
+        learn=arguments.learn,
     )
     figures = rendering.figures
+    print_conversions(figures["conversions"])
     if arguments.depth == "auto":
         print("\n".join(depth.summary(figures["depth"])))
     rendering.save(output)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,8 +100,8 @@ class MapsModel(Model):
 
     def decode(
         self,
-        output: Path,
-        map: list[str] | None = None,
+        output: str | os.PathLike | None = None,
+        map: list[str] | str | None = None,
         width: int | None = None,
         height: int | None = None,
         **reading,
@@ -109,16 +110,19 @@ class MapsModel(Model):
 
         ``.png`` has 8 bits a channel in the color space of the map; ``.exr`` is linear, in half precision unless its
         range is too small. ``reading`` is passed on to :meth:`.CompressedMaps.decode`. Returns each path with a line of
-        text. Raises :class:`UsageError`.
+        text; without an ``output``, the maps by name, ``(height, width, channels)`` float32 in the encoding of the
+        source. Raises :class:`UsageError`.
         """
         layout, file = self.image.layout, self.table.path
-        if output.suffix.lower() not in (".png", ".exr"):
+        output = None if output is None else Path(output)
+        suffix = "" if output is None else output.suffix.lower()
+        if output is not None and suffix not in (".png", ".exr"):
             raise UsageError(f'output "{output}": found the extension "{output.suffix}", allowed are .png and .exr')
-        names = tuple(map or layout.names)
+        names = (map,) if isinstance(map, str) else tuple(map or layout.names)
         for name in names:
             if name not in layout.names:
                 raise UsageError(f'{file}: --map: found "{name}", the file holds {", ".join(layout.names)}')
-            if output.suffix.lower() == ".png" and layout[name].channels > 4:
+            if suffix == ".png" and layout[name].channels > 4:
                 raise UsageError(f'{file}: "{name}" has {layout[name].channels} channels, PNG holds 4: use .exr')
         width, height = width or layout.width, height or layout.height
         try:
@@ -127,6 +131,8 @@ class MapsModel(Model):
             decoded = self.image.decode(names, width, height, **reading)
         except MemoryError:
             raise UsageError(f"{file}: {width} x {height} texels are more than fit into memory") from None
+        if output is None:
+            return decoded
         files = []
         for name, values in decoded.items():
             path = output if len(names) == 1 else output.with_name(f"{output.stem}_{name}{output.suffix}")

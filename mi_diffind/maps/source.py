@@ -400,6 +400,10 @@ def _assemble(raw: list[_RawMap], where, nonfinite: str) -> Source:
     maps, cleaned = [], 0
     digest = hashlib.sha256()
     for m in raw:
+        if m.role == "normal" and m.values.shape[2] == 1:
+            raise SourceError(
+                f'{m.file or where}: the normal map "{m.name}" has 1 channel, 3 are needed (x, y, z), or x and y alone'
+            )
         number_type = m.values.dtype.name
         color_space = m.color_space
         if color_space is None:

@@ -7,6 +7,8 @@ import io
 import math
 import os
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
 from ..files import replacing, writable_folder, write_json
 from . import plot
@@ -60,11 +62,31 @@ def write_files(
     return paths
 
 
-def publish(result: dict, paths: dict[str, str], lines: list[str]) -> dict:
-    """Print ``lines`` and ``paths``, and return the result for JSON with its ``files``."""
-    print("\n".join(lines))
-    print("\nwritten     " + ", ".join(paths.values()))
-    return {**finite(result), "files": paths}
+@dataclass
+class Tradeoff:
+    """Result of a study: its ``figures`` as JSON holds them, ``lines`` of text, and the paths of the ``files``."""
+
+    figures: dict
+    lines: list[str]
+    files: dict[str, str]
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Paths of the pictures by name; ``"png"`` is accuracy against time and bytes."""
+        return {name: path for name, path in self.files.items() if path.endswith(".png")}
+
+    def __str__(self) -> str:
+        return "\n".join([*self.lines, "", "written     " + ", ".join(self.files.values())])
+
+    def _repr_png_(self) -> bytes | None:
+        pictures = self.pictures
+        path = pictures.get("png") or next(iter(pictures.values()), None)
+        return None if path is None else Path(path).read_bytes()
+
+
+def publish(result: dict, paths: dict[str, str], lines: list[str]) -> Tradeoff:
+    """Return a result with lines of text and the ``paths`` of its files."""
+    return Tradeoff({**finite(result), "files": paths}, lines, paths)
 
 
 def write(result: dict, folder: str | os.PathLike, plan: Plan | None = None) -> dict[str, str]:

@@ -12,6 +12,10 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .report import Tradeoff
 
 #: Name of the floor among the queries of a case.
 FLOOR = "floor"
@@ -20,7 +24,8 @@ FLOOR = "floor"
 class Study:
     """Base class of studies.
 
-    ``name``: the word of the command and of the files (``tradeoff_NAME.…``); ``title``: a phrase for the help.
+    ``name``: the word of the command and of the files (``tradeoff_NAME.…``); ``title``: a phrase for the help;
+    ``example``: arguments of the example in the help.
 
     A study that compares candidates has a :meth:`plan`; any other study overrides :meth:`run`. A study ``of_scene``
     measures a scene file: its command has the argument ``scene`` and the options of scenes, and ``arguments.defines``
@@ -30,6 +35,7 @@ class Study:
 
     name = ""
     title = ""
+    example = ""
     of_scene = False
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -42,11 +48,10 @@ class Study:
         """Return the plan, in the variant that is set."""
         raise NotImplementedError(f'the study "{self.name}" has no plan')
 
-    def run(self, arguments) -> dict | None:
-        """Run a study that has no plan: measure, write the files and print the result.
+    def run(self, arguments) -> Tradeoff | None:
+        """Run a study that has no plan: measure, write the files and return the result.
 
-        Returns the result with its ``files``, after Ctrl-C an incomplete one with ``interrupted``. ``None``, the
-        default: the command measures the plan.
+        After Ctrl-C, its figures are incomplete and have ``interrupted``. ``None``, the default: the plan is measured.
         """
         return None
 

@@ -24,6 +24,7 @@ class SceneTraining(Task):
     name = "scene"
     title = "a texture, through renders of a scene that shows it"
     section = "supplemental 1.5"
+    example = "scene.xml"
     presets = {"ours": SceneRecipe().settings}  # noqa: RUF012
     storages = ()
     measurements = 10

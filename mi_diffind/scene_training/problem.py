@@ -20,9 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import scenes
+from .. import srgb
+from ..files import replacing
 from ..fitting import Problem
 from ..indirection import unfolded
+from ..tasks.shading.preview import titled
 from ..tasks.texture.training import TextureProblem, rounded
 from .recipe import SceneRecipe
 from .reference_renders import SEEDS
@@ -139,4 +141,7 @@ class SceneProblem(Problem):
 
     def _write(self, reference: np.ndarray, image: np.ndarray) -> None:
         difference = SHOWN * np.abs(image - reference)
-        scenes.write_image(self.preview, np.concatenate([reference, image, difference], axis=1))
+        picture = srgb.for_display(np.concatenate([reference, image, difference], axis=1))
+        picture = titled(picture, ("reference", "render", f"{SHOWN}x difference"))
+        with replacing(self.preview) as temporary:
+            mi.Bitmap(np.ascontiguousarray(picture)).write(str(temporary))

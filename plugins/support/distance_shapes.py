@@ -1,18 +1,20 @@
 """Shapes of Mitsuba that are signed distance fields, and their ray intersection for our integrators.
 
-Mitsuba 3.9 has no shapes written in Python but meshes. A :class:`DistanceShape` is therefore a mesh of eight triangles
-without area, at the corners of the field's box: the scene knows its extent, its material and its parameters, and no ray
-ever hits it. Integrators that support these shapes (:func:`distance_shapes_in`) trace the fields themselves
-(:func:`intersect`, :func:`occluded`) and compute the surface interaction that Mitsuba would (:func:`interaction`).
+Mitsuba 3.9 has no shapes written in Python but meshes. A *distance shape* (:func:`distance_shape`) is therefore a mesh
+of eight triangles without area, at the corners of the field's box: the scene knows its extent, its material and its
+parameters, and no ray ever hits it. Integrators that support these shapes (:func:`distance_shapes_in`) trace the fields
+themselves (:func:`intersect`, :func:`occluded`) and compute the surface interaction that Mitsuba would
+(:func:`interaction`).
 
 Once Mitsuba has Python shapes (``mi.Shape`` with ``bbox``, ``ray_intersect_preliminary``,
-``compute_surface_interaction``), :class:`DistanceShape` becomes one of these, the functions its methods, and any
+``compute_surface_interaction``), a distance shape becomes one of these, the functions its methods, and any
 integrator sees it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +22,8 @@ import numpy as np
 
 from mi_diffind import compat
 from mi_diffind.tasks.sdf import tracing
+
+from . import omissions
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
 OFFSET = 3 * tracing.EPSILON
@@ -29,6 +33,9 @@ GRAZING = 1e-2
 
 #: Bytes of each cell of Mitsuba's ``sdfgrid``, crossed or not: its value, a number, and a box of 32 bytes.
 CELL_BYTES = 40
+
+#: Integrators that trace distance shapes.
+SEEN_BY = ("path_sdf",)
 
 #: Number of triangles without area, and an attribute that keeps Mitsuba from merging them with other meshes.
 CORNERS, UNMERGED = 8, "face_solid"
@@ -65,102 +72,129 @@ class Placement:
         return self.size * (p @ self.rotation.T) + self.origin
 
 
-class DistanceShape(mi.Mesh):
-    """Shape of a distance ``field``'s surface, placed in the world by ``placement``.
+@cache
+def distance_shape(mesh: type) -> type:
+    """Return the base class of distance shapes for ``mi.Mesh`` of the current variant; each variant has its class."""
 
-    ``smooth``: shading normals are the field's smooth ones.
-    """
+    class DistanceShape(mesh):
+        """Shape of a distance ``field``'s surface, placed in the world by ``placement``.
 
-    #: Integrators that trace it.
-    seen_by = ("path_sdf",)
-
-    def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
-        self.field, self.placement, self.smooth = field, placement, smooth
-        self.ready = False
-        super().__init__(props.plugin_name(), CORNERS, CORNERS, props)
-        if self.is_emitter():
-            raise RuntimeError("emitter: found one, signed distance fields emit no light")
-        if self.is_medium_transition():
-            raise RuntimeError("medium: found one, signed distance fields hold none")
-        box = np.array([field.lower, field.upper], np.float64)
-        corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
-        buffers = mi.traverse(self)
-        buffers["vertex_positions"] = placement.world(corners).astype(np.float32).ravel()
-        buffers["faces"] = np.repeat(np.arange(CORNERS, dtype=np.uint32), 3)
-        buffers.update()
-        self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
-        self.ready = True
-        self._place()
-
-    def _place(self) -> None:
-        """Store the placement as opaque numbers, so that another one compiles no new kernel."""
-        placement = self.placement
-        self.axes = mi.Frame3f(*(mi.Vector3f(column.tolist()) for column in placement.rotation.T))
-        dr.make_opaque(self.axes)
-        self.origin = dr.opaque(mi.Point3f, placement.origin.tolist())
-        self.size = dr.opaque(mi.Float, placement.size)
-
-    def traverse(self, cb: mi.TraversalCallback) -> None:
-        if not self.ready:
-            super().traverse(cb)
-            return
-        cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
-
-    def optimised(self) -> bool:
-        """Return whether derivatives with respect to the field are enabled."""
-        return False
-
-    @property
-    def index_bytes(self) -> int:
-        """Bytes of the field's ray-marching index."""
-        return tracing.index_bytes(self.field)
-
-    def local_ray(self, o, d):
-        """Return a ray's origin and direction in the unit frame, where lengths are those of the world by ``size``."""
-        return self.axes.to_local(mi.Vector3f(o - self.origin)) / self.size, self.axes.to_local(d)
-
-    def to_world(self, p):
-        """Return a point of the unit frame in the world."""
-        return mi.Point3f(dr.fma(self.axes.to_world(mi.Vector3f(p)), self.size, self.origin))
-
-    def moved(self, p, d, active=True):
-        """Attach the hit ``p`` (unit frame) of a ray with the direction ``d`` (world) to the field's entries.
-
-        If derivatives are enabled and not suspended, the hit moves along the ray so that the value stays zero.
+        ``smooth``: shading normals are the field's smooth ones.
         """
-        p = mi.Point3f(dr.detach(p))
-        if not self.optimised():
-            return p
-        d = self.axes.to_local(dr.detach(d))
-        value, slope = self.field.gradient(p, active)
-        slope = dr.detach(slope)
-        along = dr.dot(slope, d)
-        along = dr.copysign(dr.maximum(dr.abs(along), dr.maximum(GRAZING * dr.norm(slope), 1e-6)), along)
-        return p - mi.Vector3f(d) * ((value - dr.detach(value)) / along)
 
-    def surface(self, p, d, active=True):
-        """Return place, geometric and shading normal, in the world, of the hit ``p`` (unit frame) of a ray.
+        #: Integrators that trace it.
+        seen_by = SEEN_BY
 
-        The ray has the direction ``d`` (world); the place is attached as in :meth:`moved`.
-        """
-        p = self.moved(p, d, active)
-        if not self.smooth:
-            shading = normal = self._unit(self.field.gradient(p, active)[1], d)
-        else:
-            normal, shading = (self._unit(v, d) for v in self.field.normals(p, active))
-        return self.to_world(p), self.axes.to_world(normal), self.axes.to_world(shading)
+        def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
+            self.field, self.placement, self.smooth = field, placement, smooth
+            self.ready = False
+            super().__init__(props.plugin_name(), CORNERS, CORNERS, props)
+            if self.is_emitter():
+                raise RuntimeError("emitter: found one, signed distance fields emit no light")
+            if self.is_medium_transition():
+                raise RuntimeError("medium: found one, signed distance fields hold none")
+            box = np.array([field.lower, field.upper], np.float64)
+            corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
+            buffers = mi.traverse(self)
+            buffers["vertex_positions"] = placement.world(corners).astype(np.float32).ravel()
+            buffers["faces"] = np.repeat(np.arange(CORNERS, dtype=np.uint32), 3)
+            buffers.update()
+            self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
+            self.ready = True
+            self._place()
+            omissions.watch(self)
 
-    def _unit(self, v, d):
-        length = dr.norm(v)
-        valid = length > 0
-        direction = self.axes.to_local(dr.detach(d))
-        return dr.select(valid, mi.Vector3f(v) / dr.select(valid, length, 1), -direction)
+        def _place(self) -> None:
+            """Store the placement as opaque numbers, so that another one compiles no new kernel."""
+            placement = self.placement
+            self.axes = mi.Frame3f(*(mi.Vector3f(column.tolist()) for column in placement.rotation.T))
+            dr.make_opaque(self.axes)
+            self.origin = dr.opaque(mi.Point3f, placement.origin.tolist())
+            self.size = dr.opaque(mi.Float, placement.size)
+
+        def traverse(self, cb: mi.TraversalCallback) -> None:
+            if not self.ready:
+                super().traverse(cb)
+                return
+            cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
+
+        def omitted(self, integrators: list, sensor) -> str:
+            """Return a sentence if these integrators do not trace the shape; see :mod:`.omissions`."""
+            names = [compat.integrator_name(integrator) for integrator in integrators]
+            if any(hasattr(i, "sample_shapes") for i in integrators) and compat.INTERSECTING not in names:
+                return ""
+            name = compat.INTERSECTING if compat.INTERSECTING in names else names[-1]
+            decoded = (
+                ""
+                if self.optimisable()
+                else (', set its parameter trace="grid", or load the scene with mi_diffind.load_file, which decodes it')
+            )
+            return (
+                f'the shape "{self.id()}" ({omissions.plugin_of(self)}) is left out: the integrator {name} does not '
+                f"trace its arrays; render with the integrator {' or '.join(SEEN_BY)}{decoded}"
+            )
+
+        def optimisable(self) -> bool:
+            """Return whether the field's arrays are kept in a form that can be optimised."""
+            return False
+
+        def optimised(self) -> bool:
+            """Return whether derivatives with respect to the field are enabled."""
+            return False
+
+        @property
+        def index_bytes(self) -> int:
+            """Bytes of the field's ray-marching index."""
+            return tracing.index_bytes(self.field)
+
+        def local_ray(self, o, d):
+            """Return a ray's origin and direction in the unit frame: lengths are those of the world by ``size``."""
+            return self.axes.to_local(mi.Vector3f(o - self.origin)) / self.size, self.axes.to_local(d)
+
+        def to_world(self, p):
+            """Return a point of the unit frame in the world."""
+            return mi.Point3f(dr.fma(self.axes.to_world(mi.Vector3f(p)), self.size, self.origin))
+
+        def moved(self, p, d, active=True):
+            """Attach the hit ``p`` (unit frame) of a ray with the direction ``d`` (world) to the field's entries.
+
+            If derivatives are enabled and not suspended, the hit moves along the ray so that the value stays zero.
+            """
+            p = mi.Point3f(dr.detach(p))
+            if not self.optimised():
+                return p
+            d = self.axes.to_local(dr.detach(d))
+            value, slope = self.field.gradient(p, active)
+            slope = dr.detach(slope)
+            along = dr.dot(slope, d)
+            along = dr.copysign(dr.maximum(dr.abs(along), dr.maximum(GRAZING * dr.norm(slope), 1e-6)), along)
+            return p - mi.Vector3f(d) * ((value - dr.detach(value)) / along)
+
+        def surface(self, p, d, active=True):
+            """Return place, geometric and shading normal, in the world, of the hit ``p`` (unit frame) of a ray.
+
+            The ray has the direction ``d`` (world); the place is attached as in :meth:`moved`.
+            """
+            p = self.moved(p, d, active)
+            if not self.smooth:
+                shading = normal = self._unit(self.field.gradient(p, active)[1], d)
+            else:
+                normal, shading = (self._unit(v, d) for v in self.field.normals(p, active))
+            return self.to_world(p), self.axes.to_world(normal), self.axes.to_world(shading)
+
+        def _unit(self, v, d):
+            length = dr.norm(v)
+            valid = length > 0
+            direction = self.axes.to_local(dr.detach(d))
+            return dr.select(valid, mi.Vector3f(v) / dr.select(valid, length, 1), -direction)
+
+    return DistanceShape
 
 
-def distance_shapes_in(scene: mi.Scene) -> list[DistanceShape]:
+def distance_shapes_in(scene: mi.Scene) -> list:
     """Return the distance shapes of a scene. Raises ``RuntimeError`` if one is in a shape group."""
-    shapes = [shape for shape in scene.shapes() if isinstance(shape, DistanceShape)]
-    hidden = [s for s in compat.objects_of(scene) if isinstance(s, DistanceShape) and s not in shapes]
+    shapes = [shape for shape in scene.shapes() if hasattr(shape, "local_ray")]
+    hidden = [s for s in compat.objects_of(scene) if hasattr(s, "local_ray") and s not in shapes]
     if hidden:
         raise RuntimeError(
             f'"{hidden[0].id()}": is in a shapegroup, where its arrays cannot be traced; several shapes of one file '
@@ -233,7 +267,7 @@ class ShapeHit:
     p: mi.Point3f
 
 
-def intersect(shapes: list[DistanceShape], o, d, maxt, active=True) -> ShapeHit:
+def intersect(shapes: list, o, d, maxt, active=True) -> ShapeHit:
     """Return the first hit of rays before ``maxt``; without a hit, ``t`` is ``maxt``."""
     nearest = ShapeHit(mi.UInt32(0), mi.Float(maxt), mi.Point3f(0))
     for i, shape in enumerate(shapes):
@@ -245,7 +279,7 @@ def intersect(shapes: list[DistanceShape], o, d, maxt, active=True) -> ShapeHit:
     return nearest
 
 
-def occluded(shapes: list[DistanceShape], o, d, maxt, active=True):
+def occluded(shapes: list, o, d, maxt, active=True):
     """Return whether rays hit any distance shape before ``maxt``."""
     blocked = mi.Bool(False)
     for shape in shapes:
@@ -254,7 +288,7 @@ def occluded(shapes: list[DistanceShape], o, d, maxt, active=True):
     return blocked
 
 
-def interaction(shapes: list[DistanceShape], hit: ShapeHit, ray, si, active=True):
+def interaction(shapes: list, hit: ShapeHit, ray, si, active=True):
     """Replace ``si`` (``mi.SurfaceInteraction3f``) where a distance shape was hit."""
     for i, shape in enumerate(shapes):
         here = (hit.number == i + 1) & active
@@ -266,11 +300,12 @@ def interaction(shapes: list[DistanceShape], hit: ShapeHit, ray, si, active=True
         at.dp_du, at.dp_dv = at.sh_frame.s, at.sh_frame.t
         at.wi = at.sh_frame.to_local(-ray.d)
         at.shape = mi.ShapePtr(shape)
+        at.duv_dx, at.duv_dy = si.duv_dx, si.duv_dy
         si = dr.select(here, at, si)
     return si
 
 
-def shift(shapes: list[DistanceShape], hit: ShapeHit, d, active=True):
+def shift(shapes: list, hit: ShapeHit, d, active=True):
     """Return zero with the derivative of the hit's place in the world, for rays with the direction ``d``."""
     change = mi.Vector3f(0)
     for i, shape in enumerate(shapes):
@@ -280,7 +315,7 @@ def shift(shapes: list[DistanceShape], hit: ShapeHit, d, active=True):
     return change
 
 
-def spawn(shapes: list[DistanceShape], hit: ShapeHit, si, d):
+def spawn(shapes: list, hit: ShapeHit, si, d):
     """Return the origin of a ray from ``si`` in the direction ``d``, off the surface by :data:`OFFSET`."""
     o = si.spawn_ray(d).o
     for i, shape in enumerate(shapes):

@@ -12,6 +12,7 @@ The functions of this module neither evaluate nor differentiate: footprints are 
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -20,6 +21,8 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import compat
+
+from . import omissions
 
 #: Limit of the components of a footprint in uv: larger than any texture, and its fourth power is finite.
 LARGEST = 2.0**20
@@ -343,12 +346,27 @@ def attach(scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None)
         return 0
     cone = None
     try:
-        if not isinstance(sensor, int):
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor] if scene.sensors() else None
+        if sensor is not None:
             cone = Cone.of(sensor, spp)
-        elif scene.sensors():
-            cone = Cone.of(scene.sensors()[sensor], spp)
     except RuntimeError as e:
         mi.Log(mi.LogLevel.Warn, f"textures are not filtered: {e}")
+        omissions.settle(filtering)
     for texture in filtering:
         texture.set_cone(cone)
+        _attached[texture] = (0, "") if cone is None else (id(sensor), sensor.id())
+    omissions.recheck()
     return len(filtering)
+
+
+def attached_sensor(texture) -> tuple[int, str]:
+    """Return the ``id`` in Python, and that in the scene, of the sensor that a texture got from :func:`attach`.
+
+    They are 0 and "" if it got none.
+    """
+    return _attached.get(texture, (0, ""))
+
+
+#: Texture → :func:`attached_sensor`.
+_attached: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import threading
 import weakref
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import numpy as np
 
 from mi_diffind import compat
 from mi_diffind.compat import module_of
+from mi_diffind.files import relative_path, write_json
 from mi_diffind.maps.compressed import CompressedMaps
 from mi_diffind.maps.layout import Layout, MapLayout
 from mi_diffind.maps.pyramid import Pyramid
@@ -224,6 +226,25 @@ def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
         raise RuntimeError(str(e)) from None
     chosen = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
     return _original(props, path, table.settings), chosen
+
+
+def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:
+    """Write a manifest of an image's colours as ``bitmap`` reads them, and return its path.
+
+    ``raw``: values are left as they are; ``normal``: they are a normal map. Raises ``RuntimeError``.
+    """
+    bitmap = mi.Bitmap(str(image))
+    formats = mi.Bitmap.PixelFormat
+    entry = {
+        "file": relative_path(image, folder),
+        "color_space": "srgb" if bitmap.srgb_gamma() and not raw else "linear",
+    }
+    if bitmap.pixel_format() in (formats.YA, formats.RGBA):
+        entry["channels"] = "rgb" if bitmap.pixel_format() == formats.RGBA else "r"
+    name = "normal" if normal else "data" if raw else "albedo"
+    path = folder / f"{image.stem}_{hashlib.sha256(str([name, entry]).encode()).hexdigest()[:12]}.json"
+    write_json(path, {"maps": {name: entry}})
+    return path
 
 
 def _original(props, path: Path, settings: dict) -> Path:

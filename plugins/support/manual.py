@@ -71,7 +71,8 @@ PARTS = {
         It comes from the first of these sources that has it: Mitsuba itself (from version 3.10); an integrator that
         fills the partial derivatives of uv, such as :monosp:`path_footprint`; the sensor, if the ray comes straight
         from it; otherwise an estimate that is rather too sharp than too blurred. Without any source, for instance
-        without a sensor, the footprint is zero and the texture is not filtered. No derivative passes through the
+        without a sensor, the footprint is zero and the texture is not filtered: :monosp:`mi.render` warns once. No
+        derivative passes through the
         footprint.
 
         ``anisotropic`` always reads ``max_anisotropy`` places, evenly spaced over the major axis, on a level half a
@@ -79,6 +80,9 @@ PARTS = {
         level is. ``stochastic`` chooses one of these places by a hash of the hit's position and uv. Its expectation is
         the result of ``anisotropic``, with the noise of one sample; every read on a path makes the same choice, and so
         do all samples through one point of a pixel.""",
+    "executable": """\
+        The program ``mitsuba`` of Mitsuba 3.9 loads no plugins written in Python and ends with "Plugin not found". Use
+        ``mi-diffind render SCENE.xml``, or ``import mi_diffind`` and :monosp:`mi.render` in Python.""",
     "gradient": """\
         With ``off``, the gradient that :monosp:`bumpmap` reads is that of :monosp:`bitmap`. Any other filter takes the
         difference over the width of one texel of the trilinear level.""",

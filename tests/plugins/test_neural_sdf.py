@@ -167,6 +167,12 @@ def test_reports(mi_rgb, folder):
     json.dumps(list(result.values()))
 
 
+def test_each_variant_has_a_shape_of_its_own(mi_any, folder):
+    """One process may change the variant: a shape derived from the mesh of another variant is no shape there."""
+    loaded = mi_any.load_dict({"type": "scene", "solid": shape(folder, id="solid")})
+    assert loaded.shapes()[0].id() == "solid" and isinstance(loaded.shapes()[0], mi_any.Mesh)
+
+
 def test_shapes_of_one_file_share_its_arrays(mi_rgb, folder):
     loaded = scene(mi_rgb, {"a": shape(folder), "b": shape(folder)})
     a, b = (s for s in loaded.shapes() if isinstance(s, mi_rgb.Mesh))
@@ -449,8 +455,9 @@ def integrator(name, inner=""):
 
 EXPLICIT = '<string name="trace" value="arrays"/>'
 TRACED = integrator("path_sdf")
-STOCK = [integrator("path"), integrator("moment", integrator("path")), integrator("prb")]
-OURS = [TRACED, integrator("aov", '<string name="aovs" value="d:depth"/>' + TRACED), integrator("moment", TRACED)]
+CHANNELS = integrator("aov", '<string name="aovs" value="d:depth"/>' + TRACED)  # from rays of its own
+STOCK = [integrator("path"), integrator("moment", integrator("path")), integrator("prb"), CHANNELS]
+OURS = [TRACED, integrator("moment", TRACED)]
 
 
 @pytest.mark.parametrize("xml", STOCK)

@@ -1,8 +1,11 @@
 """Plugins that declare themselves: found here and in other packages, checked, and known by what they were made from."""
 
+import re
+import subprocess
 import sys
 import textwrap
 from importlib import metadata
+from pathlib import Path
 
 import drjit as dr
 import pytest
@@ -154,6 +157,27 @@ def test_plugins_of_this_package_say_what_they_are(mi_rgb):
     )
     assert plugins.with_counterpart("mipmap") == ("neural_texture",)
     assert plugins.with_counterpart("principled") == ("disney", "neural_disney")
+
+
+def test_manual_pages_are_complete(mi_rgb):
+    """Shared parts are filled in; each page names the program that cannot load the plugin, and the one that can."""
+    folder = Path(plugins.__file__).parent
+    for name, plugin in plugins.declared().items():
+        parts = sys.modules[f"{plugins.__name__}.{name}"]
+        classes = [v for v in vars(parts).values() if isinstance(v, type) and v.__module__ == parts.__name__]
+        classes += [parts.integrator()] if hasattr(parts, "integrator") else []
+        (page,) = [c.__doc__ for c in classes if f"-{name}:" in (c.__doc__ or "")]
+        assert "``mitsuba``" in page and "mi-diffind render" in page and (folder / f"{name}.py").is_file()
+        assert not re.search(r"^ *\{\w+\}$", page, re.MULTILINE), plugin.name
+
+
+def test_program_of_mitsuba_loads_no_plugins(mi_rgb, tmp_path):
+    """As manual pages and the README have it; they change when this fails."""
+    (tmp_path / "scene.xml").write_text('<scene version="3.0.0"><bsdf type="neural_disney"/></scene>')
+    program = Path(mi_rgb.__file__).parent / ("mitsuba.exe" if sys.platform == "win32" else "mitsuba")
+    command = [str(program), "-m", "scalar_rgb", str(tmp_path / "scene.xml")]
+    output = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert 'Plugin "neural_disney" not found!' in output.stdout + output.stderr
 
 
 def test_each_variant_has_classes_of_its_own():

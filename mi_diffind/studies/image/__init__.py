@@ -25,6 +25,7 @@ class ImageStudy(Study):
 
     name = "image"
     title = "a compressed image or material, in bytes, training and reads"
+    example = "material.json"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("source", metavar="IMAGE|MATERIAL.json")

@@ -22,6 +22,7 @@ class RadianceStudy(Study):
 
     name = "field"
     title = "the radiance field of a capture, in equal bytes, views, reads and renders"
+    example = "views"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument(

@@ -7,9 +7,13 @@ sample count at which they are equal (:mod:`~mi_diffind.measure.bias`).
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from ...arguments import natural, positive
 from ...measure.study import Study
+
+if TYPE_CHECKING:
+    from ...measure.report import Tradeoff
 
 
 class SceneStudy(Study):
@@ -17,6 +21,7 @@ class SceneStudy(Study):
 
     name = "scene"
     title = "a scene, learned and exact, at several sample counts"
+    example = "scene.xml --spp 64"
     of_scene = True
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -25,7 +30,7 @@ class SceneStudy(Study):
         )
         parser.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
 
-    def run(self, arguments) -> dict:
+    def run(self, arguments) -> Tradeoff:
         from ...measure.report import publish
         from . import renders, report
 

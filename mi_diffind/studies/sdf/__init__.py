@@ -22,6 +22,7 @@ class SdfStudy(Study):
 
     name = "sdf"
     title = "the distance field of a mesh, in equal bytes, reads, rays and renders"
+    example = "mesh.ply"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument(

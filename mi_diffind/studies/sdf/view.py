@@ -77,10 +77,11 @@ class MeshView:
 
     def field_scene(self, field: DistanceField, lit: bool = False):
         """Return a scene of the field, traced by ``path_sdf``."""
-        from ...plugins.support.distance_shapes import DistanceShape, Placement
+        from ...plugins.support.distance_shapes import Placement, distance_shape
 
         placement = Placement.of(mi.ScalarTransform4f(), 1.0, (0.0, 0.0, 0.0))
-        return self._scene(DistanceShape(_material(), field, placement, True), "path_sdf", lit)
+        shape = distance_shape(mi.Mesh)(_material(), field, placement, True)
+        return self._scene(shape, "path_sdf", lit)
 
     def _scene(self, shape, integrator: str, lit: bool):
         scene = {"type": "scene", "shape": shape}

@@ -33,6 +33,7 @@ class ShadingStudy(Study):
 
     name = "shading"
     title = "textures trained for their shading, by the weight of that, and classical filters of normals"
+    example = "material.json"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument(

@@ -19,6 +19,7 @@ class TextureStudy(Study):
 
     name = "texture"
     title = "a texture that filters itself, in renders, levels and flicker"
+    example = "material.json"
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         parser.add_argument(

@@ -24,6 +24,7 @@ class Image(Task):
     title = "an image or the maps of a material"
     files = "compressed"
     section = "supplemental 1.3"
+    example = "material.json --compression 12x"
     plugin = ("texture", "neural_image")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
@@ -53,7 +54,7 @@ class Image(Task):
     def settings(self, preset, given, options):
         defaults = without(PRESETS[preset], options["without"]).settings
         steps = given.get("steps", defaults.steps)
-        return dataclasses.replace(defaults, measure_every=max(1, steps // 10), **given)
+        return dataclasses.replace(defaults, **{"measure_every": max(1, steps // 10), **given})
 
 
 TASK = Image()

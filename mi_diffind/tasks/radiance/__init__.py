@@ -21,6 +21,7 @@ class RadianceField(Task):
     name = "field"
     title = "a radiance field, from images of a scene"
     section = "supplemental 1.7"
+    example = "views --bytes 600k"
     plugin = ("integrator", "neural_field")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()

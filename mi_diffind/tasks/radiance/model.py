@@ -99,19 +99,32 @@ class RadianceFieldModel(Model):
 
         ``capture`` is its folder; by default, that of the capture that was fitted, if it still exists.
         """
+        return self._test_views(capture).evaluate(self.field)
+
+    def render_views(self, capture=None, count: int | None = None) -> list[np.ndarray]:
+        """Return pictures of the field from the test views of a capture (default: that which was fitted).
+
+        They are the first ``count`` (default: all), ``(height, width, 4)``: linear colours multiplied by alpha, and
+        alpha.
+        """
+        images = self._test_views(capture)
+        return [images.render(self.field, i) for i in range(min(count or len(images.views), len(images.views)))]
+
+    def _test_views(self, capture):
+        """Return the test views of a capture. Raises :class:`~mi_diffind.tables.TableError` if it is not there."""
         from .training import ViewImages, load_held_out
 
         folder = (self.table.path or Path("x")).resolve().parent
         path = Path(capture) if capture is not None else folder / self.table.settings.get("capture_path", "")
         if (capture is None and not self.table.settings.get("capture_path")) or not path.is_dir():
             self._refuse(f"was fitted to the capture {path}, which is not there")
-        return ViewImages(self.types, load_held_out(path)[0]).evaluate(self.field)
+        return ViewImages(self.types, load_held_out(path)[0])
 
     def decode(self, output: Path, resolution: int | None = None):
         """Write density and colour on a dense grid (:mod:`.decode`)."""
         from .decode import decode
 
-        return decode(self.field, output, resolution)
+        return decode(self.field, Path(output), resolution)
 
 
 MODEL = RadianceFieldModel

@@ -32,6 +32,7 @@ class Sdf(Task):
     name = "sdf"
     title = "the signed distance field of a mesh"
     section = "supplemental 1.6"
+    example = "mesh.ply --bytes 200k"
     plugin = ("shape", "neural_sdf")
     presets = {  # noqa: RUF012
         "sparse": FitSettings(
@@ -44,7 +45,7 @@ class Sdf(Task):
     measurements = 4
     files = "model"
     arguments = (
-        Argument("source", metavar="MESH", help="a mesh that trimesh reads: ply, obj, stl, off, glb, …"),
+        Argument("source", metavar="MESH", help="a mesh: ply, obj, stl, off, glb, serialized, …"),
         Argument(
             "--bytes", type=checked(units.parse_bytes), metavar="N",
             help="size in memory, as in 256k or 1.5M (default: 1M)",

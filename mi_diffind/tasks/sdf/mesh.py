@@ -1,7 +1,7 @@
 """Triangle meshes in the unit frame: the bounding box is centred at the origin and its longest side is 1.
 
-All distances, tolerances and points of this task are in that frame; negative is inside. Every format of trimesh is
-read. Repairs that "inside" depends on are listed in :attr:`Mesh.warnings`.
+All distances, tolerances and points of this task are in that frame; negative is inside. Every format of trimesh
+and Mitsuba's ``.serialized`` are read. Repairs that "inside" depends on are listed in :attr:`Mesh.warnings`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
+from . import serialized
 
 #: Extent along an axis, relative to the longest side, below which a mesh is flat: float32 resolves no volume in it.
 FLAT = 1e-6
@@ -181,7 +182,11 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            loaded = trimesh.load(path, process=False)
+            if path.suffix.lower() == ".serialized":
+                meshes = (trimesh.Trimesh(*arrays, process=False) for arrays in serialized.read(path))
+                loaded = trimesh.Scene(list(meshes))
+            else:
+                loaded = trimesh.load(path, process=False)
     except MemoryError:
         raise
     except Exception as e:  # readers of a dozen formats raise whatever they like

@@ -171,8 +171,9 @@ class SdfModel(Model):
             "centre": list(self.centre),
         }
         size = " x ".join(f"{self.scale * (b - a):.4g}" for a, b in zip(field.lower, field.upper, strict=True))
+        centre = ", ".join(f"{x:.4g}" for x in self.centre)
         lines = [
-            f"{self.memory_nbytes:,} bytes in memory, box of {size} units around {self.centre}",
+            f"{self.memory_nbytes:,} bytes in memory, box of {size} units around ({centre})",
             f"cells of 1/{1 / field.spacing:.0f} of the longest side, slope at most {field.slope:.2f}",
         ]
         if self.sparse:
@@ -208,8 +209,8 @@ class SdfModel(Model):
         with Distances(loaded) as distances:
             return SurfaceEvaluation(loaded, distances, count).measure(self.field)
 
-    def decode(self, output: Path, resolution: int | None = None):
-        """Write the surface as triangles, or distances as a grid (``.npz``).
+    def decode(self, output: str | os.PathLike | None = None, resolution: int | None = None):
+        """Write the surface as triangles, or distances as a grid (``.npz``); without an ``output``, return the mesh.
 
         ``resolution`` is the number of cells along the longest side, by default finer than the field's cells.
         """
@@ -217,6 +218,9 @@ class SdfModel(Model):
         from .grids import grid
 
         resolution = resolution or min(1024, round(1.5 / self.field.spacing))
+        if output is None:
+            return extract(self.field, resolution, self.scale, self.centre)
+        output = Path(output)
         suffix = output.suffix.lower()
         if suffix == ".npz":
             values, lower, upper = grid(self.field, resolution)

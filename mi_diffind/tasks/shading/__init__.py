@@ -24,6 +24,7 @@ class Shading(Task):
     name = "shading"
     title = "a texture, for what it looks like when it is shaded"
     section = "supplemental 1.5"
+    example = "material.json --compression 12x"
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()
     measurements = 10

@@ -12,6 +12,7 @@ from ...maps.pyramid import Pyramid
 from ...maps.source import load_source
 from ...tables import Table
 from ...task import FitRequest, Fitted
+from ...units import labelled
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
 from ..texture import training as textures
@@ -83,13 +84,19 @@ def fit(request: FitRequest) -> Fitted:
     else:
         table = start
     table.settings |= request.paths(source_path=options["source"])
-    lines = [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
+    lines = [
+        f"{labelled({name: value})[0]} before the training for the shading"
+        for name, value in table.settings.get("before", {}).items()
+    ]
+    lines += [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
-    lines += [f"left out: {effect} ({reason})" for effect, reason in reasons.items()]
+    if reasons:
+        lines.append("left out: " + ", ".join(f"{effect} ({reason})" for effect, reason in reasons.items()))
     not_shaded = material.left_out(pyramid.layout)
     lines += [f"not shaded: {name} ({reason})" for name, reason in not_shaded.items()]
     figures = {
+        "before": table.settings.get("before", {}),
         "source_bytes": source.nbytes,
         "compression": source.nbytes / table.nbytes,
         "effects_in_use": list(effects.names),

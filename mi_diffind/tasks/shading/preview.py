@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,12 @@ BRIGHTNESS = 0.3
 #: Smallest number of pixels along the side of each image.
 PANEL = 192
 
+#: Height of a strip of titles, pixels.
+TITLE = 16
+
 
 def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) -> None:
-    """Write a picture with a row for each of :data:`LEVELS`: truth, shaded image, amplified difference.
+    """Write a picture with a row for each of :data:`LEVELS`, with titles: truth, shaded image, amplified difference.
 
     View and light are those under which the material is neither dark nor glaring.
     """
@@ -33,10 +37,26 @@ def write_preview(path: Path, evaluation: ShadedEvaluation, read: ShadedReader) 
     for level in (i for i in LEVELS if i < evaluation.levels):
         truth, got = truths[level][pair], evaluation.images(read, level, [pair])[0]
         row = [srgb.for_display(truth), srgb.for_display(got), np.clip(AMPLIFIED * np.abs(truth - got), 0, 1)]
-        rows.append(np.concatenate([_enlarged(image, side) for image in row], axis=1))
-    picture = np.rint(255 * np.concatenate(rows)).astype(np.uint8)
+        titles = (f"level {level}: reference", "shaded", f"{AMPLIFIED}x difference")
+        rows.append(titled(np.concatenate([_enlarged(image, side) for image in row], axis=1), titles))
+    picture = np.concatenate(rows)
     with replacing(path) as temporary:
         mi.Bitmap(np.ascontiguousarray(picture)).write(str(temporary))
+
+
+def titled(picture: np.ndarray, titles: Sequence[str]) -> np.ndarray:
+    """Return a picture ``(height, width, 3)`` of values from 0 to 1 with a strip of ``titles`` above, 8 bits.
+
+    The titles stand above as many parts of equal width.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    width = picture.shape[1]
+    strip = Image.new("RGB", (width, TITLE), "white")
+    font = ImageFont.load_default(size=11)
+    for i, title in enumerate(titles):
+        ImageDraw.Draw(strip).text((i * width // len(titles) + 2, 1), title, "black", font)
+    return np.concatenate([np.asarray(strip), np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)])
 
 
 def _enlarged(image: np.ndarray, side: int) -> np.ndarray:

@@ -124,8 +124,9 @@ def fit_shading(
     """Train the arrays ``start`` (:func:`start_of`) of ``source`` for shading; return its table and the run's record.
 
     The table is of the task ``texture``, with its errors as a texture and as shaded images of the ``evaluation``. The
-    best state is chosen by other images of the same form; it may be the start (settings ``kept_start``). ``preview`` is
-    a picture that is written at each measurement.
+    best state is chosen by other images of the same form; it may be the start (settings ``kept_start``). The settings
+    ``before`` are the errors of the start as shaded images. ``preview`` is a picture that is written at each
+    measurement.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
     validation = None if evaluation is None else evaluation.another()
@@ -147,7 +148,12 @@ def fit_shading(
     table.preset, table.seed = request.preset, recipe.settings.seed
     errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)
     if evaluation is not None:
-        shown = evaluation.measure(reader(texture, problem.effects, problem.decoder), flip=False)
-        errors = {**{f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in shown.items()}, **errors}
+        start_texture = CompressedTexture(pyramid.layout, first)
+        both = (
+            evaluation.measure(reader(t, problem.effects, problem.decoder), False) for t in (start_texture, texture)
+        )
+        before, after = ({f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in shown.items()} for shown in both)
+        table.settings["before"] = {name: float(f"{value:.5g}") for name, value in before.items()}
+        errors = {**after, **errors}
     table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
     return table, result

@@ -31,6 +31,7 @@ class Texture(Task):
     title = "a texture or the maps of a material at every level of detail"
     files = "compressed"
     section = "supplemental 1.4"
+    example = "material.json --compression 12x"
     plugin = ("texture", "neural_texture")
     presets = {name: recipe.settings for name, recipe in PRESETS.items()}  # noqa: RUF012
     storages = ()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import asdict
-from pathlib import Path
 
 import drjit as dr
 import numpy as np
@@ -250,7 +249,7 @@ class TextureModel(MapsModel):
             lines.append(f"  {image.levels} levels of detail: {listed} dB")
         return figures, lines
 
-    def decode(self, output: Path, map=None, width=None, height=None, level: int = 0):
+    def decode(self, output=None, map=None, width=None, height=None, level: int = 0):
         """Write the maps at a level of detail, by default in its own size (:meth:`.MapsModel.decode`)."""
         image = self.image
         if not 0 <= level < image.levels:

@@ -458,7 +458,7 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     said = json.loads(record.read_text())
     assert said["task"] == "shading" and said["settings"]["shading"]["share"] == OURS.share
     assert said["effects_left_out"]["diffuse"] == "metallic is 1" and said["measured"]["shaded_converged_db"] > 10
-    assert np.array(mi.Bitmap(str(tmp_path / "metal_preview.png"))).shape == (2 * 192, 3 * 192, 3)
+    assert np.array(mi.Bitmap(str(tmp_path / "metal_preview.png"))).shape == (2 * (16 + 192), 3 * 192, 3)
     texture = mi.load_dict({"type": "neural_texture", "filename": str(out), "channels": "roughness"})
     si = dr.zeros(mi.SurfaceInteraction3f, 4)
     assert np.isfinite(texture.eval_1(si).numpy()).all()

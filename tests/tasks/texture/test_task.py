@@ -574,7 +574,7 @@ def test_fit_inspect_decode(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert main(["inspect", "m.npz", "--measure", "--variant", "llvm_ad_rgb"]) == 0
     shown = capsys.readouterr().out
-    assert "6 levels of detail" in shown and "psnr_worst_db" in shown
+    assert "6 levels of detail" in shown and "PSNR worst level" in shown
     assert main(["decode", "m.npz", "-o", "d.png", "--map", "albedo", "--level", "2", "--variant", "llvm_ad_rgb"]) == 0
     assert np.array(mi.Bitmap("d.png")).shape == (8, 6)
     capsys.readouterr()

@@ -1,0 +1,43 @@
+"""``mi-diffind convert``: a scene with learned plugins in place of Mitsuba's."""
+
+from __future__ import annotations
+
+from .common import learn_option, print_conversions, require_scene, scene_options, set_variant, verb
+
+HELP = "write a scene with learned plugins in place of Mitsuba's, fitted to what they show"
+
+EXAMPLE = "mi-diffind convert scene.xml -o learned.xml"
+
+
+def add(commands) -> None:
+    """Add the verb and its options to ``commands``, the subparsers of the command line."""
+    sub = verb(commands, "convert", run, HELP, EXAMPLE)
+    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument("-o", "--output", required=True, metavar="NEW.xml", help="scene file to write")
+    sub.add_argument("--tables", metavar="DIR", help="folder of the table files (default: NEW_tables beside NEW.xml)")
+    learn_option(sub, "all of them")
+    scene_options(sub, rendering=False)
+
+
+def run(arguments) -> dict:
+    """Convert the scene, write it, and return the ``output`` and the ``conversions``.
+
+    Raises :class:`~mi_diffind.errors.UsageError`, and as :mod:`mi_diffind.conversion` does.
+    """
+    require_scene(arguments.scene)
+    set_variant(arguments.variant)
+    from ..conversion import convert
+
+    conversions = [
+        vars(c)
+        for c in convert(
+            arguments.scene,
+            arguments.output,
+            learn=arguments.learn or None,
+            tables=arguments.tables,
+            defines=dict(arguments.defines),
+        )
+    ]
+    print_conversions(conversions)
+    print(f"scene       {arguments.output}")
+    return {"output": arguments.output, "conversions": conversions}
