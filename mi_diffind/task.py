@@ -57,7 +57,7 @@ class FitRequest:
     ``preset`` and its ``settings`` as they were changed, the module of Dr.Jit ``types`` to train with, the ``storage``
     form of the result ("": the task's own), and the task's own arguments (``options``, all of them). ``seconds`` limits
     the time in place of the steps: that of each training, or with a ``deadline`` that of all that is left to do.
-    ``output`` is the file for the result, if it is known.
+    ``output`` is the file for the result, if it is known, and ``task`` the name of the task.
     """
 
     preset: str
@@ -71,6 +71,7 @@ class FitRequest:
     progress: bool = True
     output: Path | None = None
     deadline: Deadline | None = None
+    task: str = ""
 
     def train(
         self,
@@ -159,7 +160,7 @@ class Fitted:
         table, result = self.table, self.result
         return {
             "interrupted": result.interrupted,
-            "task": table.task,
+            "task": (self.request and self.request.task) or table.task,
             "preset": table.preset,
             "bytes": table.nbytes,
             "storage": table.storage,
@@ -580,6 +581,7 @@ def fit(
     request.output = None if output is None else table_path(output)
     if resume and seconds is not None:
         raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
+    request.task = task
     chosen.check(request)
     request.types = array_module(variant)
     fitted = chosen.fit(request)

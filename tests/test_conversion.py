@@ -155,6 +155,29 @@ def test_serialized_meshes(mi_rgb, tmp_path, version, double):
         assert np.array_equal(params["faces"].numpy().reshape(-1, 3), faces)
     both = load_mesh(path)
     assert both.components == 2 and both.watertight and both.scale == pytest.approx(4)
+    assert load_mesh(f"{path}#1").digest == load_mesh((meshes[1].vertices, meshes[1].faces)).digest
+    with pytest.raises(MeshError, match='holds no mesh "2", allowed are 0 to 1'):
+        load_mesh(f"{path}#2")
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(MeshError, match="no file of serialized meshes, or cut short"):
         load_mesh(path)
+
+
+def test_shapes_of_a_scene(mi_rgb, tmp_path):
+    """One by its id, placed as in the scene, or all; the fitted field finds its mesh again."""
+    from mi_diffind.plugins.support import sdf_meshes
+
+    trimesh.creation.icosphere(1).export(tmp_path / "ball.ply")
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><shape type="ply" id="ball"><string name="filename" value="ball.ply"/><transform '
+        'name="to_world"><scale x="1" y="2" z="1"/><translate x="5"/></transform></shape>'
+        '<shape type="cube" id="box"/><shape type="sphere" id="round"/></scene>'
+    )
+    ball = load_mesh(f"{path}#ball")
+    assert ball.scale == pytest.approx(4) and ball.centre == pytest.approx((5, 0, 0)) and ball.components == 1
+    assert load_mesh(path).components == 2 and load_mesh(path).scale == pytest.approx(7)
+    with pytest.raises(MeshError, match='holds no mesh "round", found "ball", "box"'):
+        load_mesh(f"{path}#round")
+    written = sdf_meshes._as_ply(tmp_path / "scene.xml#box", (0,))
+    assert load_mesh(written).digest == load_mesh(f"{path}#box").digest

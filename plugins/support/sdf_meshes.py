@@ -17,7 +17,7 @@ from mi_diffind.errors import DiffindError
 from mi_diffind.tables import TableError
 from mi_diffind.task import stamp
 from mi_diffind.tasks.sdf import TASK, serialized
-from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh
+from mi_diffind.tasks.sdf.mesh import directed_edges, load_mesh, split_part
 
 from . import properties
 from .stock import Kept
@@ -37,9 +37,10 @@ def to_mesh(props: mi.Properties) -> None:
     if not recorded:
         raise RuntimeError(f"{path}: names no mesh that it was made from")
     mesh = (path.resolve().parent / recorded).resolve()
-    if not mesh.is_file():
-        raise RuntimeError(f"{mesh}: no such file, {path.name} was made from it")
-    props["filename"] = str(mesh) if mesh.suffix.lower() == ".ply" else _as_ply(mesh, stamp(mesh))
+    file, _ = split_part(mesh)
+    if not file.is_file():
+        raise RuntimeError(f"{file}: no such file, {path.name} was made from it")
+    props["filename"] = str(mesh) if mesh.suffix.lower() == ".ply" else _as_ply(mesh, stamp(file))
 
 
 def closed_mesh_of(path: Path, folder: Path, index: int = 0) -> Path:
@@ -78,6 +79,6 @@ def _as_ply(path: Path, stamp: tuple) -> str:
         mesh = load_mesh(path)
     except DiffindError as e:
         raise RuntimeError(str(e)) from None
-    written = _folder() / f"{path.stem}_{abs(hash((path, stamp))):x}.ply"
+    written = _folder() / f"{split_part(path)[0].stem}_{abs(hash((path, stamp))):x}.ply"
     trimesh.Trimesh(mesh.to_file_frame(mesh.vertices), mesh.faces, process=False).export(written)
     return str(written)

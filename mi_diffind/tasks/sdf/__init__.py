@@ -45,7 +45,10 @@ class Sdf(Task):
     measurements = 4
     files = "model"
     arguments = (
-        Argument("source", metavar="MESH", help="a mesh: ply, obj, stl, off, glb, serialized, …"),
+        Argument(
+            "source", metavar="MESH",
+            help="a mesh: ply, obj, stl, off, glb, serialized, …; SCENE.xml, or one shape of it: SCENE.xml#ID",
+        ),
         Argument(
             "--bytes", type=checked(units.parse_bytes), metavar="N",
             help="size in memory, as in 256k or 1.5M (default: 1M)",

@@ -1,7 +1,7 @@
 """Triangle meshes in the unit frame: the bounding box is centred at the origin and its longest side is 1.
 
-All distances, tolerances and points of this task are in that frame; negative is inside. Every format of trimesh
-and Mitsuba's ``.serialized`` are read. Repairs that "inside" depends on are listed in :attr:`Mesh.warnings`.
+All distances, tolerances and points of this task are in that frame; negative is inside. Every format of trimesh,
+Mitsuba's ``.serialized`` and its scenes are read. Repairs that "inside" depends on are listed in :attr:`Mesh.warnings`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
-from . import serialized
+from . import scene_meshes, serialized
 
 #: Extent along an axis, relative to the longest side, below which a mesh is flat: float32 resolves no volume in it.
 FLAT = 1e-6
@@ -31,6 +31,10 @@ SLIVER = 1e-12
 
 #: Largest number of components whose orientation is tested one by one.
 MAX_ORIENTED = 200
+
+
+#: Extension of files with several meshes → the function that reads them, or the part that is named.
+PARTS = {".serialized": serialized.read, ".xml": scene_meshes.read}
 
 
 class MeshError(DiffindError, ValueError):
@@ -112,17 +116,18 @@ class Mesh:
 def load_mesh(mesh) -> Mesh:
     """Read a mesh file, or take a ``trimesh.Trimesh``, a ``trimesh.Scene``, a ``mi.Mesh`` or ``(vertices, faces)``.
 
-    The meshes of a scene file are joined where its transforms place them. Equal vertices are merged, degenerate
+    The meshes of a scene file are joined where its transforms place them. ``SCENE.xml#ID`` names one shape of a Mitsuba
+    scene, ``FILE.serialized#N`` one mesh, counted from 0. Equal vertices are merged, degenerate
     triangles left out, and triangles wound against their neighbours or around their solid the wrong way are turned.
     Raises :class:`MeshError`.
     """
     if not isinstance(mesh, (str, os.PathLike)):
         return make_mesh(*_in_memory(mesh))
-    path = Path(mesh)
+    path, part = split_part(mesh)
     if not path.is_file():
         raise MeshError(f"{path}: {'is a folder' if path.is_dir() else 'there is no such file'}, expected a mesh")
-    vertices, faces = _read(path)
-    return make_mesh(vertices, faces, str(path))
+    vertices, faces = _read(path, part)
+    return make_mesh(vertices, faces, str(mesh))
 
 
 def _in_memory(mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -173,7 +178,16 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") -> Me
     return mesh
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def split_part(path: str | os.PathLike) -> tuple[Path, str]:
+    """Return the file and the part of ``FILE#PART``; the part is "" without one, or if there is a file of that name."""
+    path = Path(path)
+    name, _, part = path.name.rpartition("#")
+    if path.is_file() or Path(name).suffix.lower() not in PARTS:
+        return path, ""
+    return path.with_name(name), part
+
+
+def _read(path: Path, part: str = "") -> tuple[np.ndarray, np.ndarray]:
     """Read vertices and faces of all triangles of a file."""
     import trimesh
 
@@ -182,8 +196,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            if path.suffix.lower() == ".serialized":
-                meshes = (trimesh.Trimesh(*arrays, process=False) for arrays in serialized.read(path))
+            if path.suffix.lower() in PARTS:
+                meshes = (trimesh.Trimesh(*arrays, process=False) for arrays in PARTS[path.suffix.lower()](path, part))
                 loaded = trimesh.Scene(list(meshes))
             else:
                 loaded = trimesh.load(path, process=False)

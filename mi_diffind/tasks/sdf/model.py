@@ -195,13 +195,13 @@ class SdfModel(Model):
         """
         from .distances import Distances
         from .evaluation import SurfaceEvaluation
-        from .mesh import load_mesh
+        from .mesh import load_mesh, split_part
 
         settings, folder = self.table.settings, (self.table.path or Path("x")).resolve().parent
         if mesh is None and not settings.get("mesh_path"):
             self._refuse("was fitted to a mesh in memory, which is not in the file: measure(mesh)")
         path = folder / settings["mesh_path"] if mesh is None else mesh
-        if isinstance(path, (str, os.PathLike)) and not Path(path).is_file():
+        if isinstance(path, (str, os.PathLike)) and not split_part(path)[0].is_file():
             self._refuse(f"was fitted to the mesh {path}, which is not there")
         loaded = load_mesh(path)
         if loaded.digest != settings.get("source"):

@@ -16,8 +16,8 @@ MAGIC = 0x041C
 NORMALS, TEXTURE_COORDINATES, COLOURS, DOUBLE = 0x1, 0x2, 0x8, 0x2000
 
 
-def read(path: str | os.PathLike) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the meshes of a file: vertices ``(V, 3)``, float64, and faces ``(F, 3)``, int64.
+def read(path: str | os.PathLike, number: str = "") -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the meshes of a file, or one by its number: vertices ``(V, 3)``, float64, and faces ``(F, 3)``, int64.
 
     The format is described at Mitsuba's shape ``serialized``; versions 3 and 4 are read. Raises ``ValueError`` for
     other content, and ``OSError``.
@@ -28,9 +28,12 @@ def read(path: str | os.PathLike) -> list[tuple[np.ndarray, np.ndarray]]:
         count = struct.unpack_from("<I", data, len(data) - 4)[0]
         width = 8 if version == 4 else 4
         starts = np.frombuffer(data, f"<u{width}", count, len(data) - 4 - width * count)
-        return [_mesh(data, int(start), version) for start in starts]
+        meshes = [_mesh(data, int(start), version) for start in starts]
     except (struct.error, zlib.error, ValueError) as e:
         raise ValueError(f"is no file of serialized meshes, or cut short: {e}") from None
+    if number and number not in map(str, range(count)):
+        raise ValueError(f'holds no mesh "{number}", allowed are 0 to {count - 1}')
+    return [meshes[int(number)]] if number else meshes
 
 
 def _mesh(data: bytes, start: int, version: int) -> tuple[np.ndarray, np.ndarray]:
