@@ -22,6 +22,7 @@ from .files import writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
 from .measure.statistics import spread
+from .progress import progress_bar
 from .runtime import use_variant
 
 #: Pairs of passes that a ratio of times needs, and the largest ratio of its quartiles: beyond, none is given.
@@ -151,7 +152,7 @@ def compare(
     passes, done = max(1, min(max(passes, 2), spp)), 0
     turns = [written, *sides.values()]
     total = passes * sum(side.oversampling for side in turns)
-    with interruptible() as stop, scenes.progress_bar("render", total, progress=progress) as bar:
+    with interruptible() as stop, progress_bar("render", total, progress=progress) as bar:
         for i in range(passes):
             n = (i + 1) * spp // passes - done
             for side in turns if i % 2 == 0 else reversed(turns):

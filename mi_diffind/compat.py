@@ -141,6 +141,11 @@ def kernel_seconds(history: list[dict]) -> float:
     return sum(entry["execution_time"] for entry in history) / 1e3
 
 
+def compile_seconds(history: list[dict]) -> float:
+    """Return the seconds that the compilation of the kernels of a ``dr.kernel_history()`` took."""
+    return sum(entry.get("backend_time", 0.0) for entry in history) / 1e3
+
+
 def was_compiled(history: list[dict]) -> bool:
     """Return whether a kernel of a ``dr.kernel_history()`` was compiled or fetched from the disk."""
     return any(not entry.get("cache_hit", True) or entry.get("cache_disk", False) for entry in history)

@@ -35,6 +35,7 @@ import numpy as np
 from . import compat, scenes
 from .interrupt import interruptible
 from .plugins.support import distance_shapes as sdf
+from .progress import progress_bar
 
 #: Part of the scattered light that may be left out, and the multiple of it that a single tile may lose of its light.
 TOLERANCE, IN_A_TILE = 0.005, 10
@@ -254,7 +255,7 @@ def auto_depth(parsed: scenes.ParsedScene, tolerance: float = TOLERANCE, seed: i
             f"surfaces can be measured; a number sets its depth"
         )
     start = time.perf_counter()
-    with interruptible() as stop, scenes.progress_bar("probe", PASSES, progress=progress) as bar:
+    with interruptible() as stop, progress_bar("probe", PASSES, progress=progress) as bar:
         shares = bounces(probe(scene, max_depth, seed=seed, on_pass=bar.update, stop=stop))
     seconds = time.perf_counter() - start
     chosen = choose(shares, max_depth, tolerance)

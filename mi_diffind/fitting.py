@@ -21,13 +21,21 @@ from drjit.opt import Adam
 from tqdm import tqdm
 
 from . import compat
+from .deadline import duration
 from .files import replacing, writable_file
 from .indirection import aligned_copy, unfolded
 from .interrupt import interruptible
+from .progress import in_terminal, progress_bar
 from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
 
 __all__ = ["LOSSES", "SCHEDULES", "FitResult", "FitSettings", "FittingError", "Problem", "fit"]
 
+
+#: Most measurements of a training whose time is limited, and the largest share of the time that they take.
+MEASUREMENTS, MEASURING = 10, 0.2
+
+#: Share of the steps of the settings below which a training whose time is limited is unfinished.
+UNFINISHED = 0.05
 
 #: Rate of the exponential-like distribution on [0, 1]: half of the samples lie below 0.21.
 EXPONENTIAL_RATE = 3.0
@@ -126,12 +134,14 @@ class FitResult:
     restarts: int
     history: list[dict] = field(default_factory=list)
     asked_to_stop: bool = False  # by Ctrl-C, which may have come too late to interrupt it
+    unfinished: bool = False  # the time was too short
 
     @property
     def outcome(self) -> str:
         """State that was kept and, after Ctrl-C, why it is not the last one: for a sentence."""
         if not self.interrupted:
-            return f"best step {self.step}"
+            steps = f"{self.steps} step{'s' if self.steps != 1 else ''}: unfinished, " if self.unfinished else ""
+            return f"{steps}best step {self.step}"
         name, value = next(iter(self.measured.items()))
         last = next((h for h in reversed(self.history) if h["step"] == self.steps), None)
         if self.step == self.steps or last is None:
@@ -164,15 +174,17 @@ def fit(
     log=None,
     title=None,
     seconds: float | None = None,
+    least: int = 1,
 ) -> FitResult:
     """Train ``problem.net`` in place and leave the best state of the training in it.
 
     ``checkpoint`` is a file that keeps the state of the training, written at every measurement; with ``resume`` it is
     read first (it must belong to the same settings). ``title`` stands before the progress bar. With ``seconds``, the
-    training ends after that time, its schedules follow the clock in place of the steps, and it is measured ten times.
-    Ctrl-C ends the training after the current step, which is measured, too, and keeps the best state so far. If the
-    loss or a parameter becomes NaN, or the loss explodes, the last good state is restored and the learning rate halved;
-    ``log`` (default: print to stderr) gets one sentence about it.
+    training and its last measurement end after that time, though not before ``least`` steps, and its schedules follow
+    the clock in place of the steps. It is measured as often as the settings say, at most ten times, and less often if
+    measurements take long. Ctrl-C ends the training after the current step, which is measured, too, and keeps the best
+    state so far. If the loss or a parameter becomes NaN, or the loss explodes, the last good state is restored and the
+    learning rate halved; ``log`` (default: print to stderr) gets one sentence about it.
 
     Raises :class:`FittingError` if the training diverges again and again, or the checkpoint does not fit.
     """
@@ -196,29 +208,32 @@ def fit(
         plateau.restore(extra["plateau"])
 
     start = time.perf_counter() - spent
+    clock = None if seconds is None else _Clock(start, seconds)
 
     def share() -> float:
         """Return the share of the training that is over."""
-        if seconds is None:
+        if clock is None:
             return trainer.step / settings.steps
-        return min(1.0, (time.perf_counter() - start) / seconds)
+        return clock.share() if trainer.step >= least else min(clock.share(), 0.999)
 
     trainer.share = share()
     good = trainer.snapshot()
     bar = _Bar(settings.steps, seconds, title, progress)
+    planned = min(MEASUREMENTS, max(1, settings.steps // settings.measure_every))  # with a limit of time
     bar.show(trainer)
     log = log or (lambda message: tqdm.write(message, file=sys.stderr))
     interrupted = False
 
     def measure(loss: float | None):
         nonlocal best, best_measured, best_step
-        measured = {k: float(v) for k, v in problem.measure(net).items()}
+        figures = problem.measure(net) if clock is None else clock.measured(lambda: problem.measure(net))
+        measured = {k: float(v) for k, v in figures.items()}
         name, value = next(iter(measured.items()))
         history.append({"step": trainer.step, "loss": loss, **measured})
         top = max((h[name] for h in history if math.isfinite(h[name])), default=value)
         if best is None or value >= top - problem.tolerance:
             best, best_measured, best_step = trainer.snapshot().parameters, measured, trainer.step
-        bar.measured(loss, name, value)
+        bar.measured(name, value)
 
     with interruptible() as stop, _cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
@@ -232,7 +247,7 @@ def fit(
             last = trainer.share >= 1
             measured = trainer.step % settings.measure_every == 0
             if seconds is not None:
-                measured = int(10 * trainer.share) > int(10 * share_before)
+                measured = int(planned * trainer.share) > int(planned * share_before) and not clock.slow
             due = trainer.step % settings.check_every == 0 or measured
             reference = references.get(trainer.phase)
             if not (due or last or reference is None):
@@ -257,6 +272,7 @@ def fit(
                 continue
             references[trainer.phase] = value if reference is None else 0.5 * (reference + value)
             plateau.update(trainer.step, value)
+            bar.loss(value)
             good = before  # not the state after this step: nobody has seen its loss yet
             if measured or last:
                 measure(value)
@@ -276,33 +292,76 @@ def fit(
         raise FittingError("the training was stopped before its first measurement: there is nothing to keep")
     trainer.load_parameters(best)
     spent = time.perf_counter() - start
-    return FitResult(best_measured, best_step, trainer.step, spent, interrupted, restarts, history, stop.is_set())
+    unfinished = clock is not None and not interrupted and trainer.step < UNFINISHED * settings.steps
+    return FitResult(
+        best_measured, best_step, trainer.step, spent, interrupted, restarts, history, stop.is_set(), unfinished
+    )
+
+
+class _Clock:
+    """Share of a training that is over, if its time is limited.
+
+    The time of the last measurement, as the measurements so far took it, and that of half a step are kept for the end.
+    """
+
+    def __init__(self, start: float, seconds: float):
+        self.start, self.seconds, self.over = start, seconds, 0.0
+        self.measuring, self.measurement = 0.0, 0.0  # seconds of all measurements, and of one without compilation
+        self.before, self.step = None, math.inf  # time of the step before, and the duration of the shortest one
+
+    def share(self) -> float:
+        """Return the share that is over, asked for after each step; it never falls."""
+        now = time.perf_counter()
+        if self.before is not None:
+            self.step = min(self.step, now - self.before)
+        self.before = now
+        half = 0.5 * self.step if math.isfinite(self.step) else 0.0
+        limit = max(self.seconds - self.measurement - half, 1e-9)
+        self.over = min(1.0, max(self.over, (now - self.start) / limit))
+        return self.over
+
+    @property
+    def slow(self) -> bool:
+        """True if measurements take too much of the time, so that only the last one is still carried out."""
+        return self.measuring > MEASURING * (self.before - self.start)
+
+    def measured(self, measure):
+        """Return the result of a measurement, whose duration counts."""
+        start = time.perf_counter()
+        figures, self.measurement = duration(measure)
+        self.before = time.perf_counter()  # the next step begins here
+        self.measuring += self.before - start
+        return figures
 
 
 class _Bar:
-    """Progress bar, in steps, or in the seconds that are left of the time of a training."""
+    """Progress of a training, in steps, or in the seconds that are left."""
 
     def __init__(self, steps: int, seconds: float | None, title: str | None, progress: bool):
-        self.seconds, self.text = seconds, {}
-        options = {"desc": title, "disable": None if progress else True}
+        self.seconds, self.text, self.lines = seconds, {}, not in_terminal()
+        self.title = f"{title}: " if title and self.lines else ""
         if seconds is not None:
-            self.shown = tqdm(total=1.0, bar_format=self._form(0.0), **options)
+            self.shown = progress_bar(title, 1.0, "", progress, line=self._form(0, 0.0), bar_format=self._form(0, 0.0))
         else:
-            self.shown = tqdm(total=steps, unit="step", **options)
+            line = "step {n_fmt} of {total_fmt}, {remaining} left{postfix}"
+            self.shown = progress_bar(title, steps, "step", progress, line=line)
 
-    def _form(self, share: float) -> str:
-        return "{l_bar}{bar}| {elapsed}<" + tqdm.format_interval((1 - share) * self.seconds) + "{postfix}"
+    def _form(self, step: int, share: float) -> str:
+        left = tqdm.format_interval((1 - share) * self.seconds)
+        return f"step {step}, {left} left{{postfix}}" if self.lines else "{l_bar}{bar}| {elapsed}<" + left + "{postfix}"
 
     def show(self, trainer: _Trainer) -> None:
         if self.seconds is not None:
-            self.shown.bar_format = self._form(trainer.share)
+            self.shown.bar_format = self.title + self._form(trainer.step, trainer.share)
         self.shown.update((trainer.step if self.seconds is None else trainer.share) - self.shown.n)
 
-    def measured(self, loss: float | None, name: str, value: float) -> None:
-        if loss is not None:
-            self.text["loss"] = f"{loss:.3g}"
+    def loss(self, loss: float) -> None:
+        self.text["loss"] = f"{loss:.3g}"
+        self.shown.set_postfix(self.text, refresh=False)
+
+    def measured(self, name: str, value: float) -> None:
         self.text[name] = f"{value:.2f}"
-        self.shown.set_postfix(self.text)
+        self.shown.set_postfix(self.text, refresh=not self.lines)
 
 
 def _diverged(value: float, reference: float | None) -> bool:

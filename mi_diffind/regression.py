@@ -27,6 +27,7 @@ from .files import writable_file, writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
 from .measure.store import fingerprint, sources
+from .progress import progress_bar
 from .reference_files import (
     BadReference,
     Reference,
@@ -217,7 +218,7 @@ def update_reference(
 
         def failing_part(spp: int) -> float:
             title = f"{stem}: probe at {spp} spp"
-            with scenes.progress_bar(title, PROBE_PASSES, progress=progress) as bar, scenes.scene_errors(path):
+            with progress_bar(title, PROBE_PASSES, progress=progress) as bar, scenes.scene_errors(path):
                 return probe(scene, spp, seed, bar.update, stop, probe_samples)
 
         def refusal(verdict: str, failing: str, more: str = "") -> scenes.SceneError:
@@ -232,7 +233,7 @@ def update_reference(
             if failing > _HOPELESS * (1 - REQUIRED) + _CHANCE / (width * height):
                 raise refusal("would fail", f"about {failing:.2%} of the pixels")
             missing = REFERENCE_PASSES - moments.samples // _samples_of_a_pass(wanted, REFERENCE_PASSES)
-            with scenes.progress_bar(f"{stem}: reference", max(0, missing), progress=progress) as bar:
+            with progress_bar(f"{stem}: reference", max(0, missing), progress=progress) as bar:
                 image, variance, result["spp"] = render_with_variance(
                     scene, wanted, seed, REFERENCE_PASSES, bar.update, stop, moments
                 )
@@ -276,7 +277,7 @@ def _render_check(scene, spp: int, seed: int, title: str, progress: bool, stop: 
     """Render the image of a check, in passes of bounded memory."""
     width, height = scenes.film_size(scene)
     passes = min(spp, -(-spp * width * height // _PASS))
-    with scenes.progress_bar(title, passes, progress=progress) as bar:
+    with progress_bar(title, passes, progress=progress) as bar:
         return scenes.colour_channels(scenes.render(scene, spp, seed, passes, bar.update, stop)[0])
 
 

@@ -18,6 +18,7 @@ from . import depth as depths
 from . import orbit as orbits
 from .errors import UsageError
 from .interrupt import interruptible
+from .progress import progress_bar
 from .runtime import use_variant
 
 #: Samples per pixel of a pass, after each of which Ctrl-C may end the rendering.
@@ -142,12 +143,12 @@ def render(
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
     if orbit:
-        with interruptible() as stop, scenes.progress_bar("orbit", orbit, "frame", progress) as bar:
+        with interruptible() as stop, progress_bar("orbit", orbit, "frame", progress) as bar:
             frames = orbits.orbit(loaded, orbit, centre, spp=spp, seed=seed, on_frame=bar.update, stop=stop)
         interrupted, done = len(frames) < orbit, spp
     else:
         passes = max(1, spp // PASS)
-        with interruptible() as stop, scenes.progress_bar("render", passes, "pass", progress) as bar:
+        with interruptible() as stop, progress_bar("render", passes, "pass", progress) as bar:
             image, seconds = scenes.render(loaded, spp, seed, passes, bar.update, stop)
         frames, done = [image], len(seconds) * spp // passes
         interrupted = done < spp

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from tqdm import tqdm
 
 from . import compat, plugins
 from .errors import DiffindError
@@ -401,11 +400,6 @@ def colour_channels(image):
     """Drop alpha and other channels that are no colour from an image ``(height, width, channels)``, array or tensor."""
     count = 3 if image.shape[2] >= 3 else 1
     return image if image.shape[2] == count else image[:, :, :count]
-
-
-def progress_bar(title: str, total: int, unit: str = "pass", progress: bool = True, initial: int = 0) -> tqdm:
-    """Return a progress bar on stderr; without ``progress`` it stays hidden, as it does outside of a terminal."""
-    return tqdm(total=total, initial=initial, desc=title, unit=unit, disable=None if progress else True)
 
 
 def write_image(path: str | os.PathLike, image: np.ndarray) -> None:

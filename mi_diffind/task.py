@@ -24,7 +24,7 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 from . import discovery
 from .arguments import Argument
 from .compat import module_of
+from .deadline import Deadline
 from .errors import UsageError
 from .settings import FitSettings
 from .units import labelled
@@ -55,7 +56,8 @@ class FitRequest:
 
     ``preset`` and its ``settings`` as they were changed, the module of Dr.Jit ``types`` to train with, the ``storage``
     form of the result ("": the task's own), and the task's own arguments (``options``, all of them). ``seconds`` limits
-    the time in place of the steps; ``output`` is the file for the result, if it is known.
+    the time in place of the steps: that of each training, or with a ``deadline`` that of all that is left to do.
+    ``output`` is the file for the result, if it is known, and ``task`` the name of the task.
     """
 
     preset: str
@@ -68,14 +70,45 @@ class FitRequest:
     resume: bool = False
     progress: bool = True
     output: Path | None = None
+    deadline: Deadline | None = None
+    task: str = ""
 
-    def train(self, problem: Problem, title: str | None = None) -> FitResult:
-        """Train a problem with the settings of this request."""
+    def train(
+        self,
+        problem: Problem,
+        title: str | None = None,
+        finish: Callable[[], object] | None = None,
+        times: float = 1.0,
+        least: int = 1,
+    ) -> FitResult:
+        """Train a problem with the settings of this request.
+
+        With a deadline, ``finish`` is carried out once before, so that room is kept for the measurement that follows,
+        which takes ``times`` as long. At least ``least`` steps are taken.
+        """
         from .fitting import fit
 
+        seconds = self.seconds
+        if self.deadline is not None:
+            if finish is not None:
+                self.deadline.rehearse(finish, times)
+            seconds = self.deadline.left()
         return fit(
-            problem, self.settings, self.checkpoint, self.resume, self.progress, title=title, seconds=self.seconds
+            problem,
+            self.settings,
+            self.checkpoint,
+            self.resume,
+            self.progress,
+            title=title,
+            seconds=seconds,
+            least=least,
         )
+
+    def part(self, share: float) -> FitRequest:
+        """Return the request for a stage that takes a ``share`` of the time that is left, if time is limited."""
+        if self.deadline is None:
+            return dataclasses.replace(self)
+        return dataclasses.replace(self, deadline=self.deadline.part(share))
 
     def recorded(self, result: FitResult | None = None) -> dict:
         """Return the settings as a table file keeps them: with a limit of time, the steps are those of the result."""
@@ -127,7 +160,7 @@ class Fitted:
         table, result = self.table, self.result
         return {
             "interrupted": result.interrupted,
-            "task": table.task,
+            "task": (self.request and self.request.task) or table.task,
             "preset": table.preset,
             "bytes": table.nbytes,
             "storage": table.storage,
@@ -135,6 +168,7 @@ class Fitted:
             "measured": table.measured,
             "step": result.step,
             "seconds": result.seconds,
+            "unfinished": result.unfinished,
             "restarts": result.restarts,
             "history": result.history,
             **self.figures,
@@ -329,12 +363,16 @@ class Task:
         if fit := self._implementation("fit", "fit"):
             return fit(request)
         problem = self.problem(request)
-        result = request.train(problem)
-        table = self.table(problem, request)
-        table.preset, table.seed = request.preset, request.settings.seed
+
+        def stored() -> tuple[Table, dict[str, float]]:
+            table = self.table(problem, request)
+            table.preset, table.seed = request.preset, request.settings.seed
+            table = table.to(request.storage) if request.storage else table
+            return table, self.model(table, request.types.TensorXf).measure()
+
+        result = request.train(problem, finish=stored)
+        table, measured = stored()
         table.settings = {**request.recorded(result), **table.settings}
-        table = table.to(request.storage) if request.storage else table
-        measured = self.model(table, request.types.TensorXf).measure()
         table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
         return Fitted(table, result)
 
@@ -486,7 +524,7 @@ def fit(
     preset: str = "",
     variant: str | None = None,
     storage: str = "",
-    seconds: float | None = None,
+    seconds: float | Deadline | None = None,
     checkpoint: str | os.PathLike | None = None,
     resume: bool = False,
     progress: bool = True,
@@ -503,7 +541,7 @@ def fit(
     - ``variant``: variant of Mitsuba on whose device to train (``None``: the one that is set; the GPU if none is set
       and there is one).
     - ``storage``: storage form of the result ("": the task's default).
-    - ``seconds``: duration of the training, in place of ``steps``.
+    - ``seconds``: duration of everything in place of ``steps``: reading, preparation, training and measurement.
     - ``checkpoint``: file that keeps the state of the training, with which ``resume`` continues it.
     - ``progress``: show a progress bar in a terminal.
     - ``output``: file in which the table will be saved; nothing is written there.
@@ -527,6 +565,7 @@ def fit(
     arguments = {argument.name: argument for argument in chosen.arguments}
     options = {key: argument.default for key, argument in arguments.items()}
     fields = {f.name for f in dataclasses.fields(FitSettings)}
+    deadline = Deadline(seconds) if isinstance(seconds, (int, float)) else seconds
     for key, value in given.items():
         if key == "source" and key not in options:
             raise UsageError(f"{task}: found a source, but this task has none")
@@ -536,11 +575,13 @@ def fit(
         if key in options:
             options[key] = arguments[key].parsed(value)
     settings = chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options)
-    request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options, seconds)
+    request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options)
+    request.deadline, request.seconds = deadline, None if deadline is None else deadline.seconds
     request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
     request.output = None if output is None else table_path(output)
     if resume and seconds is not None:
         raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
+    request.task = task
     chosen.check(request)
     request.types = array_module(variant)
     fitted = chosen.fit(request)

@@ -29,6 +29,7 @@ from .files import replacing, writable_folder, write_json
 from .interrupt import interruptible
 from .plugins.support import footprint
 from .poses import frame_of, orbit_directions, pose, sphere_directions
+from .progress import progress_bar
 from .runtime import use_variant
 
 #: Shapes of the camera path.
@@ -236,7 +237,7 @@ def capture(
         writable_folder(folder / split, create=True)
         left += [(split, i) for i in range(len(views)) if not (folder / _name(split, i, settings)).is_file()]
     total, start, rendered, opaque = sum(map(len, splits.values())), time.perf_counter(), 0, bool(left)
-    bar = scenes.progress_bar("capture", total, "view", progress, initial=total - len(left))
+    bar = progress_bar("capture", total, "view", progress, initial=total - len(left))
     _write_lists(folder, settings, splits, box)
     with interruptible() as stop, bar:
         for split, i in left:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..arguments import add_arguments, natural, positive
+from ..deadline import Deadline
 from ..errors import UsageError
 from ..files import writable_file
 from ..settings import LOSSES, SCHEDULES, FittingError
@@ -47,7 +48,7 @@ def _add(sub, task: Task) -> None:
     variant_option(sub)
     length = sub.add_mutually_exclusive_group()
     length.add_argument("--steps", type=positive, help=f"optimisation steps (default: {_default(task, 'steps')})")
-    length.add_argument("--seconds", type=positive, help="length of the training in seconds, in place of steps")
+    length.add_argument("--seconds", type=positive, help="duration of the command in seconds, in place of steps")
     for name, text, options in SETTINGS:
         sub.add_argument(f"--{name}", **options, help=f"{text} (default: {_default(task, name)})")
     sub.add_argument(
@@ -71,6 +72,7 @@ def run(arguments) -> dict:
     After Ctrl-C, these are of the best state so far. Raises :class:`UsageError`,
     :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.
     """
+    deadline = None if arguments.seconds is None else Deadline(arguments.seconds)
     output = table_path(arguments.output)
     if arguments.checkpoint is not None and Path(arguments.checkpoint).resolve() == output.resolve():
         raise UsageError(f'"{output}" cannot be the output and the checkpoint')
@@ -82,7 +84,7 @@ def run(arguments) -> dict:
     set_variant(arguments.variant)
     try:
         fitted = fit(
-            task.name, preset=arguments.preset, storage=getattr(arguments, "storage", ""), seconds=arguments.seconds,
+            task.name, preset=arguments.preset, storage=getattr(arguments, "storage", ""), seconds=deadline,
             checkpoint=arguments.checkpoint, resume=arguments.resume, output=output,
             deterministic=not arguments.all_cores, **given,
         )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
@@ -23,6 +24,9 @@ from .stored_texture import budget_of, original_of, texture_file, texture_proble
 from .trained_scene import TrainedScene
 from .views import ViewDistribution, views_of
 
+#: Share of a limited time in which the references are rendered.
+REFERENCES = 0.4
+
 
 def fit(request: FitRequest) -> Fitted:
     """Train a texture of a scene as requested on the command line, in the active variant."""
@@ -37,7 +41,10 @@ def fit(request: FitRequest) -> Fitted:
         "bits": {name: a.bits for name, a in table.arrays.items()},
         "views": dataclasses.asdict(views),
     }
-    return Fitted(table, result, [f"{views.count} views, {recipe.spp} samples a pixel"], figures)
+    lines = [f"{views.count} views, {recipe.spp} samples a pixel"]
+    if (samples := table.settings.get("reference_samples", recipe.reference_spp)) < recipe.reference_spp:
+        lines.append(f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}")
+    return Fitted(table, result, lines, figures)
 
 
 def fit_scene(
@@ -71,6 +78,7 @@ def fit_scene(
     rendered = ReferenceRenders(
         parsed, views, recipe.reference_spp, references, recipe.against,
         without=(file,), inputs=(source.digest,), progress=request.progress,
+        deadline=request.part(REFERENCES).deadline,
     )  # fmt: skip
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
@@ -80,13 +88,19 @@ def fit_scene(
         [*zip(measured, images[len(trained) :], strict=True)], recipe, rendered.digest, preview,
     )  # fmt: skip
     problem.identity |= {"views": dataclasses.asdict(views)}
-    result = request.train(problem)
     identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
+
+    def stored(settings: Mapping) -> tuple[Table, dict[str, float]]:
+        trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net)), settings)
+        return trained_table, CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
+
+    result = request.train(problem, finish=lambda: stored(identity))
     settings = {**request.recorded(result), **identity, **request.paths(scene_path=parsed.path)}
-    trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net)), settings)
+    if rendered.samples < recipe.reference_spp:
+        settings["reference_samples"] = rendered.samples
+    trained_table, errors = stored(settings)
     trained_table.settings |= request.paths(source_path=source_path)
     trained_table.preset, trained_table.seed = request.preset, recipe.settings.seed
-    errors = CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
     errors["psnr_scene_db"] = result.measured["psnr_db"]
     trained_table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
     return trained_table, result

@@ -13,9 +13,11 @@ import mitsuba as mi
 import numpy as np
 
 from .. import __version__, plugins, scenes
+from ..deadline import Deadline
 from ..files import replacing, writable_folder
 from ..measure.store import fingerprint
 from ..plugins.support import footprint
+from ..progress import progress_bar
 from ..tasks import disney
 from .rig import Rig
 from .views import View, ViewDistribution
@@ -25,6 +27,9 @@ PASS = 1 << 23
 
 #: First seed of references; trained renders use smaller ones.
 SEEDS = 1 << 31
+
+#: Samples per pixel of a pass if time is limited.
+SHORT = 4
 
 
 @dataclass
@@ -36,6 +41,9 @@ class ReferenceRenders:
     scene and the files that it names, except those ``without`` influence, such as the table that is trained;
     ``inputs``, texts that stand for further files; the view, the samples, versions and the code of plugins. Files are
     replaced in one piece, after each pass. ``pass_samples``: samples of the whole image in one pass.
+
+    With a ``deadline``, each view gets an equal part of the time, and as many samples as fit; such images are not
+    kept. ``samples`` is the number of samples that all images have.
 
     Raises :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.files.OutputError`.
     """
@@ -49,6 +57,7 @@ class ReferenceRenders:
     inputs: Sequence[str] = ()
     progress: bool = True
     pass_samples: int = PASS
+    deadline: Deadline | None = None
     #: Number of passes that were rendered, and of images that were kept from an earlier run.
     rendered: int = 0
     reused: int = 0
@@ -57,7 +66,7 @@ class ReferenceRenders:
     def __post_init__(self):
         if self.folder is not None:
             self.folder = writable_folder(self.folder, create=True)
-        self.digest = self._digest()
+        self.digest, self.samples = self._digest(), self.spp
 
     def _digest(self) -> str:
         """Return a hash of everything that the images of all views depend on."""
@@ -85,25 +94,29 @@ class ReferenceRenders:
 
         The exact scene is dropped afterwards: Dr.Jit compiles the materials of all loaded scenes into every kernel.
         """
-        bar = scenes.progress_bar("references", len(views) * self.spp, "spp", self.progress)
+        bar = progress_bar("references", len(views) * self.spp, "spp", self.progress)
         try:
             with bar:
-                return [self._image(view, bar) for view in views]
+                return [self._image(view, bar, len(views) - i) for i, view in enumerate(views)]
         finally:
             self._loaded = None
             gc.collect()
 
-    def _image(self, view: View, bar) -> np.ndarray:
+    def _image(self, view: View, bar, left: int) -> np.ndarray:
+        """Return the image of a view; ``left`` views, this one included, share the time that is left."""
         path = self.path(view)
         total, done = self._kept(path)
         self.reused += done > 0
         bar.update(done)
         if done < self.spp:
             scene, rig, samples = self._scene()
+            deadline = None if self.deadline is None else self.deadline.part(1 / left)
+            if deadline is not None:
+                path, samples, total, done = None, min(samples, SHORT), 0.0, 0
             rig.place(view)
             footprint.attach(scene, 0, self.spp)
             seed = int(self._key(view)[:8], 16) % 2**19 << 12
-            while done < self.spp:
+            while done < self.spp and not (done and deadline is not None and deadline.passed):
                 n = min(samples, self.spp - done)
                 # The pass number follows from the finished samples: the same after an interruption
                 image = scenes.render_pass(scene, n, SEEDS + seed + done // samples % 2**12)
@@ -114,6 +127,7 @@ class ReferenceRenders:
                 if path is not None:
                     with replacing(path) as temporary:
                         np.savez(temporary, total=total, done=np.int64(done))
+        self.samples = min(self.samples, done)
         return scenes.colour_channels((total / done).astype(np.float32))
 
     def _kept(self, path: Path | None) -> tuple:

@@ -143,8 +143,8 @@ class PresetContender(Contender):
         import mitsuba as mi
 
         return task.fit(
-            self.task_name, self.preset, mi.variant(), progress=progress, output=self.file, deterministic=False,
-            **self.arguments(),
+            self.task_name, preset=self.preset, variant=mi.variant(), progress=progress, output=self.file,
+            deterministic=False, **self.arguments(),
         )  # fmt: skip
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:

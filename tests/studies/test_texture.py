@@ -240,7 +240,7 @@ def small(tmp_path, monkeypatch):
         requests.append((name, preset, seconds))
         options.pop("footprint_samples")
         if not fitted:
-            fitted.append(fit(name, "", variant, steps=STEPS, batch=2**12, **options))
+            fitted.append(fit(name, variant=variant, steps=STEPS, batch=2**12, **options))
         return fitted[0]
 
     monkeypatch.setattr(task, "fit", once)

@@ -220,7 +220,12 @@ def fit_image(
         result = FitResult({}, 0, 0, 0.0, False, 0)
     else:
         problem = problem_of(source, size, recipe, types, layout, border)
-        result = request.train(problem, title)
+
+        def finish() -> None:
+            stored = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), problem.identity)
+            CompressedImage.of(stored, types.TensorXf).measure(source)
+
+        result = request.train(problem, title, finish)
         settings = {**request.recorded(result), **problem.identity, "ratio": size.ratio}
         settings["structure"] = recipe.structure if recipe.structure != "auto" else _name_of(size)
         table = to_table(CompressedImage(layout, stored_form(problem.net, problem.bits)), settings)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,6 @@ import numpy as np
 from ... import units
 from ...errors import UsageError
 from ...fitting import FitResult, FittingError
-from ...fitting import fit as train
 from ...interrupt import interruptible
 from ...tables import StoredArray, Table, save_table
 from ...task import FitRequest, Fitted
@@ -32,6 +33,13 @@ VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 300, 2**15, 1e-2
 
 #: Share of the bytes of the supplement's arrays that the density gets.
 DENSITY_SHARE = 0.35
+
+#: Shares of a limited time: that of the grid, and, of what is left then, that of the training on its numbers.
+GRID_TIME, VALUE_TIME = 0.6, 0.2
+
+#: Held-out views of measurements during a training, and least steps of the first stage of the grid, if time is limited:
+#: a field that nobody sees has no second stage.
+WATCHED, FIRST_STEPS = 8, 100
 
 
 def check(request: FitRequest) -> None:
@@ -58,7 +66,8 @@ def fit(request: FitRequest) -> Fitted:
     Raises :class:`UsageError`, :class:`.views.ViewsError`, :class:`~mi_diffind.tables.TableError` and
     :class:`~mi_diffind.fitting.FittingError`.
     """
-    return FieldFit(request, FieldSession.load(request.types, request.options["source"])).run()
+    watched = None if request.deadline is None else WATCHED
+    return FieldFit(request, FieldSession.load(request.types, request.options["source"], watched)).run()
 
 
 @dataclasses.dataclass
@@ -91,7 +100,7 @@ class FieldFit:
         measured = session.held_out_images.evaluate(field)
         table.preset, table.seed = request.preset, request.settings.seed
         table.settings = {
-            **request.recorded(),
+            **request.recorded(result),
             "source": session.views.digest,
             **request.paths(capture_path=options["source"], grid_path=options["grid"] or None),
             "warnings": warnings,
@@ -101,6 +110,8 @@ class FieldFit:
         dense = dense_bytes(grid.nodes.shape)
         seconds = time.perf_counter() - start - grid_seconds
         lines = [f"{grid_seconds:.1f} s for the grid, {seconds:.1f} s for the rest"]
+        if layout != "grid" and grid_result is not None and grid_result.unfinished:
+            lines.append(f"the grid was trained for {grid_result.steps} steps: unfinished")
         size = getattr(field, "nbytes", None)
         if size:
             lines.append(f"{size:,} bytes in memory, {dense / size:.0f} times less than the dense grid of float32")
@@ -140,6 +151,7 @@ class FieldFit:
         )
         nodes = request.options["resolution"] or RESOLUTION
         stages_file = Path(f"{request.checkpoint}.grid.npz") if request.checkpoint else None
+        limited = request.part(GRID_TIME if request.preset != "grid" else 1.0)
         grid, finished, result = None, 0, None
         if stages_file is not None and request.resume and stages_file.exists():
             table = files.load(stages_file)
@@ -168,11 +180,17 @@ class FieldFit:
             )
             problem = grids.GridProblem(grid, self.session)
             checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
-            result = train(
-                problem, stage, checkpoint, request.resume and checkpoint is not None and os.path.exists(checkpoint),
-                request.progress, title=f"grid, {round(nodes * share)}³",
-                seconds=None if request.seconds is None or request.preset != "grid" else request.seconds * part,
-            )  # fmt: skip
+            stage_request = dataclasses.replace(
+                limited.part(part / sum(later for _, later in STAGES[number:])),
+                settings=stage,
+                checkpoint=checkpoint,
+                resume=request.resume and checkpoint is not None and os.path.exists(checkpoint),
+                seconds=None,
+            )
+            finish = functools.partial(self.finish_grid, problem) if last and request.preset == "grid" else None
+            result = stage_request.train(
+                problem, f"grid, {round(nodes * share)}³", finish, self.times, 1 if number else FIRST_STEPS
+            )
             grid = problem.trained()
             if result.interrupted or (result.asked_to_stop and not last):
                 return grid, dataclasses.replace(result, interrupted=True)
@@ -182,6 +200,17 @@ class FieldFit:
                 table.measured = result.measured
                 save_table(stages_file, table)
         return grid, result
+
+    def finish_grid(self, problem: grids.GridProblem) -> dict[str, float]:
+        """Measure the table of a grid, as at the end of the preset ``grid``."""
+        return self.session.watched_images.evaluate(
+            files.field_of(self.grid_table(problem.trained()), self.request.types)
+        )
+
+    @property
+    def times(self) -> float:
+        """Ratio of all held-out views and those of measurements during a training."""
+        return len(self.session.held_out) / len(self.session.watched_images.views)
 
     def visible(self, grid: NodeGrid) -> NodeGrid:
         """Return the part of a grid that the training views see."""
@@ -201,8 +230,8 @@ class FieldFit:
             return round(dense_bytes(grid.nodes.shape) / units.parse_compression(options["compression"]))
         return None
 
-    def train(self, problem: ImagesProblem, stopped: bool, suffix: str = "") -> FitResult:
-        """Train a problem through the images, with the checkpoint of the request and a ``suffix``.
+    def train(self, problem: ImagesProblem, stopped: bool, finish: Callable[[], object], suffix: str = "") -> FitResult:
+        """Train a problem through the images, with the checkpoint of the request and a ``suffix``; then ``finish``.
 
         If the training of the grid was ``stopped``, the problem is only measured, so that its state is kept; a resumed
         run then continues with the grid.
@@ -217,7 +246,7 @@ class FieldFit:
                 before = [f"{request.checkpoint}.{name}" for name in ("stage0", "grid.npz")]
                 resume = not suffix and not any(map(os.path.exists, before))
             request = dataclasses.replace(request, checkpoint=path, resume=resume)
-        return request.train(problem, title="through the images")
+        return request.train(problem, "through the images", finish, self.times)
 
     def sparse(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult, VolumeField]:
         """Compress a grid to density levels and a palette, in the bytes or to the PSNR that the options ask for."""
@@ -235,16 +264,22 @@ class FieldFit:
         """Train a palette of ``2**bits`` colours on a grid; return the table, the result and the field."""
         coding = compression.palette_coding(grid, bits, self.request.settings.seed)
         problem = compression.PaletteProblem(coding, self.session)
-        result = self.train(problem, stopped, suffix)
-        table = files.palette_table(grid.nodes, problem.stored(), bits)
-        return table, result, files.field_of(table, self.request.types)
+
+        def stored() -> tuple[Table, VolumeField]:
+            table = files.palette_table(grid.nodes, problem.stored(), bits)
+            return table, files.field_of(table, self.request.types)
+
+        result = self.train(problem, stopped, lambda: self.session.watched_images.evaluate(stored()[1]), suffix)
+        table, field = stored()
+        return table, result, field
 
     def smallest(self, grid: NodeGrid, psnr: float, stopped: bool):
         """Return the first size of :data:`LADDER` that reaches a PSNR in decibels over white, else the last one."""
         cells = grids.visible(grid, self.session.images)
         for number, (share, bits) in enumerate(LADDER):
             smaller = grids.divided(grid, cells, share)
-            fitted = self.compressed(smaller, bits, stopped, f".size{number}")
+            size = dataclasses.replace(self, request=self.request.part(1 / (len(LADDER) - number)))
+            fitted = size.compressed(smaller, bits, stopped, f".size{number}")
             reached = self.session.held_out_images.evaluate(fitted[2])["psnr_white_db"]
             print(f"{fitted[2].nbytes:,} bytes: {reached:.2f} dB over white", file=sys.stderr)
             if reached >= psnr or fitted[1].interrupted:
@@ -257,14 +292,19 @@ class FieldFit:
         nbytes = self.wanted_bytes(grid) or dense_bytes(grid.nodes.shape) / COMPRESSION
         visible = self.visible(grid)
         problem = self.pairs_problem(visible, nbytes, 0 if stopped else VALUE_STEPS)
-        result = self.train(problem, stopped)
-        arrays = {}
-        for name in ("density", "colour"):
-            pair = getattr(problem.net, name)
-            arrays[f"{name}_primary"] = StoredArray.of(pair.primary[0].quantised(8))
-            arrays[f"{name}_cascaded"] = StoredArray.of(pair.cascaded.quantised(8))
-        table = files.pairs_table(visible.nodes, arrays, problem.low, problem.high)
-        return table, result, files.field_of(table, self.request.types)
+
+        def stored() -> tuple[Table, VolumeField]:
+            arrays = {}
+            for name in ("density", "colour"):
+                pair = getattr(problem.net, name)
+                arrays[f"{name}_primary"] = StoredArray.of(pair.primary[0].quantised(8))
+                arrays[f"{name}_cascaded"] = StoredArray.of(pair.cascaded.quantised(8))
+            table = files.pairs_table(visible.nodes, arrays, problem.low, problem.high)
+            return table, files.field_of(table, self.request.types)
+
+        result = self.train(problem, stopped, lambda: self.session.watched_images.evaluate(stored()[1]))
+        table, field = stored()
+        return table, result, field
 
     def pairs_problem(self, grid: NodeGrid, nbytes: float, steps: int) -> paper.PairsProblem:
         """Return the arrays of the supplement in ``nbytes``, trained on the numbers of the grid for ``steps``."""
@@ -282,7 +322,8 @@ class FieldFit:
                 request.settings, steps=steps, batch=VALUE_BATCH, lr=VALUE_RATE, measure_every=steps
             )
             values = paper.ValuesProblem(net, field, grid)
-            train(values, settings, progress=request.progress, title="the numbers of the grid")
+            limited = dataclasses.replace(request.part(VALUE_TIME), settings=settings, checkpoint=None, resume=False)
+            dataclasses.replace(limited, seconds=None).train(values, "the numbers of the grid")
         return paper.PairsProblem(net, grid.nodes, low, high, self.session)
 
 

@@ -96,11 +96,13 @@ class FieldSession:
     held_out: CapturedViews
     #: False if the capture has no test views, so that ``held_out`` are the training views.
     has_test_views: bool = True
+    #: Most held-out views that are rendered at a measurement during a training (``None``: all).
+    watched: int | None = None
 
     @staticmethod
-    def load(types: ModuleType, folder) -> FieldSession:
+    def load(types: ModuleType, folder, watched: int | None = None) -> FieldSession:
         """Read the capture in a folder. Raises :class:`.views.ViewsError`."""
-        return FieldSession(types, load_views(folder, "train"), *load_held_out(folder))
+        return FieldSession(types, load_views(folder, "train"), *load_held_out(folder), watched)
 
     @functools.cached_property
     def images(self) -> ViewImages:
@@ -111,6 +113,14 @@ class FieldSession:
     def held_out_images(self) -> ViewImages:
         """Held-out views as Dr.Jit arrays."""
         return ViewImages(self.types, self.held_out)
+
+    @functools.cached_property
+    def watched_images(self) -> ViewImages:
+        """Held-out views for measurements during a training, evenly spread in the list."""
+        count = len(self.held_out)
+        if self.watched is None or self.watched >= count:
+            return self.held_out_images
+        return ViewImages(self.types, self.held_out.chosen(np.arange(self.watched) * count // self.watched))
 
 
 def load_held_out(folder) -> tuple[CapturedViews, bool]:
@@ -154,7 +164,7 @@ class ImagesProblem(Problem):
         return total * (1 / (3 * count))
 
     def measure(self, net):
-        return self.session.held_out_images.evaluate(self.field_of(net))
+        return self.session.watched_images.evaluate(self.field_of(net))
 
 
 def displayed(image: np.ndarray) -> np.ndarray:

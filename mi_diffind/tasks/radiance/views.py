@@ -11,6 +11,7 @@ opaque everywhere, so that its background becomes part of the field.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -68,6 +69,13 @@ class CapturedViews:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def chosen(self, numbers: np.ndarray) -> CapturedViews:
+        """Return the views with these ``numbers`` alone."""
+        return dataclasses.replace(
+            self, images=self.images[numbers], poses=self.poses[numbers], focal=self.focal[numbers],
+            centre=self.centre[numbers], names=tuple(self.names[i] for i in numbers),
+        )  # fmt: skip
 
     @property
     def height(self) -> int:

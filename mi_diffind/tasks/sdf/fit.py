@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 
 import drjit as dr
 import numpy as np
@@ -161,7 +162,11 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
         warnings = [*mesh.warnings, *distances.warnings]
         for warning in warnings:
             print(f"warning: {warning}", file=sys.stderr)
-        lines = []
+        lines, evaluation = [], SurfaceEvaluation(mesh, distances, measured)
+
+        def measure(field) -> tuple[dict[str, float], int]:
+            return evaluation.measure(field), lost_pieces(field, distances)
+
         if request.preset == "sparse":
             sampled = search_grid(distances, nbytes, request.options["bits"])
             if sampled.missed > THIN:
@@ -170,12 +175,11 @@ def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, h
                     f"change of sign: parts may be thinner than a cell, 1/{1 / sampled.structure.spacing:.0f} of the "
                     f"longest side: more --bytes help"
                 )
-            table, result, field = fit_sparse(distances, sampled, request, held_out)
+            table, result, field = fit_sparse(distances, sampled, request, held_out, measure)
         else:
-            table, result, field = fit_pair(distances, nbytes, request, samples, held_out)
+            table, result, field = fit_pair(distances, nbytes, request, samples, held_out, measure)
         prepared = time.perf_counter() - start - result.seconds
-        errors = SurfaceEvaluation(mesh, distances, measured).measure(field)
-        lost = lost_pieces(field, distances)
+        errors, lost = measure(field)
     if lost:
         count = distances.surface.components
         lines.append(f"{lost} of {count} pieces of the mesh are too small for the field: more --bytes help")
@@ -244,20 +248,34 @@ def entries_for(sampled: encoding.SampledNodes, bits: int) -> int:
     return max(1, min(2**bits, sampled.structure.nodes))
 
 
-def fit_sparse(distances: Distances, sampled: encoding.SampledNodes, request: FitRequest, held_out: int = HELD_OUT):
-    """Train and encode the nodes of a sampled grid: ``(table, training result, field)``."""
+def fit_sparse(
+    distances: Distances,
+    sampled: encoding.SampledNodes,
+    request: FitRequest,
+    held_out: int = HELD_OUT,
+    measure: Callable[[SparseNodes], object] = lambda field: None,
+):
+    """Train and encode the nodes of a sampled grid: ``(table, training result, field)``.
+
+    ``measure`` is the measurement that will follow, for which a limit of time leaves room.
+    """
     bits, structure, types = request.options["bits"], sampled.structure, request.types
     held = HeldOut(distances, types, structure.spacing, count=held_out)
     problem = NodeProblem(SparseNodes(types, structure, 1.0), distances.surface, sampled, bits, held)
-    result = request.train(problem)
-    coding = encoding.NodeCoding(sampled, bits, request.settings.seed)
-    coding.encode(problem.values())
-    words = codes.pointer_words(coding.pointers, bits)
-    nodes = coding.values().astype(np.float64)
-    slope = slope_bound(nodes[:, 0], nodes[:, 1:], sampled.corners)
-    settings = {
-        "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": bits,
-        "nodes": structure.nodes, "slope": slope,
-    }  # fmt: skip
-    table = Table("sdf", sparse_arrays(structure, coding.frames, words, coding.entries), settings=settings)
-    return table, result, coded_field(types, structure, slope, coding.frames, words, bits, coding.entries)
+
+    def stored() -> tuple[Table, SparseNodes]:
+        coding = encoding.NodeCoding(sampled, bits, request.settings.seed)
+        coding.encode(problem.values())
+        words = codes.pointer_words(coding.pointers, bits)
+        nodes = coding.values().astype(np.float64)
+        slope = slope_bound(nodes[:, 0], nodes[:, 1:], sampled.corners)
+        settings = {
+            "layout": "sparse", "lower": list(structure.lower), "spacing": structure.spacing, "bits": bits,
+            "nodes": structure.nodes, "slope": slope,
+        }  # fmt: skip
+        table = Table("sdf", sparse_arrays(structure, coding.frames, words, coding.entries), settings=settings)
+        return table, coded_field(types, structure, slope, coding.frames, words, bits, coding.entries)
+
+    result = request.train(problem, finish=lambda: measure(stored()[1]))
+    table, field = stored()
+    return table, result, field

@@ -7,6 +7,8 @@ distance itself.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
@@ -205,10 +207,18 @@ class PairProblem(Problem):
             return errors
 
 
-def fit_pair(distances: Distances, nbytes: int, request: FitRequest, samples: int = SAMPLES, held_out: int = HELD_OUT):
+def fit_pair(
+    distances: Distances,
+    nbytes: int,
+    request: FitRequest,
+    samples: int = SAMPLES,
+    held_out: int = HELD_OUT,
+    measure: Callable[[PairField], object] = lambda field: None,
+):
     """Fit dense arrays of ``nbytes`` bytes: ``(table, training result, field)``.
 
-    ``samples`` and ``held_out`` are the numbers of training samples and of points measured on the way. Raises
+    ``samples`` and ``held_out`` are the numbers of training samples and of points measured on the way;
+    ``measure`` is the measurement that will follow, for which a limit of time leaves room. Raises
     :class:`~mi_diffind.errors.UsageError` if even the smallest arrays are larger.
     """
     mesh, options = distances.mesh, request.options
@@ -242,13 +252,17 @@ def fit_pair(distances: Distances, nbytes: int, request: FitRequest, samples: in
     field = PairField(request.types, net, lower, upper, band, 1.0)
     held = HeldOut(distances, request.types, spacing / 2, count=held_out)
     problem = PairProblem(field, mesh, unit, d, held)
-    result = request.train(problem)
-    stored = stored_form(problem.net)
-    slope = slope_of(stored, lower, upper, band)
+
+    def quantised() -> tuple[PairField, Indirection]:
+        stored = stored_form(problem.net)
+        return PairField(request.types, stored, lower, upper, band, slope_of(stored, lower, upper, band)), stored
+
+    result = request.train(problem, finish=lambda: measure(quantised()[0]))
+    field, stored = quantised()
     arrays = {"primary": StoredArray.of(stored.primary[0]), "cascaded": StoredArray.of(stored.cascaded)}
     settings = {
-        "layout": "pair", "lower": lower.tolist(), "upper": upper.tolist(), "band": band, "slope": slope,
+        "layout": "pair", "lower": lower.tolist(), "upper": upper.tolist(), "band": band, "slope": field.slope,
         "ratio": primary[0] / cascaded[0], "start": start,
     }  # fmt: skip
     table = Table("sdf", arrays, settings=settings)
-    return table, result, PairField(request.types, stored, lower, upper, band, slope)
+    return table, result, field

@@ -36,6 +36,9 @@ def recipe_of(preset: str, settings, options) -> ShadingRecipe:
 #: direction dominate the PSNR.
 PAIRS, SIDE = 32, 48
 
+#: Share of the time in which the arrays are trained as a texture, if time is limited.
+PRETRAINING = 0.4
+
 
 def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that exclude each other."""
@@ -51,8 +54,9 @@ def check(request: FitRequest) -> None:
 def fit(request: FitRequest) -> Fitted:
     """Train as a texture, unless a trained one is given, then for shading, and measure the result.
 
-    Each training takes half of a given time. Raises :class:`UsageError`, :class:`~mi_diffind.maps.source.SourceError`,
-    :class:`~mi_diffind.tables.TableError` and :class:`~mi_diffind.fitting.FittingError`.
+    If time is limited, the first training takes :data:`PRETRAINING` of what is left. Raises :class:`UsageError`,
+    :class:`~mi_diffind.maps.source.SourceError`, :class:`~mi_diffind.tables.TableError` and
+    :class:`~mi_diffind.fitting.FittingError`.
     """
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
@@ -67,10 +71,7 @@ def fit(request: FitRequest) -> Fitted:
     else:
         start, result = pretrained(source, pyramid, recipe, request)
     if result is None or not result.interrupted:
-        seconds = request.seconds
-        shading_request = dataclasses.replace(
-            request, seconds=seconds if result is None or seconds is None else seconds / 2
-        )
+        shading_request = dataclasses.replace(request)
         if shading_request.resume and not os.path.exists(shading_request.checkpoint or ""):
             shading_request.resume = False  # the training as a texture was interrupted
         evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
@@ -127,8 +128,7 @@ def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequ
     size = texture_fit.size_of(source, pyramid, requested_bytes(options, source), texture, options)
     checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
     first = dataclasses.replace(
-        request, preset=recipe.texture, checkpoint=checkpoint, options=options,
+        request.part(PRETRAINING), preset=recipe.texture, checkpoint=checkpoint, options=options,
         resume=request.resume and os.path.exists(checkpoint or ""),
-        seconds=None if request.seconds is None else request.seconds / 2,
     )  # fmt: skip
     return textures.fit_texture(source, size, texture, first, pyramid)

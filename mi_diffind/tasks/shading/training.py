@@ -131,7 +131,11 @@ def fit_shading(
     request = dataclasses.replace(request, settings=recipe.settings)
     validation = None if evaluation is None else evaluation.another()
     problem = ShadingProblem(start, pyramid, recipe, source.digest, validation)
-    first, before = textures.stored_form(start), {} if validation is None else problem.measure(start)
+    first, before = textures.stored_form(start), {}
+    if validation is not None:
+        # The measurement of the result takes as long
+        begin = request.deadline.rehearse if request.deadline is not None else lambda measure: measure()
+        before = begin(lambda: problem.measure(start))
     problem.preview = preview
     result = request.train(problem, "shading")
     kept = any(before[name] > result.measured[name] for name in list(before)[:1])

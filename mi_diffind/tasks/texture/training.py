@@ -187,8 +187,13 @@ def fit_texture(
         result = FitResult({}, 0, 0, 0.0, False, 0)
     else:
         problem = problem_of(source, size, recipe, pyramid)
-        result = request.train(problem)
         identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
+
+        def finish() -> None:
+            stored = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net)), identity)
+            CompressedTexture.of(stored, request.types.TensorXf).measure(source)
+
+        result = request.train(problem, finish=finish)
         settings = {**request.recorded(result), **identity}
         table = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net)), settings)
     table.preset, table.seed = request.preset, recipe.settings.seed

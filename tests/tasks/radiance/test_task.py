@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mi_diffind import fitting
 from mi_diffind.cli import main
 from mi_diffind.fitting import FitSettings
 from mi_diffind.fitting import fit as train
@@ -181,7 +182,7 @@ def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return train(problem, settings, *args, **kwargs)
 
-    monkeypatch.setattr(field_fit, "train", stopping)
+    monkeypatch.setattr(fitting, "fit", stopping)
     checkpoint = tmp_path / "state"
     with pytest.raises(KeyboardInterrupt):
         fit("field", preset="grid", progress=False, checkpoint=checkpoint, **options)
@@ -206,7 +207,7 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
     checkpoint = tmp_path / "state"
     options = {"source": str(folder), "resolution": 24, "batch": 512, "steps": 4, "variant": "llvm_ad_rgb"}
     with monkeypatch.context() as patch:
-        patch.setattr(field_fit, "train", stopping)
+        patch.setattr(fitting, "fit", stopping)
         kept = tmp_path / "grid.npz"
         found = fit("field", progress=False, checkpoint=checkpoint, grid=str(kept), **options)
     assert not kept.exists()

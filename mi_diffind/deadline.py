@@ -1,0 +1,60 @@
+"""Time limit of a whole command, shared by its stages. Importing this imports no Dr.Jit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from . import compat
+
+#: Least time that a stage is given, in seconds: a stage that comes too late still takes one step.
+LEAST = 1e-3
+
+
+class Deadline:
+    """Moment at which a command is to be over, ``seconds`` after the deadline was created.
+
+    A training takes the time that is left, a stage before another one a part of it. The reserve is the time of what
+    follows the last training, such as the measurement of the result: nobody gets it.
+    """
+
+    def __init__(self, seconds: float):
+        self.seconds, self.reserve = seconds, 0.0
+        self.end = time.perf_counter() + seconds
+
+    def left(self) -> float:
+        """Return the seconds that are left for trainings, at least :data:`LEAST`."""
+        return max(LEAST, self.end - time.perf_counter() - self.reserve)
+
+    @property
+    def passed(self) -> bool:
+        """True if no time is left for trainings."""
+        return self.left() <= LEAST
+
+    def part(self, share: float) -> Deadline:
+        """Return the deadline of a stage that takes a ``share`` of the seconds that are left."""
+        return Deadline(share * self.left())
+
+    def rehearse(self, finish: Callable[[], object], times: float = 1.0) -> object:
+        """Carry out ``finish``, return its result, and add its duration to the reserve.
+
+        It stands for what follows the last training and takes ``times`` as long.
+        """
+        result, seconds = duration(finish)
+        self.reserve += times * seconds
+        return result
+
+
+def duration(work: Callable[[], object]) -> tuple[object, float]:
+    """Carry out ``work``; return its result, and the seconds that another call takes, without compiling kernels."""
+    import drjit as dr
+
+    dr.sync_thread()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        start = time.perf_counter()
+        result = work()
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+        compiled = compat.compile_seconds(dr.kernel_history())
+    return result, max(0.0, seconds - compiled)

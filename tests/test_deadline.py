@@ -1,0 +1,122 @@
+"""Limits of the time of whole commands, and progress where stderr is no terminal; by a clock of their own."""
+
+import io
+
+import drjit as dr
+import drjit.llvm.ad as types
+import pytest
+
+from mi_diffind import fitting, progress
+from mi_diffind.deadline import Deadline
+from mi_diffind.fitting import FitSettings, Problem, fit
+from mi_diffind.task import FitRequest
+
+
+class Clock:
+    """A clock that stands still unless the work of a test takes time."""
+
+    now = 100.0
+
+    def take(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(fitting.time, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr("tqdm.std.time", lambda: clock.now)
+    monkeypatch.setattr("mi_diffind.compat.compile_seconds", lambda history: 0.0)
+    return clock
+
+
+class Slow(Problem):
+    """One number; a step and a measurement take the given seconds."""
+
+    def __init__(self, clock, step, measurement):
+        self.clock, self.step, self.measurement = clock, step, measurement
+        self.net = {"x": types.TensorXf([1.0])}
+
+    def loss(self, net, rng, size):
+        self.clock.take(self.step)
+        return dr.square(net["x"].array - 0.5)
+
+    def measure(self, net):
+        self.clock.take(self.measurement)
+        return {"psnr_db": 1.0}
+
+
+def settings(steps=1000):
+    return FitSettings(steps=steps, batch=1, measure_every=max(1, steps // 10))
+
+
+def request(seconds, **options):
+    return FitRequest("", settings(), types, progress=False, deadline=Deadline(seconds), seconds=seconds, **options)
+
+
+def test_parts_and_what_follows_share_the_time(clock):
+    deadline = Deadline(40)
+    clock.take(4)
+    assert deadline.rehearse(lambda: clock.take(3) or "figures", times=2) == "figures"
+    assert deadline.left() == 40 - 4 - 3 - 6
+    stage = deadline.part(1 / 3)
+    clock.take(5)
+    assert stage.left() == 4 and deadline.left() == 22 and not stage.passed
+    clock.take(4)
+    assert stage.passed and not deadline.passed and 0 < stage.left() < 0.01
+
+
+@pytest.mark.parametrize(("step", "measurement", "ending"), [(0.1, 0.05, 2), (1, 3, 5), (2.5, 0.1, 0.1), (0.5, 8, 4)])
+def test_a_limit_bounds_reading_training_and_measuring(clock, step, measurement, ending):
+    start, limited = clock.now, request(40)
+    clock.take(6)  # reading
+    result = limited.train(Slow(clock, step, measurement), finish=lambda: clock.take(ending))
+    clock.take(ending)
+    assert 34 <= clock.now - start <= 46
+    assert result.steps > 3 and result.unfinished == (result.steps < 50)
+
+
+def test_measurements_that_take_long_are_fewer(clock):
+    result = fit(Slow(clock, 0.1, 4), settings(), progress=False, seconds=40)
+    assert len(result.history) == 3 and result.history[-1]["step"] == result.steps
+
+
+def test_too_few_steps_are_unfinished(clock):
+    limited = request(10)
+    clock.take(12)
+    result = limited.train(Slow(clock, 2, 1))
+    assert result.steps == 1 and result.outcome == "1 step: unfinished, best step 1"
+    assert limited.train(Slow(clock, 2, 1), least=7).steps == 7
+    assert fit(Slow(clock, 1, 1), settings(20), progress=False, seconds=20).outcome.startswith("best step")
+
+
+@pytest.fixture
+def log(monkeypatch):
+    """What is written to a stderr that is no terminal."""
+    log = io.StringIO()
+    monkeypatch.setattr(progress, "in_terminal", lambda: False)
+    monkeypatch.setattr(progress, "sys", type("sys", (), {"stderr": log}))
+    return log
+
+
+def test_lines_of_a_training_in_a_log(clock, log):
+    fit(Slow(clock, 0.5, 0), FitSettings(steps=100, batch=1, measure_every=20), title="a curve")
+    lines = log.getvalue().splitlines()
+    assert "\r" not in log.getvalue()
+    assert lines[1].startswith("a curve: step 40 of 100, 00:30 left, loss=") and "psnr_db=1.00" in lines[1]
+    assert [line.split()[3] for line in lines[:5]] == ["20", "40", "60", "80", "100"]
+
+
+def test_lines_of_a_limited_training_in_a_log(clock, log):
+    fit(Slow(clock, 0.5, 0), settings(), title="timed", seconds=40)
+    lines = log.getvalue().splitlines()
+    assert 3 <= len(lines) <= 5 and all(line.startswith("timed: step ") and " left" in line for line in lines)
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_short_and_quiet_jobs_write_no_line(clock, log, shown):
+    with progress.progress_bar("render", 10, progress=shown) as bar:
+        for _ in range(10):
+            clock.take(0.5 if shown else 50)
+            bar.update()
+    assert log.getvalue() == ""
