@@ -7,6 +7,7 @@ from pathlib import Path
 from .. import units
 from ..arguments import Argument, checked, decibels, positive
 from ..errors import UsageError
+from ..tables import MAX_BYTES
 from .source import NONFINITE, Source
 
 _SIZES = (
@@ -54,9 +55,12 @@ def requested_bytes(options, source: Source) -> int:
     if not any(given.values()):
         given["compression"] = 12
     try:
-        return units.parse_size(source.nbytes, source.texels, **given)
+        wanted = units.parse_size(source.nbytes, source.texels, **given)
     except ValueError as e:
         raise UsageError(str(e)) from None
+    if options["bytes"] is not None:
+        units.check_size("--bytes", wanted, MAX_BYTES)
+    return wanted
 
 
 def requested_border(options) -> tuple[str, str] | None:
