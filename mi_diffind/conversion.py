@@ -251,5 +251,5 @@ def summary(conversions: Sequence[Conversion | Mapping]) -> list[str]:
     lines = []
     for stock, learned in dict.fromkeys((c.stock, c.learned) for c in replaced):
         count = sum((c.stock, c.learned) == (stock, learned) for c in replaced)
-        lines.append(f"learned     {count} x {stock} → {learned}")
+        lines.append(f"replaced    {count} x {stock} → {learned}")
     return [*lines, *(f"kept        {c}" for c in conversions if not c.learned)]

@@ -1,5 +1,6 @@
 """Conversion of scenes: what replaces Mitsuba's plugins, what stays and why, and fits that are not repeated."""
 
+import json
 import struct
 import zlib
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mi_diffind import conversion, scenes
+from mi_diffind import comparison, conversion, scenes
 from mi_diffind.errors import UsageError
 from mi_diffind.tasks.sdf import serialized
 from mi_diffind.tasks.sdf.mesh import MeshError, load_mesh
@@ -70,7 +71,7 @@ def test_a_converted_scene_shows_the_same(mi_rgb, folder):
         ("path", "path_sdf", "path"),
     ]  # fmt: skip
     assert [task for task, _ in fits] == ["sdf", "texture"]
-    assert conversion.summary(conversions)[0] == "learned     1 x ply → neural_sdf"
+    assert conversion.summary(conversions)[0] == "replaced    1 x ply → neural_sdf"
     (folder / "other").mkdir()
     conversion.write_scene(scene, folder / "other" / "new.xml")
     learned = scenes.render(scenes.load(folder / "other" / "new.xml"), 16)[0]
@@ -112,6 +113,33 @@ def test_what_stays_is_named_with_the_reason(mi_rgb, folder, group, objects, nam
     assert conversion.summary([one]) == [f"kept        {one}"]
     stays = scene.change(lambda state: [node.props.plugin_name() for node in state.nodes])
     assert one.stock in stays and "path" in stays
+
+
+def test_the_command_and_a_comparison_with_the_stock_scene(mi_rgb, tmp_path, capsys):
+    import mi_diffind
+    from mi_diffind.cli import main
+
+    materials = '<bsdf type="principled" id="Clay"/><bsdf type="principled" id="Glass"><float name="spec_trans" '
+    ball = 'value="1"/></bsdf><shape type="sphere"><ref id="Clay"/></shape>'
+    parsed(tmp_path, materials + ball)
+    scene, new = str(tmp_path / "scene.xml"), tmp_path / "new.xml"
+    arguments = ["-o", str(new), "--json", str(tmp_path / "a.json"), "--variant", mi_rgb.variant()]
+    assert main(["convert", scene, *arguments]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed == [
+        "replaced    1 x principled → neural_disney",
+        'kept        principled "Glass": transmits light (spec_trans), which the Disney BRDF does not',
+        f"scene       {new}",
+    ]  # fmt: skip
+    assert [c["learned"] for c in json.loads((tmp_path / "a.json").read_text())["conversions"]] == ["neural_disney", ""]
+    assert new.read_text().count("neural_disney") == 1 and not (tmp_path / "new_tables").exists()
+    for output, fault in (("scene.xml", "is the scene itself"), ("new.json", "allowed is .xml")):
+        assert main(["convert", scene, "-o", str(tmp_path / output)]) == 2 and fault in capsys.readouterr().err
+    result = mi_diffind.compare(scene, 8, learn=["principled"], progress=False)
+    assert comparison.truth_label(result.figures) == "stock (principled), 8 spp" and result.further == ()
+    assert printed[:2] == str(result).splitlines()[3:5] and result.figures["psnr_db"] > 25
+    same = mi_diffind.compare(new, 8, against="principled", progress=False)
+    np.testing.assert_allclose(same.written, result.written, atol=1e-4)
 
 
 def test_unknown_groups_are_refused(mi_rgb, folder):

@@ -92,4 +92,4 @@ def run(arguments) -> dict:
         raise FittingError(str(e)) from e
     fitted.save(output)
     print("\n".join(fitted.summary(output)))
-    return {"output": str(output), **fitted.report}
+    return {"output": str(output), **fitted.report, "task": task.name}

@@ -84,10 +84,11 @@ def fit(request: FitRequest) -> Fitted:
     else:
         table = start
     table.settings |= request.paths(source_path=options["source"])
-    lines = [
-        f"{labelled({name: value})[0]} before the training for the shading"
-        for name, value in table.settings.get("before", {}).items()
-    ]
+    before, lines = table.settings.get("before", {}), []
+    if before:
+        lines.append(
+            "before the training for the shading: " + ", ".join(map(" ".join, map(str.split, labelled(before))))
+        )
     lines += [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
@@ -96,7 +97,7 @@ def fit(request: FitRequest) -> Fitted:
     not_shaded = material.left_out(pyramid.layout)
     lines += [f"not shaded: {name} ({reason})" for name, reason in not_shaded.items()]
     figures = {
-        "before": table.settings.get("before", {}),
+        "before": before,
         "source_bytes": source.nbytes,
         "compression": source.nbytes / table.nbytes,
         "effects_in_use": list(effects.names),

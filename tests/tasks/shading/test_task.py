@@ -333,6 +333,7 @@ def test_training_for_shading_gains(start, ad):
     new = evaluation.measure(reader(CompressedTexture.of(found, ad.TensorXf), effects, decoder), flip=False)
     assert new["C"]["coarse_db"] > old["C"]["coarse_db"] + 1.5
     assert found.measured["shaded_converged_db"] == pytest.approx(new["C"]["mean_db"], abs=1e-3)
+    assert found.settings["before"]["shaded_converged_db"] == pytest.approx(old["C"]["mean_db"], abs=1e-3)
     assert found.task == "texture" and found.settings["shading"]["share"] == 0.9
     arrays = DISNEY.open(ad.TensorXf, storage="uint8").arrays
     for name, values in before.items():
