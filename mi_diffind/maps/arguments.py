@@ -7,7 +7,6 @@ from pathlib import Path
 from .. import units
 from ..arguments import Argument, checked, decibels, positive
 from ..errors import UsageError
-from ..tables import MAX_BYTES
 from .source import NONFINITE, Source
 
 _SIZES = (
@@ -51,6 +50,8 @@ DECODED = (
 
 def requested_bytes(options, source: Source) -> int:
     """Return the bytes of the options :data:`SIZES`, by default a twelfth of the source's. Raises UsageError."""
+    from ..tables import MAX_BYTES
+
     given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
     if not any(given.values()):
         given["compression"] = 12
