@@ -20,6 +20,7 @@ from .errors import UsageError
 from .interrupt import interruptible
 from .progress import progress_bar
 from .runtime import use_variant
+from .units import check_memory
 
 #: Samples per pixel of a pass, after each of which Ctrl-C may end the rendering.
 PASS = 16
@@ -143,6 +144,8 @@ def render(
     ready = time.perf_counter()
     spp = spp or loaded.sensors()[0].sampler().sample_count()
     if orbit:
+        width, height = scenes.film_size(loaded)
+        check_memory("orbit", orbit, 16 * orbit * width * height)
         with interruptible() as stop, progress_bar("orbit", orbit, "frame", progress) as bar:
             frames = orbits.orbit(loaded, orbit, centre, spp=spp, seed=seed, on_frame=bar.update, stop=stop)
         interrupted, done = len(frames) < orbit, spp

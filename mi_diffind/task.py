@@ -107,7 +107,7 @@ class FitRequest:
     def part(self, share: float) -> FitRequest:
         """Return the request for a stage that takes a ``share`` of the time that is left, if time is limited."""
         if self.deadline is None:
-            return dataclasses.replace(self)
+            return self
         return dataclasses.replace(self, deadline=self.deadline.part(share))
 
     def recorded(self, result: FitResult | None = None) -> dict:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Mapping
+
+from .errors import UsageError
 
 _NUMBER = r"(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
 #: End of the name of a figure → its unit and the digits after the point.
@@ -42,6 +45,30 @@ def parse_bytes(text: str | float) -> int:
     if not 1 <= value < 2**63:
         raise ValueError(f"{text!r} is {value:.3g} bytes, allowed are 1 to 2⁶³")
     return round(value)
+
+
+def memory() -> int:
+    """Return the bytes of memory of this machine; 64 GiB where the system does not say."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 2**36
+
+
+def check_memory(name: str, value: float, nbytes: float) -> None:
+    """Refuse a ``value`` of an option that takes about ``nbytes`` bytes of memory.
+
+    Raises :class:`~mi_diffind.errors.UsageError` if the machine has less.
+    """
+    if nbytes > memory():
+        needed, there = (f"{n / 2**30:,.0f} GiB" for n in (nbytes, memory()))
+        raise UsageError(f"{name}: found {value:,}, which takes about {needed} of memory, this machine has {there}")
+
+
+def check_size(name: str, value: float, most: float) -> None:
+    """Refuse a number of bytes above ``most``, as of a table file. Raises :class:`~mi_diffind.errors.UsageError`."""
+    if value > most:
+        raise UsageError(f"{name}: found {value:,} bytes, a table file holds at most {most:,}")
 
 
 def parse_size(

@@ -31,6 +31,10 @@ from .plugins.support import footprint
 from .poses import frame_of, orbit_directions, pose, sphere_directions
 from .progress import progress_bar
 from .runtime import use_variant
+from .units import check_memory
+
+#: Bytes of memory for a sample of a pass and for the camera of a view, roughly.
+SAMPLE, VIEW = 512, 1024
 
 #: Shapes of the camera path.
 PATHS = ("sphere", "orbit")
@@ -96,6 +100,8 @@ class CaptureSettings:
         for name, least in (("views", 1), ("test", 0), ("resolution", 1), ("spp", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ {least}")
+        check_memory("resolution", self.resolution, SAMPLE * self.resolution**2)
+        check_memory("views", self.views + self.test, VIEW * (self.views + self.test))
         if not 0 < self.fov < 170:
             raise ValueError(f"fov: found {self.fov:g}, allowed are degrees between 0 and 170")
         if self.radius is not None and not 0 < self.radius < math.inf:

@@ -4,12 +4,16 @@ import io
 
 import drjit as dr
 import drjit.llvm.ad as types
+import numpy as np
 import pytest
 
 from mi_diffind import fitting, progress
 from mi_diffind.deadline import Deadline
+from mi_diffind.errors import UsageError
 from mi_diffind.fitting import FitSettings, Problem, fit
-from mi_diffind.task import FitRequest
+from mi_diffind.maps.arguments import requested_bytes
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.task import FitRequest, tasks
 
 
 class Clock:
@@ -120,3 +124,44 @@ def test_short_and_quiet_jobs_write_no_line(clock, log, shown):
             clock.take(0.5 if shown else 50)
             bar.update()
     assert log.getvalue() == ""
+
+
+#: What asks for too much of a machine of 16 GiB, and the sentence.
+TOO_MUCH = {
+    "sdf, bytes": (lambda: started("sdf", bytes="100G"), "--bytes: found 107,374,182,400 bytes, a table file holds"),
+    "sdf, memory": (lambda: started("sdf", bytes="512M"), "--bytes: found 536,870,912, which takes about 32 GiB"),
+    "field": (
+        lambda: started("field", resolution=100_000),
+        "--resolution: found 100,000, which takes about 22,351,742",
+    ),
+    "field, bytes": (lambda: started("field", bytes="100G"), "--bytes: found 107,374,182,400 bytes"),
+    "image": (lambda: image("100G"), "--bytes: found 107,374,182,400 bytes, a table file holds at most 1,073,741,824"),
+    "capture": (lambda: capture(resolution=100_000), "resolution: found 100,000, which takes about"),
+    "views": (lambda: capture(views=10**9), "views: found 1,000,000,"),
+}
+
+
+def started(task, **options):
+    chosen = tasks()[task]
+    options = {argument.name: argument.default for argument in chosen.arguments} | {"source": "x"} | options
+    chosen.check(FitRequest(next(iter(chosen.presets)), settings(), types, options=options))
+
+
+def capture(**options):
+    from mi_diffind.view_capture import CaptureSettings
+
+    CaptureSettings(**options).check()
+
+
+def image(nbytes):
+    source = from_arrays({"image": np.zeros((4, 4, 3), np.float32)})
+    requested_bytes({"compression": None, "bpp": None, "bytes": nbytes}, source)
+
+
+@pytest.mark.parametrize("name", TOO_MUCH)
+def test_what_takes_too_much_is_refused(name, monkeypatch):
+    monkeypatch.setattr("mi_diffind.units.memory", lambda: 2**34)
+    action, sentence = TOO_MUCH[name]
+    with pytest.raises((UsageError, ValueError)) as error:
+        action()
+    assert str(error.value).startswith(sentence)

@@ -50,13 +50,18 @@ DECODED = (
 
 def requested_bytes(options, source: Source) -> int:
     """Return the bytes of the options :data:`SIZES`, by default a twelfth of the source's. Raises UsageError."""
+    from ..tables import MAX_BYTES
+
     given = {k: options[k] for k in ("compression", "bpp")} | {"nbytes": options["bytes"]}
     if not any(given.values()):
         given["compression"] = 12
     try:
-        return units.parse_size(source.nbytes, source.texels, **given)
+        wanted = units.parse_size(source.nbytes, source.texels, **given)
     except ValueError as e:
         raise UsageError(str(e)) from None
+    if options["bytes"] is not None:
+        units.check_size("--bytes", wanted, MAX_BYTES)
+    return wanted
 
 
 def requested_border(options) -> tuple[str, str] | None:

@@ -19,6 +19,12 @@ from .training import dims_of, fit_image, layout_of, structure_of
 #: Share of the steps that a candidate of a search is trained for.
 SHORT = 1 / 8
 
+#: Share of a limited time for such a search, and the number of candidates that share it; the best is trained longer.
+SEARCHED, CANDIDATES = 2 / 3, 16
+
+#: Most trainings of a search by quality whose time is limited.
+LIMITED = 4
+
 #: Sides of the cascaded array that a search tries, by its dimensions.
 SIDES = {1: (64, 256), 2: (16, 32, 64), 3: (8, 16, 32), 4: (4, 8, 12, 16)}
 
@@ -77,18 +83,23 @@ def ratio_search(
     and the dimensions. The best so far is kept after each. ``request`` and ``border`` are those of :func:`.fit_image`.
     """
     steps = max(20, round(recipe.settings.steps * SHORT))
-    tried, tables = [], []
+    tried, tables, limit = [], [], request.part(SEARCHED).deadline
 
     def attempt(recipe: ImageRecipe, side: int) -> bool:
         """Train a candidate, unless it is known or too large; returns whether the training was interrupted."""
         size = sized(source, nbytes, recipe, side)
         structure, recipe = structure_of(source, recipe, nbytes), dataclasses.replace(recipe, dims=size.dims)
         known = any((t["dims"], t["structure"], t["cascaded"]) == (recipe.dims, structure, side) for t in tried)
+        if tried and limit is not None and limit.left() < limit.seconds / CANDIDATES:
+            return False
         if known or size.nbytes > nbytes * (1 + memory_budget.TOLERANCE):
             return False
         title = f"try {size.columns}×{size.rows}×{size.dims} of {structure} → {size.cascaded}"
         shortened = replaced(recipe, steps=steps, measure_every=steps)
-        table, result = fit_image(source, size, shortened, request, border, title)
+        candidate = request
+        if limit is not None:
+            candidate = dataclasses.replace(request, deadline=limit.part(limit.seconds / CANDIDATES / limit.left()))
+        table, result = fit_image(source, size, shortened, candidate, border, title)
         tried.append({
             "dims": size.dims, "structure": structure, "cascaded": side, "rows": size.rows, "columns": size.columns,
             "ratio": size.ratio, "bytes": table.nbytes, "psnr_db": table.measured["psnr_db"],
@@ -153,13 +164,15 @@ def psnr_search(
     the goal.
     """
     tried, kept = [], None
+    most = most if request.deadline is None else min(most, LIMITED)
     nbytes = middle = source.nbytes / 12
     while len(tried) < most:
         sizes = [default_size(source, n, recipe) for n in (nbytes, middle)]
         size = next((s for s in sizes if all(t["bytes"] != s.nbytes for t in tried)), None)
         if size is None:
             break
-        table, result = fit_image(source, size, recipe, request, border, f"try {size.nbytes:,} bytes")
+        limited = request.part(1 / (most - len(tried)))
+        table, result = fit_image(source, size, recipe, limited, border, f"try {size.nbytes:,} bytes")
         psnr = table.measured["psnr_db"]
         tried.append({"bytes": size.nbytes, "psnr_db": psnr, "rows": size.rows, "cascaded": size.cascaded})
         log(f"{size.nbytes:,} bytes: {psnr:.2f} dB")

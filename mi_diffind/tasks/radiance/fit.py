@@ -16,7 +16,7 @@ from ... import units
 from ...errors import UsageError
 from ...fitting import FitResult, FittingError
 from ...interrupt import interruptible
-from ...tables import StoredArray, Table, save_table
+from ...tables import MAX_BYTES, StoredArray, Table, save_table
 from ...task import FitRequest, Fitted
 from . import compression, files, paper
 from . import grid as grids
@@ -33,6 +33,9 @@ VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 300, 2**15, 1e-2
 
 #: Share of the bytes of the supplement's arrays that the density gets.
 DENSITY_SHARE = 0.35
+
+#: Bytes of memory for each node of the dense grid, empty or not, roughly.
+VOXEL = 24
 
 #: Shares of a limited time: that of the grid, and, of what is left then, that of the training on its numbers.
 GRID_TIME, VALUE_TIME = 0.6, 0.2
@@ -55,9 +58,13 @@ def check(request: FitRequest) -> None:
     for name, parse in (("bytes", units.parse_bytes), ("compression", units.parse_compression)):
         if options[name] is not None:
             try:
-                parse(options[name])
+                value = parse(options[name])
             except ValueError as e:
                 raise UsageError(f"--{name}: {e}") from None
+            if name == "bytes":
+                units.check_size("--bytes", value, MAX_BYTES)
+    nodes = options["resolution"] or RESOLUTION
+    units.check_memory("--resolution", nodes, VOXEL * nodes**3)
 
 
 def fit(request: FitRequest) -> Fitted:

@@ -15,7 +15,7 @@ from ...errors import UsageError
 from ...fitting import Problem
 from ...indirection import device_array, device_tensor
 from ...settings import FittingError
-from ...tables import Table
+from ...tables import MAX_BYTES, Table
 from ...task import FitRequest, Fitted
 from . import codes, encoding
 from .distances import Distances
@@ -27,6 +27,9 @@ from .paper import SAMPLES, fit_pair
 
 #: Default size in memory, in bytes.
 BYTES = 2**20
+
+#: Bytes of samples of the nodes during the training for each byte of the field, roughly.
+SAMPLED = 64
 
 #: First, finest and coarsest spacing in the search for a grid's size, relative to the longest side.
 FIRST, FINEST, COARSEST = 1 / 64, 1 / 2048, 1 / 8
@@ -143,9 +146,12 @@ def check(request: FitRequest) -> None:
 def requested_bytes(options) -> int:
     """Return the size from the command's options. Raises :class:`UsageError`."""
     try:
-        return BYTES if options["bytes"] is None else units.parse_bytes(options["bytes"])
+        nbytes = BYTES if options["bytes"] is None else units.parse_bytes(options["bytes"])
     except ValueError as e:
         raise UsageError(f"--bytes: {e}") from None
+    units.check_size("--bytes", nbytes, MAX_BYTES)
+    units.check_memory("--bytes", nbytes, SAMPLED * nbytes)
+    return nbytes
 
 
 def fit(request: FitRequest, measured: int = MEASURED, samples: int = SAMPLES, held_out: int = HELD_OUT) -> Fitted:

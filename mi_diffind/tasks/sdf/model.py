@@ -15,6 +15,7 @@ from ...files import replacing
 from ...indirection import Indirection, device_tensor
 from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout, restored
 from ...task import Model
+from ...units import check_memory
 from . import codes
 from .field import DistanceField
 from .nodes import SparseNodes, coded_field, decoded_nodes, slope_bound
@@ -26,6 +27,9 @@ LAYOUTS = {
     "sparse": {"regions": (3, 1), "region_masks": (1, 16), "blocks": (1, 13), "pointers": (1, 4), "entries": (1, 3)},
     "pair": {"primary": (3, 3), "cascaded": (3, 1)},
 }
+
+#: Bytes of memory for each cell of a side's square while a surface is extracted, roughly.
+TRIANGLES = 128
 
 #: Extensions of the mesh formats that ``decode`` writes, through trimesh.
 MESHES = (".ply", ".obj", ".stl", ".off", ".glb")
@@ -218,6 +222,7 @@ class SdfModel(Model):
         from .grids import grid
 
         resolution = resolution or min(1024, round(1.5 / self.field.spacing))
+        check_memory("resolution", resolution, TRIANGLES * resolution**2)
         if output is None:
             return extract(self.field, resolution, self.scale, self.centre)
         output = Path(output)
