@@ -415,7 +415,7 @@ def test_an_image_that_a_file_cannot_hold_is_not_rendered(mi_rgb, tmp_path, monk
     }
     for name, integrator in integrators.items():
         for pixel_format in ("rgb", "rgba", "luminance"):
-            content = {**wall(mi, small(mi)), "integrator": integrator}
+            content = {**wall(mi, {"type": "rgb", "value": 0.5}), "integrator": integrator}
             content["sensor"] = {"type": "perspective", "film": {
                 "type": "hdrfilm", "width": 4, "height": 4, "pixel_format": pixel_format}}  # fmt: skip
             loaded = mi.load_dict(content)
