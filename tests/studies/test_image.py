@@ -38,7 +38,7 @@ def requested_seconds():
     def stepwise(source, size, recipe, request, *options):
         seconds.append(request.seconds)
         recipe = replaced(recipe, steps=STEPS, batch=2**12)
-        return fit_image(source, size, recipe, dataclasses.replace(request, seconds=None), *options)
+        return fit_image(source, size, recipe, dataclasses.replace(request, seconds=None, deadline=None), *options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "fit_image", stepwise)
