@@ -11,7 +11,7 @@ import numpy as np
 
 from . import compat, plugins
 from .errors import UsageError
-from .tables import Table, save_table
+from .tables import Table, moved_paths, save_table
 from .task import STORAGES, table_path, task_of
 
 
@@ -53,9 +53,7 @@ def save(source, path: str | os.PathLike, storage: str = "", file: str | os.Path
         stored = task_of(table).stored(table, entries, storage)
     except ValueError as e:
         raise UsageError(f"{path}: {e}") from None
-    folders = Path(table.path or "x").resolve().parent, path.resolve().parent
-    files = {key: value for key, value in stored.settings.items() if key.endswith("_path")}
-    stored.settings.update({key: os.path.relpath(folders[0] / value, folders[1]) for key, value in files.items()})
+    stored.settings = moved_paths(stored.settings, Path(table.path or "x").resolve().parent, path.resolve().parent)
     save_table(path, stored)
     return Saved(path, stored.nbytes, stored.storage, _errors(stored, entries))
 

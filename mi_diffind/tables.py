@@ -138,6 +138,12 @@ def stored_arrays(name: str, array: DifferentiableArray) -> dict[str, StoredArra
     }
 
 
+def moved_paths(settings: dict, before: Path, after: Path) -> dict:
+    """Return settings whose files (keys in ``_path``), relative to the folder ``before``, are relative to ``after``."""
+    files = {key: value for key, value in settings.items() if key.endswith("_path")}
+    return {**settings, **{key: os.path.relpath(before / value, after) for key, value in files.items()}}
+
+
 def restored(table: Table, arrays: dict[str, DifferentiableArray], storage: str = "") -> Table:
     """Return a table whose ``arrays`` (by name, in single precision) were optimised, in a storage form.
 

@@ -180,14 +180,12 @@ class Fitted:
         Files that the table names, such as its source, are named relative to the new file's folder. Raises
         :class:`~mi_diffind.errors.UsageError` for another extension and :class:`~mi_diffind.files.OutputError`.
         """
-        from .tables import save_table
+        from .tables import moved_paths, save_table
 
         path, table = table_path(path), self.table
         if self.request is not None:
-            before, after = self.request.folder, path.resolve().parent
-            files = {key: value for key, value in table.settings.items() if key.endswith("_path")}
-            moved = {key: os.path.relpath(before / value, after) for key, value in files.items()}
-            table = dataclasses.replace(table, settings={**table.settings, **moved})
+            settings = moved_paths(table.settings, self.request.folder, path.resolve().parent)
+            table = dataclasses.replace(table, settings=settings)
         save_table(path, table)
         return path
 
