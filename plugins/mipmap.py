@@ -6,11 +6,19 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import srgb
+from mi_diffind.maps.pyramid import TexelPyramid
 
 from . import Plugin
 from .filtered_texture import FilteredTexture
 from .support.image_files import SharedMaps, open_uncompressed
 from .support.manual import shared_parts
+
+
+class Texels:
+    """Holder of the parameter ``data``, which frozen functions (``dr.freeze``) do not read and must not look for."""
+
+    def __init__(self, tensor: mi.TensorXf):
+        self.tensor = tensor
 
 
 @shared_parts
@@ -53,6 +61,12 @@ class MipMap(FilteredTexture):
 
      {filtering}
 
+     * - data
+       - |tensor|
+       - The texels of the map that is shown, ``(height, width, channels)``: linear values of colours in sRGB, values as
+         they are of everything else. Another height or width is allowed.
+       - |exposed|, |differentiable|
+
     An uncompressed image that filters itself over the footprint of a pixel, from a mip pyramid as in graphics hardware:
     box-filtered levels, averaged in linear values where the image is sRGB. It is the reference for
     :monosp:`neural_texture`, and useful in scenes of Mitsuba 3.9, whose :monosp:`bitmap` has no levels of detail. **The
@@ -61,6 +75,12 @@ class MipMap(FilteredTexture):
     Levels are kept in single precision, four channels to a texel: 21 bytes per texel of a colour image. With ``filter``
     ``off`` the values are those of :monosp:`bitmap`, also between texels, except for spectra, which are upsampled from
     the filtered colour.
+
+    **Optimisation.** A change of ``data`` gives this texture levels of its own, computed from ``data`` with each
+    :monosp:`update()`; derivatives of all levels reach ``data``, so texels seen minified are optimised, too. Values are
+    not limited to [0, 1]: limit them after each step of an optimiser, as for :monosp:`bitmap`. Levels of a normal map
+    are mean directions. In spectral variants, ``data`` are linear colours, not coefficients of spectra. Other textures
+    of the same file keep its texels.
 
     {footprint}
 
@@ -90,7 +110,38 @@ class MipMap(FilteredTexture):
         maps, self._path = open_uncompressed(props, self.wrap_mode)
         #: The arrays of the levels, where frozen functions (``dr.freeze``) look for them.
         self.texels = maps.image.arrays
+        self._data = None
         return maps
+
+    def traverse(self, cb: mi.TraversalCallback):
+        if self._data is None:
+            self._data, self._entry = Texels(self._finest()), self.map
+        cb.put("data", self._data.tensor, mi.ParamFlags.Differentiable)
+        super().traverse(cb)
+
+    def _finest(self) -> mi.TensorXf:
+        """Return the texels of the map, converted; nothing is stored until a kernel or an update needs them."""
+        with dr.suspend_grad():
+            (width, height), channels, needed = self._size, self.map.channels, self._needed()
+            index = dr.arange(mi.UInt32, width * height * channels)
+            stored = self.image.interpolated_texels(index // channels) if needed else []
+            values = self._used_of([stored[i] for i in needed])
+            flat = values[0]
+            for c in range(1, channels):
+                flat = dr.select(index % channels == c, values[c], flat)
+            return mi.TensorXf(flat, (height, width, channels))
+
+    def parameters_changed(self, keys: list[str] = ()):
+        if "data" in keys:
+            data, channels = self._data.tensor, self.map.channels
+            if data.ndim != 3 or data.shape[2] != channels or 0 in data.shape:
+                raise RuntimeError(
+                    f'parameter "data": has the shape {tuple(data.shape)}, expected (height, width, {channels})'
+                )
+            self._shared = SharedMaps(TexelPyramid(self._entry, data, self.image.border), {})
+            self.image, self.texels = self._shared.image, self._shared.image.arrays
+            self.map = self.image.layout.maps[0]
+        super().parameters_changed(keys)
 
     def _read(self, uv):
         return self._used_of(self._interpolated(uv, mi.Float(0), whole=True))

@@ -13,12 +13,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import ModuleType
 
 import drjit as dr
 import numpy as np
 
-from .. import lookup, srgb
+from .. import compat, lookup, srgb
 from ..indirection import aligned
 from . import components
 from .compressed import FilteredMaps
@@ -117,7 +118,7 @@ class Pyramid(FilteredMaps):
 
     @property
     def levels(self) -> int:
-        return len(self.values)
+        return len(level_sizes(self.layout.height, self.layout.width))
 
     @property
     def nbytes(self) -> int:
@@ -168,7 +169,7 @@ class Pyramid(FilteredMaps):
 
     def texels(self, index) -> list:
         """Return the stored channels of texels, given their ``index`` in a list of all, level by level, row by row."""
-        return self.encoded(self._fetch(index, True))
+        return self.encoded(self.interpolated_texels(index, True))
 
     def _bilinear(self, u, v, level, active) -> list:
         """Return the bilinear values in one level, a whole number, for each place."""
@@ -182,10 +183,11 @@ class Pyramid(FilteredMaps):
         total = None
         for row, a in corners[0]:
             for column, b in corners[1]:
-                total = weighted_sum(a * b, self._fetch(offset + row * columns + column, active), total)
+                total = weighted_sum(a * b, self.interpolated_texels(offset + row * columns + column, active), total)
         return total
 
-    def _fetch(self, index, active) -> list:
+    def interpolated_texels(self, index, active=True) -> list:
+        """Return the values of texels, given their ``index`` as in :meth:`texels`, in the form that is interpolated."""
         return padded_texels(self.types, self._texels, self._padded, index, active)[: self.layout.stored]
 
     def encoded(self, values: list) -> list:
@@ -204,6 +206,76 @@ class Pyramid(FilteredMaps):
                 value = (value - owner.low) / (owner.high - owner.low)
             stored.append(value)
         return stored
+
+
+class TexelPyramid(Pyramid):
+    """Mip pyramid of one map whose finest level is a Dr.Jit tensor: derivatives of all levels reach that tensor.
+
+    ``texels``, ``(height, width, channels)``, holds the values that are interpolated and averaged: linear values for a
+    map ``entry`` in sRGB, the values themselves for all other maps. Values of any size are allowed. The map of the
+    resulting ``layout`` is linear, with no channel constant or left out, and ``values`` is empty.
+    """
+
+    def __init__(self, entry: MapLayout, texels, border):
+        height, width, count = texels.shape
+        plain = replace(entry, color_space="linear", where=tuple(range(count)), low=0.0, high=1.0, knee=0.0)
+        self.layout = Layout(width, height, (plain,), (0.5,) * count, (entry.name,) * count)
+        self.types, self.border, self.values = compat.module_of(texels), tuple(border), []
+        self._owners, self._padded = [plain] * count, lookup.padded_channels(count)
+        Float, UInt32 = self.types.Float, self.types.UInt32
+        sizes = level_sizes(height, width)
+        offsets = np.cumsum([0] + [rows * columns for rows, columns in sizes])
+        index = dr.arange(UInt32, int(offsets[1]))
+        levels = [[dr.gather(Float, texels.array, dr.fma(index, count, c)) for c in range(count)]]
+        vectors, signed = entry.role == "normal" and count == 3, entry.low < 0
+        if vectors:
+            mean = levels[0] if signed else [2 * x - 1 for x in levels[0]]
+            mean = [*mean, dr.norm(self.types.Array3f(*mean))]
+        else:
+            mean = levels[0]
+        for rows, columns in sizes[:-1]:
+            mean = _halved_channels(self.types, mean, rows, columns)
+            levels.append(_rescaled(self.types, mean, signed) if vectors else mean)
+        index = dr.arange(UInt32, int(offsets[-1]))
+        self._texels = dr.zeros(Float, int(offsets[-1]) * self._padded)
+        for c in range(count):
+            channel = dr.concat([level[c] for level in levels])
+            dr.scatter(self._texels, channel, dr.fma(index, self._padded, c), mode=dr.ReduceMode.NoConflicts)
+        self._offsets = UInt32(offsets[:-1].astype(np.uint32))
+        dr.eval(self._texels)
+
+
+def _halved_channels(types: ModuleType, channels: list, rows: int, columns: int) -> list:
+    """Return :func:`halved` for ``channels``, flat Dr.Jit arrays of ``rows · columns`` texels each."""
+    index = dr.arange(types.UInt32, max(1, rows // 2) * max(1, columns // 2))
+    # Opaque, so that one kernel halves images of all sizes
+    width, stride = dr.opaque(types.UInt32, max(1, columns // 2)), dr.opaque(types.UInt32, columns)
+    down, across = _covered(types, index // width, rows), _covered(types, index % width, columns)
+    total = None
+    for i, a in down:
+        for j, b in across:
+            place = dr.fma(i, stride, j)
+            total = weighted_sum(a * b, [dr.gather(types.Float, x, place) for x in channels], total)
+    return total
+
+
+def _covered(types: ModuleType, i, n: int) -> list:
+    """Return the texels, out of ``n`` along an axis, that texel ``i`` of the next level covers, with their weights."""
+    if n == 1:
+        return [(i, types.Float(1))]
+    if n % 2 == 0:
+        return [(2 * i, types.Float(0.5)), (2 * i + 1, types.Float(0.5))]
+    scale, half, x = dr.opaque(types.Float, 1 / n), dr.opaque(types.Float, n // 2), types.Float(i)
+    return [(2 * i, (half - x) * scale), (2 * i + 1, half * scale), (2 * i + 2, (x + 1) * scale)]
+
+
+def _rescaled(types: ModuleType, mean: list, signed: bool) -> list:
+    """Return mean vectors (three channels) rescaled to their mean length (the fourth), in [0, 1] unless ``signed``."""
+    vector = types.Array3f(*mean[:3])
+    length = dr.norm(vector)
+    valid = length > 1e-6
+    vector = dr.select(valid, vector / dr.select(valid, length, 1), types.Array3f(0, 0, 1)) * mean[3]
+    return list(vector if signed else dr.fma(vector, 0.5, 0.5))
 
 
 def weighted_sum(weight, values: list, total: list | None) -> list:

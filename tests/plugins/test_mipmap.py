@@ -281,6 +281,121 @@ def test_gradients_of_wrong_footprints_are_finite(mi_rgb, file):
         assert np.isfinite(dr.grad(si.uv).numpy()).all() and np.isfinite(dr.grad(si.duv_dx).numpy()).all()
 
 
+def changed(mi, texture, values):
+    """Set ``data`` from an array; return the parameters."""
+    params = mi.traverse(texture)
+    params["data"] = mi.TensorXf(np.array(values, np.float32))
+    params.update()
+    return params
+
+
+@pytest.mark.parametrize("role", ["srgb", "linear", "normal"])
+def test_changed_texels_are_those_of_a_new_texture(mi_rgb, rng, role):
+    """At all levels, also of odd sizes; ``data`` are the values of ``bitmap``."""
+    mi = mi_rgb
+    from mi_diffind.plugins.support import image_files
+
+    shape = (10, 7, 3)
+    old, new = rng.random((2, *shape)).astype(np.float32)
+    if role == "normal":
+        old, new = (0.5 + 0.5 * v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (old - 0.5, new - 0.5))
+    space = "srgb" if role == "srgb" else "linear"
+    si = texture_scenes.hits(mi, rng.random((2, 300)), *texture_scenes.footprints(rng, 300, shape[1::-1], 4))
+    textures = []
+    for values in (old, new):
+        source = from_arrays({role: values}, {role: space})
+        assert source.maps[0].role == role or role != "normal"
+        image_files.PYRAMIDS["texels"] = Pyramid.of(source, types=module_of(mi.TensorXf), border=("repeat",) * 2)
+        textures.append(mi.load_dict({"type": "mipmap", "pyramid": "texels", "raw": role != "srgb"}))
+    del image_files.PYRAMIDS["texels"]
+    texture, truth = textures
+    data, precision = mi.traverse(truth)["data"].numpy(), 3e-3 if role == "normal" else 2e-5
+    np.testing.assert_allclose(data, linear(new) if role == "srgb" else new, atol=precision)
+    assert np.abs(texture.eval(si).numpy() - truth.eval(si).numpy()).max() > 0.1
+    changed(mi, texture, data)
+    np.testing.assert_allclose(texture.eval(si).numpy(), truth.eval(si).numpy(), atol=precision)
+    assert float(texture.mean()[0]) == pytest.approx(float(truth.mean()[0]), abs=1e-4)
+    assert texture.max() == pytest.approx(truth.max(), abs=1e-4)
+
+
+def test_texels_of_other_textures_stay(mi_rgb, file, rng):
+    """Reading ``data`` changes nothing; changing it changes one texture, of another size and with colours, too."""
+    mi = mi_rgb
+    si = texture_scenes.hits(mi, rng.random((2, 100)), *texture_scenes.footprints(rng, 100, SIZE))
+    grey = {"type": "mipmap", "bitmap": mi.Bitmap(np.full((4, 4, 3), 128, np.uint8))}
+    one, other, constant = mi.load_dict(plugin(file)), mi.load_dict(plugin(file)), mi.load_dict(grey)
+    before = one.eval(si).numpy()
+    params = mi.traverse(one)
+    assert params.flags("data") == mi.ParamFlags.Differentiable and one.image is other.image
+    params.update()
+    np.testing.assert_array_equal(one.eval(si).numpy(), before)
+    values = rng.random((6, 5, 3))
+    for texture in (one, constant):
+        changed(mi, texture, values)
+        assert list(texture.resolution()) == [5, 6] and texture.is_spatially_varying()
+        assert texture.max() == pytest.approx(values.max())
+    np.testing.assert_array_equal(one.eval(si).numpy(), constant.eval(si).numpy())
+    np.testing.assert_array_equal(other.eval(si).numpy(), before)
+    assert np.abs(one.eval(si).numpy() - before).max() > 0.1
+    for wrong in ((6, 5, 1), (6, 5), (0, 5, 3)):
+        with pytest.raises(RuntimeError, match=r'parameter "data": has the shape .*, expected \(height, width, 3\)'):
+            changed(mi, one, np.zeros(wrong))
+
+
+@pytest.mark.parametrize("name", ["trilinear", "anisotropic", "off"])
+def test_gradients_reach_the_texels(mi_rgb, file, rng, name):
+    """From all levels: the texture is linear in its texels, so a gradient times the texels is the sum of its values."""
+    mi = mi_rgb
+    uv, (ddx, ddy) = rng.random((2, 200)), texture_scenes.footprints(rng, 200, SIZE, 5)
+    si = texture_scenes.hits(mi, uv, ddx, ddy)
+    texture = mi.load_dict(plugin(file, name))
+    params = mi.traverse(texture)
+    dr.enable_grad(params["data"])
+    params.update()
+    weight = mi.Color3f(*(mi.Float(aligned(x.astype(np.float32))) for x in rng.random((3, 200))))
+    total = dr.sum(dr.dot(weight, texture.eval(si)))
+    dr.backward(total)
+    gradient, values = dr.grad(params["data"]).numpy(), params["data"].numpy().copy()
+    assert (gradient * values).sum(dtype=np.float64) == pytest.approx(total.array[0], rel=1e-5)
+    for _ in range(3):
+        change = rng.normal(size=values.shape).astype(np.float32)
+        changed(mi, texture, values + change)
+        step = dr.sum(dr.dot(weight, texture.eval(si))).array[0] - total.array[0]
+        assert step == pytest.approx((gradient * change).sum(dtype=np.float64), rel=1e-3, abs=1e-2)
+    if name == "off":
+        theirs = mi.load_dict({"type": "bitmap", "filename": file, "format": "variant"})
+        params = mi.traverse(theirs)
+        dr.enable_grad(params["data"])
+        params.update()
+        dr.backward(dr.sum(dr.dot(weight, theirs.eval(si))))
+        np.testing.assert_allclose(gradient, dr.grad(params["data"]).numpy(), atol=1e-4)
+
+
+def test_texels_seen_minified_are_recovered(mi_rgb, detailed):
+    """By a few steps of Adam, from a render in which a pixel covers several texels: their mean is what it shows."""
+    mi = mi_rgb
+    from mi_diffind.plugins.support import footprint
+
+    true = 0.2 + 0.6 * (detailed[:16, :16] / 255)
+    images, scenes_ = [], []
+    for values in (true, np.full_like(true, 0.5)):
+        bitmap = mi.Bitmap(values.astype(np.float32))
+        texture = {"type": "mipmap", "bitmap": bitmap, "to_uv": mi.ScalarTransform4f().scale(8)}
+        scenes_.append(texture_scenes.plane(mi, texture, size=16, integrator={"type": "prb", "max_depth": 1}))
+        footprint.attach(scenes_[-1])
+        images.append(mi.render(scenes_[-1]))
+    params = mi.traverse(scenes_[1])
+    key = "plane.emitter.radiance.data"
+    optimizer, losses = mi.ad.Adam(lr=0.05, params={key: params[key]}), []
+    for step in range(12):
+        params.update(optimizer)
+        loss = dr.mean(dr.square(mi.render(scenes_[1], params, seed=step) - images[0]), axis=None)
+        dr.backward(loss)
+        optimizer.step()
+        losses.append(loss.array[0])
+    assert losses[-1] < 0.1 * losses[0], losses
+
+
 def test_slope_of_a_filtered_texture(mi_rgb, rng):
     """``eval_1_grad`` is the slope of a ramp at any level, through ``to_uv``; of the whole image it is 0."""
     mi = mi_rgb
