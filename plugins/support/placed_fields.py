@@ -16,7 +16,7 @@ from mi_diffind.tasks.radiance import march as marching
 from mi_diffind.tasks.radiance.files import load
 
 from . import properties, upsampling
-from .distance_shapes import Placement
+from .placement import Placement
 
 #: Luminance of linear sRGB, the same as in Mitsuba.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
