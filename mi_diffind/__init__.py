@@ -25,6 +25,7 @@ _NAMES = {
     "open": "task:open_model",
     "save": "saving",
     "from_arrays": "maps.source",
+    "example_maps": "studies.shading.materials",
     # Scenes
     "load_file": "scenes",
     "load_dict": "scenes",

@@ -8,10 +8,9 @@ import json
 from pathlib import Path
 
 import mitsuba as mi
-import numpy as np
 from scene_xml import element, head, lying, plugin, transform, write
 
-from mi_diffind.studies.shading.materials import generated_source
+import mi_diffind as md
 
 ABOUT = """Hammered metal with rust, minified: what a texture that is trained for its shading is for. Written by
 make_rust.py: change that file.
@@ -27,13 +26,10 @@ SIDE, PLATE, REPEATS = 256, 5.0, 24.0
 
 def write_maps() -> None:
     """Write rust_*.png and rust.json."""
-    source, files = generated_source("hammered", SIDE), {}
-    for m in source.maps:
-        files[m.name] = f"rust_{m.name}.png"
-        values = np.rint(255 * m.values).astype(np.uint8)
-        mi.Bitmap(np.ascontiguousarray(values if m.channels == 3 else values[..., 0])).write(
-            str(FOLDER / "assets" / files[m.name])
-        )
+    files = {}
+    for name, values in md.example_maps("hammered", SIDE).items():
+        files[name] = f"rust_{name}.png"
+        mi.Bitmap(values).write(str(FOLDER / "assets" / files[name]))
     (FOLDER / "assets" / "rust.json").write_text(json.dumps({"maps": files}, indent=2) + "\n", encoding="utf-8")
 
 

@@ -97,12 +97,23 @@ MATERIALS: dict[str, Callable[[int], dict[str, np.ndarray]]] = {
 }  # fmt: skip
 
 
-def generated_source(name: str, side: int = SIDE) -> Source:
-    """Return one of :data:`MATERIALS` as a source of 8-bit maps: albedo sRGB-encoded, normals as (n + 1)/2."""
+def example_maps(name: str = "hammered", side: int = SIDE) -> dict[str, np.ndarray]:
+    """Return the maps of one of :data:`MATERIALS`: name → ``(side, side, channels)`` or ``(side, side)``, bytes.
+
+    Albedos are sRGB-encoded, normals are (n + 1)/2. Maps repeat. The same arguments give the same bytes. Raises
+    ``ValueError`` for another name.
+    """
     from ...srgb import for_display
 
+    if name not in MATERIALS:
+        raise ValueError(f'found the example material "{name}", expected {", ".join(MATERIALS)}')
     maps = {}
     for key, values in MATERIALS[name](side).items():
         values = for_display(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values
         maps[key] = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
-    return from_arrays(maps)
+    return maps
+
+
+def generated_source(name: str, side: int = SIDE) -> Source:
+    """Return one of :data:`MATERIALS` as a source of 8-bit maps."""
+    return from_arrays(example_maps(name, side))
