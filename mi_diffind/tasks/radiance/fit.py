@@ -37,8 +37,8 @@ DENSITY_SHARE = 0.35
 #: Bytes of memory for each node of the dense grid, empty or not, roughly.
 VOXEL = 24
 
-#: Shares of a limited time: that of the grid, and, of what is left then, those of the training on its numbers and of the
-#: clusters of its colours.
+#: Shares of a limited time: that of the grid, and, of what is left then, those of the training on its numbers and of
+#: the clusters of its colours.
 GRID_TIME, VALUE_TIME, CLUSTER_TIME = 0.6, 0.2, 0.25
 
 #: Least steps of the first stage of the grid if time is limited: a field that nobody sees has no second stage.
@@ -294,19 +294,17 @@ class FieldFit:
         With a limit of time, a size that would take longer than what is left is not tried.
         """
         cells = grids.visible(grid, self.session.seeing_images)
+        limit, duration = self.request.deadline, 0.0
         for number, (share, bits) in enumerate(LADDER):
-            smaller = grids.divided(grid, cells, share)
-            if (
-                number
-                and self.request.deadline is not None
-                and self.request.deadline.left() < time.perf_counter() - start
-            ):
+            if limit is not None and limit.left() < duration:
                 print(f"warning: the time allowed {number} of {len(LADDER)} sizes", file=sys.stderr)
                 break
             start = time.perf_counter()
+            smaller = grids.divided(grid, cells, share)
             size = dataclasses.replace(self, request=self.request.part(1 / (len(LADDER) - number)))
             fitted = size.compressed(smaller, bits, stopped, f".size{number}")
             reached = self.session.held_out_images.evaluate(fitted[2])["psnr_white_db"]
+            duration = time.perf_counter() - start
             print(f"{fitted[2].nbytes:,} bytes: {reached:.2f} dB over white", file=sys.stderr)
             if reached >= psnr or fitted[1].interrupted:
                 return fitted
