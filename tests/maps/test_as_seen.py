@@ -51,7 +51,8 @@ def test_patches_come_from_all_of_a_map():
         for j in range(4):
             patch = shown[4 * i : 4 * i + 4, 4 * j : 4 * j + 4]
             assert (patch - patch[0, 0] == np.stack(np.mgrid[0:4, 0:4], axis=-1)).all()
-            assert 12.5 * i - 1 <= patch[0, 0, 0] <= 12.5 * i + 8.5 and 17.5 * j - 1 <= patch[0, 0, 1] <= 17.5 * j + 13.5
+            y, x = patch[0, 0]
+            assert 12.5 * i - 1 <= y <= 12.5 * i + 8.5 and 17.5 * j - 1 <= x <= 17.5 * j + 13.5
 
 
 @pytest.mark.parametrize("height, width", [(1, 1), (5, 16), (16, 3)])

@@ -9,8 +9,8 @@ import mi_diffind as md
 from mi_diffind.errors import UsageError
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
-from mi_diffind.tasks.image import fit, presets, search, training, weights
-from mi_diffind.tasks.image.compressed import CompressedImage, to_table
+from mi_diffind.tasks.image import presets, search, training, weights
+from mi_diffind.tasks.image.compressed import CompressedImage
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 
@@ -84,17 +84,17 @@ def test_a_file_names_its_weights(tmp_path):
 
 
 def test_measured_weights(monkeypatch):
-    """A material is weighted by its pictures, with our recipe only."""
+    """With ``auto``, a material is weighted by its pictures."""
     from mi_diffind.maps import as_seen
 
     rng, batch = np.random.default_rng(0), {"steps": 1, "batch": 64, "progress": False}
     maps = {name: rng.integers(100, 150, (16, 16, 3), np.uint8) for name in ("albedo", "normal")}
     monkeypatch.setattr(as_seen, "SIZE", (16, 12))
     monkeypatch.setattr(as_seen, "sensitivities", lambda source, types: {"albedo": 0.1, "normal": 0.2})
-    fitted = md.fit("image", maps, **batch)
+    fitted = md.fit("image", maps, weights="auto", **batch)
     expected = weights.balanced({"albedo": 0.1, "normal": 0.2}, {"albedo": 3, "normal": 3})
     assert fitted.table.settings["weights"] == expected
     assert fitted.table.measured["seen_db"] > 0 and fitted.table.measured["angle_normal_deg"] > 0
-    for other in ({"weights": "equal"}, {"preset": "paper"}):
+    for other in ({"weights": "equal"}, {}):
         assert "weights" not in md.fit("image", maps, **batch, **other).table.settings
     assert fit.weights is weights
