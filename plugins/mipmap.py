@@ -168,6 +168,9 @@ class MipMap(FilteredTexture):
             for where in self.map.where
         ]
 
+    def layout_bounds(self, m=None):
+        return None  # an update of ``data`` may replace the map
+
     def _storage(self):
         return {"preset": "", "storage": "float32", "table_bytes": self.image.memory_nbytes}
 
