@@ -126,7 +126,7 @@ class MipMap(FilteredTexture):
             index = dr.arange(mi.UInt32, width * height * channels)
             stored = self.image.interpolated_texels(index // channels) if needed else []
             values = self._used_of([stored[i] for i in needed])
-            flat = values[0]
+            flat = values[0] + dr.zeros(mi.Float, width * height * channels)  # as many where a channel is constant
             for c in range(1, channels):
                 flat = dr.select(index % channels == c, values[c], flat)
             return mi.TensorXf(flat, (height, width, channels))
