@@ -15,7 +15,7 @@ from ..maps.arguments import preview_path
 from ..maps.source import load_source
 from ..tables import Table
 from ..task import FitRequest, Fitted
-from ..tasks.texture.compressed import CompressedTexture, load, to_table
+from ..tasks.texture.compressed import CompressedTexture, bias_of, load, to_table
 from ..tasks.texture.training import problem_of, stored_form
 from .problem import SceneProblem
 from .recipe import SceneRecipe, recipe_of
@@ -72,9 +72,10 @@ def fit_scene(
     source_path = original_of(table, file, given)
     source = load_source(source_path, nonfinite="clean")
     texture = texture_problem(table, source)
+    bias = bias_of(table.settings)
     if recipe.start == "untrained":
         texture = problem_of(source, budget_of(table), texture.recipe, texture.pyramid)
-        table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
+        table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net), bias), {})
     rendered = ReferenceRenders(
         parsed, views, recipe.reference_spp, references, recipe.against,
         without=(file,), inputs=(source.digest,), progress=request.progress,
@@ -91,7 +92,7 @@ def fit_scene(
     identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
 
     def stored(settings: Mapping) -> tuple[Table, dict[str, float]]:
-        trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net)), settings)
+        trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net), bias), settings)
         return trained_table, CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
 
     result = request.train(problem, finish=lambda: stored(identity))
