@@ -235,7 +235,7 @@ def fit(
             best, best_measured, best_step = trainer.snapshot().parameters, measured, trainer.step
         bar.measured(name, value)
 
-    with interruptible() as stop, _cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
+    with interruptible() as stop, cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
             before, share_before = trainer.snapshot(), trainer.share
             loss = trainer.take_step(plateau.factor)
@@ -528,7 +528,8 @@ LARGEST_SUMS = 2**28
 
 
 @contextlib.contextmanager
-def _cores(deterministic: bool):
+def cores(deterministic: bool):
+    """Compute on one core in this context if the result is to be ``deterministic``."""
     before = dr.thread_count()
     if deterministic:
         compat.use_threads(1)

@@ -534,7 +534,7 @@ def fit(
     - ``source``: what the tables are fitted to, as a file or as an object in memory. Of ``image``, ``texture`` and
       ``shading``: an image file or a manifest, an array ``(height, width, channels)``, a ``mi.Bitmap``, or a dictionary
       of such maps by name. Of ``sdf``: a mesh file, a ``trimesh.Trimesh`` or a ``mi.Mesh``. Of ``field``: a folder of
-      views. Of ``scene``: a scene file. ``ggx`` and ``disney`` have none.
+      views. Of ``scene``: a scene file, or a dictionary as of ``mi.load_dict``. ``ggx`` and ``disney`` have none.
     - ``preset``: layout and training ("": the task's default).
     - ``variant``: variant of Mitsuba on whose device to train (``None``: the one that is set; the GPU if none is set
       and there is one).

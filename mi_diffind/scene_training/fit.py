@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
 
 from .. import scenes
-from ..fitting import FitResult
+from ..deadline import duration
+from ..fitting import FitResult, cores
 from ..maps.arguments import preview_path
 from ..maps.source import load_source
 from ..tables import Table
@@ -24,8 +26,12 @@ from .stored_texture import budget_of, original_of, texture_file, texture_proble
 from .trained_scene import TrainedScene
 from .views import ViewDistribution, views_of
 
-#: Share of a limited time in which the references are rendered.
-REFERENCES = 0.4
+#: Shares of a limited time: that of the references, and that of a measurement of renders.
+REFERENCES, MEASURING = 0.25, 0.1
+
+#: Duration of a step in renders of one sample a pixel, and of the compilation of its kernels in that of a render's: a
+#: step renders three times, once with derivatives, whose kernel is four times as long.
+STEP_RENDERS, STEP_KERNELS = 20, 8
 
 
 def fit(request: FitRequest) -> Fitted:
@@ -41,7 +47,11 @@ def fit(request: FitRequest) -> Fitted:
         "bits": {name: a.bits for name, a in table.arrays.items()},
         "views": dataclasses.asdict(views),
     }
-    lines = [f"{views.count} views, {recipe.spp} samples a pixel"]
+    count = len(views.trained())
+    lines = [
+        f"{count} view{'s' if count != 1 else ''}, {recipe.spp} samples a pixel",
+        *filter(None, [table.settings.get("remark")]),
+    ]
     if (samples := table.settings.get("reference_samples", recipe.reference_spp)) < recipe.reference_spp:
         lines.append(f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}")
     return Fitted(table, result, lines, figures)
@@ -95,8 +105,12 @@ def fit_scene(
         trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net), bias), settings)
         return trained_table, CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
 
+    remark = "" if request.deadline is None else limit(problem, request)
     result = request.train(problem, finish=lambda: stored(identity))
-    settings = {**request.recorded(result), **identity, **request.paths(scene_path=parsed.path)}
+    file = None if parsed.description else parsed.path
+    settings = {**request.recorded(result), **identity, **request.paths(scene_path=file)}
+    if remark:
+        settings["remark"], result.unfinished = remark, True
     if rendered.samples < recipe.reference_spp:
         settings["reference_samples"] = rendered.samples
     trained_table, errors = stored(settings)
@@ -105,3 +119,31 @@ def fit_scene(
     errors["psnr_scene_db"] = result.measured["psnr_db"]
     trained_table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
     return trained_table, result
+
+
+def limit(problem: SceneProblem, request: FitRequest) -> str:
+    """Fit a problem into a limited time; return a sentence if only the texture alone can be trained, else "".
+
+    A measurement of one render a view is rehearsed. Measurements then have so many samples as fit, and where a step
+    would take longer than what is left, renders have no share in the loss.
+    """
+    deadline, spp, most = request.deadline, problem.scene.spp, problem.samples
+    problem.samples = spp
+    with cores(request.settings.deterministic):
+        start = time.perf_counter()
+        _, seconds = duration(lambda: problem.measure(problem.net))
+        compiling = time.perf_counter() - start - seconds
+    render = seconds / (2 * len(problem.measured) * spp)
+    problem.samples = max(spp, min(most, int(MEASURING * deadline.seconds * spp / seconds)))
+    deadline.reserve += seconds * problem.samples / spp
+    step = STEP_RENDERS * spp * render + STEP_KERNELS * compiling
+    if problem.recipe.share == 0 or step < deadline.left():
+        return ""
+    problem.recipe = dataclasses.replace(problem.recipe, share=0.0)
+    problem.identity["shading"]["share"] = 0.0
+    kernels = f", {STEP_KERNELS * compiling:.0f} s of it to compile its kernels" if compiling > 1 else ""
+    enough = deadline.seconds + 2 * step
+    return (
+        f"no step through renders: one takes about {step:.0f} s{kernels}; the texture was trained alone; give "
+        f"--seconds {enough:.0f} or more, or a smaller film"
+    )
