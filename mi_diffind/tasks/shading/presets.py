@@ -35,7 +35,7 @@ class ShadingRecipe:
 #: Steps of a training without a time limit.
 STEPS = 600
 
-_OURS = FitSettings(steps=STEPS, batch=2**16, lr=2e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10)
+_OURS = FitSettings(steps=STEPS, batch=2**16, lr=5e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10)
 
 #: The first is the default. The paper's λ is 0.1 or 0.25, by its scene.
 PRESETS = {
