@@ -381,7 +381,7 @@ def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, k
 
     def profiled(work):
         start = clock.now
-        return work(), clock.now - start, [{"backend_time": 1e3 * compiling, "operation_count": 20_000}]
+        return work(), clock.now - start, [{}, {"backend_time": 1e3 * compiling, "operation_count": 20_000}]
 
     monkeypatch.setattr("mi_diffind.scene_training.fit.profiled", profiled)
     problem = Timed(clock)

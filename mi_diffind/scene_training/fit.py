@@ -152,7 +152,7 @@ def limit(problem: SceneProblem, request: FitRequest, compiled: bool) -> str:
         _, seconds, history = profiled(lambda: problem.measure(problem.net))
     compiling = compat.compile_seconds(history)
     if not compiled:
-        compiling = max(compiling, OPERATION * max((entry["operation_count"] for entry in history), default=0))
+        compiling = max(compiling, OPERATION * max((entry.get("operation_count", 0) for entry in history), default=0))
     render = seconds / (2 * len(problem.measured) * spp)
     problem.samples = max(spp, min(most, int(MEASURING * deadline.seconds * spp / seconds)))
     deadline.reserve += seconds * problem.samples / spp
