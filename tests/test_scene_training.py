@@ -363,6 +363,7 @@ class Timed:
 
     def measure(self, net):
         self.clock.now += 0.1 * 2 * self.samples
+        return {"psnr_db": 20.0}
 
 
 @pytest.mark.parametrize(
@@ -386,7 +387,8 @@ def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, k
     monkeypatch.setattr("mi_diffind.scene_training.fit.profiled", profiled)
     problem = Timed(clock)
     request = FitRequest("ours", problem.recipe.settings, None, deadline=Deadline(seconds))
-    sentence = limit(problem, request, known)
+    sentence, figures = limit(problem, request, known)
+    assert figures == {"psnr_db": 20.0}
     assert sentence.startswith("no step through renders: " + remark if remark else remark)
     assert bool(sentence) == bool(remark) == (problem.recipe.share == 0)
     assert problem.samples == samples and problem.identity["shading"]["share"] == problem.recipe.share

@@ -112,8 +112,14 @@ def fit_scene(
     remark = ""
     if request.deadline is not None:
         compiled = compiled_file(f"{rendered.digest} {recipe.spp}")
-        remark = limit(problem, request, compiled is not None and compiled.is_file())
+        remark, before = limit(problem, request, compiled is not None and compiled.is_file())
+    start = {name: array.data for name, array in problem.net.arrays.items()}
     result = request.train(problem, finish=lambda: stored(identity))
+    if remark and before["psnr_db"] > result.measured["psnr_db"]:
+        for name, data in start.items():
+            problem.net.arrays[name].data = data
+        result.measured, result.step = before, 0
+        remark += "; it gained nothing, these are the arrays that it started from"
     if request.deadline is not None and compiled is not None and problem.recipe.share > 0:
         compiled.touch()
     file = None if parsed.description else parsed.path
@@ -139,8 +145,10 @@ def compiled_file(key: str) -> Path | None:
     return folder / hashlib.sha256(key.encode()).hexdigest()[:16]
 
 
-def limit(problem: SceneProblem, request: FitRequest, compiled: bool) -> str:
-    """Fit a problem into a limited time; return a sentence if only the texture alone can be trained, else "".
+def limit(problem: SceneProblem, request: FitRequest, compiled: bool) -> tuple[str, dict[str, float]]:
+    """Fit a problem into a limited time.
+
+    Returns a sentence if only the texture alone can be trained, else "", and the figures before the training.
 
     A measurement of one render a view is rehearsed. Measurements then have so many samples as fit, and where a step
     would take longer than what is left, renders have no share in the loss. Its kernels are expected to be compiled
@@ -149,7 +157,7 @@ def limit(problem: SceneProblem, request: FitRequest, compiled: bool) -> str:
     deadline, spp, most = request.deadline, problem.scene.spp, problem.samples
     problem.samples = spp
     with cores(request.settings.deterministic):
-        _, seconds, history = profiled(lambda: problem.measure(problem.net))
+        figures, seconds, history = profiled(lambda: problem.measure(problem.net))
     compiling = compat.compile_seconds(history)
     if not compiled:
         compiling = max(compiling, OPERATION * max((entry.get("operation_count", 0) for entry in history), default=0))
@@ -158,12 +166,13 @@ def limit(problem: SceneProblem, request: FitRequest, compiled: bool) -> str:
     deadline.reserve += seconds * problem.samples / spp
     step = STEP_RENDERS * spp * render + STEP_KERNELS * compiling
     if problem.recipe.share == 0 or step < deadline.left():
-        return ""
+        return "", figures
     problem.recipe = dataclasses.replace(problem.recipe, share=0.0)
     problem.identity["shading"]["share"] = 0.0
     kernels = f", {STEP_KERNELS * compiling:.0f} s of it to compile its kernels" if compiling > 1 else ""
     enough = deadline.seconds + 2 * step
-    return (
+    sentence = (
         f"no step through renders: one takes about {step:.0f} s{kernels}; the texture was trained alone; give "
         f"--seconds {enough:.0f} or more, or a smaller film"
     )
+    return sentence, figures
