@@ -73,6 +73,7 @@ def fit(request: FitRequest) -> Fitted:
         start, result = started(options["start"], source, request), None
     else:
         start, result = pretrained(source, pyramid, recipe, request)
+    first = result
     if result is None or not result.interrupted:
         shading_request = dataclasses.replace(request)
         if shading_request.resume and not os.path.exists(shading_request.checkpoint or ""):
@@ -93,6 +94,8 @@ def fit(request: FitRequest) -> Fitted:
         lines.append(
             "before the training for the shading: " + ", ".join(map(" ".join, map(str.split, labelled(before))))
         )
+    if first is not None and first.unfinished and not first.interrupted:
+        lines.append(f"the training as a texture: {first.outcome}")
     lines += [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("level_bias"):
         lines.append(f"read {-table.settings['level_bias']:g} levels finer than the footprint")
