@@ -546,7 +546,8 @@ def parsed_files(state) -> list[str]:
 def property_kind(props, key: str) -> str:
     """Return the type of a parsed parameter as a word.
 
-    It is ``number``, ``colour``, ``text``, ``object`` (nested or referred to) or ``other``.
+    It is ``number``, ``colour``, ``text``, ``object`` (nested or referred to), ``existing`` (an object that exists
+    already) or ``other``.
     """
     import mitsuba as mi
 
@@ -555,7 +556,8 @@ def property_kind(props, key: str) -> str:
         return "number"
     if parameter in (types.Reference, types.ResolvedReference):
         return "object"
-    return {types.Color: "colour", types.String: "text"}.get(parameter, "other")
+    words = {types.Color: "colour", types.String: "text", types.Object: "existing", types.Any: "existing"}
+    return words.get(parameter, "other")
 
 
 @contextlib.contextmanager

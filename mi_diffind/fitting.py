@@ -235,7 +235,7 @@ def fit(
             best, best_measured, best_step = trainer.snapshot().parameters, measured, trainer.step
         bar.measured(name, value)
 
-    with interruptible() as stop, _cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
+    with interruptible() as stop, cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
             before, share_before = trainer.snapshot(), trainer.share
             loss = trainer.take_step(plateau.factor)
@@ -473,6 +473,15 @@ def _save_checkpoint(path, settings: dict, state: _State, extra: dict) -> None:
         np.savez(stream, **arrays)
 
 
+def checkpoint_settings(path) -> dict:
+    """Return the settings of the training and the identity of the problem in a checkpoint; {} if it holds none."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return dict(json.loads(data["meta"].tobytes())["settings"])
+    except Exception:  # zipfile, json and numpy each have their own for another kind of file
+        return {}
+
+
 def _is_checkpoint(path) -> bool:
     try:
         with np.load(path, allow_pickle=False) as data:
@@ -519,7 +528,8 @@ LARGEST_SUMS = 2**28
 
 
 @contextlib.contextmanager
-def _cores(deterministic: bool):
+def cores(deterministic: bool):
+    """Compute on one core in this context if the result is to be ``deterministic``."""
     before = dr.thread_count()
     if deterministic:
         compat.use_threads(1)

@@ -172,8 +172,11 @@ def update_reference(
     progress: bool = True,
     defines: dict[str, str] | None = None,
     probe_samples: int = PROBE_SAMPLES,
+    source: str | os.PathLike | dict | mi.Scene | None = None,
 ) -> dict:
     """Render a reference of the scene file ``path`` in the current variant and store it (:func:`reference_path`).
+
+    Of a scene in memory, ``source``, the path is a name.
 
     ``spp`` are the samples per pixel of a check; the reference gets 16 times as many or more. Settings that are not
     given are those of the reference that is replaced: ``spp`` (else two million samples of the image), ``seed`` (else
@@ -196,7 +199,7 @@ def update_reference(
     """
     output, stem = reference_path(path, references), Path(path).stem
     before = read_reference(path, references).about if output.is_file() else {}
-    parsed = scenes.ParsedScene(path, {**before.get("defines", {}), **(defines or {})})
+    parsed = _parsed(path if source is None else source, {**before.get("defines", {}), **(defines or {})})
     scene = parsed.load()
     writable_folder(output.parent, create=True)
     writable_file(output)
@@ -205,7 +208,7 @@ def update_reference(
     seed = before.get("seed", 0) if seed is None else seed
     partial = output.with_suffix(".partial.npz")
     key = {"scene": stem, "variant": mi.variant(), "defines": parsed.defines, "seed": seed}
-    key["sources"] = fingerprint(sources() | set(parsed.files())) + mi.__version__
+    key["sources"] = fingerprint(sources() | set(parsed.files())) + mi.__version__ + parsed.description
     moments = read_partial(partial, key)
     start, wanted = time.perf_counter(), REFERENCE_FACTOR * budget
     result = {
@@ -260,6 +263,15 @@ def update_reference(
     write_reference(output, Reference(image, variance, about))
     partial.unlink(missing_ok=True)
     return {**result, "bytes": output.stat().st_size}
+
+
+def _parsed(scene, defines: dict) -> scenes.ParsedScene:
+    """Return a scene file or a dictionary parsed, or a loaded scene in their place."""
+    if not isinstance(scene, mi.Scene):
+        return scenes.ParsedScene(scene, defines)
+    if defines:
+        raise UsageError("defines: given with a scene in memory, allowed are scene files")
+    return scenes.LoadedScene(scene)
 
 
 def _advice(spp: int, failing_part: Callable[[int], float], stop: threading.Event) -> str:
@@ -319,8 +331,9 @@ class Regression:
 
 
 def regress(
-    scene: str | os.PathLike,
+    scene: str | os.PathLike | dict | mi.Scene,
     *,
+    name: str | None = None,
     update: bool = False,
     references: str | os.PathLike | None = None,
     out: str | os.PathLike | None = None,
@@ -329,8 +342,10 @@ def regress(
     defines: Mapping[str, object] | None = None,
     progress: bool = True,
 ) -> Regression:
-    """Render the file ``scene`` in the variant that is set and test it against its reference (:func:`.z_test.z_test`).
+    """Render the ``scene`` in the variant that is set and test it against its reference (:func:`.z_test.z_test`).
 
+    The scene is a file, a dictionary as of ``mi.load_dict``, or a loaded ``mi.Scene``. A scene in memory needs a
+    ``name`` for its reference, ``references/NAME.VARIANT.exr`` in the current folder, and has no ``defines``.
     ``spp`` and ``defines`` are the reference's unless given, ``seed`` is 0; every seed is independent of the reference.
     If the check fails and ``out`` names a folder, the images are written there (:func:`write_failure`). With
     ``update``, the reference is rendered again instead and stored (:func:`update_reference`).
@@ -342,14 +357,16 @@ def regress(
     :class:`BadReference`, :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.files.OutputError`.
     """
     use_variant()
-    path, seed_of_check = scene, seed or 0
-    if not isinstance(path, (str, os.PathLike)):
-        raise UsageError(f"scene: found a {type(path).__name__}, a scene file is needed")
+    seed_of_check, path = seed or 0, scene
+    if not isinstance(scene, (str, os.PathLike)):
+        if not name:
+            raise UsageError("name: not given, a scene in memory needs one, after which its reference is called")
+        path = f"{name}.xml"
     if update:
-        return Regression(update_reference(path, references, spp, seed, progress, dict(defines or {})))
+        return Regression(update_reference(path, references, spp, seed, progress, dict(defines or {}), source=scene))
     reference = read_reference(path, references)
     about = reference.about
-    parsed = scenes.ParsedScene(path, {**about["defines"], **(defines or {})})
+    parsed = _parsed(scene, {**about["defines"], **(defines or {})})
     loaded = parsed.load()
     width, height = scenes.film_size(loaded)
     _check_size(path, reference, height, width)

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import compat, plugins
-from .errors import DiffindError
+from .errors import DiffindError, UsageError
 from .files import replacing
 from .measure.operations import bsdf_operations
 from .plugins.support import footprint, omissions
@@ -35,17 +35,36 @@ class SceneError(DiffindError, RuntimeError):
 
 
 class ParsedScene:
-    """Scene file ``path``, parsed once, with ``defines`` (name → value) in place of its ``<default>`` values.
+    """Scene file ``source``, parsed once, with ``defines`` (name → value) in place of its ``<default>`` values.
 
     Answers questions about the file, and builds any number of scenes from it: each from a copy of the parsed state.
-    All methods raise :class:`SceneError`, as does the constructor for a file that cannot be parsed.
+    The source may also be a dictionary, as of ``mi.load_dict``: ``path`` is then a name in the current folder, beside
+    which relative names of files are sought. All methods raise :class:`SceneError`, as does the constructor for a
+    scene that cannot be parsed, and :class:`~mi_diffind.errors.UsageError` for a source of another type.
     """
 
-    def __init__(self, path: str | os.PathLike, defines: dict[str, str] | None = None):
-        self.path = Path(path)
+    #: Text that stands for a scene without a file, "" for a scene file.
+    description = ""
+
+    def __init__(self, source: str | os.PathLike | dict, defines: dict[str, str] | None = None, name: str = "scene"):
+        in_memory = isinstance(source, dict)
+        if not in_memory and not isinstance(source, (str, os.PathLike)):
+            source_type = (
+                "loaded scene, which cannot be changed any more" if _is_scene(source) else type(source).__name__
+            )
+            raise UsageError(
+                f"scene: found a {source_type}; a scene file is needed, or a dictionary as of mi.load_dict"
+            )
+        if in_memory and defines:
+            raise UsageError("defines: given with a scene in memory, allowed are scene files")
+        self.path = path = Path.cwd() / name if in_memory else Path(source)
         self.defines = {name: str(value) for name, value in (defines or {}).items()}
         self._resolver = None  # parsing adds the folders of <path> to it
         with self._errors():
+            if in_memory:
+                _, self._state = compat.parse(source)
+                self.description = _description(self._state)
+                return
             if not self.path.is_file():
                 raise RuntimeError(f"{path}: no such scene file")
             if self.path.suffix.lower() == ".npz":
@@ -65,6 +84,7 @@ class ParsedScene:
         against: str | tuple[str, ...] = "exact",
         change: Callable[[object], object] | None = None,
         merge: bool = True,
+        parallel: bool = True,
     ):
         """Return a loaded scene, as :func:`load_file` does.
 
@@ -72,7 +92,8 @@ class ParsedScene:
         (the first of several that it has).
         ``longest_path`` replaces the ``max_depth`` of the scene's integrator (1: emitted light, 2: direct light, …; -1:
         infinite). ``change(state)`` may change the parsed scene (``mi.parser.ParserState``) before anything else does.
-        Without ``merge``, Mitsuba joins no meshes, and each keeps its id.
+        Without ``merge``, Mitsuba joins no meshes, and each keeps its id. Objects that are not loaded in ``parallel``
+        have the same order in each run, so that the kernels of an earlier run are found again.
 
         Shapes whose stored arrays the scene's integrator cannot trace are decoded, with a warning that states the
         memory, unless the scene forbids decoding; then this is an error.
@@ -81,6 +102,7 @@ class ParsedScene:
             config, state = compat.copy_parsed(self._state)
             if not merge:
                 compat.keep_meshes(config)
+            config.parallel = parallel
             if change is not None:
                 change(state)
             if exact:
@@ -155,6 +177,41 @@ class ParsedScene:
                         if file.is_file():
                             files.append(file.resolve())
             return list(dict.fromkeys(files))
+
+
+class LoadedScene(ParsedScene):
+    """Scene that Mitsuba has loaded, in the place of one that can be loaded: nothing of it can be changed."""
+
+    def __init__(self, scene: mi.Scene, name: str = "scene"):
+        self.scene, self.path, self.defines = scene, Path.cwd() / name, {}
+        self.description = _unique()
+
+    def load(self):
+        """Return the scene."""
+        return self.scene
+
+    def files(self) -> list[Path]:
+        """Return no files: they are not known."""
+        return []
+
+
+def _unique() -> str:
+    """Return a text that no other call returns."""
+    return os.urandom(16).hex()
+
+
+def _description(state) -> str:
+    """Return a parsed scene as text: equal texts stand for equal scenes, without the content of files.
+
+    Objects that exist already, such as bitmaps, have no such text: the result is then another one each time.
+    """
+    nodes = compat.properties_of(state)
+    existing = any(compat.property_kind(props, key) == "existing" for props in nodes for key in props)
+    return "\n".join([_unique() if existing else "", *map(str, nodes)])
+
+
+def _is_scene(value) -> bool:
+    return isinstance(value, mi.Scene)
 
 
 def load(path: str | os.PathLike, defines: dict[str, str] | None = None, **options):
@@ -232,10 +289,10 @@ def _refuse(sentence: str):
 
 def _integrators(state) -> list[str]:
     """Return the plugin names of all integrators of a parsed scene, nested ones included."""
-    return [props.plugin_name() for props in _integrator_properties(state)]
+    return [props.plugin_name() for props in integrator_properties(state)]
 
 
-def _integrator_properties(state) -> list:
+def integrator_properties(state) -> list:
     """Return the properties of all integrators of a parsed scene, nested ones included."""
     names = {name for name, plugin in plugins.declared().items() if plugin.object_type == "integrator"}
     return compat.properties_of(state, mi.ObjectType.Integrator, names)
@@ -243,7 +300,7 @@ def _integrator_properties(state) -> list:
 
 def _path_integrator(state):
     """Return the properties of the one integrator that follows the paths of a parsed scene."""
-    integrators = _integrator_properties(state)
+    integrators = integrator_properties(state)
     following = [
         props for props in integrators if props.plugin_name() in MAX_DEPTHS
         # A radiance field leaves the paths to the integrator that is nested in it

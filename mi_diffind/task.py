@@ -46,6 +46,9 @@ if TYPE_CHECKING:
 #: Storage forms that a training may end in (:data:`.lookup.STORAGES`, without importing Dr.Jit).
 STORAGES = ("float32", "float16", "uint8")
 
+#: Share of a limited time beyond which the result says how long it took.
+OVERRUN = 1.15
+
 #: The folder of the tables that ship.
 DATA = Path(__file__).resolve().parent / "data"
 
@@ -534,7 +537,7 @@ def fit(
     - ``source``: what the tables are fitted to, as a file or as an object in memory. Of ``image``, ``texture`` and
       ``shading``: an image file or a manifest, an array ``(height, width, channels)``, a ``mi.Bitmap``, or a dictionary
       of such maps by name. Of ``sdf``: a mesh file, a ``trimesh.Trimesh`` or a ``mi.Mesh``. Of ``field``: a folder of
-      views. Of ``scene``: a scene file. ``ggx`` and ``disney`` have none.
+      views. Of ``scene``: a scene file, or a dictionary as of ``mi.load_dict``. ``ggx`` and ``disney`` have none.
     - ``preset``: layout and training ("": the task's default).
     - ``variant``: variant of Mitsuba on whose device to train (``None``: the one that is set; the GPU if none is set
       and there is one).
@@ -584,4 +587,6 @@ def fit(
     request.types = array_module(variant)
     fitted = chosen.fit(request)
     fitted.request = request
+    if deadline is not None and deadline.spent() > OVERRUN * deadline.seconds:
+        fitted.lines.append(f"took {deadline.spent():.0f} s of the {deadline.seconds:g} s that were given")
     return fitted

@@ -206,28 +206,27 @@ class Captured:
 
 
 def capture(
-    scene: str | os.PathLike,
+    scene: str | os.PathLike | dict,
     folder: str | os.PathLike,
     *,
     defines: Mapping[str, object] | None = None,
     progress: bool = True,
     **given,
 ) -> Captured:
-    """Render the views of a scene file into ``folder``, in the variant that is set.
+    """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
+    The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden.
     ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
     ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters. The folder is
-    created if its parent exists. Views of an earlier capture with the same settings of the same scene are kept; after
-    Ctrl-C the current view is the last. Raises :class:`~mi_diffind.errors.UsageError` for bad settings,
-    :class:`CaptureError`, also for a folder with other settings, :class:`~mi_diffind.scenes.SceneError` and
-    :class:`~mi_diffind.files.OutputError`.
+    created if its parent exists. Views of an earlier capture with the same settings of the same scene are kept, unless
+    a dictionary holds objects that exist already; after Ctrl-C the current view is the last. Raises
+    :class:`~mi_diffind.errors.UsageError` for bad settings, :class:`CaptureError`, also for a folder with other
+    settings, :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.files.OutputError`.
     """
     use_variant()
     settings = _settings(given)
-    if not isinstance(scene, (str, os.PathLike)):
-        raise UsageError(f"scene: found a {type(scene).__name__}, a scene file is needed")
-    folder = writable_folder(folder, create=True)
     parsed = scenes.ParsedScene(scene, defines)
+    folder = writable_folder(folder, create=True)
     record = _record(parsed, settings)
     _check_record(folder, record)
     loaded = _load(parsed)
@@ -235,7 +234,7 @@ def capture(
     centre = box.mean(axis=0) if settings.centre is None else np.array(settings.centre, np.float64)
     radius = settings.radius or _reach(loaded, settings.objects, centre) / math.sin(math.radians(settings.fov) / 2)
     if not radius > 0:
-        raise CaptureError(f"{scene}: the captured objects have no extent, --radius has to be given")
+        raise CaptureError(f"{parsed.path}: the captured objects have no extent, --radius has to be given")
     camera = CaptureCamera(loaded, settings)
     write_json(folder / RECORD, record)
     splits, left = _plan(settings, centre, radius), []
@@ -331,7 +330,7 @@ def _load(parsed: scenes.ParsedScene):
     """Load a scene so that its integrators hide its lights, and its meshes keep their ids."""
 
     def hide(state) -> None:
-        for props in compat.properties_of(state, mi.ObjectType.Integrator):
+        for props in scenes.integrator_properties(state):
             if not scenes.nests_another(props):  # the nested one follows the paths
                 props["hide_emitters"] = True
 
@@ -430,7 +429,7 @@ def _only(inner, shapes: list):
 
 def _record(parsed: scenes.ParsedScene, settings: CaptureSettings) -> dict:
     """Return the record of a folder: the settings, and everything else that its images depend on."""
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(parsed.description.encode())
     for file in parsed.files():
         digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
     return {

@@ -38,13 +38,13 @@ between the last sign and the next is found by false position. Secondary rays st
 longest side off the surface: walls thinner than that are not reliable. Seen from :math:`10^3` times its size away, a
 solid's hits are precise to :math:`10^{-4}` of the size, which is single precision.
 
-**Derivatives** are computed by path replay with respect to materials, textures, emitters and, with ``storage``
-``float32``, the arrays of fields: hits move along their rays by the implicit function theorem, and normals, cosines and
-the solid angles between vertices follow. The derivatives are those of *interiors*: where the outline of a solid, its
-shadow or its image in a mirror moves over a pixel, radiance jumps, and this part of the derivative is missing. An
-optimisation from images therefore learns from shading, not from silhouettes; masks, or a loss on the field itself, have
-to compensate. Ordinary shapes are constants, and so are places seen in smooth mirrors and through smooth glass.
-Polarised variants and media are not supported.
+**Derivatives** are computed by path replay with respect to materials, textures, emitters, the ``to_world`` of fields
+and, with ``storage`` ``float32``, their arrays: hits move along their rays by the implicit function theorem, and
+normals, cosines and the solid angles between vertices follow. The derivatives are those of *interiors*: where the
+outline of a solid, its shadow or its image in a mirror moves over a pixel, radiance jumps, and this part of the
+derivative is missing. An optimisation from images therefore learns from shading, not from silhouettes; masks, or a loss
+on the field itself, have to compensate. Ordinary shapes are constants, and so are places seen in smooth mirrors and
+through smooth glass. Polarised variants and media are not supported.
 
 {executable}
 

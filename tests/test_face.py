@@ -332,6 +332,8 @@ BALL = """<scene version="3.0.0"><default name="light" value="1"/><integrator ty
 
 def test_captured_views(mi_rgb, tmp_path):
     """Images and poses are those of the folder; what is there is kept; words of the command are keywords."""
+    from mi_diffind.view_capture import CaptureError
+
     (tmp_path / "ball.xml").write_text(BALL)
     settings = {"views": 4, "test": 1, "resolution": 12, "spp": 4, "path": "orbit"}
     captured = mi_diffind.capture(tmp_path / "ball.xml", tmp_path / "views", progress=False, **settings)
@@ -352,8 +354,35 @@ def test_captured_views(mi_rgb, tmp_path):
     ):
         with pytest.raises(UsageError, match=sentence):
             mi_diffind.capture(tmp_path / "ball.xml", tmp_path / "views", **bad)
-    with pytest.raises(UsageError, match="scene: found a dict, a scene file is needed"):
-        mi_diffind.capture({"type": "scene"}, tmp_path / "views")
+    # The same scene as a dictionary: the same images, kept until the dictionary changes
+    again = mi_diffind.capture(ball(), tmp_path / "dict", progress=False, **settings)
+    np.testing.assert_array_equal(again.images, captured.images)
+    assert mi_diffind.capture(ball(), tmp_path / "dict", progress=False, **settings).rendered == 0
+    with pytest.raises(CaptureError, match="files have changed"):
+        mi_diffind.capture(ball(2), tmp_path / "dict", progress=False, **settings)
+    with pytest.raises(UsageError, match="found a loaded scene, which cannot be changed any more; a scene file is"):
+        mi_diffind.capture(mi_diffind.load_dict(ball()), tmp_path / "views", **settings)
+
+
+def ball(light=1.0) -> dict:
+    """Return the scene :data:`BALL` as a dictionary."""
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    return {
+        "type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective", "film": film},
+        "sky": {"type": "constant", "radiance": {"type": "spectrum", "value": light}},
+        "ball": {"type": "sphere", "center": [0, 0, 4], "material": {"type": "diffuse"}},
+    }  # fmt: skip
+
+
+def test_scenes_in_memory_that_hold_existing_objects_are_known_once(mi_rgb):
+    """The content of a bitmap is in no description; two dictionaries of plain values have equal ones."""
+    import mitsuba as mi
+
+    from mi_diffind.scenes import ParsedScene
+
+    assert ParsedScene(ball()).description == ParsedScene(ball()).description != ParsedScene(ball(2)).description
+    scene = ball() | {"other": mi.load_dict({"type": "sphere"})}
+    assert ParsedScene(scene).description != ParsedScene(scene).description
 
 
 def test_a_reference_and_its_checks(mi_rgb, tmp_path):
@@ -370,6 +399,15 @@ def test_a_reference_and_its_checks(mi_rgb, tmp_path):
     assert brighter.passed is False and brighter._repr_png_().startswith(b"\x89PNG")
     assert Path(brighter.figures["files"]["figure"]).is_file()
     assert brighter.images["image"].mean() == pytest.approx(1.5 * check.images["image"].mean(), rel=0.02)
+    # Scenes in memory, against the same reference by its name
+    known = {"name": "ball", "references": tmp_path / "references", "progress": False}
+    for scene in (ball(), mi_diffind.load_dict(ball())):
+        assert mi_diffind.regress(scene, **known).passed
+    assert mi_diffind.regress(ball(1.5), **known).passed is False
+    with pytest.raises(UsageError, match="name: not given, a scene in memory needs one"):
+        mi_diffind.regress(ball())
+    with pytest.raises(UsageError, match="defines: given with a scene in memory"):
+        mi_diffind.regress(mi_diffind.load_dict(ball()), defines={"light": 2}, **known)
 
 
 def test_keywords_of_a_study(monkeypatch, tmp_path, mi_rgb):

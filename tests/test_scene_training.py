@@ -13,6 +13,7 @@ from shading_scenes import fitted, material, scene_file
 from mi_diffind import scenes
 from mi_diffind.arguments import add_arguments
 from mi_diffind.compat import use_threads
+from mi_diffind.deadline import Deadline
 from mi_diffind.errors import UsageError
 from mi_diffind.files import OutputError
 from mi_diffind.maps.pyramid import Pyramid
@@ -21,7 +22,7 @@ from mi_diffind.plugins.support import footprint
 from mi_diffind.runtime import array_module
 from mi_diffind.scene_training import recipe as scene_recipe
 from mi_diffind.scene_training import reference_renders
-from mi_diffind.scene_training.fit import fit_scene
+from mi_diffind.scene_training.fit import fit_scene, limit
 from mi_diffind.scene_training.problem import SceneProblem, exposure_of
 from mi_diffind.scene_training.recipe import SCENE_ARGUMENTS, SceneRecipe
 from mi_diffind.scene_training.reference_renders import ReferenceRenders
@@ -340,6 +341,58 @@ def test_only_colours_count(path):
 def test_a_folder_for_references_that_cannot_be(path, tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
         references_of(path, ViewDistribution(), 4, tmp_path / "nowhere" / "kept")
+
+
+def test_a_scene_may_be_a_dictionary(folder, trained):
+    """The texture and its parameters are those of the file."""
+    file = (folder / "material.npz").resolve()
+    texture = {"type": "neural_texture", "filename": str(file), "channels": "albedo"}
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    parsed = scenes.ParsedScene({"type": "scene", "sensor": {"type": "perspective"}, "floor": floor})
+    assert texture_file(parsed) == (file, "")
+    assert TrainedScene(parsed, file, ViewDistribution(), 1, load(file)).keys.keys() == trained[0].keys.keys()
+
+
+class Timed:
+    """A problem whose measurement takes seconds of a clock that stands still otherwise: one for each sample."""
+
+    def __init__(self, clock):
+        self.clock, self.net, self.measured, self.samples = clock, None, [None], 8
+        self.scene, self.recipe = type("scene", (), {"spp": 1}), SceneRecipe()
+        self.identity = {"shading": {"share": 0.9}}
+
+    def measure(self, net):
+        self.clock.now += 0.1 * 2 * self.samples
+        return {"psnr_db": 20.0}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "compiling", "known", "samples", "remark"),
+    [
+        (40, 0.0, True, 8, ""),
+        (5, 0.0, True, 2, ""),
+        (2, 0.0, True, 1, "one takes about 2 s; the texture was trained alone; give --seconds 6 or more"),
+        (40, 6.0, True, 8, "one takes about 50 s, 48 s of it to compile its kernels; the texture was trained alone"),
+        (40, 0.0, False, 8, "one takes about 50 s, 48 s of it to compile its kernels; the texture was trained alone"),
+    ],
+)
+def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, known, samples, remark):
+    clock = type("clock", (), {"now": 5.0})
+    monkeypatch.setattr("time.perf_counter", lambda: clock.now)
+
+    def profiled(work):
+        start = clock.now
+        return work(), clock.now - start, [{}, {"backend_time": 1e3 * compiling, "operation_count": 20_000}]
+
+    monkeypatch.setattr("mi_diffind.scene_training.fit.profiled", profiled)
+    problem = Timed(clock)
+    request = FitRequest("ours", problem.recipe.settings, None, deadline=Deadline(seconds))
+    sentence, figures = limit(problem, request, known)
+    assert figures == {"psnr_db": 20.0}
+    assert sentence.startswith("no step through renders: " + remark if remark else remark)
+    assert bool(sentence) == bool(remark) == (problem.recipe.share == 0)
+    assert problem.samples == samples and problem.identity["shading"]["share"] == problem.recipe.share
+    assert request.deadline.reserve == pytest.approx(0.2 * samples)
 
 
 # -- training, while no other scene is there ---------------------------------------------------------------------------

@@ -12,6 +12,8 @@ shaded values without a scene.
 
 from __future__ import annotations
 
+import os
+
 from ..arguments import Argument, fraction
 from ..errors import UsageError
 from ..task import FitRequest, Fitted, Task
@@ -39,7 +41,7 @@ class SceneTraining(Task):
 
     def check(self, request: FitRequest) -> None:
         source = request.options["source"]
-        if not str(source).lower().endswith(".xml"):
+        if isinstance(source, (str, os.PathLike, type(None))) and not str(source).lower().endswith(".xml"):
             raise UsageError(f"source: found {source}, a scene file (.xml) is needed; fit shading trains maps")
 
     def fit(self, request: FitRequest) -> Fitted:

@@ -76,6 +76,8 @@ class SceneProblem(Problem):
         self.references = [mi.TensorXf(np.ascontiguousarray(self.exposure * image)) for _, image in trained]
         self.measured = [(view, self.exposure * image) for view, image in measured]
         recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
+        #: Samples per pixel of each half of a measured render.
+        self.samples = max(MEASURED // 2, scene.spp)
         self.identity = {**texture.identity, "scene": digest, "shading": recorded, "exposure": self.exposure}
         self._view = 0
 
@@ -135,9 +137,8 @@ class SceneProblem(Problem):
 
     def _sampled(self, number: int) -> np.ndarray:
         """Render half the samples of a measurement, the same for the same number."""
-        spp = max(MEASURED // 2, self.scene.spp)
         seed = dr.opaque(mi.UInt32, SEEDS - 1 - number)
-        return self.exposure * np.nan_to_num(self.scene.render(seed, seed + SEEDS, spp).numpy())
+        return self.exposure * np.nan_to_num(self.scene.render(seed, seed + SEEDS, self.samples).numpy())
 
     def _write(self, reference: np.ndarray, image: np.ndarray) -> None:
         difference = SHOWN * np.abs(image - reference)

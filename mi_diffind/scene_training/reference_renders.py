@@ -76,7 +76,7 @@ class ReferenceRenders:
             "spp": self.spp, "target": self.views.target, "up": self.views.up, "variant": mi.variant(),
             "versions": [mi.__version__, __version__, fingerprint(code)], "pass": self.pass_samples,
         }  # fmt: skip
-        digest = hashlib.sha256(json.dumps(common).encode())
+        digest = hashlib.sha256((json.dumps(common) + self.scene.description).encode())
         for file in self.scene.files():
             if file not in self.without:
                 digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
@@ -144,7 +144,7 @@ class ReferenceRenders:
     def _scene(self) -> tuple:
         """Return the exact scene, loaded on the first call, its rig, and the samples per pixel of one pass."""
         if self._loaded is None:
-            scene = self.scene.load(exact=True, against=self.against)
+            scene = self.scene.load(exact=True, against=self.against, parallel=False)
             width, height = scenes.film_size(scene)
             self._loaded = scene, Rig(scene, self.views), max(1, self.pass_samples // (width * height))
         return self._loaded

@@ -24,6 +24,7 @@ from mi_diffind import compat
 from mi_diffind.tasks.sdf import tracing
 
 from . import omissions
+from .placement import Placement, PlacementParameter
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
 OFFSET = 3 * tracing.EPSILON
@@ -41,37 +42,6 @@ SEEN_BY = ("path_sdf",)
 CORNERS, UNMERGED = 8, "face_solid"
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Transform from the unit frame to the world: ``p ↦ size · rotation p + origin``, or with a reflection."""
-
-    rotation: np.ndarray
-    size: float
-    origin: np.ndarray
-
-    @classmethod
-    def of(cls, to_world, scale: float, centre) -> Placement:
-        """Return the placement of a mesh moved by ``to_world`` (``mi.ScalarTransform4f``).
-
-        ``centre`` and ``scale`` are the centre and the longest side of the mesh's box in its units. Raises
-        ``RuntimeError`` unless ``to_world`` is a rotation, a uniform scale and a translation.
-        """
-        matrix = np.array(to_world.matrix, np.float64)
-        linear = matrix[:3, :3]
-        size = float(np.abs(np.linalg.det(linear))) ** (1 / 3)
-        affine = np.isfinite(matrix).all() and size > 0 and np.allclose(matrix[3], (0, 0, 0, 1))
-        if not affine or not np.allclose(linear.T @ linear, size**2 * np.eye(3), atol=1e-4 * size**2):
-            rows = ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in linear)
-            raise RuntimeError(
-                f'parameter "to_world": found [{rows}], allowed are rotations, uniform scales and translations'
-            )
-        return cls(linear / size, size * scale, linear @ np.asarray(centre, np.float64) + matrix[:3, 3])
-
-    def world(self, p: np.ndarray) -> np.ndarray:
-        """Return points ``(N, 3)`` of the unit frame in the world."""
-        return self.size * (p @ self.rotation.T) + self.origin
-
-
 @cache
 def distance_shape(mesh: type) -> type:
     """Return the base class of distance shapes for ``mi.Mesh`` of the current variant; each variant has its class."""
@@ -86,37 +56,48 @@ def distance_shape(mesh: type) -> type:
         seen_by = SEEN_BY
 
         def __init__(self, props: mi.Properties, field, placement: Placement, smooth: bool):
-            self.field, self.placement, self.smooth = field, placement, smooth
+            self.field, self.smooth, self.position = field, smooth, PlacementParameter(placement)
             self.ready = False
             super().__init__(props.plugin_name(), CORNERS, CORNERS, props)
             if self.is_emitter():
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
             if self.is_medium_transition():
                 raise RuntimeError("medium: found one, signed distance fields hold none")
-            box = np.array([field.lower, field.upper], np.float64)
-            corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
-            buffers = mi.traverse(self)
-            buffers["vertex_positions"] = placement.world(corners).astype(np.float32).ravel()
-            buffers["faces"] = np.repeat(np.arange(CORNERS, dtype=np.uint32), 3)
-            buffers.update()
-            self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
-            self.ready = True
             self._place()
+            self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
             omissions.watch(self)
 
+        @property
+        def placement(self) -> Placement:
+            """Placement of the unit frame in the world."""
+            return self.position.placement
+
         def _place(self) -> None:
-            """Store the placement as opaque numbers, so that another one compiles no new kernel."""
-            placement = self.placement
-            self.axes = mi.Frame3f(*(mi.Vector3f(column.tolist()) for column in placement.rotation.T))
-            dr.make_opaque(self.axes)
-            self.origin = dr.opaque(mi.Point3f, placement.origin.tolist())
-            self.size = dr.opaque(mi.Float, placement.size)
+            """Move the triangles to the corners of the field's box in the world, and the frame with them."""
+            # Attributes of their own, where frozen functions (``dr.freeze``) look for arrays
+            self.axes, self.origin, self.size = self.position.axes, self.position.origin, self.position.size
+            box = np.array([self.field.lower, self.field.upper], np.float64)
+            corners = np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
+            self.ready = False
+            buffers = mi.traverse(self)
+            buffers["vertex_positions"] = self.placement.world(corners).astype(np.float32).ravel()
+            buffers["faces"] = np.repeat(np.arange(CORNERS, dtype=np.uint32), 3)
+            buffers.update()
+            self.ready = True
 
         def traverse(self, cb: mi.TraversalCallback) -> None:
             if not self.ready:
                 super().traverse(cb)
                 return
             cb.put("bsdf", self.bsdf(), mi.ParamFlags.Differentiable)
+            cb.put("to_world", self.position.transform, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+
+        def parameters_changed(self, keys=()) -> None:
+            if not self.ready:
+                super().parameters_changed(keys)
+            elif not keys or "to_world" in keys:
+                self.position.update()
+                self._place()
 
         def omitted(self, integrators: list, sensor) -> str:
             """Return a sentence if these integrators do not trace the shape; see :mod:`.omissions`."""
@@ -139,8 +120,8 @@ def distance_shape(mesh: type) -> type:
             return False
 
         def optimised(self) -> bool:
-            """Return whether derivatives with respect to the field are enabled."""
-            return False
+            """Return whether derivatives with respect to the field or its place are enabled."""
+            return self.position.moving()
 
         @property
         def index_bytes(self) -> int:
@@ -149,38 +130,51 @@ def distance_shape(mesh: type) -> type:
 
         def local_ray(self, o, d):
             """Return a ray's origin and direction in the unit frame: lengths are those of the world by ``size``."""
-            return self.axes.to_local(mi.Vector3f(o - self.origin)) / self.size, self.axes.to_local(d)
+            return self.local_point(o), self.axes.to_local(d)
+
+        def local_point(self, p):
+            """Return a point of the world in the unit frame."""
+            return self.axes.to_local(mi.Vector3f(p - self.origin)) / self.size
 
         def to_world(self, p):
             """Return a point of the unit frame in the world."""
             return mi.Point3f(dr.fma(self.axes.to_world(mi.Vector3f(p)), self.size, self.origin))
 
-        def moved(self, p, d, active=True):
-            """Attach the hit ``p`` (unit frame) of a ray with the direction ``d`` (world) to the field's entries.
+        def moved(self, p, d, active=True) -> tuple:
+            """Return the hit ``p`` (unit frame) of a ray with the direction ``d`` (world), and its place in the world.
 
-            If derivatives are enabled and not suspended, the hit moves along the ray so that the value stays zero.
+            If derivatives are enabled and not suspended, both are attached to the field's entries and to its placement:
+            the hit moves along the ray so that the value stays zero.
             """
             p = mi.Point3f(dr.detach(p))
             if not self.optimised():
-                return p
-            d = self.axes.to_local(dr.detach(d))
+                return p, self.to_world(p)
+            direction = mi.Vector3f(dr.detach(self.axes).to_local(dr.detach(d)))
             value, slope = self.field.gradient(p, active)
             slope = dr.detach(slope)
-            along = dr.dot(slope, d)
+            along = dr.dot(slope, direction)
             along = dr.copysign(dr.maximum(dr.abs(along), dr.maximum(GRAZING * dr.norm(slope), 1e-6)), along)
-            return p - mi.Vector3f(d) * ((value - dr.detach(value)) / along)
+            moving = self.position.moving()
+            if moving:
+                # The frame moves, this place of the world does not
+                place = dr.detach(self.to_world(p))
+                p = dr.replace_grad(p, self.local_point(place))
+                value = value + dr.dot(slope, p - dr.detach(p))
+            back = (value - dr.detach(value)) / along
+            p = p - direction * back
+            return p, place - dr.detach(d) * (back * dr.detach(self.size)) if moving else self.to_world(p)
 
         def surface(self, p, d, active=True):
             """Return place, geometric and shading normal, in the world, of the hit ``p`` (unit frame) of a ray.
 
             The ray has the direction ``d`` (world); the place is attached as in :meth:`moved`.
             """
-            p = self.moved(p, d, active)
+            p, place = self.moved(p, d, active)
             if not self.smooth:
                 shading = normal = self._unit(self.field.gradient(p, active)[1], d)
             else:
                 normal, shading = (self._unit(v, d) for v in self.field.normals(p, active))
-            return self.to_world(p), self.axes.to_world(normal), self.axes.to_world(shading)
+            return place, self.axes.to_world(normal), self.axes.to_world(shading)
 
         def _unit(self, v, d):
             length = dr.norm(v)
@@ -310,8 +304,8 @@ def shift(shapes: list, hit: ShapeHit, d, active=True):
     change = mi.Vector3f(0)
     for i, shape in enumerate(shapes):
         here = (hit.number == i + 1) & active
-        p = shape.to_world(shape.moved(hit.p, d, here))
-        change = dr.select(here, p - dr.detach(p), change)
+        _, place = shape.moved(hit.p, d, here)
+        change = dr.select(here, place - dr.detach(place), change)
     return change
 
 

@@ -16,7 +16,7 @@ from mi_diffind.tasks.radiance import march as marching
 from mi_diffind.tasks.radiance.files import load
 
 from . import properties, upsampling
-from .distance_shapes import Placement
+from .placement import Placement, PlacementParameter
 
 #: Luminance of linear sRGB, the same as in Mitsuba.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
@@ -30,11 +30,22 @@ class PlacedField:
     """
 
     def __init__(self, field, to_world):
-        self.field, self.placement = field, Placement.of(to_world, 1.0, (0, 0, 0))
-        self.axes = mi.Frame3f(*(mi.Vector3f(column.tolist()) for column in self.placement.rotation.T))
-        dr.make_opaque(self.axes)
-        self.origin = dr.opaque(mi.Point3f, self.placement.origin.tolist())
-        self.size = dr.opaque(mi.Float, self.placement.size)
+        self.field, self.position = field, PlacementParameter(Placement.of(to_world, 1.0, (0, 0, 0)))
+        self._turn = None
+        self._place()
+
+    def _place(self) -> None:
+        self.axes, self.origin, self.size = self.position.axes, self.position.origin, self.position.size
+
+    def update(self) -> None:
+        """Follow a change of the parameter ``to_world``. Raises ``RuntimeError`` unless it is a similarity."""
+        self.position.update()
+        self._place()
+
+    @property
+    def placement(self) -> Placement:
+        """Placement of the field's frame in the world."""
+        return self.position.placement
 
     def held(self) -> list:
         """Return all arrays that rays read.
@@ -50,13 +61,22 @@ class PlacedField:
         return {name: values for name, values in self.field.arrays.items() if dr.is_float_v(values)}
 
     def optimised(self) -> bool:
-        """Return whether a derivative with respect to the field's arrays is requested."""
-        return any(compat.has_gradient(values) for values in self.exposed.values())
+        """Return whether a derivative with respect to the field's arrays or its place is requested."""
+        return self.position.moving() or any(compat.has_gradient(values) for values in self.exposed.values())
 
     def _local(self, ray, far, active) -> tuple:
         """Return the arguments of the functions of :mod:`.march` after the field."""
         o = mi.Point3f(self.axes.to_local(mi.Vector3f(ray.o - self.origin)) / self.size)
         return o, self.axes.to_local(ray.d), mi.Float(0), far / self.size, active
+
+    @staticmethod
+    def _seen_from(numbers: list, ray, far, active) -> tuple:
+        """Return :meth:`_local` for a placement that is attached: ``numbers`` are those of :meth:`_numbers`."""
+        axes = mi.Frame3f(*(mi.Vector3f(*numbers[i : i + 3]) for i in (0, 3, 6)))
+        origin, size = mi.Point3f(*numbers[9:12]), numbers[12]
+        o = mi.Point3f(axes.to_local(mi.Vector3f(ray.o - origin)) / size)
+        # Infinity over the size has no derivative
+        return o, axes.to_local(ray.d), mi.Float(0), dr.minimum(far, 1e18) / size, active
 
     def enters(self, ray, far, active=True) -> tuple:
         """Return the distance at which rays enter the field's box, and whether they do so before ``far``."""
@@ -86,13 +106,50 @@ class PlacedField:
 
     def replay(self, ray, far, active, marched, d_colour, d_transmittance, d_depth) -> None:
         """Call :func:`.march.replay`; ``depth`` is in units of the world."""
-        local = self._local(ray, far, active)
-        marching.replay(self.field, *local, 0.5, marched, d_colour, d_transmittance, d_depth * self.size)
+        moving = self.position.moving()
+        with dr.resume_grad(when=moving):
+            if moving:
+                # Gathered, so that the kernel of the rays sums the gradients: sums of a width of 1 are kernels each
+                first = dr.minimum(dr.arange(mi.UInt32, dr.width(ray.o)), 0)
+                numbers = [dr.gather(mi.Float, v, first) for v in self._numbers()]
+                local = self._seen_from(numbers, ray, far, active)
+            else:
+                local = self._local(ray, far, active)
+        d_inside = d_depth * dr.detach(self.size)
+        marching.replay(self.field, *local, 0.5, marched, d_colour, d_transmittance, d_inside, moving)
+        if moving:
+            with dr.resume_grad():
+                depth = dr.select(active, d_depth * dr.detach(marched.depth), 0)
+                dr.backward_from(depth * dr.gather(mi.Float, self.size, first), marching.ANY)
+
+    def start_forward(self) -> None:
+        """Determine the tangents of the placement, once before :meth:`tangent`."""
+        self._turn = None
+        if self.position.moving():
+            with dr.resume_grad():
+                self._turn = dr.forward_to(*self._numbers(), flags=marching.ANY)
+
+    def _numbers(self) -> list:
+        return [*self.axes.s, *self.axes.t, *self.axes.n, *self.origin, self.size]
 
     def tangent(self, ray, far, active, marched) -> tuple:
         """Call :func:`.march.tangent`; ``depth`` is in units of the world."""
-        colour, transmittance, depth = marching.tangent(self.field, *self._local(ray, far, active), 0.5, marched)
-        return colour, transmittance, depth * self.size
+        moving = self._turn is not None
+        if not moving:
+            local, size = self._local(ray, far, active), self.size
+        else:
+            with dr.resume_grad():
+                # Numbers of their own: tangents pass through these more than once
+                numbers = [mi.Float(dr.detach(v)) for v in self._numbers()]
+                for number, change in zip(numbers, self._turn, strict=True):
+                    dr.enable_grad(number)
+                    dr.set_grad(number, change)
+                size, local = numbers[12], self._seen_from(numbers, ray, far, active)
+        colour, transmittance, depth = marching.tangent(self.field, *local, 0.5, marched, moving)
+        depth = depth * dr.detach(size)
+        if moving:
+            depth += dr.select(active, dr.detach(marched.depth) * self._turn[12], 0)
+        return colour, transmittance, depth
 
 
 def _arrays_of(value, visited: set) -> list:

@@ -157,13 +157,15 @@ def sparse_table(shape=torus, spacing=1 / 40, entries=256, scale=2.0, centre=(0.
 def register(mi, fields: dict, name: str = "test_solid") -> None:
     """A shape ``name`` whose ``field`` is the key of one in ``fields``; its box is as large as in the unit frame."""
     from mi_diffind.plugins.support import distance_shapes as shapes
+    from mi_diffind.plugins.support.placement import Placement
 
     def make(props):
-        placement = shapes.Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
+        placement = Placement.of(props.get("to_world", mi.ScalarTransform4f()), 1.0, (0, 0, 0))
         return Held(props, fields[props["field"]], placement, props.get("smooth", False))
 
     class Held(shapes.distance_shape(mi.Mesh)):
         def optimised(self):
-            return any(dr.is_diff_v(v) and v.index_ad for v in vars(self.field).values() if isinstance(v, mi.Float))
+            values = [v for v in vars(self.field).values() if isinstance(v, mi.Float)]
+            return super().optimised() or any(dr.is_diff_v(v) and v.index_ad for v in values)
 
     mi.register_shape(name, make)

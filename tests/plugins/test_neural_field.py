@@ -474,6 +474,72 @@ def test_derivatives_before_an_integrator_in_cpp(mi_rgb, fields):
     assert np.abs(found[..., 3:]).max() == 0
 
 
+def check_place(mi, made, key, step=1e-3):
+    """Forward and backward derivatives along a move of a field, turned and scaled as well, against differences."""
+    params, integrator = mi.traverse(made), made.integrator()
+    start = mi.AffineTransform4f(params[key])
+
+    def put(value, gradient=False):
+        v, one = mi.Float(value), mi.AffineTransform4f
+        if gradient:
+            dr.enable_grad(v)
+        turn = one().rotate(mi.Vector3f(0.6, 0, 0.8), 60 * v).scale(1 + 0.5 * v)
+        params[key] = one().translate(v * mi.Vector3f(0.3, 0.7, -0.2)) @ turn @ start
+        params.update()
+        return v
+
+    images = []
+    for value in (step, -step):
+        put(value)
+        images.append(render(mi, made, 1, 8).astype(np.float64))
+    differences = (images[0] - images[1]) / (2 * step)
+    dr.forward(put(0, True), dr.ADFlag.ClearEdges)
+    forward = np.array(integrator.render_forward(made, params, spp=1, seed=8))
+    weights = np.random.default_rng(3).normal(size=forward.shape).astype(np.float32)
+    v = put(0, True)
+    dr.backward(dr.sum(mi.render(made, params, spp=1, seed=7, seed_grad=8) * mi.TensorXf(weights), axis=None))
+    assert dr.grad(v)[0] == pytest.approx(float((weights * forward).sum()), rel=1e-3, abs=1e-3)
+    for c in range(forward.shape[2]):
+        size = np.sqrt((differences[..., c] ** 2).mean())
+        assert size > 1e-2 and np.sqrt(((forward - differences)[..., c] ** 2).mean()) < 5e-3 * size, (key, c)
+
+
+def test_derivatives_of_the_place(mi_rgb, fields):
+    """In front of surfaces and in a mirror, with a box that cuts bumps; one of two fields."""
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    place = at().translate([0.1, 0.2, -0.1]).rotate([0.8, 0.6, 0], 30).scale(0.9)
+    options = {"aovs": "depth,opacity", "hide_emitters": True, "to_world": place}
+    made = lit(mi, integrator={**options, "max_depth": 3})
+    assert mi.traverse(made).flags("it.to_world") == mi.ParamFlags.Discontinuous
+    check_place(mi, made, "it.to_world")
+    inner = {"type": "test_field", "field": "bumps", "to_world": at().translate([0, 2.5, 0]).scale(0.8)}
+    two = scene(mi, "fog", size=(16, 12), integrator={"aovs": "depth,opacity", "c": inner})
+    for key in ("it.surfaces.to_world", "it.to_world"):
+        check_place(mi, two, key)
+
+
+def test_a_moved_field_is_that_of_a_new_scene(mi_rgb, fields):
+    """To the last bit; a transform that is refused, or that makes fields overlap, is not accepted."""
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    turn = at().translate([0.3, 0.2, -0.1]).rotate([0.6, 0, 0.8], 40).scale([-0.7, 0.7, 0.7])
+    new, made = (scene(mi, "bumps", size=(16, 12), integrator=more) for more in ({"to_world": turn}, {}))
+    expected, before = render(mi, new), render(mi, made)
+    params = mi.traverse(made)
+    for given, image in ((turn, expected), (at(), before)):
+        params["it.to_world"] = given
+        params.update()
+        np.testing.assert_array_equal(render(mi, made), image)
+    assert np.abs(before - expected).max() > 0.1
+    params["it.to_world"] = at().scale([1, 2, 1])
+    with pytest.raises(RuntimeError, match=r'parameter "to_world": found .* allowed are rotations'):
+        params.update()
+    inner = {"type": "test_field", "field": "fog", "id": "inner", "to_world": at().translate([0, 2.5, 0])}
+    params = mi.traverse(scene(mi, "bumps", integrator={"c": inner}))
+    params["it.surfaces.to_world"] = at().translate([0, 1.5, 0])
+    with pytest.raises(RuntimeError, match="boxes of two nested fields overlap"):
+        params.update()
+
+
 @pytest.mark.parametrize("ending", ["reflectance.value", "specular_reflectance.value", "sky.radiance.value"])
 def test_derivatives_of_surfaces(mi_rgb, fields, ending):
     """Of the inner integrator, behind the field, and of the mirrors and lights that rays are followed to."""
@@ -615,7 +681,7 @@ def test_arrays_of_a_file_can_be_optimised(mi_rgb, fields, file):
     made = scene(mi, size=(16, 12))
     integrator = mi.load_dict({"type": "neural_field", "filename": str(file), "storage": "float32", "id": "it"})
     params = mi.traverse(integrator)
-    assert set(params.keys()) == {"tables.density", "tables.colour"}
+    assert set(params.keys()) == {"tables.density", "tables.colour", "to_world"}
     before = render(mi, made, integrator=integrator)
     dr.enable_grad(params["tables.colour"])
     image = mi.render(made, params, spp=1, integrator=integrator)

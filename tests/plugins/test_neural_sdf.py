@@ -237,6 +237,27 @@ def test_derivatives_reach_the_nodes(mi_rgb, folder):
     assert result == pytest.approx(differences, rel=0.03)
 
 
+def test_a_moved_shape_is_that_of_a_new_scene(mi_rgb, folder):
+    """To the last bit, with its extent; a transform that is refused moves nothing."""
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    turn = at().translate([0.3, 0.2, -0.1]).rotate([0.6, 0, 0.8], 40).scale([-1.2, 1.2, 1.2])
+    new, loaded = (scene(mi, {"a": shape(folder, **more)}) for more in ({"to_world": turn}, {}))
+    expected, before = (np.array(mi.render(v, spp=4)) for v in (new, loaded))
+    assert np.abs(before - expected).max() > 0.1
+    params = mi.traverse(loaded)
+    params["a.to_world"] = turn
+    params.update()
+    np.testing.assert_array_equal(np.array(mi.render(loaded, spp=4)), expected)
+    assert loaded.bbox() == new.bbox()
+    params["a.to_world"] = at().scale([1, 2, 1])
+    with pytest.raises(RuntimeError, match=r'parameter "to_world": found .* allowed are rotations'):
+        params.update()
+    np.testing.assert_array_equal(np.array(mi.render(loaded, spp=4)), expected)
+    params["a.to_world"] = at()
+    params.update()
+    np.testing.assert_array_equal(np.array(mi.render(loaded, spp=4)), before)
+
+
 # -- how fine a grid is ------------------------------------------------------------------------------------------------
 
 

@@ -236,3 +236,63 @@ def test_derivatives_against_differences(mi_rgb, fields):
     differences = (images[1] - images[0]) / 2e-3
     forward, _ = both_modes(mi, loaded, ball, 2)
     assert np.abs(forward - differences).mean() < 2e-3 * np.abs(differences).mean()
+
+
+MOVES = {
+    "translation": lambda mi, v: mi.AffineTransform4f().translate(v * mi.Vector3f(0.3, -0.5, 0.8)),
+    "rotation": lambda mi, v: mi.AffineTransform4f().rotate(mi.Vector3f(0.6, 0, 0.8), 90 * v),
+    "scale": lambda mi, v: mi.AffineTransform4f().scale(1 + v),
+}
+
+
+def of_place(mi, loaded, integrator, move, mode="forward", spp=64, seed=3):
+    """The image's derivative along a move of the ball that begins at rest, or the gradient of its sum."""
+    params, v = mi.traverse(loaded), mi.Float(0)
+    dr.enable_grad(v)
+    params["ball.to_world"] = MOVES[move](mi, v) @ mi.AffineTransform4f(params["ball.to_world"])
+    params.update()
+    if mode == "forward":
+        dr.forward(v, dr.ADFlag.ClearEdges)
+        return np.array(integrator.render_forward(loaded, params, spp=spp, seed=seed))
+    dr.backward(dr.sum(mi.render(loaded, params, integrator=integrator, spp=spp, seed=9, seed_grad=seed), axis=None))
+    return dr.grad(v)[0]
+
+
+@pytest.mark.parametrize("move, depth", [("translation", 2), ("rotation", 4)])
+def test_derivatives_of_the_place_are_those_of_prb(mi_rgb, fields, move, depth):
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    other = {"other": {"type": "sphere", "center": [0.6, -0.9, 1.6], "radius": 0.5, "bsdf": BSDFS["rough"]}}
+    ours = solid(mi, "aside", bsdf=BSDFS["rough"])
+    sphere = {"type": "sphere", "to_world": at().scale(2.5).translate([0.15, 0.1, -0.05]).scale(0.3)}
+    loaded = scene(mi, {"ball": ours, **other}, **interior(mi))
+    tracer = mi.load_dict({"type": "path_sdf", "max_depth": depth})
+    actual = of_place(mi, loaded, tracer, move)
+    assert of_place(mi, loaded, tracer, move, "backward") == pytest.approx(actual.sum(), rel=1e-3)
+    loaded = scene(mi, {"ball": {**sphere, "bsdf": BSDFS["rough"]}, **other}, **interior(mi))
+    expected = of_place(mi, loaded, mi.load_dict({"type": "prb", "max_depth": depth}), move)
+    error = np.abs(actual - expected)
+    assert np.median(error) < 0.02 * np.median(np.abs(expected))
+    assert actual.mean() == pytest.approx(expected.mean(), rel=0.01 if depth == 2 else 0.15)
+
+
+@pytest.mark.parametrize("move", ["rotation", "scale"])
+def test_derivatives_of_the_place_against_differences(mi_rgb, fields, move):
+    """As those of the radius."""
+    mi = mi_rgb
+    point = {"type": "point", "position": [-3, -4, 4], "intensity": 20.0}
+    dark = {name: {"type": "sphere", "center": [0, 0, 99]} for name in ("lamp", "sky")}
+    place = mi.ScalarTransform4f().translate([-0.4, -0.3, 0.2]).scale(2.5 * 4 / 3)
+    ball = {"type": "test_solid", "field": "aside", "to_world": place, "bsdf": BSDFS["rough"]}
+    loaded = scene(mi, {"ball": ball}, **interior(mi), point=point, **dark)
+    integrator = mi.load_dict({"type": "path_sdf", "max_depth": 2})
+    params, images = mi.traverse(loaded), []
+    assert params.flags("ball.to_world") == mi.ParamFlags.Discontinuous
+    start = mi.AffineTransform4f(params["ball.to_world"])
+    for v in (-1e-3, 1e-3, 0):
+        params["ball.to_world"] = MOVES[move](mi, mi.Float(v)) @ start
+        params.update()
+        images.append(np.array(mi.render(loaded, spp=64, seed=3, integrator=integrator)))
+    differences = (images[1] - images[0]) / 2e-3
+    assert np.abs(differences).mean() > 0.1
+    forward = of_place(mi, loaded, integrator, move)
+    assert np.abs(forward - differences).mean() < 2e-3 * np.abs(differences).mean()

@@ -77,7 +77,8 @@ class MeshView:
 
     def field_scene(self, field: DistanceField, lit: bool = False):
         """Return a scene of the field, traced by ``path_sdf``."""
-        from ...plugins.support.distance_shapes import Placement, distance_shape
+        from ...plugins.support.distance_shapes import distance_shape
+        from ...plugins.support.placement import Placement
 
         placement = Placement.of(mi.ScalarTransform4f(), 1.0, (0.0, 0.0, 0.0))
         shape = distance_shape(mi.Mesh)(_material(), field, placement, True)

@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...deadline import Deadline
 from ...indirection import device_array, device_tensor, fold
 from . import grid as grids
 from .grid import NodeGrid
@@ -58,9 +59,9 @@ class PaletteCoding:
     index_bits: int
 
 
-def palette_coding(grid: NodeGrid, index_bits: int, seed: int) -> PaletteCoding:
-    """Return the initial coding of a grid of visible nodes."""
-    palette, index = clusters(grid.colour[1:], 2**index_bits, seed)
+def palette_coding(grid: NodeGrid, index_bits: int, seed: int, deadline: Deadline | None = None) -> PaletteCoding:
+    """Return the initial coding of a grid of visible nodes, with fewer rounds of :func:`clusters` at the deadline."""
+    palette, index = clusters(grid.colour[1:], 2**index_bits, seed, deadline)
     # Neighbours in the palette look alike, so that the upper bits of an index vary little and deflate
     centred = palette - palette.mean(axis=0)
     principal = np.linalg.eigh(centred.T @ centred)[1][:, -1]
@@ -72,10 +73,13 @@ def palette_coding(grid: NodeGrid, index_bits: int, seed: int) -> PaletteCoding:
     return PaletteCoding(grid.nodes, levels, index, palette[order], index_bits)
 
 
-def clusters(colour: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def clusters(
+    colour: np.ndarray, count: int, seed: int, deadline: Deadline | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return ``count`` cluster centres of ``colour`` ``(n, 12)`` and the index of the nearest one for each row.
 
-    The centres, ``(count, 12)``, are found by Lloyd's algorithm on random rows.
+    The centres, ``(count, 12)``, are found by Lloyd's algorithm on random rows, in :data:`ROUNDS` rounds unless the
+    deadline passes.
     """
     rng = np.random.default_rng(seed)
     metric = np.tile([1.0, DIRECTION, DIRECTION, DIRECTION], 3)
@@ -84,6 +88,8 @@ def clusters(colour: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.
     centres = points[rng.choice(len(points), count, replace=False)]
     sample = rng.choice(len(points), min(len(points), SAMPLES * count), replace=False)
     for _ in range(ROUNDS):
+        if deadline is not None and deadline.passed:
+            break
         nearest = cKDTree(centres).query(points[sample])[1]
         used = np.bincount(nearest, minlength=count)
         sums = np.stack([np.bincount(nearest, points[sample, c], count) for c in range(12)], axis=1)

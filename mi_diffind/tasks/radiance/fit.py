@@ -37,12 +37,16 @@ DENSITY_SHARE = 0.35
 #: Bytes of memory for each node of the dense grid, empty or not, roughly.
 VOXEL = 24
 
-#: Shares of a limited time: that of the grid, and, of what is left then, that of the training on its numbers.
-GRID_TIME, VALUE_TIME = 0.6, 0.2
+#: Shares of a limited time: that of the grid, and, of what is left then, those of the training on its numbers and of
+#: the clusters of its colours.
+GRID_TIME, VALUE_TIME, CLUSTER_TIME = 0.6, 0.2, 0.25
 
-#: Held-out views of measurements during a training, and least steps of the first stage of the grid, if time is limited:
-#: a field that nobody sees has no second stage.
-WATCHED, FIRST_STEPS = 8, 100
+#: Least steps of the first stage of the grid if time is limited: a field that nobody sees has no second stage.
+FIRST_STEPS = 100
+
+#: Pixels of held-out views that are measured, and of training views in which visible cells are sought, for each second
+#: of a limited time.
+PIXELS = 40_000
 
 
 def check(request: FitRequest) -> None:
@@ -73,8 +77,8 @@ def fit(request: FitRequest) -> Fitted:
     Raises :class:`UsageError`, :class:`.views.ViewsError`, :class:`~mi_diffind.tables.TableError` and
     :class:`~mi_diffind.fitting.FittingError`.
     """
-    watched = None if request.deadline is None else WATCHED
-    return FieldFit(request, FieldSession.load(request.types, request.options["source"], watched)).run()
+    pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
+    return FieldFit(request, FieldSession.load(request.types, request.options["source"], pixels)).run()
 
 
 @dataclasses.dataclass
@@ -118,7 +122,10 @@ class FieldFit:
         seconds = time.perf_counter() - start - grid_seconds
         lines = [f"{grid_seconds:.1f} s for the grid, {seconds:.1f} s for the rest"]
         if layout != "grid" and grid_result is not None and grid_result.unfinished:
-            lines.append(f"the grid was trained for {grid_result.steps} steps: unfinished")
+            steps = f"{grid_result.steps} step{'s' if grid_result.steps != 1 else ''}"
+            lines.append(f"the grid was trained for {steps}: unfinished")
+        if request.deadline is not None:
+            lines.append(f"measured in {len(session.held_out)} held-out views")
         size = getattr(field, "nbytes", None)
         if size:
             lines.append(f"{size:,} bytes in memory, {dense / size:.0f} times less than the dense grid of float32")
@@ -172,9 +179,9 @@ class FieldFit:
                 continue
             with interruptible() as stop:
                 if grid is None:
-                    grid = grids.begin(request.types, views, max(8, round(nodes * share)))
+                    grid = grids.begin(request.types, self.session.seeing_images.views, max(8, round(nodes * share)))
                 else:
-                    visible = grids.visible(grid, self.session.images)
+                    visible = grids.visible(grid, self.session.seeing_images)
                     grid = grids.divided(grid, visible, share / STAGES[number - 1][0], wide=1)
             if stop.is_set() and result is not None:
                 return grid, dataclasses.replace(result, interrupted=True)
@@ -221,7 +228,7 @@ class FieldFit:
 
     def visible(self, grid: NodeGrid) -> NodeGrid:
         """Return the part of a grid that the training views see."""
-        return grids.divided(grid, grids.visible(grid, self.session.images))
+        return grids.divided(grid, grids.visible(grid, self.session.seeing_images))
 
     def grid_table(self, grid: NodeGrid) -> Table:
         """Return the table of the visible part of a grid."""
@@ -261,7 +268,7 @@ class FieldFit:
         if options["psnr"] is not None:
             return self.smallest(grid, float(options["psnr"]), stopped)
         try:
-            smaller, bits = compression.sized(grid, self.session.images, self.wanted_bytes(grid))
+            smaller, bits = compression.sized(grid, self.session.seeing_images, self.wanted_bytes(grid))
         except ValueError as e:
             given = "bytes" if options["bytes"] is not None else "compression"
             raise UsageError(f"--{given}: {e}") from None
@@ -269,7 +276,8 @@ class FieldFit:
 
     def compressed(self, grid: NodeGrid, bits: int, stopped: bool, suffix: str = ""):
         """Train a palette of ``2**bits`` colours on a grid; return the table, the result and the field."""
-        coding = compression.palette_coding(grid, bits, self.request.settings.seed)
+        limit = self.request.part(CLUSTER_TIME).deadline
+        coding = compression.palette_coding(grid, bits, self.request.settings.seed, limit)
         problem = compression.PaletteProblem(coding, self.session)
 
         def stored() -> tuple[Table, VolumeField]:
@@ -281,17 +289,26 @@ class FieldFit:
         return table, result, field
 
     def smallest(self, grid: NodeGrid, psnr: float, stopped: bool):
-        """Return the first size of :data:`LADDER` that reaches a PSNR in decibels over white, else the last one."""
-        cells = grids.visible(grid, self.session.images)
+        """Return the first size of :data:`LADDER` that reaches a PSNR in decibels over white, else the last one.
+
+        With a limit of time, a size that would take longer than what is left is not tried.
+        """
+        cells = grids.visible(grid, self.session.seeing_images)
+        limit, duration = self.request.deadline, 0.0
         for number, (share, bits) in enumerate(LADDER):
+            if limit is not None and limit.left() < duration:
+                print(f"warning: the time allowed {number} of {len(LADDER)} sizes", file=sys.stderr)
+                break
+            start = time.perf_counter()
             smaller = grids.divided(grid, cells, share)
             size = dataclasses.replace(self, request=self.request.part(1 / (len(LADDER) - number)))
             fitted = size.compressed(smaller, bits, stopped, f".size{number}")
             reached = self.session.held_out_images.evaluate(fitted[2])["psnr_white_db"]
+            duration = time.perf_counter() - start
             print(f"{fitted[2].nbytes:,} bytes: {reached:.2f} dB over white", file=sys.stderr)
             if reached >= psnr or fitted[1].interrupted:
                 return fitted
-        print(f"warning: no size reaches {psnr:g} dB, the largest has {reached:.2f} dB", file=sys.stderr)
+        print(f"warning: {psnr:g} dB were not reached, the largest size has {reached:.2f} dB", file=sys.stderr)
         return fitted
 
     def pairs(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult, VolumeField]:

@@ -28,6 +28,9 @@ NOTHING = 2e-7
 #: Flags of derivatives: not all arrays have to be differentiated.
 ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
+#: The same, and derivatives of results remain that others are computed from.
+KEPT = dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad
+
 
 class Marched:
     """Result of a marched ray: ``colour`` (premultiplied), ``transmittance`` and ``depth``.
@@ -105,24 +108,33 @@ def _next(field, o, d, t, far, step, offset, active):
     return t, occupied
 
 
-def replay(field, o, d, near, far, active, offset, marched: Marched, d_colour, d_transmittance=0, d_depth=0) -> None:
+def replay(
+    field, o, d, near, far, active, offset, marched: Marched, d_colour, d_transmittance=0, d_depth=0, moving=False
+) -> None:
     """Add to the gradients of ``field.arrays``, given those with respect to colour, transmittance and depth.
 
-    ``marched`` is what :func:`march` returned for these arguments.
+    ``marched`` is what :func:`march` returned for these arguments. ``moving``: gradients also reach what the rays
+    ``o``, ``d``, ``near`` and ``far`` are attached to.
     """
-    _follow(field, o, d, near, far, active, offset, marched, (d_colour, d_transmittance, d_depth), None)
+    _follow(field, o, d, near, far, active, offset, marched, (d_colour, d_transmittance, d_depth), moving)
 
 
-def tangent(field, o, d, near, far, active, offset, marched: Marched) -> tuple:
-    """Return the derivatives of colour, transmittance and depth along the tangents set for ``field.arrays``."""
-    return _follow(field, o, d, near, far, active, offset, marched, None, field)
+def tangent(field, o, d, near, far, active, offset, marched: Marched, moving=False) -> tuple:
+    """Return the derivatives of colour, transmittance and depth along the tangents set for ``field.arrays``.
+
+    ``moving``: also along those of what the rays ``o``, ``d``, ``near`` and ``far`` are attached to.
+    """
+    return _follow(field, o, d, near, far, active, offset, marched, None, moving)
 
 
 @dr.syntax
-def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
+def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
     types = field.types
     with dr.suspend_grad():
+        attached = o, d, near, far
+        o, d = types.Array3f(dr.detach(o)), types.Array3f(dr.detach(d))
         o, near, far, active = box(field, o, d, near, far, active)
+        crossing = types.Bool(active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
         through = types.Float(1)
         offset = types.Float(offset)
@@ -131,19 +143,42 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
         d_colour, d_through, d_depth = types.Array3f(0), types.Float(0), types.Float(0)
         if dr.hint(adjoint is not None, mode="scalar"):
             d_colour, d_through, d_depth = types.Array3f(adjoint[0]), types.Float(adjoint[1]), types.Float(adjoint[2])
+        # Tangents (forward) or gradients (backward) of the place of entry, direction, length, and distance of entry
+        d_entry, d_way, d_length, d_near = types.Array3f(0), types.Array3f(0), types.Float(0), types.Float(0)
+        if dr.hint(moving and adjoint is None, mode="scalar"):
+            with dr.resume_grad():
+                rays = _attached(field, *attached, crossing)
+                d_entry, d_way, d_length, d_near = dr.forward_to(*rays, flags=KEPT)
         while active:
             t, here = _next(field, o, d, t, far, step, offset, active)
             end = dr.minimum(t + step, far)
             length = end - t
             at = dr.fma(offset, length, t)
             p = dr.fma(d, at, o)
+            place, way = p, d
+            # The last step ends where the ray does
+            last = dr.select(t + step > far, types.Float(1), 0)
             with dr.resume_grad():
-                density, point_data = field.density_at(p, here)
+                if dr.hint(moving, mode="scalar"):
+                    place, way = types.Array3f(dr.detach(p)), types.Array3f(dr.detach(d))
+                    dr.enable_grad(place, way)
+                    if dr.hint(adjoint is None, mode="scalar"):
+                        dr.set_grad(place, d_entry + at * d_way + d * (last * offset * d_length))
+                        dr.set_grad(way, d_way)
+                density, point_data = field.density_at(place, here)
             passed = through * dr.exp(-dr.detach(density) * length)
             weight = dr.select(here, through - passed, 0)
             shown = here & (weight > NOTHING)
-            colour = types.Array3f(0)
-            if shown:
+            colour, radiance, change = types.Array3f(0), types.Array3f(0), types.Array4f(0)
+            if dr.hint(moving, mode="scalar"):
+                # Not in a branch: derivatives of the place leave it
+                with dr.resume_grad():
+                    radiance = types.Array3f(*field.radiance_at(point_data, place, way, shown))
+                    if dr.hint(adjoint is None, mode="scalar"):
+                        change = types.Array4f(dr.select(here, density, 0), *radiance)
+                        change = dr.forward_to(change, flags=ANY)
+                colour = dr.detach(radiance)
+            elif shown:
                 # Nothing that is differentiated leaves this branch
                 with dr.resume_grad():
                     radiance = types.Array3f(*field.radiance_at(point_data, p, d, shown))
@@ -159,17 +194,51 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, forward):
             if dr.hint(adjoint is not None, mode="scalar"):
                 slope = dr.dot(d_colour, step_colour) + d_depth * step_depth - d_through * total
                 with dr.resume_grad():
-                    dr.backward_from(dr.select(here, density * (length * slope), 0), ANY)
+                    light = dr.select(here, density * (length * slope), 0)
+                    if dr.hint(moving, mode="scalar"):
+                        light += dr.select(shown, dr.dot(radiance, d_colour * weight), 0)
+                    dr.backward_from(light, ANY)
+                    moved, turned = dr.grad(place), dr.grad(way)
+                if dr.hint(moving, mode="scalar"):
+                    moved = dr.select(here, moved, 0)
+                    d_entry += moved
+                    d_way += at * moved + dr.select(here, turned, 0)
+                    d_near += d_depth * weight
+                    along = offset * (dr.dot(moved, d) + d_depth * weight)
+                    d_length += last * dr.select(here, dr.detach(density) * slope + along, 0)
             else:
-                with dr.resume_grad():
-                    rate = length * dr.forward_to(dr.select(here, density, 0), flags=ANY)
+                if dr.hint(moving, mode="scalar"):
+                    rate = length * change[0] + last * dr.select(here, dr.detach(density), 0) * d_length
+                    d_colour += dr.select(shown, weight * types.Array3f(change[1], change[2], change[3]), 0)
+                    d_depth += weight * (d_near + last * offset * d_length)
+                else:
+                    with dr.resume_grad():
+                        rate = length * dr.forward_to(dr.select(here, density, 0), flags=ANY)
                 d_colour += rate * step_colour
                 d_depth += rate * step_depth
                 d_through -= rate * total
             through = dr.select(here, passed, through)
             t += step
             active &= here & (t < far) & (through > OPAQUE)
+        if dr.hint(moving and adjoint is not None, mode="scalar"):
+            with dr.resume_grad():
+                entry, way, length, near = _attached(field, *attached, crossing)
+                moved = dr.dot(entry, d_entry) + dr.dot(way, d_way) + length * d_length + near * d_near
+                dr.backward_from(moved, ANY)
     return d_colour, d_through, d_depth
+
+
+#: Component of a direction below which a ray counts as parallel to the sides of the box, when it is differentiated.
+PARALLEL = 1e-10
+
+
+def _attached(field, o, d, near, far, active) -> tuple:
+    """Return place of entry, direction, length, and distance of entry of rays, attached; 0 where not ``active``."""
+    types = field.types
+    o = types.Array3f(*(dr.select(active, x, 0) for x in o))
+    d = types.Array3f(*(dr.select(active & (dr.abs(x) > PARALLEL), x, 0) for x in d))
+    entry, near, length, _ = box(field, o, d, near, far, active)
+    return dr.select(active, entry, 0), d, dr.select(active, length, 0), dr.select(active, near, 0)
 
 
 @dr.syntax

@@ -23,6 +23,10 @@ from .volume_field import VolumeField
 #: Pixels along a side of a patch.
 PATCH = 4
 
+#: Most held-out views of measurements during a training whose time is limited, their share of the held-out views that
+#: are read, and the least views for visible cells.
+WATCHED, WATCHED_SHARE, SEEING = 8, 0.2, 8
+
 
 class ViewImages:
     """Captured ``views`` as Dr.Jit arrays, and the rays of their pixels."""
@@ -96,18 +100,32 @@ class FieldSession:
     held_out: CapturedViews
     #: False if the capture has no test views, so that ``held_out`` are the training views.
     has_test_views: bool = True
-    #: Most held-out views that are rendered at a measurement during a training (``None``: all).
-    watched: int | None = None
+    #: Most pixels of the views in which the visible cells of a field are sought (``None``: all).
+    pixels: float | None = None
 
     @staticmethod
-    def load(types: ModuleType, folder, watched: int | None = None) -> FieldSession:
-        """Read the capture in a folder. Raises :class:`.views.ViewsError`."""
-        return FieldSession(types, load_views(folder, "train"), *load_held_out(folder), watched)
+    def load(types: ModuleType, folder, pixels: float | None = None) -> FieldSession:
+        """Read the capture in a folder, of the held-out views so many that they have at most ``pixels``.
+
+        Raises :class:`.views.ViewsError`.
+        """
+        views = load_views(folder, "train")
+        most = None if pixels is None else max(2, round(pixels / (views.height * views.width)))
+        return FieldSession(types, views, *load_held_out(folder, most), pixels)
 
     @functools.cached_property
     def images(self) -> ViewImages:
         """Training views as Dr.Jit arrays."""
         return ViewImages(self.types, self.views)
+
+    @functools.cached_property
+    def seeing_images(self) -> ViewImages:
+        """Training views in which visible cells are sought, evenly spread in the list."""
+        views = self.views
+        most = len(views) if self.pixels is None else max(SEEING, round(self.pixels / (views.height * views.width)))
+        if most >= len(views):
+            return self.images
+        return ViewImages(self.types, views.chosen(np.arange(most) * len(views) // most))
 
     @functools.cached_property
     def held_out_images(self) -> ViewImages:
@@ -116,20 +134,21 @@ class FieldSession:
 
     @functools.cached_property
     def watched_images(self) -> ViewImages:
-        """Held-out views for measurements during a training, evenly spread in the list."""
+        """Held-out views for measurements during a training, evenly spread in the list; few if time is limited."""
         count = len(self.held_out)
-        if self.watched is None or self.watched >= count:
+        if self.pixels is None:
             return self.held_out_images
-        return ViewImages(self.types, self.held_out.chosen(np.arange(self.watched) * count // self.watched))
+        watched = min(count, max(1, min(WATCHED, round(WATCHED_SHARE * count))))
+        return ViewImages(self.types, self.held_out.chosen(np.arange(watched) * count // watched))
 
 
-def load_held_out(folder) -> tuple[CapturedViews, bool]:
-    """Return the test views of a capture and True or, if there are none, its training views and False."""
+def load_held_out(folder, most: int | None = None) -> tuple[CapturedViews, bool]:
+    """Return ``most`` test views of a capture and True or, if there are none, of its training views and False."""
     try:
-        return load_views(folder, "test"), True
+        return load_views(folder, "test", most), True
     except ViewsError as e:
         try:
-            return load_views(folder, "train"), False
+            return load_views(folder, "train", most), False
         except ViewsError:
             raise e from None
 

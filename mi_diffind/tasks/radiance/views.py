@@ -91,11 +91,12 @@ class CapturedViews:
         return self.poses[:, :3, 3]
 
 
-def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews:
+def load_views(folder: str | os.PathLike, split: str = "train", most: int | None = None) -> CapturedViews:
     """Read the views of a ``split``: "train", "test" or "val".
 
     The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``,
-    ``test_filenames`` and ``val_filenames``. If no file or list names the test views, every eighth view is one.
+    ``test_filenames`` and ``val_filenames``. If no file or list names the test views, every eighth view is one. Of more
+    than ``most`` views, so many are read, evenly spread in the list.
     Raises :class:`ViewsError`, also for fewer than two training views, since one view does not show depth.
     """
     folder = Path(folder)
@@ -106,6 +107,8 @@ def load_views(folder: str | os.PathLike, split: str = "train") -> CapturedViews
         raise ViewsError(f"{file}: has {len(frames)} view for training, at least 2 are needed: one shows no depth")
     if not frames:
         raise ViewsError(f'{file}: has no views for the split "{split}"')
+    if most is not None and most < len(frames):
+        frames = [frames[i * len(frames) // most] for i in range(most)]
     cameras = [_camera(file, content, frame) for frame in frames]
     names, images, has_alpha = [], None, True
     for i, ((_, numbers), frame) in enumerate(zip(cameras, frames, strict=True)):

@@ -13,6 +13,7 @@ from PIL import Image
 
 from mi_diffind import fitting
 from mi_diffind.cli import main
+from mi_diffind.deadline import Deadline
 from mi_diffind.fitting import FitSettings
 from mi_diffind.fitting import fit as train
 from mi_diffind.runtime import array_module
@@ -323,6 +324,9 @@ def test_clusters(rng):
     points = centres[which] + 0.01 * rng.normal(size=(4000, 12))
     entries, codes = compression.clusters(points, 64, 0)
     assert np.abs(entries[codes] - points).max() < 0.2
+    # Without time for a round, the centres are rows
+    entries, _ = compression.clusters(points, 64, 0, Deadline(0))
+    assert np.abs(entries[:, None] - points).max(axis=2).min(axis=1).max() < 1e-6
 
 
 def test_scores_of_a_known_error(folder):

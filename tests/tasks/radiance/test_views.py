@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from mi_diffind.tasks.radiance.training import ViewImages
+from mi_diffind.tasks.radiance.training import FieldSession, ViewImages
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
 
 SIZE = (6, 8)  # height, width
@@ -32,6 +32,26 @@ def write_image(path, seed=0, channels=4, size=SIZE):
 
 def write_json(path, **content):
     path.write_text(json.dumps(content))
+
+
+def test_few_views_of_many_are_evenly_spread(blender):
+    assert load_views(blender, most=2).names == ("train/r_0.png", "train/r_2.png")
+    assert load_views(blender, most=9).digest == load_views(blender).digest
+
+
+def test_a_limit_of_pixels_leaves_out_held_out_views(blender):
+    """Two views at least; the views that are trained by are complete."""
+    height, width = SIZE
+    for pixels in (None, 100 * height * width, 1):
+        session = FieldSession.load(llvm, blender, pixels)
+        assert (len(session.views), len(session.held_out)) == (4, 2)
+        assert len(session.watched_images.views) == (2 if pixels is None else 1)
+    change(
+        blender, "transforms_test.json", frames=json.loads((blender / "transforms_train.json").read_text())["frames"]
+    )
+    session = FieldSession.load(llvm, blender, 3 * height * width)
+    assert session.held_out.names == ("train/r_0.png", "train/r_1.png", "train/r_2.png")
+    assert session.seeing_images is session.images
 
 
 @pytest.fixture
