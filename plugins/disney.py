@@ -129,7 +129,8 @@ class Disney(mi.BSDF):
     **Only the effects in use are computed.** A part of the model that the parameters make zero (``clearcoat`` 0,
     ``metallic`` 1, a black texture, the tint of a grey albedo, …) is neither traced nor sampled. The effects in use are
     determined when the scene is loaded and whenever parameters change. A parameter with gradients enabled always counts
-    as in use, and so does a texture whose bounds are unknown (those of constants and bitmaps are known).
+    as in use, and so does a texture whose bounds are unknown. Known are those of constants and bitmaps, and the
+    constant maps of compressed files.
     ``mi-diffind inspect SCENE.xml`` lists the other effects and the reasons. Terms that depend on constant parameters
     alone are evaluated once, not for each sample.
 

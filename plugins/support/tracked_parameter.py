@@ -45,9 +45,9 @@ def tracked(texture, colour: bool = False, is_eta: bool = False) -> TrackedParam
 
 @dataclass(frozen=True)
 class FixedParameter:
-    """Parameter whose ``bounds`` no change of an array alters; other members are those of :class:`TrackedParameter`.
+    """Parameter whose bounds are ``known`` for any entries of its arrays; a constant has no entries.
 
-    Of what varies, optimisers may change everything but the bounds; of what is constant, nothing.
+    The methods are those of :class:`TrackedParameter`.
     """
 
     known: ValueBounds
