@@ -85,17 +85,25 @@ def disney_forms() -> str:
     return table(["form", "bytes", "PSNR, dB: training / uniform", *timings], rows)
 
 
+def _decibel(value: float | None) -> str:
+    return "all is noise" if value is None else f"{value:.1f}"
+
+
 def comparisons() -> str:
-    """Return errors and time ratios of the scenes by ``compare``."""
+    """Return errors and time ratios of the scenes by ``compare``, each against its truths."""
     rows = []
     for path in sorted((DOCS / "measured").glob("compare_*.json")):
-        f = measured(path.stem)
-        against, ratio = f.get("against") or "exact counterparts", f["time_ratio"]["median"]
-        rows.append([
-            f"`{Path(f['scene']).name}`", against, f"{f['psnr_db']:.1f}", f"{f['flip']:.4f}",
-            "not measurable" if ratio is None else f"{ratio:.2f}",
-        ])  # fmt: skip
-    return table(["scene", "against", "PSNR, dB", "FLIP", "time of a pass over that of the other"], rows)
+        first = measured(path.stem)
+        for f in (first, *first.get("further", ())):
+            ratio = f["time_ratio"]
+            uncertain = ratio["median"] is None or ratio["q3"] > 1.5 * ratio["q1"]
+            rows.append([
+                f"`{Path(f['scene']).name}`", f"{f['against']}, {f['truth_spp']} samples", f"{f['psnr_db']:.1f}",
+                _decibel(f['psnr_without_noise_db']), f"{f['flip']:.4f}",
+                "not measurable" if uncertain or f["truth_spp"] != f["spp"] else f"{ratio['median']:.2f}",
+            ])  # fmt: skip
+    columns = ["scene", "against", "PSNR, dB", "without noise", "FLIP", "time of a pass over that of the other"]
+    return table(columns, rows)
 
 
 def image_pages() -> str:
@@ -245,6 +253,19 @@ def shading_shares(study: str) -> str:
     return table(["material", "", "", *(f"λ {share:g}" for share in shares)], rows)
 
 
+def material_times() -> str:
+    """Return the cost of a pass with each form of a material, as multiples of separate plugins."""
+    frame, fixed = (measured("bench_material")[size] for size in ("frame", "fixed"))
+    separate = frame["normalmap + disney + 4 neural_texture"]["operations"]
+    rows = []
+    for name, figures in frame.items():
+        counts = (figures["operations"][key] / separate[key] for key in ("instructions", "flops", "gathers"))
+        ratios = (x["ratio"] for x in (fixed[name], figures))
+        times = (f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" for r in ratios)
+        rows.append([f"`{name}`", *(f"{count:.2f}" for count in counts), *times])
+    return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640 pixels"], rows)
+
+
 def sdf_errors(study: str) -> str:
     """Return errors of distance fields in equal bytes: IoU, IoU near the surface, normals."""
     from mi_diffind.studies.equal_memory import candidates_by_budget
@@ -373,7 +394,10 @@ def mean(values) -> float:
     return sum(values) / len(values)
 
 
-TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_bytes, image_pages, texture_memory, texture_presets)}
+TABLES = {
+    f.__name__: f
+    for f in (disney_forms, comparisons, image_bytes, image_pages, material_times, texture_memory, texture_presets)
+}
 for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))

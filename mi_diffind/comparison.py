@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import compat, conversion, metrics, plugins, scenes
+from .errors import UsageError
 from .files import writable_folder
 from .interrupt import interruptible
 from .measure import figure_grid
@@ -86,7 +87,7 @@ class _Side:
 
 
 def compare(
-    scene: str | os.PathLike,
+    scene: str | os.PathLike | dict,
     spp: int | None = None,
     seed: int = 0,
     *,
@@ -96,7 +97,9 @@ def compare(
     defines: Mapping[str, object] | None = None,
     progress: bool = True,
 ) -> Comparison:
-    """Render a scene file as written and with counterparts, in turn, pass by pass, with the same random numbers.
+    """Render a scene, a file or a dictionary as of ``mi.load_dict``, as written and with counterparts.
+
+    They are rendered in turn, pass by pass, with the same random numbers.
 
     Every learned plugin is replaced by its exact counterpart. ``against`` may name another counterpart, such as
     ``"principled"``: then every plugin that has it is replaced, learned or not. Without ``against``, a scene with
@@ -130,12 +133,14 @@ def compare(
         others = dict.fromkeys(c.name for plugin in plugins.declared().values() for c in plugin.others)
         raise scenes.SceneError(f'"{against}": no plugin has this counterpart; there are {", ".join(others)}')
     parsed = scenes.ParsedScene(scene, defines)
+    if learn and parsed.description:
+        raise UsageError("learn: given with a scene in memory, allowed are scene files")
     conversions = conversion.replace_stock(parsed, learn, progress=progress)
     replaced = parsed.learned_plugins(against or "exact")
     if not replaced:
         what = f'plugin that "{against}" can stand for' if against not in (None, "exact") else "learned plugin"
         names = ", ".join(plugins.with_counterpart(against or "exact"))
-        raise scenes.SceneError(f"{scene}: names no {what} ({names}), so there is nothing to compare")
+        raise scenes.SceneError(f"{parsed.path}: names no {what} ({names}), so there is nothing to compare")
     learned = [entry for entry in replaced if entry["plugin"] in plugins.with_counterpart()]
     truths, sides = {against: (against,)} if against else _default_truths(replaced), {}
     counterparts = {name: _counterparts(replaced, names) for name, names in truths.items()}
@@ -162,7 +167,7 @@ def compare(
                 break
 
     common = {
-        "scene": str(scene),
+        "scene": str(parsed.path),
         "variant": mi.variant(),
         "spp": done,
         "seed": seed,

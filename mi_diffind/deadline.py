@@ -22,6 +22,10 @@ class Deadline:
         self.seconds, self.reserve = seconds, 0.0
         self.end = time.perf_counter() + seconds
 
+    def spent(self) -> float:
+        """Return the seconds since the deadline was created."""
+        return time.perf_counter() - self.end + self.seconds
+
     def left(self) -> float:
         """Return the seconds that are left for trainings, at least :data:`LEAST`."""
         return max(LEAST, self.end - time.perf_counter() - self.reserve)
@@ -47,6 +51,11 @@ class Deadline:
 
 def duration(work: Callable[[], object]) -> tuple[object, float]:
     """Carry out ``work``; return its result, and the seconds that another call takes, without compiling kernels."""
+    return profiled(work)[:2]
+
+
+def profiled(work: Callable[[], object]) -> tuple[object, float, list[dict]]:
+    """Carry out ``work``; return the result and the seconds of :func:`duration`, and Dr.Jit's kernel history."""
     import drjit as dr
 
     dr.sync_thread()
@@ -56,5 +65,5 @@ def duration(work: Callable[[], object]) -> tuple[object, float]:
         result = work()
         dr.sync_thread()
         seconds = time.perf_counter() - start
-        compiled = compat.compile_seconds(dr.kernel_history())
-    return result, max(0.0, seconds - compiled)
+        history = dr.kernel_history()
+    return result, max(0.0, seconds - compat.compile_seconds(history)), history

@@ -473,6 +473,15 @@ def _save_checkpoint(path, settings: dict, state: _State, extra: dict) -> None:
         np.savez(stream, **arrays)
 
 
+def checkpoint_settings(path) -> dict:
+    """Return the settings of the training and the identity of the problem in a checkpoint; {} if it holds none."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return dict(json.loads(data["meta"].tobytes())["settings"])
+    except Exception:  # zipfile, json and numpy each have their own for another kind of file
+        return {}
+
+
 def _is_checkpoint(path) -> bool:
     try:
         with np.load(path, allow_pickle=False) as data:

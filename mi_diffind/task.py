@@ -46,6 +46,9 @@ if TYPE_CHECKING:
 #: Storage forms that a training may end in (:data:`.lookup.STORAGES`, without importing Dr.Jit).
 STORAGES = ("float32", "float16", "uint8")
 
+#: Share of a limited time beyond which the result says how long it took.
+OVERRUN = 1.15
+
 #: The folder of the tables that ship.
 DATA = Path(__file__).resolve().parent / "data"
 
@@ -584,4 +587,6 @@ def fit(
     request.types = array_module(variant)
     fitted = chosen.fit(request)
     fitted.request = request
+    if deadline is not None and deadline.spent() > OVERRUN * deadline.seconds:
+        fitted.lines.append(f"took {deadline.spent():.0f} s of the {deadline.seconds:g} s that were given")
     return fitted

@@ -98,7 +98,7 @@ class FilteredTexture(MapTexture):
 
     def _filtered(self, uv, level) -> list:
         """Return the values of one place at a level of detail, in a form that can be averaged (:meth:`_used_of`)."""
-        stored = self.image.filtered(*self._wrapped_at(uv, level), level)
+        stored = self.image.filtered(*self._wrapped_at(uv, self.image.biased(level)), level)
         return self._used(stored) if self._is_encoded() else [stored[i] for i in self._needed()]
 
     def _rounded(self, uv, level, sample) -> list:
@@ -132,10 +132,11 @@ class FilteredTexture(MapTexture):
         if self._is_upsampled():
             self._refuse("eval_1_grad", "a gradient")
         uv = self._uv(si)
-        level = self.image.clamped(isotropic(*self._footprint(si)), mi.Float)
+        level = isotropic(*self._footprint(si))
+        side = dr.exp2(self.image.clamped(self.image.biased(level), mi.Float))
         gradient = []
         for axis, n in enumerate(self._size):
-            width = dr.minimum(dr.exp2(level) * (1 / n), 1)
+            width = dr.minimum(side * (1 / n), 1)
             step = mi.Vector2f(*(0.5 * width if i == axis else 0 for i in range(2)))
             ahead, behind = (luminance(self._used_of(self._filtered(p, level))) for p in (uv + step, uv - step))
             gradient.append((ahead - behind) / width)

@@ -68,6 +68,7 @@ def test_parts_and_what_follows_share_the_time(clock):
     assert stage.left() == 4 and deadline.left() == 22 and not stage.passed
     clock.take(4)
     assert stage.passed and not deadline.passed and 0 < stage.left() < 0.01
+    assert deadline.spent() == 16 and stage.spent() == 9
 
 
 @pytest.mark.parametrize(("step", "measurement", "ending"), [(0.1, 0.05, 2), (1, 3, 5), (2.5, 0.1, 0.1), (0.5, 8, 4)])

@@ -363,35 +363,34 @@ class Timed:
 
     def measure(self, net):
         self.clock.now += 0.1 * 2 * self.samples
+        return {"psnr_db": 20.0}
 
 
 @pytest.mark.parametrize(
-    ("seconds", "compiling", "samples", "remark"),
+    ("seconds", "compiling", "known", "samples", "remark"),
     [
-        (40, 0.0, 8, ""),
-        (5, 0.0, 2, ""),
-        (2, 0.0, 1, "no step through renders: one takes about 2 s; the texture was trained alone; give --seconds 6 or"),
-        (
-            40,
-            6.0,
-            8,
-            "no step through renders: one takes about 50 s, 48 s of it to compile its kernels; the texture was",
-        ),
+        (40, 0.0, True, 8, ""),
+        (5, 0.0, True, 2, ""),
+        (2, 0.0, True, 1, "one takes about 2 s; the texture was trained alone; give --seconds 6 or more"),
+        (40, 6.0, True, 8, "one takes about 50 s, 48 s of it to compile its kernels; the texture was trained alone"),
+        (40, 0.0, False, 8, "one takes about 50 s, 48 s of it to compile its kernels; the texture was trained alone"),
     ],
 )
-def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, samples, remark):
+def test_renders_that_fit_into_a_limited_time(monkeypatch, seconds, compiling, known, samples, remark):
     clock = type("clock", (), {"now": 5.0})
     monkeypatch.setattr("time.perf_counter", lambda: clock.now)
 
-    def duration(work):
-        clock.now += compiling
+    def profiled(work):
         start = clock.now
-        return work(), clock.now - start
+        return work(), clock.now - start, [{}, {"backend_time": 1e3 * compiling, "operation_count": 20_000}]
 
-    monkeypatch.setattr("mi_diffind.scene_training.fit.duration", duration)
+    monkeypatch.setattr("mi_diffind.scene_training.fit.profiled", profiled)
     problem = Timed(clock)
     request = FitRequest("ours", problem.recipe.settings, None, deadline=Deadline(seconds))
-    assert limit(problem, request).startswith(remark) and bool(remark) == (problem.recipe.share == 0)
+    sentence, figures = limit(problem, request, known)
+    assert figures == {"psnr_db": 20.0}
+    assert sentence.startswith("no step through renders: " + remark if remark else remark)
+    assert bool(sentence) == bool(remark) == (problem.recipe.share == 0)
     assert problem.samples == samples and problem.identity["shading"]["share"] == problem.recipe.share
     assert request.deadline.reserve == pytest.approx(0.2 * samples)
 

@@ -124,12 +124,20 @@ class FilteredMaps(CompressedMaps):
 
     levels: int
 
+    #: Levels by which a footprint's level of detail is read finer (negative): :meth:`biased`.
+    level_bias: float = 0.0
+
     def filtered(self, u, v, level, active=True) -> list:
         """Return the stored channels at (u, v) in [0, 1]² and a level of detail, a real number for each place.
 
-        Linear between levels. Numbers beyond the levels mean the nearest level, NaN means 0.
+        The level is that of the footprint; :meth:`biased` is read. Linear between levels. Numbers beyond the levels
+        mean the nearest level, NaN means 0.
         """
         raise NotImplementedError
+
+    def biased(self, level):
+        """Return the level of detail that is read for a footprint's ``level``, not limited to the existing levels."""
+        return level + self.level_bias if self.level_bias else level
 
     def clamped(self, level, Float):
         """Return a level of detail limited to the existing levels, as an array."""

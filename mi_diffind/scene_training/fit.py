@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
 
-from .. import scenes
-from ..deadline import duration
+from .. import compat, scenes
+from ..conversion import cache_folder
+from ..deadline import profiled
+from ..files import writable_folder
 from ..fitting import FitResult, cores
 from ..maps.arguments import preview_path
 from ..maps.source import load_source
 from ..tables import Table
 from ..task import FitRequest, Fitted
-from ..tasks.texture.compressed import CompressedTexture, load, to_table
+from ..tasks.texture.compressed import CompressedTexture, bias_of, load, to_table
 from ..tasks.texture.training import problem_of, stored_form
 from .problem import SceneProblem
 from .recipe import SceneRecipe, recipe_of
@@ -32,6 +34,9 @@ REFERENCES, MEASURING = 0.25, 0.1
 #: Duration of a step in renders of one sample a pixel, and of the compilation of its kernels in that of a render's: a
 #: step renders three times, once with derivatives, whose kernel is four times as long.
 STEP_RENDERS, STEP_KERNELS = 20, 8
+
+#: Seconds that LLVM takes to compile one operation of a render's kernel.
+OPERATION = 3e-4
 
 
 def fit(request: FitRequest) -> Fitted:
@@ -49,7 +54,7 @@ def fit(request: FitRequest) -> Fitted:
     }
     count = len(views.trained())
     lines = [
-        f"{count} view{'s' if count != 1 else ''}, {recipe.spp} samples a pixel",
+        f"{count} view{'s' if count != 1 else ''}, {recipe.spp} sample{'s' if recipe.spp != 1 else ''} a pixel",
         *filter(None, [table.settings.get("remark")]),
     ]
     if (samples := table.settings.get("reference_samples", recipe.reference_spp)) < recipe.reference_spp:
@@ -82,9 +87,10 @@ def fit_scene(
     source_path = original_of(table, file, given)
     source = load_source(source_path, nonfinite="clean")
     texture = texture_problem(table, source)
+    bias = bias_of(table.settings)
     if recipe.start == "untrained":
         texture = problem_of(source, budget_of(table), texture.recipe, texture.pyramid)
-        table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net)), {})
+        table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net), bias), {})
     rendered = ReferenceRenders(
         parsed, views, recipe.reference_spp, references, recipe.against,
         without=(file,), inputs=(source.digest,), progress=request.progress,
@@ -101,11 +107,22 @@ def fit_scene(
     identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
 
     def stored(settings: Mapping) -> tuple[Table, dict[str, float]]:
-        trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net)), settings)
+        trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net), bias), settings)
         return trained_table, CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
 
-    remark = "" if request.deadline is None else limit(problem, request)
+    remark = ""
+    if request.deadline is not None:
+        compiled = compiled_file(f"{rendered.digest} {recipe.spp}")
+        remark, before = limit(problem, request, compiled is not None and compiled.is_file())
+    start = {name: array.data for name, array in problem.net.arrays.items()}
     result = request.train(problem, finish=lambda: stored(identity))
+    if remark and before["psnr_db"] > result.measured["psnr_db"]:
+        for name, data in start.items():
+            problem.net.arrays[name].data = data
+        result.measured, result.step = before, 0
+        remark += "; it gained nothing, these are the arrays that it started from"
+    if request.deadline is not None and compiled is not None and problem.recipe.share > 0:
+        compiled.touch()
     file = None if parsed.description else parsed.path
     settings = {**request.recorded(result), **identity, **request.paths(scene_path=file)}
     if remark:
@@ -120,29 +137,43 @@ def fit_scene(
     return trained_table, result
 
 
-def limit(problem: SceneProblem, request: FitRequest) -> str:
-    """Fit a problem into a limited time; return a sentence if only the texture alone can be trained, else "".
+def compiled_file(key: str) -> Path | None:
+    """Return the file that is there once a training has compiled the kernels of a scene; ``None`` if it cannot be."""
+    try:
+        folder = writable_folder(cache_folder() / "compiled", create=True)
+    except OSError:
+        return None
+    return folder / hashlib.sha256(key.encode()).hexdigest()[:16]
+
+
+def limit(problem: SceneProblem, request: FitRequest, compiled: bool) -> tuple[str, dict[str, float]]:
+    """Fit a problem into a limited time.
+
+    Returns a sentence if only the texture alone can be trained, else "", and the figures before the training.
 
     A measurement of one render a view is rehearsed. Measurements then have so many samples as fit, and where a step
-    would take longer than what is left, renders have no share in the loss.
+    would take longer than what is left, renders have no share in the loss. Its kernels are expected to be compiled
+    unless an earlier training of the scene has ``compiled`` them.
     """
     deadline, spp, most = request.deadline, problem.scene.spp, problem.samples
     problem.samples = spp
     with cores(request.settings.deterministic):
-        start = time.perf_counter()
-        _, seconds = duration(lambda: problem.measure(problem.net))
-        compiling = time.perf_counter() - start - seconds
+        figures, seconds, history = profiled(lambda: problem.measure(problem.net))
+    compiling = compat.compile_seconds(history)
+    if not compiled:
+        compiling = max(compiling, OPERATION * max((entry.get("operation_count", 0) for entry in history), default=0))
     render = seconds / (2 * len(problem.measured) * spp)
     problem.samples = max(spp, min(most, int(MEASURING * deadline.seconds * spp / seconds)))
     deadline.reserve += seconds * problem.samples / spp
     step = STEP_RENDERS * spp * render + STEP_KERNELS * compiling
     if problem.recipe.share == 0 or step < deadline.left():
-        return ""
+        return "", figures
     problem.recipe = dataclasses.replace(problem.recipe, share=0.0)
     problem.identity["shading"]["share"] = 0.0
     kernels = f", {STEP_KERNELS * compiling:.0f} s of it to compile its kernels" if compiling > 1 else ""
     enough = deadline.seconds + 2 * step
-    return (
+    sentence = (
         f"no step through renders: one takes about {step:.0f} s{kernels}; the texture was trained alone; give "
         f"--seconds {enough:.0f} or more, or a smaller film"
     )
+    return sentence, figures

@@ -510,7 +510,7 @@ def test_derivatives_of_the_place(mi_rgb, fields):
     place = at().translate([0.1, 0.2, -0.1]).rotate([0.8, 0.6, 0], 30).scale(0.9)
     options = {"aovs": "depth,opacity", "hide_emitters": True, "to_world": place}
     made = lit(mi, integrator={**options, "max_depth": 3})
-    assert mi.traverse(made).flags("it.to_world") == mi.ParamFlags.Differentiable
+    assert mi.traverse(made).flags("it.to_world") == mi.ParamFlags.Discontinuous
     check_place(mi, made, "it.to_world")
     inner = {"type": "test_field", "field": "bumps", "to_world": at().translate([0, 2.5, 0]).scale(0.8)}
     two = scene(mi, "fog", size=(16, 12), integrator={"aovs": "depth,opacity", "c": inner})

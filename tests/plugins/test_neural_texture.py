@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import texture_scenes
 from arrays import aligned, numpy_of
+from texture_files import make
 from texture_scenes import WRONG, linear
 
 from mi_diffind import scenes
@@ -21,35 +22,13 @@ from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure.operations import bsdf_operations, count
-from mi_diffind.runtime import array_module
 from mi_diffind.tables import load_table, save_table
-from mi_diffind.tasks.texture import TASK, memory_budget, training
+from mi_diffind.tasks.texture import TASK
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
-from mi_diffind.tasks.texture.presets import PRESETS
 
 SIZE = WIDTH, HEIGHT = 32, 16
 
 FILTERS = ("off", "trilinear", "anisotropic", "stochastic")
-
-
-def make(path, source, preset="ours", border="repeat", **settings):
-    """A file of arrays as a training starts with them, almost without loss; the paper's are random."""
-    recipe, types = PRESETS[preset], array_module("llvm")
-    pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, (border, border))
-    stored = pyramid.layout.stored
-    if preset == "paper":
-        size = memory_budget.PaperBudget(9, 12, 4, 4, stored)
-    else:
-        dims = min(3, stored)
-        size = memory_budget.TextureBudget(
-            source.height, source.width, stored, (memory_budget.FineArray(0, dims, 8),), 1, dims, 12
-        )
-    net, rng = training.problem_of(source, size, recipe, pyramid).net, np.random.default_rng(7)
-    if preset == "paper":
-        for array in net.arrays.values():
-            array.data = types.TensorXf(aligned(rng.random(array.data.shape)))
-    save_table(path, to_table(CompressedTexture(pyramid.layout, training.stored_form(net)), settings))
-    return str(path)
 
 
 def material(seed=2):
@@ -136,6 +115,28 @@ def test_trilinear_is_the_level_of_the_area(mi_any, files, rng, preset, name):
     if more:
         spectra = mi.load_dict(plugin(files[preset], channels=name)).eval(si).numpy()
         assert np.isfinite(spectra).all() and spectra.min() >= 0 and spectra.max() <= 1
+
+
+@pytest.mark.parametrize("name", ["trilinear", "anisotropic"])
+def test_a_level_bias_reads_as_a_smaller_footprint(mi_rgb, files, tmp_path, rng, name):
+    """One level finer: a footprint of half the side, in colours, gradients, and images that are not repeated."""
+    mi = mi_rgb
+    biased = make(tmp_path / "biased.npz", from_arrays(material()), level_bias=-1.0)
+    uv, (ddx, ddy) = rng.random((2, 200)), (8 * x for x in texture_scenes.footprints(rng, 200, SIZE))
+    si = texture_scenes.hits(mi, uv, ddx, ddy)
+    for more in ({}, {"wrap_mode": "clamp"}):
+        texture, plain = (mi.load_dict(plugin(f, name, "roughness", **more)) for f in (biased, files["ours"]))
+        if name == "anisotropic":  # the taps stay where they are
+            plain._filtered = lambda uv, level, read=plain._filtered: read(uv, level - 1)
+            smaller = si
+        else:
+            smaller = texture_scenes.hits(mi, uv, ddx / 2, ddy / 2)
+        found, expected = texture.eval_1(si).numpy(), plain.eval_1(smaller).numpy()
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+        assert np.abs(found - plain.eval_1(texture_scenes.hits(mi, uv, 2 * ddx, 2 * ddy)).numpy()).max() > 0.01
+        if name == "trilinear":
+            slopes = texture.eval_1_grad(si).numpy(), plain.eval_1_grad(smaller).numpy()
+            np.testing.assert_allclose(*slopes, atol=1e-3)
 
 
 @pytest.mark.parametrize("border, wrap_mode", [("ours", "clamp"), ("clamp", "repeat")])

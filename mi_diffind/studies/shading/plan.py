@@ -278,7 +278,10 @@ class CompressedFilter(ShadingTraining):
 
 @dataclass
 class ShadingRun(ShadingTraining):
-    """A training for shading with weight ``share``; ``base`` is the run of the same seed with λ = 0."""
+    """A training for shading with weight ``share``; ``base`` is the run of the same seed with λ = 0.
+
+    λ = 0 is read at the level of the footprint; for other λ, the training chooses the level bias.
+    """
 
     start: TextureStart | None = None
     remedies: Remedies = REMEDIES[0]
@@ -292,14 +295,16 @@ class ShadingRun(ShadingTraining):
         settings = dataclasses.replace(preset.settings, schedule=schedule)
         request = context.request(settings, context.settings.length, self.seed, progress)
         clip = (preset.clip or CLIP) if self.remedies.clip else None
-        recipe = dataclasses.replace(preset, share=self.share, clip=clip, settings=request.settings)
+        bias = preset.level_bias if self.share else 0.0
+        recipe = dataclasses.replace(preset, share=self.share, clip=clip, level_bias=bias, settings=request.settings)
         net = start_of(self.start.table, context.pyramid)
         try:
             trained, result = fit_shading(context.source, net, recipe, request, context.pyramid, context.evaluation)
         except FittingError:  # diverged repeatedly: the result is the start
             trained, result = self.start.table, FitResult({}, 0, 0, 0.0, False, 0, [])
         details = {"share": self.share, "clip": self.remedies.clip, "schedule": self.remedies.schedule,
-                   "seed": self.seed, "way": self.remedies.name}  # fmt: skip
+                   "seed": self.seed, "way": self.remedies.name,
+                   "level_bias": trained.settings.get("level_bias", 0.0)}  # fmt: skip
         record = self.measure_table(trained, result, begin, **details)
         if record is not None:
             base = self.base.record["details"] if self.base is not None and self.base.record else None

@@ -13,7 +13,7 @@ Training through renders of a scene is :mod:`mi_diffind.scene_training`.
 from __future__ import annotations
 
 from ...arguments import Argument, fraction, positive_or_none
-from ...maps.arguments import PREVIEW, SIZES, SOURCES
+from ...maps.arguments import LEVEL_BIAS, PREVIEW, SIZES, SOURCES
 from ...task import Task
 from .presets import PRESETS, REFERENCES
 
@@ -52,6 +52,7 @@ class Shading(Task):
             help="samples of the reference: 16 unfiltered ones (jittered, default), the paper's 16 "
             "prefiltered ones (default of paper), or 256 unfiltered ones (converged)",
         ),
+        LEVEL_BIAS,
         *SOURCES,
         PREVIEW,
     )  # fmt: skip

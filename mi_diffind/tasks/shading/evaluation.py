@@ -29,6 +29,9 @@ TRUTHS = {"C": "converged", "P": "prefiltered"}
 #: of a footprint: with 16 × 16 in all, the noise of the reference is at 36 dB on level 5 of a glossy material.
 PER_TEXEL, LARGEST = 4, 64
 
+#: Side of the images of :meth:`ShadedEvaluation.another`, and the largest number of their pixels on a level.
+PART, CHOOSING = 4, 2**14
+
 #: Seed of the views and lights; trainings use other generators.
 SEED = 20231212
 
@@ -73,8 +76,13 @@ class ShadedEvaluation:
         self.truths = {letter: [self._truth(TRUTHS[letter], i) for i in range(self.levels)] for letter in truths}
 
     def another(self) -> ShadedEvaluation:
-        """Return images of the same number and size under other views and lights, with the converged truth alone."""
-        return ShadedEvaluation(self.pyramid, self.effects, *self.form, "C", stream=1)
+        """Return small images under many other views and lights, with the converged truth alone.
+
+        Their errors choose bias and state of a training. With few pairs, a single highlight would decide.
+        """
+        levels, pairs, side = self.form
+        pairs = max(1, min(CHOOSING, pairs * side * side) // PART**2)
+        return ShadedEvaluation(self.pyramid, self.effects, levels, pairs, PART, "C", stream=1)
 
     def _lanes(self, level: int, pairs=None) -> tuple:
         """Return ``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""

@@ -16,6 +16,7 @@ from ...units import labelled
 from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
 from ..texture import training as textures
+from ..texture.compressed import bias_of
 from ..texture.presets import PRESETS as TEXTURES
 from . import material, training
 from .evaluation import ShadedEvaluation
@@ -25,8 +26,10 @@ from .presets import PRESETS, ShadingRecipe
 def recipe_of(preset: str, settings, options) -> ShadingRecipe:
     """Return the recipe of a preset with the given options in place of its own."""
     recipe = PRESETS[preset]
-    given = {"share": options["share"], "reference": options["reference"]}
+    given = {"share": options["share"], "reference": options["reference"], "level_bias": options["level_bias"]}
     given = {k: v for k, v in given.items() if v is not None}
+    if options["level_bias"] == "auto":
+        given["level_bias"] = None
     if options["clip"] is not None:
         given["clip"] = None if options["clip"] == math.inf else options["clip"]
     return dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
@@ -70,6 +73,7 @@ def fit(request: FitRequest) -> Fitted:
         start, result = started(options["start"], source, request), None
     else:
         start, result = pretrained(source, pyramid, recipe, request)
+    first = result
     if result is None or not result.interrupted:
         shading_request = dataclasses.replace(request)
         if shading_request.resume and not os.path.exists(shading_request.checkpoint or ""):
@@ -80,7 +84,8 @@ def fit(request: FitRequest) -> Fitted:
             net = training.start_of(start, pyramid)
         except ValueError as e:
             raise UsageError(str(e)) from None
-        table, result = training.fit_shading(source, net, recipe, shading_request, pyramid, evaluation, preview)
+        bias = bias_of(start.settings)
+        table, result = training.fit_shading(source, net, recipe, shading_request, pyramid, evaluation, preview, bias)
     else:
         table = start
     table.settings |= request.paths(source_path=options["source"])
@@ -89,7 +94,11 @@ def fit(request: FitRequest) -> Fitted:
         lines.append(
             "before the training for the shading: " + ", ".join(map(" ".join, map(str.split, labelled(before))))
         )
+    if first is not None and first.unfinished and not first.interrupted:
+        lines.append(f"the training as a texture: {first.outcome}")
     lines += [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
+    if table.settings.get("level_bias"):
+        lines.append(f"read {-table.settings['level_bias']:g} levels finer than the footprint")
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
     if reasons:

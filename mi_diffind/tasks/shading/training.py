@@ -9,11 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import drjit as dr
+import numpy as np
 
-from ...fitting import FitResult, sample_losses
+from ... import lookup
+from ...deadline import duration
+from ...fitting import FitResult, checkpoint_settings, sample_losses
 from ...indirection import unfolded
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
@@ -32,23 +36,34 @@ from .reference import reference
 #: Factor of the number of shaded samples from one level to the next coarser one, and the last level that it counts for.
 FALL, TOP = 0.7, 9
 
+#: Level biases that are tried, and the share of the steps, or of the time that is left, that each of them is trained.
+BIASES, TRIAL = (0.0, -0.5, -1.0), 0.08
+
+#: Least time of such a trial, in measurements; in less time, the biases of the start itself are compared.
+SHORTEST = 4
+
 
 class ShadingProblem(textures.TextureProblem):
     """Training problem of shaded appearance.
 
     ``net`` reads the stored channels, ``pyramid`` is the truth of the maps. The images of ``evaluation`` decide which
-    state is the best (``None``: the PSNR of the texture decides).
+    state is the best (``None``: the PSNR of the texture decides). Shaded values are read with the recipe's level bias,
+    the texture's loss is that of the levels as they are stored. ``base`` is the PSNR of each level of the images that
+    no state may fall below.
     """
 
     #: Tolerance of the PSNR of shaded images, dB.
     tolerance = 0.02
 
     def __init__(
-        self, net, pyramid: Pyramid, recipe: ShadingRecipe, digest: str = "", evaluation: ShadedEvaluation | None = None
-    ):
+        self, net, pyramid: Pyramid, recipe: ShadingRecipe, digest: str = "",
+        evaluation: ShadedEvaluation | None = None, base: Sequence[float] = (),
+    ):  # fmt: skip
         super().__init__(net, pyramid, TEXTURES[recipe.texture], digest)
-        self.shading, self.evaluation = recipe, evaluation
-        self.preview: Path | None = None
+        self.shading, self.evaluation, self.base = recipe, evaluation, base
+        self.level_bias = recipe.level_bias or 0.0
+        #: Picture that is written at each measurement, and the images that it shows a part of
+        self.preview: tuple[Path, ShadedEvaluation] | None = None
         self.effects, _ = effects_of(pyramid.layout)
         self.decoder = frozen_decoder(self.types)
         recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
@@ -71,6 +86,9 @@ class ShadingProblem(textures.TextureProblem):
         (u, v, level), (wi, wo) = self.places(rng, size), random_directions(rng, types, size)
         truth = reference(recipe.reference, self.pyramid, u, v, level, wi, wo, self.effects, rng)
         dr.eval(u, v, level, wi, wo, truth)
+        if self.level_bias:  # opaque, so that one kernel serves all
+            bias = dr.opaque(types.Float, self.level_bias)
+            level = lookup.clamp(level + bias, 0.0, float(len(self.sizes) - 1))
         surface = surface_of(self.pyramid, net.filtered(u, v, level))
         limit = None if recipe.clip is None else recipe.clip * recipe.share / size
         value = shaded(self.decoder, surface, wi, wo, self.effects, limit)
@@ -87,16 +105,28 @@ class ShadingProblem(textures.TextureProblem):
         return u, v, dr.log(1 - (1 - lowest) * level) * (1 / math.log(FALL))
 
     def measure(self, net) -> dict[str, float]:
-        """Return the PSNR of shaded images, entries rounded, against both references, and the PSNR of the texture."""
+        """Return the PSNR of shaded images, entries rounded, and the PSNR of the texture.
+
+        With a ``base``, the first figure is ``gain_db``: the mean gain of all levels, if no level loses, else the
+        largest loss of a level, negative.
+        """
         texture = super().measure(net)
         if self.evaluation is None:
             return texture
-        maps = CompressedTexture(self.pyramid.layout, textures.rounded(unfolded(net)))
+        maps = CompressedTexture(self.pyramid.layout, textures.rounded(unfolded(net)), self.level_bias)
         read = reader(maps, self.effects, self.decoder)
         if self.preview is not None:
-            write_preview(self.preview, self.evaluation, read)
-        shading = {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in self.evaluation.measure(read, False).items()}
-        return {**shading, **{f"texture_{name}": value for name, value in texture.items()}}
+            write_preview(*self.preview, read)
+        errors = self.evaluation.measure(read, False)
+        gain = {"gain_db": gain_of(errors["C"]["psnr_db"], self.base)} if self.base else {}
+        shading = {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
+        return {**gain, **shading, **{f"texture_{name}": value for name, value in texture.items()}}
+
+
+def gain_of(levels: Sequence[float], base: Sequence[float]) -> float:
+    """Return the mean gain of ``levels`` over ``base``, in dB, if no level loses, else the largest loss, negative."""
+    gains = np.subtract(levels, base)
+    return float(gains.mean() if gains.min() >= 0 else gains.min())
 
 
 def _bounded(x):
@@ -120,40 +150,89 @@ def fit_shading(
     pyramid: Pyramid,
     evaluation: ShadedEvaluation | None = None,
     preview: Path | None = None,
+    start_bias: float = 0.0,
 ) -> tuple[Table, FitResult]:
     """Train the arrays ``start`` (:func:`start_of`) of ``source`` for shading; return its table and the run's record.
 
-    The table is of the task ``texture``, with its errors as a texture and as shaded images of the ``evaluation``. The
-    best state is chosen by other images of the same form; it may be the start (settings ``kept_start``). The settings
-    ``before`` are the errors of the start as shaded images. ``preview`` is a picture that is written at each
-    measurement.
+    The table is of the task ``texture``, with its errors as a texture and as shaded images of the ``evaluation``. Level
+    bias and state are chosen by other images, under views and lights that neither training nor evaluation draws. If no
+    state gains without a loss at some level, the table holds the start, read with its own ``start_bias`` (setting
+    ``kept_start``). The setting ``before`` has the errors of the start as shaded images, ``level_biases`` the gains by
+    which the bias was chosen (:func:`choose_bias`). ``preview`` is a picture that is written at each measurement.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
     validation = None if evaluation is None else evaluation.another()
-    problem = ShadingProblem(start, pyramid, recipe, source.digest, validation)
-    first, before = textures.stored_form(start), {}
-    if validation is not None:
+    effects, decoder = effects_of(pyramid.layout)[0], frozen_decoder(pyramid.types)
+    texture = CompressedTexture(pyramid.layout, textures.stored_form(start), start_bias)
+    base, before, stopped = [], {}, None
+    bias, gains = recorded_choice(request) if recipe.level_bias is None else (recipe.level_bias, {})
+
+    def shaded_errors(texture: CompressedTexture) -> dict[str, float]:
+        errors = evaluation.measure(reader(texture, effects, decoder), False)
+        return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
+
+    def problem_of(bias: float) -> ShadingProblem:
+        net = start.changed(lambda array, bits: array.copy())
+        changed = dataclasses.replace(recipe, level_bias=bias)
+        return ShadingProblem(net, pyramid, changed, source.digest, validation, base)
+
+    if evaluation is not None:
         # The measurement of the result takes as long
         begin = request.deadline.rehearse if request.deadline is not None else lambda measure: measure()
-        before = begin(lambda: problem.measure(start))
-    problem.preview = preview
-    result = request.train(problem, "shading")
-    kept = any(before[name] > result.measured[name] for name in list(before)[:1])
+        before = begin(lambda: shaded_errors(texture))
+        base = validation.measure(reader(texture, effects, decoder), False)["C"]["psnr_db"]
+        if bias is None:
+            bias, gains, stopped = choose_bias(problem_of, request)
+    problem, result = stopped or (problem_of(bias or 0.0), None)
+    if result is None:
+        problem.identity |= {"level_biases": gains} if gains else {}
+        problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
+        result = request.train(problem, "shading")
+    kept = bool(base) and result.measured["gain_db"] <= 0
+    if not kept:
+        texture = CompressedTexture(pyramid.layout, textures.stored_form(problem.net), problem.level_bias)
     identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
-    settings = {**request.recorded(result), **identity}
-    if kept:
-        settings["kept_start"] = True
-    texture = CompressedTexture(pyramid.layout, first if kept else textures.stored_form(problem.net))
+    settings = {**request.recorded(result), **identity, "level_bias": texture.level_bias}
+    settings |= {"kept_start": True} if kept else {}
     table = to_table(texture, settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
     errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)
     if evaluation is not None:
-        start_texture = CompressedTexture(pyramid.layout, first)
-        both = (
-            evaluation.measure(reader(t, problem.effects, problem.decoder), False) for t in (start_texture, texture)
-        )
-        before, after = ({f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in shown.items()} for shown in both)
         table.settings["before"] = {name: float(f"{value:.5g}") for name, value in before.items()}
-        errors = {**after, **errors}
+        errors = {**(before if kept else shaded_errors(texture)), **errors}
     table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
     return table, result
+
+
+def choose_bias(problem_of: Callable[[float], ShadingProblem], request: FitRequest) -> tuple:
+    """Return the best of :data:`BIASES` after a short training with each, the gains, and ``None``.
+
+    The best has the largest mean of levels among those that lose at no level, or among all if each loses somewhere. The
+    gains are ``gain_db`` by the text of a bias. If Ctrl-C ends a training, its problem and record are returned in place
+    of ``None``. If the time is too short (:data:`SHORTEST`), the untrained arrays are compared.
+    """
+    measured, steps = {}, max(1, round(TRIAL * request.settings.steps))
+    settings = dataclasses.replace(request.settings, steps=steps, measure_every=steps)
+    seconds = None if request.seconds is None else TRIAL * request.seconds
+    short = None
+    for bias in BIASES:
+        problem = problem_of(bias)
+        measured[bias], measurement = duration(lambda problem=problem: problem.measure(problem.net))
+        trial = dataclasses.replace(
+            request.part(TRIAL), settings=settings, seconds=seconds, checkpoint=None, resume=False
+        )
+        limit = seconds if trial.deadline is None else trial.deadline.left()
+        short = limit is not None and limit < SHORTEST * measurement if short is None else short
+        if not short:
+            result = trial.train(problem, f"level bias {bias:g}")
+            if result.interrupted:
+                return bias, {}, (problem, result)
+            measured[bias] = result.measured
+    best = max(BIASES, key=lambda bias: (measured[bias]["gain_db"] >= 0, measured[bias]["shaded_converged_db"]))
+    return best, {f"{bias:g}": float(f"{m['gain_db']:.4g}") for bias, m in measured.items()}, None
+
+
+def recorded_choice(request: FitRequest) -> tuple[float | None, dict]:
+    """Return the level bias of the training that is resumed, ``None`` without one, and the gains it was chosen by."""
+    recorded = checkpoint_settings(request.checkpoint) if request.resume and request.checkpoint is not None else {}
+    return recorded.get("shading", {}).get("level_bias"), recorded.get("level_biases", {})

@@ -13,6 +13,7 @@ from ...compat import module_of
 from ...errors import UsageError
 from ...indirection import DifferentiableArray, aligned_copy
 from ...lookup import BORDERS
+from ...maps.arguments import BIAS_RANGE
 from ...maps.compressed import FilteredMaps, decibel
 from ...maps.layout import Layout
 from ...maps.model import MapsModel, allocate_maps, page_entries
@@ -29,11 +30,12 @@ class CompressedTexture(FilteredMaps):
     """A compressed texture or material, read at any level of detail.
 
     ``layout`` lists the maps, ``net`` reads the arrays (:mod:`.nets`). ``net`` is ``None`` if all channels are
-    constant.
+    constant. ``level_bias`` is added to a footprint's level of detail; negative
+    ones (:data:`.arguments.BIAS_RANGE`) read finer levels.
     """
 
-    def __init__(self, layout: Layout, net: PaperNet | LayeredNet | None):
-        self.layout, self.net = layout, net
+    def __init__(self, layout: Layout, net: PaperNet | LayeredNet | None, level_bias: float = 0.0):
+        self.layout, self.net, self.level_bias = layout, net, level_bias
         self.types = None if net is None else module_of(net.cascaded.data)
         self.border = ("clamp", "clamp") if net is None else net.border
         self.levels = len(level_sizes(layout.height, layout.width))
@@ -54,7 +56,7 @@ class CompressedTexture(FilteredMaps):
 
     def filtered(self, u, v, level, active=True) -> list:
         """Return the stored channels at (u, v) and a level of detail."""
-        return [] if self.net is None else self.net.filtered(u, v, self.clamped(level, type(u)), active)
+        return [] if self.net is None else self.net.filtered(u, v, self.clamped(self.biased(level), type(u)), active)
 
     def measure(self, source: Source) -> dict[str, float]:
         """Return the errors against the mip pyramid of ``source``.
@@ -62,7 +64,8 @@ class CompressedTexture(FilteredMaps):
         - ``psnr_db``, ``psnr_MAP_db``: all channels, and each map, at the texel centres of level 0.
         - ``psnr_l0_db``, ``psnr_l1_db``, …: all channels at the texel centres of each level; ``psnr_worst_db``: the
           least of these.
-        - ``psnr_between_db``: all channels at 2¹⁸ random places and levels of detail, half of them magnified.
+        - ``psnr_between_db``: all channels at 2¹⁸ random places and levels of detail, half of them magnified, against
+          the pyramid at the same level.
         - ``mean_error``: the largest difference of the mean of a channel at level 0.
 
         Values are compared in the encoding of the file, values of high dynamic range as logarithms.
@@ -104,7 +107,8 @@ class CompressedTexture(FilteredMaps):
         level = np.maximum(0, rng.random(count, dtype=np.float32) * 2 - 1) * (self.levels - 1)
         place = [Float(aligned_copy(x, np.float32)) for x in (u, v, level)]
         with dr.suspend_grad():
-            pairs = [*zip(self.filtered(*place), pyramid.filtered(*place), strict=True)]
+            truth = pyramid.filtered(*place[:2], self.biased(place[2]))
+            pairs = [*zip(self.filtered(*place), truth, strict=True)]
             dr.eval(pairs)  # all channels at once: NumPy asks for one after the other, each a kernel
             return float(np.mean([np.mean((a.numpy() - b.numpy()) ** 2, dtype=np.float64) for a, b in pairs]))
 
@@ -118,14 +122,14 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
 
 def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> CompressedTexture:
     """Return the texture of a checked table from its allocated arrays."""
-    layout = Layout.from_json(table.settings["layout"])
+    layout, bias = Layout.from_json(table.settings["layout"]), bias_of(table.settings)
     if not arrays:
         return CompressedTexture(layout, None)
     structure, border = structure_of(table.settings, layout)
     if isinstance(structure, PaperStructure):
-        return CompressedTexture(layout, PaperNet(*(arrays[name] for name in PAPER), structure))
+        return CompressedTexture(layout, PaperNet(*(arrays[name] for name in PAPER), structure), bias)
     fine = [arrays[f"level{layer.level}"] for layer in structure.layers]
-    return CompressedTexture(layout, LayeredNet(fine, arrays["coarse"], arrays["cascaded"], structure, border))
+    return CompressedTexture(layout, LayeredNet(fine, arrays["coarse"], arrays["cascaded"], structure, border), bias)
 
 
 def to_table(texture: CompressedTexture, settings: dict) -> Table:
@@ -134,6 +138,8 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
     for name, array in texture.arrays.items():
         stored |= stored_arrays(name, array)
     settings = {**settings, "layout": texture.layout.to_json()}
+    if texture.level_bias:
+        settings["level_bias"] = texture.level_bias
     if texture.net is not None:
         structure = texture.net.structure
         if isinstance(structure, PaperStructure):
@@ -144,6 +150,15 @@ def to_table(texture: CompressedTexture, settings: dict) -> Table:
                 "border": list(texture.border), "layers": list(map(asdict, structure.layers)),
             }  # fmt: skip
     return Table("texture", stored, settings=settings)
+
+
+def bias_of(settings: dict) -> float:
+    """Return the level bias of a file, 0 if its settings have none. Raises ``ValueError`` beyond the allowed range."""
+    bias = settings.get("level_bias", 0.0)
+    low, high = BIAS_RANGE
+    if isinstance(bias, bool) or not isinstance(bias, (int, float)) or not low <= bias <= high:
+        raise ValueError(f"level_bias: found {bias!r:.40}, allowed are numbers from {low:g} to {high:g}")
+    return float(bias)
 
 
 def structure_of(settings: dict, layout: Layout):
@@ -183,6 +198,7 @@ def load(path: str | os.PathLike) -> Table:
     structure = border = None
     try:
         layout = Layout.from_json(table.settings["layout"])
+        bias_of(table.settings)
         if layout.stored:
             structure, border = structure_of(table.settings, layout)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
@@ -243,10 +259,12 @@ class TextureModel(MapsModel):
         figures, lines = super().describe()
         image, measured = self.image, self.table.measured
         by_level = [measured.get(f"psnr_l{i}_db") for i in range(image.levels)]
-        figures = {**figures, "levels": image.levels, "psnr_by_level_db": by_level}
+        figures = {**figures, "levels": image.levels, "level_bias": image.level_bias, "psnr_by_level_db": by_level}
         if all(value is not None for value in by_level):
             listed = ", ".join(f"{value:.1f}" for value in by_level)
             lines.append(f"  {image.levels} levels of detail: {listed} dB")
+        if image.level_bias:
+            lines.append(f"  read {-image.level_bias:g} levels finer than the footprint")
         return figures, lines
 
     def decode(self, output=None, map=None, width=None, height=None, level: int = 0):

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import json
 import re
+import time
 
 import drjit as dr
 import numpy as np
@@ -12,7 +13,9 @@ import pytest
 from arrays import numpy_of
 
 from mi_diffind.cli import main
+from mi_diffind.deadline import Deadline
 from mi_diffind.errors import UsageError
+from mi_diffind.fitting import FitResult
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
@@ -306,6 +309,7 @@ def start(ad, tmp_path_factory):
 
 def quick(**changed):
     settings = {"steps": 60, "batch": 4096, "measure_every": 60, "lr": 1e-2}
+    changed = {"level_bias": 0.0, **changed}
     settings |= {k: changed.pop(k) for k in list(changed) if k in ("steps", "batch", "measure_every", "lr", "loss")}
     return dataclasses.replace(OURS, settings=dataclasses.replace(OURS.settings, **settings), **changed)
 
@@ -343,10 +347,65 @@ def test_training_for_shading_gains(start, ad):
 def test_a_training_that_loses_keeps_its_start(start, ad):
     """At a rate that destroys everything, what comes out is what went in."""
     table = start[2]
-    found, _ = trained(start, ad, quick(steps=2, measure_every=2, lr=0.3))
-    assert found.settings["kept_start"]
+    found, result = trained(start, ad, quick(steps=2, measure_every=2, lr=0.3, level_bias=-1.0))
+    assert found.settings["kept_start"] and found.settings["level_bias"] == 0 and result.measured["gain_db"] < 0
+    assert found.measured["shaded_converged_db"] == pytest.approx(found.settings["before"]["shaded_converged_db"])
     for name, array in table.arrays.items():
         assert np.array_equal(found.arrays[name].entries, array.entries)
+
+
+def test_a_level_that_loses_outweighs_all_that_gain():
+    assert training.gain_of([21, 32, 43], [20, 30, 40]) == 2
+    assert training.gain_of([20, 30, 43], [20, 30, 40]) == 1
+    assert training.gain_of([19.9, 40, 50], [20, 30, 40]) == pytest.approx(-0.1)
+
+
+@pytest.mark.parametrize(
+    "gains, expected",
+    [
+        ({0.0: (1.0, 30), -0.5: (2.0, 31), -1.0: (-0.1, 32)}, -0.5),  # the best that loses nowhere
+        ({0.0: (-3.0, 30), -0.5: (-2.0, 31), -1.0: (-0.1, 29)}, -0.5),  # all lose somewhere: the best mean
+        ({0.0: (0.0, 30), -0.5: (-2.0, 31), -1.0: (-0.1, 29)}, 0.0),
+    ],
+)
+def test_choice_of_the_level_bias(ad, gains, expected):
+    """Figures that are made up for the images that choose; a training of each bias, unless the time is too short."""
+
+    class Figures(training.ShadingProblem):
+        def __init__(self, bias):
+            self.level_bias = bias
+
+        net = property(lambda self: None)
+
+        def measure(self, net):
+            time.sleep(1e-3)  # longer than the limits below
+            return dict(zip(("gain_db", "shaded_converged_db"), gains[self.level_bias], strict=True))
+
+    class Request(FitRequest):
+        def train(self, problem, title):
+            assert self.settings.steps == 8 and self.checkpoint is None
+            trained.append(problem.level_bias)
+            return FitResult(problem.measure(None), 8, 8, 0.0, False, 0)
+
+    for limit, biases in (({}, training.BIASES), ({"seconds": 1e-9}, ()), ({"deadline": Deadline(1e-9)}, ())):
+        trained, settings = [], dataclasses.replace(OURS.settings, steps=100)
+        bias, kept, stopped = training.choose_bias(Figures, Request("ours", settings, ad, checkpoint="x", **limit))
+        assert bias == expected and stopped is None and trained == list(biases)
+        assert kept == {f"{b:g}": pytest.approx(g) for b, (g, _) in gains.items()}
+
+
+def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
+    """Arrays whose levels differ: the loss at a bias is that of the levels that a biased file reads."""
+    from mi_diffind.tasks.texture.compressed import CompressedTexture
+
+    _, pyramid, table, *_ = start
+    problem = training.ShadingProblem(training.start_of(table, pyramid), pyramid, quick(share=1.0))
+    problem.settings, losses = problem.shading.settings, []
+    for bias, net in ((-0.5, problem.net), (0.0, CompressedTexture(pyramid.layout, problem.net, -0.5))):
+        problem.level_bias = bias
+        losses.append(problem.shading_errors(net, dr.rng(seed=dr.opaque(ad.UInt64, 7)), 512).numpy())
+    np.testing.assert_allclose(*losses, rtol=1e-4, atol=1e-6)
+    assert not np.allclose(losses[0], problem.shading_errors(problem.net, dr.rng(seed=dr.opaque(ad.UInt64, 7)), 512))
 
 
 def test_share_zero_is_the_texture_alone(start, ad):
@@ -364,7 +423,7 @@ def test_share_zero_is_the_texture_alone(start, ad):
 
 
 def test_training_can_be_resumed(start, ad, tmp_path):
-    whole, _ = trained(start, ad, quick(steps=8, measure_every=4))
+    whole, _ = trained(start, ad, quick(steps=8, measure_every=4, level_bias=-0.5))
 
     class Stop(Exception):
         pass
@@ -373,18 +432,20 @@ def test_training_can_be_resumed(start, ad, tmp_path):
 
     def measure(self, net):
         calls.append(1)
-        if len(calls) == 3:  # the start, and the first two measurements
+        if len(calls) == 2:
             raise Stop
         return problem_measure(self, net)
 
     training.ShadingProblem.measure = measure
     try:
         with pytest.raises(Stop):
-            trained(start, ad, quick(steps=8, measure_every=4), checkpoint=checkpoint)
+            trained(start, ad, quick(steps=8, measure_every=4, level_bias=-0.5), checkpoint=checkpoint)
     finally:
         training.ShadingProblem.measure = problem_measure
-    again, result = trained(start, ad, quick(steps=8, measure_every=4), checkpoint=checkpoint, resume=True)
-    assert result.steps == 8
+    # The level bias is that of the checkpoint, without a choice
+    chosen = quick(steps=8, measure_every=4, level_bias=None)
+    again, result = trained(start, ad, chosen, checkpoint=checkpoint, resume=True)
+    assert result.steps == 8 and again.settings["level_bias"] == -0.5 and "level_biases" not in again.settings
     for name, array in whole.arrays.items():
         assert np.array_equal(array.entries, again.arrays[name].entries)
 
@@ -458,6 +519,8 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
     assert main(command) == 0
     said = json.loads(record.read_text())
     assert said["task"] == "shading" and said["settings"]["shading"]["share"] == OURS.share
+    assert set(said["settings"]["level_biases"]) == {"0", "-0.5", "-1"}
+    assert said["settings"]["level_bias"] in (training.BIASES if not said["settings"].get("kept_start") else (0,))
     assert said["effects_left_out"]["diffuse"] == "metallic is 1" and said["measured"]["shaded_converged_db"] > 10
     assert np.array(mi.Bitmap(str(tmp_path / "metal_preview.png"))).shape == (2 * (16 + 192), 3 * 192, 3)
     texture = mi.load_dict({"type": "neural_texture", "filename": str(out), "channels": "roughness"})
@@ -474,6 +537,7 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
         (["--lambda", "1.5"], "argument --lambda: found '1.5', allowed are numbers from 0 to 1"),
         (["--clip", "-1"], "argument --clip: found '-1', expected a positive number or none"),
         (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size"),
+        (["--level-bias", "0.5"], "argument --level-bias: found '0.5', allowed are numbers from -4 to 0"),
         (["--spp", "4"], "unrecognized arguments: --spp 4"),
     ],
 )

@@ -540,6 +540,8 @@ def no_pointer(table):
         (lambda t: t.settings["arrays"]["layers"][0].update(scale=[-1]), "describe no texture .the scales"),
         (lambda t: t.settings.pop("arrays"), "describe no texture .'arrays'"),
         (lambda t: t.settings.update(layout=3), "describe no texture"),
+        (lambda t: t.settings.update(level_bias=0.5), "level_bias: found 0.5, allowed are numbers from -4 to 0"),
+        (lambda t: t.settings.update(level_bias="x"), "level_bias: found 'x', allowed are numbers from -4 to 0"),
     ],
 )
 def test_damaged_files_are_refused(made, tmp_path, change, message):
@@ -548,6 +550,21 @@ def test_damaged_files_are_refused(made, tmp_path, change, message):
     with pytest.raises(TableError, match=message) as e:
         TASK.load(path)
     assert str(path) in str(e.value) and "\n" not in str(e.value)
+
+
+def test_a_level_bias_is_a_finer_level(made, tmp_path):
+    """Bit for bit; in decoded images, too, which stay as they are without a bias."""
+    path, (u, v, level) = tmp_path / "biased.npz", np.random.default_rng(3).random((3, 200))
+    save_table(path, damaged(made[3], lambda table: table.settings.update(level_bias=-0.5)))
+    plain, biased = (TASK.model(t, array_module("llvm").TensorXf).image for t in (made[3], TASK.load(path)))
+    assert (plain.level_bias, biased.level_bias) == (0, -0.5)
+    levels = 0.5 + 3 * level.astype(np.float32)
+    assert np.array_equal(read(biased, u, v, levels), read(plain, u, v, levels - np.float32(0.5)))
+    assert not np.allclose(read(biased, u, v, levels), read(plain, u, v, levels), atol=1e-3)
+    (name, *_) = plain.layout.names
+    assert np.array_equal(biased.decode([name], level=0)[name], plain.decode([name])[name])
+    shape = {"width": 8, "height": 8}
+    assert np.array_equal(biased.decode([name], **shape, level=1.5)[name], plain.decode([name], **shape, level=1)[name])
 
 
 # -- the command line -------------------------------------------------------------------------------------------------
