@@ -97,4 +97,3 @@ def test_measured_weights(monkeypatch):
     assert fitted.table.measured["seen_db"] > 0 and fitted.table.measured["angle_normal_deg"] > 0
     for other in ({"weights": "equal"}, {}):
         assert "weights" not in md.fit("image", maps, **batch, **other).table.settings
-    assert fit.weights is weights
