@@ -1,8 +1,9 @@
 """Materials as they are seen: shaded pictures of the maps of a source and of decoded maps, and their differences.
 
 A floor and a ball stand under a sky with a window and lamps. They are rendered with Mitsuba's ``principled`` and
-``normalmap`` in four ways (:data:`WAYS`): glossy and rough, near and far. Both pictures of a pair take the same random
-numbers, so that maps without errors give a difference of 0.
+``normalmap`` in four ways (:data:`WAYS`): glossy and rough, near and far. The pictures of two materials take the same
+random numbers, so that maps without errors give a difference of 0. Each picture is rendered twice, with independent
+random numbers: the mean product of both differences is the squared error without the noise of the renders.
 """
 
 from __future__ import annotations
@@ -20,8 +21,11 @@ from .source import Source
 #: Share of the way from the roughness of the map to 1, by the name of a surface.
 SURFACES = {"glossy": 0.0, "rough": 0.5}
 
-#: Side of the shown texture and of its patches, both in texels, and samples a pixel, by the name of a distance.
-DISTANCES = {"near": (192, 8, 16), "far": (768, 48, 25)}
+#: Side of the shown texture and of its patches, both in texels, and samples a pixel of each render, by the distance.
+DISTANCES = {"near": (192, 8, 16), "far": (768, 48, 16)}
+
+#: Factor of all radiance, which brings a picture of grey maps to about 0.3.
+EXPOSURE = 1.2
 
 #: Names of the four pictures.
 WAYS = tuple(f"{surface}_{distance}" for surface in SURFACES for distance in DISTANCES)
@@ -61,12 +65,12 @@ def measure(source: Source, image: CompressedMaps) -> dict[str, float]:
     if image.types is None or not shows(source):
         return angles
     references, pictures = reference(source, image.types), render(by_role(source, decoded), image.types)
-    decibels = {way: metrics.psnr(references[way], pictures[way]) for way in WAYS}
+    squares = {way: squared_error(references[way], pictures[way]) for way in WAYS}
     ratios = [float(pictures[way].mean() / references[way].mean()) for way in WAYS]
     return {
         **angles,
-        "seen_db": decibel(sum(10 ** (-db / 10) for db in decibels.values()) / len(WAYS)),
-        **{f"seen_{way}_db": min(120.0, db) for way, db in decibels.items()},
+        "seen_db": decibel(sum(squares.values()) / len(WAYS)),
+        **{f"seen_{way}_db": decibel(square) for way, square in squares.items()},
         "seen_brightness": max(ratios, key=lambda ratio: abs(ratio - 1)),
     }
 
@@ -98,7 +102,7 @@ def sensitivities(source: Source, types: ModuleType) -> dict[str, float]:
         change = NOISE * rng.choice(np.float32([-1, 1]), m.values.shape)
         noisy = by_role(source, {other.name: other.values for other in source.maps} | {m.name: m.values + change})
         pictures = render({**truth, role: noisy[role]}, types, ways)
-        errors = [10 ** (-metrics.psnr(references[way], pictures[way]) / 10) for way in ways]
+        errors = [squared_error(references[way], pictures[way]) for way in ways]
         squares[m.name] = float(np.mean(errors)) / (NOISE**2 * m.channels)
     return squares
 
@@ -125,7 +129,7 @@ def _roles(source: Source) -> dict:
 
 
 def render(maps: Mapping[str, np.ndarray], types: ModuleType, ways=WAYS) -> dict[str, np.ndarray]:
-    """Return the pictures, ``(rows, columns, 3)`` linear, of maps by role (:func:`by_role`)."""
+    """Return the pictures of maps by role (:func:`by_role`): two renders each, ``(2, rows, columns, 3)``, linear."""
     import mitsuba as mi
 
     pictures = {}
@@ -135,9 +139,16 @@ def render(maps: Mapping[str, np.ndarray], types: ModuleType, ways=WAYS) -> dict
             for surface, share in SURFACES.items():
                 if f"{surface}_{distance}" in ways:
                     scene = mi.load_dict(_scene(patches, share))
-                    pictures[f"{surface}_{distance}"] = mi.render(scene, spp=samples, seed=0).numpy()
+                    renders = [mi.render(scene, spp=samples, seed=seed).numpy() for seed in range(2)]
+                    pictures[f"{surface}_{distance}"] = np.stack(renders)
                     del scene
     return pictures
+
+
+def squared_error(reference: np.ndarray, picture: np.ndarray) -> float:
+    """Return the mean squared error of a picture, without the noise of its two renders, values clipped to [0, 1]."""
+    first, second = (np.clip(picture, 0, 1) - np.clip(reference, 0, 1)).astype(np.float64)
+    return max(0.0, float(np.mean(first * second)))
 
 
 def patchwork(values: np.ndarray, side: int, patch: int) -> np.ndarray:
@@ -164,16 +175,16 @@ def patchwork(values: np.ndarray, side: int, patch: int) -> np.ndarray:
 
 
 def sky(rows: int = 64) -> np.ndarray:
-    """Return the environment, ``(rows, 2·rows, 3)``: a bright sky above a dim ground, a window and two lamps."""
+    """Return the environment, ``(rows, 2·rows, 3)``: a room with a dark ground, windows with panes, and lamps."""
     v, u = np.mgrid[0:rows, 0 : 2 * rows].astype(np.float32) + 0.5
     v, u = v / rows, u / (2 * rows)
-    up = np.clip(np.cos(np.pi * v), -1, 1)[..., None]
-    values = np.where(up > 0, 0.25 + 0.25 * up * np.float32([0.7, 0.9, 1.2]), 0.12 + 0.1 * (1 + up))
-    window, warm, cold = (0.30, 0.27, 0.06, 0.12), (0.62, 0.33, 0.02, 0.04), (0.85, 0.15, 0.05, 0.05)
-    for (x, y, wide, high), radiance in ((window, (5, 5, 5.5)), (warm, (14, 12, 9)), (cold, (6, 5, 4))):
-        inside = [np.clip((size - np.abs(d)) * rows / 2 + 0.5, 0, 1) for d, size in ((u - x, wide), (v - y, high))]
-        values = values + (inside[0] * inside[1])[..., None] * np.float32(radiance)
-    return np.ascontiguousarray(2.5 * values, dtype=np.float32)
+    up = np.cos(np.pi * v)[..., None]
+    values = np.where(up > 0, 0.3 + 0.4 * up * np.float32([0.8, 0.9, 1.1]), np.float32([0.12, 0.1, 0.08]))
+    panes = (np.abs(24 * u % 1 - 0.5) < 0.38) & (np.abs(14 * v % 1 - 0.5) < 0.4)
+    window = panes & (np.abs(v - 0.36) < 0.107) & (np.abs(np.abs(u - 0.5) - 0.21) < 0.083)
+    lamps = (np.abs(v - 0.14) < 0.03) & (np.abs(8 * u % 1 - 0.5) < 0.2)
+    values = values + window[..., None] * np.float32([5, 5.5, 6.5]) + lamps[..., None] * np.float32([9, 8, 6])
+    return np.ascontiguousarray(EXPOSURE * values, dtype=np.float32)
 
 
 def _scene(maps: Mapping[str, np.ndarray], share: float) -> dict:
