@@ -309,6 +309,7 @@ def test_report_and_text(mi_rgb, files):
     assert report["effects_left_out"]["ao"] == "the BRDF has no such parameter"
     assert {"normal", "opacity", "diffuse"} <= set(report["effects_in_use"]) and 7 in report["channels_left_out"]
     assert "filter = trilinear" in str(bsdf) and "lobes = tables" in str(bsdf)
+    assert mi_diffind.inspect(files["leaf"]).usage[-1].startswith('<bsdf type="neural_material">')
 
 
 @pytest.mark.parametrize(
