@@ -55,7 +55,8 @@ def files(tmp_path_factory):
         ),
         # Nothing but the roughness varies, and no lobe but the specular one and the diffuse one is possible
         "plain": stored(
-            folder / "plain.npz", albedo=constant(0.2, 0.2, 0.2), roughness=wave[..., 3:4], metallic=constant(0)
+            folder / "plain.npz", albedo=constant(0.2, 0.2, 0.2), roughness=wave[..., 3:4], metallic=constant(0),
+            emission=constant(0.5, 0.2, 0.1),
         ),
         "steep": stored(folder / "steep.npz", normal=bumps(1.9), roughness=constant(0), albedo=constant(0, 0, 0)),
         "other": stored(folder / "other.npz", albedo=wave[..., :3], height=wave[..., 3:4]),
@@ -297,6 +298,7 @@ def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
                 dr.enable_grad(params[key])
         params.update()
         assert bsdf._effects() == known._effects()
+    assert ours.report()["effects_left_out"]["emission"].startswith("a BSDF emits no light")
     counted = [bsdf_operations(b, ("eval",))["eval"].instructions for b in (ours, known)]
     assert counted[0] <= 1.1 * counted[1]
 
