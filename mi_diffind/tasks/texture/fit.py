@@ -56,7 +56,7 @@ def fit(request: FitRequest) -> Fitted:
     requested, size = requested_bytes(options, source), None
     if pyramid.layout.stored:
         size = size_of(source, pyramid, requested, recipe, options)
-    table, result = training.fit_texture(source, size, recipe, request, pyramid)
+    table, result = training.fit_texture(source, size, recipe, request, pyramid, options["level_bias"])
     table.settings |= request.paths(source_path=options["source"])
     figures, line = size_figures(source, table, requested)
     lines = [line]
