@@ -253,6 +253,19 @@ def shading_shares(study: str) -> str:
     return table(["material", "", "", *(f"λ {share:g}" for share in shares)], rows)
 
 
+def material_times() -> str:
+    """Return the cost of a pass with each form of a material, as multiples of separate plugins."""
+    frame, fixed = (measured("bench_material")[size] for size in ("frame", "fixed"))
+    separate = frame["normalmap + disney + 4 neural_texture"]["operations"]
+    rows = []
+    for name, figures in frame.items():
+        counts = (figures["operations"][key] / separate[key] for key in ("instructions", "flops", "gathers"))
+        ratios = (x["ratio"] for x in (fixed[name], figures))
+        times = (f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" for r in ratios)
+        rows.append([f"`{name}`", *(f"{count:.2f}" for count in counts), *times])
+    return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640 pixels"], rows)
+
+
 def sdf_errors(study: str) -> str:
     """Return errors of distance fields in equal bytes: IoU, IoU near the surface, normals."""
     from mi_diffind.studies.equal_memory import candidates_by_budget
@@ -381,7 +394,10 @@ def mean(values) -> float:
     return sum(values) / len(values)
 
 
-TABLES = {f.__name__: f for f in (disney_forms, comparisons, image_bytes, image_pages, texture_memory, texture_presets)}
+TABLES = {
+    f.__name__: f
+    for f in (disney_forms, comparisons, image_bytes, image_pages, material_times, texture_memory, texture_presets)
+}
 for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))

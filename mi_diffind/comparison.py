@@ -10,7 +10,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import drjit as dr
@@ -40,8 +40,8 @@ class Comparison:
     ``further``: comparisons of the same image with further truths.
     """
 
-    written: np.ndarray
-    reference: np.ndarray
+    written: np.ndarray = field(repr=False)
+    reference: np.ndarray = field(repr=False)
     figures: dict
     further: tuple[Comparison, ...] = ()
 

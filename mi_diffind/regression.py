@@ -310,7 +310,7 @@ class Regression:
     """
 
     figures: dict
-    images: dict[str, np.ndarray] = field(default_factory=dict)
+    images: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     test: ZTest | None = None
 
     @property

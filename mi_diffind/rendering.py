@@ -7,7 +7,7 @@ import io
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -34,9 +34,9 @@ class Rendering:
     and, of a scene that was given as a file, its ``learned_plugins`` and ``table_bytes``.
     """
 
-    frames: list[np.ndarray]
+    frames: list[np.ndarray] = field(repr=False)
     figures: dict
-    scene: object
+    scene: object = field(repr=False)
 
     @property
     def image(self) -> np.ndarray:

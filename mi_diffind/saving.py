@@ -35,8 +35,9 @@ class Saved:
 def save(source, path: str | os.PathLike, storage: str = "", file: str | os.PathLike = "") -> Saved:
     """Write tables that were optimised through renders into a table file.
 
-    - ``source``: a plugin (``neural_texture``, ``neural_image``, ``neural_disney``, ``neural_ggx``, ``neural_sdf``,
-      ``neural_field``), a scene, or ``mi.traverse(…)`` of one of them. The plugin has the storage form ``"float32"``.
+    - ``source``: a plugin (``neural_texture``, ``neural_material``, ``neural_image``, ``neural_disney``,
+      ``neural_ggx``, ``neural_sdf``, ``neural_field``), a scene, or ``mi.traverse(…)`` of one of them. The plugin has
+      the storage form ``"float32"``.
     - ``path``: table file (``.npz``) to write.
     - ``storage``: storage form of the entries (``"uint8"``, ``"float16"``, ``"float32"``); "": that of the file that
       the plugin read, with its bits per entry.

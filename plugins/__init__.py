@@ -28,20 +28,19 @@ class Counterpart:
 
     The plugin called ``name`` takes the same parameters except ``learned_only``, and needs those of ``given`` in
     addition. If more has to change, ``convert(props)`` changes the properties (``mi.Properties``), or raises
-    ``RuntimeError``. ``oversampling``: how many times the samples of the scene it needs to be a truth.
+    ``RuntimeError``; where several plugins replace one, it returns the name of the outermost. ``oversampling``: how
+    many times the samples of the scene it needs to be a truth.
     """
 
     name: str
     learned_only: tuple[str, ...] = ()
     given: dict[str, Any] = field(default_factory=dict)
-    convert: Callable[[Any], None] | None = None
+    convert: Callable[[Any], str | None] | None = None
     oversampling: int = 1
 
     def replace(self, props) -> None:
         """Change the properties of the plugin, in place, to those of the counterpart."""
-        if self.convert:
-            self.convert(props)
-        props.set_plugin_name(self.name)
+        props.set_plugin_name((self.convert(props) if self.convert else None) or self.name)
         for key in self.learned_only:
             if key in props:
                 del props[key]

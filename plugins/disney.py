@@ -13,7 +13,7 @@ from mi_diffind.tasks.disney.model import LOBES
 from . import Counterpart, Plugin
 from .support import properties, tables
 from .support.manual import shared_parts
-from .support.tracked_parameter import TrackedParameter, when_outermost
+from .support.tracked_parameter import tracked, when_outermost
 
 _DIFFERENTIABLE = mi.ParamFlags.Differentiable
 _DISCONTINUOUS = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
@@ -129,7 +129,8 @@ class Disney(mi.BSDF):
     **Only the effects in use are computed.** A part of the model that the parameters make zero (``clearcoat`` 0,
     ``metallic`` 1, a black texture, the tint of a grey albedo, …) is neither traced nor sampled. The effects in use are
     determined when the scene is loaded and whenever parameters change. A parameter with gradients enabled always counts
-    as in use, and so does a texture whose bounds are unknown (those of constants and bitmaps are known).
+    as in use, and so does a texture whose bounds are unknown. Known are those of constants and bitmaps, and the
+    constant maps of compressed files.
     ``mi-diffind inspect SCENE.xml`` lists the other effects and the reasons. Terms that depend on constant parameters
     alone are evaluated once, not for each sample.
 
@@ -241,9 +242,9 @@ class Disney(mi.BSDF):
         self.decoder, self.preset = Decoder(), ""
         #: Name of a parameter of the model → its bounds and changes.
         self._tracked = {
-            "base_color": TrackedParameter(self.base_color, colour=True),
-            **{name: TrackedParameter(texture) for name, texture in self.scalars.items()},
-            "specular": TrackedParameter(self.reflectance, is_eta=self.reflectance_name == "eta"),
+            "base_color": tracked(self.base_color, colour=True),
+            **{name: tracked(texture) for name, texture in self.scalars.items()},
+            "specular": tracked(self.reflectance, is_eta=self.reflectance_name == "eta"),
         }
         self._set_up(props)
         #: Coefficients that depend on constants alone, evaluated, and the effects that they are for.
@@ -254,26 +255,23 @@ class Disney(mi.BSDF):
     def _set_up(self, props: mi.Properties) -> None:
         """Read the properties of a learned form, before anything is evaluated."""
 
-    def _set_flags(self, varies: bool, is_anisotropic: bool) -> None:
-        front = mi.BSDFFlags.FrontSide
+    def _set_flags(self, varies: bool, is_anisotropic: bool, sides=mi.BSDFFlags.FrontSide) -> None:
         if varies:
-            front = front | mi.BSDFFlags.SpatiallyVarying
-        glossy = mi.BSDFFlags.GlossyReflection | front
+            sides = sides | mi.BSDFFlags.SpatiallyVarying
+        glossy = mi.BSDFFlags.GlossyReflection | sides
         anisotropic = glossy | mi.BSDFFlags.Anisotropic
-        self.m_components = [mi.BSDFFlags.DiffuseReflection | front, anisotropic if is_anisotropic else glossy, glossy]
+        self.m_components = [mi.BSDFFlags.DiffuseReflection | sides, anisotropic if is_anisotropic else glossy, glossy]
         self.m_flags = self.m_components[0] | self.m_components[1] | self.m_components[2]
 
     def _textures(self) -> dict[str, mi.Texture]:
-        textures = {"base_color": self.base_color, **self.scalars}
-        if isinstance(self.reflectance, mi.Texture):
-            textures[self.reflectance_name] = self.reflectance
-        return textures
+        textures = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
+        return {name: texture for name, texture in textures.items() if isinstance(texture, mi.Texture)}
 
     def traverse(self, cb: mi.TraversalCallback):
-        cb.put("base_color", self.base_color, _DIFFERENTIABLE)
-        for name, texture in self.scalars.items():
-            cb.put(name, texture, _DISCONTINUOUS if name == "roughness" else _DIFFERENTIABLE)
-        cb.put(self.reflectance_name, self.reflectance, _DISCONTINUOUS)
+        given = {"base_color": self.base_color, **self.scalars, self.reflectance_name: self.reflectance}
+        for name, texture in given.items():
+            if texture is not None:
+                cb.put(name, texture, _DISCONTINUOUS if name in ("roughness", "specular", "eta") else _DIFFERENTIABLE)
         for lobe, name in self.RATES.items():
             cb.put(name, self.rates[lobe], mi.ParamFlags.NonDifferentiable)
 
@@ -309,7 +307,7 @@ class Disney(mi.BSDF):
             parameter.update()
         effects, _ = self._find_effects()
         groups = sorted({*self.decoder.required(effects), *sampling.required(effects)})
-        parameters = Parameters(self, dr.zeros(mi.SurfaceInteraction3f), True)
+        parameters = self._point(mi.BSDFContext(), dr.zeros(mi.SurfaceInteraction3f), True).parameters
         with dr.suspend_grad():
             self._constant = {
                 group: self.decoder.coefficients(group, parameters, effects)
@@ -360,18 +358,15 @@ class Disney(mi.BSDF):
             if lobe in effects.lobes and ctx.is_enabled(flag, component)
         }
 
-    def _prepare(self, si, wo, active):
-        """Return directions that are safe to compute with in every lane, and the mask of lanes whose result counts."""
-        active = active & (si.wi.z > 0) & (wo.z > 0)
-        up = mi.Vector3f(0, 0, 1)
-        return dr.select(active, si.wi, up), dr.select(active, wo, up), active
+    def _point(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, active: mi.Bool) -> ShadedPoint:
+        """Return the parameters and the frame at a hit."""
+        return ShadedPoint(Parameters(self, si, active), si.wi)
 
-    def _surface(self, si, active, effects: Effects, value: bool = True, density: bool = True):
-        """Return the parameters at ``si`` and the coefficients that values and densities need.
+    def _surface(self, point: ShadedPoint, effects: Effects, value: bool = True, density: bool = True) -> dict:
+        """Return the coefficients that values and densities need.
 
         All coefficients are computed here: at their first use, derivatives may be suspended.
         """
-        parameters = Parameters(self, si, active)
         groups = (*(self.decoder.required(effects) if value else ()), *(sampling.required(effects) if density else ()))
         usable = self._constant if effects == self._constant_for else {}
         coefficients = {}
@@ -380,51 +375,65 @@ class Disney(mi.BSDF):
             if group in usable and self._is_constant(group):
                 coefficients[group] = usable[group]
             else:
-                coefficients[group] = self.decoder.coefficients(group, parameters, effects)
-        return parameters, coefficients
+                coefficients[group] = self.decoder.coefficients(group, point.parameters, effects)
+        return coefficients
 
-    def _value(self, surface, effects, lobes, wi, wo, active):
-        parameters, coefficients = surface
-        value = self.decoder.value(coefficients, effects, lobes, parameters, wi, wo)
-        value = mi.UnpolarizedSpectrum(value)
-        return mi.depolarizer(mi.Spectrum(dr.select(active & _are_directions(wi, wo), value, 0)))
+    def _prepare(self, point: ShadedPoint, wo, active):
+        """Return both directions in the point's frame, and the mask of lanes whose result counts.
 
-    def _density(self, surface, effects, rates, wi, wo, active):
+        Directions are safe to compute with in every lane.
+        """
+        inside, above = point.enter(wo)
+        active = active & point.above & above
+        up = mi.Vector3f(0, 0, 1)
+        wi, inside = dr.select(active, point.wi, up), dr.select(active, inside, up)
+        return wi, inside, active & _are_directions(wi, inside)
+
+    def _value(self, point, coefficients, effects, lobes, wo, directions):
+        wi, inside, active = directions
+        value = self.decoder.value(coefficients, effects, lobes, point.parameters, wi, inside)
+        value = mi.UnpolarizedSpectrum(value) * point.factor(wo)
+        return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
+
+    def _density(self, point, coefficients, effects, rates, directions):
+        wi, inside, active = directions
         # Detached, see the manual page
         with dr.suspend_grad():
-            probabilities = sampling.lobe_probabilities(surface[1], effects, wi.z, rates)
-            pdf = sampling.density(surface[1], effects, probabilities, wi, wo)
-            return dr.detach(dr.select(active & _are_directions(wi, wo), mi.Float(pdf), 0))
+            probabilities = sampling.lobe_probabilities(coefficients, effects, wi.z, rates)
+            pdf = sampling.density(coefficients, effects, probabilities, wi, inside)
+            return dr.detach(dr.select(active, mi.Float(pdf) * point.share, 0))
 
     def eval(self, ctx, si, wo, active=True):
-        wi, wo, active = self._prepare(si, wo, active)
-        effects = self._effects()
-        surface = self._surface(si, active, effects, density=False)
-        return self._value(surface, effects, tuple(self._rates(ctx, effects)), wi, wo, active)
+        point, effects = self._point(ctx, si, active), self._effects()
+        coefficients = self._surface(point, effects, density=False)
+        lobes = tuple(self._rates(ctx, effects))
+        return self._value(point, coefficients, effects, lobes, wo, self._prepare(point, wo, active))
 
     def pdf(self, ctx, si, wo, active=True):
-        wi, wo, active = self._prepare(si, wo, active)
-        effects = self._effects()
-        surface = self._surface(si, active, effects, value=False)
-        return self._density(surface, effects, self._rates(ctx, effects), wi, wo, active)
+        point, effects = self._point(ctx, si, active), self._effects()
+        coefficients = self._surface(point, effects, value=False)
+        return self._density(point, coefficients, effects, self._rates(ctx, effects), self._prepare(point, wo, active))
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        wi, wo, active = self._prepare(si, wo, active)
-        effects = self._effects()
-        surface = self._surface(si, active, effects)
-        return self._eval_pdf(surface, effects, self._rates(ctx, effects), wi, wo, active)
+        point, effects = self._point(ctx, si, active), self._effects()
+        coefficients = self._surface(point, effects)
+        return self._eval_pdf(point, coefficients, effects, self._rates(ctx, effects), wo, active)
 
-    def _eval_pdf(self, surface, effects, rates, wi, wo, active):
-        value = self._value(surface, effects, tuple(rates), wi, wo, active)
-        return value, self._density(surface, effects, rates, wi, wo, active)
+    def _eval_pdf(self, point, coefficients, effects, rates, wo, active):
+        directions = self._prepare(point, wo, active)
+        value = self._value(point, coefficients, effects, tuple(rates), wo, directions)
+        return value, self._density(point, coefficients, effects, rates, directions)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
+        return self._sample(ctx, self._point(ctx, si, active), sample1, sample2, active)
+
+    def _sample(self, ctx, point: ShadedPoint, sample1, sample2, active):
+        """Return :meth:`sample` at a point."""
         effects = self._effects()
         rates = self._rates(ctx, effects)
-        active = active & (si.wi.z > 0)
-        wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
-        surface = self._surface(si, active, effects)
-        c = surface[1]
+        active = active & point.above
+        wi = dr.select(active, point.wi, mi.Vector3f(0, 0, 1))
+        c = self._surface(point, effects)
 
         bs = dr.zeros(mi.BSDFSample3f)
         with dr.suspend_grad():
@@ -445,18 +454,17 @@ class Disney(mi.BSDF):
             wo = mi.reflect(wi, half)
             if "diffuse" in p:
                 wo = dr.select(is_diffuse, mi.warp.square_to_cosine_hemisphere(sample2), wo)
-            wo = dr.detach(wo)
+            active &= dr.isfinite(wo.z) & (wo.z > 0)
+            wo = dr.detach(point.leave(dr.select(dr.isfinite(wo.z), wo, mi.Vector3f(0, 0, 1))))
 
-        bs.wo = dr.select(dr.isfinite(wo.z), wo, mi.Vector3f(0, 0, 1))
+        bs.wo = wo
         bs.eta = 1.0
         bs.sampled_component = component
         bs.sampled_type = dr.select(
             component == 0, mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
         )
 
-        active &= dr.isfinite(wo.z) & (wo.z > 0)
-        safe = dr.select(active, wo, mi.Vector3f(0, 0, 1))
-        value, pdf = self._eval_pdf(surface, effects, rates, wi, safe, active)
+        value, pdf = self._eval_pdf(point, c, effects, rates, wo, active)
         active &= pdf > _SMALLEST_DENSITY
         bs.pdf = dr.select(active, pdf, 0)
         return bs, dr.select(active, value / dr.select(active, bs.pdf, 1), 0)
@@ -478,6 +486,31 @@ class Disney(mi.BSDF):
 def _are_directions(wi, wo):
     """Return the lanes in which neither direction is NaN or much longer than 1."""
     return model.geometry(wi, wo).h2 < 100
+
+
+class ShadedPoint:
+    """Surface point as the lobes see it: parameters, and the direction ``wi`` in the frame that they reflect in.
+
+    ``above``: lanes in which the viewer is on the front side; ``share``: probability that sampling chooses a lobe. This
+    frame is that of the surface.
+    """
+
+    share: mi.Float | float = 1.0
+
+    def __init__(self, parameters: Parameters, wi: mi.Vector3f):
+        self.parameters, self.wi, self.above = parameters, wi, wi.z > 0
+
+    def enter(self, wo: mi.Vector3f) -> tuple[mi.Vector3f, mi.Bool]:
+        """Return a direction of the surface's frame in this one, and the lanes in which it leaves the front side."""
+        return wo, wo.z > 0
+
+    def leave(self, wo: mi.Vector3f) -> mi.Vector3f:
+        """Return a direction of this frame in that of the surface."""
+        return wo
+
+    def factor(self, wo: mi.Vector3f) -> mi.Float | float:
+        """Return a factor on the values towards a direction of the surface's frame."""
+        return 1.0
 
 
 class Parameters:

@@ -9,7 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from mi_diffind import srgb
+from mi_diffind.bounds import ValueBounds
 from mi_diffind.lookup import clamp
+from mi_diffind.maps.layout import MapLayout
 
 from .support import properties, tables, textures, upsampling
 from .support.image_files import SharedMaps, is_data, map_of
@@ -37,11 +39,7 @@ class MapTexture(mi.Texture):
         self.image = self._shared.image
         #: The arrays, where frozen functions (``dr.freeze``) look for them.
         self.net = getattr(self.image, "net", None)
-        self.map = map_of(self.image.layout, str(props.get("channels", "")))
-        raw = props.get("raw", is_data(self.map))
-        if not isinstance(raw, bool):
-            raise RuntimeError(f'parameter "raw": found {raw}, allowed are true and false')
-        self.raw = raw
+        self.map, self.raw = self._choose(props)
         self.to_uv = textures.transformation(props)
         self._update_transformation()
         self._clear_cache()
@@ -49,6 +47,14 @@ class MapTexture(mi.Texture):
     def _open(self, props: mi.Properties) -> SharedMaps:
         """Open the maps that the properties name, and read further properties of the class. Raises ``RuntimeError``."""
         raise NotImplementedError
+
+    def _choose(self, props: mi.Properties) -> tuple[MapLayout, bool]:
+        """Return the map to show, and whether its values stay as they are. Raises ``RuntimeError``."""
+        chosen = map_of(self.image.layout, str(props.get("channels", "")))
+        raw = props.get("raw", is_data(chosen))
+        if not isinstance(raw, bool):
+            raise RuntimeError(f'parameter "raw": found {raw}, allowed are true and false')
+        return chosen, raw
 
     def traverse(self, cb: mi.TraversalCallback):
         tables.traverse(cb, self._shared.tables)
@@ -108,17 +114,33 @@ class MapTexture(mi.Texture):
 
     def _used(self, stored: list) -> list[mi.Float]:
         """Return the channels of the map, converted from the stored channels of all maps."""
-        values = self.image.maps(stored, [self.map.name])[self.map.name]
-        values = [mi.Float(v) for v in values]
-        if not self._is_encoded():
+        return self._converted(self.map, stored)
+
+    def _converted(self, m: MapLayout, stored: list) -> list[mi.Float]:
+        """Return the channels of the map ``m``, converted from the stored channels of all maps."""
+        values = [mi.Float(v) for v in self.image.maps(stored, [m.name])[m.name]]
+        if not self._is_encoded(m):
             return values
-        bounded = self.map.low >= 0 and self.map.high <= 1 and self.map.knee == 0
+        bounded = m.low >= 0 and m.high <= 1 and m.knee == 0
         decode = srgb.to_linear_bounded if bounded else srgb.to_linear
         return [decode(v) for v in values]
 
-    def _is_encoded(self) -> bool:
-        """Return whether stored values are sRGB and have to be converted."""
-        return not self.raw and self.map.color_space == "srgb"
+    def _is_encoded(self, m: MapLayout | None = None) -> bool:
+        """Return whether stored values of a map (default: the one that is shown) are sRGB and have to be converted."""
+        return not self.raw and (m or self.map).color_space == "srgb"
+
+    def layout_bounds(self, m: MapLayout | None = None) -> ValueBounds | None:
+        """Return the bounds of a map's values (default: the one that is shown) that hold for any entries of the arrays.
+
+        Constant channels are part of the file's layout, as is the equality of channels that are stored once.
+        """
+        m = m or self.map
+        grey = len(set(m.where)) == 1
+        constants = np.array([w[1] for w in m.where if isinstance(w, tuple)])
+        if len(constants) < m.channels:
+            return ValueBounds(grey=grey)
+        constants = srgb.to_linear(constants) if self._is_encoded(m) else constants
+        return ValueBounds(float(constants.min()), float(constants.max()), grey=grey)
 
     def _is_upsampled(self) -> bool:
         """Return whether the values are colours that are upsampled to spectra."""

@@ -126,7 +126,7 @@ class MipMap(FilteredTexture):
             index = dr.arange(mi.UInt32, width * height * channels)
             stored = self.image.interpolated_texels(index // channels) if needed else []
             values = self._used_of([stored[i] for i in needed])
-            flat = values[0]
+            flat = values[0] + dr.zeros(mi.Float, width * height * channels)  # as many where a channel is constant
             for c in range(1, channels):
                 flat = dr.select(index % channels == c, values[c], flat)
             return mi.TensorXf(flat, (height, width, channels))
@@ -167,6 +167,9 @@ class MipMap(FilteredTexture):
             mi.Float(stored[where]) if isinstance(where, int) else srgb.to_linear_bounded(mi.Float(where[1]))
             for where in self.map.where
         ]
+
+    def layout_bounds(self, m=None):
+        return None  # an update of ``data`` may replace the map
 
     def _storage(self):
         return {"preset": "", "storage": "float32", "table_bytes": self.image.memory_nbytes}

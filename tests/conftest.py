@@ -15,7 +15,10 @@ if TARGET := os.environ.get("MI_DIFFIND_LLVM_TARGET"):
 
 
 def pytest_collection_modifyitems(items):
-    """Within a file, tests of one variant follow each other: every switch costs a tenth of a second."""
+    """Notebooks are long. Within a file, tests of one variant follow each other: a switch costs a tenth of a second."""
+    for item in items:
+        if item.path.suffix == ".ipynb":
+            item.add_marker(pytest.mark.long)
     files, order = {}, {name: i for i, name in enumerate(VARIANTS)}
 
     def place(item):

@@ -207,6 +207,9 @@ PLUGINS = {
     "neural_image": lambda: texture(storage="float32", type="neural_image", filename=str(ASSETS / "tiles.npz")),
     "neural_disney": lambda: {"type": "neural_disney", "storage": "float32"},
     "neural_ggx": lambda: {"type": "neural_ggx", "storage": "float32", "alpha": 0.3},
+    "neural_material": lambda: {
+        "type": "neural_material", "storage": "float32", "filename": str(ASSETS / "tiles_filtered.npz"),
+    },
 }  # fmt: skip
 
 

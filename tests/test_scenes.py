@@ -107,10 +107,15 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
             "disney",
             "",
             "exact",
-            "names no learned plugin (neural_disney, neural_field, neural_ggx, neural_image, neural_sdf, "
-            "neural_texture)",
+            "names no learned plugin (neural_disney, neural_field, neural_ggx, neural_image, neural_material, "
+            "neural_sdf, neural_texture)",
         ),
-        ("neural_ggx", "", "principled", 'names no plugin that "principled" can stand for (disney, neural_disney)'),
+        (
+            "neural_ggx",
+            "",
+            "principled",
+            'names no plugin that "principled" can stand for (disney, neural_disney, neural_material)',
+        ),
         ("disney", "", "plastic", '"plastic": no plugin has this counterpart; there are principled'),
         ("disney", '<texture name="specular" type="checkerboard"/>', "principled", '"specular": is a texture, but'),
     ],

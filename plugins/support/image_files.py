@@ -219,13 +219,17 @@ def to_mipmap(task: Task, props: mi.Properties) -> None:
 
 def original_of(task: Task, props: mi.Properties) -> tuple[Path, MapLayout]:
     """Return the path of the image or manifest that a task's file was made from, and the map that is shown."""
+    chosen = map_of(layout_of(task, props), str(props.get("channels", "")))
     path = Path(properties.filename(props))
+    return _original(props, path, task.load(path).settings), chosen
+
+
+def layout_of(task: Task, props: mi.Properties) -> Layout:
+    """Return the layout of the file that the property ``filename`` names."""
     try:
-        table = task.load(path)
+        return Layout.from_json(task.load(properties.filename(props)).settings["layout"])
     except TableError as e:
         raise RuntimeError(str(e)) from None
-    chosen = map_of(Layout.from_json(table.settings["layout"]), str(props.get("channels", "")))
-    return _original(props, path, table.settings), chosen
 
 
 def manifest_of(image: Path, folder: Path, raw: bool, normal: bool) -> Path:

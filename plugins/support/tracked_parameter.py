@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -32,6 +33,37 @@ def when_outermost(work) -> None:
             _waiting.queue.pop(0)()
     finally:
         _waiting.queue = None
+
+
+def tracked(texture, colour: bool = False, is_eta: bool = False) -> TrackedParameter | FixedParameter:
+    """Return the parameter of a BSDF, a texture or a number; :class:`TrackedParameter` has the arguments."""
+    bounds = None if is_eta or not hasattr(texture, "layout_bounds") else texture.layout_bounds()
+    if bounds is None:
+        return TrackedParameter(texture, colour, is_eta)
+    return FixedParameter(bounds, not texture.is_spatially_varying() and not (colour and mi.is_spectral))
+
+
+@dataclass(frozen=True)
+class FixedParameter:
+    """Parameter whose bounds are ``known`` for any entries of its arrays; a constant has no entries.
+
+    The methods are those of :class:`TrackedParameter`.
+    """
+
+    known: ValueBounds
+    constant: bool
+
+    def optimised(self) -> bool:
+        return False
+
+    def changed(self) -> bool:
+        return False
+
+    def update(self) -> None:
+        pass
+
+    def bounds(self) -> ValueBounds:
+        return self.known
 
 
 class TrackedParameter:

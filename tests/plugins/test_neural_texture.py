@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import texture_scenes
 from arrays import aligned, numpy_of
+from texture_files import make
 from texture_scenes import WRONG, linear
 
 from mi_diffind import scenes
@@ -21,35 +22,13 @@ from mi_diffind.maps.layout import Layout
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.measure.operations import bsdf_operations, count
-from mi_diffind.runtime import array_module
 from mi_diffind.tables import load_table, save_table
-from mi_diffind.tasks.texture import TASK, memory_budget, training
+from mi_diffind.tasks.texture import TASK
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
-from mi_diffind.tasks.texture.presets import PRESETS
 
 SIZE = WIDTH, HEIGHT = 32, 16
 
 FILTERS = ("off", "trilinear", "anisotropic", "stochastic")
-
-
-def make(path, source, preset="ours", border="repeat", **settings):
-    """A file of arrays as a training starts with them, almost without loss; the paper's are random."""
-    recipe, types = PRESETS[preset], array_module("llvm")
-    pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, (border, border))
-    stored = pyramid.layout.stored
-    if preset == "paper":
-        size = memory_budget.PaperBudget(9, 12, 4, 4, stored)
-    else:
-        dims = min(3, stored)
-        size = memory_budget.TextureBudget(
-            source.height, source.width, stored, (memory_budget.FineArray(0, dims, 8),), 1, dims, 12
-        )
-    net, rng = training.problem_of(source, size, recipe, pyramid).net, np.random.default_rng(7)
-    if preset == "paper":
-        for array in net.arrays.values():
-            array.data = types.TensorXf(aligned(rng.random(array.data.shape)))
-    save_table(path, to_table(CompressedTexture(pyramid.layout, training.stored_form(net)), settings))
-    return str(path)
 
 
 def material(seed=2):

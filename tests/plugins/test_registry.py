@@ -143,7 +143,7 @@ def test_plugins_of_this_package_say_what_they_are(mi_rgb):
     declared = plugins.declared()
     assert {name: p.object_type for name, p in declared.items()} == {
         "disney": "bsdf", "mipmap": "texture", "neural_disney": "bsdf", "neural_ggx": "bsdf",
-        "neural_field": "integrator", "neural_image": "texture",
+        "neural_field": "integrator", "neural_image": "texture", "neural_material": "bsdf",
         "neural_sdf": "shape", "neural_texture": "texture", "path_footprint": "integrator",
         "path_sdf": "integrator",
     }  # fmt: skip
@@ -152,11 +152,12 @@ def test_plugins_of_this_package_say_what_they_are(mi_rgb):
         "neural_field",
         "neural_ggx",
         "neural_image",
+        "neural_material",
         "neural_sdf",
         "neural_texture",
     )
-    assert plugins.with_counterpart("mipmap") == ("neural_texture",)
-    assert plugins.with_counterpart("principled") == ("disney", "neural_disney")
+    assert plugins.with_counterpart("mipmap") == ("neural_material", "neural_texture")
+    assert plugins.with_counterpart("principled") == ("disney", "neural_disney", "neural_material")
 
 
 def test_manual_pages_are_complete(mi_rgb):

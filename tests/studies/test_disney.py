@@ -24,6 +24,7 @@ def disney(tmp_path_factory):
     return folder, json.loads(found.read_text(encoding="utf-8"))
 
 
+@pytest.mark.long
 def test_quick_run_writes_what_it_promises(disney):
     folder, found = disney
     assert sorted(os.listdir(folder)) == [f"tradeoff_disney.{kind}" for kind in ("csv", "json", "png")]

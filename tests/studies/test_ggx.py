@@ -92,6 +92,7 @@ def quick(tmp_path_factory):
     return folder, result
 
 
+@pytest.mark.long
 def test_quick_run_writes_what_it_promises(quick):
     folder, report = quick
     pictures = ["tradeoff_ggx.png", "tradeoff_ggx_training.png"]

@@ -64,6 +64,7 @@ def folder(tmp_path_factory, requested_seconds):
     return folder
 
 
+@pytest.mark.long
 def test_what_is_written(folder):
     result = json.loads((folder / "r.json").read_text())
     candidates = {name: c for name, c in result["candidates"].items() if not c["is_reference"]}

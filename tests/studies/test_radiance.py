@@ -273,6 +273,7 @@ def command(folder, *more):
             "--variant", "llvm_ad_rgb", *more]  # fmt: skip
 
 
+@pytest.mark.long
 def test_what_is_written(folder):
     result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
     made = {n: c for n, c in result["candidates"].items() if not c["is_reference"]}

@@ -151,6 +151,7 @@ COMMAND = ["--quick", "--lambda", "1", "--remedies", "on", "--side", "16", "--fr
            "--pretrain-steps", "2"]  # fmt: skip
 
 
+@pytest.mark.long
 def test_what_is_written(tmp_path, monkeypatch, capsys):
     """A whole run, interrupted in the last training and continued: finished trainings are not repeated."""
     out = tmp_path / "out"

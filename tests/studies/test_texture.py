@@ -247,6 +247,7 @@ def small(tmp_path, monkeypatch):
     return tmp_path, requests
 
 
+@pytest.mark.long
 def test_what_is_written(small):
     """One scene and one filter."""
     from mi_diffind.maps.source import load_source

@@ -1,0 +1,339 @@
+"""Material whose maps come from one compressed file: normal map, Disney BRDF and opacity in one BSDF."""
+
+from __future__ import annotations  # Delayed parsing of type annotations
+
+import functools
+
+import drjit as dr
+import mitsuba as mi
+
+from mi_diffind import compat
+from mi_diffind.tasks.disney import TASK as DISNEY
+from mi_diffind.tasks.disney.model import clamp
+from mi_diffind.tasks.shading.material import frame, shadowing
+from mi_diffind.tasks.texture import TASK
+
+from . import Counterpart, Plugin
+from .disney import Disney, Parameters, ShadedPoint, to_principled
+from .material_maps import MaterialMaps, ignored, material_maps
+from .support import properties, textures
+from .support.filtering import PROPERTIES as FILTERING
+from .support.image_files import layout_of, to_bitmap, to_mipmap
+from .support.manual import shared_parts
+from .support.tracked_parameter import FixedParameter
+
+#: Forms of the lobes.
+LOBES = ("exact", "tables")
+
+#: Index of the component that lets light through, where there is an opacity.
+NULL = 3
+
+
+@shared_parts
+class NeuralMaterial(Disney):
+    r"""
+    .. _bsdf-neural_material:
+
+    Material from a compressed file (:monosp:`neural_material`)
+    -----------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - The maps of a material, written by ``mi-diffind fit texture`` or ``mi-diffind fit shading``.
+       - --
+
+     * - ignore
+       - |string|
+       - Names of maps that are not read, separated by commas. (Default: none)
+       - --
+
+     * - lobes
+       - |string|
+       - ``exact``: the formulas of :ref:`disney <bsdf-disney>`; ``tables``: the tables of
+         :ref:`neural_disney <bsdf-neural_disney>`, which ``fit shading`` trains with. (Default: ``exact``)
+       - --
+
+     * - two_sided
+       - |bool|
+       - Reflect on both sides, as a material in :monosp:`twosided` does. (Default: false)
+       - --
+
+     * - base_color, roughness, anisotropic, metallic, specular, eta, spec_tint, sheen, sheen_tint, flatness,
+         clearcoat, clearcoat_gloss
+       - |float|, |spectrum|
+       - Constants of :ref:`disney <bsdf-disney>`, with its defaults, for parameters without a map.
+       - |exposed|, |differentiable|
+
+     * - effects, diffuse_reflectance_sampling_rate, main_specular_sampling_rate, clearcoat_sampling_rate
+       - |string|, |float|
+       - As for :ref:`disney <bsdf-disney>`.
+       - --
+
+     {wrap_mode}
+
+     {to_uv}
+
+     {filtering}
+
+     {compressed}
+
+     * - maps.tables.NAME, maps.to_uv
+       - |tensor|, |transform|
+       - The entries of each array, exposed if ``storage`` is ``float32``; the transformation.
+       - |exposed|, |differentiable|
+
+    A material in one plugin and one file. It renders as a :monosp:`normalmap` around a :ref:`disney <bsdf-disney>` with
+    a :ref:`neural_texture <texture-neural_texture>` for each parameter does, and takes less time: the footprint is
+    computed once, and one chain of lookups reads all maps. Its exact counterpart are these two plugins with bitmaps of
+    the file's source, :monosp:`principled` is another; ``mi-diffind compare`` shows a scene beside them.
+
+    **Maps** are recognised by their names: ``base_color`` (``albedo``, ``diffuse``, ``color``), ``normal``,
+    ``roughness``, ``metallic`` (``metalness``), ``opacity`` (``alpha``), and the constants above. A map that is
+    constant in the file is a constant here, and **lobes that it rules out are not traced**: without clearcoat, without
+    metal, without hue. ``mi-diffind inspect SCENE.xml`` lists them. Any other map is refused unless ``ignore`` names
+    it. Ambient occlusion is not read, as the BRDF has no such parameter.
+
+    **Normals** turn the frame as :monosp:`normalmap` does, with its shadowing function. A direction counts if it is
+    above the surface and above the turned horizon. A normal that faces away from the viewer is mirrored at the
+    surface's normal.
+
+    **Opacity** lets rays pass straight on, as :monosp:`mask` does: component 3. **Emission is left out**: light of a
+    surface comes from an area emitter of its shape. Give the shape one, with a :monosp:`neural_texture` of the same
+    file as its radiance.
+
+    {footprint}
+
+    Without ``two_sided`` the material reflects on the front side only. Components are those of
+    :ref:`disney <bsdf-disney>`. Sampling is detached, as there.
+
+    {executable}
+
+    .. tabs::
+        .. code-tab:: xml
+            :name: neural_material
+
+            <bsdf type="neural_material">
+                <string name="filename" value="wall.npz"/>
+                <float name="clearcoat" value="0.5"/>
+            </bsdf>
+
+        .. code-tab:: python
+
+            'type': 'neural_material',
+            'filename': 'wall.npz',
+            'clearcoat': 0.5
+    """
+
+    def _set_up(self, props):
+        lobes = properties.one_of(props, "lobes", LOBES)
+        if lobes != "exact":
+            self.decoder = DISNEY.open(mi.TensorXf, preset=lobes, storage="uint8").decoder
+        self.lobes = lobes
+        self.two_sided = props.get("two_sided", False)
+        if not isinstance(self.two_sided, bool):
+            raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
+        self.maps = MaterialMaps(props)
+        for name in ("base_color", *self.scalars, "subsurface", "specular", "eta"):
+            if name in props and isinstance(props[name], mi.Texture) and not compat.is_constant_texture(props[name]):
+                raise RuntimeError(f'parameter "{name}": found a texture, allowed are numbers: maps come from the file')
+        for name, m in self.maps.maps.items():
+            others = {"flatness": ("subsurface",), "specular": ("eta",)}.get(name, ())
+            for given in (name, *others):
+                if given in props:
+                    raise RuntimeError(
+                        f'parameter "{given}": given, but the file holds the map "{m.name}"; name the map in the '
+                        f'parameter "ignore" or leave the constant out'
+                    )
+            if name not in self._tracked:
+                continue
+            constant = self.maps.is_constant(name) and not (name == "base_color" and mi.is_spectral)
+            self._tracked[name] = FixedParameter(self.maps.layout_bounds(m), constant)
+            if name == "base_color":
+                self.base_color = None
+            elif name == "specular":
+                self.reflectance = None
+            else:
+                del self.scalars[name]
+        self._upsampled = (
+            mi.is_spectral and "base_color" in self.maps.maps and self.maps.maps["base_color"].channels == 3
+        )
+        self._is_anisotropic |= "anisotropic" in self.maps.maps
+        sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
+        self._set_flags(self.maps.is_spatially_varying(), self._is_anisotropic, sides)
+        if "opacity" in self.maps.maps:
+            self.m_components = [*self.m_components, mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
+            self.m_flags = self.m_flags | self.m_components[NULL]
+
+    def traverse(self, cb: mi.TraversalCallback):
+        super().traverse(cb)
+        cb.put("maps", self.maps, mi.ParamFlags.Differentiable)
+
+    def trained(self) -> tuple:
+        """Return the table of the file, and the arrays that can be optimised, by name."""
+        return self.maps.trained()
+
+    def _point(self, ctx, si, active):
+        parameters, maps = Parameters(self, si, active), self.maps.read(si)
+        normal, opacity = maps.pop("normal", None), maps.pop("opacity", None)
+        for name, values in maps.items():
+            if name == "base_color":
+                parameters.albedo = mi.UnpolarizedSpectrum(
+                    clamp(textures.spectrum(values, si.wavelengths, self._upsampled), 0.0, 1.0)
+                )
+            else:
+                setattr(parameters, name, clamp(values[0], 0.0, 1.0))
+        if normal is not None:
+            normal = mi.Vector3f(*normal)
+            normal = normal if self.maps.maps["normal"].low < 0 else dr.fma(normal, 2, -1)
+        if opacity is not None:
+            opacity = clamp(opacity[0], 0.0, 1.0)
+        return MapPoint(parameters, si.wi, self.two_sided, normal, opacity, ctx.is_enabled(mi.BSDFFlags.Null, NULL))
+
+    def sample(self, ctx, si, sample1, sample2, active=True):
+        point = self._point(ctx, si, active)
+        if point.opacity is None:
+            return self._sample(ctx, point, sample1, sample2, active)
+        passes, opacity = ctx.is_enabled(mi.BSDFFlags.Null, NULL), dr.detach(point.opacity)
+        if not self._rates(ctx, self._effects()):
+            opacity = mi.Float(0)
+        chosen = (sample1 < opacity) if passes else mi.Bool(True)
+        rescaled = sample1 / dr.maximum(opacity, 1e-20) if passes else sample1
+        bs, weight = self._sample(ctx, point, rescaled, sample2, active & chosen)
+        clear = (1 - point.opacity) / dr.select(opacity < 1, 1 - dr.detach(point.opacity), 1)
+        bs.wo = dr.select(chosen, bs.wo, -si.wi)
+        bs.pdf = dr.select(chosen, bs.pdf, 1 - opacity)
+        bs.sampled_component = dr.select(chosen, bs.sampled_component, NULL)
+        bs.sampled_type = dr.select(chosen, bs.sampled_type, mi.UInt32(+mi.BSDFFlags.Null))
+        return bs, dr.select(chosen, weight, mi.depolarizer(mi.Spectrum(clear)))
+
+    def eval_null_transmission(self, si, active=True):
+        if "opacity" not in self.maps.maps:
+            return mi.depolarizer(mi.Spectrum(0))
+        return mi.depolarizer(mi.Spectrum(1 - clamp(self.maps.read(si)["opacity"][0], 0.0, 1.0)))
+
+    def eval_diffuse_reflectance(self, si, active=True):
+        return mi.depolarizer(mi.Spectrum(self._point(mi.BSDFContext(), si, active).parameters.albedo))
+
+    def report(self) -> dict:
+        """Return the description of :meth:`.Disney.report`, with that of the maps (:meth:`.MaterialMaps.report`)."""
+        lobes, maps = super().report(), self.maps.report()
+        given = [name for name in ("normal", "opacity") if name in self.maps.maps]
+        missing = {name: "the file has no such map" for name in ("normal", "opacity") if name not in self.maps.maps}
+        return {
+            **maps,
+            "lobes": self.lobes,
+            "maps": {name: m.name for name, m in self.maps.maps.items()},
+            "effects_in_use": [*lobes["effects_in_use"], *given],
+            "effects_left_out": {**lobes["effects_left_out"], **missing, **maps["effects_left_out"]},
+            "evaluated_once": lobes["evaluated_once"],
+        }
+
+    def to_string(self):
+        lines = str(self.maps).split("[\n  ", 1)[1].rsplit("\n]", 1)[0]
+        return f"NeuralMaterial[\n  {lines},\n  lobes = {self.lobes}\n]"
+
+
+class MapPoint(ShadedPoint):
+    """Point of a material with maps: a side, the frame of a normal (``None``: the surface's), and an opacity."""
+
+    def __init__(self, parameters, wi, two_sided: bool, normal, opacity, passes: bool):
+        self._side = wi.z if two_sided else None
+        self._frame, self.opacity = None, opacity
+        if two_sided:
+            wi = mi.Vector3f(wi.x, wi.y, dr.abs(wi.z))
+        if normal is not None:
+            self._frame = frame(normal, wi)
+        super().__init__(parameters, self._turned(wi))
+        self.above &= wi.z > 0
+        if opacity is not None and passes:
+            self.share = dr.detach(opacity)
+
+    def _turned(self, w):
+        return w if self._frame is None else mi.Vector3f(*(dr.dot(w, axis) for axis in self._frame))
+
+    def _flipped(self, w):
+        return w if self._side is None else mi.Vector3f(w.x, w.y, dr.mulsign(w.z, self._side))
+
+    def enter(self, wo):
+        wo = self._flipped(wo)
+        inside = self._turned(wo)
+        return inside, (wo.z > 0) & (inside.z > 0)
+
+    def leave(self, wo):
+        if self._frame is not None:
+            s, t, n = self._frame
+            wo = s * wo.x + t * wo.y + n * wo.z
+        return self._flipped(wo)
+
+    def factor(self, wo):
+        factor = 1.0
+        if self._frame is not None:
+            factor = shadowing(self._frame[2], self._flipped(wo))
+        return factor if self.opacity is None else factor * self.opacity
+
+
+def _convert(props: mi.Properties, bsdf: str, texture: str) -> str:
+    """Change properties to those of Mitsuba's plugins, nested, and return the name of the outermost one."""
+    maps, _ = material_maps(layout_of(TASK, props), ignored(props))
+    sides = props.get("two_sided", False)
+
+    def shown(name: str) -> mi.Texture:
+        image = mi.Properties(texture)
+        for key in ("filename", "source", "wrap_mode", "to_uv", *(FILTERING if texture == "mipmap" else ())):
+            if key in props:
+                image[key] = props[key]
+        image["channels"] = name
+        (to_mipmap if texture == "mipmap" else to_bitmap)(TASK, image)
+        dropped = ("source", *(() if texture == "mipmap" else ("filename", "channels")))
+        return mi.load_dict({"type": texture, **{key: image[key] for key in image if key not in dropped}})
+
+    inner = mi.Properties(bsdf)
+    for key in props:
+        if key in (*Disney.DEFAULTS, "base_color", "subsurface", "specular", "eta", "effects", *Disney.RATES.values()):
+            inner[key] = props[key]
+    for parameter, m in maps.items():
+        if parameter not in ("normal", "opacity"):
+            inner[parameter] = shown(m.name)
+    if bsdf == "principled":
+        to_principled(inner)
+        if "effects" in inner:
+            del inner["effects"]
+    if "normal" in maps and maps["normal"].low < 0:
+        raise RuntimeError(f'{props["filename"]}: the map "normal" has negative values, which normalmap does not take')
+    outer = [
+        *(["normalmap"] if "normal" in maps else []), *(["twosided"] if sides else []),
+        *(["mask"] if "opacity" in maps else []),
+    ]  # fmt: skip
+    for name in outer:
+        around = mi.Properties(name)
+        around["nested"] = mi.PluginManager.instance().create_object(inner)
+        if name == "normalmap":
+            around["normalmap"] = shown(maps["normal"].name)
+        if name == "mask":
+            around["opacity"] = shown(maps["opacity"].name)
+        inner = around
+    for key in list(props):
+        del props[key]
+    for key in inner:
+        props[key] = inner[key]
+    return inner.plugin_name()
+
+
+def _counterpart(name: str, bsdf: str, texture: str, oversampling: int) -> Counterpart:
+    """Return a counterpart that reads the file's source."""
+    learned_only = ("filename", "storage", "source", "lobes", "ignore")
+    convert = functools.partial(_convert, bsdf=bsdf, texture=texture)
+    return Counterpart(name, learned_only, convert=convert, oversampling=oversampling)
+
+
+PLUGIN = Plugin(
+    "neural_material",
+    "bsdf",
+    NeuralMaterial,
+    task=TASK.name,
+    exact=_counterpart("disney", "disney", "bitmap", 8),
+    others=(_counterpart("mipmap", "disney", "mipmap", 1), _counterpart("principled", "principled", "bitmap", 8)),
+    truths=("mipmap", "exact"),
+)

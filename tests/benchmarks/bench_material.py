@@ -1,0 +1,151 @@
+"""
+What a shaded pixel costs: one ``neural_material`` beside ``normalmap``, ``disney`` and a ``neural_texture`` for each
+map of the same file, and beside bitmaps of its source. Interleaved passes: a frame of one sample a pixel; the same with
+a film of 8 × 8 pixels, which is the time of everything but the kernel; and the operations of one lane of the kernel.
+Ratios are those of passes that follow each other, to the second contender. Times of a processor (``cpu_ms``) depend
+less on what else the machine does than those of a clock (``ms``); those of the small film are of the main thread.
+
+    python tests/benchmarks/bench_material.py [--rounds 21] [--json FILE]
+"""
+
+import argparse
+import json
+import multiprocessing
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import mi_diffind
+from mi_diffind.measure import clock, operations
+
+ASSETS = Path(__file__).resolve().parents[2] / "scenes" / "assets"
+FILE = str(ASSETS / "rust_plain.npz")
+
+#: Parameter of the BSDF → map of the file.
+PARAMETERS = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
+
+#: Contender that ratios are to.
+SEPARATE = "normalmap + disney + 4 neural_texture"
+
+#: Width and height of the film.
+SIZES = {"fixed": (8, 8), "frame": (960, 640)}
+
+#: The contenders (:func:`materials`).
+NAMES = ("neural_material", SEPARATE, "normalmap + disney + 4 bitmap", "normalmap + principled + 4 bitmap")
+
+
+def materials(scale: float) -> dict[str, dict]:
+    """The BSDFs, all maps repeated ``scale`` times."""
+    to_uv = mi.ScalarTransform4f().scale(scale)
+
+    def nested(bsdf, texture):
+        maps = {parameter: texture(name) for parameter, name in PARAMETERS.items()}
+        return {"type": "normalmap", "normalmap": texture("normal"), "nested": {"type": bsdf, **maps}}
+
+    def learned(name):
+        return {"type": "neural_texture", "filename": FILE, "channels": name, "to_uv": to_uv}
+
+    def bitmap(name):
+        raw = name != "albedo"
+        return {"type": "bitmap", "filename": str(ASSETS / f"rust_{name}.png"), "raw": raw, "to_uv": to_uv}
+
+    return {
+        "neural_material": {"type": "neural_material", "filename": FILE, "to_uv": to_uv},
+        SEPARATE: nested("disney", learned),
+        "normalmap + disney + 4 bitmap": nested("disney", bitmap),
+        "normalmap + principled + 4 bitmap": nested("principled", bitmap),
+    }
+
+
+def scene(bsdf: dict, width: int, height: int):
+    """A plate and a ball of one material, a sun and a sky."""
+    at = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    eye = at().look_at([0, 4.2, 7.5], [0, 0.35, 0.2], [0, 1, 0])
+    return mi_diffind.load_dict({
+        "type": "scene", "integrator": {"type": "path", "max_depth": 3},
+        "sensor": {
+            "type": "perspective", "fov": 36, "to_world": eye, "film": film,
+            "sampler": {"type": "independent", "sample_count": 1},
+        },
+        "sun": {"type": "directional", "irradiance": 3.0, "direction": [-0.55, -0.6, 0.35]},
+        "sky": {"type": "constant", "radiance": 0.5},
+        "material": {**bsdf, "id": "material"},
+        "plate": {
+            "type": "rectangle", "to_world": at().rotate([1, 0, 0], -90).scale(5),
+            "bsdf": {"type": "ref", "id": "material"},
+        },
+        "ball": {
+            "type": "sphere", "to_world": at().translate([0, 1, 0]).rotate([1, 0, 0], -90),
+            "bsdf": {"type": "ref", "id": "material"},
+        },
+    })  # fmt: skip
+
+
+def spread(values) -> dict:
+    low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
+    return {"median": float(median), "q1": float(low), "q3": float(high)}
+
+
+def worker(name: str, size: str, pipe) -> None:
+    """Process of one scene: Dr.Jit compiles the materials of all scenes that a process holds into each kernel."""
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    loaded = scene(materials(8)[name], *SIZES[size])
+    seconds = time.thread_time if size == "fixed" else time.process_time
+    pipe.send(operations.count(lambda: mi.render(loaded, spp=1)).asdict())
+    while (i := pipe.recv()) is not None:
+        seed = dr.opaque(mi.UInt32, i)
+        dr.sync_thread()
+        start, start_cpu = time.perf_counter(), seconds()
+        dr.eval(mi.render(loaded, spp=1, seed=seed))
+        dr.sync_thread()
+        pipe.send((1e3 * (time.perf_counter() - start), 1e3 * (seconds() - start_cpu)))
+
+
+def measured(size: str, rounds: int) -> dict[str, dict]:
+    """Operations of the kernels of each scene, milliseconds of a pass, and ratios to separate plugins, by turns."""
+    context, pipes, counted, times = multiprocessing.get_context("spawn"), {}, {}, {}
+    for name in NAMES:
+        pipes[name], other = context.Pipe()
+        context.Process(target=worker, args=(name, size, other), daemon=True).start()
+        counted[name], times[name] = pipes[name].recv(), []
+    for i in range(rounds + 2):
+        for name in NAMES if i % 2 == 0 else reversed(NAMES):
+            pipes[name].send(i)
+            both = pipes[name].recv()
+            if i > 1:  # the first ones compile
+                times[name].append(both)
+    for pipe in pipes.values():
+        pipe.send(None)
+    wall, cpu = ({name: np.array(both)[:, k] for name, both in times.items()} for k in (0, 1))
+    return {
+        name: {
+            "operations": counted[name],
+            "ms": spread(wall[name]), "cpu_ms": spread(cpu[name]),
+            "ratio": spread(wall[name] / wall[SEPARATE]), "cpu_ratio": spread(cpu[name] / cpu[SEPARATE]),
+        }
+        for name in NAMES
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=21)
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    results = {"machine": clock.machine("llvm_ad_rgb"), "spp": 1, "max_depth": 3, "sizes": SIZES}
+    for size in SIZES:
+        results[size] = measured(size, arguments.rounds)
+        for name, figures in results[size].items():
+            shown = {key: round(figures[key]["median"], 3) for key in ("ms", "cpu_ms", "ratio", "cpu_ratio")}
+            print(size, name, shown, figures["operations"]["instructions"], figures["operations"]["flops"], flush=True)
+    if arguments.json:
+        Path(arguments.json).write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

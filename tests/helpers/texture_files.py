@@ -1,0 +1,31 @@
+"""Files of the task ``texture`` without a training."""
+
+import numpy as np
+from arrays import aligned
+
+from mi_diffind.maps.pyramid import Pyramid
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import save_table
+from mi_diffind.tasks.texture import memory_budget, training
+from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
+from mi_diffind.tasks.texture.presets import PRESETS
+
+
+def make(path, source, preset="ours", border="repeat", **settings):
+    """A file of arrays as a training starts with them, almost without loss; the paper's are random."""
+    recipe, types = PRESETS[preset], array_module("llvm")
+    pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, (border, border))
+    stored = pyramid.layout.stored
+    if preset == "paper":
+        size = memory_budget.PaperBudget(9, 12, 4, 4, stored)
+    else:
+        dims = min(3, stored)
+        size = memory_budget.TextureBudget(
+            source.height, source.width, stored, (memory_budget.FineArray(0, dims, 8),), 1, dims, 12
+        )
+    net, rng = training.problem_of(source, size, recipe, pyramid).net, np.random.default_rng(7)
+    if preset == "paper":
+        for array in net.arrays.values():
+            array.data = types.TensorXf(aligned(rng.random(array.data.shape)))
+    save_table(path, to_table(CompressedTexture(pyramid.layout, training.stored_form(net)), settings))
+    return str(path)

@@ -1,0 +1,392 @@
+"""
+The BSDF ``neural_material`` inside Mitsuba: against ``normalmap``, ``disney``, ``mask`` and ``twosided`` with a
+``neural_texture`` for each map of the same file. (The lobes themselves: ``test_disney.py``; the maps:
+``test_neural_texture.py``.)
+"""
+
+import gc
+
+import drjit as dr
+import numpy as np
+import pytest
+import texture_scenes
+from arrays import aligned
+from texture_files import make
+
+import mi_diffind
+from mi_diffind import plugins, scenes
+from mi_diffind.maps.source import from_arrays
+from mi_diffind.measure.operations import bsdf_operations
+from mi_diffind.plugins.support import footprint
+
+WIDTH, HEIGHT = 32, 16
+
+
+def waves(count):
+    """Smooth numbers in [0.15, 0.85], ``(HEIGHT, WIDTH, count)``."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / [[[HEIGHT]], [[WIDTH]]]
+    return 0.5 + 0.35 * np.sin(2 * np.pi * np.stack([x + k * y for k in range(count)], axis=-1) + np.arange(count))
+
+
+def constant(*values):
+    return np.full((HEIGHT, WIDTH, len(values)), values)
+
+
+def bumps(strength):
+    xy = strength * (waves(2) - 0.5)
+    return 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], axis=-1)
+
+
+def stored(path, **maps):
+    return make(path, from_arrays({name: np.rint(255 * v).astype(np.uint8) for name, v in maps.items()}))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder, wave = tmp_path_factory.mktemp("materials"), waves(6)
+    return {
+        "metal": stored(
+            folder / "metal.npz", albedo=wave[..., :3], normal=bumps(1.2), roughness=wave[..., 3:4],
+            metallic=wave[..., 4:5],
+        ),
+        "leaf": stored(
+            folder / "leaf.npz", base_color=wave[..., :3], normal=bumps(0.5), roughness=wave[..., 3:4],
+            opacity=wave[..., 4:5], ao=wave[..., 5:],
+        ),
+        # Nothing but the roughness varies, and no lobe but the specular one and the diffuse one is possible
+        "plain": stored(
+            folder / "plain.npz", albedo=constant(0.2, 0.2, 0.2), roughness=wave[..., 3:4], metallic=constant(0)
+        ),
+        "steep": stored(folder / "steep.npz", normal=bumps(1.9), roughness=constant(0), albedo=constant(0, 0, 0)),
+        "other": stored(folder / "other.npz", albedo=wave[..., :3], height=wave[..., 3:4]),
+    }  # fmt: skip
+
+
+#: Parameter of ``disney`` → map of ``metal``.
+METAL = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
+
+
+def separate(file, maps, constants, **reading):
+    """The same material as several plugins."""
+
+    def texture(name):
+        return {"type": "neural_texture", "filename": file, "channels": name, **reading}
+
+    inner = {"type": "disney", **{parameter: texture(name) for parameter, name in maps.items()}, **constants}
+    return {"type": "normalmap", "normalmap": texture("normal"), "inner": inner}
+
+
+def directions(mi, rng, n, below=False, lowest=0.0):
+    z = 2 * rng.random(n) - 1 if below else lowest + (1 - lowest) * rng.random(n)
+    phi, r = 2 * np.pi * rng.random(n), np.sqrt(1 - z * z)
+    return mi.Vector3f(*(aligned(v) for v in (r * np.cos(phi), r * np.sin(phi), z)))
+
+
+def hits(mi, rng, n, below=False):
+    """Hits with footprints of all sizes, seen from all sides."""
+    ddx, ddy = texture_scenes.footprints(rng, n, (WIDTH, HEIGHT))
+    si = texture_scenes.hits(mi, rng.random((2, n)), ddx, ddy)
+    si.wi, si.sh_frame = directions(mi, rng, n, below), mi.Frame3f(mi.Vector3f(0, 0, 1))
+    si.dp_du, si.dp_dv, si.n = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Normal3f(0, 0, 1)
+    return si
+
+
+def samples(mi, rng, n):
+    u = [mi.Float(aligned(rng.random(n))) for _ in range(3)]
+    return u[0], mi.Point2f(u[1], u[2])
+
+
+# -- values ------------------------------------------------------------------------------------------------------------
+
+
+def assert_equal(mi, rng, ours, theirs, below):
+    """Values, densities and samples of two materials are equal up to rounding."""
+    n, ctx = 4000, mi.BSDFContext()
+    si, wo, u = hits(mi, rng, n, below), directions(mi, rng, n, below), samples(mi, rng, n)
+    results = [(b.eval(ctx, si, wo), b.pdf(ctx, si, wo), b.eval_pdf(ctx, si, wo), *b.sample(ctx, si, *u))
+               for b in (ours, theirs)]  # fmt: skip
+    dr.eval(results)
+    (value, pdf, both, bs, weight), (value_, pdf_, _, bs_, weight_) = results
+    value, pdf, valid = value.numpy(), pdf.numpy(), bs_.pdf.numpy() > 0
+    assert (pdf > 0).mean() > 0.15 and value.max() > 0.5
+    np.testing.assert_allclose(value, value_.numpy(), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(pdf, pdf_.numpy(), rtol=1e-4, atol=1e-6)
+    np.testing.assert_array_equal(both[0].numpy(), value)
+    np.testing.assert_array_equal(both[1].numpy(), pdf)
+    valid &= (
+        weight_.numpy().max(axis=tuple(range(weight_.numpy().ndim - 1))) > 0
+    )  # normalmap leaves the density of a sample below the horizon
+    assert valid.mean() > 0.3
+    np.testing.assert_array_equal(valid, bs.pdf.numpy() > 0)
+    np.testing.assert_allclose(bs.wo.numpy()[:, valid], bs_.wo.numpy()[:, valid], atol=1e-5)
+    np.testing.assert_allclose(bs.pdf.numpy()[valid], bs_.pdf.numpy()[valid], rtol=1e-3)
+    np.testing.assert_allclose(weight.numpy(), np.where(valid, weight_.numpy(), 0), rtol=1e-3, atol=1e-5)
+    np.testing.assert_array_equal(bs.sampled_component.numpy()[valid], bs_.sampled_component.numpy()[valid])
+
+
+@pytest.mark.parametrize(
+    "reading", [{}, {"filter": "anisotropic", "wrap_mode": "mirror"}, {"filter": "off", "storage": "float32"}]
+)
+@pytest.mark.parametrize("two_sided", [False, True])
+def test_equals_separate_plugins(mi_rgb, files, rng, reading, two_sided):
+    mi, constants = mi_rgb, {"clearcoat": 0.6, "anisotropic": 0.4, "specular": 0.7}
+    reading = {**reading, "to_uv": mi.ScalarTransform4f().scale([2, 3, 1]).rotate([0, 0, 1], 30)}
+    theirs = separate(files["metal"], METAL, constants, **reading)
+    ours = {"type": "neural_material", "filename": files["metal"], "two_sided": two_sided, **constants, **reading}
+    theirs = {"type": "twosided", "inner": theirs} if two_sided else theirs
+    assert_equal(mi, rng, mi.load_dict(ours), mi.load_dict(theirs), two_sided)
+
+
+def test_equals_separate_plugins_in_every_variant(mi_any, files, rng):
+    ours = mi_any.load_dict({"type": "neural_material", "filename": files["metal"]})
+    assert_equal(mi_any, rng, ours, mi_any.load_dict(separate(files["metal"], METAL, {})), False)
+    si = hits(mi_any, rng, 100)
+    base_color = mi_any.load_dict({"type": "neural_texture", "filename": files["metal"], "channels": "albedo"})
+    np.testing.assert_allclose(
+        mi_any.unpolarized_spectrum(ours.eval_diffuse_reflectance(si)).numpy(), base_color.eval(si).numpy(), rtol=1e-5
+    )
+
+
+def test_opacity_is_that_of_mask(mi_rgb, files, rng):
+    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 4000
+    maps = {"base_color": "base_color", "roughness": "roughness"}
+    opacity = {"type": "neural_texture", "filename": files["leaf"], "channels": "opacity"}
+    theirs = {"type": "mask", "opacity": opacity, "inner": separate(files["leaf"], maps, {})}
+    theirs = mi.load_dict(theirs)
+    ours = mi.load_dict({"type": "neural_material", "filename": files["leaf"]})
+    si, wo, u = hits(mi, rng, n, True), directions(mi, rng, n), samples(mi, rng, n)
+    results = [(b.eval(ctx, si, wo), b.pdf(ctx, si, wo), b.eval_null_transmission(si), *b.sample(ctx, si, *u))
+               for b in (ours, theirs)]  # fmt: skip
+    dr.eval(results)
+    for a, b in zip(results[0][:3], results[1][:3], strict=True):
+        np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-4, atol=1e-6)
+    (bs, weight), (bs_, weight_) = (r[3:] for r in results)
+    through = bs_.sampled_type.numpy() == int(mi.BSDFFlags.Null)
+    assert 0.3 < through.mean() < 0.7 and (bs.sampled_component.numpy()[through] == 3).all()
+    np.testing.assert_array_equal(bs.sampled_type.numpy() == int(mi.BSDFFlags.Null), through)
+    np.testing.assert_allclose(bs.wo.numpy()[:, through], -si.wi.numpy()[:, through])
+    np.testing.assert_allclose(bs.pdf.numpy()[through], bs_.pdf.numpy()[through], rtol=1e-5)
+    np.testing.assert_allclose(weight.numpy(), weight_.numpy(), rtol=1e-3, atol=1e-5)
+    pdf = ours.pdf(ctx, si, bs.wo)
+    scattered = ~through & (bs.pdf.numpy() > 0)
+    np.testing.assert_allclose(pdf.numpy()[scattered], bs.pdf.numpy()[scattered], rtol=1e-3)
+    assert ours.component_count() == 4 and mi.has_flag(ours.flags(), mi.BSDFFlags.Null)
+    opaque = mi.load_dict({"type": "neural_material", "filename": files["leaf"], "ignore": "opacity, ao"})
+    assert opaque.component_count() == 3 and not mi.has_flag(opaque.flags(), mi.BSDFFlags.Null)
+
+
+@pytest.mark.parametrize("name", ["metal", "leaf"])
+def test_chi2(mi_rgb, files, name, tmp_path, monkeypatch):
+    """Samples follow the density, on both sides and beside the horizon of a turned frame."""
+    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
+
+    monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
+    xml = f'<string name="filename" value="{files[name]}"/><boolean name="two_sided" value="true"/>'
+    xml += '<float name="clearcoat" value="0.8"/>' + (
+        '<string name="ignore" value="opacity"/>' if name == "leaf" else ""
+    )
+    for angle in (20, 100):
+        theta = np.radians(angle)
+        wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])  # one kernel for all
+        sample, pdf = BSDFAdapter("neural_material", xml, wi=wi)
+        test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=61, ires=32)
+        assert test.run(test_count=2, quiet=True), test.messages
+
+
+def test_energy_and_reciprocity(mi_rgb, files, rng):
+    """No weight exceeds the light on average; without a normal map, both directions may be exchanged."""
+    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 2**16
+    for name, more in (("metal", {}), ("steep", {"ignore": "albedo"}), ("leaf", {})):
+        bsdf = mi.load_dict({"type": "neural_material", "filename": files[name], **more})
+        for z in (0.1, 0.6, 1.0):
+            si = hits(mi, rng, n)
+            si.wi = mi.Vector3f((1 - z * z) ** 0.5, 0, z)
+            _, weight = bsdf.sample(ctx, si, *samples(mi, rng, n))
+            assert 0 < weight.numpy().mean(axis=1).max() < 1.01
+    bsdf = mi.load_dict({"type": "neural_material", "filename": files["metal"], "ignore": "normal", "clearcoat": 0.5})
+    si, wo = hits(mi, rng, n), directions(mi, rng, n)
+    forth = bsdf.eval(ctx, si, wo).numpy() * si.wi.z.numpy()
+    wi, si.wi = mi.Vector3f(si.wi), wo
+    np.testing.assert_allclose(bsdf.eval(ctx, si, wi).numpy() * wo.z.numpy(), forth, rtol=1e-3, atol=1e-6)
+
+
+def test_extremes_are_finite(mi_rgb, files, rng):
+    """Roughness 0, black, steep normals, directions at both horizons and none at all: values and derivatives."""
+    mi, n = mi_rgb, 50_000
+    bsdf = mi.load_dict({"type": "neural_material", "filename": files["steep"], "storage": "float32", "clearcoat": 1.0})
+    z = rng.choice([0, 1e-38, 1e-20, 1e-8, 1e-4, 0.5, 1, -0.5, -1e-8], (2, n))
+    phi = rng.choice([0, 1.0, np.pi, 2.0], (2, n))
+    r = np.sqrt(1 - z * z)
+    wi, wo = (mi.Vector3f(aligned([r[i] * np.cos(phi[i]), r[i] * np.sin(phi[i]), z[i]])) for i in (0, 1))
+    si = hits(mi, rng, n)
+    si.wi = dr.select(mi.Bool(rng.random(n) < 0.01), mi.Vector3f(0), wi)
+    params = mi.traverse(bsdf)
+    keys = [key for key in params.keys() if key.startswith("maps.tables.")]
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, *samples(mi, rng, n))
+    dr.backward(dr.sum(value.x + weight.x))
+    gradients = [params[key].grad for key in keys]
+    dr.eval(value, pdf, bs, weight, gradients)
+    for v in (value, pdf, bs.pdf, weight, bs.wo, *gradients):
+        assert np.isfinite(v.numpy()).all()
+    assert min(v.numpy().min() for v in (value, pdf, bs.pdf, weight)) >= 0
+    outside = (wi.z.numpy() <= 0) | (wo.z.numpy() <= 0)
+    assert (value.numpy()[:, outside] == 0).all() and (pdf.numpy()[outside] == 0).all()
+
+
+# -- parameters --------------------------------------------------------------------------------------------------------
+
+
+def test_gradients_are_those_of_differences(mi_rgb, files, rng):
+    """With respect to entries of the arrays, along a random direction, and to a constant."""
+    mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 20_000
+    more = {"storage": "float32", "clearcoat": 0.5}
+    bsdf = mi.load_dict({"type": "neural_material", "filename": files["metal"], **more})
+    params, si, wo = mi.traverse(bsdf), hits(mi, rng, n), directions(mi, rng, n, lowest=0.6)
+    si.wi = directions(mi, rng, n, lowest=0.6)  # off the horizons, across which values jump
+    key = "maps.tables.cascaded"
+    steps = {
+        key: (mi.TensorXf(aligned(rng.random(params[key].shape))), 1e-3),
+        "clearcoat.value": (mi.Float(1), 1e-2),
+    }
+
+    def total():
+        value = bsdf.eval(ctx, si, wo)
+        return dr.mean(dr.minimum(value.x + value.y + value.z, 4.0))
+
+    for name, (direction, step) in steps.items():
+        before = params[name] + 0
+        if name == key:
+            before = 0.1 + 0.8 * before  # away from the ends of [0, 1], where entries are folded
+        params[name] = before
+        dr.enable_grad(params[name])
+        params.update()
+        dr.backward(total())
+        gradient = dr.sum(params[name].grad * direction, axis=None).numpy().item()
+        sums = []
+        for sign in (1, -1):
+            params[name] = dr.detach(before) + sign * step * direction
+            params.update()
+            sums.append(total().numpy().item())
+        assert gradient == pytest.approx((sums[0] - sums[1]) / (2 * step), rel=0.03) and abs(gradient) > 1e-4
+        params[name] = dr.detach(before)
+        params.update()
+
+
+def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
+    """Of a constant map, as of a constant parameter, here and in ``disney`` with textures of the same file."""
+    mi, file = mi_rgb, files["plain"]
+    ours = mi.load_dict({"type": "neural_material", "filename": file, "spec_tint": 0.5, "storage": "float32"})
+    names = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
+    textures = separate(file, names, {"spec_tint": 0.5}, storage="float32")["inner"]
+    theirs = mi.load_dict(textures)
+    constants = {"base_color": {"type": "rgb", "value": 0.2}, "metallic": 0.0}
+    known = mi.load_dict({**textures, **constants})
+    assert not ours._is_anisotropic and ours._effects() == theirs._effects() == known._effects()
+    for bsdf in (ours, theirs):
+        report = bsdf.report()
+        assert report["effects_left_out"]["metal"] == "metallic is 0"
+        assert report["effects_left_out"]["spec_tint"] == "base_color has no hue"
+        assert {"diffuse", "f0", "shares"} <= set(report["evaluated_once"])
+        params = mi.traverse(bsdf)  # derivatives of entries change no constant
+        for key in params.keys():
+            if "tables." in key:
+                dr.enable_grad(params[key])
+        params.update()
+        assert bsdf._effects() == known._effects()
+    counted = [bsdf_operations(b, ("eval",))["eval"].instructions for b in (ours, known)]
+    assert counted[0] <= 1.1 * counted[1]
+
+
+def test_report_and_text(mi_rgb, files):
+    bsdf = mi_rgb.load_dict({"type": "neural_material", "filename": files["leaf"], "lobes": "tables"})
+    (report,) = mi_diffind.inspect(bsdf).figures["reports"]
+    assert report["learned"] and report["lobes"] == "tables" and report["table_bytes"] > 0
+    assert report["maps"] == {name: name for name in ("base_color", "normal", "roughness", "opacity")}
+    assert report["effects_left_out"]["ao"] == "the BRDF has no such parameter"
+    assert {"normal", "opacity", "diffuse"} <= set(report["effects_in_use"]) and 7 in report["channels_left_out"]
+    assert "filter = trilinear" in str(bsdf) and "lobes = tables" in str(bsdf)
+
+
+@pytest.mark.parametrize(
+    "name, parameters, sentence",
+    [
+        ("other", {}, 'the map "height" is no parameter of the material, allowed are base_color, normal, roughness'),
+        ("metal", {"roughness": 0.5}, 'parameter "roughness": given, but the file holds the map "roughness"'),
+        ("metal", {"ignore": "rough"}, 'parameter "ignore": found "rough", the file holds albedo, normal, roughness'),
+        ("metal", {"ignore": "albedo,normal,roughness,metallic"}, "no map is left to read"),
+        ("metal", {"sheen": {"type": "checkerboard"}}, 'parameter "sheen": found a texture, allowed are numbers'),
+        ("metal", {"lobes": "paper"}, 'parameter "lobes": found "paper", allowed are exact, tables'),
+        ("metal", {"two_sided": 1}, 'parameter "two_sided": found 1, allowed are true and false'),
+        ("metal", {"channels": "albedo"}, '"channels"'),
+        ("metal", {"filename": "no.npz"}, "no.npz: no such file"),
+    ],
+)
+def test_refusals(mi_rgb, files, name, parameters, sentence):
+    refusal = texture_scenes.refused(mi_rgb, {"type": "neural_material", "filename": files[name], **parameters})
+    assert sentence in refusal
+
+
+# -- scenes ------------------------------------------------------------------------------------------------------------
+
+
+def wall(mi, bsdf):
+    eye = mi.ScalarTransform4f().look_at([0, -2.5, 1], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
+    return {
+        "type": "scene", "integrator": {"type": "path", "max_depth": 2}, "sky": {"type": "constant"},
+        "sensor": {"type": "perspective", "to_world": eye, "film": film},
+        "wall": {"type": "rectangle", "bsdf": {**bsdf, "id": "paint"}},
+    }  # fmt: skip
+
+
+def test_footprints_reach_it(mi_rgb, files, capsys):
+    """The sensor of a scene is attached, and shows in the picture; plain Mitsuba warns once."""
+    gc.collect()  # what other tests left would be traced, too
+    mi = mi_rgb
+    bsdf = {"type": "neural_material", "filename": files["metal"], "to_uv": mi.ScalarTransform4f().scale(8)}
+    theirs = separate(files["metal"], METAL, {}, to_uv=mi.ScalarTransform4f().scale(8))
+    scene = mi_diffind.load_dict(wall(mi, bsdf))
+    assert len(footprint.textures(scene)) == 1 and footprint.textures(scene)[0].cone is not None
+    assert "sensor" in mi_diffind.inspect(scene).figures["reports"][0]["footprint"]
+    images = [mi.render(s, spp=16).numpy() for s in (scene, mi_diffind.load_dict(wall(mi, theirs)))]
+    assert not capsys.readouterr().err
+    sharp = mi.load_dict(wall(mi, bsdf))
+    image = mi.render(sharp, spp=16).numpy()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'the material "paint" (neural_material, ' in line and "is not filtered" in line
+    error, unfiltered = (np.abs(images[0] - other).mean() for other in (images[1], image))
+    assert error < 0.1 * unfiltered and unfiltered > 0.005
+
+
+def test_counterparts(mi_rgb, rng, tmp_path):
+    """Constants are exact in the file: pictures equal those of Mitsuba's plugins with the source."""
+    mi = mi_rgb
+    normal = np.array([0.25, -0.15, 1]) / np.linalg.norm([0.25, -0.15, 1])
+    maps = {
+        "albedo": constant(0.8, 0.4, 0.2), "normal": constant(*(0.5 + 0.5 * normal)), "roughness": constant(0.6),
+        "metallic": constant(1), "opacity": constant(0.8),
+    }  # fmt: skip
+    maps = {name: np.rint(255 * values).astype(np.uint8) for name, values in maps.items()}
+    for name, values in maps.items():
+        mi.Bitmap(values).write(str(tmp_path / f"{name}.png"))
+    names = ", ".join(f'"{name}": "{name}.png"' for name in maps)
+    (tmp_path / "paint.json").write_text(f'{{"maps": {{{names}}}}}')
+    mi_diffind.fit("texture", tmp_path / "paint.json", steps=1, progress=False).save(tmp_path / "paint.npz")
+    (tmp_path / "scene.xml").write_text("""<scene version="3.0.0"><integrator type="path"><integer name="max_depth"
+        value="4"/></integrator><emitter type="constant"/><emitter type="point"><point name="position" x="1" y="-1"
+        z="2"/></emitter><sensor type="perspective"><transform name="to_world"><lookat origin="0,-1.5,3"
+        target="0,0,0" up="0,1,0"/></transform><film type="hdrfilm"><integer name="width" value="4"/><integer
+        name="height" value="4"/></film></sensor><shape type="rectangle"><bsdf type="neural_material"><string
+        name="filename" value="paint.npz"/><boolean name="two_sided" value="true"/><float name="clearcoat"
+        value="0.5"/><float name="clearcoat_sampling_rate" value="2"/></bsdf></shape></scene>""")
+    written = mi.render(scenes.load(tmp_path / "scene.xml"), spp=64).numpy()
+    for against in ("exact", "mipmap", "principled"):
+        scene = scenes.load(tmp_path / "scene.xml", exact=True, against=against)
+        assert not [r for r in scenes.reports(scene) if r["plugin"].startswith("neural")]
+        image = mi.render(scene, spp=64).numpy()
+        np.testing.assert_allclose(image, written, rtol=0.05 if against == "principled" else 2e-3)
+    assert plugins.declared()["neural_material"].counterpart().oversampling == 8
