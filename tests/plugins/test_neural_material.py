@@ -55,7 +55,8 @@ def files(tmp_path_factory):
         ),
         # Nothing but the roughness varies, and no lobe but the specular one and the diffuse one is possible
         "plain": stored(
-            folder / "plain.npz", albedo=constant(0.2, 0.2, 0.2), roughness=wave[..., 3:4], metallic=constant(0)
+            folder / "plain.npz", albedo=constant(0.2, 0.2, 0.2), roughness=wave[..., 3:4], metallic=constant(0),
+            emission=constant(0.5, 0.2, 0.1),
         ),
         "steep": stored(folder / "steep.npz", normal=bumps(1.9), roughness=constant(0), albedo=constant(0, 0, 0)),
         "other": stored(folder / "other.npz", albedo=wave[..., :3], height=wave[..., 3:4]),
@@ -297,6 +298,7 @@ def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
                 dr.enable_grad(params[key])
         params.update()
         assert bsdf._effects() == known._effects()
+    assert ours.report()["effects_left_out"]["emission"].startswith("a BSDF emits no light")
     counted = [bsdf_operations(b, ("eval",))["eval"].instructions for b in (ours, known)]
     assert counted[0] <= 1.1 * counted[1]
 
@@ -309,6 +311,7 @@ def test_report_and_text(mi_rgb, files):
     assert report["effects_left_out"]["ao"] == "the BRDF has no such parameter"
     assert {"normal", "opacity", "diffuse"} <= set(report["effects_in_use"]) and 7 in report["channels_left_out"]
     assert "filter = trilinear" in str(bsdf) and "lobes = tables" in str(bsdf)
+    assert mi_diffind.inspect(files["leaf"]).usage[-1].startswith('<bsdf type="neural_material">')
 
 
 @pytest.mark.parametrize(

@@ -65,5 +65,14 @@ class Texture(Task):
         Argument("--level", type=natural, metavar="N", help="level of detail (default: 0, the source's)"),
     )
 
+    def usage(self, table, file):
+        lines = super().usage(table, file)
+        if len(table.settings["layout"]["maps"]) > 1:
+            lines += [
+                "<!-- or all maps -->",
+                f'<bsdf type="neural_material"><string name="filename" value="{file}"/></bsdf>',
+            ]
+        return lines
+
 
 TASK = Texture()
