@@ -59,7 +59,7 @@ def fit(request: FitRequest) -> Fitted:
         size = size_of(source, pyramid, requested, recipe, options)
     if request.deadline is not None and as_seen.shows(source):
         request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
-    table, result = training.fit_texture(source, size, recipe, request, pyramid)
+    table, result = training.fit_texture(source, size, recipe, request, pyramid, options["level_bias"])
     seen = as_seen.measure(source, CompressedTexture.of(table, request.types.TensorXf))
     table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
     table.settings |= request.paths(source_path=options["source"])
