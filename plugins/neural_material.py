@@ -97,7 +97,7 @@ class NeuralMaterial(Disney):
 
     **Normals** turn the frame as :monosp:`normalmap` does, with its shadowing function. A direction counts if it is
     above the surface and above the turned horizon. A normal that faces away from the viewer is mirrored at the
-    surface's normal.
+    surface's normal. The AOV ``sh_normal`` is the surface's normal: Mitsuba 3.9 asks its own plugins alone for another.
 
     **Opacity** lets rays pass straight on, as :monosp:`mask` does: component 3. **Emission is left out**: light of a
     surface comes from an area emitter of its shape. Give the shape one, with a :monosp:`neural_texture` of the same
