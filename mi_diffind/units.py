@@ -15,7 +15,7 @@ _FIGURE_UNITS = {"_db": (" dB", 2), "_deg": ("°", 2)}
 #: Word in the name of a figure → text.
 _WORDS = {
     "psnr": "PSNR", "mae": "MAE", "brdf": "BRDF", "iou": "IoU", "flip": "FLIP", "between": "between texels",
-    "worst": "worst level", "shaded": "PSNR shaded,", "converged": "converged truth",
+    "worst": "worst level", "seen": "as seen,", "shaded": "PSNR shaded,", "converged": "converged truth",
     "prefiltered": "prefiltered truth",
 }  # fmt: skip
 _UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}

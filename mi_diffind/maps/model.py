@@ -15,6 +15,7 @@ from ..indirection import DifferentiableArray
 from ..pages import SIDE_BITS, page_counts, page_shift
 from ..tables import PAGES, Table, TableError, allocate_pages, page_sides
 from ..task import Model
+from . import as_seen
 from .compressed import CompressedMaps
 from .source import load_source
 
@@ -85,7 +86,9 @@ class MapsModel(Model):
         return {**figures, "memory_bytes": self.memory_nbytes, "compression": ratio, "maps": maps}, lines
 
     def measure(self, source=None) -> dict[str, float]:
-        """Return the errors of :meth:`.CompressedMaps.measure` against ``source`` (default: the recorded file).
+        """Return the errors against ``source`` (default: the recorded file).
+
+        They are those of :meth:`.CompressedMaps.measure` and of :func:`.as_seen.measure`.
 
         ``source`` is a file or maps in memory, as :func:`.source.load_source` takes them.
         """
@@ -96,7 +99,7 @@ class MapsModel(Model):
             source = load_source(path, nonfinite="clean")  # cleaned values change the digest
             if source.digest != self.table.settings.get("source", source.digest):
                 raise TableError(f"{self.table.path}: its source {path} has changed since it was compressed")
-        return self.image.measure(source)
+        return {**self.image.measure(source), **as_seen.measure(source, self.image)}
 
     def decode(
         self,

@@ -119,16 +119,6 @@ def materials_of(names: Sequence[str], side: int, quick: bool = False) -> dict[s
     return sources
 
 
-class CachedEvaluation(ShadedEvaluation):
-    """Evaluation whose images for the choice among states of a training are rendered once for all trainings."""
-
-    _another: ShadedEvaluation | None = None
-
-    def another(self) -> ShadedEvaluation:
-        self._another = self._another or super().another()
-        return self._another
-
-
 @dataclass
 class ShadingStudyContext(StudyContext):
     """A material, the data that its contenders share, and their jobs by name."""
@@ -157,7 +147,7 @@ class ShadingStudyContext(StudyContext):
     @cached_property
     def evaluation(self) -> ShadedEvaluation:
         levels, pairs, side = (3, 2, 16) if self.settings.quick else (6, 16, 64)
-        return CachedEvaluation(self.pyramid, self.effects, levels, pairs, side)
+        return ShadedEvaluation(self.pyramid, self.effects, levels, pairs, side)
 
     @cached_property
     def zoom(self) -> ShadedZoom:

@@ -3,6 +3,7 @@
 Sources and stored channels are in :mod:`mi_diffind.maps`.
 
 - :mod:`.arrays`: initial arrays; :mod:`.memory_budget`, :mod:`.search`: resolutions.
+- :mod:`.weights`: weights of maps in the training.
 - :mod:`.presets`, :mod:`.training`, :mod:`.fit`: recipes, the training problem, the command ``fit image``.
 - :mod:`.compressed`: the result as an image, as a table file and as a model.
 """
@@ -11,10 +12,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from ...arguments import Argument, positive
+from ...arguments import Argument, checked, positive
 from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
 from ...task import Task
-from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, without
+from .presets import IMPROVEMENTS, PRESETS, STRUCTURES, parse_weights, without
 
 
 class Image(Task):
@@ -46,6 +47,11 @@ class Image(Task):
         Argument("--dims", type=positive, choices=range(1, 5), help="dimensions of the cascaded array"),
         Argument(
             "--cascaded", type=positive, metavar="N", help="entries along each side of the cascaded array"
+        ),
+        Argument(
+            "--weights", type=checked(parse_weights), metavar="auto|equal|MAP=W,…",
+            help="weight of each map's errors: by what they do to a shaded picture (auto), equal, or numbers "
+            "(default: equal)",
         ),
         *SOURCES,
     )  # fmt: skip

@@ -38,13 +38,15 @@ def joined(primaries: Sequence[DifferentiableArray], cascaded: DifferentiableArr
     return Indirection(primaries, cascaded, [(0, 1)] * len(primaries))
 
 
-def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, str]) -> Indirection:
+def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, str], weights=1.0) -> Indirection:
     """Return initial arrays from the principal components of ``values``, ``(height, width, k)`` in [0, 1]; unallocated.
+
+    ``weights``, a number for each channel, multiply differences: components and pages follow the heavier channels.
 
     Of two primaries, the first takes the components of the differences of neighbours, which need its resolution most;
     the second takes components of the rest. Channels beyond the image's ``k`` start as ramps along u or v.
     """
-    k = values.shape[-1]
+    k, values = values.shape[-1], values * np.asarray(weights, np.float32)
     mean = values.reshape(-1, k).mean(axis=0, dtype=np.float64)
     left, back = np.eye(k), mean  # projection onto remaining components; channels of the cascaded entries
     primaries, axis = [], 0
@@ -87,7 +89,7 @@ def from_components(values: np.ndarray, size: ImageBudget, border: tuple[str, st
             primaries.append(DifferentiableArray((rows, columns), dims, unit, fold=True, border=border))
         axis += dims
     shape = (size.cascaded,) * size.dims
-    back = np.clip(np.broadcast_to(back, (*shape, k)), 1e-3, 1 - 1e-3)
+    back = np.clip(np.broadcast_to(back / weights, (*shape, k)), 1e-3, 1 - 1e-3)
     return joined(primaries, DifferentiableArray(shape, k, back.astype(np.float32), fold=True))
 
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import dataclasses
 
 from ...errors import UsageError
+from ...maps import as_seen
 from ...maps.arguments import requested_border, requested_bytes, size_figures
 from ...maps.source import Source, load_source
 from ...pages import most_entries
 from ...settings import FittingError
 from ...tables import MAX_BYTES
 from ...task import FitRequest, Fitted
-from . import memory_budget, search, training
-from .presets import PAGED, PRESETS, STRUCTURES, ImageRecipe, without
+from . import memory_budget, search, training, weights
+from .compressed import CompressedImage
+from .presets import PAGED, PRESETS, STRUCTURES, ImageRecipe, parse_weights, without
 
 
 def recipe_of(preset: str, settings, options) -> ImageRecipe:
@@ -55,12 +57,31 @@ def fit(request: FitRequest) -> Fitted:
     options = request.options
     source = load_source(options["source"], nonfinite=options["nonfinite"])
     recipe = recipe_of(request.preset, request.settings, options)
+    recipe = dataclasses.replace(recipe, weights=_weights(request, source, recipe))
+    if request.deadline is not None and as_seen.shows(source):
+        request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
     fitted, requested = _train(request, source, recipe)
+    seen = as_seen.measure(source, CompressedImage.of(fitted.table, request.types.TensorXf))
+    fitted.table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
     fitted.table.settings |= request.paths(source_path=options["source"])
     figures, line = size_figures(source, fitted.table, requested)
     fitted.lines.append(line)
     fitted.figures = {**figures, **fitted.figures}
     return fitted
+
+
+def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[str, float]:
+    """Return the weights of maps that differ from 1. Raises :class:`UsageError` for a map that the source lacks."""
+    given = request.options["weights"] or "equal"
+    given = parse_weights(given) if isinstance(given, str) else dict(given)
+    if given == "equal":
+        return {}
+    if given == "auto":
+        return weights.measured(source, training.layout_of(source, recipe), request.types)
+    for name in given:
+        if name not in (names := [m.name for m in source.maps]):
+            raise UsageError(f'--weights: found the map "{name}", allowed are {", ".join(names)}')
+    return given
 
 
 def _train(request: FitRequest, source: Source, recipe: ImageRecipe) -> tuple[Fitted, float | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ...settings import FitSettings
@@ -34,6 +35,7 @@ class ImageRecipe:
     - ``rounded``: share of the steps, the last ones, that read entries rounded to their stored values.
     - ``structure``: one of :data:`STRUCTURES`, or ``"auto"``; ``dims``: coordinates of a pointer.
     - ``settings``: steps, batch, rate and loss.
+    - ``weights``: factor of the differences of a map, by its name, wherever errors are compared; 1 if it is missing.
     """
 
     once: bool = True
@@ -44,6 +46,7 @@ class ImageRecipe:
     structure: str = "auto"
     dims: int = 4
     settings: FitSettings = dataclasses.field(default_factory=FitSettings)
+    weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 #: Steps of 262,144 samples of a training without a time limit.
@@ -58,6 +61,9 @@ PRESETS = {
     "paper": ImageRecipe(False, False, False, 1.0, 0.0, "8 bits", 4, _PAPER),
 }
 
+#: Largest weight of a map.
+MOST_WEIGHT = 100
+
 #: Improvements over the supplement's recipe that can be switched off.
 IMPROVEMENTS = {
     "once": "equal and constant channels are stored once",
@@ -70,6 +76,22 @@ IMPROVEMENTS = {
     "rate": "a higher rate that falls to zero",
     "batch": "steps of 262,144 samples",
 }
+
+
+def parse_weights(text: str) -> str | dict[str, float]:
+    """Return ``"auto"``, ``"equal"``, or the numbers of ``MAP=W,…`` by the name of the map. Raises ``ValueError``."""
+    if text in ("auto", "equal"):
+        return text
+    weights, allowed = {}, f"auto, equal, or maps with numbers from 0 to {MOST_WEIGHT} such as normal=2"
+    for part in text.split(","):
+        name, _, number = part.partition("=")
+        try:
+            weights[name.strip()] = float(number)
+        except ValueError:
+            weights[name.strip()] = 0.0
+        if not 0 < weights[name.strip()] <= MOST_WEIGHT:
+            raise ValueError(f'found "{part}", allowed are {allowed}')
+    return weights
 
 
 def without(recipe: ImageRecipe, names) -> ImageRecipe:

@@ -104,8 +104,12 @@ class ImageProblem(Problem):
         padded[..., self.channels :] = 0
         self.values = types.TensorXf(padded)
         self.groups = layout.channels_by_map()
-        self.weights = {name: len(channels) / self.channels for name, channels in self.groups.items()}
-        self.identity = {"source": digest, **{k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}}
+        self.weights = {
+            name: recipe.weights.get(name, 1.0) ** 2 * len(channels) / self.channels
+            for name, channels in self.groups.items()
+        }
+        recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k not in ("settings", "weights")}
+        self.identity = {"source": digest, **recorded, **({"weights": recipe.weights} if recipe.weights else {})}
         self.rounded = self.jittered = False
         self._stretches = {}  # size of a batch → first texel and number of texels of each stretch
 
@@ -194,7 +198,11 @@ def problem_of(
     layout = layout or layout_of(source, recipe)
     values = layout.encode(source)
     border = border or components.borders(values)
-    net = arrays.from_components(values, size, border) if recipe.components else arrays.from_ramp(layout, size, border)
+    if recipe.components:
+        weights = [recipe.weights.get(name, 1.0) for name in layout.groups]
+        net = arrays.from_components(values, size, border, weights)
+    else:
+        net = arrays.from_ramp(layout, size, border)
     bits = [bits for *_, bits in size.primaries]
     return ImageProblem(net.alloc(types.TensorXf), bits, layout, values, border, recipe, types, source.digest)
 

@@ -60,6 +60,7 @@ class ShadedEvaluation:
         stream: int = 0,
     ):  # fmt: skip
         self.pyramid, self.effects, self.types = pyramid, effects, pyramid.types
+        self._another: ShadedEvaluation | None = None
         self.levels, self.form = min(levels, pyramid.levels), (levels, pairs, side)
         rng = np.random.default_rng((SEED, stream))
         numbers = rng.random((4, pairs))
@@ -78,11 +79,14 @@ class ShadedEvaluation:
     def another(self) -> ShadedEvaluation:
         """Return small images under many other views and lights, with the converged truth alone.
 
-        Their errors choose bias and state of a training. With few pairs, a single highlight would decide.
+        Their errors choose bias and state of a training. With few pairs, a single highlight would decide. They are
+        rendered once.
         """
-        levels, pairs, side = self.form
-        pairs = max(1, min(CHOOSING, pairs * side * side) // PART**2)
-        return ShadedEvaluation(self.pyramid, self.effects, levels, pairs, PART, "C", stream=1)
+        if self._another is None:
+            levels, pairs, side = self.form
+            pairs = max(1, min(CHOOSING, pairs * side * side) // PART**2)
+            self._another = ShadedEvaluation(self.pyramid, self.effects, levels, pairs, PART, "C", stream=1)
+        return self._another
 
     def _lanes(self, level: int, pairs=None) -> tuple:
         """Return ``(u, v, level, wi, wo)`` of all pixels of the images of a level, and their shape."""

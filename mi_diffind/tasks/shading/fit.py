@@ -37,7 +37,7 @@ def recipe_of(preset: str, settings, options) -> ShadingRecipe:
 
 #: Number of pairs of view and light, and size, of the images that measure. Many, since a few pairs near the mirror
 #: direction dominate the PSNR.
-PAIRS, SIDE = 32, 48
+PAIRS, SIDE = 32, 32
 
 #: Share of the time in which the arrays are trained as a texture, if time is limited.
 PRETRAINING = 0.4
@@ -69,16 +69,21 @@ def fit(request: FitRequest) -> Fitted:
     effects, reasons = material.effects_of(pyramid.layout)
     if not pyramid.layout.stored:
         raise UsageError(f"{options['source']}: all of its maps are constant, there is nothing to learn")
+    start, result, size = None, None, None
     if options["start"] is not None:
-        start, result = started(options["start"], source, request), None
+        start = started(options["start"], source, request)
     else:
-        start, result = pretrained(source, pyramid, recipe, request)
+        size = size_of(source, pyramid, recipe, options)
+    # Before any training, which gets a share of the time that is left
+    evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
+    evaluation.another()
+    if start is None:
+        start, result = pretrained(source, pyramid, size, recipe, request)
     first = result
     if result is None or not result.interrupted:
         shading_request = dataclasses.replace(request)
         if shading_request.resume and not os.path.exists(shading_request.checkpoint or ""):
             shading_request.resume = False  # the training as a texture was interrupted
-        evaluation = ShadedEvaluation(pyramid, effects, pairs=PAIRS, side=SIDE)
         preview = preview_path(request)
         try:
             net = training.start_of(start, pyramid)
@@ -126,18 +131,22 @@ def started(path, source, request: FitRequest) -> Table:
     return table
 
 
-def pretrained(source, pyramid: Pyramid, recipe: ShadingRecipe, request: FitRequest) -> tuple:
+def size_of(source, pyramid: Pyramid, recipe: ShadingRecipe, options):
+    """Return the memory budget of the arrays. Raises :class:`UsageError`."""
+    options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(options)
+    return texture_fit.size_of(source, pyramid, requested_bytes(options, source), TEXTURES[recipe.texture], options)
+
+
+def pretrained(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:
     """Train as a texture alone, with a separate checkpoint; return the table and the run's record."""
     texture = TEXTURES[recipe.texture]
     settings = dataclasses.replace(
         texture.settings, seed=recipe.settings.seed, deterministic=recipe.settings.deterministic
     )
     texture = dataclasses.replace(texture, settings=settings)
-    options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(request.options)
-    size = texture_fit.size_of(source, pyramid, requested_bytes(options, source), texture, options)
     checkpoint = None if request.checkpoint is None else f"{request.checkpoint}.texture"
     first = dataclasses.replace(
-        request.part(PRETRAINING), preset=recipe.texture, checkpoint=checkpoint, options=options,
+        request.part(PRETRAINING), preset=recipe.texture, checkpoint=checkpoint,
         resume=request.resume and os.path.exists(checkpoint or ""),
     )  # fmt: skip
     return textures.fit_texture(source, size, texture, first, pyramid)

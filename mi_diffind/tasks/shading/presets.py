@@ -33,7 +33,7 @@ class ShadingRecipe:
 
 
 #: Steps of a training without a time limit.
-STEPS = 600
+STEPS = 1500
 
 _OURS = FitSettings(steps=STEPS, batch=2**16, lr=5e-3, schedule="cosine", loss="mse", measure_every=STEPS // 10)
 

@@ -39,6 +39,9 @@ FALL, TOP = 0.7, 9
 #: Level biases that are tried, and the share of the steps, or of the time that is left, that each of them is trained.
 BIASES, TRIAL = (0.0, -0.5, -1.0), 0.08
 
+#: Loss of a level that is none, dB.
+ROUNDING = 1e-4
+
 #: Least time of such a trial, in measurements; in less time, the biases of the start itself are compared.
 SHORTEST = 4
 
@@ -124,9 +127,12 @@ class ShadingProblem(textures.TextureProblem):
 
 
 def gain_of(levels: Sequence[float], base: Sequence[float]) -> float:
-    """Return the mean gain of ``levels`` over ``base``, in dB, if no level loses, else the largest loss, negative."""
+    """Return the mean gain of ``levels`` over ``base``, in dB, if no level loses, else the largest loss, negative.
+
+    Losses up to :data:`ROUNDING` are those of sums in another order.
+    """
     gains = np.subtract(levels, base)
-    return float(gains.mean() if gains.min() >= 0 else gains.min())
+    return float(gains.mean() if gains.min() >= -ROUNDING else gains.min())
 
 
 def _bounded(x):

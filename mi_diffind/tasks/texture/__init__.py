@@ -10,8 +10,8 @@ Sources, stored channels and the reference, a mip pyramid, are in :mod:`mi_diffi
 
 from __future__ import annotations
 
-from ...arguments import Argument, checked, natural, positive
-from ...maps.arguments import DECODED, SIZES, SOURCE, SOURCES
+from ...arguments import Argument, between, checked, natural, positive
+from ...maps.arguments import BIAS_RANGE, DECODED, SIZES, SOURCE, SOURCES
 from ...task import Task
 from .presets import PRESETS
 
@@ -53,6 +53,10 @@ class Texture(Task):
         Argument(
             "--footprint-samples", choices=["levels", "power", "exponential"],
             help="distribution of levels of detail in training (default: levels for ours, power for paper)",
+        ),
+        Argument(
+            "--level-bias", type=between(*BIAS_RANGE), default=0.0, metavar="N",
+            help="levels by which the texture is read finer than the footprint, as in -0.5 (default: 0)",
         ),
         *SOURCES,
     )  # fmt: skip

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 
 from ...errors import UsageError
-from ...maps import components
+from ...maps import as_seen, components
 from ...maps.arguments import requested_border, requested_bytes, size_figures
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source, load_source
 from ...tables import MAX_BYTES
 from ...task import FitRequest, Fitted
 from . import arrays, memory_budget, training
+from .compressed import CompressedTexture
 from .presets import PRESETS, TextureRecipe
 
 #: Least smoothness of a smooth texture, in dB (:func:`~mi_diffind.maps.components.smoothness`).
@@ -56,7 +57,11 @@ def fit(request: FitRequest) -> Fitted:
     requested, size = requested_bytes(options, source), None
     if pyramid.layout.stored:
         size = size_of(source, pyramid, requested, recipe, options)
-    table, result = training.fit_texture(source, size, recipe, request, pyramid)
+    if request.deadline is not None and as_seen.shows(source):
+        request.deadline.rehearse(lambda: as_seen.reference(source, request.types))
+    table, result = training.fit_texture(source, size, recipe, request, pyramid, options["level_bias"])
+    seen = as_seen.measure(source, CompressedTexture.of(table, request.types.TensorXf))
+    table.measured |= {name: float(f"{value:.5g}") for name, value in seen.items()}
     table.settings |= request.paths(source_path=options["source"])
     figures, line = size_figures(source, table, requested)
     lines = [line]

@@ -174,12 +174,13 @@ def fit_texture(
     recipe: TextureRecipe,
     request: FitRequest,
     pyramid: Pyramid,
+    level_bias: float = 0.0,
 ) -> tuple[Table, FitResult]:
     """Train the arrays of ``source`` and return the table, with its errors, and the record of the training.
 
     ``size`` is ``None`` for a texture of one colour, which needs no arrays. ``request`` holds the Dr.Jit types, the
-    time and the checkpoint; its settings are replaced by those of the ``recipe``. Errors are those of
-    :meth:`.CompressedTexture.measure`.
+    time and the checkpoint; its settings are replaced by those of the ``recipe``. ``level_bias`` is stored in the file;
+    levels are trained as they are stored. Errors are those of :meth:`.CompressedTexture.measure`.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
     if size is None:
@@ -190,12 +191,12 @@ def fit_texture(
         identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
 
         def finish() -> None:
-            stored = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net)), identity)
+            stored = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net), level_bias), identity)
             CompressedTexture.of(stored, request.types.TensorXf).measure(source)
 
         result = request.train(problem, finish=finish)
         settings = {**request.recorded(result), **identity}
-        table = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net)), settings)
+        table = to_table(CompressedTexture(pyramid.layout, stored_form(problem.net), level_bias), settings)
     table.preset, table.seed = request.preset, recipe.settings.seed
     errors = CompressedTexture.of(table, request.types.TensorXf).measure(source)
     table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}

@@ -584,14 +584,14 @@ def test_fit_inspect_decode(tmp_path, monkeypatch, capsys):
         write(f"{name}.png", values if values.shape[2] > 1 else values[..., 0])
     (tmp_path / "m.json").write_text(json.dumps({name: f"{name}.png" for name in ("albedo", "normal", "roughness")}))
     short = ["--steps", "3", "--batch", "2048", "--border", "clamp", "--variant", "llvm_ad_rgb"]
-    assert main(["fit", "texture", "m.json", "-o", "m.npz", "--compression", "4x", *short]) == 0
+    assert main(["fit", "texture", "m.json", "-o", "m.npz", "--compression", "4x", "--level-bias", "-0.5", *short]) == 0
     table = load_table("m.npz")
     assert table.task == "texture" and table.preset == "ours" and table.settings["source_path"] == "m.json"
-    assert table.nbytes <= 32 * 24 * 5 / 4
+    assert table.nbytes <= 32 * 24 * 5 / 4 and table.settings["level_bias"] == -0.5
     capsys.readouterr()
     assert main(["inspect", "m.npz", "--measure", "--variant", "llvm_ad_rgb"]) == 0
     shown = capsys.readouterr().out
-    assert "6 levels of detail" in shown and "PSNR worst level" in shown
+    assert "6 levels of detail" in shown and "PSNR worst level" in shown and "read 0.5 levels finer" in shown
     assert main(["decode", "m.npz", "-o", "d.png", "--map", "albedo", "--level", "2", "--variant", "llvm_ad_rgb"]) == 0
     assert np.array(mi.Bitmap("d.png")).shape == (8, 6)
     capsys.readouterr()
