@@ -167,6 +167,11 @@ class NeuralMaterial(Disney):
             self.m_components = [*self.m_components, mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
             self.m_flags = self.m_flags | self.m_components[NULL]
 
+    @property
+    def net(self):
+        """The arrays of the maps, ``None`` if all are constant."""
+        return self.maps.net
+
     def traverse(self, cb: mi.TraversalCallback):
         super().traverse(cb)
         cb.put("maps", self.maps, mi.ParamFlags.Differentiable)
