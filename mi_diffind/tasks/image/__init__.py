@@ -51,7 +51,7 @@ class Image(Task):
         Argument(
             "--weights", type=checked(parse_weights), metavar="auto|equal|MAP=W,…",
             help="weight of each map's errors: by what they do to a shaded picture (auto), equal, or numbers "
-            "(default: equal)",
+            "(default: auto for ours, equal for paper)",
         ),
         *SOURCES,
     )  # fmt: skip
