@@ -16,7 +16,7 @@ import numpy as np
 
 from .. import metrics, srgb
 from .compressed import CompressedMaps, decibel
-from .source import Source
+from .source import Map, Source
 
 #: Share of the way from the roughness of the map to 1, by the name of a surface.
 SURFACES = {"glossy": 0.0, "rough": 0.5}
@@ -51,24 +51,29 @@ def shows(source: Source) -> bool:
 
 
 def measure(source: Source, image: CompressedMaps, ways: Sequence[str] = WAYS) -> dict[str, float]:
-    """Return errors of the decoded maps of ``image`` against those of the ``source``, in degrees and in pictures.
+    """Return errors of the decoded maps of ``image`` against those of the ``source``, as :func:`compare` does."""
+    names = [m.name for m in (*_normals(source), *(_roles(source).values() if shows(source) else ()))]
+    decoded = image.decode(tuple(dict.fromkeys(names))) if names else {}
+    return compare(source, decoded, image.types, ways)
+
+
+def compare(
+    source: Source, decoded: Mapping[str, np.ndarray], types: ModuleType | None, ways: Sequence[str] = WAYS
+) -> dict[str, float]:
+    """Return errors of ``decoded`` maps, by name, against those of the ``source``, in degrees and in pictures.
 
     - ``angle_MAP_deg``: the mean angle between normals, in degrees.
     - ``seen_WAY_db``: the PSNR of each of ``ways``, of linear values clipped to [0, 1]; ``seen_db``: that of all.
     - ``seen_brightness``: the mean of a picture relative to the source's, where it differs most.
 
-    There are no pictures unless :func:`shows`, nor of maps of one colour each.
+    There are no pictures unless :func:`shows`, nor if ``types``, the module of Dr.Jit types whose device renders, is
+    ``None``, as it is for maps of one colour each.
     """
-    normals = [m for m in source.maps if m.role == "normal" and m.channels == 3]
-    names = {m.name for m in (*normals, *_roles(source).values())}
-    if not (normals or shows(source)):
-        return {}
-    decoded = image.decode([m.name for m in source.maps if m.name in names])
-    angles = {f"angle_{m.name}_deg": metrics.angle(m.values, decoded[m.name]) for m in normals}
-    if image.types is None or not shows(source):
+    angles = {f"angle_{m.name}_deg": metrics.angle(m.values, decoded[m.name]) for m in _normals(source)}
+    if types is None or not shows(source):
         return angles
-    references = reference(source, image.types, ways)
-    pictures = render(by_role(source, decoded), image.types, ways)
+    references = reference(source, types, ways)
+    pictures = render(by_role(source, decoded), types, ways)
     squares = {way: squared_error(references[way], pictures[way]) for way in ways}
     ratios = [float(pictures[way].mean() / references[way].mean()) for way in ways]
     return {
@@ -121,7 +126,12 @@ def by_role(source: Source, maps: Mapping[str, np.ndarray]) -> dict[str, np.ndar
     return shown
 
 
-def _roles(source: Source) -> dict:
+def _normals(source: Source) -> list[Map]:
+    """Return the maps of normals of three channels."""
+    return [m for m in source.maps if m.role == "normal" and m.channels == 3]
+
+
+def _roles(source: Source) -> dict[str, Map]:
     """Return the first map of each role in :data:`DEFAULTS` that has its channels, or one channel."""
     shown = {}
     for m in source.maps:

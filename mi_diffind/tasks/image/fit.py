@@ -72,7 +72,7 @@ def fit(request: FitRequest) -> Fitted:
 
 def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[str, float]:
     """Return the weights of maps that differ from 1. Raises :class:`UsageError` for a map that the source lacks."""
-    given = request.options["weights"] or ("equal" if request.preset == "paper" else "auto")
+    given = request.options["weights"]
     given = parse_weights(given) if isinstance(given, str) else dict(given)
     if given == "equal":
         return {}

@@ -17,7 +17,7 @@ from .training import layout_of, problem_of
 #: Least weight of a map that pictures show, and of others such as ambient occlusion, in dB.
 SHOWN_DB, OTHER_DB = -1.0, -2.0
 
-#: Least gain of weights in the pictures of initial arrays, in dB. Gains below it were not kept by the training.
+#: Least gain of weights in the pictures of initial arrays, in dB.
 GAIN_DB = 0.5
 
 #: Side of the sample of a material for which initial arrays are compared, and of its patches, in texels.
