@@ -274,15 +274,15 @@ def shading_shares(study: str) -> str:
 
 def material_times() -> str:
     """Return the cost of a pass with each form of a material, as multiples of separate plugins."""
-    frame, fixed = (measured("bench_material")[size] for size in ("frame", "fixed"))
-    separate = frame["normalmap + disney + 4 neural_texture"]["operations"]
+    study = measured("bench_material")
+    separate = study["frame"]["normalmap + disney + 4 neural_texture"]["operations"]
     rows = []
-    for name, figures in frame.items():
+    for name, figures in study["frame"].items():
         counts = (figures["operations"][key] / separate[key] for key in ("instructions", "flops", "gathers"))
-        ratios = (x["ratio"] for x in (fixed[name], figures))
-        times = (f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" for r in ratios)
+        ratios = (study[size].get(name, {}).get("ratio") for size in ("fixed", "frame", "step"))
+        times = (f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" if r else "–" for r in ratios)
         rows.append([f"`{name}`", *(f"{count:.2f}" for count in counts), *times])
-    return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640 pixels"], rows)
+    return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640", "training step"], rows)
 
 
 def sdf_errors(study: str) -> str:
@@ -429,9 +429,12 @@ TABLES = {
 for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
-for source in ("", "_boombox"):
-    for make in (shading_filters, shading_shares):
-        TABLES[make.__name__ + source] = lambda make=make, source=source: make("tradeoff_shading" + source)
+TABLES |= {
+    "shading_filters": lambda: shading_filters("tradeoff_shading"),
+    "shading_shares": lambda: shading_shares("tradeoff_shading_lambda"),
+    "shading_filters_boombox": lambda: shading_filters("tradeoff_shading_boombox"),
+    "shading_shares_boombox": lambda: shading_shares("tradeoff_shading_boombox"),
+}
 for source in ("suzanne", "armadillo", "bunny"):
     for make in (sdf_errors, sdf_times):
         TABLES[f"{make.__name__}_{source}"] = lambda make=make, source=source: make(f"tradeoff_sdf_{source}")

@@ -230,7 +230,12 @@ class DifferentiableArray(nn.Module):
             require_backend(dtype)
             UInt32 = module_of(dtype).UInt32
             result.bits = bits
-            packed = as_words(pack_bits(codes, bits), spare=1) if bits < 8 else lookup.pack(codes, result.border)
+            if bits < 8:
+                more = lookup.guarded(result.resolution, result.border)[-1] - codes.shape[-2]
+                padded = np.concatenate([codes, codes[..., :more, :]], axis=-2)
+                packed = as_words(pack_bits(padded, bits), spare=2)
+            else:
+                packed = lookup.pack(codes, result.border)
             words = aligned(packed.shape, np.uint32)
             words[...] = packed
             result.data = UInt32(words)
@@ -254,10 +259,9 @@ class DifferentiableArray(nn.Module):
         if self.storage != "uint8":
             raise ValueError(f'only "uint8" storage has codes, this array is stored as "{self.storage}"')
         if self.bits < 8:
-            count = math.prod(self.resolution) * self.channels
-            return unpack_bits(self.data.numpy().view(np.uint8), count, self.bits).reshape(
-                *self.resolution, self.channels
-            )
+            shape = (*lookup.guarded(self.resolution, self.border), self.channels)
+            codes = unpack_bits(self.data.numpy().view(np.uint8), math.prod(shape), self.bits)
+            return codes.reshape(shape)[..., : self.resolution[-1], :]
         return lookup.unpack(self.data.numpy(), self.resolution, self.channels)
 
     def at(self, x) -> DifferentiableArray:
@@ -288,23 +292,24 @@ class DifferentiableArray(nn.Module):
         result.data = module.TensorXf(flat, (*resolution, stored))
         return result
 
-    def entry(self, index, active=True) -> list:
-        """Return the channels of entries without interpolation, folded.
+    def blend(self, corners, active=True) -> list:
+        """Return the channels of a weighted sum of entries, folded, without interpolation.
 
-        ``index`` is the number of an existing entry, the last axis fastest. Differentiable with respect to the entries
-        of float storage.
+        ``corners`` are pairs: the number of an existing entry, the last axis fastest, and its weight; the weights sum
+        to 1. Differentiable with respect to the weights and to the entries of float storage.
         """
         self._require_entries()
         if self.storage == "uint8":
-            return lookup.entry_packed(
-                self.data, self.scale, self.offset, self.resolution, self.channels, index, active, self.bits
+            return lookup.blend_packed(
+                self.data, self.scale, self.offset, self.resolution, self.channels, corners, active, self.bits
             )
         self.check_shape()
         entries, transform = self.data.array, fold if self.folded else None
         if self.folded and not dr.flag(dr.JitFlag.SymbolicScope):
             entries, transform = fold(entries), None
-        Float = module_of(self.data).Float
-        return lookup.fetch_float(entries, self.channels, self.data.shape[-1], active, transform, Float, index)
+        Float, stored = module_of(self.data).Float, self.data.shape[-1]
+        fetch = functools.partial(lookup.fetch_float, entries, self.channels, stored, active, transform, Float)
+        return lookup.weighted_sum((weight, fetch(index)) for index, weight in corners)
 
     @property
     def is_pointer(self) -> bool:

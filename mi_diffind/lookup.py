@@ -72,13 +72,13 @@ def _packet(count: int) -> int:
 
 
 def gathers(resolution: Sequence[int], channels: int, storage: str, bits: int = 8) -> int:
-    """Return the number of gather instructions that one read takes."""
+    """Return the number of gather instructions that one read of all channels takes on the CPU."""
     dims = len(resolution)
     if storage == "uint8" and bits < 8:
-        return 2**dims * channels_words(channels, bits)
+        return 2 ** (dims - 1) * pair_words(channels, bits)
     if storage == "uint8":
         inner, _, words = packed_layout(resolution, channels)
-        return 2 ** (dims - inner) * (words // _packet(words))
+        return 2 ** (dims - inner) * words
     stored = padded_channels(channels)
     return 2**dims * (stored // _packet(stored))
 
@@ -205,7 +205,7 @@ def read_packed(
     inner, stride, per_texel = packed_layout(resolution, channels)
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
     outer = len(resolution) - inner
-    packet = _packet(per_texel)
+    packet = _packet(per_texel) if dr.backend_v(UInt32) == dr.JitBackend.CUDA else 1
     groups = per_texel // packet
 
     convert = len(resolution) > 2
@@ -258,10 +258,24 @@ def read_packed(
     return values if active is True else [dr.select(active, v, 0) for v in values]
 
 
-def channels_words(channels: int, bits: int) -> int:
-    """Return the number of 32-bit words to read for all bits of an entry with fewer than 8 bits a channel."""
+def channels_words(channels: int, bits: int, entries: int = 1) -> int:
+    """Return the number of 32-bit words to read for all bits of consecutive entries of fewer than 8 bits a channel."""
     width = channels * bits
-    return (width + 63 - math.gcd(width, 32)) // 32  # entries begin at multiples of the divisor
+    return (entries * width + 63 - math.gcd(width, 32)) // 32  # entries begin at multiples of the divisor
+
+
+def pair_words(channels: int, bits: int) -> int:
+    """Return the number of gathers that bring two neighbouring entries of fewer than 8 bits a channel."""
+    return min(2 * channels_words(channels, bits), channels_words(channels, bits, 2))
+
+
+def guarded(resolution: Sequence[int], border: Sequence[str]) -> tuple[int, ...]:
+    """Return the resolution in memory of a table of fewer than 8 bits a channel.
+
+    If the last axis repeats, its first entry follows the last one, so that the two entries of a cell are neighbours.
+    """
+    *outer, n = resolution
+    return (*outer, n + (border[-1] == "repeat" and n > 1))
 
 
 def read_bits(
@@ -276,56 +290,112 @@ def read_bits(
     inside: bool = False,
     bits: int = 4,
 ):
-    """Read a table of fewer than 8 ``bits`` a channel (:func:`.bits.pack_bits`, in words of 32 bits and one word more).
+    """Read a table of fewer than 8 ``bits`` a channel (:func:`.bits.pack_bits`, in 32-bit words and two words more).
 
-    The table takes no more memory than these bits. A corner takes one gather if entries never cross the end of a word,
-    else two. Otherwise like :func:`read_packed`.
+    The table takes no more memory than these bits and those of :func:`guarded`. Otherwise like :func:`read_packed`.
     """
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
-    fetch = functools.partial(fetch_bits, words, channels, bits, active, type(x[0]))
-    sums = weighted_sum((weight, fetch(index)) for index, weight in _corners(axes, resolution))
-    values = [dr.fma(s, scale[k], offset[k]) for k, s in enumerate(sums)]
+    stored, (lower, _, w) = guarded(resolution, border), axes[-1]
+    ends, pairs = (1 - w, w), []
+    for index, weight in _corners(axes[:-1], stored[:-1]):
+        index = lower if index is None else dr.fma(index, stored[-1], lower)
+        pairs.append((index, ends if weight is None else [weight * end for end in ends]))
+    return blend_bits(words, scale, offset, channels, pairs, active, bits)
+
+
+def blend_bits(words, scale, offset, channels: int, pairs, active, bits: int) -> list:
+    """Return the sum of pairs of neighbouring entries of fewer than 8 ``bits``, by weights that sum to 1.
+
+    ``pairs`` hold the index of the first entry of each, and both weights. Scale and offset are applied to the sum.
+    """
+    Float = dr.float32_array_t(type(words))
+    terms = []
+    for index, weights in pairs:
+        terms += zip(weights, fetch_bits(words, channels, bits, active, Float, index, 2), strict=True)
+    sums, steps = weighted_sum(terms), bit_steps(channels, bits)
+    values = [dr.fma(s, scale[k] * steps[k], offset[k]) for k, s in enumerate(sums)]
     return values if active is True else [dr.select(active, v, 0) for v in values]
 
 
-def fetch_bits(words, channels: int, bits: int, active, Float, index) -> list:
-    """Return the numbers that :func:`.bits.pack_bits` packed for an entry, as ``Float``."""
+def fetch_bits(words, channels: int, bits: int, active, Float, index, entries: int = 1) -> list[list]:
+    """Return the numbers that :func:`.bits.pack_bits` packed for one entry, or for it and the next one, for each.
+
+    They are ``Float``, still to be multiplied by :func:`bit_steps`: bits stay where they are in a word, which saves a
+    shift for each number. A table has one word to spare for each of the ``entries``.
+    """
     UInt32, width = type(words), channels * bits
-    Int32, count = dr.int32_array_t(UInt32), channels_words(channels, bits)
+    count = channels_words(channels, bits, entries)
+    if entries > 1 and channels_words(channels, bits) == 1 < count:  # no entry crosses a word
+        return [fetch_bits(words, channels, bits, active, Float, index + i)[0] for i in range(entries)]
     start = index * width
     first, shift = start >> 5, start & 31
     gathered = [dr.gather(UInt32, words, first + i, active) for i in range(count)]
-    if count > 1:  # what is left of a word, and what the next one adds above it
+    if count > 1:  # what is left of a word, and what the next one adds above it: for LLVM, one funnel shift
         pairs = zip(gathered, [*gathered[1:], UInt32(0)], strict=True)
-        gathered = [(low >> shift) | ((high << (31 - shift)) << 1) for low, high in pairs]
+        gathered = [((high << 1) << (shift ^ 31)) | (low >> shift) for low, high in pairs]
     else:
         gathered = [gathered[0] >> shift]
-    values = []
-    for k in range(channels):
+    return [_numbers(_shifted(gathered, i * width), channels, bits, Float) for i in range(entries)]
+
+
+def _shifted(words: list, by: int) -> list:
+    """Return the words of a long number, the lowest first, without its lowest bits."""
+    skipped, shift = divmod(by, 32)
+    words = words[skipped:]
+    if shift == 0:
+        return words
+    ahead = [*(word << (32 - shift) for word in words[1:]), None]
+    return [word >> shift if more is None else (word >> shift) | more for word, more in zip(words, ahead, strict=True)]
+
+
+def _numbers(words: list, channels: int, bits: int, Float) -> list:
+    """Return the numbers of ``bits`` bits in words as ``Float``, divided by :func:`bit_steps`."""
+    Int32, values = dr.int32_array_t(type(words[0])), []
+    for k, step in enumerate(bit_steps(channels, bits)):
         word, at = divmod(k * bits, 32)
-        value = gathered[word] >> at
-        if at + bits > 32:
-            value |= gathered[word + 1] << (32 - at)
-        values.append(Float(Int32(value & (2**bits - 1))))
+        value = words[word]
+        if step == 1:
+            value = value >> at
+            if at + bits > 32:
+                value |= words[word + 1] << (32 - at)
+            at = 0
+        values.append(Float(Int32(value & ((2**bits - 1) << at))))
     return values
 
 
-def entry_packed(
-    words, scale, offset, resolution: Sequence[int], channels: int, index, active=True, bits: int = 8
+def bit_steps(channels: int, bits: int) -> list[float]:
+    """Return the powers of two by which numbers of :func:`fetch_bits` are to be multiplied."""
+    places = [k * bits % 32 for k in range(channels)]
+    return [2.0**-at if at + bits < 32 else 1.0 for at in places]
+
+
+def blend_packed(
+    words, scale, offset, resolution: Sequence[int], channels: int, corners, active=True, bits: int = 8
 ) -> list:
-    """Return the channels of the entries ``index`` of a table of bytes (:func:`pack`) or of fewer ``bits``."""
+    """Return the sum of entries of a table of bytes (:func:`pack`) or of fewer ``bits``, by weights that sum to 1.
+
+    ``corners`` are pairs (index of an entry, weight). Scale and offset are applied once, to the sum.
+    """
     UInt32, Int32 = type(words), dr.int32_array_t(type(words))
     Float = dr.float32_array_t(UInt32)
     if bits < 8:
-        codes = fetch_bits(words, channels, bits, active, Float, index)
+        steps = bit_steps(channels, bits)
+
+        def fetch(index):
+            return fetch_bits(words, channels, bits, active, Float, index)[0]
     else:
-        _, _, per_texel = packed_layout(resolution, channels)
-        codes = []
-        for word in range((channels + 3) // 4):
-            word_values = dr.gather(UInt32, words, index if per_texel == 1 else index * per_texel + word, active)
-            for rotated in (word_values, (word_values << 16) | (word_values >> 16)):
-                codes += [Float(Int32((rotated >> shift) & 0xFF)) for shift in (15, 7)]
-    values = [dr.fma(c, scale[k], offset[k]) for k, c in enumerate(codes[:channels])]
+        steps, (_, _, per_texel) = [2.0**-15, 2.0**-7] * channels, packed_layout(resolution, channels)
+
+        def fetch(index):
+            codes = []
+            for word in range((channels + 3) // 4):
+                word_values = dr.gather(UInt32, words, index if per_texel == 1 else index * per_texel + word, active)
+                for rotated in (word_values, (word_values << 16) | (word_values >> 16)):
+                    codes += [Float(Int32(rotated & mask)) for mask in (0x7F8000, 0x7F80)]
+            return codes[:channels]
+
+    sums = weighted_sum((weight, fetch(index)) for index, weight in corners)
+    values = [dr.fma(s, scale[k] * steps[k], offset[k]) for k, s in enumerate(sums)]
     return values if active is True else [dr.select(active, v, 0) for v in values]
 
 

@@ -163,7 +163,7 @@ class PagedArray(DifferentiableArray):
             codes, *affine = lookup.quantize(values, result.channels)
         result.scale, result.offset = (tuple(map(float, numbers)) for numbers in affine)
         result.bits = bits
-        packed = as_words(pack_bits(codes, bits), spare=1)
+        packed = as_words(pack_bits(codes, bits), spare=2)
         words = aligned(packed.shape, np.uint32)
         words[...] = packed
         result.data = module.UInt32(words)
@@ -214,7 +214,9 @@ class PagedArray(DifferentiableArray):
             raise ValueError(f"an array of {self.dims} dimension(s) was read at {len(x)} coordinate(s)")
         corners = self._corners(x, active, inside)
         if self.storage == "uint8":
-            fetch = functools.partial(lookup.fetch_bits, self.data, self.channels, self.bits, active, type(x[0]))
+            # The entries of a cell are neighbours along the last axis; a side of one entry reads the next by weight 0
+            pairs = [(i, (v, w)) for (i, v), (_, w) in zip(corners[::2], corners[1::2], strict=True)]
+            values = lookup.blend_bits(self.data, self.scale, self.offset, self.channels, pairs, active, self.bits)
         else:
             self.check_shape()
             entries, transform = self.data.array, None
@@ -224,10 +226,7 @@ class PagedArray(DifferentiableArray):
                 entries = fold(entries)
             stored = self.data.shape[-1]
             fetch = functools.partial(lookup.fetch_float, entries, self.channels, stored, active, transform, type(x[0]))
-        values = lookup.weighted_sum((weight, fetch(index)) for index, weight in corners)
-        if self.storage == "uint8":
-            values = [dr.fma(v, self.scale[k], self.offset[k]) for k, v in enumerate(values)]
-            values = values if active is True else [dr.select(active, v, 0) for v in values]
+            values = lookup.weighted_sum((weight, fetch(index)) for index, weight in corners)
         return nn.CoopVec(*values) if is_coopvec else values
 
     def _corners(self, x: Sequence, active, inside: bool) -> list:

@@ -23,7 +23,7 @@ from .bits import pack_bits, unpack_bits
 from .errors import DiffindError, reason
 from .files import replacing
 from .indirection import DifferentiableArray
-from .lookup import BORDERS, STORAGES, channels_words, gathers, quantize
+from .lookup import BORDERS, STORAGES, gathers, pair_words, quantize
 from .pages import SIDE_BITS, PagedArray
 
 #: Version of the format that is written. A file with another version is refused.
@@ -196,8 +196,8 @@ def gathers_of(table: Table, name: str) -> int:
     pages = table.arrays.get(name + PAGES)
     if pages is not None:
         channels, as_bytes = array.shape[-1], array.storage == "uint8"
-        corner = channels_words(channels, array.bits) if as_bytes else gathers((), channels, array.storage)
-        return corner * 2 ** (pages.entries.ndim - 1)
+        pair = pair_words(channels, array.bits) if as_bytes else 2 * gathers((), channels, array.storage)
+        return pair * 2 ** (pages.entries.ndim - 2)
     return gathers(array.shape[:-1], array.shape[-1], array.storage, array.bits)
 
 

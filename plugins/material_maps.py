@@ -107,7 +107,7 @@ class MaterialMaps(FilteredTexture):
         return [v for m in self.maps.values() for v in self._converted(m, stored)]
 
     def _filtered(self, uv, level):
-        stored = self.image.filtered(*self._wrapped_at(uv, level), level)
+        stored = self.image.filtered(*self._wrapped_at(uv, self.image.biased(level)), level)
         values = []
         for m in self.maps.values():
             encoded = self._is_encoded(m)

@@ -97,7 +97,7 @@ class NeuralMaterial(Disney):
 
     **Normals** turn the frame as :monosp:`normalmap` does, with its shadowing function. A direction counts if it is
     above the surface and above the turned horizon. A normal that faces away from the viewer is mirrored at the
-    surface's normal.
+    surface's normal. The AOV ``sh_normal`` is the surface's normal: Mitsuba 3.9 asks its own plugins alone for another.
 
     **Opacity** lets rays pass straight on, as :monosp:`mask` does: component 3. **Emission is left out**: light of a
     surface comes from an area emitter of its shape. Give the shape one, with a :monosp:`neural_texture` of the same
@@ -166,6 +166,11 @@ class NeuralMaterial(Disney):
         if "opacity" in self.maps.maps:
             self.m_components = [*self.m_components, mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
             self.m_flags = self.m_flags | self.m_components[NULL]
+
+    @property
+    def net(self):
+        """The arrays of the maps, ``None`` if all are constant."""
+        return self.maps.net
 
     def traverse(self, cb: mi.TraversalCallback):
         super().traverse(cb)

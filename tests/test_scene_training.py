@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import gc
+import re
 
 import drjit as dr
 import mitsuba as mi
@@ -557,6 +558,24 @@ def test_values_and_derivatives_have_their_own_samples(trained, weights):
     assert not [key for key in mi.traverse(bsdf).keys() if key.startswith("tables.")]
 
 
+def test_a_material_is_trained_as_its_maps_are(folder, path, trained, weights):
+    """The same images and gradients from one plugin that reads all maps."""
+    text = re.sub(
+        "<bsdf .*</bsdf>", '<bsdf type="neural_material"><string name="filename" value="material.npz"/><string '
+        'name="lobes" value="tables"/></bsdf>', path.read_text(encoding="utf-8"),
+    )  # fmt: skip
+    (folder / "whole.xml").write_text(text)
+    parsed = scenes.ParsedScene(folder / "whole.xml")
+    file, _ = texture_file(parsed)
+    whole, (scene, problem) = TrainedScene(parsed, file, ORBIT, 1, load(file)), trained
+    whole.place(View())
+    scene.place(View())
+    (a, da), (b, db) = (rendered(s, inside(problem.net), weights, 1, 2) for s in (whole, scene))
+    np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
+    for name, gradient in da.items():
+        assert np.abs(gradient - db[name]).max() < 1e-3 * np.abs(gradient).max()
+
+
 def test_gradients_against_differences(trained, weights):
     """
     Of a weighted sum of all pixels with respect to entries of each array, seven of those with the largest gradients and
@@ -589,11 +608,13 @@ def test_gradients_against_differences(trained, weights):
 def test_which_texture(path, folder):
     assert texture_file(scenes.ParsedScene(path)) == (folder / "material.npz", "")
     assert texture_file(scenes.ParsedScene(path), folder / "material.npz")[0] == folder / "material.npz"
-    with pytest.raises(UsageError, match=r"no neural_texture reads .*other\.npz, the files are material\.npz"):
+    with pytest.raises(
+        UsageError, match=r"no neural_texture or neural_material reads .*other\.npz, the files are material\.npz"
+    ):
         texture_file(scenes.ParsedScene(path), folder / "other.npz")
     plain = folder / "plain.xml"
     plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
-    with pytest.raises(UsageError, match="names 0 files of neural_texture"):
+    with pytest.raises(UsageError, match="names 0 files of neural_texture or neural_material"):
         texture_file(scenes.ParsedScene(plain))
 
 

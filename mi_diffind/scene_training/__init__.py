@@ -1,4 +1,4 @@
-"""Task 5 inside a scene: arrays of a ``neural_texture``, trained by differentiating renders of the scene that shows it.
+"""Task 5 inside a scene: arrays of a texture or material, trained through renders of the scene that shows it.
 
 References are renders of the same scene with exact plugins and many samples. The result is a table file of the task
 ``texture``. This package stands above plugins and scenes, which it renders; :mod:`mi_diffind.tasks.shading` trains for
@@ -31,7 +31,10 @@ class SceneTraining(Task):
     storages = ()
     measurements = 10
     arguments = (
-        Argument("source", metavar="SCENE.xml", help="a scene with a neural_texture, whose arrays are trained"),
+        Argument(
+            "source", metavar="SCENE.xml",
+            help="a scene with a neural_texture or neural_material, whose arrays are trained",
+        ),
         Argument(
             "--lambda", dest="share", type=fraction, metavar="L",
             help=f"share of the loss of rendered images, 0 to 1 (default: {SceneRecipe().share:g})",

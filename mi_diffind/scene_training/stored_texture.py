@@ -21,8 +21,8 @@ from ..tasks.texture.nets import PaperStructure
 from ..tasks.texture.presets import PRESETS, TextureRecipe
 from ..tasks.texture.training import TextureProblem
 
-#: Plugin whose arrays are trained.
-PLUGIN = "neural_texture"
+#: Plugins whose arrays are trained.
+PLUGINS = ("neural_texture", "neural_material")
 
 
 def texture_file(parsed: scenes.ParsedScene, file: str | os.PathLike | None = None) -> tuple[Path, str]:
@@ -33,19 +33,19 @@ def texture_file(parsed: scenes.ParsedScene, file: str | os.PathLike | None = No
     """
     folder, sources = parsed.path.resolve().parent, {}
     for entry in parsed.learned_plugins():
-        if entry["plugin"] == PLUGIN and entry.get("filename"):
+        if entry["plugin"] in PLUGINS and entry.get("filename"):
             source = entry.get("source", "")
             sources.setdefault((folder / entry["filename"]).resolve(), str(folder / source) if source else "")
-    names = ", ".join(f.name for f in sources) or "none"
+    names, readers = ", ".join(f.name for f in sources) or "none", " or ".join(PLUGINS)
     if file is None:
         if len(sources) != 1:
             raise UsageError(
-                f"{parsed.path}: names {len(sources)} files of {PLUGIN} ({names}): say which one is to be trained"
+                f"{parsed.path}: names {len(sources)} files of {readers} ({names}): say which one is to be trained"
             )
         return next(iter(sources.items()))
     wanted = Path(file).resolve()
     if wanted not in sources:
-        raise UsageError(f"{parsed.path}: no {PLUGIN} reads {file}, the files are {names}")
+        raise UsageError(f"{parsed.path}: no {readers} reads {file}, the files are {names}")
     return wanted, sources[wanted]
 
 

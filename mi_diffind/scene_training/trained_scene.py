@@ -13,7 +13,7 @@ from ..errors import UsageError
 from ..plugins.support import footprint
 from ..tables import Table, save_table
 from .rig import Rig
-from .stored_texture import PLUGIN
+from .stored_texture import PLUGINS
 from .views import View, ViewDistribution
 
 
@@ -37,7 +37,7 @@ class TrainedScene:
             def change(state):
                 for props in compat.properties_of(state):
                     name = props.plugin_name()
-                    if name == PLUGIN and (folder / str(props.get("filename", ""))).resolve() == file:
+                    if name in PLUGINS and (folder / str(props.get("filename", ""))).resolve() == file:
                         props["filename"], props["storage"] = str(copy), "float32"
                     elif name == "path":
                         props["max_depth"] = props.get("max_depth", scenes.MAX_DEPTHS[name])
@@ -52,7 +52,7 @@ class TrainedScene:
         self.parameters.keep([re.escape(key) + "$" for key in self.keys.values()])
 
     def _parameters(self, file: Path) -> dict[str, str]:
-        textures = [t for t in scenes.instances(self.scene) if plugins.origin(t)["plugin"] == PLUGIN]
+        textures = [t for t in scenes.instances(self.scene) if plugins.origin(t)["plugin"] in PLUGINS]
         reading = [t for t in textures if Path(plugins.origin(t)["filename"]).resolve() == file and t.net is not None]
         if not reading:
             raise UsageError(f"{file.name}: holds no arrays that could be trained, or no surface of the scene reads it")

@@ -3,7 +3,8 @@ What a shaded pixel costs: one ``neural_material`` beside ``normalmap``, ``disne
 map of the same file, and beside bitmaps of its source. Interleaved passes: a frame of one sample a pixel; the same with
 a film of 8 × 8 pixels, which is the time of everything but the kernel; and the operations of one lane of the kernel.
 Ratios are those of passes that follow each other, to the second contender. Times of a processor (``cpu_ms``) depend
-less on what else the machine does than those of a clock (``ms``); those of the small film are of the main thread.
+less on what else the machine does than those of a clock (``ms``); those of the small film are of the main thread. Last,
+a step of a training inside the scene: a render by ``prb`` and its derivatives with respect to all arrays.
 
     python tests/benchmarks/bench_material.py [--rounds 21] [--json FILE]
 """
@@ -31,13 +32,13 @@ PARAMETERS = {"base_color": "albedo", "roughness": "roughness", "metallic": "met
 SEPARATE = "normalmap + disney + 4 neural_texture"
 
 #: Width and height of the film.
-SIZES = {"fixed": (8, 8), "frame": (960, 640)}
+SIZES = {"fixed": (8, 8), "frame": (960, 640), "step": (128, 128)}
 
 #: The contenders (:func:`materials`).
 NAMES = ("neural_material", SEPARATE, "normalmap + disney + 4 bitmap", "normalmap + principled + 4 bitmap")
 
 
-def materials(scale: float) -> dict[str, dict]:
+def materials(scale: float, storage: str = "uint8") -> dict[str, dict]:
     """The BSDFs, all maps repeated ``scale`` times."""
     to_uv = mi.ScalarTransform4f().scale(scale)
 
@@ -46,27 +47,27 @@ def materials(scale: float) -> dict[str, dict]:
         return {"type": "normalmap", "normalmap": texture("normal"), "nested": {"type": bsdf, **maps}}
 
     def learned(name):
-        return {"type": "neural_texture", "filename": FILE, "channels": name, "to_uv": to_uv}
+        return {"type": "neural_texture", "filename": FILE, "channels": name, "to_uv": to_uv, "storage": storage}
 
     def bitmap(name):
         raw = name != "albedo"
         return {"type": "bitmap", "filename": str(ASSETS / f"rust_{name}.png"), "raw": raw, "to_uv": to_uv}
 
     return {
-        "neural_material": {"type": "neural_material", "filename": FILE, "to_uv": to_uv},
+        "neural_material": {"type": "neural_material", "filename": FILE, "to_uv": to_uv, "storage": storage},
         SEPARATE: nested("disney", learned),
         "normalmap + disney + 4 bitmap": nested("disney", bitmap),
         "normalmap + principled + 4 bitmap": nested("principled", bitmap),
     }
 
 
-def scene(bsdf: dict, width: int, height: int):
+def scene(bsdf: dict, width: int, height: int, integrator: str = "path"):
     """A plate and a ball of one material, a sun and a sky."""
     at = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     eye = at().look_at([0, 4.2, 7.5], [0, 0.35, 0.2], [0, 1, 0])
     return mi_diffind.load_dict({
-        "type": "scene", "integrator": {"type": "path", "max_depth": 3},
+        "type": "scene", "integrator": {"type": integrator, "max_depth": 3},
         "sensor": {
             "type": "perspective", "fov": 36, "to_world": eye, "film": film,
             "sampler": {"type": "independent", "sample_count": 1},
@@ -94,14 +95,30 @@ def worker(name: str, size: str, pipe) -> None:
     """Process of one scene: Dr.Jit compiles the materials of all scenes that a process holds into each kernel."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    loaded = scene(materials(8)[name], *SIZES[size])
+    trains = size == "step"
+    bsdf = materials(8, "float32" if trains else "uint8")[name]
+    loaded = scene(bsdf, *SIZES[size], "prb" if trains else "path")
+    parameters = mi.traverse(loaded)
+    parameters.keep([r".*\.tables\..*"])
     seconds = time.thread_time if size == "fixed" else time.process_time
-    pipe.send(operations.count(lambda: mi.render(loaded, spp=1)).asdict())
+
+    def run(seed):
+        if not trains:
+            return mi.render(loaded, spp=1, seed=seed)
+        for key in parameters.keys():
+            dr.enable_grad(parameters[key])
+            dr.set_grad(parameters[key], 0)
+        parameters.update()
+        dr.backward(dr.mean(mi.render(loaded, parameters, spp=1, seed=seed, seed_grad=seed + 10_000), axis=None))
+        return [parameters[key].grad for key in parameters.keys()]
+
+    counted = operations.count(lambda: run(dr.opaque(mi.UInt32, 0)))
+    pipe.send(counted.asdict())
     while (i := pipe.recv()) is not None:
         seed = dr.opaque(mi.UInt32, i)
         dr.sync_thread()
         start, start_cpu = time.perf_counter(), seconds()
-        dr.eval(mi.render(loaded, spp=1, seed=seed))
+        dr.eval(run(seed))
         dr.sync_thread()
         pipe.send((1e3 * (time.perf_counter() - start), 1e3 * (seconds() - start_cpu)))
 
@@ -109,12 +126,13 @@ def worker(name: str, size: str, pipe) -> None:
 def measured(size: str, rounds: int) -> dict[str, dict]:
     """Operations of the kernels of each scene, milliseconds of a pass, and ratios to separate plugins, by turns."""
     context, pipes, counted, times = multiprocessing.get_context("spawn"), {}, {}, {}
-    for name in NAMES:
+    names = NAMES[: 2 if size == "step" else None]
+    for name in names:
         pipes[name], other = context.Pipe()
         context.Process(target=worker, args=(name, size, other), daemon=True).start()
         counted[name], times[name] = pipes[name].recv(), []
     for i in range(rounds + 2):
-        for name in NAMES if i % 2 == 0 else reversed(NAMES):
+        for name in names if i % 2 == 0 else reversed(names):
             pipes[name].send(i)
             both = pipes[name].recv()
             if i > 1:  # the first ones compile
@@ -128,7 +146,7 @@ def measured(size: str, rounds: int) -> dict[str, dict]:
             "ms": spread(wall[name]), "cpu_ms": spread(cpu[name]),
             "ratio": spread(wall[name] / wall[SEPARATE]), "cpu_ratio": spread(cpu[name] / cpu[SEPARATE]),
         }
-        for name in NAMES
+        for name in names
     }  # fmt: skip
 
 

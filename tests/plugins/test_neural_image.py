@@ -273,8 +273,8 @@ def test_two_primaries(mi_rgb, tmp_path, rng, border, wrap_mode):
     assert keys == ["tables.cascaded", "tables.coarse", "tables.primary", "to_uv"]
     bsdf = mi.load_dict(materials(lambda m: plugin(path, m, wrap_mode=wrap_mode))["principled"])
     one = mi.load_dict(materials(lambda m: plugin(path, m, wrap_mode=wrap_mode))["diffuse"])
-    found = [bsdf_operations(b, ("eval",))["eval"].gathers for b in (bsdf, one)]
-    assert found[0] == found[1]
+    both, one = (bsdf_operations(b, ("eval",))["eval"].gathers for b in (bsdf, one))
+    assert one <= both < 2 * one  # a further word of each corner for further channels
 
 
 @pytest.mark.parametrize("border", [("repeat", "clamp"), ("clamp", "repeat")])
@@ -676,12 +676,13 @@ def test_maps_of_one_file_are_decoded_once(mi_rgb, file):
         once = bsdf_operations(found["diffuse"], ("eval",))["eval"].gathers
         assert 0 < once <= 8 + 4  # a primary of 2 channels, a cascaded array of 2 dimensions
         for method in ("eval", "pdf", "sample"):
-            assert bsdf_operations(found["principled"], (method,))[method].gathers == once, (method, more)
+            gathers = bsdf_operations(found["principled"], (method,))[method].gathers
+            assert once <= gathers <= once + 4, (method, more)  # a further word of four corners for further channels
         both = mi.load_dict({
             "type": "normalmap", "normalmap": plugin(file, "normal", **more), "bsdf": materials(
                 lambda m, k=more: plugin(file, m, **k))["principled"],
         })  # fmt: skip
-        assert bsdf_operations(both, ("eval",))["eval"].gathers == once
+        assert once <= bsdf_operations(both, ("eval",))["eval"].gathers <= once + 4
 
 
 @pytest.mark.parametrize("storage", ["uint8", "float32"])
@@ -694,8 +695,8 @@ def test_maps_of_one_file_are_decoded_once_in_a_render(mi_rgb, file, storage):
 
     with_maps = {k: gathers(k) for k in (None, "diffuse", "principled")}
     one, two = with_maps["diffuse"] - with_maps[None], with_maps["principled"] - with_maps[None]
-    # Of single precision a gather has four channels, and the roughness is another four than the albedo's
-    assert 0 < one <= two <= one + (2 if storage == "uint8" else 6)
+    # The roughness is among other four channels than the albedo, at each of four corners
+    assert 0 < one <= two <= one + 6
 
 
 def test_maps_of_other_places_are_not_confused(mi_rgb, file, rng):

@@ -14,7 +14,7 @@ from drjit import nn
 
 from ... import lookup
 from ...indirection import DifferentiableArray
-from ...maps.pyramid import around, level_sizes, weighted_sum
+from ...maps.pyramid import around, level_sizes
 from ...pages import PagedArray
 from .sampling import footprint_of
 
@@ -175,9 +175,11 @@ class LayeredNet(nn.Module):
         above = dr.maximum(level - structure.skip, 0)
         lower = dr.floor(above)
         weight = above - dr.detach(lower)
-        index = UInt32(lower) + structure.skip
-        pointer = self._coarse(u, v, index, active)
-        upper = self._coarse(u, v, dr.minimum(index + 1, len(structure.sizes) - 1), active)
+        (rows, columns), offset = self._level(UInt32(lower) + structure.skip)
+        pointer = self._coarse(u, v, rows, columns, offset, active)
+        offset = dr.minimum(offset + rows * columns, self.coarse.resolution[0] - 1)
+        rows, columns = (dr.maximum(n >> 1, 1) for n in (rows, columns))
+        upper = self._coarse(u, v, rows, columns, offset, active)
         pointer = [dr.fma(weight, b - a, a) for a, b in zip(pointer, upper, strict=True)]
         for x, array in reversed([*zip(structure.layers, self.fine, strict=True)]):
             share = 1 - lookup.clamp(level - x.until, 0.0, 1.0)
@@ -189,7 +191,8 @@ class LayeredNet(nn.Module):
         layers = [*zip(self.structure.layers, self.fine, strict=True)]
         last = next((i for i, (x, _) in enumerate(layers) if self.structure.is_pointer(x)), None)
         if last is None:
-            pointer = self._coarse(u, v, None, active)
+            UInt32 = dr.uint32_array_t(type(u))
+            pointer = self._coarse(u, v, *map(UInt32, self.structure.sizes[self.structure.skip]), UInt32(0), active)
         else:
             _, array = layers[last]
             pointer = array(self._place(array, u, v), active)
@@ -224,21 +227,22 @@ class LayeredNet(nn.Module):
             place.append(x - 0.5 / n if border == "repeat" else (x * n - 0.5) * (1 / max(1, n - 1)))
         return place
 
-    def _coarse(self, u, v, level, active) -> list:
-        """Return the pointer of ``coarse`` at (u, v) in a whole level for each place (``None``: its finest level)."""
-        structure, UInt32 = self.structure, dr.uint32_array_t(type(u))
+    def _level(self, level) -> tuple:
+        """Return rows and columns of a whole level for each place, and its first entry in ``coarse``."""
+        structure, UInt32 = self.structure, type(level)
         sizes = structure.sizes[structure.skip :]
-        if level is None or len(sizes) == 1:
-            (rows, columns), offset = (UInt32(n) for n in sizes[0]), UInt32(0)
-        else:
-            rows, columns = (dr.maximum(UInt32(n) >> level, 1) for n in (structure.height, structure.width))
-            offset, start = UInt32(0), 0
-            for i, size in enumerate(sizes[:-1]):
-                start += math.prod(size)
-                offset = dr.select(level > structure.skip + i, start, offset)
-        total = None
+        if len(sizes) == 1:
+            return tuple(map(UInt32, sizes[0])), UInt32(0)
+        offset, start = UInt32(0), 0
+        for i, size in enumerate(sizes[:-1]):
+            start += math.prod(size)
+            offset = dr.select(level > structure.skip + i, start, offset)
+        return tuple(dr.maximum(UInt32(n) >> level, 1) for n in (structure.height, structure.width)), offset
+
+    def _coarse(self, u, v, rows, columns, offset, active) -> list:
+        """Return the pointer of ``coarse`` at (u, v) in the level of so many rows and columns from an entry on."""
+        across = around(u, columns, self.border[1])
+        corners = []
         for row, a in around(v, rows, self.border[0]):
-            for column, b in around(u, columns, self.border[1]):
-                entry, weight = self.coarse.entry(offset + row * columns + column, active), a * b
-                total = weighted_sum(weight, entry, total)
-        return total
+            corners += [(offset + row * columns + column, a * b) for column, b in across]
+        return self.coarse.blend(corners, active)

@@ -1,0 +1,200 @@
+"""
+What a filtered read of a texture costs, as a multiple of a bitmap's bilinear read: run it, it only measures.
+
+    python tests/benchmarks/bench_texture.py [--table FILE.npz] [--json FILE] [--variant VARIANT]
+
+Read are the maps of a material, each by a texture, from hits that lie in memory: position in uv and its derivatives for
+a pixel. The hits are ``random`` (any place, any footprint up to the whole image), or those of a ``plane`` to the
+horizon, pixel by pixel. The bitmaps hold the decoded maps and do not read the derivatives. Times are those of the
+kernels, one of each texture before the next of any; ratios are medians of the rounds.
+
+Then whole renders of the plane in a constant light, ``path_footprint`` against ``path``, and the methods of ``disney``
+with textures against those of ``principled``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import mi_diffind
+from mi_diffind.compat import use_threads
+from mi_diffind.measure.bsdf import bsdf_queries, directions, noise_texture
+from mi_diffind.measure.clock import machine, timed, total
+from mi_diffind.measure.operations import count_query
+from mi_diffind.measure.study import FLOOR
+
+TILES = Path(__file__).parents[2] / "scenes/assets/tiles_filtered.npz"
+WIDTH, HEIGHT = 128, 128
+
+
+def hits(coherent: bool, size: tuple[int, int]):
+    """Return hits with ``uv``, ``duv_dx`` and ``duv_dy``, evaluated; the plane is repeated 40 times in uv."""
+    count = WIDTH * HEIGHT
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    if coherent:
+        index = dr.arange(mi.UInt32, count)
+        x, y = mi.Float(index % WIDTH) / WIDTH - 0.5, (mi.Float(index // WIDTH) + 1) / HEIGHT
+        depth = dr.rcp(y)
+        si.uv = 2 * mi.Point2f(x * depth, depth)
+        si.duv_dx = 2 * mi.Vector2f(depth / WIDTH, 0 * depth)
+        si.duv_dy = 2 * mi.Vector2f(-x * depth * depth, -depth * depth) / HEIGHT
+    else:
+        rng = dr.rng(seed=0)
+        u, v, side, turn, ratio = (rng.random(mi.Float, count) for _ in range(5))
+        side = dr.exp2(side * np.log2(max(size))) / max(size)
+        x, y = dr.cos(dr.two_pi * turn), dr.sin(dr.two_pi * turn)
+        si.uv = mi.Point2f(u, v)
+        si.duv_dx, si.duv_dy = side * mi.Vector2f(x, y), side * ratio * mi.Vector2f(-y, x)
+    dr.make_opaque(si.uv, si.duv_dx, si.duv_dy)
+    return si
+
+
+def textures(path: Path) -> dict[str, list]:
+    """Return name → textures of all maps of a file: bitmaps of the decoded maps, and each filter of each plugin."""
+    model = mi_diffind.open(path)
+    layout = model.image.layout
+    decoded = model.image.decode()
+    plain = {
+        m.name: {"type": "bitmap", "data": mi.TensorXf(decoded[m.name]), "raw": True, "wrap_mode": "repeat"}
+        for m in layout.maps
+    }
+    result = {"bitmap": [mi.load_dict(d) for d in plain.values()]}
+    for name in ("off", "trilinear", "anisotropic"):
+        result[f"neural_texture, {name}"] = [
+            mi.load_dict(
+                {"type": "neural_texture", "filename": str(path), "channels": m.name, "filter": name, "raw": True}
+            )
+            for m in layout.maps
+        ]
+    return result, [m.channels for m in layout.maps]
+
+
+def rounds(functions: dict, number: int) -> dict[str, np.ndarray]:
+    """Return the seconds of the kernels of each function, one of all before the next of any."""
+    for function in functions.values():
+        timed(lambda f=function: total(f())[0])
+    seconds = {name: [] for name in functions}
+    for _ in range(number):
+        for name, function in functions.items():
+            seconds[name].append(timed(lambda f=function: total(f())[0]).seconds)
+    return {name: np.array(values) for name, values in seconds.items()}
+
+
+def against(seconds: dict, base: str, count: int) -> dict[str, dict]:
+    """Return ns a lane, and the median ratio to ``base`` with its quartiles."""
+    rows = {}
+    for name, values in seconds.items():
+        low, middle, high = np.percentile(values / seconds[base], [25, 50, 75])
+        rows[name] = {
+            "ns": float(np.median(values)) / count * 1e9,
+            "ratio": float(middle),
+            "quartiles": [float(low), float(high)],
+        }
+    return rows
+
+
+def reads(path: Path, number: int) -> list[dict]:
+    """Return the costs of reads of the first map and of all maps."""
+    by_name, channels = textures(path)
+    size = by_name["bitmap"][0].resolution()
+    rows = []
+    for coherent in (False, True):
+        si = hits(coherent, tuple(size))
+        for maps in (1, len(channels)):
+
+            def read(used, maps=maps, si=si):
+                return [(t.eval_3(si) if c == 3 else t.eval_1(si)) for t, c in zip(used[:maps], channels, strict=False)]
+
+            functions = {name: lambda used=used: read(used) for name, used in by_name.items()}
+            row = {"table": path.name, "hits": "plane" if coherent else "random", "maps": maps}
+            costs = against(rounds(functions, number), "bitmap", WIDTH * HEIGHT)
+            for name, function in functions.items():
+                operations = count_query(function)
+                costs[name] |= {"instructions": operations.instructions, "gathers": operations.gathers}
+            rows.append({**row, "textures": costs})
+    return rows
+
+
+def renders(path: Path, number: int) -> dict[str, dict]:
+    """Return the costs of whole renders of a plane to the horizon at one sample a pixel."""
+    T, place = mi.ScalarTransform4f, mi.ScalarTransform3f().scale(40)
+    texture = {"type": "neural_texture", "filename": str(path), "to_uv": place, "channels": "albedo"}
+    bsdf = {"type": "diffuse", "reflectance": texture}
+    film = {"type": "hdrfilm", "width": 192, "height": 128}
+    view = T().look_at([0, 1, 6], [0, 0.3, 0], [0, 1, 0])
+    scenes = {
+        integrator: mi_diffind.load_dict({
+            "type": "scene", "integrator": {"type": integrator, "max_depth": 4}, "sky": {"type": "constant"},
+            "sensor": {"type": "perspective", "to_world": view, "film": film, "sampler": {"type": "independent"}},
+            "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(40), "bsdf": bsdf},
+            "ball": {"type": "sphere", "center": [0, 1, 0], "bsdf": bsdf},
+        })
+        for integrator in ("path", "path_footprint")
+    }  # fmt: skip
+    functions = {name: lambda s=scene: [mi.render(s, spp=1).array] for name, scene in scenes.items()}
+    return against(rounds(functions, number), "path", 192 * 128)
+
+
+def materials(number: int) -> dict[str, dict]:
+    """Return method → the costs of ``disney`` and ``principled`` with four textures."""
+    rng = np.random.default_rng(0)
+    values = {"base_color": [0.6, 0.3, 0.2], "roughness": [0.4], "metallic": [0.5], "anisotropic": [0.3]}
+    maps = {name: mi.load_dict(noise_texture(v, rng)) for name, v in values.items()}
+    bsdfs = {name: mi.load_dict({"type": name, **maps}) for name in ("principled", "disney")}
+    lanes = 2**16
+    queries = bsdf_queries(bsdfs, directions(lanes), True)
+    result = {}
+    for query, functions in queries.items():
+        costs = against(rounds({n: f for n, f in functions.items() if n != FLOOR}, number), "principled", lanes)
+        for name in costs:
+            operations = count_query(functions[name])
+            costs[name] |= {"instructions": operations.instructions, "gathers": operations.gathers}
+        result[query] = costs
+    return result
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--table", action="append", type=Path, metavar="FILE", help="texture to read (default: tiles)")
+    parser.add_argument("--rounds", type=int, default=31, help="rounds of each measurement (default: 31)")
+    parser.add_argument("--json", metavar="FILE", help="also write the numbers to this file")
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--only", choices=("reads", "renders", "materials"))
+    options = parser.parse_args()
+    mi.set_variant(options.variant)
+    use_threads(1)
+    result = {"machine": machine(options.variant), "rounds": options.rounds}
+    with dr.suspend_grad():
+        if options.only in (None, "reads"):
+            result["reads"] = [row for path in options.table or [TILES] for row in reads(path, options.rounds)]
+        if options.only in (None, "renders"):
+            result["renders"] = renders(TILES, options.rounds)
+        if options.only in (None, "materials"):
+            result["materials"] = materials(options.rounds)
+    for row in result.get("reads", []):
+        print(f"{row['table']}, {row['hits']}, {row['maps']} map(s)")
+        show(row["textures"])
+    for name, costs in {"renders": result.get("renders", {}), **result.get("materials", {})}.items():
+        print(name)
+        show(costs)
+    if options.json:
+        Path(options.json).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+def show(costs: dict[str, dict]) -> None:
+    for name, cost in costs.items():
+        counts = f", {cost['instructions']} instructions, {cost['gathers']} gathers" if "gathers" in cost else ""
+        low, high = cost["quartiles"]
+        print(f"  {name:28}{cost['ratio']:6.2f} ({low:.2f} to {high:.2f}), {cost['ns']:.1f} ns{counts}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
