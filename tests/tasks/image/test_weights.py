@@ -111,3 +111,17 @@ def test_initial_arrays_are_compared_as_seen(monkeypatch):
     given = source, recipe, 900, array_module("llvm")
     equal, normal, ao = (weights._start_db(*given, w) for w in ({}, {"normal": 4.0}, {"ao": 4.0}))
     assert normal > ao + 3 and normal >= equal - 0.1
+
+
+def test_what_is_flat_stays_flat():
+    """A channel of one value is that value, a derived normal has length 1, whatever else the file holds."""
+    y, x = np.mgrid[0:24, 0:24] / 24
+    tilt = np.dstack([0.4 * np.sin(6 * x), 0.4 * np.cos(9 * y)])
+    normal = np.dstack([tilt, np.sqrt(1 - (tilt**2).sum(axis=-1))])
+    maps = {"normal": np.float32(0.5 + 0.5 * normal), "metallic": np.full((24, 24), 77, np.uint8)}
+    maps["ao"] = np.uint8(np.dstack([255 * x, 200 + 0 * x]))
+    decoded = md.fit("image", maps, steps=2, batch=64, compression=4, progress=False).model.decode()
+    assert (decoded["metallic"] == np.float32(77 / 255)).all()
+    assert (decoded["ao"][..., 1] == np.float32(200 / 255)).all()
+    np.testing.assert_allclose(np.linalg.norm(2 * decoded["normal"] - 1, axis=-1), 1, atol=1e-5)
+    assert np.ptp(decoded["normal"][..., 0]) > 0.1
