@@ -401,9 +401,12 @@ TABLES = {
 for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
-for source in ("", "_boombox"):
-    for make in (shading_filters, shading_shares):
-        TABLES[make.__name__ + source] = lambda make=make, source=source: make("tradeoff_shading" + source)
+TABLES |= {
+    "shading_filters": lambda: shading_filters("tradeoff_shading"),
+    "shading_shares": lambda: shading_shares("tradeoff_shading_lambda"),
+    "shading_filters_boombox": lambda: shading_filters("tradeoff_shading_boombox"),
+    "shading_shares_boombox": lambda: shading_shares("tradeoff_shading_boombox"),
+}
 for source in ("suzanne", "armadillo", "bunny"):
     for make in (sdf_errors, sdf_times):
         TABLES[f"{make.__name__}_{source}"] = lambda make=make, source=source: make(f"tradeoff_sdf_{source}")
