@@ -117,6 +117,25 @@ def image_pages() -> str:
     return table(["source", "one grid, the better of two", "what auto chooses"], rows)
 
 
+def image_seen() -> str:
+    """Return errors as seen of materials with equal weights, and with those that ``--weights auto`` chooses."""
+    rows = []
+    for source, weights in (("boombox", ""), ("tiles", ""), ("rust", "auto"), ("brick", "auto")):
+        equal = measured(f"fit_image_{source}_seen_equal")["measured"]
+        auto = measured(f"fit_image_{source}_seen_{weights}")["measured"] if weights else equal
+        ways = ("seen_glossy_near_db", "seen_glossy_far_db", "seen_rough_near_db", "seen_rough_far_db")
+        maps = [n for n in equal if n.startswith("psnr_") and n not in ("psnr_db", "psnr_mean_db", "psnr_between_db")]
+        worst = min(maps, key=lambda n: auto[n] - equal[n])
+        lost = f"{worst[5:-3]} {auto[worst] - equal[worst]:+.2f}" if weights else "weights are equal"
+        rows.append([
+            source, f"{equal['psnr_db']:.1f}", f"{equal['angle_normal_deg']:.2f}",
+            *(f"{equal[way]:.1f} / {auto[way]:.1f}" for way in ways), f"{equal['seen_db']:.1f} / {auto['seen_db']:.1f}",
+            f"{100 * (equal['seen_brightness'] - 1):+.2f}%", lost,
+        ])  # fmt: skip
+    head = ["source", "PSNR of maps", "normals, °", "glossy near", "glossy far", "rough near", "rough far", "all"]
+    return table([*head, "brightness", "auto: the map that loses most"], rows)
+
+
 def image_bytes() -> str:
     """Sizes of the sources: raw, as the PNG files of the repository, and compressed."""
     assets, rows = DOCS.parent / "scenes" / "assets", []
@@ -416,6 +435,7 @@ TABLES = {
         comparisons,
         image_bytes,
         image_pages,
+        image_seen,
         material_times,
         texture_memory,
         texture_presets,

@@ -9,14 +9,14 @@ random numbers: the mean product of both differences is the squared error withou
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
 
 import numpy as np
 
 from .. import metrics, srgb
 from .compressed import CompressedMaps, decibel
-from .source import Source
+from .source import Map, Source
 
 #: Share of the way from the roughness of the map to 1, by the name of a surface.
 SURFACES = {"glossy": 0.0, "rough": 0.5}
@@ -30,14 +30,17 @@ EXPOSURE = 1.2
 #: Names of the four pictures.
 WAYS = tuple(f"{surface}_{distance}" for surface in SURFACES for distance in DISTANCES)
 
+#: Names of those from near, which take less time.
+NEAR = tuple(way for way in WAYS if way.endswith("near"))
+
 #: Columns and rows of a picture.
 SIZE = (192, 144)
 
 #: Values of maps that a material lacks, by role.
 DEFAULTS = {"albedo": (0.5, 0.5, 0.5), "normal": (0.5, 0.5, 1.0), "roughness": (0.4,), "metallic": (0.0,)}
 
-#: Error of a channel by which sensitivities are measured.
-NOISE = 0.01
+#: Error of a channel by which sensitivities are measured, and the samples of their renders.
+NOISE, FEW = 0.01, 4
 
 _references: dict[tuple, dict[str, np.ndarray]] = {}  # pictures of the latest source
 
@@ -47,62 +50,67 @@ def shows(source: Source) -> bool:
     return not {"normal", "roughness"}.isdisjoint(_roles(source))
 
 
-def measure(source: Source, image: CompressedMaps) -> dict[str, float]:
-    """Return errors of the decoded maps of ``image`` against those of the ``source``, in degrees and in pictures.
+def measure(source: Source, image: CompressedMaps, ways: Sequence[str] = WAYS) -> dict[str, float]:
+    """Return errors of the decoded maps of ``image`` against those of the ``source``, as :func:`compare` does."""
+    names = [m.name for m in (*_normals(source), *(_roles(source).values() if shows(source) else ()))]
+    decoded = image.decode(tuple(dict.fromkeys(names))) if names else {}
+    return compare(source, decoded, image.types, ways)
+
+
+def compare(
+    source: Source, decoded: Mapping[str, np.ndarray], types: ModuleType | None, ways: Sequence[str] = WAYS
+) -> dict[str, float]:
+    """Return errors of ``decoded`` maps, by name, against those of the ``source``, in degrees and in pictures.
 
     - ``angle_MAP_deg``: the mean angle between normals, in degrees.
-    - ``seen_WAY_db``: the PSNR of each of :data:`WAYS`, of linear values clipped to [0, 1]; ``seen_db``: that of all.
+    - ``seen_WAY_db``: the PSNR of each of ``ways``, of linear values clipped to [0, 1]; ``seen_db``: that of all.
     - ``seen_brightness``: the mean of a picture relative to the source's, where it differs most.
 
-    There are no pictures unless :func:`shows`, nor of maps of one colour each.
+    There are no pictures unless :func:`shows`, nor if ``types``, the module of Dr.Jit types whose device renders, is
+    ``None``, as it is for maps of one colour each.
     """
-    normals = [m for m in source.maps if m.role == "normal" and m.channels == 3]
-    names = {m.name for m in (*normals, *_roles(source).values())}
-    if not (normals or shows(source)):
-        return {}
-    decoded = image.decode([m.name for m in source.maps if m.name in names])
-    angles = {f"angle_{m.name}_deg": metrics.angle(m.values, decoded[m.name]) for m in normals}
-    if image.types is None or not shows(source):
+    angles = {f"angle_{m.name}_deg": metrics.angle(m.values, decoded[m.name]) for m in _normals(source)}
+    if types is None or not shows(source):
         return angles
-    references, pictures = reference(source, image.types), render(by_role(source, decoded), image.types)
-    squares = {way: squared_error(references[way], pictures[way]) for way in WAYS}
-    ratios = [float(pictures[way].mean() / references[way].mean()) for way in WAYS]
+    references = reference(source, types, ways)
+    pictures = render(by_role(source, decoded), types, ways)
+    squares = {way: squared_error(references[way], pictures[way]) for way in ways}
+    ratios = [float(pictures[way].mean() / references[way].mean()) for way in ways]
     return {
         **angles,
-        "seen_db": decibel(sum(squares.values()) / len(WAYS)),
+        "seen_db": decibel(sum(squares.values()) / len(squares)),
         **{f"seen_{way}_db": decibel(square) for way, square in squares.items()},
         "seen_brightness": max(ratios, key=lambda ratio: abs(ratio - 1)),
     }
 
 
-def reference(source: Source, types: ModuleType) -> dict[str, np.ndarray]:
-    """Return the pictures of the maps of a source; those of the latest source are kept.
+def reference(source: Source, types: ModuleType, ways: Sequence[str] = WAYS) -> dict[str, np.ndarray]:
+    """Return the pictures of the maps of a source; the latest ones are kept.
 
     ``types`` is the module of Dr.Jit types whose device renders.
     """
-    key = (source.digest, types.__name__)
+    key = (source.digest, types.__name__, tuple(ways))
     if key not in _references:
         _references.clear()
-        _references[key] = render(by_role(source, {m.name: m.values for m in source.maps}), types)
+        _references[key] = render(by_role(source, {m.name: m.values for m in source.maps}), types, ways)
     return _references[key]
 
 
 def sensitivities(source: Source, types: ModuleType) -> dict[str, float]:
     """Return the squared error of pictures that a squared error of 1 in a channel would cause, by the name of a map.
 
-    A little noise (:data:`NOISE`) is added to one map after the other, and the glossy and the rough picture from near
-    are compared with those of the source. A map that is not shown has 0.
+    A little noise (:data:`NOISE`) is added to one map after the other, and pictures from near, of few samples, are
+    compared with those of the source. A map that is not shown has 0.
     """
-    ways = [way for way in WAYS if way.endswith("near")]
     truth = by_role(source, {m.name: m.values for m in source.maps})
     rng = np.random.default_rng(2023)
     squares = dict.fromkeys((m.name for m in source.maps), 0.0)
-    references = render(truth, types, ways)
+    references = render(truth, types, NEAR, FEW)
     for role, m in _roles(source).items():
         change = NOISE * rng.choice(np.float32([-1, 1]), m.values.shape)
         noisy = by_role(source, {other.name: other.values for other in source.maps} | {m.name: m.values + change})
-        pictures = render({**truth, role: noisy[role]}, types, ways)
-        errors = [squared_error(references[way], pictures[way]) for way in ways]
+        pictures = render({**truth, role: noisy[role]}, types, NEAR, FEW)
+        errors = [squared_error(references[way], pictures[way]) for way in NEAR]
         squares[m.name] = float(np.mean(errors)) / (NOISE**2 * m.channels)
     return squares
 
@@ -118,7 +126,12 @@ def by_role(source: Source, maps: Mapping[str, np.ndarray]) -> dict[str, np.ndar
     return shown
 
 
-def _roles(source: Source) -> dict:
+def _normals(source: Source) -> list[Map]:
+    """Return the maps of normals of three channels."""
+    return [m for m in source.maps if m.role == "normal" and m.channels == 3]
+
+
+def _roles(source: Source) -> dict[str, Map]:
     """Return the first map of each role in :data:`DEFAULTS` that has its channels, or one channel."""
     shown = {}
     for m in source.maps:
@@ -128,18 +141,25 @@ def _roles(source: Source) -> dict:
     return shown
 
 
-def render(maps: Mapping[str, np.ndarray], types: ModuleType, ways=WAYS) -> dict[str, np.ndarray]:
-    """Return the pictures of maps by role (:func:`by_role`): two renders each, ``(2, rows, columns, 3)``, linear."""
+def render(
+    maps: Mapping[str, np.ndarray], types: ModuleType, ways: Sequence[str] = WAYS, spp: int = 0
+) -> dict[str, np.ndarray]:
+    """Return the pictures of maps by role (:func:`by_role`): two renders each, ``(2, rows, columns, 3)``, linear.
+
+    ``spp`` are the samples a pixel, by default those of the distance.
+    """
     import mitsuba as mi
 
     pictures = {}
     with _variant(types):
         for distance, (side, patch, samples) in DISTANCES.items():
+            if not any(way.endswith(distance) for way in ways):
+                continue
             patches = {role: patchwork(values, side, patch) for role, values in maps.items()}
             for surface, share in SURFACES.items():
                 if f"{surface}_{distance}" in ways:
                     scene = mi.load_dict(_scene(patches, share))
-                    renders = [mi.render(scene, spp=samples, seed=seed).numpy() for seed in range(2)]
+                    renders = [mi.render(scene, spp=spp or samples, seed=seed).numpy() for seed in range(2)]
                     pictures[f"{surface}_{distance}"] = np.stack(renders)
                     del scene
     return pictures

@@ -11,6 +11,7 @@ MEASURES = (
     ("between texels", "psnr_between_db", ".2f", True),
     ("mean of maps", "psnr_mean_db", ".2f", True),
     ("FLIP", "flip", ".4f", False),
+    ("as seen", "seen_db", ".2f", True),
 )
 
 
@@ -18,7 +19,8 @@ def table(result: dict) -> list[str]:
     """Return a table of all contenders: bytes, seconds and errors."""
     maps = result["details"]["maps"]
     measured = {name: c for name, c in result["candidates"].items() if "psnr_db" in c["errors"]}
-    cells = [["", "bytes", "ratio", "seconds", "PSNR", "between", "mean", "FLIP", "SSIM", *(f"PSNR {n}" for n in maps)]]
+    cells = [["", "bytes", "ratio", "seconds", "PSNR", "between", "mean", "FLIP", "SSIM", "seen",
+              *(f"PSNR {n}" for n in maps)]]  # fmt: skip
     for name, c in sorted(
         measured.items(), key=lambda m: (m[1]["details"]["compression"] or 0, -m[1]["errors"]["psnr_db"])
     ):
@@ -28,7 +30,7 @@ def table(result: dict) -> list[str]:
             name + ("" if details["random_access"] else " (no random access)"), f"{c['bytes']:,}",
             f"{details['ratio']:.2f}x", f"{c['training_seconds'] or details['encoding_seconds']:.1f}",
             *(f"{e[key]:.2f}" for key in ("psnr_db", "psnr_between_db", "psnr_mean_db")), f"{e['flip']:.4f}",
-            "-" if e["ssim"] is None else f"{e['ssim']:.3f}",
+            "-" if e["ssim"] is None else f"{e['ssim']:.3f}", f"{e['seen_db']:.2f}" if "seen_db" in e else "-",
             *(f"{e[f'psnr_{n}_db']:.1f}{angles[n]}" for n in maps),
         ])  # fmt: skip
     return [source_line(result["details"]), *result["notes"][1:], "", *grid(cells, "")]
@@ -48,6 +50,7 @@ def conclusions(result: dict) -> list[str]:
             texts = [
                 f"{title} {a[k]:{form}} against {b[k]:{form}}: {'ours' if (a[k] > b[k]) == more else 'ASTC'}"
                 for title, k, form, more in MEASURES
+                if k in a and k in b
             ]
             lines.append(f"{compression:g}x, {best} and {block}: " + "; ".join(texts))
     return lines

@@ -7,6 +7,7 @@ each with its own schedule. *Time*: kernels read all maps of a material at rando
 ``neural_image`` and from ``bitmap`` with 8 bits and with floats.
 
 Errors are those of the values in the source's files; FLIP and SSIM are means over maps, each shown as a picture.
+Materials with normals or roughness are also compared as they are seen (:mod:`mi_diffind.maps.as_seen`).
 """
 
 from __future__ import annotations
@@ -22,9 +23,11 @@ import mitsuba as mi
 import numpy as np
 
 from ... import metrics
+from ...maps import as_seen
 from ...maps.compressed import decibel
 from ...maps.source import Source
 from ...measure.study import FLOOR, Candidate, Case, Plan
+from ...runtime import array_module
 from ...tasks.image.presets import IMPROVEMENTS
 from ..baselines import codecs
 from ..equal_memory import Contender, PresetContender, StudyContext
@@ -128,6 +131,8 @@ class ImageContender(Contender):
         source = self.context.source
         errors = errors_of(source, maps)
         errors["psnr_between_db"] = between(source, maps) if between_db is None else between_db
+        seen = as_seen.compare(source, maps, array_module())
+        errors |= {name: value for name, value in seen.items() if name.startswith("seen_")}
         details |= {"compression": self.budget or None, "ratio": source.nbytes / nbytes}
         details |= {"random_access": self.random_access, "kind": self.method}
         return {"bytes": nbytes, "seconds": seconds, "errors": errors, "details": details}

@@ -49,9 +49,8 @@ class Image(Task):
             "--cascaded", type=positive, metavar="N", help="entries along each side of the cascaded array"
         ),
         Argument(
-            "--weights", type=checked(parse_weights), metavar="auto|equal|MAP=W,…",
-            help="weight of each map's errors: by what they do to a shaded picture (auto), equal, or numbers "
-            "(default: equal)",
+            "--weights", type=checked(parse_weights), metavar="equal|auto|MAP=W,…", default="equal",
+            help="weight of each map's errors: equal (default), by what they do to a shaded picture (auto), or numbers",
         ),
         *SOURCES,
     )  # fmt: skip

@@ -72,12 +72,13 @@ def fit(request: FitRequest) -> Fitted:
 
 def _weights(request: FitRequest, source: Source, recipe: ImageRecipe) -> dict[str, float]:
     """Return the weights of maps that differ from 1. Raises :class:`UsageError` for a map that the source lacks."""
-    given = request.options["weights"] or "equal"
+    given = request.options["weights"]
     given = parse_weights(given) if isinstance(given, str) else dict(given)
     if given == "equal":
         return {}
     if given == "auto":
-        return weights.measured(source, training.layout_of(source, recipe), request.types)
+        nbytes = source.nbytes / 12 if request.options["psnr"] else requested_bytes(request.options, source)
+        return weights.measured(source, recipe, nbytes, request.types)
     for name in given:
         if name not in (names := [m.name for m in source.maps]):
             raise UsageError(f'--weights: found the map "{name}", allowed are {", ".join(names)}')

@@ -7,6 +7,7 @@ import pytest
 
 import mi_diffind as md
 from mi_diffind.errors import UsageError
+from mi_diffind.maps import as_seen
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
 from mi_diffind.tasks.image import presets, search, training, weights
@@ -84,16 +85,43 @@ def test_a_file_names_its_weights(tmp_path):
 
 
 def test_measured_weights(monkeypatch):
-    """With ``auto``, a material is weighted by its pictures."""
-    from mi_diffind.maps import as_seen
-
+    """With ``auto`` a material is weighted by its pictures, where those of initial arrays gain by it."""
     rng, batch = np.random.default_rng(0), {"steps": 1, "batch": 64, "progress": False}
     maps = {name: rng.integers(100, 150, (16, 16, 3), np.uint8) for name in ("albedo", "normal")}
     monkeypatch.setattr(as_seen, "SIZE", (16, 12))
     monkeypatch.setattr(as_seen, "sensitivities", lambda source, types: {"albedo": 0.1, "normal": 0.2})
+    gains = {"": 30.0, "weighted": 30.6}
+    monkeypatch.setattr(weights, "_start_db", lambda *given: gains["weighted" if given[-1] else ""])
     fitted = md.fit("image", maps, weights="auto", **batch)
     expected = weights.balanced({"albedo": 0.1, "normal": 0.2}, {"albedo": 3, "normal": 3})
     assert fitted.table.settings["weights"] == expected
     assert fitted.table.measured["seen_db"] > 0 and fitted.table.measured["angle_normal_deg"] > 0
-    for other in ({"weights": "equal"}, {}):
-        assert "weights" not in md.fit("image", maps, **batch, **other).table.settings
+    assert "weights" not in md.fit("image", maps, **batch).table.settings
+    gains["weighted"] = 30.4
+    assert "weights" not in md.fit("image", maps, weights="auto", **batch).table.settings
+
+
+def test_initial_arrays_are_compared_as_seen(monkeypatch):
+    """Weights of a map are worth its pictures: a normal map that has no room beside another map as strong."""
+    monkeypatch.setattr(as_seen, "SIZE", (16, 12))
+    y, x = np.mgrid[0:32, 0:32] * np.pi / 16
+    tilted = np.dstack([0.5 + 0.3 * np.sin(x), 0.5 + 0 * x, 0.5 + 0 * x])
+    source = from_arrays({"normal": np.uint8(255 * tilted), "ao": np.uint8(127 + 80 * np.sin(y))})
+    recipe = dataclasses.replace(presets.PRESETS["ours"], structure="8 bits", dims=1)
+    given = source, recipe, 900, array_module("llvm")
+    equal, normal, ao = (weights._start_db(*given, w) for w in ({}, {"normal": 4.0}, {"ao": 4.0}))
+    assert normal > ao + 3 and normal >= equal - 0.1
+
+
+def test_what_is_flat_stays_flat():
+    """A channel of one value is that value, a derived normal has length 1, whatever else the file holds."""
+    y, x = np.mgrid[0:24, 0:24] / 24
+    tilt = np.dstack([0.4 * np.sin(6 * x), 0.4 * np.cos(9 * y)])
+    normal = np.dstack([tilt, np.sqrt(1 - (tilt**2).sum(axis=-1))])
+    maps = {"normal": np.float32(0.5 + 0.5 * normal), "metallic": np.full((24, 24), 77, np.uint8)}
+    maps["ao"] = np.uint8(np.dstack([255 * x, 200 + 0 * x]))
+    decoded = md.fit("image", maps, steps=2, batch=64, compression=4, progress=False).model.decode()
+    assert (decoded["metallic"] == np.float32(77 / 255)).all()
+    assert (decoded["ao"][..., 1] == np.float32(200 / 255)).all()
+    np.testing.assert_allclose(np.linalg.norm(2 * decoded["normal"] - 1, axis=-1), 1, atol=1e-5)
+    assert np.ptp(decoded["normal"][..., 0]) > 0.1
