@@ -120,9 +120,9 @@ def test_candidates_are_what_they_are_called(quick):
     for name in ("16→8", "24²", "16→8, log"):
         label, mark = name.split(",")[0], ", log" * ("log" in name)
         assert c[name]["bytes"] == 2 * c[f"{label} f16{mark}"]["bytes"] == 4 * c[f"{label} u8{mark}"]["bytes"]
-    # Reads: four corners in each of two arrays; all four in one word of bytes
+    # Reads: four corners in each of two arrays; all four in one word of bytes a channel
     assert plain["16→8"]["operations"]["gathers"] == 8 and plain["16→8"]["operations"]["bytes_gathered"] == 48
-    assert plain["16→8 u8"]["operations"]["gathers"] == 2 and plain["24² u8"]["operations"]["gathers"] == 1
+    assert plain["16→8 u8"]["operations"]["gathers"] == 3 and plain["24² u8"]["operations"]["gathers"] == 1
     assert plain["24²"]["operations"]["gathers"] == 4 and plain["formula"]["operations"]["gathers"] == 0
     network = plain["MLP 8x2"]["operations"]
     assert network == plain["MLP 8x2 tensor"]["operations"]
