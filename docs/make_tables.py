@@ -227,6 +227,21 @@ def texture_memory() -> str:
     return table([f"{memory['count']} textures of {memory['side']}²", "MiB", "times less"], rows)
 
 
+def texture_reads() -> str:
+    """Return the times of filtered reads, as multiples of those of bitmaps, before this version's reads and now."""
+    before, now = (measured(name)["reads"] for name in ("bench_texture_before", "bench_texture"))
+    head = ["table", "hits", "maps", "`off`", "`trilinear`", "`anisotropic`"]
+    rows = []
+    for old, new in zip(before, now, strict=True):
+        costs = [
+            f"{old['textures'][name]['ratio']:.2f} → **{new['textures'][name]['ratio']:.2f}**"
+            for name in new["textures"]
+            if name != "bitmap"
+        ]
+        rows.append([new["table"].removesuffix(".npz"), new["hits"], new["maps"], *costs])
+    return table(head, rows)
+
+
 def shading_curves(study: str) -> dict:
     """Return the results of the study of shading by material."""
     from mi_diffind.studies.shading.conclusions import curves
@@ -424,6 +439,7 @@ TABLES = {
         material_times,
         texture_memory,
         texture_presets,
+        texture_reads,
     )
 }
 for source in ("", "_boombox"):

@@ -205,6 +205,7 @@ def read_packed(
     inner, stride, per_texel = packed_layout(resolution, channels)
     axes = [_axis(v, n, b, inside) for v, n, b in zip(x, resolution, border, strict=True)]
     outer = len(resolution) - inner
+    # On the CPU, a packet takes as long as a gather of each of its words, those included that nothing needs
     packet = _packet(per_texel) if dr.backend_v(UInt32) == dr.JitBackend.CUDA else 1
     groups = per_texel // packet
 

@@ -148,8 +148,15 @@ def materials(number: int) -> dict[str, dict]:
     values = {"base_color": [0.6, 0.3, 0.2], "roughness": [0.4], "metallic": [0.5], "anisotropic": [0.3]}
     maps = {name: mi.load_dict(noise_texture(v, rng)) for name, v in values.items()}
     bsdfs = {name: mi.load_dict({"type": name, **maps}) for name in ("principled", "disney")}
-    lanes = 2**16
-    queries = bsdf_queries(bsdfs, directions(lanes), True)
+    lanes = 2**14
+    inputs, context = directions(lanes), mi.BSDFContext()
+    queries = bsdf_queries(bsdfs, inputs, True)
+
+    def together(bsdf):
+        value, pdf, bs, weight = bsdf.eval_pdf_sample(context, *inputs)
+        return [value, pdf, bs.wo, bs.pdf, weight]
+
+    queries["eval_pdf_sample"] = {name: lambda b=bsdf: together(b) for name, bsdf in bsdfs.items()}
     result = {}
     for query, functions in queries.items():
         costs = against(rounds({n: f for n, f in functions.items() if n != FLOOR}, number), "principled", lanes)
@@ -163,7 +170,7 @@ def materials(number: int) -> dict[str, dict]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--table", action="append", type=Path, metavar="FILE", help="texture to read (default: tiles)")
-    parser.add_argument("--rounds", type=int, default=31, help="rounds of each measurement (default: 31)")
+    parser.add_argument("--rounds", type=int, default=101, help="rounds of each measurement (default: 101)")
     parser.add_argument("--json", metavar="FILE", help="also write the numbers to this file")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--only", choices=("reads", "renders", "materials"))
