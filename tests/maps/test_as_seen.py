@@ -71,6 +71,13 @@ def test_maps_without_errors_give_no_difference():
     assert found["angle_normal_deg"] == 0
 
 
+def test_the_noise_of_renders_is_left_out():
+    """Noise of two renders that is 30 times as strong as a difference of 0.02, in squares, is none of the error."""
+    noise = 0.11 * np.random.default_rng(5).standard_normal((2, 300, 300, 3))
+    found = as_seen.squared_error(np.full(noise.shape, 0.5), 0.52 + noise)
+    assert found == pytest.approx(0.02**2, rel=0.25)
+
+
 def test_errors_are_seen_by_role():
     """Only maps that a picture shows change it; half of the base colour is half of the light, up to its reflections."""
     source = material()
