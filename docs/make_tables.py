@@ -100,7 +100,7 @@ def comparisons() -> str:
             rows.append([
                 f"`{Path(f['scene']).name}`", f"{f['against']}, {f['truth_spp']} samples", f"{f['psnr_db']:.1f}",
                 _decibel(f['psnr_without_noise_db']), f"{f['flip']:.4f}",
-                "not measurable" if uncertain or f["truth_spp"] != f["spp"] else f"{ratio['median']:.2f}",
+                "–" if f["truth_spp"] != f["spp"] else "not measurable" if uncertain else f"{ratio['median']:.2f}",
             ])  # fmt: skip
     columns = ["scene", "against", "PSNR, dB", "without noise", "FLIP", "time of a pass over that of the other"]
     return table(columns, rows)

@@ -97,7 +97,7 @@ def test_too_few_steps_are_unfinished(clock):
 
 @pytest.fixture
 def log(monkeypatch):
-    """What is written to a stderr that is no terminal."""
+    """Lines of a progress bar whose stderr is no terminal."""
     log = io.StringIO()
     monkeypatch.setattr(progress, "in_terminal", lambda: False)
     monkeypatch.setattr(progress, "sys", type("sys", (), {"stderr": log}))

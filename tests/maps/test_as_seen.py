@@ -63,19 +63,19 @@ def test_small_maps_are_shown_whole(height, width):
 
 def test_maps_without_errors_give_no_difference():
     source = material()
-    found = as_seen.measure(source, Decoded(values(source)))
-    assert {name for name in found if name.startswith("seen_")} == {
+    result = as_seen.measure(source, Decoded(values(source)))
+    assert {name for name in result if name.startswith("seen_")} == {
         "seen_db", "seen_brightness", *(f"seen_{way}_db" for way in as_seen.WAYS)
     }  # fmt: skip
-    assert found["seen_db"] == found["seen_rough_far_db"] == 120 and found["seen_brightness"] == 1
-    assert found["angle_normal_deg"] == 0
+    assert result["seen_db"] == result["seen_rough_far_db"] == 120 and result["seen_brightness"] == 1
+    assert result["angle_normal_deg"] == 0
 
 
 def test_the_noise_of_renders_is_left_out():
     """Noise of two renders that is 30 times as strong as a difference of 0.02, in squares, is none of the error."""
     noise = 0.11 * np.random.default_rng(5).standard_normal((2, 300, 300, 3))
-    found = as_seen.squared_error(np.full(noise.shape, 0.5), 0.52 + noise)
-    assert found == pytest.approx(0.02**2, rel=0.25)
+    result = as_seen.squared_error(np.full(noise.shape, 0.5), 0.52 + noise)
+    assert result == pytest.approx(0.02**2, rel=0.25)
 
 
 def test_errors_are_seen_by_role():
@@ -85,8 +85,8 @@ def test_errors_are_seen_by_role():
     occluded = as_seen.measure(source, Decoded({**maps, "ao": 0 * maps["ao"]}))
     assert occluded["seen_db"] == 120
     tilted = maps["normal"] + np.float32([0.05, 0, 0])
-    found = as_seen.measure(source, Decoded({**maps, "normal": tilted}))
-    assert 3 < found["angle_normal_deg"] < 8 and found["seen_db"] < 45
+    result = as_seen.measure(source, Decoded({**maps, "normal": tilted}))
+    assert 3 < result["angle_normal_deg"] < 8 and result["seen_db"] < 45
     dark = as_seen.measure(source, Decoded({**maps, "albedo": 0 * maps["albedo"]}))
     assert dark["seen_brightness"] < 0.8
 
@@ -100,11 +100,11 @@ def test_what_is_not_shown():
 def test_sensitivities_are_those_of_pictures():
     """They predict the error of another change of one map, to a factor; a flat metal has no rough colours to lose."""
     source = material()
-    found = as_seen.sensitivities(source, LLVM)
-    assert found["ao"] == 0 and list(found) == list(values(source))
+    result = as_seen.sensitivities(source, LLVM)
+    assert result["ao"] == 0 and list(result) == list(values(source))
     for name in ("albedo", "normal"):
         maps = values(source)
         sign = np.random.default_rng(7).choice(np.float32([-0.02, 0.02]), maps[name].shape)
         seen = as_seen.measure(source, Decoded({**maps, name: maps[name] + sign}))
         mse = np.mean([10 ** (-seen[f"seen_{surface}_near_db"] / 10) for surface in as_seen.SURFACES])
-        assert 0.5 < mse / (3 * 0.02**2 * found[name]) < 2
+        assert 0.5 < mse / (3 * 0.02**2 * result[name]) < 2

@@ -278,7 +278,7 @@ def test_gradients_are_those_of_differences(mi_rgb, files, rng):
 
 
 def test_what_the_file_rules_out_is_not_traced(mi_rgb, files):
-    """Of a constant map, as of a constant parameter, here and in ``disney`` with textures of the same file."""
+    """Lobes that a constant map rules out are not traced, here and in ``disney`` with textures of the same file."""
     mi, file = mi_rgb, files["plain"]
     ours = mi.load_dict({"type": "neural_material", "filename": file, "spec_tint": 0.5, "storage": "float32"})
     names = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}

@@ -7,8 +7,10 @@ import json
 import numpy as np
 import pytest
 
+import mi_diffind
 from mi_diffind import fitting
 from mi_diffind.cli import main
+from mi_diffind.errors import UsageError
 from mi_diffind.studies.shading import conclusions, materials
 
 
@@ -26,6 +28,11 @@ def test_generated_materials():
         assert ("metallic" in found) == (name == "hammered")
     assert materials.generated_source("lacquer", 64).digest == materials.generated_source("lacquer", 64).digest
     assert {m.name: m.values.mean() for m in materials.generated_source("lacquer", 64).maps}["roughness"] < 0.35
+
+
+def test_unknown_example():
+    with pytest.raises(UsageError, match='found the material "gold", allowed are hammered, weave, lacquer'):
+        mi_diffind.example_maps("gold")
 
 
 def test_noise_has_the_spectrum_that_was_asked_for(rng):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ...errors import UsageError
 from ...maps.source import Source, from_arrays
 
 #: Texels along each side.
@@ -101,12 +102,12 @@ def example_maps(name: str = "hammered", side: int = SIDE) -> dict[str, np.ndarr
     """Return the maps of one of :data:`MATERIALS`: name → ``(side, side, channels)`` or ``(side, side)``, bytes.
 
     Albedos are sRGB-encoded, normals are (n + 1)/2. Maps repeat. The same arguments give the same bytes. Raises
-    ``ValueError`` for another name.
+    :class:`~mi_diffind.errors.UsageError` for another name.
     """
     from ...srgb import for_display
 
     if name not in MATERIALS:
-        raise ValueError(f'found the example material "{name}", expected {", ".join(MATERIALS)}')
+        raise UsageError(f'name: found the material "{name}", allowed are {", ".join(MATERIALS)}')
     maps = {}
     for key, values in MATERIALS[name](side).items():
         values = for_display(values) if key == "albedo" else 0.5 + 0.5 * values if key == "normal" else values

@@ -81,9 +81,9 @@ def fit(request: FitRequest) -> Fitted:
         start, result = pretrained(source, pyramid, size, recipe, request)
     first = result
     if result is None or not result.interrupted:
-        shading_request = dataclasses.replace(request)
-        if shading_request.resume and not os.path.exists(shading_request.checkpoint or ""):
-            shading_request.resume = False  # the training as a texture was interrupted
+        # Without a checkpoint, the training as a texture was interrupted
+        resume = request.resume and os.path.exists(request.checkpoint or "")
+        shading_request = dataclasses.replace(request, resume=resume)
         preview = preview_path(request)
         try:
             net = training.start_of(start, pyramid)

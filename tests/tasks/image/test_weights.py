@@ -16,20 +16,20 @@ from mi_diffind.tasks.image.compressed import CompressedImage
 pytestmark = pytest.mark.usefixtures("few_samples")
 
 
-def decibels(found):
-    return {name: 20 * np.log10(weight) for name, weight in found.items()}
+def decibels(result):
+    return {name: 20 * np.log10(weight) for name, weight in result.items()}
 
 
 def test_weights_follow_sensitivities():
     """Between the least weights, squares of weights are proportional; decibels of all channels sum to 0."""
     channels = {"albedo": 3, "normal": 2, "ao": 1}
-    found = decibels(weights.balanced({"albedo": 0.11, "normal": 0.1, "ao": 0.0}, channels))
-    assert found["albedo"] - found["normal"] == pytest.approx(10 * np.log10(1.1), abs=0.1)
-    assert found["ao"] == pytest.approx(weights.OTHER_DB, abs=0.05)
-    assert sum(channels[name] * db for name, db in found.items()) == pytest.approx(0, abs=0.2)
-    found = decibels(weights.balanced({"albedo": 1e-4, "normal": 1.0, "ao": 0.0}, channels))
-    assert found["albedo"] == pytest.approx(weights.SHOWN_DB, abs=0.05)
-    assert found["normal"] == pytest.approx(-(3 * weights.SHOWN_DB + weights.OTHER_DB) / 2, abs=0.1)
+    result = decibels(weights.balanced({"albedo": 0.11, "normal": 0.1, "ao": 0.0}, channels))
+    assert result["albedo"] - result["normal"] == pytest.approx(10 * np.log10(1.1), abs=0.1)
+    assert result["ao"] == pytest.approx(weights.OTHER_DB, abs=0.05)
+    assert sum(channels[name] * db for name, db in result.items()) == pytest.approx(0, abs=0.2)
+    result = decibels(weights.balanced({"albedo": 1e-4, "normal": 1.0, "ao": 0.0}, channels))
+    assert result["albedo"] == pytest.approx(weights.SHOWN_DB, abs=0.05)
+    assert result["normal"] == pytest.approx(-(3 * weights.SHOWN_DB + weights.OTHER_DB) / 2, abs=0.1)
     assert weights.balanced({"albedo": 0.0, "ao": 0.0}, channels) == {}
 
 
