@@ -18,6 +18,7 @@ LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 #: Options with a positive number → help.
 _NUMBERS = {
     "--seeds": "number of seeds of each training (default: 3; --quick: 1)",
+    "--sweep-seeds": "number of seeds for weights other than 0 and the preset's (default: as --seeds)",
     "--seconds": "seconds of training for shading (default: 15; --quick: 1)",
     "--pretrain-seconds": "seconds of training as a texture before (default: 20; --quick: 1)",
     "--steps": "steps of training for shading in place of seconds, independent of the machine's speed; needs "
@@ -48,9 +49,11 @@ class ShadingStudy(Study):
             parser.add_argument(option, type=positive, metavar="N", help=text)
         parser.add_argument("--compression", default="12x", metavar="N",
                             help="compression ratio of all trainings (default: 12x)")  # fmt: skip
-        parser.add_argument("--remedies", choices=("all", "both", "on"), default="all",
-                            help="clipped derivatives and a falling rate: all four combinations, both or none, or both "
-                            "only (default: all)")  # fmt: skip
+        parser.add_argument("--preset", choices=("ours", "paper"), default="ours",
+                            help="recipe of the trainings (default: ours); the paper's has no validation")  # fmt: skip
+        parser.add_argument("--remedies", choices=("all", "both", "on", "clip"), default="all",
+                            help="clipped derivatives and a falling rate: all four combinations, both or none, both "
+                            "only, or clipped derivatives with either rate (default: all)")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check the options and load the materials; raise as :func:`.load_source` does."""
@@ -69,7 +72,8 @@ class ShadingStudy(Study):
         from .plan import REMEDIES, ShadingStudySettings, plan
 
         quick = arguments.quick
-        ways = {"all": REMEDIES, "both": (REMEDIES[0], REMEDIES[-1]), "on": REMEDIES[:1]}[arguments.remedies]
+        steps = {"all": slice(None), "both": slice(None, None, 3), "on": slice(1), "clip": slice(None, None, 2)}
+        ways = REMEDIES[steps[arguments.remedies]]
         settings = ShadingStudySettings(
             tuple(sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))})),
             ways[:: len(ways) - 1] if quick and len(ways) > 1 else ways,
@@ -80,6 +84,8 @@ class ShadingStudy(Study):
             arguments.frames or (4 if quick else 60),
             quick,
             "steps" if arguments.steps else "s",
+            arguments.sweep_seeds or arguments.seeds or 3,
+            arguments.preset,
         )
         return plan(arguments.loaded, settings)
 
