@@ -55,6 +55,10 @@ class ShadingStudy(Study):
                             help="clipped derivatives and a falling rate: all four combinations, both or none, both "
                             "only, or clipped derivatives with either rate (default: all)")  # fmt: skip
 
+        parser.add_argument("--renders", action="append", metavar="FILE.npz",
+                            help="measure whole renders of one MATERIAL.json instead, with a file that was trained on "
+                            "it; may be repeated")  # fmt: skip
+
     def check(self, arguments) -> None:
         """Check the options and load the materials; raise as :func:`.load_source` does."""
         from ...units import parse_compression
@@ -67,6 +71,22 @@ class ShadingStudy(Study):
         arguments.ratio = parse_compression(arguments.compression)
         arguments.loaded = materials_of(arguments.materials, arguments.side or (64 if arguments.quick else 512),
                                         arguments.quick)  # fmt: skip
+        if arguments.renders:
+            from ..texture.plan import tables_of
+
+            if len(arguments.loaded) != 1:
+                raise ValueError(f"--renders: found {len(arguments.loaded)} materials, one is needed")
+            arguments.tables = tables_of(arguments.renders, *arguments.loaded.values())
+
+    def run(self, arguments):
+        """Measure renders if ``--renders`` asks for them."""
+        if not arguments.renders:
+            return None
+        from .renders import RenderSettings, run
+
+        film = {"film": (96, 64), "rounds": 1, "truth": 1, "step_film": (32, 32), "quick": True}
+        ((name, source),) = arguments.loaded.items()
+        return run(name, source, arguments.tables, RenderSettings(**film if arguments.quick else {}), arguments.out)
 
     def plan(self, arguments) -> Plan:
         from .plan import REMEDIES, ShadingStudySettings, plan

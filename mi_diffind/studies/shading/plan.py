@@ -169,8 +169,9 @@ class ShadingStudyContext(StudyContext):
 
     def request(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.FitRequest:
         """Return the request for a training of a ``length``, with ``settings`` changed for it."""
-        settings, seconds = dataclasses.replace(settings, seed=seed, deterministic=False), length
-        if self.settings.unit == "steps":
+        in_steps = self.settings.unit == "steps"  # then repeatable, and on one core
+        settings, seconds = dataclasses.replace(settings, seed=seed, deterministic=in_steps), length
+        if in_steps:
             every = max(1, int(length) // 10)
             settings, seconds = dataclasses.replace(settings, steps=int(length), measure_every=every), None
         options = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
@@ -457,13 +458,15 @@ def _jobs(context: ShadingStudyContext) -> list[ShadingContender]:
         ("baked", baked, 0), *([] if settings.quick else [("baked, kernel", biased(baked), 0)]),
     ]  # fmt: skip
     roughness = {"Toksvig, compressed": lambda folder: normals.toksvig_levels(source, context.pyramid)}
-    if not settings.quick:
+    if settings.preset == "paper":  # its figure has no further filters
+        classical, roughness = classical[:1], {}
+    elif not settings.quick:
         roughness["baked, compressed"] = bake
     for label, build, channels in classical:
         jobs.append(
             ClassicalFilter("classical", 1, context, f"{name}, {label}", label=label, build=build, channels=channels)
         )
-    pyramids = {"filtered, compressed": lambda folder: context.pyramid}
+    pyramids = {"filtered, compressed": lambda folder: context.pyramid} if roughness else {}
     for label, levels in roughness.items():
         pyramid = lambda folder, levels=levels: normals.with_roughness(context.pyramid, levels(folder))  # noqa: E731
         pyramids[label] = pyramid
