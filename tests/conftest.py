@@ -15,9 +15,12 @@ if TARGET := os.environ.get("MI_DIFFIND_LLVM_TARGET"):
 
 
 def pytest_collection_modifyitems(items):
-    """Notebooks are long. Within a file, tests of one variant follow each other: a switch costs a tenth of a second."""
+    """
+    Notebooks and tests of a finished run of a study are long. Within a file, tests of one variant follow each other: a
+    switch costs a tenth of a second.
+    """
     for item in items:
-        if item.path.suffix == ".ipynb":
+        if item.path.suffix == ".ipynb" or "finished" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.long)
     files, order = {}, {name: i for i, name in enumerate(VARIANTS)}
 

@@ -15,7 +15,7 @@ ERRORS = ["mae_training", "mae_uniform", "psnr_db_training", "psnr_db_uniform"]
 
 
 @pytest.fixture(scope="module")
-def disney(tmp_path_factory):
+def finished(tmp_path_factory):
     """Folder and result of a smoke run."""
     folder = tmp_path_factory.mktemp("disney") / "out"
     found = folder.parent / "report.json"
@@ -24,9 +24,8 @@ def disney(tmp_path_factory):
     return folder, json.loads(found.read_text(encoding="utf-8"))
 
 
-@pytest.mark.long
-def test_quick_run_writes_what_it_promises(disney):
-    folder, found = disney
+def test_quick_run_writes_what_it_promises(finished):
+    folder, found = finished
     assert sorted(os.listdir(folder)) == [f"tradeoff_disney.{kind}" for kind in ("csv", "json", "png")]
     with open(folder / "tradeoff_disney.csv", encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
@@ -48,9 +47,9 @@ def test_quick_run_writes_what_it_promises(disney):
     assert (folder / "tradeoff_disney.png").stat().st_size > 50_000
 
 
-def test_candidates_are_what_they_are_called(disney):
+def test_candidates_are_what_they_are_called(finished):
     """Accuracies, reads and operations tell one from another: a wrong decoder or storage would show."""
-    _, found = disney
+    _, found = finished
     accuracy = {name: c["errors"].get("psnr_db_training") for name, c in found["candidates"].items()}
     assert accuracy["disney"] > 100
     single = [accuracy[f"only {factor} read"] for factor in ("masking", "coat")]
@@ -92,8 +91,8 @@ def test_textured_materials(mi_rgb):
     assert mi_rgb.load_dict({"type": "principled", **found}) is not None
 
 
-def test_conclusions(disney):
-    _, found = disney
+def test_conclusions(finished):
+    _, found = finished
     text = "\n".join(found["conclusions"])
     assert "exact, the paper's" in text and "bar, all lobes: principled / disney ≥ 2.5" in text
     assert "bar, all lobes: principled / tables, uint8 ≥ 0.952" in text

@@ -82,7 +82,7 @@ def test_operations_of_products(ad):
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
+def finished(tmp_path_factory):
     """Folder and result of a smoke run, of few steps."""
     import mitsuba as mi
 
@@ -92,9 +92,8 @@ def quick(tmp_path_factory):
     return folder, result
 
 
-@pytest.mark.long
-def test_quick_run_writes_what_it_promises(quick):
-    folder, report = quick
+def test_quick_run_writes_what_it_promises(finished):
+    folder, report = finished
     pictures = ["tradeoff_ggx.png", "tradeoff_ggx_training.png"]
     assert sorted(os.listdir(folder)) == sorted(
         [*pictures, "tradeoff_ggx.csv", "tradeoff_ggx.json", "tradeoff_ggx_models"]
@@ -113,8 +112,8 @@ def test_quick_run_writes_what_it_promises(quick):
     assert report["jobs"] and all(record["runs"] for record in report["jobs"].values())
 
 
-def test_candidates_are_what_they_are_called(quick):
-    _, report = quick
+def test_candidates_are_what_they_are_called(finished):
+    _, report = finished
     c, plain = report["candidates"], report["cases"][conclusions.PLAIN]["queries"]["read"]
     assert c["16→8"]["bytes"] == c["24²"]["bytes"] == 4 * conclusions.ENTRIES == 2304  # equal bytes
     for name in ("16→8", "24²", "16→8, log"):
@@ -133,8 +132,8 @@ def test_candidates_are_what_they_are_called(quick):
     assert set(report["cases"]["conductor, constant roughness"]["queries"]) == {"eval", "sample", "pdf"}
 
 
-def test_of_what_has_not_converged_nothing_is_claimed(quick):
-    _, report = quick
+def test_of_what_has_not_converged_nothing_is_claimed(finished):
+    _, report = finished
     assert not report["candidates"]["16→8"]["converged"]
     assert any("16→8 has not converged: no statement is made" in line for line in report["conclusions"])
     assert not any("wins" in line for line in report["conclusions"])
@@ -154,8 +153,8 @@ def equal_quality_lines(report, **changes):
     return {line[2:22].strip(): line for line in lines if line.startswith("  ")}, lines
 
 
-def test_equal_quality(quick):
-    _, report = quick
+def test_equal_quality(finished):
+    _, report = finished
     lines, everything = equal_quality_lines(
         report, **{"16→8": 40.0, "24²": 38.0, "48²": 45.0, "MLP 8x2": 20.0, "grid + MLP 16": "unconverged"}
     )

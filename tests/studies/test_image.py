@@ -47,8 +47,8 @@ def requested_seconds():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, requested_seconds):
-    """A material of three maps, and what a quick run leaves of it."""
+def material(tmp_path_factory):
+    """The folder of a material of three maps."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -58,15 +58,20 @@ def folder(tmp_path_factory, requested_seconds):
     for name, values in maps.items():
         mi.Bitmap(values).write(str(folder / f"{name}.png"))
     (folder / "m.json").write_text(json.dumps({name: f"{name}.png" for name in maps}))
-    command = ["tradeoff", "image", str(folder / "m.json"), "--quick", "--seconds", "3", "--dims", "4"]
-    assert main([*command, "--out", str(folder / "out"), "--json", str(folder / "r.json")]) == 0
-    assert requested_seconds == [3, 3]
     return folder
 
 
-@pytest.mark.long
-def test_what_is_written(folder):
-    result = json.loads((folder / "r.json").read_text())
+@pytest.fixture(scope="module")
+def finished(material, requested_seconds):
+    """The folder with the results of a quick run."""
+    command = ["tradeoff", "image", str(material / "m.json"), "--quick", "--seconds", "3", "--dims", "4"]
+    assert main([*command, "--out", str(material / "out"), "--json", str(material / "r.json")]) == 0
+    assert requested_seconds == [3, 3]
+    return material
+
+
+def test_what_is_written(finished):
+    result = json.loads((finished / "r.json").read_text())
     candidates = {name: c for name, c in result["candidates"].items() if not c["is_reference"]}
     trained = ["ours 12x 3 s", "paper 12x 3 s"]
     assert set(trained) <= set(candidates)
@@ -83,23 +88,23 @@ def test_what_is_written(folder):
         for t in result["cases"][place]["queries"]["read"].values():
             assert t["time"] >= 0.2 * t["floor"] > 0
     assert [c for c, found in result["cases"].items() if found["in_picture"]] == ["random places"]
-    with open(folder / "out" / "tradeoff_image.csv", encoding="utf-8") as stream:
+    with open(finished / "out" / "tradeoff_image.csv", encoding="utf-8") as stream:
         table = list(csv.DictReader(stream))
     assert {r["candidate"] for r in table} == set(result["candidates"])
     by_name = {r["candidate"]: r for r in table}
     assert by_name["paper 12x 3 s"]["case"] == "coherent places" and by_name["bicubic 12x"]["case"] == ""
     for name, c in candidates.items():
         assert float(by_name[name]["psnr_normal_db"]) == pytest.approx(c["errors"]["psnr_normal_db"], rel=1e-5)
-    assert (folder / "out" / "tradeoff_image.png").stat().st_size > 10_000
-    assert not list((folder / "out").glob("*.partial*"))
-    assert len(list((folder / "out" / "tradeoff_image_models").glob("*.npz"))) == 2
+    assert (finished / "out" / "tradeoff_image.png").stat().st_size > 10_000
+    assert not list((finished / "out").glob("*.partial*"))
+    assert len(list((finished / "out" / "tradeoff_image_models").glob("*.npz"))) == 2
 
 
-def test_panels(folder):
+def test_panels(finished):
     """Bytes, training, reads; codecs have bytes only."""
     from mi_diffind.measure.report import panels
 
-    found = panels(json.loads((folder / "r.json").read_text()))
+    found = panels(json.loads((finished / "r.json").read_text()))
     assert [p.title for p in found] == ["bytes", "training", "random places"]
     names = [{point.name for point in p.points} for p in found]
     assert names[1] == names[2] < names[0] and "bicubic 12x" in names[0] - names[1]
@@ -107,8 +112,8 @@ def test_panels(folder):
     assert {line.name.split(", below")[0] for line in found[2].lines} == {"bitmap, 8 bits", "bitmap, floats"}
 
 
-def test_what_is_installed_takes_part(folder):
-    result = json.loads((folder / "r.json").read_text())
+def test_what_is_installed_takes_part(finished):
+    result = json.loads((finished / "r.json").read_text())
     kinds = {c["details"].get("kind") for c in result["candidates"].values()}
     names = {"astc": "ASTC", "bc7": "BC7", "jpeg": "JPEG", "webp": "WebP", "bicubic": "bicubic"}
     assert {names[c] for c in codecs.available()} == kinds & set(names.values())
@@ -183,7 +188,7 @@ def test_verdicts():
     assert line.endswith("FLIP 0.0200 against 0.0100: ASTC")
 
 
-def test_a_run_goes_on(folder, tmp_path, capfd, monkeypatch):
+def test_a_run_goes_on(material, tmp_path, capfd, monkeypatch):
     """After Ctrl-C in the second training, the first is not trained again if its file exists."""
     import signal
 
@@ -195,7 +200,7 @@ def test_a_run_goes_on(folder, tmp_path, capfd, monkeypatch):
             signal.raise_signal(signal.SIGINT)
         return step(self, *args)
 
-    command = ["tradeoff", "image", str(folder / "albedo.png"), "--quick", "--seconds", "1", "--dims", "4"]
+    command = ["tradeoff", "image", str(material / "albedo.png"), "--quick", "--seconds", "1", "--dims", "4"]
     command += ["--out", str(tmp_path)]
     monkeypatch.setattr(codecs, "available", lambda: ())
     with monkeypatch.context() as m:
@@ -221,8 +226,8 @@ def test_a_run_goes_on(folder, tmp_path, capfd, monkeypatch):
         (["--seconds", "0"], "0"),
     ],
 )
-def test_bad_options(folder, tmp_path, options, message, capsys):
-    command = ["tradeoff", "image", str(folder / "albedo.png"), "--out", str(tmp_path / "out"), *options]
+def test_bad_options(material, tmp_path, options, message, capsys):
+    command = ["tradeoff", "image", str(material / "albedo.png"), "--out", str(tmp_path / "out"), *options]
     try:
         assert main(command) == 2
     except SystemExit as e:
@@ -230,7 +235,7 @@ def test_bad_options(folder, tmp_path, options, message, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_variants_without_plugins_are_refused(folder, capsys):
-    assert main(["tradeoff", "image", str(folder / "albedo.png"), "--variant", "scalar_rgb"]) == 2
+def test_variants_without_plugins_are_refused(material, capsys):
+    assert main(["tradeoff", "image", str(material / "albedo.png"), "--variant", "scalar_rgb"]) == 2
     assert "do not run" in capsys.readouterr().err
     assert dr.has_backend(dr.JitBackend.LLVM)

@@ -254,8 +254,8 @@ MADE = ("sparse", "ours")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """What a quick run leaves, and a capture of two balls."""
+def finished(tmp_path_factory):
+    """A capture of two balls, and the results of a quick run."""
     folder = tmp_path_factory.mktemp("field")
     captures.write(folder / "balls")
     with pytest.MonkeyPatch.context() as patch:
@@ -273,9 +273,8 @@ def command(folder, *more):
             "--variant", "llvm_ad_rgb", *more]  # fmt: skip
 
 
-@pytest.mark.long
-def test_what_is_written(folder):
-    result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
+def test_what_is_written(finished):
+    result = json.loads((finished / "r.json").read_text(encoding="utf-8"))
     made = {n: c for n, c in result["candidates"].items() if not c["is_reference"]}
     assert set(made) == {"sparse grid, 8 bits 60×", "ours 60×"}
     assert set(result["candidates"]) - set(made) == {"grid", "grid, trained on"}
@@ -289,19 +288,19 @@ def test_what_is_written(folder):
         assert 0.1 * d["dense_bytes"] / 60 < c["bytes"] <= 1.02 * d["dense_bytes"] / 60, name
     assert set(result["cases"]["reads"]["queries"]) == {"density", "both"}
     assert set(result["cases"]["reads"]["passes"]["render"]) == {"grid", *made}
-    out = folder / "out"
+    out = finished / "out"
     assert (out / "tradeoff_field_views.png").stat().st_size > 20_000
     assert len(list((out / "tradeoff_field_models").glob("*.npz"))) == 4
     assert result["conclusions"][0].startswith("60×: ours is ")
 
 
-def test_what_was_made_is_known(folder):
-    result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
+def test_what_was_made_is_known(finished):
+    result = json.loads((finished / "r.json").read_text(encoding="utf-8"))
     without = tuple(k for k in plans.KINDS if k not in MADE)
-    source = str(folder / "balls")
+    source = str(finished / "balls")
     plan = plans.plan(FieldSession.load(T, source), source, plans.RadianceStudySettings((60.0,), without))
     assert [job.name for job in plan.jobs] == list(result["jobs"])
-    models = folder / "out" / "tradeoff_field_models"
+    models = finished / "out" / "tradeoff_field_models"
     for job in plan.jobs:
         record = result["jobs"][job.name]
         assert job.cached_record(models, None) is None and job.cached_record(None, record) is None

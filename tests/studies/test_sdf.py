@@ -308,8 +308,8 @@ LEFT_OUT = [k for k in contenders.METHODS if k not in ("bricks4", "ours")]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """What a quick run leaves, and the mesh, a ball that is flat on top."""
+def finished(tmp_path_factory):
+    """The mesh, a ball that is flat on top, and the results of a quick run."""
     folder = tmp_path_factory.mktemp("sdf")
     vertices, faces = solids.sphere(16)
     vertices[:, 2] = np.minimum(vertices[:, 2], 0.64 + 0.2 * vertices[:, 2])
@@ -327,9 +327,8 @@ def command(folder, *more):
             "--out", str(folder / "out"), "--variant", "llvm_ad_rgb", *more]  # fmt: skip
 
 
-@pytest.mark.long
-def test_what_is_written(folder):
-    result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
+def test_what_is_written(finished):
+    result = json.loads((finished / "r.json").read_text(encoding="utf-8"))
     made = {n: c for n, c in result["candidates"].items() if not c["is_reference"]}
     assert set(made) == {"4³ bricks 24 KiB", "ours 24 KiB"}
     for name, c in made.items():
@@ -340,14 +339,14 @@ def test_what_is_written(folder):
     rays = result["cases"]["rays"]
     assert set(rays["queries"]["ray"]) == set(rays["passes"]["render"]) == {*made, "mesh (Embree)", "sdfgrid 32³"}
     assert set(result["cases"]["reads"]["queries"]) == {"value", "normal"}
-    out = folder / "out"
+    out = finished / "out"
     assert (out / "tradeoff_sdf_shapes.png").stat().st_size > 20_000
     assert len(list((out / "tradeoff_sdf_models").glob("*.npz"))) == 2
     assert result["conclusions"][0].startswith("24 KiB: ")
 
 
 @pytest.fixture(scope="module")
-def planned(folder):
+def planned(finished):
     """The plan for two budgets, the first of which is that of the folder's run, and its records of an earlier run."""
     import mitsuba as mi
 
@@ -355,14 +354,14 @@ def planned(folder):
 
     assert mi.variant() == "llvm_ad_rgb"
     settings, before = DistanceStudySettings((24576, 32768), tuple(LEFT_OUT)), {}
-    return plan_of(load_mesh(folder / "dent.ply"), str(folder / "dent.ply"), settings, before), before
+    return plan_of(load_mesh(finished / "dent.ply"), str(finished / "dent.ply"), settings, before), before
 
 
-def test_trained_models_are_cached(folder, planned):
-    result = json.loads((folder / "r.json").read_text(encoding="utf-8"))
+def test_trained_models_are_cached(finished, planned):
+    result = json.loads((finished / "r.json").read_text(encoding="utf-8"))
     jobs = planned[0].jobs[:2]
     assert [job.name for job in jobs] == list(result["jobs"])
-    models = folder / "out" / "tradeoff_sdf_models"
+    models = finished / "out" / "tradeoff_sdf_models"
     for job in jobs:
         record = result["jobs"][job.name]
         assert job.cached_record(models, None) is None and job.cached_record(None, record) is None
@@ -370,15 +369,15 @@ def test_trained_models_are_cached(folder, planned):
         assert (job.model.spacing, job.model.slope) == (record["details"]["spacing"], record["details"]["slope"])
 
 
-def test_fields_and_meshes_are_in_one_place(folder):
+def test_fields_and_meshes_are_in_one_place(finished):
     """The rays of fields, of the mesh and of the decoded grid meet surfaces in the same places."""
     import mitsuba as mi
 
     from mi_diffind.tasks.sdf.mesh import load_mesh
 
-    mesh = load_mesh(folder / "dent.ply")
+    mesh = load_mesh(finished / "dent.ply")
     view = MeshView(mesh, (64, 48))
-    model = volumes.load(next((folder / "out" / "tradeoff_sdf_models").glob("4*bricks*.npz")), T)
+    model = volumes.load(next((finished / "out" / "tradeoff_sdf_models").glob("4*bricks*.npz")), T)
     o, d = view.rays(mi)
     scenes = view.mesh_scene(), view.grid_scene(model, 48)  # what is not evaluated yet needs them
     expected = scene_distance(scenes[0], o, d).numpy()
@@ -423,9 +422,9 @@ def test_parts_are_jobs(tmp_path):
     assert not np.array_equal(*(job.model.state["numbers"] for job in plan.jobs[1:]))
 
 
-def test_errors_of_an_earlier_run(folder, planned):
+def test_errors_of_an_earlier_run(finished, planned):
     """They stand for contenders that are not timed; those that are timed are trained unless their files are there."""
-    jobs, before, models = planned[0].jobs, planned[1], folder / "out" / "tradeoff_sdf_models"
+    jobs, before, models = planned[0].jobs, planned[1], finished / "out" / "tradeoff_sdf_models"
     assert [job.cached_record(models, None) for job in jobs] == [None] * 4
     before |= {job.name: {"name": job.name} for job in jobs}
     assert [job.cached_record(models, None) for job in jobs] == list(before.values())
@@ -492,11 +491,11 @@ def test_bad_options(tmp_path, options, message, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_errors_of_another_mesh(folder, tmp_path, capsys):
+def test_errors_of_another_mesh(finished, tmp_path, capsys):
     solids.write(tmp_path / "ball.ply", solids.sphere(8))
-    assert main(["tradeoff", "sdf", str(tmp_path / "ball.ply"), "--errors-of", str(folder / "r.json")]) == 2
+    assert main(["tradeoff", "sdf", str(tmp_path / "ball.ply"), "--errors-of", str(finished / "r.json")]) == 2
     assert "is of another mesh than" in capsys.readouterr().err
-    assert main(["tradeoff", "sdf", str(folder / "dent.ply"), "--errors-of", str(folder / "r.json")]) == 2
+    assert main(["tradeoff", "sdf", str(finished / "dent.ply"), "--errors-of", str(finished / "r.json")]) == 2
     assert "is of a run with --quick" in capsys.readouterr().err
 
 

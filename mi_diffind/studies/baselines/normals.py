@@ -343,6 +343,17 @@ def toksvig_levels(source: Source, pyramid: Pyramid) -> list[np.ndarray]:
     return [toksvig_alpha2(a, r) ** 0.25 for a, r in zip(alpha2s, lengths, strict=True)]
 
 
+def lean_levels(source: Source, pyramid: Pyramid) -> list[np.ndarray]:
+    """Return the roughness of the isotropic lobe with the mean variance of :func:`lean`'s, ``(height, width)``."""
+    normals, levels = unit_normals(source), []
+    if normals is None:
+        return roughness_of(pyramid)
+    for bx, by, xx, yy, _, a2 in (np.moveaxis(m, -1, 0) for m in means(slope_moments(normals, roughness(source)))):
+        variance = np.maximum(xx - bx**2, 0) + np.maximum(yy - by**2, 0)
+        levels.append(np.clip(a2 + variance / (1 + bx**2 + by**2), 0, 1) ** 0.25)
+    return levels
+
+
 def roughness_of(pyramid: Pyramid) -> list[np.ndarray]:
     """Return the roughness of each level of a pyramid, ``(height, width)``."""
     m, levels = maps_of(pyramid.layout).get("roughness"), []

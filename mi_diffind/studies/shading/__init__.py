@@ -18,6 +18,7 @@ LAMBDAS = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 #: Options with a positive number → help.
 _NUMBERS = {
     "--seeds": "number of seeds of each training (default: 3; --quick: 1)",
+    "--sweep-seeds": "number of seeds for weights other than 0 and the preset's (default: as --seeds)",
     "--seconds": "seconds of training for shading (default: 15; --quick: 1)",
     "--pretrain-seconds": "seconds of training as a texture before (default: 20; --quick: 1)",
     "--steps": "steps of training for shading in place of seconds, independent of the machine's speed; needs "
@@ -48,9 +49,15 @@ class ShadingStudy(Study):
             parser.add_argument(option, type=positive, metavar="N", help=text)
         parser.add_argument("--compression", default="12x", metavar="N",
                             help="compression ratio of all trainings (default: 12x)")  # fmt: skip
-        parser.add_argument("--remedies", choices=("all", "both", "on"), default="all",
-                            help="clipped derivatives and a falling rate: all four combinations, both or none, or both "
-                            "only (default: all)")  # fmt: skip
+        parser.add_argument("--preset", choices=("ours", "paper"), default="ours",
+                            help="recipe of the trainings (default: ours); the paper's has no validation")  # fmt: skip
+        parser.add_argument("--remedies", choices=("all", "both", "on", "clip"), default="all",
+                            help="clipped derivatives and a falling rate: all four combinations, both or none, both "
+                            "only, or clipped derivatives with either rate (default: all)")  # fmt: skip
+
+        parser.add_argument("--renders", action="append", metavar="FILE.npz",
+                            help="measure whole renders of one MATERIAL.json instead, with a file that was trained on "
+                            "it; may be repeated")  # fmt: skip
 
     def check(self, arguments) -> None:
         """Check the options and load the materials; raise as :func:`.load_source` does."""
@@ -64,12 +71,29 @@ class ShadingStudy(Study):
         arguments.ratio = parse_compression(arguments.compression)
         arguments.loaded = materials_of(arguments.materials, arguments.side or (64 if arguments.quick else 512),
                                         arguments.quick)  # fmt: skip
+        if arguments.renders:
+            from ..texture.plan import tables_of
+
+            if len(arguments.loaded) != 1:
+                raise ValueError(f"--renders: found {len(arguments.loaded)} materials, one is needed")
+            arguments.tables = tables_of(arguments.renders, *arguments.loaded.values())
+
+    def run(self, arguments):
+        """Measure renders if ``--renders`` asks for them."""
+        if not arguments.renders:
+            return None
+        from .renders import RenderSettings, run
+
+        film = {"film": (96, 64), "rounds": 1, "truth": 1, "step_film": (32, 32), "quick": True}
+        ((name, source),) = arguments.loaded.items()
+        return run(name, source, arguments.tables, RenderSettings(**film if arguments.quick else {}), arguments.out)
 
     def plan(self, arguments) -> Plan:
         from .plan import REMEDIES, ShadingStudySettings, plan
 
         quick = arguments.quick
-        ways = {"all": REMEDIES, "both": (REMEDIES[0], REMEDIES[-1]), "on": REMEDIES[:1]}[arguments.remedies]
+        steps = {"all": slice(None), "both": slice(None, None, 3), "on": slice(1), "clip": slice(None, None, 2)}
+        ways = REMEDIES[steps[arguments.remedies]]
         settings = ShadingStudySettings(
             tuple(sorted({0.0, *(arguments.lambdas or ((0.9,) if quick else LAMBDAS))})),
             ways[:: len(ways) - 1] if quick and len(ways) > 1 else ways,
@@ -80,6 +104,8 @@ class ShadingStudy(Study):
             arguments.frames or (4 if quick else 60),
             quick,
             "steps" if arguments.steps else "s",
+            arguments.sweep_seeds or arguments.seeds or 3,
+            arguments.preset,
         )
         return plan(arguments.loaded, settings)
 

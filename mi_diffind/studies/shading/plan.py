@@ -5,8 +5,9 @@ weights λ of the shading loss; λ = 0 continues task 4. Two remedies against in
 clipped derivatives through the specular lobe, and a falling learning rate. All runs are repeated for several seeds.
 
 Classical filters of normals (:mod:`..baselines.normals`) are measured uncompressed; those that an ordinary texture can
-hold, Toksvig's and baked roughness, also compressed as λ = 0 is, in as much time. The *kernel* control reads at other
-levels of detail, those with the smallest error; λ = 0 is read in this way, too.
+hold, Toksvig's and baked roughness, also compressed as λ = 0 is, in as much time, and by ASTC in equal bytes. LEAN's
+moments have no limits, which encoders of bytes need. The *kernel* control reads at other levels of detail, those with
+the smallest error; compressed textures are read in this way, too.
 
 *Errors* are those of :class:`~mi_diffind.tasks.shading.evaluation.ShadedEvaluation`: PSNR of shaded values and FLIP,
 under views and lights of no training, against C, the converged truth, and P, the paper's reference. *Flicker*:
@@ -43,13 +44,14 @@ from ...tables import Table, save_table
 from ...tasks.shading import presets
 from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader
 from ...tasks.shading.material import effects_of, frozen_decoder
-from ...tasks.shading.training import fit_shading, start_of
+from ...tasks.shading.training import ShadingProblem, fit_shading, start_of
 from ...tasks.texture import presets as texture_presets
 from ...tasks.texture import training as textures
 from ...tasks.texture.compressed import CompressedTexture
 from ...tasks.texture.fit import size_of
-from ..baselines import normals
+from ..baselines import codecs, normals
 from ..equal_memory import Contender, StudyContext, load_arrays
+from ..texture import levels as texture_levels
 from . import pictures
 from .conclusions import conclusions, table
 from .materials import MATERIALS, generated_source
@@ -85,7 +87,9 @@ REMEDIES = (Remedies(True, True), Remedies(False, True), Remedies(True, False), 
 class ShadingStudySettings:
     """Settings of the shading study.
 
-    ``lambdas`` are the weights λ, 0 among them, ``ways`` the combinations of remedies, ``seeds`` the number of seeds.
+    ``lambdas`` are the weights λ, 0 among them, ``ways`` the combinations of remedies, ``seeds`` the number of seeds,
+    ``sweep_seeds`` that of weights other than 0 and the preset's. ``preset`` is the recipe: the paper's has neither
+    validation nor level bias, and ends in its last state.
     ``length`` is that of the training for shading, ``pretraining`` that of the training as a texture before it, in the
     ``unit`` ``"s"`` or ``"steps"``. ``frames`` is the length of the zoom; ``quick`` makes it a smoke run.
     """
@@ -99,6 +103,12 @@ class ShadingStudySettings:
     frames: int = 60
     quick: bool = False
     unit: str = "s"
+    sweep_seeds: int = 3
+    preset: str = "ours"
+
+    @property
+    def recipe(self) -> presets.ShadingRecipe:
+        return presets.PRESETS[self.preset]
 
 
 def materials_of(names: Sequence[str], side: int, quick: bool = False) -> dict[str, Source]:
@@ -130,7 +140,7 @@ class ShadingStudyContext(StudyContext):
 
     @cached_property
     def recipe(self):
-        return texture_presets.PRESETS["ours"]
+        return texture_presets.PRESETS[self.settings.recipe.texture]
 
     @cached_property
     def pyramid(self) -> Pyramid:
@@ -159,13 +169,15 @@ class ShadingStudyContext(StudyContext):
 
     def request(self, settings: FitSettings, length: float, seed: int, progress: bool) -> task.FitRequest:
         """Return the request for a training of a ``length``, with ``settings`` changed for it."""
-        settings, seconds = dataclasses.replace(settings, seed=seed, deterministic=False), length
-        if self.settings.unit == "steps":
+        in_steps = self.settings.unit == "steps"  # then repeatable, and on one core
+        settings, seconds = dataclasses.replace(settings, seed=seed, deterministic=in_steps), length
+        if in_steps:
             every = max(1, int(length) // 10)
             settings, seconds = dataclasses.replace(settings, steps=int(length), measure_every=every), None
         options = {argument.name: argument.default for argument in task.tasks()["texture"].arguments}
         options["compression"] = self.settings.compression
-        return task.FitRequest("ours", settings, self.types, seconds=seconds, progress=progress, options=options)
+        preset = self.settings.preset
+        return task.FitRequest(preset, settings, self.types, seconds=seconds, progress=progress, options=options)
 
     def fit_texture(self, pyramid: Pyramid, length: float, seed: int, progress: bool) -> tuple[Table, FitResult]:
         """Train a texture as task 4 does, on a pyramid in place of the source's."""
@@ -177,7 +189,7 @@ class ShadingStudyContext(StudyContext):
         result = request.train(problem, f"{self.name}: texture, seed {seed}")
         stored = CompressedTexture(pyramid.layout, textures.stored_form(problem.net))
         trained = textures.to_table(stored, {**request.recorded(), "source": self.source.digest, "steps": result.steps})
-        trained.preset, trained.seed = "ours", seed
+        trained.preset, trained.seed = self.settings.preset, seed
         return trained, result
 
 
@@ -215,6 +227,29 @@ class ClassicalFilter(ShadingContender):
     def run(self, folder: Path | None, progress: bool) -> dict:
         start, pyramid = time.perf_counter(), self.context.pyramid
         return self.measure(pyramid.nbytes + self.channels * sum(v[..., 0].size for v in pyramid.values), start)
+
+
+@dataclass
+class EncodedFilter(ShadingContender):
+    """A classical filter whose levels ASTC stores in the bytes of the trainings."""
+
+    has_file = False
+    pyramid: Callable[[Path | None], Pyramid] = lambda folder: None
+
+    @cached_property
+    def encoded(self) -> tuple[Pyramid, int]:
+        """The decoded levels, and their bytes."""
+        pyramid = self.pyramid(self.file.parent if self.file else None)
+        names = [m.name for m in pyramid.layout.maps if m.role == "normal"]
+        nbytes = int(self.context.source.nbytes / self.budget)
+        levels, nbytes = codecs.astc_levels(texture_levels.images(pyramid), nbytes, "thorough", names)
+        return texture_levels.pyramid_of({name: e.levels for name, e in levels.items()}, pyramid), nbytes
+
+    def load(self, path: Path | None) -> ShadedReader:
+        return normals.reader(self.encoded[0], self.context.effects)
+
+    def run(self, folder: Path | None, progress: bool) -> dict:
+        return self.measure(self.encoded[1], time.perf_counter())
 
 
 @dataclass
@@ -280,7 +315,7 @@ class ShadingRun(ShadingTraining):
     base: ShadingRun | None = None
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        begin, context, preset = time.perf_counter(), self.context, presets.PRESETS["ours"]
+        begin, context, preset = time.perf_counter(), self.context, self.context.settings.recipe
         schedule = "cosine" if self.remedies.schedule else "constant"
         settings = dataclasses.replace(preset.settings, schedule=schedule)
         request = context.request(settings, context.settings.length, self.seed, progress)
@@ -289,7 +324,8 @@ class ShadingRun(ShadingTraining):
         recipe = dataclasses.replace(preset, share=self.share, clip=clip, level_bias=bias, settings=request.settings)
         net = start_of(self.start.table, context.pyramid)
         try:
-            trained, result = fit_shading(context.source, net, recipe, request, context.pyramid, context.evaluation)
+            fit = fit_shading if preset.bounded else fit_to_the_end
+            trained, result = fit(context.source, net, recipe, request, context.pyramid, context.evaluation)
         except FittingError:  # diverged repeatedly: the result is the start
             trained, result = self.start.table, FitResult({}, 0, 0, 0.0, False, 0, [])
         details = {"share": self.share, "clip": self.remedies.clip, "schedule": self.remedies.schedule,
@@ -302,19 +338,28 @@ class ShadingRun(ShadingTraining):
         return record
 
 
+def fit_to_the_end(source, net, recipe, request, pyramid: Pyramid, evaluation: ShadedEvaluation) -> tuple:
+    """Train as the paper does, without validation; return the table of the last state and the run's record."""
+    problem = ShadingProblem(net, pyramid, recipe, source.digest, evaluation.another())
+    problem.tolerance = math.inf
+    result = request.train(problem, "shading")
+    stored = CompressedTexture(pyramid.layout, textures.stored_form(problem.net))
+    return textures.to_table(stored, {**request.recorded(), "source": source.digest}), result
+
+
 @dataclass
 class BiasedRun(ShadingContender):
-    """λ = 0 read at the levels of detail that suit the truth's kernel best; nothing is trained."""
+    """A compressed texture read at the levels of detail that suit the truth's kernel best; nothing is trained."""
 
     has_file = False
-    base: ShadingRun | None = None
+    base: ShadingContender | None = None
     biased: Callable = lambda build: build
 
     def load(self, path: Path | None) -> ShadedReader:
         return self.biased(lambda folder: self.base.model)(None)
 
     def run(self, folder: Path | None, progress: bool) -> dict:
-        return self.measure(self.base.table.nbytes, time.perf_counter())
+        return self.measure(self.base.record["bytes"], time.perf_counter())
 
 
 def troubles(details: dict, base: dict | None) -> list[str]:
@@ -361,8 +406,9 @@ def plan(sources: dict[str, Source], settings: ShadingStudySettings) -> Plan:
         accuracy_label="PSNR of shaded values against converged truth, mean of levels, dB",
         details={"sources": digests, "request": request, "evaluation": evaluation},
         notes=[
+            *codecs.install_notes(["astc"]),
             f"{sizes}; {settings.compression:g}x, {settings.pretraining:g} {settings.unit} of training as a texture, "
-            f"then {settings.length:g} {settings.unit} for shading; C: converged truth, P: the paper's reference."
+            f"then {settings.length:g} {settings.unit} for shading; C: converged truth, P: the paper's reference.",
         ],
         jobs=[job for context in contexts.values() for job in context.jobs.values()],
         jobs_fingerprint=f"{digests} {request}",
@@ -412,23 +458,41 @@ def _jobs(context: ShadingStudyContext) -> list[ShadingContender]:
         ("baked", baked, 0), *([] if settings.quick else [("baked, kernel", biased(baked), 0)]),
     ]  # fmt: skip
     roughness = {"Toksvig, compressed": lambda folder: normals.toksvig_levels(source, context.pyramid)}
-    if not settings.quick:
+    if settings.preset == "paper":  # its figure has no further filters
+        classical, roughness = classical[:1], {}
+    elif not settings.quick:
         roughness["baked, compressed"] = bake
     for label, build, channels in classical:
         jobs.append(
             ClassicalFilter("classical", 1, context, f"{name}, {label}", label=label, build=build, channels=channels)
         )
+    pyramids = {"filtered, compressed": lambda folder: context.pyramid} if roughness else {}
     for label, levels in roughness.items():
         pyramid = lambda folder, levels=levels: normals.with_roughness(context.pyramid, levels(folder))  # noqa: E731
+        pyramids[label] = pyramid
         jobs.append(
             CompressedFilter("compressed", settings.compression, context, f"{name}, {label}", label=label,
                              pyramid=pyramid)
         )  # fmt: skip
+    if "baked, compressed" in roughness:
+        label = "baked, kernel, compressed"
+        jobs.append(BiasedRun("compressed", settings.compression, context, f"{name}, {label}", label=label,
+                              base=jobs[-1], biased=biased))  # fmt: skip
+    for label, pyramid in pyramids.items() if "astc" in codecs.available() else ():
+        label = label.replace("compressed", "ASTC")
+        jobs.append(EncodedFilter("compressed", settings.compression, context, f"{name}, {label}", label=label,
+                                  pyramid=pyramid))  # fmt: skip
+        if not settings.quick and not label.startswith("Toksvig"):
+            label = label.replace("ASTC", "kernel, ASTC").removeprefix("filtered, ")
+            jobs.append(BiasedRun("compressed", settings.compression, context, f"{name}, {label}", label=label,
+                                  base=jobs[-1], biased=biased))  # fmt: skip
     for seed in range(settings.seeds):
         start = TextureStart("start", settings.compression, context, f"{name}, texture, seed {seed}", seed=seed)
         jobs.append(start)
         bases: dict[bool, ShadingRun] = {}
         for share in settings.lambdas:
+            if share not in (0.0, settings.recipe.share) and seed >= settings.sweep_seeds:
+                continue
             for way in settings.ways:
                 if share == 0 and way.schedule in bases:
                     continue  # without a shading loss, there is nothing to clip

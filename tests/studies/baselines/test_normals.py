@@ -89,6 +89,15 @@ def test_toksvig_of_gaussian_slopes(types, rng):
     assert normals.toksvig_alpha2(alpha**2, 0.5) > normals.toksvig_alpha2(alpha**2, 0.9) > alpha**2
 
 
+def test_isotropic_lobe_of_slopes(types, rng):
+    """The roughness that is left, and α² plus twice the mean variance of slopes."""
+    slopes = 0.1 * rng.standard_normal((SIDE, SIDE, 2)) * [1, 0]
+    pyramid, _ = prepared(material(slopes), types)
+    levels = normals.lean_levels(material(slopes), pyramid)
+    assert levels[0] == pytest.approx(0.4, abs=1e-4)
+    assert levels[-1] == pytest.approx((0.4**4 + slopes[..., 0].var()) ** 0.25, rel=1e-2)
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.5, -1.2])
 def test_lobe_of_slopes_along_one_direction(types, angle):
     """Slopes that vary along one direction make a lobe that is wide along it, and as it was across."""
