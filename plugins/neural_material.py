@@ -99,8 +99,8 @@ class NeuralMaterial(Disney):
     above the surface and above the turned horizon. A normal that faces away from the viewer is mirrored at the
     surface's normal. The AOV ``sh_normal`` is the surface's normal: Mitsuba 3.9 asks its own plugins alone for another.
 
-    **Extras**, which ``mi-diffind fit shading --extras auto`` may add to a file, shape the highlight where it is seen from
-    afar: α² of the specular lobe becomes a symmetric 2×2 matrix, and a weight from 0 to 1 multiplies its values.
+    **Extras**, which ``mi-diffind fit shading --extras auto`` may add to a file, shape the highlight at each level of
+    detail: α² of the specular lobe becomes a symmetric 2×2 matrix, and a weight from 0 to 1 multiplies its values.
     ``anisotropic`` is then not allowed. No other plugin reads them.
 
     **Opacity** lets rays pass straight on, as :monosp:`mask` does: component 3. **Emission is left out**: light of a
