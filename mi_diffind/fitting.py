@@ -78,6 +78,9 @@ class Problem:
     #: States whose first measured number differs by less than this count as equally good, and the later one is kept.
     tolerance: float = 0.0
 
+    #: Adam's decay of squared gradients. A rare, large gradient moves an entry by ``1 / √(1 − beta_2)`` learning rates.
+    beta_2: float = 0.999
+
     #: What the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
     identity: Mapping = {}
 
@@ -399,7 +402,7 @@ class _Trainer:
         self.problem, self.settings = problem, settings
         self.step, self.lr_scale, self.restarts, self.phase = 0, 1.0, 0, ""
         self.share = 0.0  # of the training that is over
-        self.optimizer = Adam(lr=settings.lr)
+        self.optimizer = Adam(lr=settings.lr, beta_2=problem.beta_2)
         self.optimizer.update(problem.net)
         self.module = compat.module_of(next(iter(self.optimizer.values())))
 

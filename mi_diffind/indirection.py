@@ -166,6 +166,18 @@ class DifferentiableArray(nn.Module):
         result.folded = False
         return result
 
+    def fixed(self, count: int | None = None) -> DifferentiableArray:
+        """Return a copy without gradients of the first ``count`` entries along the first axis (``None``: of all)."""
+        self._require_entries()
+        result, entries = self._like(), self.data.array
+        constant = dr.detach(entries)
+        if count is not None:
+            first = count * (len(entries) // self.resolution[0])
+            index = dr.arange(dr.uint32_array_t(type(entries)), len(entries))
+            constant = dr.select(index < first, constant, entries)
+        result.data = type(self.data)(constant, self.data.shape)
+        return result
+
     def rounded(self, bits: int) -> DifferentiableArray:
         """Return a copy whose entries in [0, 1], after the fold, are rounded as :meth:`quantised` stores them.
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -40,11 +41,26 @@ FALL, TOP = 0.7, 9
 #: Level biases that are tried, and the share of the steps, or of the time that is left, that each of them is trained.
 BIASES, TRIAL = (0.0, -0.5, -1.0), 0.08
 
+#: Level biases that are tried with the finest arrays as they are, if each of :data:`BIASES` loses at some level.
+FIXED_BIASES = (0.0, -0.25, -0.5)
+
 #: Loss of a level that is none, dB.
 ROUNDING = 1e-4
 
 #: Least time of such a trial, in measurements; in less time, the biases of the start itself are compared.
 SHORTEST = 4
+
+
+class Choice(NamedTuple):
+    """What short trainings decide: the level bias, whether there are extras, and whether fine levels are fixed."""
+
+    bias: float
+    extras: bool = False
+    fixed: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.bias:g}{', extras' * self.extras}{', fine levels fixed' * self.fixed}"
 
 
 class ShadingProblem(textures.TextureProblem):
@@ -58,6 +74,9 @@ class ShadingProblem(textures.TextureProblem):
 
     #: Tolerance of the PSNR of shaded images, dB.
     tolerance = 0.02
+
+    #: Highlights are rare: with 0.999, single ones tilt the normals of glossy, flat pages by degrees.
+    beta_2 = 0.99
 
     def __init__(
         self, net, pyramid: Pyramid, recipe: ShadingRecipe, digest: str = "",
@@ -75,6 +94,7 @@ class ShadingProblem(textures.TextureProblem):
 
     def loss(self, net, rng, size: int):
         net, share = self.seen(unfolded(net)), self.shading.share
+        net = net.fixed_fine() if self.shading.fixed else net
         losses = []
         if share < 1:
             inputs, targets = self.batch(rng, size)
@@ -165,7 +185,7 @@ def fit_shading(
     bias and state are chosen by other images, under views and lights that neither training nor evaluation draws. If no
     state gains without a loss at some level, the table holds the start, read with its own ``start_bias`` (setting
     ``kept_start``). The setting ``before`` has the errors of the start as shaded images, ``level_biases`` the gains by
-    which the bias was chosen (:func:`choose_bias`). ``preview`` is a picture that is written at each measurement.
+    which the bias was chosen (:func:`choose`). ``preview`` is a picture that is written at each measurement.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
     validation = None if evaluation is None else evaluation.another()
@@ -173,20 +193,20 @@ def fit_shading(
     texture = CompressedTexture(pyramid.layout, textures.stored_form(start), start_bias)
     base, before, stopped = [], {}, None
     choice, gains = recorded_choice(request)
-    choices = [(bias, False) for bias in (BIASES if recipe.level_bias is None else (recipe.level_bias,))]
-    if choice is None and len(choices) == 1 and not recipe.extras:
-        choice = choices[0]
+    biases = BIASES if recipe.level_bias is None else (recipe.level_bias,)
+    if choice is None and recipe.level_bias is not None and not recipe.extras:
+        choice = Choice(recipe.level_bias)
 
     def shaded_errors(texture: CompressedTexture) -> dict[str, float]:
         errors = evaluation.measure(reader(texture, effects, decoder), False)
         return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
 
-    def problem_of(bias: float, extras: bool) -> ShadingProblem:
+    def problem_of(choice: Choice) -> ShadingProblem:
         net = start.changed(lambda array, bits: array.copy())
-        if extras and net.extras is None:
+        if choice.extras and net.extras is None:
             layout = pyramid.layout
             net.extras = neutral_extras(layout.height, layout.width, net.border).alloc(pyramid.types.TensorXf)
-        changed = dataclasses.replace(recipe, level_bias=bias, extras=extras)
+        changed = dataclasses.replace(recipe, level_bias=choice.bias, extras=choice.extras, fixed=choice.fixed)
         return ShadingProblem(net, pyramid, changed, source.digest, validation, base)
 
     if evaluation is not None:
@@ -195,8 +215,8 @@ def fit_shading(
         before = begin(lambda: shaded_errors(texture))
         base = validation.measure(reader(texture, effects, decoder), False)["C"]["psnr_db"]
         if choice is None:
-            choice, gains, stopped = choose(problem_of, request, choices, recipe.extras)
-    problem, result = stopped or (problem_of(*(choice or choices[0])), None)
+            choice, gains, stopped = choose(problem_of, request, biases, recipe)
+    problem, result = stopped or (problem_of(choice or Choice(biases[0])), None)
     if result is None:
         problem.identity |= {"level_biases": gains} if gains else {}
         problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
@@ -218,30 +238,34 @@ def fit_shading(
 
 
 def choose(
-    problem_of: Callable[[float, bool], ShadingProblem], request: FitRequest, choices: list, extras: bool
+    problem_of: Callable[[Choice], ShadingProblem], request: FitRequest, biases: Sequence[float], recipe: ShadingRecipe
 ) -> tuple:
-    """Return the best of ``choices`` after a short training with each, the gains, and ``None``.
+    """Return the best :class:`Choice` after a short training with each, the gains, and ``None``.
 
-    A choice is a level bias, and whether there are extras. With ``extras``, the best choice is trained with them, too.
-    The best has the largest mean of levels among those that lose at no level, or among all if each loses somewhere. The
-    gains are ``gain_db`` by the text of a choice. If Ctrl-C ends a training, its problem and record are returned in
-    place of ``None``. If the time is too short (:data:`SHORTEST`), the untrained arrays are compared.
+    The best has the largest mean of levels among those that lose at no level, or among all if each loses somewhere. If
+    each of ``biases`` does, :data:`FIXED_BIASES` follow, with fixed fine levels; a recipe with a bias has its own. With
+    extras in the ``recipe``, the best so far is trained with them, too. The gains are ``gain_db`` by the name of a
+    choice. If Ctrl-C ends a training, its problem and record are returned in place of ``None``. If the time is too
+    short (:data:`SHORTEST`), the untrained arrays are compared.
     """
     measured, steps = {}, max(1, round(TRIAL * request.settings.steps))
     settings = dataclasses.replace(request.settings, steps=steps, measure_every=steps)
     seconds = None if request.seconds is None else TRIAL * request.seconds
     short = None
 
-    def name(choice: tuple[float, bool]) -> str:
-        return f"{choice[0]:g}{', extras' if choice[1] else ''}"
-
-    def best() -> tuple[float, bool]:
+    def best() -> Choice:
         return max(measured, key=lambda c: (measured[c]["gain_db"] >= 0, measured[c]["shaded_converged_db"]))
 
-    waiting = list(choices)
-    while waiting:
-        choice = waiting.pop(0)
-        problem = problem_of(*choice)
+    def choices() -> Iterator[Choice]:
+        yield from map(Choice, biases)
+        if measured[best()]["gain_db"] < 0 and TEXTURES[recipe.texture].layered:
+            fixed = FIXED_BIASES if recipe.level_bias is None else biases
+            yield from (Choice(bias, fixed=True) for bias in fixed)
+        if recipe.extras:
+            yield best()._replace(extras=True)
+
+    for choice in choices():
+        problem = problem_of(choice)
         measured[choice], measurement = duration(lambda problem=problem: problem.measure(problem.net))
         trial = dataclasses.replace(
             request.part(TRIAL), settings=settings, seconds=seconds, checkpoint=None, resume=False
@@ -249,18 +273,18 @@ def choose(
         limit = seconds if trial.deadline is None else trial.deadline.left()
         short = limit is not None and limit < SHORTEST * measurement if short is None else short
         if not short:
-            result = trial.train(problem, f"level bias {name(choice)}")
+            result = trial.train(problem, f"level bias {choice.name}")
             if result.interrupted:
                 return choice, {}, (problem, result)
             measured[choice] = result.measured
-        if extras and not waiting and not choice[1]:
-            waiting.append((best()[0], True))
-    return best(), {name(c): float(f"{m['gain_db']:.4g}") for c, m in measured.items()}, None
+    return best(), {c.name: float(f"{m['gain_db']:.4g}") for c, m in measured.items()}, None
 
 
-def recorded_choice(request: FitRequest) -> tuple[tuple[float, bool] | None, dict]:
-    """Return level bias and extras of the training that is resumed, or ``None``, and the gains of the choice."""
+def recorded_choice(request: FitRequest) -> tuple[Choice | None, dict]:
+    """Return the choice of the training that is resumed, or ``None``, and the gains that it was made by."""
     recorded = checkpoint_settings(request.checkpoint) if request.resume and request.checkpoint is not None else {}
     shading = recorded.get("shading", {})
-    choice = (shading["level_bias"], bool(shading.get("extras"))) if "level_bias" in shading else None
+    if "level_bias" not in shading:
+        return None, {}
+    choice = Choice(shading["level_bias"], *(bool(shading.get(name)) for name in ("extras", "fixed")))
     return choice, recorded.get("level_biases", {})
