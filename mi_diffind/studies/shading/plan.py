@@ -478,11 +478,11 @@ def _jobs(context: ShadingStudyContext) -> list[ShadingContender]:
         label = "baked, kernel, compressed"
         jobs.append(BiasedRun("compressed", settings.compression, context, f"{name}, {label}", label=label,
                               base=jobs[-1], biased=biased))  # fmt: skip
-    for label, pyramid in pyramids.items() if "astc" in codecs.available() else ():
+    for label, pyramid in pyramids.items() if "astc" in codecs.available() and not settings.quick else ():
         label = label.replace("compressed", "ASTC")
         jobs.append(EncodedFilter("compressed", settings.compression, context, f"{name}, {label}", label=label,
                                   pyramid=pyramid))  # fmt: skip
-        if not settings.quick and not label.startswith("Toksvig"):
+        if not label.startswith("Toksvig"):
             label = label.replace("ASTC", "kernel, ASTC").removeprefix("filtered, ")
             jobs.append(BiasedRun("compressed", settings.compression, context, f"{name}, {label}", label=label,
                                   base=jobs[-1], biased=biased))  # fmt: skip
