@@ -289,13 +289,14 @@ def shading_shares(*studies: str) -> str:
 
 
 def shading_renders() -> str:
-    """Return errors and times of whole renders, and bytes, of one sample a pixel unless the name says more."""
+    """Return errors and times of whole renders, bytes, and the time of a training step over that of the first row."""
     study = measured("tradeoff_shading_renders")
-    chosen = {name: (1,) for name in study["bytes"]} | {"principled + bitmaps": (1, 16, 64)}
+    chosen = {name: (1,) for name in study["bytes"] if name != "disney + mip maps"}
+    chosen |= {"principled + bitmaps": (1, 16), "principled + bitmaps, multijittered": (4, 16)}
     rows = []
     for points in zip(*(scene["points"] for scene in study["scenes"].values()), strict=True):
         name, spp = points[0]["name"], points[0]["spp"]
-        if spp in chosen[name]:
+        if spp in chosen.get(name, ()):
             cells = (f"{p['psnr_db']:.1f} / {p['cpu_ms']['median']:.0f}" for p in points)
             step = study["steps"].get(name)
             rows.append([f"{name}, {spp} spp", f"{study['bytes'][name]:,}", *cells,

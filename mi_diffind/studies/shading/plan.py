@@ -180,8 +180,8 @@ class ShadingStudyContext(StudyContext):
         return task.FitRequest(preset, settings, self.types, seconds=seconds, progress=progress, options=options)
 
     def fit_texture(self, pyramid: Pyramid, length: float, seed: int, progress: bool) -> tuple[Table, FitResult]:
-        """Train a texture as task 4 does, on a pyramid in place of the source's."""
-        request = self.request(self.recipe.settings, length, seed, progress)
+        """Train a texture at our rate, with which it converges soonest, on a pyramid in place of the source's."""
+        request = self.request(texture_presets.PRESETS["ours"].settings, length, seed, progress)
         recipe = dataclasses.replace(self.recipe, settings=request.settings)
         nbytes = self.source.nbytes / self.settings.compression
         size = size_of(self.source, pyramid, nbytes, recipe, request.options)
