@@ -464,7 +464,7 @@ for source in ("", "_boombox"):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
 TABLES |= {
     "shading_best": lambda: shading_best("tradeoff_shading", "tradeoff_shading_boombox"),
-    "shading_shares": lambda: shading_shares("tradeoff_shading", "tradeoff_shading_boombox"),
+    "shading_shares": lambda: shading_shares("tradeoff_shading_lambda"),
     "shading_shares_paper": lambda: shading_shares("tradeoff_shading_paper"),
     "shading_renders": shading_renders,
 }
