@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mi_diffind.tasks.disney import model, sampling
-from mi_diffind.tasks.disney.decoder import Decoder
+from mi_diffind.tasks.disney.decoder import Decoder, Lobe
 from mi_diffind.tasks.disney.effects import Effects, find_effects
 from mi_diffind.tasks.disney.model import LOBES
 
@@ -439,7 +439,7 @@ class Disney(mi.BSDF):
         with dr.suspend_grad():
             # The specular lobe is what remains: it is also what a context without any lobe "samples", with density 0
             p = sampling.lobe_probabilities(c, effects, wi.z, rates)
-            half, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, *c["ggx"]["alpha"], True).sample(wi, sample2)
+            half = _visible_normal(c["ggx"]["alpha"], wi, sample2)
             component = mi.UInt32(1)
             threshold = mi.Float(0)
             if "diffuse" in p:
@@ -483,6 +483,19 @@ class Disney(mi.BSDF):
         return f"{type(self).__name__}[\n  " + ",\n".join(lines).replace("\n", "\n  ") + "\n]"
 
 
+def _visible_normal(alpha: tuple, wi: mi.Vector3f, sample: mi.Point2f) -> mi.Normal3f:
+    """Return a visible normal of GGX: ``alpha`` has α along both axes, or the three of :func:`.decoder.sheared_ggx`.
+
+    The latter stretch a surface of α = 1, seen from a direction that is stretched likewise.
+    """
+    if len(alpha) == 2:
+        return mi.MicrofacetDistribution(mi.MicrofacetType.GGX, *alpha, True).sample(wi, sample)[0]
+    xx, yx, yy = alpha
+    wi = dr.normalize(mi.Vector3f(dr.fma(xx, wi.x, yx * wi.y), yy * wi.y, wi.z))
+    half, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, 1.0, 1.0, True).sample(wi, sample)
+    return dr.normalize(mi.Normal3f(xx * half.x, dr.fma(yx, half.x, yy * half.y), half.z))
+
+
 def _are_directions(wi, wo):
     """Return the lanes in which neither direction is NaN or much longer than 1."""
     return model.geometry(wi, wo).h2 < 100
@@ -516,8 +529,11 @@ class ShadedPoint:
 class Parameters:
     """Parameters of a material at a surface interaction: ``roughness``, …, ``specular``, ``albedo``, ``luminance``.
 
-    Each is read at its first use, so unused parameters are not read.
+    Each is read at its first use, so unused parameters are not read. ``lobe`` is the shape of the specular lobe
+    (:class:`.decoder.Lobe`), ``None`` if ``anisotropic`` shapes it.
     """
+
+    lobe: Lobe | None = None
 
     def __init__(self, bsdf: Disney, si: mi.SurfaceInteraction3f, active: mi.Bool):
         self._bsdf, self._si, self._active = bsdf, si, active

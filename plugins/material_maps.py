@@ -7,10 +7,13 @@ from collections.abc import Iterator
 import mitsuba as mi
 
 from mi_diffind.maps.layout import Layout, MapLayout
+from mi_diffind.tasks.disney.decoder import Lobe
 from mi_diffind.tasks.disney.model import PARAMETERS
+from mi_diffind.tasks.shading.material import lobe_of
 from mi_diffind.tasks.texture import TASK
 
 from .filtered_texture import FilteredTexture
+from .support.filtering import anisotropic, isotropic
 from .support.image_files import SharedMaps, open_compressed
 
 #: Role of a map → the parameter that it is of.
@@ -98,6 +101,20 @@ class MaterialMaps(FilteredTexture):
         """Return the channels of each map at a hit, linear, by parameter."""
         return self._by_parameter(iter(self._values(si)))
 
+    def lobe(self, si: mi.SurfaceInteraction3f) -> Lobe | None:
+        """Return the shape of the specular lobe at a hit, from the extras of the file; ``None`` without extras.
+
+        They are coarse: one place is read, whatever the filter.
+        """
+        if not self.image.has_extras:
+            return None
+        uv, level = self._uv(si), mi.Float(0)
+        if self.filter.name != "off":
+            ddx, ddy = self._footprint(si)
+            taps = self.filter.taps
+            level = isotropic(ddx, ddy) if self.filter.name == "trilinear" else anisotropic(ddx, ddy, taps)[0]
+        return lobe_of(self.image.extra(*self._wrapped_at(uv, self.image.biased(level)), level))
+
     def _by_parameter(self, values: Iterator) -> dict[str, list]:
         return {parameter: [next(values) for _ in range(m.channels)] for parameter, m in self.maps.items()}
 
@@ -145,5 +162,6 @@ class MaterialMaps(FilteredTexture):
             "map": ", ".join(m.name for m in self.maps.values()),
             "channels_read": sorted(needed),
             "channels_left_out": [i for i in range(layout.stored) if i not in needed],
+            "extras": self.image.has_extras,
             "effects_left_out": {**kept, **self.left_out},
         }

@@ -99,6 +99,10 @@ class NeuralMaterial(Disney):
     above the surface and above the turned horizon. A normal that faces away from the viewer is mirrored at the
     surface's normal. The AOV ``sh_normal`` is the surface's normal: Mitsuba 3.9 asks its own plugins alone for another.
 
+    **Extras**, which ``mi-diffind fit shading --extras auto`` may add to a file, shape the highlight at each level of
+    detail: α² of the specular lobe becomes a symmetric 2×2 matrix, and a weight from 0 to 1 multiplies its values.
+    ``anisotropic`` is then not allowed. No other plugin reads them.
+
     **Opacity** lets rays pass straight on, as :monosp:`mask` does: component 3. **Emission is left out**: light of a
     surface comes from an area emitter of its shape. Give the shape one, with a :monosp:`neural_texture` of the same
     file as its radiance.
@@ -160,12 +164,21 @@ class NeuralMaterial(Disney):
         self._upsampled = (
             mi.is_spectral and "base_color" in self.maps.maps and self.maps.maps["base_color"].channels == 3
         )
-        self._is_anisotropic |= "anisotropic" in self.maps.maps
+        extras = self.maps.image.has_extras
+        if extras and (self._is_anisotropic or "anisotropic" in self.maps.maps):
+            raise RuntimeError(
+                'parameter "anisotropic": found one above 0 or a map, but the extras of the file shape the highlight'
+            )
+        self._is_anisotropic |= extras or "anisotropic" in self.maps.maps
         sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
         self._set_flags(self.maps.is_spatially_varying(), self._is_anisotropic, sides)
         if "opacity" in self.maps.maps:
             self.m_components = [*self.m_components, mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
             self.m_flags = self.m_flags | self.m_components[NULL]
+
+    def _is_constant(self, group):
+        shaped = self.maps.image.has_extras and "anisotropic" in self.decoder.groups[group]
+        return not shaped and super()._is_constant(group)
 
     @property
     def net(self):
@@ -182,6 +195,7 @@ class NeuralMaterial(Disney):
 
     def _point(self, ctx, si, active):
         parameters, maps = Parameters(self, si, active), self.maps.read(si)
+        parameters.lobe = self.maps.lobe(si)
         normal, opacity = maps.pop("normal", None), maps.pop("opacity", None)
         for name, values in maps.items():
             if name == "base_color":
@@ -226,6 +240,7 @@ class NeuralMaterial(Disney):
         """Return the description of :meth:`.Disney.report`, with that of the maps (:meth:`.MaterialMaps.report`)."""
         lobes, maps = super().report(), self.maps.report()
         given = [name for name in ("normal", "opacity") if name in self.maps.maps]
+        given += ["extras"] if self.maps.image.has_extras else []
         missing = {name: "the file has no such map" for name in ("normal", "opacity") if name not in self.maps.maps}
         return {
             **maps,

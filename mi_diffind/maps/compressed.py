@@ -135,6 +135,10 @@ class FilteredMaps(CompressedMaps):
         """
         raise NotImplementedError
 
+    def extra(self, u, v, level, active=True) -> list | None:
+        """Return numbers beside the channels at a place and a footprint's level of detail, ``None`` without any."""
+        return None
+
     def biased(self, level):
         """Return the level of detail that is read for a footprint's ``level``, not limited to the existing levels."""
         return level + self.level_bias if self.level_bias else level

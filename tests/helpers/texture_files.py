@@ -8,11 +8,15 @@ from mi_diffind.runtime import array_module
 from mi_diffind.tables import save_table
 from mi_diffind.tasks.texture import memory_budget, training
 from mi_diffind.tasks.texture.compressed import CompressedTexture, to_table
+from mi_diffind.tasks.texture.nets import neutral_extras
 from mi_diffind.tasks.texture.presets import PRESETS
 
 
-def make(path, source, preset="ours", border="repeat", **settings):
-    """A file of arrays as a training starts with them, almost without loss; the paper's are random."""
+def make(path, source, preset="ours", border="repeat", extras=None, **settings):
+    """A file of arrays as a training starts with them, almost without loss; the paper's are random.
+
+    ``extras``: a function that returns entries from their shape.
+    """
     recipe, types = PRESETS[preset], array_module("llvm")
     pyramid = Pyramid.of(source, training.layout_of(source, recipe), types, (border, border))
     stored = pyramid.layout.stored
@@ -27,5 +31,8 @@ def make(path, source, preset="ours", border="repeat", **settings):
     if preset == "paper":
         for array in net.arrays.values():
             array.data = types.TensorXf(aligned(rng.random(array.data.shape)))
+    if extras is not None:
+        net.extras = neutral_extras(source.height, source.width, net.border).alloc(types.TensorXf)
+        net.extras.data = types.TensorXf(aligned(extras(net.extras.numpy().shape)))
     save_table(path, to_table(CompressedTexture(pyramid.layout, training.stored_form(net)), settings))
     return str(path)

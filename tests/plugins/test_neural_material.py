@@ -37,8 +37,18 @@ def bumps(strength):
     return 0.5 + 0.5 * np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], axis=-1)
 
 
-def stored(path, **maps):
-    return make(path, from_arrays({name: np.rint(255 * v).astype(np.uint8) for name, v in maps.items()}))
+def stored(path, extras=None, **maps):
+    maps = from_arrays({name: np.rint(255 * v).astype(np.uint8) for name, v in maps.items()})
+    return make(path, maps, extras=extras)
+
+
+def shapes(shape):
+    """Extras of all shapes, weights from 0.4 to 1."""
+    return np.random.default_rng(5).random(shape) * [1, 1, 0.6] + [0, 0, 0.4]
+
+
+def neutral(shape):
+    return np.broadcast_to([128 / 255, 128 / 255, 1.0], shape)
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +58,18 @@ def files(tmp_path_factory):
         "metal": stored(
             folder / "metal.npz", albedo=wave[..., :3], normal=bumps(1.2), roughness=wave[..., 3:4],
             metallic=wave[..., 4:5],
+        ),
+        "shaped": stored(
+            folder / "shaped.npz", shapes, albedo=wave[..., :3], normal=bumps(1.2), roughness=wave[..., 3:4],
+            metallic=wave[..., 4:5],
+        ),
+        "round": stored(
+            folder / "round.npz", neutral, albedo=wave[..., :3], normal=bumps(1.2), roughness=wave[..., 3:4],
+            metallic=wave[..., 4:5],
+        ),
+        "smooth": stored(
+            folder / "smooth.npz", lambda shape: np.rint(shapes(shape)), normal=bumps(1.9), roughness=constant(0),
+            albedo=constant(0, 0, 0),
         ),
         "leaf": stored(
             folder / "leaf.npz", base_color=wave[..., :3], normal=bumps(0.5), roughness=wave[..., 3:4],
@@ -176,7 +198,41 @@ def test_opacity_is_that_of_mask(mi_rgb, files, rng):
     assert opaque.component_count() == 3 and not mi.has_flag(opaque.flags(), mi.BSDFFlags.Null)
 
 
-@pytest.mark.parametrize("name", ["metal", "leaf"])
+@pytest.mark.parametrize("reading", [{}, {"filter": "off", "lobes": "tables"}])
+def test_neutral_extras_change_nothing(mi_rgb, files, rng, reading):
+    ours, theirs = (mi_rgb.load_dict({"type": "neural_material", "filename": files[name], **reading})
+                    for name in ("round", "metal"))  # fmt: skip
+    assert_equal(mi_rgb, rng, ours, theirs, False)
+
+
+def test_extras_shape_and_weigh_the_highlight(mi_rgb, files, rng):
+    """Against the matrix of the lobe in NumPy, at the level and the place of the footprint."""
+    mi, n = mi_rgb, 2000
+    bsdf = mi.load_dict({
+        "type": "neural_material", "filename": files["shaped"], "ignore": "albedo, normal", "base_color": 0.0,
+        "specular": 1.0, "filter": "trilinear",
+    })  # fmt: skip
+    si, wo = hits(mi, rng, n), directions(mi, rng, n)
+    ctx = mi.BSDFContext()
+    ctx.component = 1
+    values, maps = bsdf.eval(ctx, si, wo).numpy()[0], bsdf.maps.read(si)
+    roughness, metallic = (maps[name][0].numpy() for name in ("roughness", "metallic"))
+    lobe = bsdf.maps.lobe(si)
+    c, s, weight = (np.asarray(v.numpy()) for v in (lobe.c, lobe.s, lobe.weight))
+    assert np.hypot(c, s).max() > 0.8 and weight.min() < 0.6
+    a = np.maximum(roughness**2, 1e-3)[:, None, None] ** 2 * np.moveaxis([[1 + c, s], [s, 1 - c]], 2, 0)
+    wi, wo = si.wi.numpy().T, wo.numpy().T
+    h = (wi + wo) / np.linalg.norm(wi + wo, axis=1, keepdims=True)
+    slope = np.einsum("ni,nij,nj->n", h[:, :2], np.linalg.inv(a), h[:, :2])
+    d = 1 / (np.pi * np.sqrt(np.linalg.det(a)) * (slope + h[:, 2] ** 2) ** 2)
+    masked = [w[:, 2] + np.sqrt(w[:, 2] ** 2 + np.einsum("ni,nij,nj->n", w[:, :2], a, w[:, :2])) for w in (wi, wo)]
+    schlick = (1 - np.einsum("ni,ni->n", h, wi)) ** 5
+    f0 = 0.08 * (1 - metallic)
+    expected = weight * (f0 + (1 - f0) * schlick) * d * wo[:, 2] / (masked[0] * masked[1])
+    np.testing.assert_allclose(values, expected, rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["metal", "leaf", "shaped"])
 def test_chi2(mi_rgb, files, name, tmp_path, monkeypatch):
     """Samples follow the density, on both sides and beside the horizon of a turned frame."""
     from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
@@ -197,24 +253,25 @@ def test_chi2(mi_rgb, files, name, tmp_path, monkeypatch):
 def test_energy_and_reciprocity(mi_rgb, files, rng):
     """No weight exceeds the light on average; without a normal map, both directions may be exchanged."""
     mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 2**16
-    for name, more in (("metal", {}), ("steep", {"ignore": "albedo"}), ("leaf", {})):
+    for name, more in (("metal", {}), ("steep", {"ignore": "albedo"}), ("leaf", {}), ("shaped", {})):
         bsdf = mi.load_dict({"type": "neural_material", "filename": files[name], **more})
         for z in (0.1, 0.6, 1.0):
             si = hits(mi, rng, n)
             si.wi = mi.Vector3f((1 - z * z) ** 0.5, 0, z)
             _, weight = bsdf.sample(ctx, si, *samples(mi, rng, n))
             assert 0 < weight.numpy().mean(axis=1).max() < 1.01
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files["metal"], "ignore": "normal", "clearcoat": 0.5})
+    bsdf = mi.load_dict({"type": "neural_material", "filename": files["shaped"], "ignore": "normal", "clearcoat": 0.5})
     si, wo = hits(mi, rng, n), directions(mi, rng, n)
     forth = bsdf.eval(ctx, si, wo).numpy() * si.wi.z.numpy()
     wi, si.wi = mi.Vector3f(si.wi), wo
     np.testing.assert_allclose(bsdf.eval(ctx, si, wi).numpy() * wo.z.numpy(), forth, rtol=1e-3, atol=1e-6)
 
 
-def test_extremes_are_finite(mi_rgb, files, rng):
+@pytest.mark.parametrize("name", ["steep", "smooth"])
+def test_extremes_are_finite(mi_rgb, files, rng, name):
     """Roughness 0, black, steep normals, directions at both horizons and none at all: values and derivatives."""
     mi, n = mi_rgb, 50_000
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files["steep"], "storage": "float32", "clearcoat": 1.0})
+    bsdf = mi.load_dict({"type": "neural_material", "filename": files[name], "storage": "float32", "clearcoat": 1.0})
     z = rng.choice([0, 1e-38, 1e-20, 1e-8, 1e-4, 0.5, 1, -0.5, -1e-8], (2, n))
     phi = rng.choice([0, 1.0, np.pi, 2.0], (2, n))
     r = np.sqrt(1 - z * z)
@@ -245,12 +302,14 @@ def test_gradients_are_those_of_differences(mi_rgb, files, rng):
     """With respect to entries of the arrays, along a random direction, and to a constant."""
     mi, ctx, n = mi_rgb, mi_rgb.BSDFContext(), 20_000
     more = {"storage": "float32", "clearcoat": 0.5}
-    bsdf = mi.load_dict({"type": "neural_material", "filename": files["metal"], **more})
+    bsdf = mi.load_dict({"type": "neural_material", "filename": files["shaped"], **more})
     params, si, wo = mi.traverse(bsdf), hits(mi, rng, n), directions(mi, rng, n, lowest=0.6)
     si.wi = directions(mi, rng, n, lowest=0.6)  # off the horizons, across which values jump
     key = "maps.tables.cascaded"
+    extras = "maps.tables.extras"
     steps = {
         key: (mi.TensorXf(aligned(rng.random(params[key].shape))), 1e-3),
+        extras: (mi.TensorXf(aligned(rng.random(params[extras].shape))), 1e-3),
         "clearcoat.value": (mi.Float(1), 1e-2),
     }
 
@@ -260,7 +319,7 @@ def test_gradients_are_those_of_differences(mi_rgb, files, rng):
 
     for name, (direction, step) in steps.items():
         before = params[name] + 0
-        if name == key:
+        if name in (key, extras):
             before = 0.1 + 0.8 * before  # away from the ends of [0, 1], where entries are folded
         params[name] = before
         dr.enable_grad(params[name])
@@ -311,6 +370,12 @@ def test_report_and_text(mi_rgb, files):
     assert report["effects_left_out"]["ao"] == "the BRDF has no such parameter"
     assert {"normal", "opacity", "diffuse"} <= set(report["effects_in_use"]) and 7 in report["channels_left_out"]
     assert "filter = trilinear" in str(bsdf) and "lobes = tables" in str(bsdf)
+    shaped = mi_rgb.load_dict({"type": "neural_material", "filename": files["shaped"]})
+    assert shaped.report()["extras"] and "extras" in shaped.report()["effects_in_use"] and not report["extras"]
+    assert mi_rgb.has_flag(shaped.flags(1), mi_rgb.BSDFFlags.Anisotropic)
+    assert mi_diffind.inspect(files["shaped"]).figures["extras"] and "extras" in str(
+        mi_diffind.inspect(files["shaped"])
+    )
     assert mi_diffind.inspect(files["leaf"]).usage[-1].startswith('<bsdf type="neural_material">')
 
 
@@ -319,6 +384,7 @@ def test_report_and_text(mi_rgb, files):
     [
         ("other", {}, 'the map "height" is no parameter of the material, allowed are base_color, normal, roughness'),
         ("metal", {"roughness": 0.5}, 'parameter "roughness": given, but the file holds the map "roughness"'),
+        ("shaped", {"anisotropic": 0.5}, 'parameter "anisotropic": found one above 0 or a map, but the extras of the'),
         ("metal", {"ignore": "rough"}, 'parameter "ignore": found "rough", the file holds albedo, normal, roughness'),
         ("metal", {"ignore": "albedo,normal,roughness,metallic"}, "no map is left to read"),
         ("metal", {"sheen": {"type": "checkerboard"}}, 'parameter "sheen": found a texture, allowed are numbers'),

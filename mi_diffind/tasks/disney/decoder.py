@@ -11,6 +11,7 @@ Learned forms replace some of its methods by reads (:class:`.factored.FactoredDe
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -65,6 +66,8 @@ class Decoder:
 
     def _ggx(self, p, e: Effects) -> dict:
         """Return the coefficients of the specular lobe (:func:`ggx_coefficients`)."""
+        if p.lobe is not None:
+            return sheared_ggx(dr.maximum(dr.square(p.roughness), model.ALPHA_MIN), p.lobe)
         if not e.anisotropic:
             return ggx_coefficients(dr.maximum(dr.square(p.roughness), model.ALPHA_MIN))
         return ggx_coefficients(*model.roughness_to_alpha(p.roughness, p.anisotropic))
@@ -137,6 +140,7 @@ class Decoder:
                 total = c["sheen"]["colour"] * (s * wo.z) + total
         if "specular" in lobes:
             colour = dr.fma(c["f0"]["f0"], 1 - s, s) if "f0" in c else s
+            colour = colour * self.ggx(c).get("weight", 1)
             total = colour * self.specular(c, g, wi, wo, active) + total
         if "clearcoat" in lobes and e.clearcoat:
             total = self.clearcoat(c, g, s, wi, wo) + total
@@ -195,18 +199,52 @@ def ggx_coefficients(ax, ay=None) -> dict:
     return {"alpha": (ax, ay), "alpha2": (ax2, ay2), "q": (norm / ax2, norm / ay2, norm)}
 
 
+@dataclass
+class Lobe:
+    """Shape and ``weight`` of a specular lobe whose axes are not those of the frame.
+
+    In place of α² stands the symmetric matrix ``A = α² [[1 + c, s], [s, 1 − c]]`` with ``c² + s² < 1``. The ``weight``,
+    from 0 to 1, multiplies the lobe's values.
+    """
+
+    c: Any
+    s: Any
+    weight: Any
+
+
+def sheared_ggx(alpha, lobe: Lobe) -> dict:
+    """Return the coefficients of GGX with the matrix ``A`` of a lobe, and its ``weight``.
+
+    ``alpha`` is the lower triangular ``L`` with ``A = L Lᵀ``, as ``(L_xx, L_yx, L_yy)``. ``alpha2`` and ``q`` are as in
+    :func:`ggx_coefficients` and have the factor of ``x y`` at their end; ``q`` is that of ``A⁻¹``.
+    """
+    a2, c, s = dr.square(alpha), lobe.c, lobe.s
+    root = dr.sqrt(1 - dr.square(c) - dr.square(s))
+    norm = dr.sqrt(dr.pi * root) * alpha
+    inverse = norm / (a2 * dr.square(root))
+    corner = dr.sqrt(1 + c)
+    return {
+        "alpha": (alpha * corner, alpha * s / corner, alpha * root / corner),
+        "alpha2": (a2 * (1 + c), a2 * (1 - c), 2 * a2 * s),
+        "q": (inverse * (1 - c), inverse * (1 + c), norm, -2 * inverse * s),
+        "weight": lobe.weight,
+    }
+
+
 def quadric(q, g):
-    """Return ``Σ q_k h_k²``, with two coefficients for the isotropic form."""
+    """Return ``Σ q_k h_k²``, with two coefficients for the isotropic form; a fourth one is that of ``h_x h_y``."""
     if len(q) == 2:
         return dr.fma(q[0], dr.square(g.h.x) + dr.square(g.h.y), q[1] * dr.square(g.h.z))
-    return dr.fma(q[0], dr.square(g.h.x), dr.fma(q[1], dr.square(g.h.y), q[2] * dr.square(g.h.z)))
+    total = dr.fma(q[0], dr.square(g.h.x), dr.fma(q[1], dr.square(g.h.y), q[2] * dr.square(g.h.z)))
+    return total if len(q) == 3 else dr.fma(q[3], g.h.x * g.h.y, total)
 
 
 def stretched(alpha2, w):
-    """Return ``α_x² x² + α_y² y²`` of a direction, from one α² or one for each axis."""
+    """Return ``wᵀ A w`` of a direction's x and y: from one α², one for each axis, or those and the factor of x y."""
     if len(alpha2) == 1:
         return alpha2[0] * (dr.square(w.x) + dr.square(w.y))
-    return dr.fma(alpha2[0], dr.square(w.x), alpha2[1] * dr.square(w.y))
+    total = dr.fma(alpha2[0], dr.square(w.x), alpha2[1] * dr.square(w.y))
+    return total if len(alpha2) == 2 else dr.maximum(dr.fma(alpha2[2], w.x * w.y, total), 0)
 
 
 def masking(alpha2, w):

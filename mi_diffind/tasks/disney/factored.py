@@ -166,6 +166,8 @@ class FactoredDecoder(decoder.Decoder):
         return tuple(instead.get(name, name) for name in super().required(e))
 
     def _read_ggx(self, p, e):
+        if p.lobe is not None:
+            return decoder.sheared_ggx(self._alpha(self.arrays.encode(p), False)[0], p.lobe)
         return decoder.ggx_coefficients(*self._alpha(self.arrays.encode(p), e.anisotropic))
 
     def _read_coat(self, p, e):

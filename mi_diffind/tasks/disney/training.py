@@ -16,7 +16,7 @@ import drjit as dr
 from ...fitting import Problem, exponential_like
 from . import model
 from .arrays import DisneyArrays
-from .decoder import Decoder
+from .decoder import Decoder, Lobe
 from .effects import Effects
 from .model import PARAMETERS, Material, compose, exact_factors
 
@@ -51,23 +51,31 @@ def random_directions(rng, types, size: int):
 
 @dataclass
 class Shaded(Material):
-    """A material with its ``albedo``, a colour, and the albedo's ``luminance``."""
+    """A material with its ``albedo``, a colour, the albedo's ``luminance``, and the shape of its specular ``lobe``.
+
+    Without a ``lobe``, ``anisotropic`` shapes it.
+    """
 
     albedo: Any
     luminance: Any
+    lobe: Lobe | None = None
 
     @classmethod
-    def of(cls, material: Material, albedo) -> Shaded:
+    def of(cls, material: Material, albedo, lobe: Lobe | None = None) -> Shaded:
         luminance = sum(w * c for w, c in zip(LUMINANCE, albedo, strict=True))
-        return cls(**{n: getattr(material, n) for n in PARAMETERS}, albedo=albedo, luminance=luminance)
+        return cls(**{n: getattr(material, n) for n in PARAMETERS}, albedo=albedo, luminance=luminance, lobe=lobe)
 
 
-def shade(decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects = Effects(), lobes=None):  # noqa: B008
+def shade(
+    decoder: Decoder | None, m: Material, albedo, wi, wo, effects: Effects = Effects(), lobes=None,  # noqa: B008
+    lobe: Lobe | None = None,
+):  # fmt: skip
     """Return BRDF · cosine in RGB, from ``decoder``, or by the published formulas if it is ``None``.
 
-    ``lobes`` names the lobes to sum; by default, all that are in use.
+    ``lobes`` names the lobes to sum; by default, all that are in use. ``lobe`` is the shape of the specular one, which
+    the published formulas do not know.
     """
-    p, lobes = Shaded.of(m, albedo), lobes or effects.lobes
+    p, lobes = Shaded.of(m, albedo, lobe), lobes or effects.lobes
     if decoder is None:
         return model.colour(compose(p, exact_factors(p, wi, wo), lobes).values(), albedo, p.luminance)
     c = {group: decoder.coefficients(group, p, effects) for group in decoder.required(effects)}

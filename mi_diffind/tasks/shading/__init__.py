@@ -53,6 +53,11 @@ class Shading(Task):
             "prefiltered ones (default of paper), or 256 unfiltered ones (converged)",
         ),
         LEVEL_BIAS,
+        Argument(
+            "--extras", choices=("auto", "off"), default="off",
+            help="shape and weight of the highlight in coarse grids beside the maps, read by neural_material alone; "
+            "auto keeps them if shaded images gain (default: off)",
+        ),
         *SOURCES,
         PREVIEW,
     )  # fmt: skip

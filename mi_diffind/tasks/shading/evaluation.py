@@ -41,7 +41,8 @@ def reader(maps: FilteredMaps, effects: Effects, decoder: Decoder | None = None)
     decoder = decoder or Decoder()
 
     def read(u, v, level, wi, wo):
-        return shaded(decoder, surface_of(maps, maps.filtered(u, v, level)), wi, wo, effects)
+        surface = surface_of(maps, maps.filtered(u, v, level), maps.extra(u, v, level))
+        return shaded(decoder, surface, wi, wo, effects)
 
     return read
 

@@ -17,6 +17,7 @@ from ..texture import TASK as TEXTURE
 from ..texture import fit as texture_fit
 from ..texture import training as textures
 from ..texture.compressed import bias_of
+from ..texture.nets import neutral_extras
 from ..texture.presets import PRESETS as TEXTURES
 from . import material, training
 from .evaluation import ShadedEvaluation
@@ -32,7 +33,8 @@ def recipe_of(preset: str, settings, options) -> ShadingRecipe:
         given["level_bias"] = None
     if options["clip"] is not None:
         given["clip"] = None if options["clip"] == math.inf else options["clip"]
-    return dataclasses.replace(recipe, settings=settings or recipe.settings, **given)
+    extras = options["extras"] == "auto"
+    return dataclasses.replace(recipe, settings=settings or recipe.settings, extras=extras, **given)
 
 
 #: Number of pairs of view and light, and size, of the images that measure. Many, since a few pairs near the mirror
@@ -52,6 +54,8 @@ def check(request: FitRequest) -> None:
         raise UsageError(f"source: found the scene {options['source']}; fit scene trains a texture inside a scene")
     if options["start"] is not None and any(options[name] for name in ("compression", "bytes", "bpp")):
         raise UsageError("--start: the arrays have their size, leave out --compression, --bytes and --bpp")
+    if options["extras"] == "auto" and PRESETS[request.preset].texture == "paper":
+        raise UsageError(f"--extras: found auto, the arrays of the preset {request.preset} have none, allowed is off")
 
 
 def fit(request: FitRequest) -> Fitted:
@@ -134,7 +138,11 @@ def started(path, source, request: FitRequest) -> Table:
 def size_of(source, pyramid: Pyramid, recipe: ShadingRecipe, options):
     """Return the memory budget of the arrays. Raises :class:`UsageError`."""
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(options)
-    return texture_fit.size_of(source, pyramid, requested_bytes(options, source), TEXTURES[recipe.texture], options)
+    nbytes = requested_bytes(options, source)
+    if recipe.extras:
+        extras = neutral_extras(pyramid.layout.height, pyramid.layout.width, pyramid.border)
+        nbytes -= math.prod(extras.resolution) * extras.channels
+    return texture_fit.size_of(source, pyramid, nbytes, TEXTURES[recipe.texture], options)
 
 
 def pretrained(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:

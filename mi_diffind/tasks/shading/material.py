@@ -23,10 +23,11 @@ from ...errors import UsageError
 from ...maps.compressed import FilteredMaps
 from ...maps.layout import Layout, MapLayout
 from ..disney import TASK as DISNEY
-from ..disney.decoder import Decoder
+from ..disney.decoder import Decoder, Lobe
 from ..disney.effects import Effects, find_effects
 from ..disney.model import PARAMETERS, Material, sanitize
 from ..disney.training import shade
+from ..texture.nets import NEUTRAL
 
 #: Values of parameters without a map, the defaults of the plugin ``disney``.
 DEFAULTS = {**dict.fromkeys(PARAMETERS, 0.0), "roughness": 0.5, "specular": 0.5}
@@ -40,13 +41,15 @@ class SurfaceParameters:
     """Parameters of the material at a point.
 
     ``albedo``: a linear colour; ``normal``: of any length, in the frame of the surface, ``None`` without a map;
-    ``roughness`` and ``metallic``: arrays, or numbers without a map.
+    ``roughness`` and ``metallic``: arrays, or numbers without a map; ``lobe``: shape of the specular lobe, ``None``
+    without extras.
     """
 
     albedo: Any
     normal: Any
     roughness: Any
     metallic: Any
+    lobe: Lobe | None = None
 
 
 def maps_of(layout: Layout) -> dict[str, MapLayout]:
@@ -95,8 +98,19 @@ def linear(values, m: MapLayout):
     return [srgb.to_linear(v, fused=False) for v in values]
 
 
-def surface_of(maps: FilteredMaps, stored: list) -> SurfaceParameters:
-    """Return the material at points with the stored channels ``stored``."""
+#: Largest length of (c, s) of a lobe.
+SHEAR = 0.95
+
+
+def lobe_of(extra: list) -> Lobe:
+    """Return the shape of a specular lobe from extras, numbers in [0, 1] (:data:`.nets.NEUTRAL`: a round one)."""
+    c, s = (2 * (x - n) for x, n in zip(extra[:2], NEUTRAL, strict=False))
+    scale = SHEAR * dr.rsqrt(dr.maximum(dr.square(c) + dr.square(s), SHEAR**2))
+    return Lobe(c * scale, s * scale, extra[2])
+
+
+def surface_of(maps: FilteredMaps, stored: list, extra: list | None = None) -> SurfaceParameters:
+    """Return the material at points with the stored channels ``stored``, and extras, if there are any."""
     by_role = maps_of(maps.layout)
     read = maps.maps(stored, [m.name for m in by_role.values()])
     channels = {role: linear(read[m.name], m) for role, m in by_role.items()}
@@ -114,7 +128,7 @@ def surface_of(maps: FilteredMaps, stored: list) -> SurfaceParameters:
         signed = by_role["normal"].low < 0
         normal = vector(normal) if signed else 2 * vector(normal) - 1
     numbers = {n: channels[n][0] if n in channels else DEFAULTS[n] for n in ("roughness", "metallic")}
-    return SurfaceParameters(vector(albedo), normal, **numbers)
+    return SurfaceParameters(vector(albedo), normal, **numbers, lobe=None if extra is None else lobe_of(extra))
 
 
 #: Colour of a material without an albedo, the default of the plugin ``disney``.
@@ -140,14 +154,15 @@ def shaded(decoder: Decoder | None, surface: SurfaceParameters, wi, wo, effects:
     wi_local, wo_local = dr.select(visible, wi_local, up), dr.select(visible, wo_local, up)
     given = {"roughness": Float(surface.roughness), "metallic": Float(surface.metallic)}
     material = sanitize(Material(**{**{n: Float(v) for n, v in DEFAULTS.items()}, **given}))
-    albedo = dr.maximum(surface.albedo, 0)
+    albedo, lobe = dr.maximum(surface.albedo, 0), surface.lobe
     if limit is None or "specular" not in effects.lobes:
-        value = shade(decoder, material, albedo, wi_local, wo_local, effects)
+        value = shade(decoder, material, albedo, wi_local, wo_local, effects, lobe=lobe)
     else:
         rest = tuple(lobe for lobe in effects.lobes if lobe != "specular")
         bounded = Material(**{name: clipped(getattr(material, name), limit) for name in PARAMETERS})
         inputs = [clipped(x, limit) for x in (albedo, wi_local, wo_local)]
-        value = shade(decoder, bounded, *inputs, effects, ("specular",))
+        lobe = None if lobe is None else Lobe(*(clipped(x, limit) for x in (lobe.c, lobe.s, lobe.weight)))
+        value = shade(decoder, bounded, *inputs, effects, ("specular",), lobe)
         if rest:
             value = value + shade(decoder, material, albedo, wi_local, wo_local, effects, rest)
     return dr.select(visible, dr.pi * shadow * value, 0)

@@ -18,9 +18,10 @@ class ShadingRecipe:
     ``share``: λ, the share of the loss of shaded values. ``clip``: bound of the derivatives of a sample's error through
     the specular lobe (``None``: unlimited). ``reference``: sample pattern of the reference. ``bounded``: whether values
     above 1 are compared in log space. ``level_bias``: levels by which a footprint's level of detail is read finer
-    (negative), stored in the file (``None``: chosen by images). ``texture``: recipe of task 4, which trains the start
-    unless one is given, and defines the samples and the loss of the texture. ``settings``: the rest; its ``loss`` is
-    that of shaded values.
+    (negative), stored in the file (``None``: chosen by images). ``extras``: whether the shape and weight of the
+    specular lobe are tried as coarse extras, which ``neural_material`` alone reads. ``texture``: recipe of task 4,
+    which trains the start unless one is given, and defines the samples and the loss of the texture. ``settings``: the
+    rest; its ``loss`` is that of shaded values.
     """
 
     share: float = 0.9
@@ -28,6 +29,7 @@ class ShadingRecipe:
     reference: str = "jittered"
     bounded: bool = True
     level_bias: float | None = None
+    extras: bool = False
     texture: str = "ours"
     settings: FitSettings = dataclasses.field(default_factory=FitSettings)
 

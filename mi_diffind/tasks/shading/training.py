@@ -26,6 +26,7 @@ from ...task import FitRequest
 from ..disney.training import random_directions
 from ..texture import training as textures
 from ..texture.compressed import CompressedTexture, to_table
+from ..texture.nets import neutral_extras
 from ..texture.presets import PRESETS as TEXTURES
 from .evaluation import TRUTHS, ShadedEvaluation, reader
 from .material import effects_of, frozen_decoder, shaded, surface_of
@@ -92,7 +93,7 @@ class ShadingProblem(textures.TextureProblem):
         if self.level_bias:  # opaque, so that one kernel serves all
             bias = dr.opaque(types.Float, self.level_bias)
             level = lookup.clamp(level + bias, 0.0, float(len(self.sizes) - 1))
-        surface = surface_of(self.pyramid, net.filtered(u, v, level))
+        surface = surface_of(self.pyramid, net.filtered(u, v, level), net.extra(u, v, level))
         limit = None if recipe.clip is None else recipe.clip * recipe.share / size
         value = shaded(self.decoder, surface, wi, wo, self.effects, limit)
         bounded = _bounded if recipe.bounded else (lambda x: x)
@@ -171,15 +172,21 @@ def fit_shading(
     effects, decoder = effects_of(pyramid.layout)[0], frozen_decoder(pyramid.types)
     texture = CompressedTexture(pyramid.layout, textures.stored_form(start), start_bias)
     base, before, stopped = [], {}, None
-    bias, gains = recorded_choice(request) if recipe.level_bias is None else (recipe.level_bias, {})
+    choice, gains = recorded_choice(request)
+    choices = [(bias, False) for bias in (BIASES if recipe.level_bias is None else (recipe.level_bias,))]
+    if choice is None and len(choices) == 1 and not recipe.extras:
+        choice = choices[0]
 
     def shaded_errors(texture: CompressedTexture) -> dict[str, float]:
         errors = evaluation.measure(reader(texture, effects, decoder), False)
         return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
 
-    def problem_of(bias: float) -> ShadingProblem:
+    def problem_of(bias: float, extras: bool) -> ShadingProblem:
         net = start.changed(lambda array, bits: array.copy())
-        changed = dataclasses.replace(recipe, level_bias=bias)
+        if extras and net.extras is None:
+            layout = pyramid.layout
+            net.extras = neutral_extras(layout.height, layout.width, net.border).alloc(pyramid.types.TensorXf)
+        changed = dataclasses.replace(recipe, level_bias=bias, extras=extras)
         return ShadingProblem(net, pyramid, changed, source.digest, validation, base)
 
     if evaluation is not None:
@@ -187,9 +194,9 @@ def fit_shading(
         begin = request.deadline.rehearse if request.deadline is not None else lambda measure: measure()
         before = begin(lambda: shaded_errors(texture))
         base = validation.measure(reader(texture, effects, decoder), False)["C"]["psnr_db"]
-        if bias is None:
-            bias, gains, stopped = choose_bias(problem_of, request)
-    problem, result = stopped or (problem_of(bias or 0.0), None)
+        if choice is None:
+            choice, gains, stopped = choose(problem_of, request, choices, recipe.extras)
+    problem, result = stopped or (problem_of(*(choice or choices[0])), None)
     if result is None:
         problem.identity |= {"level_biases": gains} if gains else {}
         problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
@@ -210,35 +217,50 @@ def fit_shading(
     return table, result
 
 
-def choose_bias(problem_of: Callable[[float], ShadingProblem], request: FitRequest) -> tuple:
-    """Return the best of :data:`BIASES` after a short training with each, the gains, and ``None``.
+def choose(
+    problem_of: Callable[[float, bool], ShadingProblem], request: FitRequest, choices: list, extras: bool
+) -> tuple:
+    """Return the best of ``choices`` after a short training with each, the gains, and ``None``.
 
+    A choice is a level bias, and whether there are extras. With ``extras``, the best choice is trained with them, too.
     The best has the largest mean of levels among those that lose at no level, or among all if each loses somewhere. The
-    gains are ``gain_db`` by the text of a bias. If Ctrl-C ends a training, its problem and record are returned in place
-    of ``None``. If the time is too short (:data:`SHORTEST`), the untrained arrays are compared.
+    gains are ``gain_db`` by the text of a choice. If Ctrl-C ends a training, its problem and record are returned in
+    place of ``None``. If the time is too short (:data:`SHORTEST`), the untrained arrays are compared.
     """
     measured, steps = {}, max(1, round(TRIAL * request.settings.steps))
     settings = dataclasses.replace(request.settings, steps=steps, measure_every=steps)
     seconds = None if request.seconds is None else TRIAL * request.seconds
     short = None
-    for bias in BIASES:
-        problem = problem_of(bias)
-        measured[bias], measurement = duration(lambda problem=problem: problem.measure(problem.net))
+
+    def name(choice: tuple[float, bool]) -> str:
+        return f"{choice[0]:g}{', extras' if choice[1] else ''}"
+
+    def best() -> tuple[float, bool]:
+        return max(measured, key=lambda c: (measured[c]["gain_db"] >= 0, measured[c]["shaded_converged_db"]))
+
+    waiting = list(choices)
+    while waiting:
+        choice = waiting.pop(0)
+        problem = problem_of(*choice)
+        measured[choice], measurement = duration(lambda problem=problem: problem.measure(problem.net))
         trial = dataclasses.replace(
             request.part(TRIAL), settings=settings, seconds=seconds, checkpoint=None, resume=False
         )
         limit = seconds if trial.deadline is None else trial.deadline.left()
         short = limit is not None and limit < SHORTEST * measurement if short is None else short
         if not short:
-            result = trial.train(problem, f"level bias {bias:g}")
+            result = trial.train(problem, f"level bias {name(choice)}")
             if result.interrupted:
-                return bias, {}, (problem, result)
-            measured[bias] = result.measured
-    best = max(BIASES, key=lambda bias: (measured[bias]["gain_db"] >= 0, measured[bias]["shaded_converged_db"]))
-    return best, {f"{bias:g}": float(f"{m['gain_db']:.4g}") for bias, m in measured.items()}, None
+                return choice, {}, (problem, result)
+            measured[choice] = result.measured
+        if extras and not waiting and not choice[1]:
+            waiting.append((best()[0], True))
+    return best(), {name(c): float(f"{m['gain_db']:.4g}") for c, m in measured.items()}, None
 
 
-def recorded_choice(request: FitRequest) -> tuple[float | None, dict]:
-    """Return the level bias of the training that is resumed, ``None`` without one, and the gains it was chosen by."""
+def recorded_choice(request: FitRequest) -> tuple[tuple[float, bool] | None, dict]:
+    """Return level bias and extras of the training that is resumed, or ``None``, and the gains of the choice."""
     recorded = checkpoint_settings(request.checkpoint) if request.resume and request.checkpoint is not None else {}
-    return recorded.get("shading", {}).get("level_bias"), recorded.get("level_biases", {})
+    shading = recorded.get("shading", {})
+    choice = (shading["level_bias"], bool(shading.get("extras"))) if "level_bias" in shading else None
+    return choice, recorded.get("level_biases", {})

@@ -20,7 +20,7 @@ from ...maps.model import MapsModel, allocate_maps, page_entries
 from ...maps.pyramid import Pyramid, level_sizes
 from ...maps.source import Source
 from ...tables import PAGES, Table, TableError, load_table, stored_arrays
-from .nets import FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
+from .nets import NEUTRAL, FineLayer, LayeredNet, LayeredStructure, PaperNet, PaperStructure
 
 #: Names of the paper's arrays.
 PAPER = ("primary0", "primary1", "cascaded")
@@ -57,6 +57,15 @@ class CompressedTexture(FilteredMaps):
     def filtered(self, u, v, level, active=True) -> list:
         """Return the stored channels at (u, v) and a level of detail."""
         return [] if self.net is None else self.net.filtered(u, v, self.clamped(self.biased(level), type(u)), active)
+
+    @property
+    def has_extras(self) -> bool:
+        """Whether the arrays hold numbers beside the channels (:attr:`.LayeredNet.extras`)."""
+        return self.net is not None and self.net.extras is not None
+
+    def extra(self, u, v, level, active=True) -> list | None:
+        """Return the extras at (u, v) and a level of detail (:meth:`.LayeredNet.extra`), ``None`` without them."""
+        return self.net.extra(u, v, self.clamped(self.biased(level), type(u)), active) if self.has_extras else None
 
     def measure(self, source: Source) -> dict[str, float]:
         """Return the errors against the mip pyramid of ``source``.
@@ -129,7 +138,8 @@ def assembled(table: Table, arrays: dict[str, DifferentiableArray]) -> Compresse
     if isinstance(structure, PaperStructure):
         return CompressedTexture(layout, PaperNet(*(arrays[name] for name in PAPER), structure), bias)
     fine = [arrays[f"level{layer.level}"] for layer in structure.layers]
-    return CompressedTexture(layout, LayeredNet(fine, arrays["coarse"], arrays["cascaded"], structure, border), bias)
+    net = LayeredNet(fine, arrays["coarse"], arrays["cascaded"], structure, border, arrays.get("extras"))
+    return CompressedTexture(layout, net, bias)
 
 
 def to_table(texture: CompressedTexture, settings: dict) -> Table:
@@ -205,7 +215,8 @@ def load(path: str | os.PathLike) -> Table:
         raise TableError(f"{path}: its settings describe no texture ({e})") from None
     layers = {f"level{x.level}": x for x in structure.layers} if isinstance(structure, LayeredStructure) else {}
     pages = [name + PAGES for name, x in layers.items() if x.paged]
-    expected = PAPER if isinstance(structure, PaperStructure) else [*layers, *pages, "coarse", "cascaded"]
+    extras = ["extras"] if "extras" in table.arrays else []
+    expected = PAPER if isinstance(structure, PaperStructure) else [*layers, *pages, "coarse", "cascaded", *extras]
     if set(table.arrays) != set(expected if structure else ()):
         names, wanted = (", ".join(sorted(n)) or "none" for n in (table.arrays, expected if structure else ()))
         raise TableError(f"{path}: holds the arrays {names}, expected {wanted}")
@@ -223,6 +234,8 @@ def load(path: str | os.PathLike) -> Table:
             raise TableError(f'{path}: array "{name}" has the shape {actual}, expected {text}')
         if not array.is_pointer:
             raise TableError(f'{path}: array "{name}" has entries outside of [0, 1]')
+        if name == "extras" and array.border != ("clamp", *border):
+            raise TableError(f'{path}: array "{name}" has the borders {array.border}, expected {("clamp", *border)}')
         if name not in layers:
             continue
         spread = table.arrays[name + PAGES] if layers[name].paged else array
@@ -246,6 +259,8 @@ def _layered_shapes(table: Table, layout: Layout, structure: LayeredStructure, l
         shapes[name] = (*((page_entries(table, name, size),) if layer.paged else size), layer.channels)
     shapes["coarse"] = (sum(map(math.prod, structure.sizes[structure.skip :])), dims)
     shapes["cascaded"] = (structure.skip + 1,) * (axes > dims) + (None,) * dims + (layout.stored,)
+    if "extras" in table.arrays:
+        shapes["extras"] = (None, None, None, len(NEUTRAL))
     return shapes
 
 
@@ -265,7 +280,9 @@ class TextureModel(MapsModel):
             lines.append(f"  {image.levels} levels of detail: {listed} dB")
         if image.level_bias:
             lines.append(f"  read {-image.level_bias:g} levels finer than the footprint")
-        return figures, lines
+        if image.has_extras:
+            lines.append("  extras: shape and weight of the highlight, read by neural_material alone")
+        return {**figures, "extras": image.has_extras}, lines
 
     def decode(self, output=None, map=None, width=None, height=None, level: int = 0):
         """Write the maps at a level of detail, by default in its own size (:meth:`.MapsModel.decode`)."""

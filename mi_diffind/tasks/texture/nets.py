@@ -48,10 +48,16 @@ class PaperNet(nn.Module):
         """The arrays by name, in the order of a file."""
         return {"primary0": self.primary0, "primary1": self.primary1, "cascaded": self.cascaded}
 
+    #: Numbers beside the channels: none
+    extras = None
+
     @property
     def border(self) -> tuple[str, str]:
         """The border of the texture along v and u."""
         return self.primary0.border
+
+    def extra(self, u, v, level, active=True) -> None:
+        """Return ``None``, see :meth:`LayeredNet.extra`."""
 
     def changed(self, change) -> PaperNet:
         """Return a copy with ``change(array, bits)`` in place of each array."""
@@ -131,6 +137,24 @@ class LayeredStructure:
         return layer.paged or (self.base and layer == self.layers[-1])
 
 
+#: Extras that change nothing: two for the shape of a specular lobe (an entry of 8 bits), and its weight.
+NEUTRAL = (128 / 255, 128 / 255, 1.0)
+
+#: Entries along a side of each level of the extras, at most.
+EXTRA_SIDE = 8
+
+
+def neutral_extras(height: int, width: int, border: tuple[str, str]) -> DifferentiableArray:
+    """Return extras for a texture of ``height`` × ``width`` texels, not allocated, all neutral.
+
+    There is a grid for each level that is larger than a grid, and for the first that is not.
+    """
+    sizes = level_sizes(height, width)
+    levels = next((i for i, size in enumerate(sizes) if max(size) <= EXTRA_SIDE), len(sizes) - 1) + 1
+    resolution = (levels, *(min(n, EXTRA_SIDE) for n in (height, width)))
+    return DifferentiableArray(resolution, len(NEUTRAL), "constant", NEUTRAL, fold=True, border=("clamp", *border))
+
+
 class LayeredNet(nn.Module):
     """Our arrays.
 
@@ -139,6 +163,8 @@ class LayeredNet(nn.Module):
       all channels; or pointers, where arrays consist of pages.
     - ``cascaded``: the colours, read at the sum. If it has one dimension more than ``coarse`` has channels, its first
       axis is the level of detail, one entry a level up to ``structure.skip``.
+    - ``extras`` (or ``None``): numbers beside the channels, in a coarse grid for each level up to one as coarse, read
+      trilinearly by :meth:`extra`.
     """
 
     DRJIT_STRUCT = {  # noqa: RUF012
@@ -147,26 +173,40 @@ class LayeredNet(nn.Module):
         "cascaded": DifferentiableArray,
         "structure": object,
         "border": tuple,
+        "extras": object,
     }
 
     def __init__(
-        self, fine=(), coarse=None, cascaded=None, structure: LayeredStructure | None = None, border=("clamp", "clamp")
-    ):
+        self, fine=(), coarse=None, cascaded=None, structure: LayeredStructure | None = None,
+        border=("clamp", "clamp"), extras: DifferentiableArray | None = None,
+    ):  # fmt: skip
         self.fine, self.coarse, self.cascaded, self.structure = tuple(fine), coarse, cascaded, structure
         #: The border of the texture along v and u
         self.border = tuple(border)
+        self.extras = extras
 
     @property
     def arrays(self) -> dict[str, DifferentiableArray]:
         """The arrays by name, in the order of a file."""
         fine = {f"level{x.level}": a for x, a in zip(self.structure.layers, self.fine, strict=True)}
-        return {**fine, "coarse": self.coarse, "cascaded": self.cascaded}
+        extras = {} if self.extras is None else {"extras": self.extras}
+        return {**fine, "coarse": self.coarse, "cascaded": self.cascaded, **extras}
 
     def changed(self, change) -> LayeredNet:
         """Return a copy with ``change(array, bits)`` in place of each array."""
         structure = self.structure
         fine = [change(a, x.bits) for a, x in zip(self.fine, structure.layers, strict=True)]
-        return LayeredNet(fine, change(self.coarse, structure.bits), change(self.cascaded, 8), structure, self.border)
+        extras = None if self.extras is None else change(self.extras, 8)
+        coarse, cascaded = change(self.coarse, structure.bits), change(self.cascaded, 8)
+        return LayeredNet(fine, coarse, cascaded, structure, self.border, extras)
+
+    def extra(self, u, v, level, active=True) -> list | None:
+        """Return the ``extras`` at (u, v) and a level of detail, numbers in [0, 1], or ``None`` without them."""
+        if self.extras is None:
+            return None
+        levels, *sizes = self.extras.resolution
+        coordinates = [lookup.clamp(level * (1 / max(1, levels - 1)), 0.0, 1.0)]
+        return self.extras([*coordinates, *self._at(u, v, sizes)], active)
 
     def filtered(self, u, v, level, active=True) -> list:
         """Return the channels at (u, v) and a level of detail from 0 to the last level."""
@@ -220,10 +260,12 @@ class LayeredNet(nn.Module):
 
     def _place(self, array: DifferentiableArray, u, v) -> list:
         """Return the coordinates (v, u) of a read of a fine array, whose entries lie at texel centres."""
-        if isinstance(array, PagedArray):
-            return [v, u]
+        return [v, u] if isinstance(array, PagedArray) else self._at(u, v, array.resolution)
+
+    def _at(self, u, v, resolution) -> list:
+        """Return the coordinates (v, u) of a read of a grid, whose entries lie at texel centres."""
         place = []
-        for x, n, border in zip((v, u), array.resolution, self.border, strict=True):
+        for x, n, border in zip((v, u), resolution, self.border, strict=True):
             place.append(x - 0.5 / n if border == "repeat" else (x * n - 0.5) * (1 / max(1, n - 1)))
         return place
 

@@ -19,7 +19,7 @@ from mi_diffind.fitting import FitResult
 from mi_diffind.maps.pyramid import Pyramid
 from mi_diffind.maps.source import from_arrays
 from mi_diffind.runtime import array_module
-from mi_diffind.tables import load_table, save_table
+from mi_diffind.tables import TableError, load_table, save_table
 from mi_diffind.task import FitRequest
 from mi_diffind.tasks.disney import TASK as DISNEY
 from mi_diffind.tasks.disney.decoder import Decoder
@@ -363,35 +363,74 @@ def test_a_level_that_loses_outweighs_all_that_gain():
 @pytest.mark.parametrize(
     "gains, expected",
     [
-        ({0.0: (1.0, 30), -0.5: (2.0, 31), -1.0: (-0.1, 32)}, -0.5),  # the best that loses nowhere
-        ({0.0: (-3.0, 30), -0.5: (-2.0, 31), -1.0: (-0.1, 29)}, -0.5),  # all lose somewhere: the best mean
-        ({0.0: (0.0, 30), -0.5: (-2.0, 31), -1.0: (-0.1, 29)}, 0.0),
+        # The best that loses nowhere; the best mean if all lose somewhere; extras, only if they gain
+        ({(0.0, False): (1.0, 30), (-0.5, False): (2.0, 31), (-1.0, False): (-0.1, 32)}, (-0.5, False)),
+        ({(0.0, False): (-3.0, 30), (-0.5, False): (-2.0, 31), (-1.0, False): (-0.1, 29)}, (-0.5, False)),
+        ({(0.0, False): (0.0, 30), (-0.5, False): (-2.0, 31), (-1.0, False): (-0.1, 29)}, (0.0, False)),
+        ({(0.0, False): (1.0, 30), (-0.5, False): (2.0, 31), (-1.0, False): (3.0, 29), (-0.5, True): (2.1, 31.1)},
+         (-0.5, True)),
+        ({(0.0, False): (1.0, 30), (-0.5, False): (2.0, 31), (-1.0, False): (3.0, 29), (-0.5, True): (-0.1, 32)},
+         (-0.5, False)),
     ],
-)
-def test_choice_of_the_level_bias(ad, gains, expected):
-    """Figures that are made up for the images that choose; a training of each bias, unless the time is too short."""
+)  # fmt: skip
+def test_choice_of_level_bias_and_extras(ad, gains, expected):
+    """Figures that are made up for the images that choose; a training of each choice, unless the time is too short."""
 
     class Figures(training.ShadingProblem):
-        def __init__(self, bias):
-            self.level_bias = bias
+        def __init__(self, *choice):
+            self.choice = choice
 
         net = property(lambda self: None)
 
         def measure(self, net):
             time.sleep(1e-3)  # longer than the limits below
-            return dict(zip(("gain_db", "shaded_converged_db"), gains[self.level_bias], strict=True))
+            return dict(zip(("gain_db", "shaded_converged_db"), gains[self.choice], strict=True))
 
     class Request(FitRequest):
         def train(self, problem, title):
             assert self.settings.steps == 8 and self.checkpoint is None
-            trained.append(problem.level_bias)
+            trained.append(problem.choice)
             return FitResult(problem.measure(None), 8, 8, 0.0, False, 0)
 
-    for limit, biases in (({}, training.BIASES), ({"seconds": 1e-9}, ()), ({"deadline": Deadline(1e-9)}, ())):
+    choices = [choice for choice in gains if not choice[1]]
+    for limit in ({}, {"seconds": 1e-9}, {"deadline": Deadline(1e-9)}):
         trained, settings = [], dataclasses.replace(OURS.settings, steps=100)
-        bias, kept, stopped = training.choose_bias(Figures, Request("ours", settings, ad, checkpoint="x", **limit))
-        assert bias == expected and stopped is None and trained == list(biases)
-        assert kept == {f"{b:g}": pytest.approx(g) for b, (g, _) in gains.items()}
+        request = Request("ours", settings, ad, checkpoint="x", **limit)
+        choice, kept, stopped = training.choose(Figures, request, choices, len(gains) > 3)
+        assert choice == expected and stopped is None and trained == ([] if limit else list(gains))
+        assert kept == {f"{b:g}{', extras' * x}": pytest.approx(g) for (b, x), (g, _) in gains.items()}
+
+
+def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start, ad, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "choose", lambda *a: ((0.0, True), {"0, extras": 1.0}, None))
+    found, _ = trained(start, ad, quick(steps=30, measure_every=30, extras=True))
+    extras = found.arrays["extras"]
+    assert extras.shape == (3, 8, 8, 3) and found.settings["shading"]["extras"] and "kept_start" not in found.settings
+    assert found.settings["level_biases"] == {"0, extras": 1.0}
+    assert all(np.ptp(extras.entries[..., k].astype(float)) > 3 for k in range(3))
+    path, plain = str(tmp_path / "extras.npz"), str(tmp_path / "plain.npz")
+    save_table(path, found)
+    save_table(plain, dataclasses.replace(found, arrays={k: v for k, v in found.arrays.items() if k != "extras"}))
+    assert TEXTURE.load(path).nbytes == TEXTURE.load(plain).nbytes + 576
+    mi, values = mi_rgb, {}
+    si = dr.zeros(mi.SurfaceInteraction3f, 64)
+    si.uv, si.wi = mi.Point2f(*np.random.default_rng(1).random((2, 64)).astype(np.float32)), mi.Vector3f(0.6, 0, 0.8)
+    for file in (path, plain):
+        texture = mi.load_dict({"type": "neural_texture", "filename": file, "channels": "roughness"})
+        bsdf = mi.load_dict({"type": "neural_material", "filename": file, "filter": "off"})
+        value = bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(-0.5, 0.1, 0.8))
+        values[file] = texture.eval_1(si).numpy(), value.numpy()
+    np.testing.assert_array_equal(values[path][0], values[plain][0])
+    assert np.abs(values[path][1] - values[plain][1]).max() > 1e-3
+    for entries, border, sentence in (
+        (extras.entries[..., :2], extras.border, 'array "extras" has the shape (3, 8, 8, 2), expected N x N x N x 3'),
+        (extras.entries, ("clamp",) * 3, 'array "extras" has the borders'),
+    ):
+        scale = extras.scale[: entries.shape[-1]], extras.offset[: entries.shape[-1]]
+        damaged = dataclasses.replace(extras, entries=entries, border=border, scale=scale[0], offset=scale[1])
+        save_table(path, dataclasses.replace(found, arrays={**found.arrays, "extras": damaged}))
+        with pytest.raises(TableError, match=re.escape(sentence)):
+            TEXTURE.load(path)
 
 
 def test_training_reads_the_level_that_a_file_is_read_at(start, ad):
@@ -537,6 +576,7 @@ def test_command_trains_both_and_the_plugin_reads_it(mi_rgb, start, manifest, tm
         (["--lambda", "1.5"], "argument --lambda: found '1.5', allowed are numbers from 0 to 1"),
         (["--clip", "-1"], "argument --clip: found '-1', expected a positive number or none"),
         (["--start", "x.npz", "--compression", "3x"], "--start: the arrays have their size"),
+        (["--extras", "auto", "--preset", "paper"], "--extras: found auto, the arrays of the preset paper have none"),
         (["--level-bias", "0.5"], "argument --level-bias: found '0.5', allowed are numbers from -4 to 0"),
         (["--spp", "4"], "unrecognized arguments: --spp 4"),
     ],
