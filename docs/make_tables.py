@@ -317,6 +317,21 @@ def material_times() -> str:
     return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640", "training step"], rows)
 
 
+def scene_training() -> str:
+    """Return errors of held-out views and lights after training inside a scene and over the hemisphere."""
+    rows = []
+    for path in sorted((DOCS / "measured").glob("tradeoff_scene_training_*.json")):
+        for record in measured(path.stem)["jobs"].values():
+            d = record["details"]
+            times = [f"{d[key]:.{digits}f}" if key in d else "–" for key, digits in TRAINING_TIMES.items()]
+            rows.append([d["scene"], d["way"], f"{d['psnr_db']:.2f}", f"{d['flip']:.3f}", *times, d["peak_mib"]])
+    return table(["scene", "run", "PSNR, dB", "FLIP", "seconds", "ms a step", "level bias", "peak MiB"], rows)
+
+
+#: Figures of a training in the table above, and their digits.
+TRAINING_TIMES = {"training_seconds": 0, "step_ms": 0, "level_bias": 1}
+
+
 def sdf_errors(study: str) -> str:
     """Return errors of distance fields in equal bytes: IoU, IoU near the surface, normals."""
     from mi_diffind.studies.equal_memory import candidates_by_budget
@@ -454,6 +469,7 @@ TABLES = {
         image_pages,
         image_seen,
         material_times,
+        scene_training,
         texture_memory,
         texture_presets,
         texture_reads,

@@ -8,7 +8,8 @@ from ...measure.formatting import grid
 GAIN = 1.0
 
 #: Names of the runs.
-WAYS = ("start", "scene", "hemisphere", "hemisphere, then scene", "untrained, then scene")
+AFTER = "hemisphere, then scene"
+WAYS = ("start", "scene", "hemisphere", AFTER, "untrained, then scene")
 
 
 def runs_of(result: dict) -> dict[str, list[dict]]:
@@ -34,27 +35,22 @@ def table(result: dict) -> list[str]:
 
 
 def conclusions(result: dict) -> list[str]:
-    """Return a line for each scene: the gain over hemisphere training, and that of wrong starts."""
-    lines, gains = [], []
+    """Return a line for each scene, and two about the gains over hemisphere training."""
+    lines, alone, after = [], [], []
     for scene, runs in runs_of(result).items():
-        first = [d for d in runs if d["spp"] == runs[0]["spp"]]
-        by_way = dict.fromkeys(WAYS)
-        for d in sorted(first, key=lambda d: d["psnr_db"]):
+        by_way = {}
+        for d in sorted((d for d in runs if d["spp"] == runs[0]["spp"]), key=lambda d: d["psnr_db"]):
             by_way[d["way"]] = d["psnr_db"]
-        if by_way["hemisphere"] is None or by_way["scene"] is None:
-            continue
-        gains.append(max(by_way["scene"], by_way["hemisphere, then scene"] or 0) - by_way["hemisphere"])
-        line = f"{scene}: inside the scene {by_way['scene'] - by_way['start']:+.2f} dB, hemisphere "
-        line += f"{by_way['hemisphere'] - by_way['start']:+.2f} dB over the start"
-        for way in ("hemisphere, then scene", "untrained, then scene"):
-            if by_way[way] is not None:
-                line += f"; {way} {by_way[way] - by_way['start']:+.2f} dB"
-        lines.append(line)
-    if gains:
-        reached = sum(gain >= GAIN for gain in gains)
-        lines.append(
-            f"Training inside the scene, alone or after the hemisphere, gains {min(gains):+.2f} to {max(gains):+.2f} "
-            f"dB over hemisphere training of the same seconds; {reached} of {len(gains)} scenes gain {GAIN:g} dB or "
-            "more."
-        )
+        gains = [f"{way} {by_way[way] - by_way['start']:+.2f} dB" for way in WAYS[1:] if way in by_way]
+        lines += [f"{scene}, over the start: {'; '.join(gains)}"] if gains else []
+        if "hemisphere" in by_way:
+            alone += [by_way["scene"] - by_way["hemisphere"]] if "scene" in by_way else []
+            after += [by_way[AFTER] - by_way["hemisphere"]] if AFTER in by_way else []
+    texts = {"inside the scene for the same seconds": alone, "after the hemisphere, with more seconds": after}
+    for text, gains in texts.items():
+        if gains:
+            lines.append(
+                f"over hemisphere training, training {text} gains {min(gains):+.2f} to {max(gains):+.2f} dB: "
+                f"{sum(gain >= GAIN for gain in gains)} of {len(gains)} scenes gain {GAIN:g} dB or more"
+            )
     return lines

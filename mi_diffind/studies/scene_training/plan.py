@@ -28,12 +28,15 @@ import numpy as np
 
 from ... import metrics, scenes, task
 from ...files import writable_folder
+from ...measure import plot
+from ...measure.formatting import figure_caption
 from ...measure.study import Candidate, Plan
 from ...scene_training.problem import exposure_of
 from ...scene_training.reference_renders import ReferenceRenders
 from ...scene_training.stored_texture import original_of, texture_file
 from ...scene_training.trained_scene import TrainedScene
 from ...scene_training.views import View, ViewDistribution
+from ...srgb import for_display
 from ...tables import Table
 from ...tasks.texture.compressed import load
 from ..equal_memory import Contender, StudyContext
@@ -140,6 +143,27 @@ class SceneTrainingContext(StudyContext):
                 flips.append(metrics.flip(truth, np.clip(sum(halves) / 2, 0, 1)))
         gc.collect()
         return {"psnr_db": -10 * math.log10(max(np.mean(errors), 1e-12)), "flip": float(np.mean(flips))}
+
+
+def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[TrainingInScene], result: dict):
+    """Draw the first measured view of each scene: after each run with the smallest number of samples, and the truth."""
+    columns = max(len([r for r in runs if r.context is c and r.budget == c.settings.counts[0]]) for c in contexts) + 1
+    figure = plot.figure(result["title"], figure_caption(result), 2.3 * columns, 1.7 * len(contexts))
+    for row, context in enumerate(contexts):
+        distribution, views, references, exposure = context.tests
+        shown = [r for r in runs if r.context is context and r.budget == context.settings.counts[0]]
+        images = {}
+        for run in shown:
+            share = "" if run.share is None else f", λ {run.share:g}"
+            scene = TrainedScene(context.parsed, context.file, distribution, int(run.budget), run.model)
+            with dr.suspend_grad():
+                scene.place(views[0])
+                image = scene.render(0, 1, context.settings.spp).numpy()
+            images[f"{run.method}{share}\n{run.record['details']['psnr_db']:.1f} dB"] = image
+        for column, (text, image) in enumerate({**images, "truth": references[0]}.items()):
+            axes = figure.add_subplot(len(contexts), columns, row * columns + column + 1)
+            plot.image_panel(axes, for_display(exposure * image), text, "" if column else context.name)
+    return figure
 
 
 @dataclass
@@ -249,7 +273,7 @@ def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
         ],
         jobs=runs,
         jobs_fingerprint=f"{files} {request}",
-        panels=("training_seconds",),
+        pictures={"png": lambda result: picture(contexts, runs, result)},
         sampled=False,
         table=table,
         conclusions=conclusions,
