@@ -242,49 +242,66 @@ def texture_reads() -> str:
     return table(head, rows)
 
 
-def shading_curves(study: str) -> dict:
+def shading_curves(*studies: str) -> dict:
     """Return the results of the study of shading by material."""
     from mi_diffind.studies.shading.conclusions import curves
 
-    return curves(measured(study))
+    return {name: material for study in studies for name, material in curves(measured(study)).items()}
 
 
-def shading_filters(study: str) -> str:
-    """Return errors of textures trained for shading, beside classical filters and a texture trained for its values."""
-    from mi_diffind.studies.shading.conclusions import COMBINED, PLAIN
+def with_spread(values: list[float]) -> str:
+    """Return a mean with half the range, if there are several values."""
+    return f"{mean(values):.2f}" + (f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else "")
 
+
+def shading_best(*studies: str) -> str:
+    """Return errors of textures trained for shading, beside the best classical filters and the texture before."""
     rows = []
-    for name, material in shading_curves(study).items():
-        methods = [(f"{label}, uncompressed", [material.classical[label]]) for label in ("filtered", *PLAIN, *COMBINED)
-                 if label in material.classical]  # fmt: skip
-        methods += [(label, [details]) for label, details in material.compressed.items()]
-        way, best = material.best()
-        methods += [("texture, λ = 0", material.runs[way, 0.0]), (f"trained, λ = {best:g}", material.runs[way, best])]
+    for name, material in shading_curves(*studies).items():
+        (way,) = material.remedies
+        methods = []
+        for label, filters in (("uncompressed", material.classical), ("equal bytes", material.compressed)):
+            best = max(filters, key=lambda key, filters=filters: filters[key]["C"]["mean_db"])
+            methods.append((f"{best.removesuffix(', compressed')}, {label}", [filters[best]]))
+        methods.append(("trained, λ = 0.9", material.runs[way, 0.9]))
         for label, runs in methods:
-            cells = [f"{mean(d['C']['mean_db'] for d in runs):.2f}", f"{mean(d['C']['coarse_db'] for d in runs):.2f}"]
+            cells = [with_spread([d["C"]["mean_db"] for d in runs])]
             cells += [f"{mean(mean(d['C']['flip']) for d in runs):.3f}"]
             cells += [f"{mean(d['C']['psnr_db'][level] for d in runs):.1f}" for level in range(6)]
-            cells += [f"{mean(d['P']['mean_db'] for d in runs):.2f}"]
-            rows.append([name, label, *cells])
-    head = ["material", "", "C, dB", "C, L2 on", "FLIP", *(f"L{i}" for i in range(6)), "P, dB"]
+            rows.append([name, label, *cells, f"{mean(d['P']['mean_db'] for d in runs):.2f}"])
+    head = ["material", "", "C, dB", "FLIP", *(f"L{i}" for i in range(6)), "P, dB"]
     return table(head, rows)
 
 
-def shading_shares(study: str) -> str:
+def shading_shares(*studies: str) -> str:
     """Return the paper's figure 2 as a table: quality by λ, with the spread over seeds."""
-    rows = []
-    for name, material in shading_curves(study).items():
+    from mi_diffind.studies.shading.conclusions import trouble
+
+    rows, materials = [], shading_curves(*studies)
+    shares = sorted({share for material in materials.values() for _, share in material.runs})
+    for name, material in materials.items():
         for way in material.remedies:
+            met = trouble([d for share in shares if share for d in material.runs.get((way, share), [])])
             for letter in "CP":
-                cells = []
-                for share in material.shares(way):
-                    values = material.values(way, share, letter)
-                    spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
-                    cells.append(f"{mean(values):.2f}{spread}")
-                rows.append([name, way, letter, *cells])
-    curves = shading_curves(study).values()
-    shares = max((material.shares(way) for material in curves for way in material.remedies), key=len)
-    return table(["material", "", "", *(f"λ {share:g}" for share in shares)], rows)
+                values = [material.values(way, share, letter) for share in shares]
+                rows.append([name, way, letter, *(with_spread(v) if v else "–" for v in values), met or "none"])
+    return table(["material", "", "", *(f"λ {share:g}" for share in shares), "trouble"], rows)
+
+
+def shading_renders() -> str:
+    """Return errors and times of whole renders, bytes, and the time of a training step over that of the first row."""
+    study = measured("tradeoff_shading_renders")
+    chosen = {name: (1,) for name in study["bytes"] if name != "disney + mip maps"}
+    chosen |= {"principled + bitmaps": (1, 16), "principled + bitmaps, multijittered": (4, 16)}
+    rows = []
+    for points in zip(*(scene["points"] for scene in study["scenes"].values()), strict=True):
+        name, spp = points[0]["name"], points[0]["spp"]
+        if spp in chosen.get(name, ()):
+            cells = (f"{p['psnr_db']:.1f} / {p['cpu_ms']['median']:.0f}" for p in points)
+            step = study["steps"].get(name)
+            rows.append([f"{name}, {spp} spp", f"{study['bytes'][name]:,}", *cells,
+                         f"{step['ratio']['median']:.2f}" if step and spp == 1 else ""])  # fmt: skip
+    return table(["", "bytes", *study["scenes"], "training step"], rows)
 
 
 def material_times() -> str:
@@ -298,6 +315,21 @@ def material_times() -> str:
         times = (f"{r['median']:.2f} ({r['q1']:.2f} to {r['q3']:.2f})" if r else "–" for r in ratios)
         rows.append([f"`{name}`", *(f"{count:.2f}" for count in counts), *times])
     return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640", "training step"], rows)
+
+
+def scene_training() -> str:
+    """Return errors of held-out views and lights after training inside a scene and over the hemisphere."""
+    rows = []
+    for path in sorted((DOCS / "measured").glob("tradeoff_scene_training_*.json")):
+        for record in measured(path.stem)["jobs"].values():
+            d = record["details"]
+            times = [f"{d[key]:.{digits}f}" if key in d else "–" for key, digits in TRAINING_TIMES.items()]
+            rows.append([d["scene"], d["way"], f"{d['psnr_db']:.2f}", f"{d['flip']:.3f}", *times, d["peak_mib"]])
+    return table(["scene", "run", "PSNR, dB", "FLIP", "seconds", "ms a step", "level bias", "peak MiB"], rows)
+
+
+#: Figures of a training in the table above, and their digits.
+TRAINING_TIMES = {"training_seconds": 0, "step_ms": 0, "level_bias": 1}
 
 
 def sdf_errors(study: str) -> str:
@@ -437,6 +469,7 @@ TABLES = {
         image_pages,
         image_seen,
         material_times,
+        scene_training,
         texture_memory,
         texture_presets,
         texture_reads,
@@ -446,10 +479,10 @@ for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
 TABLES |= {
-    "shading_filters": lambda: shading_filters("tradeoff_shading"),
+    "shading_best": lambda: shading_best("tradeoff_shading", "tradeoff_shading_boombox"),
     "shading_shares": lambda: shading_shares("tradeoff_shading_lambda"),
-    "shading_filters_boombox": lambda: shading_filters("tradeoff_shading_boombox"),
-    "shading_shares_boombox": lambda: shading_shares("tradeoff_shading_boombox"),
+    "shading_shares_paper": lambda: shading_shares("tradeoff_shading_paper"),
+    "shading_renders": shading_renders,
 }
 for source in ("suzanne", "armadillo", "bunny"):
     for make in (sdf_errors, sdf_times):

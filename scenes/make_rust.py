@@ -35,15 +35,9 @@ def write_maps() -> None:
 
 def metal(repeats: float, id: str):
     """Return the material, its maps repeated the given number of times."""
-
-    def of(channels: str, parameter: str):
-        scale = transform("to_uv", scale={"x": repeats, "y": repeats})
-        return plugin("texture", "neural_texture", scale, name=parameter, channels=channels,
-                      filename="assets/$metal", storage="$storage", filter="$filter")  # fmt: skip
-
-    names = (("albedo", "base_color"), ("roughness", "roughness"), ("metallic", "metallic"))
-    inner = plugin("bsdf", "neural_disney", *(of(*pair) for pair in names))
-    return plugin("bsdf", "normalmap", of("normal", "normalmap"), inner, id=id)
+    scale = transform("to_uv", scale={"x": repeats, "y": repeats})
+    return plugin("bsdf", "neural_material", scale, id=id, filename="assets/$metal", lobes="tables",
+                  storage="$storage", filter="$filter")  # fmt: skip
 
 
 def main() -> None:

@@ -662,3 +662,20 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
     table = load(tmp_path / "x.npz")
     assert budget_of(table) == wanted
     assert recipe_of(table) == recipe
+
+
+def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
+    """With a rate that ruins the arrays; and a start of another source is refused."""
+    settings = FitSettings(steps=2, batch=64, lr=5.0, measure_every=1, deterministic=True)
+    recipe, before = SceneRecipe(reference_spp=4, settings=settings), load(folder / "material.npz")
+    request = FitRequest("ours", settings, array_module("llvm"), progress=False)
+    parsed, views = scenes.ParsedScene(path, {"film": 4}), ViewDistribution(1, 1)
+    table, result = fit_scene(parsed, views, recipe, request)
+    assert table.settings["kept_start"] and result.step == 0
+    for name, array in table.arrays.items():
+        np.testing.assert_array_equal(array.values, before.arrays[name].values)
+    other = load(folder / "material.npz")
+    other.settings["source"] = "other"
+    save_table(folder / "other.npz", other)
+    with pytest.raises(UsageError, match=r"--start: .*other\.npz holds other maps"):
+        fit_scene(parsed, views, recipe, request, start=folder / "other.npz")

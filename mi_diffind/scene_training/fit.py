@@ -13,6 +13,7 @@ import mitsuba as mi
 from .. import compat, scenes
 from ..conversion import cache_folder
 from ..deadline import profiled
+from ..errors import UsageError
 from ..files import writable_folder
 from ..fitting import FitResult, cores
 from ..maps.arguments import preview_path
@@ -45,8 +46,9 @@ def fit(request: FitRequest) -> Fitted:
     views, recipe = views_of(options, request.settings.seed), recipe_of(options, request.settings)
     parsed = scenes.ParsedScene(options["source"], dict(options["defines"] or ()))
     table, result = fit_scene(
-        parsed, views, recipe, request, options["texture"], options["references"], preview_path(request)
-    )
+        parsed, views, recipe, request, options["texture"], options["references"], preview_path(request),
+        options["start"],
+    )  # fmt: skip
     figures = {
         "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
         "bits": {name: a.bits for name, a in table.arrays.items()},
@@ -57,6 +59,8 @@ def fit(request: FitRequest) -> Fitted:
         f"{count} view{'s' if count != 1 else ''}, {recipe.spp} sample{'s' if recipe.spp != 1 else ''} a pixel",
         *filter(None, [table.settings.get("remark")]),
     ]
+    if table.settings.get("kept_start"):
+        lines.append("training inside the scene gained nothing: these are the arrays that it started from")
     if (samples := table.settings.get("reference_samples", recipe.reference_spp)) < recipe.reference_spp:
         lines.append(f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}")
     return Fitted(table, result, lines, figures)
@@ -70,12 +74,15 @@ def fit_scene(
     file: str | os.PathLike | None = None,
     references: str | os.PathLike | None = None,
     preview: Path | None = None,
+    start: str | os.PathLike | None = None,
 ) -> tuple[Table, FitResult]:
     """Train the arrays of a texture of a scene for the ``views``, and return the stored table and the run's record.
 
     ``file`` is the texture's file, needed if the scene reads several. ``request`` gives duration and checkpoint; its
     settings are those of the ``recipe``. ``references`` is a folder that keeps the reference images; ``preview`` a
-    picture that is written at each measurement. Runs in the variant that is set.
+    picture that is written at each measurement; ``start`` a file whose arrays and level bias the training starts from,
+    in place of the texture's. If no state renders the held-out views better than the start, the table holds the start
+    (setting ``kept_start``). Runs in the variant that is set.
 
     Raises :class:`~mi_diffind.scenes.SceneError`, :class:`~mi_diffind.errors.UsageError`,
     :class:`~mi_diffind.tables.TableError`, :class:`~mi_diffind.maps.source.SourceError`,
@@ -86,6 +93,8 @@ def fit_scene(
     table = load(file)
     source_path = original_of(table, file, given)
     source = load_source(source_path, nonfinite="clean")
+    if start is not None:
+        table = started(start, table)
     texture = texture_problem(table, source)
     bias = bias_of(table.settings)
     if recipe.start == "untrained":
@@ -110,21 +119,24 @@ def fit_scene(
         trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net), bias), settings)
         return trained_table, CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
 
-    remark = ""
+    remark, before = "", None
     if request.deadline is not None:
         compiled = compiled_file(f"{rendered.digest} {recipe.spp}")
         remark, before = limit(problem, request, compiled is not None and compiled.is_file())
-    start = {name: array.data for name, array in problem.net.arrays.items()}
+    elif recipe.start == "file":
+        before = problem.measure(problem.net)
+    arrays = {name: array.data for name, array in problem.net.arrays.items()}
     result = request.train(problem, finish=lambda: stored(identity))
-    if remark and before["psnr_db"] > result.measured["psnr_db"]:
-        for name, data in start.items():
+    kept = recipe.start == "file" and before["psnr_db"] > result.measured["psnr_db"]
+    if kept:
+        for name, data in arrays.items():
             problem.net.arrays[name].data = data
         result.measured, result.step = before, 0
-        remark += "; it gained nothing, these are the arrays that it started from"
     if request.deadline is not None and compiled is not None and problem.recipe.share > 0:
         compiled.touch()
     file = None if parsed.description else parsed.path
     settings = {**request.recorded(result), **identity, **request.paths(scene_path=file)}
+    settings |= {"kept_start": True} if kept else {}
     if remark:
         settings["remark"], result.unfinished = remark, True
     if rendered.samples < recipe.reference_spp:
@@ -135,6 +147,14 @@ def fit_scene(
     errors["psnr_scene_db"] = result.measured["psnr_db"]
     trained_table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
     return trained_table, result
+
+
+def started(start: str | os.PathLike, table: Table) -> Table:
+    """Return the table of a file to start from. Raises :class:`UsageError` if its maps are not those of ``table``."""
+    other = load(start)
+    if any(other.settings.get(key) != table.settings.get(key) for key in ("layout", "source")):
+        raise UsageError(f"--start: {start} holds other maps, or is of another source, than {table.path}")
+    return other
 
 
 def compiled_file(key: str) -> Path | None:

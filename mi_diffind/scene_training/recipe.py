@@ -86,10 +86,14 @@ FILE_ARGUMENTS = (
     Argument(
         "-D", dest="defines", action="append", type=define, metavar="NAME=VALUE", help="set a <default> of the scene"
     ),
+    Argument(
+        "--start", metavar="FILE.npz",
+        help="arrays to start from, of the same maps, such as those of fit shading (default: the scene's file)",
+    ),
     Argument("--texture", metavar="FILE.npz", help="file of the trained texture (default: the only one)"),
     Argument("--references", metavar="FOLDER", help="folder that keeps the references for later runs"),
     PREVIEW,
-)
+)  # fmt: skip
 
 #: All arguments of ``fit scene`` but the scene and the share.
 SCENE_ARGUMENTS = (*VIEW_ARGUMENTS, *RECIPE_ARGUMENTS, *FILE_ARGUMENTS)

@@ -64,12 +64,33 @@ def small(tmp_path, monkeypatch):
 
 
 def test_studies_are_found():
-    assert list(studies()) == ["disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture"]
+    assert list(studies()) == [
+        "disney",
+        "field",
+        "ggx",
+        "image",
+        "scene",
+        "scene-training",
+        "sdf",
+        "shading",
+        "texture",
+    ]
 
 
 def test_studies_of_others_are_found(small):
     with pytest.warns(RuntimeWarning) as warned:
-        assert list(studies()) == ["disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture", "small"]
+        assert list(studies()) == [
+            "disney",
+            "field",
+            "ggx",
+            "image",
+            "scene",
+            "scene-training",
+            "sdf",
+            "shading",
+            "texture",
+            "small",
+        ]
     texts = sorted(str(w.message) for w in warned)
     assert len(texts) == 2 and "No module named 'no_such_module_at_all'" in texts[0]
     assert texts[1].startswith('"ggx" (its_module) is left out: mi_diffind.studies has ')

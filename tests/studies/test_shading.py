@@ -154,6 +154,19 @@ def test_the_zoom_is_what_the_camera_sees(mi_rgb):
     np.testing.assert_allclose(aligned[0][inner], aligned[2][inner], atol=1e-3)
 
 
+def test_seeds_of_the_sweep(mi_rgb):
+    """Weights other than 0 and the preset's have fewer seeds; the paper's recipe has no filters beside it."""
+    from mi_diffind.studies.shading import plan
+
+    sources = {"lacquer": materials.generated_source("lacquer", 16)}
+    for preset, last in (("ours", 0.9), ("paper", 0.25)):
+        settings = plan.ShadingStudySettings((0.0, 0.25, 0.9), plan.REMEDIES[:1], 2, sweep_seeds=1, preset=preset)
+        jobs = plan.plan(sources, settings).jobs
+        runs = [(job.share, job.seed) for job in jobs if isinstance(job, plan.ShadingRun)]
+        assert sorted(runs) == sorted([(0.0, 0), (0.0, 1), (0.25, 0), (0.9, 0), (last, 1)])
+        assert any("Toksvig" in job.name for job in jobs) == (preset == "ours")
+
+
 COMMAND = ["--quick", "--lambda", "1", "--remedies", "on", "--side", "16", "--frames", "2", "--steps", "2",
            "--pretrain-steps", "2"]  # fmt: skip
 
@@ -227,6 +240,7 @@ def test_what_is_written(tmp_path, monkeypatch, capsys):
         (["lacquer", "lacquer"], "twice"),
         (["--compression", "0"], "0"),
         (["--steps", "3"], "--pretrain-steps"),
+        (["lacquer", "weave", "--renders", "file.npz"], "--renders: found 2 materials, one is needed"),
         (["--steps", "3", "--pretrain-steps", "3", "--seconds", "1"], "beside seconds"),
     ],
 )

@@ -8,8 +8,8 @@ converged render of the bitmaps with the contender's BSDF; errors are those of l
 pixels that are minified and on the surface.
 
 Each contender is rendered by a process of its own, since Dr.Jit compiles the materials of all scenes that a process
-holds into each kernel. They take turns; times are medians, of a clock (``ms``) and of the processor (``cpu_ms``), which
-depends less on what else the machine does.
+holds into each kernel. They take turns, on one core; times are medians, of a clock (``ms``) and of the processor
+(``cpu_ms``), which depends less on what else the machine does.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ... import scenes, task
+from ...compat import use_threads
 from ...maps.compressed import decibel
 from ...maps.pyramid import Pyramid
 from ...maps.source import Source
@@ -181,6 +182,7 @@ def materials_of(source: Source, tables: Sequence[Table]) -> list[RenderedMateri
 def _worker(material: RenderedMaterial, case: str, film, trains: bool, pipe) -> None:
     """Process of a contender in a scene: answer a pass ``(spp, seed)`` with an image and two times in ms."""
     mi.set_variant(pipe.recv())
+    use_threads(1)  # threads that wait for each other count as time of the processor
     mi.set_log_level(mi.LogLevel.Error)
     loaded = material.load(shape_of(case), film, SCENES[case][2], trains)
     while (request := pipe.recv()) is not None:
@@ -241,7 +243,7 @@ def measure(name: str, source: Source, tables: Sequence[Table], settings: Render
         "machine": clock.machine(mi.variant()), "date": time.strftime("%Y-%m-%d"),
         "settings": dataclasses.asdict(settings), "tables": [Path(t.path).name for t in tables],
         "notes": [f"{name}, {source.width} × {source.height}; {settings.film[0]} × {settings.film[1]} pixels; "
-                  "times of the processor.", *codecs.install_notes(["astc"])],
+                  "times of the processor, one core.", *codecs.install_notes(["astc"])],
         "bytes": {m.name: m.nbytes for m in materials}, "scenes": cases,
         "steps": _steps(materials, settings),
     }  # fmt: skip

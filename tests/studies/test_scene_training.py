@@ -1,0 +1,32 @@
+"""``tradeoff scene-training``: its scenes and sentences."""
+
+import pytest
+
+import mi_diffind
+from mi_diffind.errors import UsageError
+from mi_diffind.studies.scene_training import conclusions
+
+
+def details(way, psnr, scene="room", spp=1):
+    figures = {"scene": scene, "way": way, "spp": spp, "psnr_db": psnr, "flip": 0.1, "peak_mib": 300, "lambda": None}
+    return {"details": figures}
+
+
+def test_sentences_name_the_gain_over_the_hemisphere():
+    ways = {"start": 20.0, "scene": 22.0, "hemisphere": 21.5, "hemisphere, then scene": 22.75}
+    result = {"jobs": {way: details(way, psnr) for way, psnr in ways.items()}}
+    line, alone, after = conclusions.conclusions(result)
+    assert line == "room, over the start: scene +2.00 dB; hemisphere +1.50 dB; hemisphere, then scene +2.75 dB"
+    assert "for the same seconds gains +0.50 to +0.50 dB: 0 of 1 scenes" in alone
+    assert "with more seconds gains +1.25 to +1.25 dB: 1 of 1 scenes" in after
+    # Other samples per pixel than those of the first run do not count
+    result["jobs"]["other"] = details("scene", 40.0, spp=4)
+    assert conclusions.conclusions(result)[0] == line
+    assert len(conclusions.table(result)) == 6
+    del result["jobs"]["hemisphere"]
+    assert len(conclusions.conclusions(result)) == 1
+
+
+def test_a_scene_that_does_not_exist(tmp_path):
+    with pytest.raises(UsageError, match=r"nowhere\.xml, which is no file"):
+        mi_diffind.tradeoff("scene-training", tmp_path / "nowhere.xml")
