@@ -51,8 +51,8 @@ ROUNDING = 1e-4
 SHORTEST = 4
 
 
-class Choice(NamedTuple):
-    """What short trainings decide: the level bias, whether there are extras, and whether fine levels are fixed."""
+class Trial(NamedTuple):
+    """A short training, and what it decides: level bias, whether there are extras, whether fine levels are fixed."""
 
     bias: float
     extras: bool = False
@@ -75,9 +75,6 @@ class ShadingProblem(textures.TextureProblem):
     #: Tolerance of the PSNR of shaded images, dB.
     tolerance = 0.02
 
-    #: Highlights are rare: with 0.999, single ones tilt the normals of glossy, flat pages by degrees.
-    beta_2 = 0.99
-
     def __init__(
         self, net, pyramid: Pyramid, recipe: ShadingRecipe, digest: str = "",
         evaluation: ShadedEvaluation | None = None, base: Sequence[float] = (),
@@ -85,6 +82,7 @@ class ShadingProblem(textures.TextureProblem):
         super().__init__(net, pyramid, TEXTURES[recipe.texture], digest)
         self.shading, self.evaluation, self.base = recipe, evaluation, base
         self.level_bias = recipe.level_bias or 0.0
+        self.beta_2 = recipe.beta_2 if recipe.share > 0 else self.beta_2
         #: Picture that is written at each measurement, and the images that it shows a part of
         self.preview: tuple[Path, ShadedEvaluation] | None = None
         self.effects, _ = effects_of(pyramid.layout)
@@ -195,13 +193,13 @@ def fit_shading(
     choice, gains = recorded_choice(request)
     biases = BIASES if recipe.level_bias is None else (recipe.level_bias,)
     if choice is None and recipe.level_bias is not None and not recipe.extras:
-        choice = Choice(recipe.level_bias)
+        choice = Trial(recipe.level_bias)
 
     def shaded_errors(texture: CompressedTexture) -> dict[str, float]:
         errors = evaluation.measure(reader(texture, effects, decoder), False)
         return {f"shaded_{TRUTHS[k]}_db": f["mean_db"] for k, f in errors.items()}
 
-    def problem_of(choice: Choice) -> ShadingProblem:
+    def problem_of(choice: Trial) -> ShadingProblem:
         net = start.changed(lambda array, bits: array.copy())
         if choice.extras and net.extras is None:
             layout = pyramid.layout
@@ -216,7 +214,7 @@ def fit_shading(
         base = validation.measure(reader(texture, effects, decoder), False)["C"]["psnr_db"]
         if choice is None:
             choice, gains, stopped = choose(problem_of, request, biases, recipe)
-    problem, result = stopped or (problem_of(choice or Choice(biases[0])), None)
+    problem, result = stopped or (problem_of(choice or Trial(biases[0])), None)
     if result is None:
         problem.identity |= {"level_biases": gains} if gains else {}
         problem.preview = None if preview is None or evaluation is None else (preview, evaluation)
@@ -238,9 +236,9 @@ def fit_shading(
 
 
 def choose(
-    problem_of: Callable[[Choice], ShadingProblem], request: FitRequest, biases: Sequence[float], recipe: ShadingRecipe
+    problem_of: Callable[[Trial], ShadingProblem], request: FitRequest, biases: Sequence[float], recipe: ShadingRecipe
 ) -> tuple:
-    """Return the best :class:`Choice` after a short training with each, the gains, and ``None``.
+    """Return the best :class:`Trial` after a short training with each, the gains, and ``None``.
 
     The best has the largest mean of levels among those that lose at no level, or among all if each loses somewhere. If
     each of ``biases`` does, :data:`FIXED_BIASES` follow, with fixed fine levels; a recipe with a bias has its own. With
@@ -253,14 +251,14 @@ def choose(
     seconds = None if request.seconds is None else TRIAL * request.seconds
     short = None
 
-    def best() -> Choice:
+    def best() -> Trial:
         return max(measured, key=lambda c: (measured[c]["gain_db"] >= 0, measured[c]["shaded_converged_db"]))
 
-    def choices() -> Iterator[Choice]:
-        yield from map(Choice, biases)
+    def choices() -> Iterator[Trial]:
+        yield from map(Trial, biases)
         if measured[best()]["gain_db"] < 0 and TEXTURES[recipe.texture].layered:
             fixed = FIXED_BIASES if recipe.level_bias is None else biases
-            yield from (Choice(bias, fixed=True) for bias in fixed)
+            yield from (Trial(bias, fixed=True) for bias in fixed)
         if recipe.extras:
             yield best()._replace(extras=True)
 
@@ -280,11 +278,11 @@ def choose(
     return best(), {c.name: float(f"{m['gain_db']:.4g}") for c, m in measured.items()}, None
 
 
-def recorded_choice(request: FitRequest) -> tuple[Choice | None, dict]:
+def recorded_choice(request: FitRequest) -> tuple[Trial | None, dict]:
     """Return the choice of the training that is resumed, or ``None``, and the gains that it was made by."""
     recorded = checkpoint_settings(request.checkpoint) if request.resume and request.checkpoint is not None else {}
     shading = recorded.get("shading", {})
     if "level_bias" not in shading:
         return None, {}
-    choice = Choice(shading["level_bias"], *(bool(shading.get(name)) for name in ("extras", "fixed")))
+    choice = Trial(shading["level_bias"], *(bool(shading.get(name)) for name in ("extras", "fixed")))
     return choice, recorded.get("level_biases", {})

@@ -31,6 +31,7 @@ from mi_diffind.tasks.shading.presets import PRESETS
 from mi_diffind.tasks.shading.reference import reference
 from mi_diffind.tasks.texture import TASK as TEXTURE
 from mi_diffind.tasks.texture import training as textures
+from mi_diffind.tasks.texture.compressed import CompressedTexture
 from mi_diffind.tasks.texture.presets import PRESETS as TEXTURES
 
 OURS = PRESETS["ours"]
@@ -363,46 +364,64 @@ def test_a_level_that_loses_outweighs_all_that_gain():
 @pytest.mark.parametrize(
     "gains, expected",
     [
-        # The best that loses nowhere; the best mean if all lose somewhere; extras, only if they gain
-        ({(0.0, False): (1.0, 30), (-0.5, False): (2.0, 31), (-1.0, False): (-0.1, 32)}, (-0.5, False)),
-        ({(0.0, False): (-3.0, 30), (-0.5, False): (-2.0, 31), (-1.0, False): (-0.1, 29)}, (-0.5, False)),
-        ({(0.0, False): (0.0, 30), (-0.5, False): (-2.0, 31), (-1.0, False): (-0.1, 29)}, (0.0, False)),
-        ({(0.0, False): (1.0, 30), (-0.5, False): (2.0, 31), (-1.0, False): (3.0, 29), (-0.5, True): (2.1, 31.1)},
-         (-0.5, True)),
-        ({(0.0, False): (1.0, 30), (-0.5, False): (2.0, 31), (-1.0, False): (3.0, 29), (-0.5, True): (-0.1, 32)},
-         (-0.5, False)),
+        # The best that loses nowhere
+        ({"0": (1.0, 30), "-0.5": (2.0, 31), "-1": (-0.1, 32)}, "-0.5"),
+        ({"0": (0.0, 30), "-0.5": (-2.0, 31), "-1": (-0.1, 29)}, "0"),
+        # With fixed fine levels, if all lose somewhere; the best mean if these do, too
+        ({"0": (-3.0, 30), "-0.5": (-2.0, 31), "-1": (-0.1, 29), "0, fine levels fixed": (0.1, 28),
+          "-0.25, fine levels fixed": (0.2, 28.5), "-0.5, fine levels fixed": (-0.1, 29)}, "-0.25, fine levels fixed"),
+        ({"0": (-3.0, 30), "-0.5": (-2.0, 31), "-1": (-0.1, 29), "0, fine levels fixed": (-0.1, 28),
+          "-0.25, fine levels fixed": (-0.2, 28.5), "-0.5, fine levels fixed": (-0.1, 29)}, "-0.5"),
+        # Extras, only if they gain
+        ({"0": (1.0, 30), "-0.5": (2.0, 31), "-1": (3.0, 29), "-0.5, extras": (2.1, 31.1)}, "-0.5, extras"),
+        ({"0": (1.0, 30), "-0.5": (2.0, 31), "-1": (3.0, 29), "-0.5, extras": (-0.1, 32)}, "-0.5"),
     ],
 )  # fmt: skip
-def test_choice_of_level_bias_and_extras(ad, gains, expected):
+def test_choice_by_short_trainings(ad, gains, expected):
     """Figures that are made up for the images that choose; a training of each choice, unless the time is too short."""
 
     class Figures(training.ShadingProblem):
-        def __init__(self, *choice):
+        def __init__(self, choice):
             self.choice = choice
 
         net = property(lambda self: None)
 
         def measure(self, net):
             time.sleep(1e-3)  # longer than the limits below
-            return dict(zip(("gain_db", "shaded_converged_db"), gains[self.choice], strict=True))
+            return dict(zip(("gain_db", "shaded_converged_db"), gains[self.choice.name], strict=True))
 
     class Request(FitRequest):
         def train(self, problem, title):
             assert self.settings.steps == 8 and self.checkpoint is None
-            trained.append(problem.choice)
+            trained.append(problem.choice.name)
             return FitResult(problem.measure(None), 8, 8, 0.0, False, 0)
 
-    choices = [choice for choice in gains if not choice[1]]
+    recipe = dataclasses.replace(OURS, extras=any("extras" in name for name in gains))
     for limit in ({}, {"seconds": 1e-9}, {"deadline": Deadline(1e-9)}):
         trained, settings = [], dataclasses.replace(OURS.settings, steps=100)
         request = Request("ours", settings, ad, checkpoint="x", **limit)
-        choice, kept, stopped = training.choose(Figures, request, choices, len(gains) > 3)
-        assert choice == expected and stopped is None and trained == ([] if limit else list(gains))
-        assert kept == {f"{b:g}{', extras' * x}": pytest.approx(g) for (b, x), (g, _) in gains.items()}
+        choice, kept, stopped = training.choose(Figures, request, training.BIASES, recipe)
+        assert choice.name == expected and stopped is None and trained == ([] if limit else list(gains))
+        assert kept == {name: pytest.approx(gain) for name, (gain, _) in gains.items()}
+
+
+def test_fixed_fine_levels_keep_their_values(start, ad, monkeypatch):
+    """Level 0 is that of the start, to the byte; coarse levels are trained."""
+    fixed = training.Trial(0.0, fixed=True)
+    monkeypatch.setattr(training, "choose", lambda *a: (fixed, {fixed.name: 1.0}, None))
+    monkeypatch.setattr(training, "gain_of", lambda *a: 1.0)
+    _, pyramid, table, *_ = start
+    found, _ = trained(start, ad, quick(steps=5, measure_every=5, lr=0.05, level_bias=None))
+    assert found.settings["shading"]["fixed"]
+    nets = [CompressedTexture.of(t, ad.TensorXf) for t in (table, found)]
+    u, v = (ad.Float(np.random.default_rng(i).random(200, np.float32)) for i in range(2))
+    for level, equal in ((0.0, True), (pyramid.levels - 2.0, False)):
+        before, after = (np.array(net.filtered(u, v, dr.full(ad.Float, level, 200))) for net in nets)
+        assert np.array_equal(before, after) == equal
 
 
 def test_extras_are_trained_stored_and_read_by_the_material_alone(mi_rgb, start, ad, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "choose", lambda *a: ((0.0, True), {"0, extras": 1.0}, None))
+    monkeypatch.setattr(training, "choose", lambda *a: (training.Trial(0.0, extras=True), {"0, extras": 1.0}, None))
     found, _ = trained(start, ad, quick(steps=30, measure_every=30, extras=True))
     extras = found.arrays["extras"]
     assert extras.shape == (3, 8, 8, 3) and found.settings["shading"]["extras"] and "kept_start" not in found.settings
