@@ -317,6 +317,16 @@ def material_times() -> str:
     return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640", "training step"], rows)
 
 
+def shading_distances() -> str:
+    """Return the PSNR of materials before and after training for their shading, as seen from three distances."""
+    rows = []
+    for name, study in measured("bench_shading_distances").items():
+        pairs = ((f["before"]["psnr_db"], f["after"]["psnr_db"]) for f in study["seen"].values())
+        figures = (f"{before:.1f} → {after:.1f}" for before, after in pairs)
+        rows.append([name, f"{study['level_bias']:g}", "yes" if study["fixed"] else "no", *figures])
+    return table(["material", "level bias", "fine levels fixed", "near, dB", "middle, dB", "far, dB"], rows)
+
+
 def scene_training() -> str:
     """Return errors of held-out views and lights after training inside a scene and over the hemisphere."""
     rows = []
@@ -469,6 +479,7 @@ TABLES = {
         image_pages,
         image_seen,
         material_times,
+        shading_distances,
         scene_training,
         texture_memory,
         texture_presets,

@@ -108,6 +108,8 @@ def fit(request: FitRequest) -> Fitted:
     lines += [f"{source.nbytes / table.nbytes:.2f}x", f"effects that are shaded: {', '.join(effects.names)}"]
     if table.settings.get("level_bias"):
         lines.append(f"read {-table.settings['level_bias']:g} levels finer than the footprint")
+    if table.settings.get("shading", {}).get("fixed") and not table.settings.get("kept_start"):
+        lines.append("fine levels keep the values of the texture: any training of theirs made some level worse")
     if table.settings.get("kept_start"):
         lines.append("training for the shading gained nothing: these are the arrays that it started from")
     if reasons:
