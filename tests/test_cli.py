@@ -376,7 +376,8 @@ def test_help_lists_what_each_task_says(capsys):
     text, _ = asked_for_help([["fit"], *(["fit", name] for name in tasks())])
     for name, task in tasks().items():
         line = " ".join(text["fit",].split())
-        assert f"{name} train tables of {task.title} ({task.section})" in line
+        section = f" ({task.section})" if task.section else ""
+        assert f"{name} train tables of {task.title}{section}" in line
         own = " ".join(text["fit", name].split())
         assert "{" + ",".join(task.presets) + "}" in own
         for preset, settings in task.presets.items():

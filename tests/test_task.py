@@ -24,7 +24,7 @@ from mi_diffind.tables import Table
 from mi_diffind.task import Model, Task, fit, task_of, tasks
 
 ROOT = Path(__file__).resolve().parents[1]
-BUILT_IN = ("disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture")
+BUILT_IN = ("bsdf", "disney", "field", "ggx", "image", "scene", "sdf", "shading", "texture")
 
 
 # -- what is found ----------------------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def test_what_a_task_declares(name):
     """Enough for the help and the documentation; a file that ships for each preset that says so."""
     task = tasks()[name]
     assert (task.title and task.title[0].islower()) or task.title.split()[0].isupper()
-    assert task.section and sys.modules[type(task).__module__].__doc__.strip()
+    assert sys.modules[type(task).__module__].__doc__.strip()
     assert task.presets and all(isinstance(s, FitSettings) for s in task.presets.values())
     assert set(task.storages) <= set(STORAGES) == set(task_module.STORAGES)
     assert set(task.shipped) <= set(task.presets)

@@ -142,7 +142,7 @@ SCENE = """
 def test_plugins_of_this_package_say_what_they_are(mi_rgb):
     declared = plugins.declared()
     assert {name: p.object_type for name, p in declared.items()} == {
-        "disney": "bsdf", "mipmap": "texture", "neural_disney": "bsdf", "neural_ggx": "bsdf",
+        "disney": "bsdf", "mipmap": "texture", "neural_bsdf": "bsdf", "neural_disney": "bsdf", "neural_ggx": "bsdf",
         "neural_field": "integrator", "neural_image": "texture", "neural_material": "bsdf",
         "neural_sdf": "shape", "neural_texture": "texture", "path_footprint": "integrator",
         "path_sdf": "integrator",

@@ -1,0 +1,57 @@
+"""Learned BSDFs: any reflecting BSDF as an analytic proxy times a learned residual.
+
+- :mod:`.model`: the form of a learned BSDF, its proxy and coordinates;
+- :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.symmetry`: symmetries, measured;
+- :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
+- :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
+- :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo; :mod:`.files`: table files.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from ...arguments import Argument, checked
+from ...settings import FitSettings
+from ...task import Task
+from ...units import parse_bytes
+
+
+def _coordinate(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"found {text!r}, a number is needed") from None
+
+
+class BSDFTask(Task):
+    """The task. ``ours``: proxy × indirection; ``table``: proxy × one array; ``paper``: indirection alone."""
+
+    name = "bsdf"
+    title = "any reflecting BSDF"
+    example = "scene.xml --material wood"
+    plugin = ("bsdf", "neural_bsdf")
+    presets = {  # noqa: RUF012
+        name: FitSettings(steps=1500, batch=2**14, lr=2e-2, schedule="cosine", seed=1, measure_every=150)
+        for name in ("ours", "table", "paper")
+    }
+    storages = ()
+    arguments = (
+        Argument("source", metavar="SOURCE", help="scene or BSDF (.xml), or measured file (.bsdf, .pbsdf, .binary)"),
+        Argument("--material", default="", metavar="ID", help="id of a BSDF of the scene"),
+        Argument(
+            "--uv", nargs=2, type=_coordinate, default=(0.5, 0.5), metavar=("U", "V"),
+            help="point of the textures at which the BSDF is fitted (default: 0.5 0.5)",
+        ),
+        Argument(
+            "--bytes", type=checked(parse_bytes), default="2k", metavar="SIZE",
+            help="size of the residual's arrays (default: 2k)",
+        ),
+        Argument(
+            "--energy", choices=("source", "raw"), default="source",
+            help="limit the albedo to the source's, or leave it as it was fitted (default: source)",
+        ),
+    )  # fmt: skip
+
+
+TASK = BSDFTask()

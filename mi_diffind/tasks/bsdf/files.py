@@ -1,0 +1,137 @@
+"""Table files of learned BSDFs."""
+
+from __future__ import annotations
+
+import math
+import os
+
+import numpy as np
+
+from ...indirection import DifferentiableArray, Indirection
+from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
+from ...task import Model
+from .mixture import Mixture
+from .model import AZIMUTHS, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, Proxy
+
+#: Arrays of the residual.
+RESIDUAL = ("primary_uv", "primary_vw", "cascaded")
+
+#: Limit of the range of residuals, natural logarithms.
+WIDEST = 40.0
+
+
+def to_table(
+    net: BSDFArrays, form: Form, alphas, weights: np.ndarray, scale: np.ndarray | None, settings: dict
+) -> Table:
+    """Return the table of trained arrays: residual, weights and scale as bytes, the proxy in single precision."""
+    arrays = {}
+    residual = net.residual
+    if isinstance(residual, Indirection):
+        parts = dict(zip(RESIDUAL, (*residual.primary, residual.cascaded), strict=True))
+    else:
+        parts = {"cascaded": residual}
+    arrays |= {name: StoredArray.of(array.quantised(8)) for name, array in parts.items()}
+    if net.proxy is not None:
+        logarithms = net.rate * net.proxy.numpy()
+        arrays["proxy"] = StoredArray(logarithms.astype(np.float32))
+    arrays["weights"] = byte_array(np.rint(weights * 255), 1 / 255)
+    if scale is not None:
+        low = min(float(scale.min()), 1 - 1e-6)
+        step = (1 - low) / 255
+        arrays["energy"] = byte_array(np.floor((scale[:, None] - low) / step + 1e-9), step, low)
+    return Table("bsdf", arrays, settings={"form": form.to_json(), "alphas": list(alphas), **settings})
+
+
+def form_of(table: Table) -> Form:
+    """Return the form in a table's settings. Raises :class:`TableError`."""
+    given = table.settings.get("form")
+    try:
+        form = Form(
+            tuple(given["terms"]), given["isotropic"], given["azimuth"],
+            tuple(map(float, given["scale"])), tuple(map(float, given["range"])),
+        )  # fmt: skip
+        low, high = form.range
+        valid = (
+            set(form.terms) <= set(TERMS)
+            and isinstance(form.isotropic, bool)
+            and form.azimuth in AZIMUTHS
+            and len(form.scale) == 2
+            and all(1e-3 <= a <= 1 for a in form.scale)
+            and -WIDEST <= low < high <= WIDEST
+        )
+    except (KeyError, TypeError, ValueError):
+        valid = False
+    if not valid:
+        raise TableError(f'{table.path}: its setting "form" is {str(given)[:80]!r}, which is no form of a BSDF')
+    return form
+
+
+def load(path: str | os.PathLike) -> Table:
+    """Read and check a table file of this task. Raises :class:`TableError`."""
+    table = load_table(path, "bsdf")
+    form = form_of(table)
+    dims = {"cascaded": (3, 3), "weights": (1, 3)}
+    if "primary_uv" in table.arrays or "primary_vw" in table.arrays:
+        dims |= {"primary_uv": (2, 2), "primary_vw": (2, 1)}
+    if form.terms:
+        dims["proxy"] = (1, 1)
+    if "energy" in table.arrays:
+        dims["energy"] = (1, 1)
+    for name in dims:
+        if name not in table.arrays:
+            raise TableError(f'{path}: the array "{name}" is missing')
+    for name, array in table.arrays.items():
+        if name not in dims:
+            raise TableError(f'{path}: has an unexpected array "{name}"')
+        if (len(array.shape) - 1, array.shape[-1]) != dims[name]:
+            raise TableError(
+                f'{path}: the array "{name}" has the shape {array.shape}, expected {dims[name][0]} dimension(s) and '
+                f"{dims[name][1]} channel(s)"
+            )
+    if form.terms and table.arrays["proxy"].shape != (PARAMETERS, 1):
+        raise TableError(f'{path}: the array "proxy" has the shape {table.arrays["proxy"].shape}, expected (22, 1)')
+    unit = (0.0, 1.0)
+    check_ranges(table, {n: unit for n in table.arrays if n != "proxy"})
+    alphas = table.settings.get("alphas")
+    if not (isinstance(alphas, list) and len(alphas) == 2 and all(_is_alpha(a) for a in alphas)):
+        raise TableError(f'{path}: its setting "alphas" is {alphas!r}, expected 2 numbers from 0.001 to 1')
+    return table
+
+
+def _is_alpha(value) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value) and 1e-3 <= value <= 1
+
+
+def allocate(table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
+    """Return the arrays; ``storage`` is the form of those of the residual, ``proxy`` is always in single precision."""
+    result = {}
+    for name, array in table.arrays.items():
+        form = storage if name in RESIDUAL else "float32"
+        result[name] = array.allocate(dtype, form, fold=name in RESIDUAL)
+    return result
+
+
+class BSDFModel(Model):
+    """A table file as a ``bsdf`` (:class:`.model.LearnedBSDF`) and a ``mixture`` that samples it."""
+
+    forms = ("float32", "uint8")
+
+    def build(self):
+        self.form = form_of(self.table)
+        self.mixture = Mixture(self.arrays["weights"], tuple(self.table.settings["alphas"]))
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Build the BSDF anew from its arrays, after some of them have changed."""
+        parts = [self.arrays.get(name) for name in RESIDUAL]
+        residual = parts[2] if parts[0] is None else Indirection(parts[:2], parts[2], [(0, 1), (1, 2)])
+        proxy = self.arrays.get("proxy")
+        proxy = None if proxy is None else Proxy.of(BSDFArrays(None, proxy).logarithms(), self.form)
+        self.bsdf = LearnedBSDF(self.form, residual, proxy, self.arrays.get("energy"))
+
+    def entries(self) -> dict:
+        """Return what can be optimised: the residual's arrays in single precision, and the proxy."""
+        return {n: a for n, a in self.arrays.items() if a.storage == "float32" and n in (*RESIDUAL, "proxy")}
+
+
+MODEL = BSDFModel

@@ -1,0 +1,135 @@
+"""``fit bsdf SOURCE``: any reflecting BSDF as a proxy, a residual, and a mixture that samples it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import drjit as dr
+import numpy as np
+
+from ...errors import UsageError
+from ...task import FitRequest, Fitted
+from ...units import parse_bytes
+from . import energy, mixture, symmetry, training
+from .files import BSDFModel, allocate, to_table
+from .model import Form, LearnedBSDF, structure_of
+from .truth import Truth, truth_of
+from .view import SphereView
+
+#: Share of a limited time in which the proxy is fitted.
+PRETRAINING = 0.3
+
+
+def check(request: FitRequest) -> None:
+    """Raise :class:`UsageError` for options that exclude each other."""
+    if request.options["source"] is None:
+        raise UsageError("source: not given, a BSDF is needed: a scene, a .xml of one BSDF, or a measured file")
+
+
+def fit(request: FitRequest) -> Fitted:
+    """Fit a BSDF as requested on the command line, in the active variant. Raises :class:`UsageError`."""
+    use_rgb_variant(request)
+    options = request.options
+    u, v = options["uv"]
+    truth = truth_of(options["source"], request.types, options["material"], (float(u), float(v)))
+    return fit_truth(truth, request)
+
+
+def use_rgb_variant(request: FitRequest) -> None:
+    """Set an RGB variant of Mitsuba on the device of the request, if none is set."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("cuda_ad_rgb" if ".cuda." in request.types.__name__ else "llvm_ad_rgb")
+
+
+def fit_truth(truth: Truth, request: FitRequest) -> Fitted:
+    """Fit a learned BSDF to a source, measure it, and return its table and the record of its training."""
+    types, options, settings = request.types, request.options, request.settings
+    with dr.suspend_grad():
+        symmetries = symmetry.measured_symmetry(truth, types)
+    isotropic = symmetries["isotropy"] <= symmetry.TOLERANCE
+    azimuth = "mirror" if symmetries["mirror"] <= symmetry.TOLERANCE else "half"
+    lines = [symmetry_line(symmetries)]
+    plain = request.preset == "table"
+    try:
+        structure = structure_of(parse_bytes(options["bytes"]), plain)
+    except ValueError as e:
+        raise UsageError(f"--bytes: {e}") from None
+    samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)
+    validation = training.draw(truth, types, training.VALIDATION, settings.seed + 2, isotropic)
+    view = SphereView(truth, types)
+    if request.preset == "paper":
+        logarithms, form = np.zeros(22, np.float32), Form((), isotropic, azimuth, (0.05, 0.05))
+        form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
+    else:
+        logarithms, _ = training.fit_proxy(samples, validation, types, isotropic, request.progress)
+        form = training.form_of(logarithms, validation, isotropic, azimuth)
+    identity = {"source": truth.digest, "structure": dataclasses.asdict(structure), "form": form.to_json()}
+    problem = training.residual_problem(logarithms, form, structure, samples, view, identity)
+    result = request.train(problem)
+    bsdf = LearnedBSDF.of(form, problem.net.rounded())
+
+    alphas, weights = mixture.fitted_mixture(truth, types, isotropic)
+    scale, raw = None, view.psnr(cosine(bsdf))
+    if options["energy"] == "source":
+        azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
+        scale = energy.fitted_scale(cosine(bsdf), truth, types, azimuths)
+    table = to_table(problem.net, form, alphas, weights, scale, {
+        **request.recorded(result), "source": truth.digest, "name": truth.name, "symmetry": symmetries,
+        "structure": dataclasses.asdict(structure),
+    })  # fmt: skip
+    table.preset, table.seed = request.preset, settings.seed
+    table.settings |= request.paths(source_path=options["source"])
+    model = BSDFModel(table, allocate(table, types.TensorXf), types.TensorXf)
+    measured = measure(model, truth, view)
+    table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
+    if scale is not None:
+        lines.append(f"albedo limited to the source's: factors down to {scale.min():.4f}; {raw:.2f} dB without")
+    left_out = [name for name in ("diffuse", "first", "second") if name not in form.terms]
+    if left_out and form.terms:
+        lines.append(f"the proxy has no {' and no '.join(left_out)} lobe: the source does not need it")
+    figures = {
+        "symmetry": symmetries,
+        "form": form.to_json(),
+        "arrays": {n: list(a.shape) for n, a in table.arrays.items()},
+    }
+    return Fitted(table, result, lines, figures)
+
+
+def symmetry_line(symmetries: dict[str, float]) -> str:
+    """Return the measured symmetries as a line of text."""
+    assumed = {
+        "isotropy": ("isotropic", "anisotropic"),
+        "mirror": ("symmetric about the plane of incidence", "not symmetric about the plane of incidence"),
+        "reciprocity": ("reciprocal", "not reciprocal: its symmetric part is fitted"),
+    }
+    parts = []
+    for name, (yes, no) in assumed.items():
+        value = symmetries[name]
+        parts.append(f"{yes if value <= symmetry.TOLERANCE else no} ({100 * value:.2g}%)")
+    return "measured: " + ", ".join(parts)
+
+
+def cosine(bsdf: LearnedBSDF):
+    """Return the function f cos θ_o of a learned BSDF."""
+    return lambda wi, wo: [v * wo.z for v in bsdf.value(wi, wo)]
+
+
+def measure(model: BSDFModel, truth: Truth, view: SphereView) -> dict[str, float]:
+    """Return figures of a model: PSNR, albedo and sampling.
+
+    ``psnr_db`` is that of the picture of :mod:`.view`; ``albedo_excess`` the largest relative difference by which a
+    directional albedo, from 0° to 89°, lies above the source's; ``sample_weight_moment`` the mean of E[w²]/E[w]² of the
+    weights of samples at 0°, 45° and 80°.
+    """
+    types, value = model.types, cosine(model.bsdf)
+    cos = np.cos(np.radians([0, 15, 30, 45, 60, 70, 80, 85, 89]))
+    source, learned = energy.albedos([truth.value, value], truth, types, cos)
+    moments = [mixture.second_moment(truth.value, model.mixture, truth, types, float(c)) for c in cos[[0, 3, 6]]]
+    return {
+        "psnr_db": view.psnr(value),
+        "albedo_excess": float(((learned - source) / np.maximum(source, 1e-3)).max()),
+        "sample_weight_moment": float(np.mean(moments)),
+    }

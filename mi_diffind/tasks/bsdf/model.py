@@ -1,0 +1,298 @@
+"""Reflecting BSDF as an analytic proxy times the exponential of a learned residual.
+
+In the local frame, with the normal (0, 0, 1), directions ``wi`` and ``wo`` above the surface, their half vector h, and
+the angle θ_d between h and either direction,
+
+    f(wi, wo) = proxy(wi, wo) · exp(C[P₁(u, v), P₂(v, w)]).
+
+The *proxy* is the sum of a Lambertian lobe with an edge term, ρ/π (1 + (e − 1)(1 − cos θ_i)⁵)(1 + (e − 1)(1 − cos
+θ_o)⁵), and of two microfacet lobes D V F. D is the generalised Trowbridge–Reitz distribution of exponent γ (Burley
+2012, appendix B; γ = 2 is GGX), V Smith's masking over 4 cos θ_i cos θ_o, and F = F₀ + (F₉₀ − F₀)(1 − cos θ_d)⁵ with
+free F₀ and F₉₀.
+
+The *residual* is an indirection (two primary arrays, one cascaded array) in three coordinates in [0, 1]:
+
+- u = log(1 + t) / log(1 + 1/a²), t = h_x²/a_x² + h_y²/a_y², where a = α/√γ of the narrowest lobe: entries are dense in
+  the peak;
+- v = √(1 − cos θ_d), nearly linear in θ_d;
+- w = cos²φ_d = (cos θ_i − cos θ_o)² / (4 sin²θ_h sin²θ_d), φ_d the azimuth of ``wi`` about h (Rusinkiewicz 1998).
+
+None of them changes when ``wi`` and ``wo`` are exchanged: f is reciprocal, bit for bit but for rounding. Exchanging
+them also maps φ_d to φ_d + π, so that w assumes in addition that f is symmetric about the plane of incidence
+(``azimuth="mirror"``). With ``azimuth="half"``, w = φ_d/π mod 1 assumes reciprocity alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+import drjit as dr
+import numpy as np
+from drjit import nn
+
+from ...indirection import DifferentiableArray, Indirection, rounded, unfolded
+from ...lookup import clamp
+
+#: Smallest roughness of a lobe, and smallest scale of the coordinate u.
+ALPHA_MIN = 1e-3
+
+#: Parameters of the proxy: 3 of the diffuse colour, 1 edge, and for each of two lobes α_u, α_v, γ/2, F₀ and F₉₀ (RGB).
+DIFFUSE, EDGE, LOBE, PARAMETERS = slice(0, 3), 3, 9, 22
+
+#: Names of the proxy's terms.
+TERMS = ("diffuse", "first", "second")
+
+#: Logarithm below which a colour of the proxy counts as black.
+BLACK = -9.0
+
+#: Logarithms of the proxy's parameters are limited to this range.
+LOGARITHMS = (-14.0, 5.0)
+
+AZIMUTHS = ("mirror", "half")
+
+
+@dataclass(frozen=True)
+class Form:
+    """Form of a learned BSDF: what a file's settings say beyond its arrays.
+
+    ``terms`` are those of the proxy (:data:`TERMS`; none: the residual alone). ``scale`` = (a_x, a_y) of the coordinate
+    u, ``range`` the residuals that 0 and 1 in the cascaded array stand for. ``isotropic``: α_v of the lobes is α_u.
+    """
+
+    terms: tuple[str, ...] = TERMS
+    isotropic: bool = True
+    azimuth: str = "mirror"
+    scale: tuple[float, float] = (0.1, 0.1)
+    range: tuple[float, float] = (-1.0, 1.0)
+
+    def to_json(self) -> dict:
+        """Return the form as JSON."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+
+
+@dataclass
+class DirectionPair:
+    """Terms that the proxy and the coordinates share; all are even in exchanging ``wi`` and ``wo``.
+
+    ``hx2``, ``hy2`` and ``hz2`` are the squared components of the half vector, which sum to 1; ``cos_d`` = cos θ_d;
+    ``schlick`` = (1 − cos θ_d)⁵.
+    """
+
+    wi: object
+    wo: object
+    half: object
+    hx2: object
+    hy2: object
+    hz2: object
+    cos_d: object
+    schlick: object
+
+    @classmethod
+    def of(cls, wi, wo) -> DirectionPair:
+        half = wi + wo
+        h2 = dr.maximum(dr.squared_norm(half), 1e-12)
+        inverse, cos_d = dr.rcp(h2), dr.minimum(0.5 * dr.sqrt(h2), 1)
+        x, y, z = (dr.square(c) * inverse for c in half)
+        return cls(wi, wo, half, x, y, z, cos_d, _fifth(1 - cos_d))
+
+
+def _fifth(x):
+    return dr.square(dr.square(x)) * x
+
+
+@dataclass
+class ProxyLobe:
+    """Microfacet lobe of the proxy; roughness, exponent, and colours as lists of three arrays."""
+
+    alpha_u: object
+    alpha_v: object
+    gamma: object
+    f0: list
+    f90: list
+
+    def value(self, g: DirectionPair) -> list:
+        """Return D V F, three arrays."""
+        slope = dr.fma(g.hx2, dr.rcp(dr.square(self.alpha_u)), dr.fma(g.hy2, dr.rcp(dr.square(self.alpha_v)), g.hz2))
+        d = dr.exp2(-self.gamma * dr.log2(slope)) * dr.rcp(dr.pi * self.alpha_u * self.alpha_v)
+        d = d * dr.rcp(masking(g.wi, self.alpha_u, self.alpha_v) * masking(g.wo, self.alpha_u, self.alpha_v))
+        return [d * dr.fma(edge - normal, g.schlick, normal) for normal, edge in zip(self.f0, self.f90, strict=True)]
+
+
+def masking(w, alpha_u, alpha_v):
+    """Return d(w), the denominator of Smith's masking G₁(w) = 2 cos θ / d(w); at least the smaller roughness."""
+    projected = dr.square(alpha_u * w.x) + dr.square(alpha_v * w.y)
+    return w.z + dr.sqrt(dr.fma(w.z, w.z, projected))
+
+
+@dataclass
+class Proxy:
+    """Analytic proxy: ``diffuse`` (three arrays) and ``edge``, and microfacet ``lobes`` by name."""
+
+    diffuse: list | None
+    edge: object
+    lobes: dict[str, ProxyLobe]
+
+    @classmethod
+    def of(cls, logarithms: list, form: Form) -> Proxy:
+        """Return the proxy of :data:`PARAMETERS` logarithms, arrays."""
+        values = [dr.exp(clamp(x, *LOGARITHMS)) for x in logarithms]
+        lobes = {}
+        for k, name in enumerate(TERMS[1:]):
+            a = 4 + k * LOBE
+            if name in form.terms:
+                alphas = [dr.clip(values[a + i], ALPHA_MIN, 1) for i in (0, 0 if form.isotropic else 1)]
+                lobes[name] = ProxyLobe(*alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9])
+        return cls(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
+
+    def value(self, g: DirectionPair) -> list:
+        """Return the proxy, without the cosine, three arrays."""
+        result = [0, 0, 0]
+        if self.diffuse is not None:
+            k = self.edge - 1
+            shape = dr.fma(k, _fifth(1 - g.wi.z), 1) * dr.fma(k, _fifth(1 - g.wo.z), 1) * dr.inv_pi
+            result = [colour * shape for colour in self.diffuse]
+        for lobe in self.lobes.values():
+            result = [a + b for a, b in zip(result, lobe.value(g), strict=True)]
+        return result
+
+
+class BSDFArrays(nn.Module):
+    """Arrays of a learned BSDF.
+
+    ``residual`` is an :class:`~mi_diffind.indirection.Indirection` of three coordinates, or one array that is read at
+    them; ``proxy`` holds the logarithms of the proxy's parameters, divided by ``rate``, as an array ``(22, 1)``
+    (``None``: no proxy).
+    """
+
+    DRJIT_STRUCT = {"residual": nn.Module, "proxy": DifferentiableArray, "rate": float}  # noqa: RUF012
+
+    def __init__(self, residual=None, proxy=None, rate: float = 1.0):
+        self.residual, self.proxy, self.rate = residual, proxy, rate
+
+    def _alloc(self, dtype, size=-1, rng=None):
+        parts = [None if part is None else part._alloc(dtype)[0] for part in (self.residual, self.proxy)]
+        return BSDFArrays(*parts, self.rate), 3
+
+    def logarithms(self) -> list:
+        """Return the logarithms of the proxy's parameters as arrays of one number each."""
+        entries = self.proxy.data.array
+        index = dr.uint32_array_t(type(entries))
+        return [self.rate * dr.gather(type(entries), entries, index(i)) for i in range(PARAMETERS)]
+
+    def rounded(self) -> BSDFArrays:
+        """Return a copy whose residual rounds its entries to bytes, for training."""
+        residual = self.residual
+        residual = rounded(residual) if isinstance(residual, Indirection) else residual.rounded(8)
+        return BSDFArrays(residual, self.proxy, self.rate)
+
+    def unfolded(self) -> BSDFArrays:
+        """Return a copy whose entries are folded already."""
+        return BSDFArrays(unfolded(self.residual), self.proxy, self.rate)
+
+
+class LearnedBSDF:
+    """BSDF of arrays.
+
+    ``residual`` is any function of a list of three coordinates, or ``None``; ``proxy`` may be ``None``, too. ``energy``
+    is an array of s(θ) ≤ 1, read at √cos θ: f is multiplied by s(θ_i) s(θ_o), which limits the albedo and keeps
+    reciprocity (``None``: 1).
+    """
+
+    def __init__(self, form: Form, residual, proxy: Proxy | None, energy=None):
+        self.form, self.residual, self.proxy, self.energy = form, residual, proxy, energy
+
+    @classmethod
+    def of(cls, form: Form, arrays: BSDFArrays) -> LearnedBSDF:
+        proxy = None if arrays.proxy is None else Proxy.of(arrays.logarithms(), form)
+        return cls(form, arrays.residual, proxy)
+
+    def coordinates(self, g: DirectionPair) -> list:
+        """Return u, v and w."""
+        return [coordinate_u(g, self.form.scale), dr.sqrt(dr.maximum(1 - g.cos_d, 0)), coordinate_w(g, self.form)]
+
+    def value(self, wi, wo, active=True) -> list:
+        """Return f without the cosine, three arrays, for unit directions above the surface."""
+        g = DirectionPair.of(wi, wo)
+        result = [1, 1, 1] if self.proxy is None else self.proxy.value(g)
+        if self.energy is not None:
+            scale = self.energy([dr.sqrt(wi.z)], active)[0] * self.energy([dr.sqrt(wo.z)], active)[0]
+            result = [scale * v for v in result]
+        if self.residual is None:
+            return result
+        low, high = self.form.range
+        numbers = self.residual(self.coordinates(g), active)
+        factors = [dr.exp(dr.fma(clamp(x, 0, 1), high - low, low)) for x in numbers]
+        return [a * b for a, b in zip(result, factors, strict=True)]
+
+
+def coordinate_u(g: DirectionPair, scale: tuple[float, float]):
+    """Return u in [0, 1], the coordinate of the half vector."""
+    t = dr.fma(g.hx2, scale[0] ** -2, g.hy2 * scale[1] ** -2)
+    return dr.minimum(dr.log2(1 + t) * (1 / math.log2(1 + min(scale) ** -2)), 1)
+
+
+def coordinate_w(g: DirectionPair, form: Form):
+    """Return w in [0, 1], the coordinate of the azimuth φ_d; 0 where the azimuth is undefined."""
+    sin2_h, sin2_d = g.hx2 + g.hy2, dr.maximum(1 - dr.square(g.cos_d), 0)
+    if form.azimuth == "mirror":
+        product = 4 * sin2_h * sin2_d
+        ratio = dr.square(g.wi.z - g.wo.z) * dr.rcp(dr.maximum(product, 1e-12))
+        return dr.select(product > 1e-12, dr.minimum(ratio, 1), 0)
+    # tan φ_d from components of wi along the tangents of h: towards the normal, and perpendicular to both
+    along = 0.5 * (g.wo.z - g.wi.z)
+    across = (g.wo.x * g.wi.y - g.wo.y * g.wi.x) * 0.5 * dr.rcp(dr.maximum(g.cos_d, 1e-6))
+    defined = (sin2_h > 1e-12) & (sin2_d > 1e-12)
+    turn = dr.atan2(across, along) * dr.inv_pi
+    turn = turn - dr.floor(turn)
+    return dr.select(defined & (turn < 1), turn, 0)
+
+
+@dataclass(frozen=True)
+class ResidualSizes:
+    """Sizes of the arrays: entries of P₁ (u, v), P₂ (v, w) and C; without primaries, of C (u, v, w) alone."""
+
+    first: tuple[int, int] | None = (14, 9)
+    second: tuple[int, int] | None = (8, 6)
+    cascaded: tuple[int, int, int] = (14, 8, 5)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all entries."""
+        total = 3 * math.prod(self.cascaded)
+        return total if self.first is None else total + 2 * math.prod(self.first) + math.prod(self.second)
+
+    def residual(self, start: float, azimuth: str = "mirror"):
+        """Return the arrays, not yet allocated: the identity, then ``start`` (in [0, 1]) everywhere."""
+        border = ("clamp", "clamp", "repeat" if azimuth == "half" else "clamp")
+        if self.first is None:
+            return DifferentiableArray(self.cascaded, 3, "constant", start, fold=True, border=border)
+        second = np.broadcast_to(np.linspace(0, 1, self.second[1])[None, :, None], (*self.second, 1))
+        if azimuth == "half":  # w wraps around: its primary stays below the end of the cascaded array's period
+            second = second * (1 - 1 / self.second[1])
+        primary = [
+            DifferentiableArray(self.first, 2, "ramp", fold=True),
+            DifferentiableArray(self.second, 1, second.astype(np.float32), fold=True, border=(border[0], border[2])),
+        ]
+        cascaded = DifferentiableArray(self.cascaded, 3, "constant", start, fold=True, border=border)
+        return Indirection(primary, cascaded, [(0, 1), (1, 2)])
+
+
+def structure_of(nbytes: int, plain: bool = False) -> ResidualSizes:
+    """Return the largest structure of the default's proportions within ``nbytes``. Raises ``ValueError``.
+
+    ``plain``: a single array, without primaries.
+    """
+    best = None
+    for step in range(1, 400):
+        scale = 0.2 * 1.02**step
+        cascaded = tuple(max(2, round(n * scale)) for n in (14, 9 if plain else 8, 5))
+        first, second = (tuple(max(2, round(n * scale**0.75)) for n in pair) for pair in ((14, 9), (8, 6)))
+        structure = ResidualSizes(None, None, cascaded) if plain else ResidualSizes(first, second, cascaded)
+        if structure.nbytes <= nbytes:
+            best = structure
+    if best is None:
+        raise ValueError(
+            f"found {nbytes} bytes, the smallest arrays need {ResidualSizes((2, 2), (2, 2), (2, 2, 2)).nbytes}"
+        )
+    return best

@@ -1,0 +1,193 @@
+"""Training of a learned BSDF: samples of the source, the proxy, then proxy and residual together."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import drjit as dr
+import numpy as np
+
+from ...fitting import Problem, fit
+from ...indirection import DifferentiableArray
+from ...settings import FitSettings
+from .model import BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, ResidualSizes
+from .pool import Samples, incident, outgoing
+from .starts import starts
+from .view import SphereView
+
+#: Samples of the source, of which each step draws a batch, and samples that measure the proxy.
+SAMPLES, VALIDATION = 2**20, 2**16
+
+#: Largest contribution of a sample to the loss, f cos θ over its density: rare samples of narrow lobes are limited.
+LIMIT = 20.0
+
+#: Number of starts from which the proxy is trained.
+STARTS = 2
+
+#: Training of the proxy from each start, in logarithms of its parameters.
+PROXY = FitSettings(steps=300, batch=2**13, lr=0.05, schedule="cosine", measure_every=250, check_every=50)
+
+#: Learning rate of the proxy's logarithms, relative to that of entries, while the residual is trained.
+RATE = 0.3
+
+#: Share of the residuals that lie within the range of the cascaded array before it is widened, and the widening.
+QUANTILE, MARGIN = 0.998, 0.25
+
+#: Least residual range, and the value relative to the mean below which a source counts as black.
+LEAST, DARK = 0.05, 1e-5
+
+#: Share of the training after which entries are rounded to bytes in each step.
+ROUNDED = 0.5
+
+
+def draw(truth, types, size: int, seed: int, isotropic: bool) -> Samples:
+    """Return samples of a source, with ``weight`` limited by :data:`LIMIT`, in random order."""
+    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
+    samples = outgoing(rng, types, incident(rng, types, size, isotropic), truth)
+    with dr.suspend_grad():
+        value = truth.value(samples.wi, samples.wo)
+        largest = dr.maximum(dr.maximum(value[0], value[1]), value[2])
+        samples.weight = dr.minimum(samples.weight, LIMIT * dr.rcp(dr.maximum(largest, 1e-6)))
+        samples.value = [dr.detach(v) for v in value]
+    dr.eval(samples.weight, samples.value)
+    return samples
+
+
+def proxy_array(logarithms: np.ndarray, rate: float) -> DifferentiableArray:
+    """Return logarithms of a proxy, divided by ``rate``, as an array."""
+    return DifferentiableArray((PARAMETERS,), 1, (logarithms / rate).reshape(PARAMETERS, 1).astype(np.float32))
+
+
+class BSDFProblem(Problem):
+    """Training problem of ``net``, in the form ``form``, on samples of a source.
+
+    The loss is the mean of |f̂ − f| cos θ_o over the density of the sample: an error counts by the light that it adds to
+    a surface in a constant environment. ``measure`` returns what decides which state is the best.
+    """
+
+    def __init__(self, net: BSDFArrays, form: Form, samples: Samples, measure: Callable, identity: dict | None = None):
+        self.net, self.form, self.samples, self._measure = net, form, samples, measure
+        self.identity, self._share = identity or {}, 0.0
+
+    def begin(self, step: int, share: float) -> str:
+        self._share = share
+        return ""
+
+    def trained(self, net: BSDFArrays) -> LearnedBSDF:
+        """Return the BSDF that a step evaluates."""
+        if net.residual is not None:
+            net = net.rounded() if self._share >= ROUNDED else net.unfolded()
+        return LearnedBSDF.of(self.form, net)
+
+    def loss(self, net, rng, size: int):
+        # The samples are in random order: a run of them is a batch, and is read from memory in order
+        Float, count = type(self.samples.weight), dr.width(self.samples.weight)
+        UInt32 = dr.uint32_array_t(Float)
+        s = self.samples.at((UInt32(rng.random(Float, 1) * count) + dr.arange(UInt32, size)) % count)
+        value = self.trained(net).value(s.wi, s.wo)
+        weight = s.weight * (1 / (3 * size))
+        errors = [dr.abs(dr.fma(v, s.wo.z, -t)) for v, t in zip(value, s.value, strict=True)]
+        return weight * sum(errors[1:], errors[0])
+
+    def measure(self, net) -> dict[str, float]:
+        with dr.suspend_grad():
+            net = net.rounded() if net.residual is not None else net
+            return self._measure(LearnedBSDF.of(self.form, net))
+
+
+def proxy_loss(samples: Samples) -> Callable:
+    """Return a measurement: the mean error of a BSDF at samples, in dB below the mean value."""
+
+    def measure(bsdf: LearnedBSDF) -> dict[str, float]:
+        value = bsdf.value(samples.wi, samples.wo)
+        pairs = zip(value, samples.value, strict=True)
+        error = sum(dr.mean(samples.weight * dr.abs(v * samples.wo.z - t)) for v, t in pairs)
+        total = sum(dr.mean(samples.weight * t) for t in samples.value)
+        return {"error_db": -20 * math.log10(max(float((error / total)[0]), 1e-9))}
+
+    return measure
+
+
+def fit_proxy(
+    samples: Samples, validation: Samples, types, isotropic: bool, progress: bool
+) -> tuple[np.ndarray, float]:
+    """Return the logarithms of the best proxy of :data:`STARTS` trainings, and its error in dB."""
+    best = None
+    form = Form(isotropic=isotropic)
+    for k, start in enumerate(starts(validation, types, STARTS)):
+        net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
+        problem = BSDFProblem(net, form, samples, proxy_loss(validation))
+        title = f"proxy, start {k + 1} of {STARTS}"
+        result = fit(problem, dataclasses.replace(PROXY, seed=k), progress=progress, title=title)
+        error = result.measured["error_db"]
+        if best is None or error > best[1]:
+            best = net.proxy.numpy().ravel().copy(), error
+    return best
+
+
+def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: str) -> Form:
+    """Return the form of a fitted proxy: its terms, the scale of u, and the range of the residuals of ``samples``."""
+    values = np.exp(logarithms)
+    terms = ["diffuse"] if logarithms[DIFFUSE].max() > BLACK else []
+    scales = []
+    for k, name in enumerate(TERMS[1:]):
+        a = 4 + k * LOBE
+        if logarithms[a + 3 : a + 9].max() > BLACK:
+            terms.append(name)
+            gamma = math.sqrt(2 * values[a + 2])
+            # GGX of this roughness is as wide as the lobe of exponent γ where half of the peak is reached
+            scales.append(
+                [float(np.clip(values[a + i] * math.sqrt(2) / gamma, 1e-3, 1)) for i in (0, 0 if isotropic else 1)]
+            )
+    scale = min(scales, key=min) if scales else [1.0, 1.0]
+    form = Form(tuple(terms), isotropic, azimuth, tuple(scale))
+    return dataclasses.replace(form, range=residual_range(form, logarithms, samples))
+
+
+def residual_range(form: Form, logarithms: np.ndarray, samples: Samples) -> tuple[float, float]:
+    """Return the range of log(f / proxy) over samples, from quantiles."""
+    types = module_types(samples)
+    value = [1.0, 1.0, 1.0]
+    if form.terms:
+        net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
+        value = LearnedBSDF.of(form, net).value(samples.wi, samples.wo)
+    with dr.suspend_grad():
+        least = DARK * sum(float(dr.mean(samples.weight * t)[0]) for t in samples.value) / 3
+        ratios = [
+            (dr.log(dr.maximum(t, 1e-12) / dr.maximum(v * samples.wo.z, 1e-12))).numpy()[
+                (t * samples.weight).numpy() > least
+            ]
+            for v, t in zip(value, samples.value, strict=True)
+        ]
+    ratios = np.concatenate(ratios)
+    if not len(ratios):
+        return -LEAST, LEAST
+    low, high = np.quantile(ratios, [1 - QUANTILE, QUANTILE])
+    low, high = min(low, -LEAST), max(high, LEAST)
+    margin = MARGIN * (high - low)
+    return float(low - margin), float(high + margin)
+
+
+def module_types(samples: Samples):
+    """Return the module of the Dr.Jit types of samples."""
+    from ...compat import module_of
+
+    return module_of(samples.weight)
+
+
+def residual_problem(
+    logarithms: np.ndarray, form: Form, structure: ResidualSizes, samples: Samples, view: SphereView, identity: dict
+) -> BSDFProblem:
+    """Return the problem of training proxy and residual together, which starts from the proxy alone."""
+    types = module_types(samples)
+    low, high = form.range
+    start = float(np.clip(-low / (high - low), 0, 1))
+    proxy = proxy_array(logarithms, RATE) if form.terms else None
+    net = BSDFArrays(structure.residual(start, form.azimuth), proxy, RATE).alloc(types.TensorXf)
+
+    def measure(bsdf):
+        return {"psnr_db": view.psnr(lambda wi, wo: [v * wo.z for v in bsdf.value(wi, wo)])}
+
+    return BSDFProblem(net, form, samples, measure, identity)

@@ -1,0 +1,195 @@
+"""Sources of BSDFs: plugins of Mitsuba, scenes, measured files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+
+from ...errors import UsageError, reason
+from ...lookup import clamp
+
+#: Largest value f cos θ that counts; a plugin may exceed it next to the horizon.
+LARGEST = 1e8
+
+
+class Truth:
+    """Base class of sources.
+
+    ``name`` describes the source; ``digest`` changes when its content does; ``samples``: it samples directions itself;
+    ``isotropic``: it is isotropic by its format (``None``: it has to be measured).
+    """
+
+    name: str
+    digest: str
+    samples = False
+    isotropic: bool | None = None
+
+    def value(self, wi, wo) -> list:
+        """Return f cos θ_o in linear sRGB, three arrays, for unit directions above the surface."""
+        raise NotImplementedError
+
+    def sample(self, wi, w, u, v):
+        """Return directions ``wo`` from three uniform numbers each."""
+        raise NotImplementedError
+
+    def density(self, wi, wo):
+        """Return the density of :meth:`sample` per solid angle."""
+        raise NotImplementedError
+
+
+class MitsubaTruth(Truth):
+    """BSDF of the Mitsuba variant that is set, at the point ``uv`` of its textures. Raises :class:`UsageError`."""
+
+    samples = True
+
+    def __init__(self, bsdf, name: str, digest: str, uv: tuple[float, float] = (0.5, 0.5)):
+        import mitsuba as mi
+
+        self.bsdf, self.name, self.digest, self.uv = bsdf, name, digest, uv
+        self.mi, self.context = mi, mi.BSDFContext()
+        flags = bsdf.flags()
+        if mi.has_flag(flags, mi.BSDFFlags.Transmission) or mi.has_flag(flags, mi.BSDFFlags.Null):
+            raise UsageError(f"{name}: transmits light, only BSDFs that reflect can be fitted")
+        if mi.has_flag(flags, mi.BSDFFlags.Delta):
+            raise UsageError(f"{name}: reflects into single directions, only BSDFs without delta lobes can be fitted")
+        if mi.is_spectral or mi.is_monochromatic:
+            raise UsageError(f"{name}: the variant {mi.variant()} is set, a variant with RGB colours is needed")
+
+    def _interaction(self, wi):
+        mi = self.mi
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
+        si.t, si.wi, si.uv = 1.0, mi.Vector3f(wi), mi.Point2f(*self.uv)
+        si.n = mi.Normal3f(0, 0, 1)
+        si.sh_frame = mi.Frame3f(si.n)
+        si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+        return si
+
+    def value(self, wi, wo):
+        spectrum = self.bsdf.eval(self.context, self._interaction(wi), self.mi.Vector3f(wo))
+        colour = self.mi.unpolarized_spectrum(spectrum)
+        return [clamp(channel, 0, LARGEST) for channel in colour]
+
+    def sample(self, wi, w, u, v):
+        bs, _ = self.bsdf.sample(self.context, self._interaction(wi), w, self.mi.Point2f(u, v))
+        return type(wi)(bs.wo)
+
+    def density(self, wi, wo):
+        return clamp(self.bsdf.pdf(self.context, self._interaction(wi), self.mi.Vector3f(wo)), 0, LARGEST)
+
+
+class MERLTruth(Truth):
+    """Isotropic measurement of the MERL database (Matusik et al. 2003): a ``.binary`` file of 90 × 90 × 180 numbers.
+
+    Angles are θ_h (by its square root), θ_d and φ_d; values are interpolated linearly. Raises :class:`UsageError`.
+    """
+
+    isotropic = True
+    SIZES, SCALES = (90, 90, 180), (1.0 / 1500, 1.15 / 1500, 1.66 / 1500)
+
+    def __init__(self, path: Path, types):
+        count = int(np.prod(self.SIZES))
+        try:
+            content = path.read_bytes()
+        except OSError as e:
+            raise UsageError(f"{path}: cannot be read ({reason(e)})") from None
+        if len(content) != 12 + 24 * count or tuple(np.frombuffer(content, "<i4", 3)) != self.SIZES:
+            raise UsageError(f"{path}: is no measurement of the MERL database, which has {12 + 24 * count:,} bytes")
+        numbers = np.frombuffer(content, "<f8", offset=12).reshape(3, count)
+        scaled = np.maximum(numbers * np.array(self.SCALES)[:, None], 0).astype(np.float32)
+        self.name, self.digest = path.name, hashlib.sha256(content).hexdigest()
+        self.channels = [types.Float(np.ascontiguousarray(c)) for c in scaled]
+
+    def value(self, wi, wo):
+        half = wi + wo
+        half = half * dr.rsqrt(dr.maximum(dr.squared_norm(half), 1e-20))
+        cos_d = dr.clip(dr.dot(wi, half), 0, 1)
+        theta_h = dr.atan2(dr.sqrt(dr.square(half.x) + dr.square(half.y)), half.z)
+        theta_d = dr.acos(cos_d)
+        along = wo.z - wi.z
+        across = (wo.x * wi.y - wo.y * wi.x) * dr.rcp(dr.maximum(cos_d, 1e-6))
+        phi_d = dr.atan2(across, along)
+        phi_d = dr.select(phi_d < 0, phi_d + dr.pi, phi_d)
+        positions = [dr.sqrt(theta_h * 2 * dr.inv_pi) * 90, theta_d * 2 * dr.inv_pi * 90, phi_d * dr.inv_pi * 180]
+        return [wo.z * channel for channel in self._read(positions)]
+
+    def _read(self, positions):
+        axes = []
+        for x, n in zip(positions, self.SIZES, strict=True):
+            x = dr.clip(x, 0, n - 1)
+            index = dr.minimum(dr.uint32_array_t(type(x))(x), n - 2)
+            axes.append((index, x - type(x)(index)))
+        result = [0, 0, 0]
+        for corner in range(8):
+            index, weight = 0, 1
+            for k, ((i, f), n) in enumerate(zip(axes, self.SIZES, strict=True)):
+                up = corner >> k & 1
+                index, weight = index * n + i + up, weight * (f if up else 1 - f)
+            result = [
+                r + weight * dr.gather(type(weight), c, index) for r, c in zip(result, self.channels, strict=True)
+            ]
+        return result
+
+
+def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 0.5)) -> Truth:
+    """Return the source of a BSDF.
+
+    ``source`` is a scene or a single BSDF as a file (``.xml``) or as a dictionary of ``mi.load_dict``, a ``mi.BSDF``,
+    or a measured file (``.bsdf``, ``.pbsdf``, ``.binary``). ``material`` is the id of a BSDF of a scene. Raises
+    :class:`~mi_diffind.errors.UsageError`.
+    """
+    import mitsuba as mi
+
+    if isinstance(source, mi.BSDF):
+        return MitsubaTruth(source, source.class_name(), hashlib.sha256(str(source).encode()).hexdigest(), uv)
+    if isinstance(source, dict):
+        name, content = str(source.get("type", "dictionary")), repr(sorted(source.items(), key=str)).encode()
+        return MitsubaTruth(
+            _chosen(_built(name, lambda: mi.load_dict(source)), name, material), name, _hash(content), uv
+        )
+    path = Path(os.fspath(source))
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
+    suffix = path.suffix.lower()
+    if suffix == ".binary":
+        return MERLTruth(path, types)
+    if suffix in (".bsdf", ".pbsdf"):
+        plugin = "measured" if suffix == ".bsdf" else "measured_polarized"
+        bsdf = _built(path, lambda: mi.load_dict({"type": plugin, "filename": str(path)}))
+        return MitsubaTruth(bsdf, path.name, _hash(path.read_bytes()), uv)
+    if suffix != ".xml":
+        raise UsageError(f'{path}: found the extension "{path.suffix}", allowed are .xml, .bsdf, .pbsdf and .binary')
+    loaded = _built(path, lambda: mi.load_file(str(path), optimize=False))
+    bsdf = _chosen(loaded, path, material)
+    return MitsubaTruth(bsdf, bsdf.id() or path.name, _hash(path.read_bytes() + material.encode()), uv)
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _built(name, load):
+    try:
+        return load()
+    except Exception as e:  # Mitsuba raises several types
+        raise UsageError(f"{name}: cannot be loaded ({reason(e)})") from None
+
+
+def _chosen(loaded, name, material: str):
+    """Return the BSDF of what was loaded: itself, or that of a scene with the id ``material``."""
+    import mitsuba as mi
+
+    if isinstance(loaded, mi.BSDF):
+        return loaded
+    if not isinstance(loaded, mi.Scene):
+        raise UsageError(f"{name}: is a {type(loaded).__name__}, a BSDF or a scene is needed")
+    bsdfs = {shape.bsdf().id(): shape.bsdf() for shape in loaded.shapes() if shape.bsdf() is not None}
+    if not material and len(bsdfs) == 1:
+        return next(iter(bsdfs.values()))
+    if material not in bsdfs:
+        names = ", ".join(sorted(bsdfs)) or "none"
+        raise UsageError(f'material: found "{material}", the materials of {name} are {names}')
+    return bsdfs[material]

@@ -1,0 +1,321 @@
+"""Learned BSDF: an analytic proxy times a learned residual."""
+
+from __future__ import annotations  # Delayed parsing of type annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mi_diffind.indirection import DifferentiableArray
+from mi_diffind.lookup import clamp
+from mi_diffind.tasks.bsdf import TASK
+from mi_diffind.tasks.bsdf.files import RESIDUAL
+from mi_diffind.tasks.bsdf.model import (
+    ALPHA_MIN,
+    DIFFUSE,
+    EDGE,
+    LOBE,
+    LOGARITHMS,
+    PARAMETERS,
+    TERMS,
+    Proxy,
+    ProxyLobe,
+)
+
+from . import Plugin
+from .support import properties, tables, upsampling
+from .support.manual import shared_parts
+
+#: Smallest density of a sample that counts.
+SMALLEST_DENSITY = 1e-20
+
+
+@shared_parts
+class NeuralBSDF(mi.BSDF):
+    r"""
+    .. _bsdf-neural_bsdf:
+
+    Learned BSDF (:monosp:`neural_bsdf`)
+    ------------------------------------
+
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - A table file, written by ``mi-diffind fit bsdf``.
+       - --
+
+     * - scale
+       - |float|
+       - Factor on the reflected light, 0 to 1. (Default: 1)
+       - |exposed|, |differentiable|
+
+     * - two_sided
+       - |bool|
+       - Reflect on both sides, as a material in :monosp:`twosided` does. (Default: false)
+       - --
+
+     * - energy
+       - |string|
+       - ``source``: the directional albedo is at most 0.1% above the source's, by a factor s(θ_i) s(θ_o) of the file;
+         ``raw``: as it was fitted. (Default: ``source``)
+       - --
+
+     * - storage
+       - |string|
+       - Storage form of the residual's arrays: ``float32``, ``float16`` or ``uint8``. Only ``float32`` arrays are
+         exposed as parameters. (Default: that of the file, ``uint8``)
+       - --
+
+     * - diffuse, edge
+       - |spectrum|, |float|
+       - Albedo of the proxy's diffuse lobe (linear sRGB), and its factor at the horizon.
+       - |exposed|, |differentiable|
+
+     * - first.alpha_u, first.alpha_v, first.gamma, first.f0, first.f90; second.…
+       - |float|, |float|, |float|, |spectrum|, |spectrum|
+       - Roughness, exponent (2: GGX), and reflectance at normal and grazing incidence of the proxy's microfacet lobes.
+         Of isotropic files, ``alpha_u`` alone counts.
+       - |exposed|, |differentiable|
+
+     * - tables.primary_uv, tables.primary_vw, tables.cascaded
+       - |tensor|
+       - The entries of the residual's arrays.
+       - |exposed|, |differentiable|
+
+    Any reflecting BSDF in two kilobytes: an analytic proxy (a diffuse lobe and two microfacet lobes) times the
+    exponential of a residual that is read by *differentiable indirection* (Datta et al., *Efficient Graphics
+    Representation with Differentiable Indirection*, SIGGRAPH Asia 2023). ``mi-diffind fit bsdf`` makes the file of a
+    material of a scene, of any of Mitsuba's BSDFs, or of measured data.
+
+    **Reciprocal**: exchanging both directions changes no coordinate of the residual and no term of the proxy.
+
+    **Sampling** chooses between a cosine and two lobes of visible GGX normals, with probabilities that the file holds
+    for each angle of incidence. ``pdf`` is exactly the density of this mixture. Sampling is detached: gradients flow
+    through the value of a sample, not through its position or density.
+
+    Colours are those of the file, in linear sRGB. In spectral variants they are upsampled, as those of textures are; in
+    polarised variants, the material depolarises. Terms of the proxy that the source does not need are not computed.
+
+    {executable}
+
+    .. tabs::
+        .. code-tab:: xml
+            :name: neural_bsdf
+
+            <bsdf type="neural_bsdf">
+                <string name="filename" value="paint.npz"/>
+            </bsdf>
+
+        .. code-tab:: python
+
+            'type': 'neural_bsdf',
+            'filename': 'paint.npz'
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        if "filename" not in props:
+            raise RuntimeError('parameter "filename": not given, a table file is needed (mi-diffind fit bsdf)')
+        properties.check_range(props, "scale", 0, 1)
+        self.two_sided = props.get("two_sided", False)
+        if not isinstance(self.two_sided, bool):
+            raise RuntimeError(f'parameter "two_sided": found {self.two_sided}, allowed are true and false')
+        self.energy = properties.one_of(props, "energy", ("source", "raw"))
+        self.scale = dr.opaque(mi.Float, float(props.get("scale", 1.0)))
+        self.model = tables.open_tables(props, TASK)
+        if self.energy == "raw":
+            self.model.arrays.pop("energy", None)
+            self.model.refresh()
+        self.proxy = _parameters(self.model) if self.model.form.terms else {}
+
+        side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
+        flags = mi.BSDFFlags.GlossyReflection | side
+        if not self.model.form.isotropic:
+            flags = flags | mi.BSDFFlags.Anisotropic
+        self.m_components = [flags]
+        self.m_flags = flags
+
+    def _arrays(self) -> dict:
+        return {name: self.model.arrays[name] for name in RESIDUAL if name in self.model.arrays}
+
+    def trained(self) -> tuple:
+        """Return the table of the file, and the arrays that can be optimised, by name."""
+        arrays = tables.exposed(self._arrays())
+        if self.proxy:
+            arrays = {**arrays, "proxy": _stored(self.proxy)}
+        return self.model.table, arrays
+
+    def traverse(self, cb: mi.TraversalCallback):
+        cb.put("scale", self.scale, mi.ParamFlags.Differentiable)
+        for name, value in self.proxy.items():
+            cb.put(name, value, mi.ParamFlags.Differentiable)
+        tables.traverse(cb, tables.exposed(self._arrays()))
+
+    def parameters_changed(self, keys: list[str] = ()):
+        tables.check_shapes(tables.exposed(self._arrays()))
+
+    def _bsdf(self):
+        """Return the BSDF with the present parameters of the proxy."""
+        bsdf = self.model.bsdf
+        if self.proxy:
+            bsdf.proxy = _proxy(self.proxy, self.model.form)
+        return bsdf
+
+    def _prepare(self, ctx, wi, wo, active):
+        """Return both directions on the front side, and the mask of lanes whose result counts."""
+        if self.two_sided:
+            wi, wo = mi.Vector3f(wi.x, wi.y, dr.abs(wi.z)), mi.Vector3f(wo.x, wo.y, dr.mulsign(wo.z, wi.z))
+        # Directions have length 1; the comparison is false for NaN and infinities
+        active = active & (wi.z > 0) & (wo.z > 0) & (dr.squared_norm(wi) + dr.squared_norm(wo) < 100)
+        if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
+            active = mi.Bool(False)
+        up = mi.Vector3f(0, 0, 1)
+        return dr.select(active, wi, up), dr.select(active, wo, up), active
+
+    def _value(self, si, wi, wo, active):
+        """Return f cos θ_o."""
+        rgb = self._bsdf().value(wi, wo, active)
+        factor = wo.z * clamp(self.scale, 0.0, 1.0)
+        value = _spectrum([v * factor for v in rgb], si.wavelengths)
+        return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
+
+    def _density(self, wi, wo, active):
+        with dr.suspend_grad():
+            return dr.detach(dr.select(active, self.model.mixture.density(wi, wo, active), 0))
+
+    def eval(self, ctx, si, wo, active=True):
+        wi, wo, active = self._prepare(ctx, si.wi, wo, active)
+        return self._value(si, wi, wo, active)
+
+    def pdf(self, ctx, si, wo, active=True):
+        return self._density(*self._prepare(ctx, si.wi, wo, active))
+
+    def eval_pdf(self, ctx, si, wo, active=True):
+        wi, wo, active = self._prepare(ctx, si.wi, wo, active)
+        return self._value(si, wi, wo, active), self._density(wi, wo, active)
+
+    def sample(self, ctx, si, sample1, sample2, active=True):
+        up = mi.Vector3f(0, 0, 1)
+        wi, _, active = self._prepare(ctx, si.wi, dr.select(si.wi.z < 0, -up, up) if self.two_sided else up, active)
+        with dr.suspend_grad():
+            wo = dr.detach(self.model.mixture.sample(wi, sample1, sample2.x, sample2.y, active))
+            active = active & (wo.z > 0) & (dr.squared_norm(wo) < 2)
+            wo = dr.select(active, wo, up)
+        pdf = self._density(wi, wo, active)
+        active = active & (pdf > SMALLEST_DENSITY)
+        value = self._value(si, wi, wo, active)
+        bs = dr.zeros(mi.BSDFSample3f)
+        bs.wo = mi.Vector3f(wo.x, wo.y, dr.mulsign(wo.z, si.wi.z)) if self.two_sided else wo
+        bs.eta = 1.0
+        bs.sampled_component = 0
+        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+        bs.pdf = dr.select(active, pdf, 0)
+        return bs, dr.select(active, value * dr.rcp(dr.select(active, pdf, 1)), 0)
+
+    def report(self) -> dict:
+        """Return a description of this instance, for ``mi-diffind inspect``.
+
+        Keys: ``preset``, ``effects_in_use``, ``effects_left_out`` (effect → reason), ``storage`` and ``table_bytes``.
+        """
+        form, arrays = self.model.form, self.model.arrays
+        left_out = {name: "the source does not need it" for name in TERMS if form.terms and name not in form.terms}
+        if not form.terms:
+            left_out = {"proxy": f"the preset {self.model.table.preset} has none"}
+        if "energy" not in arrays:
+            left_out["energy"] = "energy is raw" if "energy" in self.model.table.arrays else "the file has no limit"
+        in_use = ["residual", *form.terms, *(["energy"] if "energy" in arrays else [])]
+        return {
+            **tables.described(self.model.table.preset, arrays),
+            "effects_in_use": in_use,
+            "effects_left_out": left_out,
+        }
+
+    def to_string(self):
+        report = self.report()
+        lines = (
+            f"source = {self.model.table.settings.get('name', '')}",
+            f"scale = {self.scale}",
+            f"{report['table_bytes']} bytes as {report['storage']}",
+            f"effects = {', '.join(report['effects_in_use'])}",
+        )
+        return f"NeuralBSDF[\n  {(',' + chr(10) + '  ').join(lines)}\n]"
+
+
+def _parameters(model) -> dict:
+    """Return the proxy's parameters by name, in linear units."""
+    logarithms = np.clip(model.arrays["proxy"].numpy().ravel().astype(np.float64), *LOGARITHMS)
+    values, form, result = np.exp(logarithms), model.form, {}
+
+    def number(value):
+        return dr.opaque(mi.Float, float(value))
+
+    def colour(values):
+        return mi.Color3f(*map(number, values))
+
+    if "diffuse" in form.terms:
+        result |= {"diffuse": colour(values[DIFFUSE]), "edge": number(values[EDGE])}
+    for k, name in enumerate(TERMS[1:]):
+        a = 4 + k * LOBE
+        if name in form.terms:
+            v = values[a : a + LOBE]
+            result |= {
+                f"{name}.alpha_u": number(v[0]),
+                **({} if form.isotropic else {f"{name}.alpha_v": number(v[1])}),
+                f"{name}.gamma": number(2 * v[2]),
+                f"{name}.f0": colour(v[3:6]),
+                f"{name}.f90": colour(v[6:9]),
+            }
+    return result
+
+
+def _proxy(parameters: dict, form) -> Proxy:
+    """Return the proxy of parameters by name, limited to what is finite."""
+    low, high = (float(np.exp(x)) for x in LOGARITHMS)
+
+    def limited(value):
+        return clamp(value, low, high)
+
+    lobes = {}
+    for name in TERMS[1:]:
+        if name in form.terms:
+            axes = ("alpha_u", "alpha_u" if form.isotropic else "alpha_v")
+            alphas = [clamp(parameters[f"{name}.{axis}"], ALPHA_MIN, 1.0) for axis in axes]
+            colours = [[limited(c) for c in parameters[f"{name}.{key}"]] for key in ("f0", "f90")]
+            lobes[name] = ProxyLobe(*alphas, limited(parameters[f"{name}.gamma"]), *colours)
+    if "diffuse" not in form.terms:
+        return Proxy(None, None, lobes)
+    return Proxy([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
+
+
+def _stored(parameters: dict) -> DifferentiableArray:
+    """Return the logarithms of parameters as the array ``proxy`` of a file."""
+    values = np.full(PARAMETERS, np.exp(LOGARITHMS[0]))
+
+    def numbers(name):
+        value = parameters[name]
+        return [float(dr.detach(c).numpy()[0]) for c in (value if dr.depth_v(value) > 1 else [value])]
+
+    if "diffuse" in parameters:
+        values[DIFFUSE], values[EDGE] = numbers("diffuse"), numbers("edge")[0]
+    for k, name in enumerate(TERMS[1:]):
+        if f"{name}.alpha_u" in parameters:
+            a = 4 + k * LOBE
+            alpha_v = f"{name}.alpha_v" if f"{name}.alpha_v" in parameters else f"{name}.alpha_u"
+            values[a : a + 3] = *numbers(f"{name}.alpha_u"), *numbers(alpha_v), numbers(f"{name}.gamma")[0] / 2
+            values[a + 3 : a + 6], values[a + 6 : a + 9] = numbers(f"{name}.f0"), numbers(f"{name}.f90")
+    logarithms = np.log(np.maximum(values, np.exp(LOGARITHMS[0]))).astype(np.float32)[:, None]
+    return DifferentiableArray((PARAMETERS,), 1, logarithms).alloc(mi.TensorXf)
+
+
+def _spectrum(rgb: list, wavelengths):
+    """Return a spectrum for linear sRGB, whose components may exceed 1."""
+    if mi.is_monochromatic:
+        return mi.UnpolarizedSpectrum(mi.luminance(mi.Color3f(*rgb)))
+    if not mi.is_spectral:
+        return mi.UnpolarizedSpectrum(*rgb)
+    largest = dr.maximum(dr.maximum(dr.maximum(rgb[0], rgb[1]), rgb[2]), 1e-20)
+    return largest * upsampling.spectrum([v / largest for v in rgb], wavelengths)
+
+
+PLUGIN = Plugin("neural_bsdf", "bsdf", NeuralBSDF, task="bsdf", storage="uint8")

@@ -1,0 +1,192 @@
+"""The plugin ``neural_bsdf`` inside Mitsuba: values, sampling, derivatives, parameters, variants."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from arrays import aligned, numpy_of
+from learned_bsdfs import formula, handmade
+from variants import VARIANTS, set_variant
+
+import mi_diffind
+from mi_diffind.tables import load_table, save_table
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bsdfs")
+    for name, form in {
+        "isotropic": {},
+        "anisotropic": {"isotropic": False, "scale": (0.05, 0.3), "terms": ("first", "second")},
+    }.items():
+        save_table(folder / f"{name}.npz", handmade(**form))
+    return {path.stem: str(path) for path in folder.glob("*.npz")}
+
+
+def directions(rng, n, low=0.02):
+    z, phi = low + (1 - low) * rng.random(n), 2 * np.pi * rng.random(n)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1).astype(np.float32)
+
+
+def hits(mi, wi):
+    si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
+    si.wi = mi.Vector3f(aligned(wi.T))
+    if mi.is_spectral:
+        si.wavelengths = mi.UnpolarizedSpectrum(450, 520, 580, 650)
+    return si
+
+
+def uniform(mi, rng, n):
+    u = [mi.Float(aligned(rng.random(n))) for _ in range(3)]
+    return u[0], mi.Point2f(u[1], u[2])
+
+
+@pytest.mark.parametrize("name", ["isotropic", "anisotropic"])
+def test_values_and_densities(mi_rgb, files, rng, name):
+    """``eval`` is the formula times the cosine; ``eval_pdf``, ``pdf`` and ``sample`` agree with it."""
+    mi, n, ctx = mi_rgb, 4000, mi_rgb.BSDFContext()
+    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files[name], "scale": 0.5})
+    wi, wo = directions(rng, n), directions(rng, n)
+    si, towards = hits(mi, wi), mi.Vector3f(aligned(wo.T))
+    value, pdf = bsdf.eval_pdf(ctx, si, towards)
+    expected = 0.5 * wo[:, 2:] * formula(load_table(files[name]), wi.astype(float), wo.astype(float))
+    bs, weight = bsdf.sample(ctx, si, *uniform(mi, rng, n))
+    again = bsdf.eval(ctx, si, bs.wo)
+    results = numpy_of([*value, *bsdf.eval(ctx, si, towards), pdf, bsdf.pdf(ctx, si, towards), bs.pdf,
+                        bsdf.pdf(ctx, si, bs.wo), *weight, *again])  # fmt: skip
+    np.testing.assert_allclose(results[:, :3], expected, rtol=5e-3, atol=1e-6)
+    np.testing.assert_array_equal(results[:, :3], results[:, 3:6])
+    np.testing.assert_array_equal(results[:, 6], results[:, 7])
+    valid = results[:, 8] > 0
+    assert 0.8 < valid.mean() <= 1
+    np.testing.assert_allclose(results[valid, 8], results[valid, 9], rtol=1e-4)
+    np.testing.assert_allclose(results[valid, 10:13] * results[valid, 8:9], results[valid, 13:16], rtol=1e-3, atol=1e-6)
+
+
+def test_chi2(mi_rgb, files, tmp_path, monkeypatch):
+    """Samples follow the density, at 20° and 80°, seen from the back, too."""
+    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
+
+    monkeypatch.chdir(tmp_path)  # where a failing test leaves its histogram
+    xml = f'<string name="filename" value="{files["isotropic"]}"/><boolean name="two_sided" value="true"/>'
+    for angle in (20, 80, 150):
+        theta = np.radians(angle)
+        wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])  # one kernel for all
+        sample, pdf = BSDFAdapter("neural_bsdf", xml, wi=wi)
+        test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=61, ires=32)
+        assert test.run(test_count=3, quiet=True), test.messages
+
+
+def test_sides(mi_rgb, files, rng):
+    """The back is black, or with ``two_sided`` looks like the front; no light passes."""
+    mi, ctx = mi_rgb, mi_rgb.BSDFContext()
+    wi, wo = directions(rng, 500), directions(rng, 500)
+    one, two = (
+        mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"], "two_sided": t}) for t in (False, True)
+    )
+    signs = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+    columns = []
+    for bsdf in (one, two):
+        for a, b in signs:
+            flip = np.float32([1, 1, a]), np.float32([1, 1, b])
+            columns += list(bsdf.eval(ctx, hits(mi, wi * flip[0]), mi.Vector3f(aligned((wo * flip[1]).T))))
+    values = numpy_of(columns).reshape(500, 2, 4, 3)
+    front = values[:, 0, 0]
+    assert front.min() > 0
+    np.testing.assert_array_equal(values[:, 0, 1:], 0)
+    np.testing.assert_array_equal(values[:, 1, :2], np.stack([front, front], axis=1))
+    np.testing.assert_array_equal(values[:, 1, 2:], 0)
+
+
+def test_derivatives(mi_rgb, files, rng):
+    """Derivatives by parameters of the proxy and entries agree with finite differences."""
+    mi, ctx = mi_rgb, mi_rgb.BSDFContext()
+    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"], "storage": "float32"})
+    params = mi.traverse(bsdf)
+    wi, wo = directions(rng, 256, 0.2), directions(rng, 256, 0.2)
+    si, towards = hits(mi, wi), mi.Vector3f(aligned(wo.T))
+
+    def total():
+        return dr.sum(sum(bsdf.eval(ctx, si, towards)))
+
+    for key, step in (("first.alpha_u", 1e-3), ("second.gamma", 1e-2), ("edge", 1e-2), ("scale", 1e-2)):
+        before = mi.Float(params[key]) - (0.5 if key == "scale" else 0)
+        ends = []
+        for sign in (1, -1):
+            params[key] = before + sign * step
+            params.update()
+            ends.append(float(total()[0]))
+        params[key] = before
+        dr.enable_grad(params[key])
+        params.update()
+        dr.backward(total())
+        slope = float(dr.grad(params[key])[0])
+        params[key] = dr.detach(before)
+        params.update()
+        assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02, abs=1e-3), key
+    dr.enable_grad(params["tables.cascaded"])
+    params.update()
+    dr.backward(total())
+    assert np.abs(dr.grad(params["tables.cascaded"]).numpy()).max() > 1e-3
+
+
+def test_changed_parameters_are_saved(mi_rgb, files, tmp_path):
+    """An optimised proxy is written to a file, and read back."""
+    mi = mi_rgb
+    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"]})
+    params = mi.traverse(bsdf)
+    params["first.alpha_u"] = mi.Float(0.31)
+    params["second.f0"] = mi.Color3f(0.5, 0.25, 0.125)
+    params.update()
+    mi_diffind.save(bsdf, tmp_path / "saved.npz")
+    again = mi.traverse(mi.load_dict({"type": "neural_bsdf", "filename": str(tmp_path / "saved.npz")}))
+    assert float(again["first.alpha_u"][0]) == pytest.approx(0.31)
+    np.testing.assert_allclose(np.ravel(again["second.f0"]), [0.5, 0.25, 0.125], rtol=1e-5)
+    np.testing.assert_allclose(np.ravel(again["diffuse"]), np.ravel(params["diffuse"]), rtol=1e-5)
+
+
+def test_reports(mi_rgb, files):
+    """A report names the terms in use, and those left out with the reason."""
+    load = mi_rgb.load_dict
+    report = load({"type": "neural_bsdf", "filename": files["anisotropic"]}).report()
+    assert report["effects_in_use"] == ["residual", "first", "second", "energy"]
+    assert report["effects_left_out"] == {"diffuse": "the source does not need it"}
+    raw = load({"type": "neural_bsdf", "filename": files["isotropic"], "energy": "raw"}).report()
+    assert raw["effects_left_out"] == {"energy": "energy is raw"}
+
+
+@pytest.mark.parametrize("variant", [name for name in VARIANTS if not name.endswith("_rgb")])
+def test_other_variants(variant, files, rng):
+    """Greys are the same in all variants; a polarised one depolarises."""
+    mi = set_variant(variant)
+    wi, wo = directions(rng, 64), directions(rng, 64)
+    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": files["isotropic"]})
+    value = bsdf.eval(mi.BSDFContext(), hits(mi, wi), mi.Vector3f(aligned(wo.T)))
+    if mi.is_polarized:
+        assert float(dr.max(dr.abs(value[1, 1][0]))[0]) == 0
+        value = value[0, 0]
+    value = numpy_of(value)
+    rgb = wo[:, 2:] * formula(load_table(files["isotropic"]), wi.astype(float), wo.astype(float))
+    assert (value > 0).all()
+    if mi.is_monochromatic:
+        luminance = rgb @ [0.212671, 0.715160, 0.072169]
+        np.testing.assert_allclose(value[:, 0], luminance, rtol=5e-3)
+    else:
+        assert (value.max(axis=1) < 1.02 * rgb.max(axis=1)).all() and (value.max(axis=1) > 0.8 * rgb.max(axis=1)).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"filename": ""}, "filename"),
+        ({"scale": 1.5}, r'parameter "scale": found 1.5, allowed is \[0, 1\]'),
+        ({"energy": "low"}, 'parameter "energy": found "low", allowed are source, raw'),
+        ({"two_sided": 3}, 'parameter "two_sided": found 3, allowed are true and false'),
+    ],
+)
+def test_bad_parameters(mi_rgb, files, changes, message):
+    given = {"type": "neural_bsdf", "filename": files["isotropic"], **changes}
+    if not given["filename"]:
+        del given["filename"]
+    with pytest.raises(RuntimeError, match=message):
+        mi_rgb.load_dict(given)

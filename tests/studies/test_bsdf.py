@@ -1,0 +1,36 @@
+"""The study of learned BSDFs: what it writes, and its candidates."""
+
+import json
+import os
+
+import pytest
+
+from mi_diffind.cli import main
+from mi_diffind.errors import UsageError
+from mi_diffind.tradeoffs import tradeoff
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Folder and result of a smoke run."""
+    folder = tmp_path_factory.mktemp("bsdf") / "out"
+    found = folder.parent / "report.json"
+    assert main(["tradeoff", "bsdf", "--quick", "--out", str(folder), "--json", str(found)]) == 0
+    return folder, json.loads(found.read_text(encoding="utf-8"))
+
+
+def test_quick_run_writes_what_it_promises(finished):
+    folder, found = finished
+    assert {f"tradeoff_bsdf.{kind}" for kind in ("csv", "json", "png")} <= set(os.listdir(folder))
+    assert not found["interrupted"]
+    ours = found["candidates"]["plastic, nonlinear: ours"]
+    assert ours["bytes"] < 2300 and ours["errors"]["psnr_db"] > ours["errors"]["psnr_proxy_db"] > 35
+    assert 1 <= ours["errors"]["moment_learned"] < 1.5
+    queries = found["cases"]["plastic, nonlinear"]["queries"]
+    assert set(queries) == {"eval", "sample", "pdf"}
+    assert {name.split(": ")[1] for name in queries["eval"]} >= {"source", "principled", "ours"}
+
+
+def test_unknown_materials_are_refused(tmp_path):
+    with pytest.raises(UsageError, match='found the material "gold", allowed are'):
+        tradeoff("bsdf", "gold", out=tmp_path)

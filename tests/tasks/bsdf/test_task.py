@@ -1,0 +1,290 @@
+"""Learned BSDFs: their formula, symmetries, sources, sampling, the limit of the albedo, files, and a training."""
+
+import dataclasses
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+from arrays import aligned, numpy_of
+from learned_bsdfs import formula, handmade
+
+import mi_diffind
+from mi_diffind.errors import UsageError
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.tasks.bsdf import TASK, energy, mixture, pool, symmetry, training, view
+from mi_diffind.tasks.bsdf.model import TERMS, Form, structure_of
+from mi_diffind.tasks.bsdf.truth import MERLTruth, Truth, truth_of
+
+FORMS = {
+    "isotropic": {},
+    "anisotropic": {"isotropic": False, "scale": (0.05, 0.3)},
+    "half": {"azimuth": "half"},
+    "one lobe": {"terms": ("second",)},
+    "residual alone": {"terms": ()},
+}
+
+
+@pytest.fixture
+def types(mi_rgb):
+    return array_module()
+
+
+@pytest.fixture
+def model(types, tmp_path):
+    def opened(form, storage="uint8"):
+        save_table(tmp_path / f"{form}.npz", handmade(**FORMS[form]))
+        return mi_diffind.open(tmp_path / f"{form}.npz", storage)
+
+    return opened
+
+
+def directions(rng, n, horizon=0.02):
+    """Pairs ``(n, 3)`` above the horizon, a third of them near each other's reflection."""
+    pair = []
+    for _ in range(2):
+        z, phi = horizon + (1 - horizon) * rng.random(n), 2 * np.pi * rng.random(n)
+        r = np.sqrt(1 - z * z)
+        pair.append(np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1))
+    wi, wo = pair
+    mirrored = wi * [-1, -1, 1] + 0.02 * rng.normal(size=(n, 3))
+    mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
+    near = (np.arange(n) % 3 == 0) & (mirrored[:, 2] > horizon)
+    return wi, np.where(near[:, None], mirrored, wo)
+
+
+def arrays3(types, w):
+    return types.Array3f(aligned(np.asarray(w).T))
+
+
+def values(bsdf, types, wi, wo):
+    return numpy_of(bsdf.value(arrays3(types, wi), arrays3(types, wo)))
+
+
+# -- the formula -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_formula(types, model, rng, form):
+    """Values are those of an implementation by angles and rotations."""
+    wi, wo = directions(rng, 3000)
+    opened = model(form)
+    np.testing.assert_allclose(values(opened.bsdf, types, wi, wo), formula(opened.table, wi, wo), rtol=2e-3)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_reciprocity(types, model, rng, form):
+    """Exchanging the directions changes nothing but the last digits."""
+    wi, wo = directions(rng, 3000, 1e-3)
+    bsdf = model(form).bsdf
+    np.testing.assert_allclose(values(bsdf, types, wi, wo), values(bsdf, types, wo, wi), rtol=1e-4)
+
+
+@pytest.mark.parametrize("form", ["isotropic", "half"])
+def test_extremes(types, model, form):
+    """Values at the normal, at the horizon, in the mirror direction and for equal directions are finite."""
+    z = np.array([1, 1, 1e-7, 1e-4, 0.5, 1e-7, 0.3])
+    wi = np.stack([np.sqrt(1 - z * z), 0 * z, z], axis=1)
+    wo = wi * [-1, 1, 1]
+    wo[4:] = wi[4:]
+    result = values(model(form).bsdf, types, wi, wo)
+    assert np.isfinite(result).all() and (result >= 0).all() and result[0].min() > 0
+
+
+def test_sizes_follow_the_bytes():
+    assert structure_of(2048).nbytes <= 2048 and structure_of(2048).nbytes > 1700
+    assert structure_of(8192, plain=True).first is None and structure_of(8192, plain=True).nbytes > 7000
+    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays need 36"):
+        structure_of(10)
+
+
+# -- sources -----------------------------------------------------------------------------------------------------------
+
+
+class FormulaTruth(Truth):
+    """A lobe about the mirror direction, without or with each symmetry."""
+
+    name, digest = "formula", "0"
+
+    def __init__(self, anisotropy=0.0, skew=0.0, exchange=0.0, alpha=0.2):
+        self.anisotropy, self.skew, self.exchange, self.alpha = anisotropy, skew, exchange, alpha
+
+    def value(self, wi, wo):
+        half = wi + wo
+        half = half * dr.rsqrt(dr.squared_norm(half))
+        lobe = 0.3 + dr.exp(-(dr.square(half.x) + (1 + self.anisotropy) * dr.square(half.y)) / self.alpha**2)
+        lobe *= 1 + self.skew * (wi.x * wo.y - wi.y * wo.x) * (wi.z - wo.z) + self.exchange * wi.z
+        return [wo.z * 0.2 * (k + 1) * lobe for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "broken"), [({}, ()), ({"anisotropy": 1}, ("isotropy", "mirror")), ({"skew": 2}, ("mirror",)),
+                            ({"exchange": 0.3}, ("reciprocity",))],
+)  # fmt: skip
+def test_symmetries_are_measured(types, changes, broken):
+    with dr.suspend_grad():
+        measured = symmetry.measured_symmetry(FormulaTruth(**changes), types, 2**14)
+    for name, value in measured.items():
+        assert (value > 0.02) if name in broken else (value < 1e-3), (name, value)
+
+
+def test_merl(types, tmp_path, rng):
+    """A file of the database is read at its nodes and between them, by all three angles and with all three factors."""
+
+    def numbers(theta_h, theta_d, phi_d):
+        return 1 + np.cos(theta_h) * (1 + 0.3 * np.cos(2 * phi_d) * np.sin(theta_d)) + theta_d
+
+    h, d, p = np.meshgrid((np.arange(90) / 90) ** 2 * np.pi / 2, np.arange(90) / 90 * np.pi / 2,
+                          np.arange(180) / 180 * np.pi, indexing="ij")  # fmt: skip
+    grid = numbers(h, d, p)
+    content = np.array([90, 90, 180], "<i4").tobytes()
+    content += b"".join(
+        (s * grid / f).astype("<f8").tobytes() for s, f in zip((1, 2, 3), MERLTruth.SCALES, strict=True)
+    )
+    path = tmp_path / "made.binary"
+    path.write_bytes(content)
+    wi, wo = directions(rng, 2000, 0.1)
+    truth = truth_of(path, types)
+    read = numpy_of(truth.value(arrays3(types, wi), arrays3(types, wo)))
+    half = wi + wo
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    theta, phi = np.arccos(half[:, 2]), np.arctan2(half[:, 1], half[:, 0])
+    x = np.cos(phi) * wi[:, 0] + np.sin(phi) * wi[:, 1]
+    y = -np.sin(phi) * wi[:, 0] + np.cos(phi) * wi[:, 1]
+    phi_d = np.arctan2(y, np.cos(theta) * x - np.sin(theta) * wi[:, 2])
+    expected = numbers(theta, np.arccos(np.einsum("ni,ni->n", wi, half)), phi_d) * wo[:, 2]
+    np.testing.assert_allclose(read, expected[:, None] * [1, 2, 3], rtol=5e-3)
+    assert truth.isotropic
+    path.write_bytes(content[:-8])
+    with pytest.raises(UsageError, match="is no measurement of the MERL database, which has 34,992,012 bytes"):
+        truth_of(path, types)
+
+
+SCENE = """<scene version="3.0.0">
+    <bsdf type="roughplastic" id="paint"/><bsdf type="dielectric" id="glass"/><bsdf type="conductor" id="mirror"/>
+    <shape type="sphere"><ref id="paint"/></shape><shape type="sphere"><ref id="glass"/></shape>
+    <shape type="sphere"><ref id="mirror"/></shape>
+</scene>"""
+
+
+def test_sources(types, tmp_path):
+    """Scenes, files and dictionaries; what cannot be fitted is refused by one sentence."""
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE)
+    assert truth_of(scene, types, "paint").name == "paint"
+    assert truth_of({"type": "roughplastic"}, types).name == "roughplastic"
+    refused = {
+        (scene, ""): 'found "", the materials of .* are glass, mirror, paint',
+        (scene, "glass"): "glass: transmits light, only BSDFs that reflect can be fitted",
+        (scene, "mirror"): "mirror: reflects into single directions, only BSDFs without delta lobes can be fitted",
+        (tmp_path / "none.xml", ""): "none.xml: no such file",
+        (tmp_path / "lamp.txt", ""): r'found the extension ".txt", allowed are .xml, .bsdf, .pbsdf and .binary',
+    }
+    (tmp_path / "lamp.txt").write_text("")
+    for (source, material), message in refused.items():
+        with pytest.raises(UsageError, match=message):
+            truth_of(source, types, material)
+
+
+# -- sampling and albedo -----------------------------------------------------------------------------------------------
+
+
+def test_the_mixture_follows_the_source(types):
+    """For a sum of a cosine and a GGX lobe, the squares of the weights are close to their lower bound, the albedo's."""
+    cosine, alpha = 0.4, 0.1
+
+    class Sum(Truth):
+        def value(self, wi, wo):
+            p = cosine * wo.z * dr.inv_pi + (1 - cosine) * pool.density_ggx(
+                wi, wo, type(wi.z)(alpha), type(wi.z)(alpha)
+            )
+            return [p, p, p]
+
+    alphas, weights = mixture.fitted_mixture(Sum(), types, True)
+    assert min(abs(math.log(a / alpha)) for a in alphas) < 0.5
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    array = StoredArray(weights.astype(np.float32)).allocate(types.TensorXf)
+    fitted = mixture.Mixture(array, alphas)
+    assert mixture.second_moment(Sum().value, fitted, Sum(), types, 0.7, 2**14) < 1.03
+    one_lobe = mixture.Mixture(StoredArray(np.float32([[1e-3, 1, 1]] * 2)).allocate(types.TensorXf), (0.5, 0.5))
+    assert mixture.second_moment(Sum().value, one_lobe, Sum(), types, 0.7, 2**14) > 1.3
+
+
+def test_the_albedo_is_limited(types):
+    """A BSDF that is too bright in some angles is scaled below the source + 0.1%, at other angles and samples, too."""
+    truth = FormulaTruth()
+
+    def bright(wi, wo):
+        factor = 1 + 0.06 * dr.exp(-dr.square((wi.z - 0.5) / 0.1)) * (1 + wo.z)
+        return [factor * v for v in truth.value(wi, wo)]
+
+    scale = energy.fitted_scale(bright, truth, types)
+    array = StoredArray(scale[:, None].astype(np.float32)).allocate(types.TensorXf)
+
+    def scaled(wi, wo):
+        factor = array([dr.sqrt(wi.z)])[0] * array([dr.sqrt(wo.z)])[0]
+        return [factor * v for v in bright(wi, wo)]
+
+    cos = np.cos(np.radians(np.linspace(0, 88.5, 50)))
+    source, before, after = energy.albedos([truth.value, bright, scaled], truth, types, cos, seed=77)
+    assert (before / source).max() > 1.08
+    assert (after / source).max() < 1.001 and (after / source).min() > 0.9
+
+
+# -- files and training ------------------------------------------------------------------------------------------------
+
+DAMAGES = {
+    "form": (lambda t: t.settings.pop("form"), "its setting \"form\" is 'None', which is no form of a BSDF"),
+    "range": (lambda t: t.settings["form"].update(range=[3, -3]), "which is no form of a BSDF"),
+    "scale": (lambda t: t.settings["form"].update(scale=[0, 0.1]), "which is no form of a BSDF"),
+    "terms": (lambda t: t.settings["form"].update(terms=["third"]), "which is no form of a BSDF"),
+    "alphas": (lambda t: t.settings.update(alphas=[0.1, "x"]), r'its setting "alphas" is \[0.1, \'x\'\]'),
+    "proxy": (lambda t: t.arrays.pop("proxy"), 'the array "proxy" is missing'),
+    "length": (lambda t: t.arrays.update(proxy=StoredArray(np.zeros((5, 1), np.float32))), r"expected \(22, 1\)"),
+    "shape": (lambda t: t.arrays.update(cascaded=t.arrays["primary_uv"]), "expected 3 dimension"),
+    "one primary": (lambda t: t.arrays.pop("primary_vw"), 'the array "primary_vw" is missing'),
+    "other": (lambda t: t.arrays.update(more=t.arrays["energy"]), 'has an unexpected array "more"'),
+    "high": (lambda t: t.arrays.update(energy=StoredArray(np.full((3, 1), 2, np.float32))), "allowed is"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_files_are_refused(tmp_path, damage):
+    table = handmade()
+    change, message = DAMAGES[damage]
+    change(table)
+    save_table(tmp_path / "damaged.npz", table)
+    with pytest.raises(TableError, match=message):
+        TASK.load(tmp_path / "damaged.npz")
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Trainings of a second."""
+    monkeypatch.setattr(training, "SAMPLES", 2**14)
+    monkeypatch.setattr(training, "STARTS", 1)
+    monkeypatch.setattr(training, "PROXY", dataclasses.replace(training.PROXY, steps=60, batch=2**11))
+    monkeypatch.setattr(view, "SIDE", 16)
+    monkeypatch.setattr(view.SphereView.__init__, "__defaults__", (7, 16, 16))
+
+
+def test_a_plastic_is_fitted(types, short, tmp_path):
+    """From a scene to a file that stands for it: the picture, the albedo, and the same bytes again."""
+    source = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}}
+    options = {"steps": 80, "batch": 2**11, "measure_every": 40, "progress": False}
+    fitted = mi_diffind.fit("bsdf", source, **options)
+    assert fitted.history[-1]["psnr_db"] > fitted.history[0]["psnr_db"] - 1 and fitted.table.measured["psnr_db"] > 42
+    assert fitted.table.measured["albedo_excess"] < 1e-3 and fitted.table.measured["sample_weight_moment"] < 1.3
+    assert "isotropic" in fitted.lines[0] and "not reciprocal" not in fitted.lines[0]
+    saved = load_table(fitted.save(tmp_path / "a.npz"))
+    assert TASK.load(tmp_path / "a.npz").nbytes < 2300 and saved.settings["form"]["terms"] == list(TERMS)
+    again = mi_diffind.fit("bsdf", source, **options).save(tmp_path / "b.npz")
+    assert again.read_bytes() == (tmp_path / "a.npz").read_bytes()
+
+
+def test_the_range_holds_the_residual(types):
+    """Without a proxy, the range is that of log f, from quantiles."""
+    samples = training.draw(FormulaTruth(), types, 2**13, 1, True)
+    low, high = training.residual_range(Form(()), np.zeros(22), samples)
+    assert low < math.log(0.2 * 0.3) and math.log(0.6 * 1.3) < high < 3
