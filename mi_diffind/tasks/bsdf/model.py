@@ -90,11 +90,17 @@ class DirectionPair:
 
     @classmethod
     def of(cls, wi, wo) -> DirectionPair:
-        half = wi + wo
-        h2 = dr.maximum(dr.squared_norm(half), 1e-12)
+        half = half_vector(wi, wo)
+        h2 = dr.squared_norm(half)
         inverse, cos_d = dr.rcp(h2), dr.minimum(0.5 * dr.sqrt(h2), 1)
         x, y, z = (dr.square(c) * inverse for c in half)
         return cls(wi, wo, half, x, y, z, cos_d, _fifth(1 - cos_d))
+
+
+def half_vector(wi, wo):
+    """Return wi + wo, or a short normal where directions cancel, which they can at the horizon."""
+    half = wi + wo
+    return dr.select(dr.squared_norm(half) > 1e-12, half, type(wi)(0, 0, 1e-6))
 
 
 def _fifth(x):

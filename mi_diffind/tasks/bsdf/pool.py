@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from .model import masking
+from .model import half_vector, masking
 
 #: Roughness of the GGX lobes of the pool, and the share of its cosine-weighted directions.
 ALPHAS, COSINE = (0.003, 0.015, 0.06, 0.2, 0.6), 0.3
@@ -33,8 +33,8 @@ def sample_ggx(wi, alpha_u, alpha_v, u, v):
 
 def density_ggx(wi, wo, alpha_u, alpha_v):
     """Return the density of :func:`sample_ggx` per solid angle, D / (2 d(wi))."""
-    half = wi + wo
-    inverse = dr.rcp(dr.maximum(dr.squared_norm(half), 1e-12))
+    half = half_vector(wi, wo)
+    inverse = dr.rcp(dr.squared_norm(half))
     stretched = dr.square(half.x / alpha_u) + dr.square(half.y / alpha_v) + dr.square(half.z)
     return dr.rcp(2 * dr.pi * alpha_u * alpha_v * dr.square(stretched * inverse) * masking(wi, alpha_u, alpha_v))
 
