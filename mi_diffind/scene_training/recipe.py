@@ -40,8 +40,8 @@ class SceneRecipe:
 
     share: float = 0.9
     spp: int = 1
-    samples: int = 2**15
     bound: float | None = 1.0
+    samples: int = 2**15
     reference_spp: int = 1024
     against: str = "exact"
     exposure: float | None = None
