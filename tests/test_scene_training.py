@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from shading_scenes import fitted, material, scene_file
 
+import mi_diffind
 from mi_diffind import scenes
 from mi_diffind.arguments import add_arguments
 from mi_diffind.compat import use_threads
@@ -23,16 +24,23 @@ from mi_diffind.plugins.support import footprint
 from mi_diffind.runtime import array_module
 from mi_diffind.scene_training import recipe as scene_recipe
 from mi_diffind.scene_training import reference_renders
-from mi_diffind.scene_training.fit import fit_scene, limit
+from mi_diffind.scene_training.fit import fit_scene, joined, limit
 from mi_diffind.scene_training.problem import SceneProblem, exposure_of
 from mi_diffind.scene_training.recipe import SCENE_ARGUMENTS, SceneRecipe
 from mi_diffind.scene_training.reference_renders import ReferenceRenders
 from mi_diffind.scene_training.rig import Rig
-from mi_diffind.scene_training.stored_texture import budget_of, recipe_of, texture_file, texture_problem
+from mi_diffind.scene_training.stored_texture import (
+    budget_of,
+    recipe_of,
+    stored_textures,
+    texture_file,
+    texture_files,
+    texture_problem,
+)
 from mi_diffind.scene_training.trained_scene import TrainedScene
 from mi_diffind.scene_training.views import View, ViewDistribution, views_of
 from mi_diffind.settings import FitSettings
-from mi_diffind.tables import load_table, save_table
+from mi_diffind.tables import TableError, load_table, save_table
 from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
 from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
@@ -76,7 +84,7 @@ def trained(folder, path):
     file, _ = texture_file(parsed)
     table = load(file)
     problem = texture_problem(table, load_source(folder / "material.json"))
-    scene = TrainedScene(parsed, file, ORBIT, 1, table)
+    scene = TrainedScene(parsed, {file: table}, ORBIT, 1)
     return scene, problem
 
 
@@ -352,7 +360,7 @@ def test_a_scene_may_be_a_dictionary(folder, trained):
     floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
     parsed = scenes.ParsedScene({"type": "scene", "sensor": {"type": "perspective"}, "floor": floor})
     assert texture_file(parsed) == (file, "")
-    assert TrainedScene(parsed, file, ViewDistribution(), 1, load(file)).keys.keys() == trained[0].keys.keys()
+    assert TrainedScene(parsed, {file: load(file)}, ViewDistribution(), 1).keys.keys() == trained[0].keys.keys()
 
 
 class Timed:
@@ -419,7 +427,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
 
     def fitted_scene(**more):
         request = FitRequest("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
-        return fit_scene(
+        tables, result = fit_scene(
             parsed,
             ORBIT,
             recipe,
@@ -427,6 +435,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
             references=tmp_path / "kept",
             preview=tmp_path / "preview.png",
         )
+        return tables["material.npz"], result
 
     found, result = fitted_scene()
     history = [h["psnr_db"] for h in result.history]
@@ -581,7 +590,7 @@ def test_a_material_is_trained_as_its_maps_are(folder, path, trained, weights):
     (folder / "whole.xml").write_text(text)
     parsed = scenes.ParsedScene(folder / "whole.xml")
     file, _ = texture_file(parsed)
-    whole, (scene, problem) = TrainedScene(parsed, file, ORBIT, 1, load(file)), trained
+    whole, (scene, problem) = TrainedScene(parsed, {file: load(file)}, ORBIT, 1), trained
     whole.place(View())
     scene.place(View())
     (a, da), (b, db) = (rendered(s, inside(problem.net), weights, 1, 2) for s in (whole, scene))
@@ -619,17 +628,117 @@ def test_gradients_against_differences(trained, weights):
         array.data = before
 
 
-def test_which_texture(path, folder):
-    assert texture_file(scenes.ParsedScene(path)) == (folder / "material.npz", "")
-    assert texture_file(scenes.ParsedScene(path), folder / "material.npz")[0] == folder / "material.npz"
+def test_which_textures(path, folder):
+    parsed = scenes.ParsedScene(path)
+    assert texture_files(parsed) == texture_files(parsed, [folder / "material.npz"]) == {folder / "material.npz": ""}
     with pytest.raises(
         UsageError, match=r"no neural_texture or neural_material reads .*other\.npz, the files are material\.npz"
     ):
-        texture_file(scenes.ParsedScene(path), folder / "other.npz")
+        texture_files(parsed, [folder / "other.npz"])
     plain = folder / "plain.xml"
     plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
-    with pytest.raises(UsageError, match="names 0 files of neural_texture or neural_material"):
-        texture_file(scenes.ParsedScene(plain))
+    with pytest.raises(UsageError, match="names no file of neural_texture or neural_material"):
+        texture_files(scenes.ParsedScene(plain))
+
+
+# -- several textures -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pair(path):
+    """A scene of two surfaces with textures of two files that hold the same arrays; of one file with ``b=a.npz``."""
+    folder = path.parent / "pair"
+    folder.mkdir()
+    for name in ("albedo.png", "roughness.png", "material.json"):
+        (folder / name).write_bytes(path.with_name(name).read_bytes())
+    for name in ("a.npz", "b.npz"):
+        (folder / name).write_bytes(path.with_name("material.npz").read_bytes())
+    text = path.read_text("utf-8")
+    surface = (
+        '<shape type="rectangle"><transform name="to_world"><translate x="{}"/></transform><bsdf type="diffuse">'
+        '<texture type="neural_texture" name="reflectance"><string name="filename" value="{}"/>'
+        '<string name="channels" value="albedo"/><string name="filter" value="off"/></texture></bsdf></shape>'
+    )
+    surfaces = surface.format(-1, "a.npz") + surface.format(1, "$b")
+    text = re.sub("<shape .*</shape>", surfaces, text)
+    (folder / "pair.xml").write_text(text.replace("<default", '<default name="b" value="b.npz"/><default', 1), "utf-8")
+    return folder / "pair.xml"
+
+
+def test_gradients_of_several_files(pair, weights):
+    """Together they are the gradients of one file that both surfaces show."""
+    images, gradients = {}, {}
+    for b in ("a.npz", "b.npz"):
+        parsed = scenes.ParsedScene(pair, {"b": b})
+        textures = stored_textures(parsed)
+        problem = joined({t.file.name: t.problem for t in textures})
+        scene = TrainedScene(parsed, {t.file: t.table for t in textures}, ViewDistribution(), 1)
+        images[b], gradients[b] = rendered(scene, inside(problem.net), weights, 1, 2)
+    np.testing.assert_allclose(images["a.npz"], images["b.npz"], atol=1e-5)
+    assert len(gradients["b.npz"]) == 2 * len(gradients["a.npz"])
+    assert np.abs(gradients["a.npz"]["level0"]).max() > 0
+    for name, gradient in gradients["a.npz"].items():
+        parts = [gradients["b.npz"][f"{file}/{name}"] for file in ("a.npz", "b.npz")]
+        assert all(np.abs(part).max() >= 0.1 * np.abs(gradient).max() for part in parts)
+        np.testing.assert_allclose(sum(parts), gradient, atol=1e-4 * np.abs(gradient).max())
+    assert problem.shares == [0.5, 0.5]
+    assert problem.measure(problem.net) == {
+        f"{t.file.name}_{key}": value for t in textures for key, value in t.problem.measure(t.problem.net).items()
+    }
+
+
+def test_several_files_are_trained(pair, tmp_path, monkeypatch):
+    """All that the scene names, in one run, into a folder; a checkpoint keeps all of them."""
+    checkpoint = tmp_path / "c.npz"
+    given = {
+        "defines": [("film", "6")], "views": 1, "held_out": 1, "reference_spp": 64, "progress": False,
+        "steps": 2, "measure_every": 2, "batch": 512, "lr": 0.02, "deterministic": True,
+    }  # fmt: skip
+
+    def trained_files(**more):
+        return mi_diffind.fit("scene", pair, checkpoint=checkpoint, output=tmp_path / "out", **given, **more)
+
+    fitted_files = trained_files()
+    folder = fitted_files.save(tmp_path / "out")
+    names = ["a.npz", "b.npz"]
+    assert sorted(file.name for file in folder.iterdir()) == sorted(fitted_files.report["files"]) == names
+    assert fitted_files.report["bytes"] == sum(model.nbytes for model in fitted_files.models.values())
+    assert f"{folder / 'b.npz'}: " in "\n".join(fitted_files.summary(folder))
+    with pytest.raises(UsageError, match="2 files were trained"):
+        _ = fitted_files.model
+    resumed = trained_files(resume=True)
+    for name in names:
+        table = load(folder / name)
+        assert table.settings["trained_with"] == names and table.settings["source_path"].endswith("pair/material.json")
+        assert ((folder / table.settings["source_path"]).resolve()) == pair.with_name("material.json")
+        changed = {key for key, array in table.arrays.items() if not np.array_equal(
+            array.entries, load(pair.with_name(name)).arrays[key].entries)}  # fmt: skip
+        assert "coarse" in changed and "kept_start" not in table.settings
+        for key, array in resumed.tables[name].arrays.items():
+            np.testing.assert_array_equal(array.entries, table.arrays[key].entries)
+    # Nothing is replaced if one of them cannot be written
+    before = {name: (folder / name).read_bytes() for name in names}
+    fitted_files.tables["a.npz"].seed = 5
+    fitted_files.tables["b.npz"].seed = object()
+    with pytest.raises(TableError):
+        fitted_files.save(folder)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"output": "x.npz"}, r"2 textures are trained \(a.npz, b.npz\): give a folder"),
+        ({"output": "."}, "found the folder of the trained textures"),
+        ({"texture": "b.npz", "output": "x"}, 'found the extension ""'),
+        ({"start": ["a.npz"]}, "--start: a.npz is not the only one for a.npz, or belongs to several"),
+        ({"texture": "b.npz", "start": ["b.npz", "a.npz"]}, "--start: a.npz is not the only one for b.npz"),
+    ],
+)
+def test_several_files_that_cannot_be(pair, monkeypatch, change, match):
+    monkeypatch.chdir(pair.parent)
+    with pytest.raises(UsageError, match=match):
+        mi_diffind.fit("scene", pair, progress=False, **change)
 
 
 # -- its parts --------------------------------------------------------------------------------------------------------
@@ -684,7 +793,8 @@ def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
     recipe, before = SceneRecipe(reference_spp=4, settings=settings), load(folder / "material.npz")
     request = FitRequest("ours", settings, array_module("llvm"), progress=False)
     parsed, views = scenes.ParsedScene(path, {"film": 4}), ViewDistribution(1, 1)
-    table, result = fit_scene(parsed, views, recipe, request)
+    tables, result = fit_scene(parsed, views, recipe, request)
+    table = tables["material.npz"]
     assert table.settings["kept_start"] and result.step == 0
     for name, array in table.arrays.items():
         np.testing.assert_array_equal(array.values, before.arrays[name].values)
@@ -692,4 +802,4 @@ def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
     other.settings["source"] = "other"
     save_table(folder / "other.npz", other)
     with pytest.raises(UsageError, match=r"--start: .*other\.npz holds other maps"):
-        fit_scene(parsed, views, recipe, request, start=folder / "other.npz")
+        fit_scene(parsed, views, recipe, request, starts=[folder / "other.npz"])

@@ -95,10 +95,15 @@ FILE_ARGUMENTS = (
         "-D", dest="defines", action="append", type=define, metavar="NAME=VALUE", help="set a <default> of the scene"
     ),
     Argument(
-        "--start", metavar="FILE.npz",
-        help="arrays to start from, of the same maps, such as those of fit shading (default: the scene's file)",
+        "--start", action="append", metavar="FILE.npz",
+        help="arrays to start from, of the same maps, such as those of fit shading; may be repeated, once for each "
+        "texture (default: the scene's files)",
     ),
-    Argument("--texture", metavar="FILE.npz", help="file of the trained texture (default: the only one)"),
+    Argument(
+        "--texture", action="append", metavar="FILE.npz",
+        help="file of a trained texture, may be repeated (default: all that the scene reads); several are trained "
+        "together, and -o names a folder, in which each keeps its name",
+    ),
     Argument("--references", metavar="FOLDER", help="folder that keeps the references for later runs"),
     PREVIEW,
 )  # fmt: skip

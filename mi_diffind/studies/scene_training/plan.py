@@ -139,7 +139,7 @@ class SceneTrainingContext(StudyContext):
     def measure(self, table: Table, spp: int) -> dict[str, float]:
         """Return ``psnr_db`` and ``flip`` of a table in renders with footprints of ``spp`` samples a pixel."""
         distribution, views, references, exposure = self.tests
-        scene = TrainedScene(self.parsed, self.file, distribution, spp, table)
+        scene = TrainedScene(self.parsed, {self.file: table}, distribution, spp)
         errors, flips = [], []
         with dr.suspend_grad():
             for i, (view, reference) in enumerate(zip(views, references, strict=True)):
@@ -166,7 +166,7 @@ def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[TrainingInS
         images = {}
         for run in (r for r in runs if r.context is context):
             share = "" if run.share is None else f", λ {run.share:g}"
-            scene = TrainedScene(context.parsed, context.file, distribution, int(run.budget), run.model)
+            scene = TrainedScene(context.parsed, {context.file: run.model}, distribution, int(run.budget))
             with dr.suspend_grad():
                 scene.place(views[0])
                 image = scene.render(0, 1, context.settings.spp).numpy()
