@@ -130,7 +130,8 @@ def test_bad_views(change, match):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"share": 1.5}, "share: found 1.5"), ({"spp": 0}, "spp: found 0"), ({"bound": -1.0}, "bound: found -1"),
+        ({"share": 1.5}, "share: found 1.5"), ({"spp": 0}, "spp: found 0"), ({"samples": 0}, "samples: found 0"),
+        ({"bound": -1.0}, "bound: found -1"),
         ({"start": "there"}, 'start: found "there"'), ({"exposure": float("nan")}, "exposure: found nan"),
     ],
 )  # fmt: skip
@@ -493,7 +494,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     save_table(tmp_path / "material.npz", table)
     scene = scene_file(tmp_path / "material.npz", NAMES)
     parsed = scenes.ParsedScene(scene)
-    recipe = SceneRecipe(share=1.0, reference_spp=16)
+    recipe = SceneRecipe(share=1.0, reference_spp=16, samples=1)
     changed = {"steps": 12, "measure_every": 6, "batch": 2048, "lr": 0.1, "schedule": "constant"}
     recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
 
@@ -619,6 +620,19 @@ def rendered(scene, net, weights, *seeds):
 @pytest.fixture(scope="module")
 def weights(one_core):
     return mi.TensorXf(np.random.default_rng(0).random((24, 24, 3), dtype=np.float32))
+
+
+def test_small_films_are_rendered_with_more_samples(trained, monkeypatch):
+    """A step draws as many samples as the recipe says, for values and derivatives alike; the footprints stay."""
+    (scene, texture), given = trained, []
+    black = np.zeros((24, 24, 3), np.float32)
+    monkeypatch.setattr(mi, "render", lambda *_, **options: given.append(options) or mi.TensorXf(black))
+    for samples, spp in ((1, 1), (576, 1), (577, 2), (2**15, 57)):
+        problem = SceneProblem(texture, scene, [(View(), black)], [], SceneRecipe(samples=samples))
+        problem.settings = problem.recipe.settings
+        problem.image_loss(problem.net, dr.rng(seed=0))
+        options = given.pop()
+        assert (options["spp"], options["spp_grad"], scene.spp) == (spp, spp, 1)
 
 
 def test_values_and_derivatives_have_their_own_samples(trained, weights):

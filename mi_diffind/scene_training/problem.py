@@ -80,6 +80,8 @@ class SceneProblem(Problem):
         recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
         #: Samples per pixel of each half of a measured render.
         self.samples = max(MEASURED // 2, scene.spp)
+        #: Samples per pixel of a trained render.
+        self.drawn = max(scene.spp, math.ceil(recipe.samples / math.prod(self.references[0].shape[:2])))
         #: What the settings of all trained files have in common.
         self.common = {"scene": digest, "shading": recorded, "exposure": self.exposure}
         self.identity = {**texture.identity, **self.common}
@@ -106,7 +108,7 @@ class SceneProblem(Problem):
         value, derivative = (dr.gather(mi.UInt32, seeds, i) for i in range(2))
         self.scene.hold(self.texture.seen(unfolded(net)))
         self.scene.place(self.views[self._view])
-        error = self.exposure * self.scene.render(value, derivative) - self.references[self._view]
+        error = self.exposure * self.scene.render(value, derivative, self.drawn) - self.references[self._view]
         return self.errors(error.array) * (1 / math.prod(error.shape))
 
     def errors(self, error):

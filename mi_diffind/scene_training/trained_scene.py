@@ -95,9 +95,8 @@ class TrainedScene:
 
         Values come from the samples of ``seed``, derivatives from those of ``seed_grad``: the derivative of the loss by
         the image is then independent of the derivative of the image by the arrays, and their product is right on
-        average for squared errors.
+        average for squared errors. ``spp`` (``None``: the scene's) changes no footprints.
         """
-        image = mi.render(
-            self.scene, self.parameters, spp=spp or self.spp, spp_grad=self.spp, seed=seed, seed_grad=seed_grad
-        )
+        spp = spp or self.spp
+        image = mi.render(self.scene, self.parameters, spp=spp, spp_grad=spp, seed=seed, seed_grad=seed_grad)
         return scenes.colour_channels(image)
