@@ -428,12 +428,6 @@ def nodes_of(params) -> list:
     return list({id(node): node for node in params.hierarchy}.values())
 
 
-def keys_of(params, node) -> dict[str, str]:
-    """Return the keys of ``params`` (``mi.SceneParameters``) for the parameters of an object itself, by their names."""
-    keys = [key for key, (_, _, owner, _) in params.properties.items() if owner is node]
-    return {key.rpartition(".")[2]: key for key in keys}
-
-
 def is_instance(shape) -> bool:
     """Return whether a shape is an ``instance`` of a ``shapegroup``, by the name of its class (not promised)."""
     return shape.class_name() == "Instance"

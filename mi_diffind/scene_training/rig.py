@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import compat
 from ..poses import rotation
 from ..scenes import SceneError
 from .views import View, ViewDistribution
@@ -125,8 +124,7 @@ class Rig:
 
 def _lights(scene: mi.Scene) -> list[_Movable | _AreaLight]:
     """Return the lights that can be moved: emitters with a place or a direction, and shapes that emit."""
-    parameters = mi.traverse(scene)
-    emitting = [_AreaLight(parameters, shape) for shape in scene.shapes() if shape.is_emitter()]
+    emitting = [_AreaLight(scene, shape) for shape in scene.shapes() if shape.is_emitter()]
     lights = [_Movable(emitter) for emitter in scene.emitters()]
     return [light for light in (*lights, *emitting) if light.parameter]
 
@@ -165,31 +163,31 @@ class _Movable:
 class _AreaLight:
     """An area light, moved with its shape: by the shape's ``to_world``, or of a mesh by its vertices.
 
-    ``parameters`` are those of the scene, which is to know that a shape has moved; ``centre`` is that of its bounds.
+    ``before`` is the matrix of a ``to_world``, the identity for a mesh; ``centre`` is that of the shape's bounds.
     """
 
     environment = at_infinity = False
     sun = None
 
-    def __init__(self, parameters: mi.SceneParameters, shape: mi.Shape):
-        keys = compat.keys_of(parameters, shape)
-        self.parameters, self.centre = parameters, np.array(shape.bbox().center(), np.float64).ravel()
-        self.parameter = keys.get("to_world") or keys.get("vertex_positions", "")
-        self.matrix, self.before = "to_world" in keys, np.eye(4)
-        self.normals = keys.get("vertex_normals", "")
-        if self.matrix:
-            self.before = np.array(parameters[self.parameter].matrix, np.float64).reshape(4, 4)
+    def __init__(self, scene: mi.Scene, shape: mi.Shape):
+        self.scene, self.parameters = scene, mi.traverse(shape)
+        self.centre, self.before = np.array(shape.bbox().center(), np.float64).ravel(), np.eye(4)
+        self.parameter = next((k for k in ("to_world", "vertex_positions") if k in self.parameters), "")
+        if self.parameter == "to_world":
+            self.before = np.array(self.parameters["to_world"].matrix, np.float64).reshape(4, 4)
         elif self.parameter:
-            self.vertices = {k: np.array(parameters[k]).reshape(-1, 3) for k in (self.parameter, self.normals) if k}
+            keys = [k for k in ("vertex_positions", "vertex_normals") if k in self.parameters]
+            self.vertices = {k: np.array(self.parameters[k]).reshape(-1, 3) for k in keys}
 
     def move(self, matrix: np.ndarray) -> None:
-        if self.matrix:
-            self.parameters[self.parameter] = _transform(self.parameters[self.parameter], matrix)
+        if self.parameter == "to_world":
+            self.parameters["to_world"] = _transform(self.parameters["to_world"], matrix)
         else:
             for key, values in self.vertices.items():
-                shift = matrix[:3, 3] if key == self.parameter else 0
+                shift = matrix[:3, 3] if key == "vertex_positions" else 0
                 self.parameters[key] = (values @ matrix[:3, :3].T + shift).ravel().astype(np.float32)
         self.parameters.update()
+        self.scene.parameters_changed()  # rays are to find the shape at its place
 
 
 def _transform(before, matrix: np.ndarray):
