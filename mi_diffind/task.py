@@ -340,6 +340,10 @@ class Task:
             lines.append(f'    <string name="channels" value="{maps[0]}"/>  <!-- or {", ".join(maps[1:])} -->')
         return [f'<{tag} type="{name}">', *lines, f"</{tag}>"]
 
+    def output_path(self, path: str | os.PathLike) -> Path:
+        """Return the path of the output. Raises :class:`UsageError` if it is no table file."""
+        return table_path(path)
+
     def check(self, request: FitRequest) -> None:
         """Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
 
@@ -579,7 +583,7 @@ def fit(
     request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options)
     request.deadline, request.seconds = deadline, None if deadline is None else deadline.seconds
     request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
-    request.output = None if output is None else table_path(output)
+    request.output = None if output is None else chosen.output_path(output)
     if resume and seconds is not None:
         raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
     request.task = task

@@ -66,7 +66,7 @@ def opened(folder: Path, light: str, names=NAMES, preset="ours", fine="0:2:4", d
     problem = texture_problem(table, load_source(folder / "material.json"))
     path = scene_file(file, names, light, FILM, depth)
     views = ORBIT if light == "directional" else ViewDistribution()
-    return TrainedScene(ParsedScene(path), file, views, 1, table), problem, path
+    return TrainedScene(ParsedScene(path), {file: table}, views, 1), problem, path
 
 
 def inside(net):
@@ -318,7 +318,8 @@ def steps(folder: Path, count=2000) -> dict:
     rendered = ReferenceRenders(ParsedScene(path), views, 64, progress=False)
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
-    scene = TrainedScene(ParsedScene(path), path.parent / "material.npz", views, 1, load(path.parent / "material.npz"))
+    file = path.parent / "material.npz"
+    scene = TrainedScene(ParsedScene(path), {file: load(file)}, views, 1)
     problem = SceneProblem(texture, scene, [*zip(trained, images, strict=False)], [(measured[0], images[-1])], recipe)
     marks, begin = [], problem.begin
 

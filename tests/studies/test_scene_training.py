@@ -18,13 +18,19 @@ def test_sentences_name_the_gain_over_the_hemisphere():
     line, alone, after = conclusions.conclusions(result)
     assert line == "room, over the start: scene +2.00 dB; hemisphere +1.50 dB; hemisphere, then scene +2.75 dB"
     assert "for the same seconds gains +0.50 to +0.50 dB: 0 of 1 scenes" in alone
-    assert "with more seconds gains +1.25 to +1.25 dB: 1 of 1 scenes" in after
+    assert "with more seconds, gains +1.25 to +1.25 dB: 1 of 1 scenes" in after
     # Other samples per pixel than those of the first run do not count
     result["jobs"]["other"] = details("scene", 40.0, spp=4)
     assert conclusions.conclusions(result)[0] == line
     assert len(conclusions.table(result)) == 6
+    # The control, and a wrong start
+    result["jobs"]["longer"] = details(conclusions.LONGER, 21.75)
+    result["jobs"]["wrong"] = details(f"{conclusions.OTHER}, then scene", 21.9)
+    control, wrong = conclusions.conclusions(result)[3:]
+    assert "to its end" in control and "gains +1.00 to +1.00 dB: 1 of 1 scenes" in control
+    assert wrong == "a start from another material ends -0.10 to -0.10 dB from the right one"
     del result["jobs"]["hemisphere"]
-    assert len(conclusions.conclusions(result)) == 1
+    assert not any("for the same seconds" in line for line in conclusions.conclusions(result))
 
 
 def test_a_scene_that_does_not_exist(tmp_path):
