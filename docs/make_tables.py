@@ -288,6 +288,19 @@ def shading_shares(*studies: str) -> str:
     return table(["material", "", "", *(f"λ {share:g}" for share in shares), "trouble"], rows)
 
 
+def shading_extras(study: str) -> str:
+    """Return errors of textures of the first seed, trained for shading without and with extras."""
+    jobs, rows = measured(study)["jobs"], []
+    for name, material in shading_curves(study).items():
+        without = f"lambda 0.9, {material.remedies[0]}, seed 0"
+        for label, job in (("without", without), ("with", "extras, seed 0")):
+            record = jobs[f"{name}, {job}"]
+            c = record["details"]["C"]
+            rows.append([name, label, f"{record['bytes']:,}", f"{c['mean_db']:.2f}", f"{mean(c['flip']):.3f}",
+                         *(f"{psnr:.1f}" for psnr in c["psnr_db"])])  # fmt: skip
+    return table(["material", "extras", "bytes", "C, dB", "FLIP", *(f"L{i}" for i in range(6))], rows)
+
+
 def shading_renders() -> str:
     """Return errors and times of whole renders, bytes, and the time of a training step over that of the first row."""
     study = measured("tradeoff_shading_renders")
@@ -325,6 +338,16 @@ def shading_distances() -> str:
         figures = (f"{before:.1f} → {after:.1f}" for before, after in pairs)
         rows.append([name, f"{study['level_bias']:g}", "yes" if study["fixed"] else "no", *figures])
     return table(["material", "level bias", "fine levels fixed", "near, dB", "middle, dB", "far, dB"], rows)
+
+
+def rust() -> str:
+    """Return the errors of the scene rust at one sample a pixel, before and after training for its shading."""
+    figures, rows = measured("rust"), []
+    for name in ("rust_plain.npz", "rust_shaded.npz"):
+        f = figures[name]
+        brightness = f"{100 * (f['brightness'] - 1):+.1f}%"
+        rows.append([f"`{name}`", f"{f['bytes']:,}", f"{f['psnr_db']:.1f}", f"{f['flip']:.3f}", brightness])
+    return table(["texture", "bytes", "PSNR, dB", "FLIP", "brightness"], rows)
 
 
 def scene_training() -> str:
@@ -494,8 +517,10 @@ for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
 TABLES |= {
+    "rust": rust,
     "shading_best": lambda: shading_best("tradeoff_shading", "tradeoff_shading_boombox"),
     "shading_shares": lambda: shading_shares("tradeoff_shading_lambda"),
+    "shading_extras": lambda: shading_extras("tradeoff_shading_lambda"),
     "shading_shares_paper": lambda: shading_shares("tradeoff_shading_paper"),
     "shading_renders": shading_renders,
 }

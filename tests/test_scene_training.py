@@ -14,7 +14,7 @@ from shading_scenes import fitted, material, scene_file
 import mi_diffind
 from mi_diffind import scenes
 from mi_diffind.arguments import add_arguments
-from mi_diffind.compat import use_threads
+from mi_diffind.compat import use_threads, was_compiled
 from mi_diffind.deadline import Deadline
 from mi_diffind.errors import UsageError
 from mi_diffind.files import OutputError
@@ -180,6 +180,8 @@ LIGHTS = {
     "lamp": {"type": "point", "position": [1, 0, 1]},
     "sky": {"type": "envmap", "bitmap": None},
     "shape": {"type": "rectangle", "emitter": {"type": "area"}},
+    "ambient": {"type": "constant"},
+    "noon": {"type": "sunsky", "hour": 12.0},
 }
 
 
@@ -236,6 +238,75 @@ def test_camera_and_lights_are_where_a_view_has_them():
     np.testing.assert_allclose(matrix(emitters(scene)["sun"])[:3, 2], before["sun"][:3, 2], atol=1e-5)
 
 
+@pytest.fixture
+def tilted(tmp_path):
+    """A mesh whose normals are not those of its faces, in a file."""
+    vertices, normals = np.float32([[0, 0, 0], [0, 1, 0], [1, 0, 0]]), np.float32([[0.6, 0, -0.8]] * 3)
+    mesh = mi.Mesh("tilted", 3, 1, has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), [0, 1, 2]
+    parameters["vertex_normals"] = normals.ravel()
+    mesh.write_ply(str(tmp_path / "tilted.ply"))
+    return str(tmp_path / "tilted.ply")
+
+
+def test_area_lights_are_where_a_view_has_them(tilted):
+    """As images of a scene that is written so, by Mitsuba's own rotations; no kernel depends on the place."""
+    t = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "to_world": t().look_at([0, -4, 4], [0, 0, 0], [0, 0, 1]), "film": film}
+    lights = {
+        "rectangle": ({"type": "rectangle"}, t().translate([1, 1, 1]).rotate([1, 0, 0], 180).scale(0.3)),
+        "sphere": ({"type": "sphere"}, t().translate([-1, 1, 1]).scale(0.2)),
+        "mesh": ({"type": "ply", "filename": tilted}, t().translate([-1.5, -1.5, 1])),
+    }
+
+    def scene(places):
+        glow = {"type": "area", "radiance": {"type": "rgb", "value": 9}}
+        content = {name: {**lights[name][0], "to_world": place, "emitter": glow} for name, place in places.items()}
+        content |= {"floor": {"type": "rectangle", "to_world": t().scale(3)}, "sensor": sensor}
+        return mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **content}, parallel=False)
+
+    def image(scene):
+        return mi.render(scene, spp=16, seed=opaque(3)).numpy()
+
+    moved = scene({name: place for name, (_, place) in lights.items()})
+    rig = Rig(moved, ViewDistribution(target=(0, 0, 0), up=(0, 0, 1), light_azimuth=(0, 9), light_elevation=(0, 9)))
+    rig.place(View())
+    before = image(moved)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        rig.place(View(light_azimuth=40, light_elevation=50))
+        after = image(moved)
+        assert not any(was_compiled([entry]) for entry in dr.kernel_history() if entry.get("operation_count", 0) > 500)
+    places = {}
+    for (name, (_, place)), middle in zip(lights.items(), ([1, 1, 1], [-1, 1, 1], [-1, -1, 1]), strict=True):
+        turned = np.array(t().rotate([0, 0, 1], 40) @ mi.ScalarPoint3f(middle)).ravel()
+        angle = 50 - np.degrees(np.arcsin(turned[2] / np.linalg.norm(turned)))
+        axis = np.cross(turned, [0, 0, 1])
+        places[name] = t().rotate(list(axis / np.linalg.norm(axis)), angle) @ t().rotate([0, 0, 1], 40) @ place
+    expected = image(scene(places))
+    np.testing.assert_allclose(after, expected, atol=1e-4 * expected.max())
+    assert np.abs(after - before).mean() > 0.3 * before.mean()
+    rig.place(View())
+    np.testing.assert_allclose(image(moved), before, atol=1e-4 * before.max())
+
+
+def test_the_sun_of_a_sky_is_where_a_view_has_it():
+    """It turns with its sky, and rises in it, whose zenith is the vertical."""
+    t = mi.ScalarTransform4f
+    upright = t().rotate([1, 0, 0], -90)
+    sky = {"type": "sunsky", "sun_direction": [0.6, 0, 0.8], "to_world": upright, "sun_scale": 0.5}
+    scene = mi.load_dict({"type": "scene", "sky": sky, "sensor": {"type": "perspective"}})
+    rig = Rig(scene, ViewDistribution(up=(0, 1, 0), light_azimuth=(0, 9), light_elevation=(0, 9)))
+    (emitter,) = scene.emitters()
+    for view, azimuth, direction in (
+        (View(light_azimuth=90, light_elevation=30), 90, [np.sqrt(0.75), 0, 0.5]), (View(), 0, [0.6, 0, 0.8])
+    ):  # fmt: skip
+        rig.place(view)
+        np.testing.assert_allclose(np.array(mi.traverse(emitter)["sun_direction"]).ravel(), direction, atol=1e-5)
+        np.testing.assert_allclose(matrix(emitter), (t().rotate([0, 1, 0], azimuth) @ upright).matrix, atol=1e-5)
+
+
 def test_a_camera_in_a_box_looks_at_the_target():
     scene = lit("sun")
     Rig(scene, ViewDistribution(origins=((0, 0, 0), (1, 1, 1)), target=(0, 0, 0))).place(View(origin=(3, 4, 5)))
@@ -246,10 +317,12 @@ def test_a_camera_in_a_box_looks_at_the_target():
 
 def test_rigs_that_cannot_be():
     turn = ViewDistribution(light_azimuth=(0, 90))
-    with pytest.raises(scenes.SceneError, match=r"light_azimuth: no light of the scene can be moved so \(AreaLight\)"):
-        Rig(lit("shape"), turn)
-    with pytest.raises(scenes.SceneError, match="light_elevation: no light"):
-        Rig(lit("sky"), dataclasses.replace(turn, light_elevation=(0, 9)))
+    with pytest.raises(scenes.SceneError, match=r"light_azimuth: no light .* \(ConstantBackgroundEmitter\)"):
+        Rig(lit("ambient"), turn)
+    raised = dataclasses.replace(turn, light_elevation=(0, 9))
+    for name in ("sky", "noon"):
+        with pytest.raises(scenes.SceneError, match="light_elevation: no light"):
+            Rig(lit(name), raised)
     Rig(lit("sky"), turn)
     with pytest.raises(scenes.SceneError, match="target: not given, and the middle"):
         Rig(lit("sky"), ViewDistribution(azimuth=(0, 9)))
