@@ -275,7 +275,8 @@ def other_maps(source: Path) -> dict[str, np.ndarray]:
     return maps
 
 
-def _runs(context: SceneTrainingContext, without: Sequence[str]) -> list[TrainingInScene]:
+def planned_runs(context: SceneTrainingContext, without: Sequence[str]) -> list[TrainingInScene]:
+    """Return the runs of a scene in their order, ``without`` those of these names and those that start from them."""
     settings, default = context.settings, SceneRecipe().share
     share = default if default in settings.lambdas else settings.lambdas[-1]
 
@@ -306,7 +307,7 @@ def _runs(context: SceneTrainingContext, without: Sequence[str]) -> list[Trainin
 def plan(paths: Sequence[Path], settings: SceneTrainingSettings, without: Sequence[str] = ()) -> Plan:
     """Return the plan for scene files in the current variant, ``without`` the runs of these names."""
     contexts = [SceneTrainingContext(path, settings) for path in paths]
-    runs = [run for context in contexts for run in _runs(context, without)]
+    runs = [run for context in contexts for run in planned_runs(context, without)]
 
     def candidate(run: TrainingInScene) -> Candidate:
         def errors(samples: int) -> dict[str, float]:
