@@ -158,7 +158,10 @@ class SceneTrainingContext(StudyContext):
 
 def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[TrainingInScene], result: dict):
     """Draw the first measured view of each scene: after each of the :data:`SHOWN` runs, and the truth."""
-    runs = list({(r.context.name, r.method): r for r in reversed(runs) if r.method in SHOWN}.values())[::-1]
+    first = {}
+    for run in runs:
+        first.setdefault((run.context.name, run.method), run)
+    runs = [run for run in first.values() if run.method in SHOWN]
     columns = max(len([r for r in runs if r.context is c]) for c in contexts) + 1
     figure = plot.figure(result["title"], figure_caption(result), 2.3 * columns, 1.7 * len(contexts))
     for row, context in enumerate(contexts):
