@@ -354,15 +354,19 @@ def scene_training() -> str:
     """Return errors of held-out views and lights after training inside a scene and over the hemisphere."""
     rows = []
     for path in sorted((DOCS / "measured").glob("tradeoff_scene_training_*.json")):
-        for record in measured(path.stem)["jobs"].values():
-            d = record["details"]
-            times = [f"{d[key]:.{digits}f}" if key in d else "–" for key, digits in TRAINING_TIMES.items()]
-            rows.append([d["scene"], d["way"], f"{d['psnr_db']:.2f}", f"{d['flip']:.3f}", *times, d["peak_mib"]])
-    return table(["scene", "run", "PSNR, dB", "FLIP", "seconds", "ms a step", "level bias", "peak MiB"], rows)
+        runs = [record["details"] for record in measured(path.stem)["jobs"].values()]
+        weights = [d["lambda"] for d in runs if d["lambda"] is not None]
+        for d in runs:
+            name = d["way"]
+            name += f", λ {d['lambda']:g}" if d["lambda"] not in (None, *weights[:1]) else ""
+            name += f", {d['spp']} samples a pixel" if d["spp"] != runs[0]["spp"] else ""
+            times = [f"{d[key]:.{digits}f}" if key in d else "–" for key, digits in TRAINING_FIGURES.items()]
+            rows.append([d["scene"], name, f"{d['psnr_db']:.2f}", f"{d['flip']:.3f}", *times])
+    return table(["scene", "run", "PSNR, dB", "FLIP", "steps", "processor s", "level bias"], rows)
 
 
 #: Figures of a training in the table above, and their digits.
-TRAINING_TIMES = {"training_seconds": 0, "step_ms": 0, "level_bias": 1}
+TRAINING_FIGURES = {"steps": 0, "processor_seconds": 0, "level_bias": 1}
 
 
 def sdf_errors(study: str) -> str:

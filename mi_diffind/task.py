@@ -549,7 +549,7 @@ def fit(
     - ``seconds``: duration of everything in place of ``steps``: reading, preparation, training and measurement.
     - ``checkpoint``: file that keeps the state of the training, with which ``resume`` continues it.
     - ``progress``: show a progress bar in a terminal.
-    - ``output``: file in which the table will be saved; nothing is written there.
+    - ``output``: file in which the table will be saved, a folder for several textures of a scene; nothing is written.
     - ``given``: the other options of the command line as keywords (``mi-diffind fit TASK --help``): settings of the
       training (``steps``, ``lr``, ``batch``, ``seed``, …) and the task's own (``compression=12``).
 

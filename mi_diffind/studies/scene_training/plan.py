@@ -158,7 +158,10 @@ class SceneTrainingContext(StudyContext):
 
 def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[TrainingInScene], result: dict):
     """Draw the first measured view of each scene: after each of the :data:`SHOWN` runs, and the truth."""
-    runs = list({(r.context.name, r.method): r for r in reversed(runs) if r.method in SHOWN}.values())[::-1]
+    first = {}
+    for run in runs:
+        first.setdefault((run.context.name, run.method), run)
+    runs = [run for run in first.values() if run.method in SHOWN]
     columns = max(len([r for r in runs if r.context is c]) for c in contexts) + 1
     figure = plot.figure(result["title"], figure_caption(result), 2.3 * columns, 1.7 * len(contexts))
     for row, context in enumerate(contexts):
@@ -275,7 +278,8 @@ def other_maps(source: Path) -> dict[str, np.ndarray]:
     return maps
 
 
-def _runs(context: SceneTrainingContext, without: Sequence[str]) -> list[TrainingInScene]:
+def planned_runs(context: SceneTrainingContext, without: Sequence[str]) -> list[TrainingInScene]:
+    """Return the runs of a scene in their order, ``without`` those of these names and those that start from them."""
     settings, default = context.settings, SceneRecipe().share
     share = default if default in settings.lambdas else settings.lambdas[-1]
 
@@ -306,7 +310,7 @@ def _runs(context: SceneTrainingContext, without: Sequence[str]) -> list[Trainin
 def plan(paths: Sequence[Path], settings: SceneTrainingSettings, without: Sequence[str] = ()) -> Plan:
     """Return the plan for scene files in the current variant, ``without`` the runs of these names."""
     contexts = [SceneTrainingContext(path, settings) for path in paths]
-    runs = [run for context in contexts for run in _runs(context, without)]
+    runs = [run for context in contexts for run in planned_runs(context, without)]
 
     def candidate(run: TrainingInScene) -> Candidate:
         def errors(samples: int) -> dict[str, float]:
