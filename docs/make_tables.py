@@ -289,6 +289,19 @@ def shading_shares(*studies: str) -> str:
     return table(["material", "", "", *(f"λ {share:g}" for share in shares), "trouble"], rows)
 
 
+def shading_extras(study: str) -> str:
+    """Return errors of textures of the first seed, trained for shading without and with extras."""
+    jobs, rows = measured(study)["jobs"], []
+    for name, material in shading_curves(study).items():
+        without = f"lambda 0.9, {material.remedies[0]}, seed 0"
+        for label, job in (("without", without), ("with", "extras, seed 0")):
+            record = jobs[f"{name}, {job}"]
+            c = record["details"]["C"]
+            rows.append([name, label, f"{record['bytes']:,}", f"{c['mean_db']:.2f}", f"{mean(c['flip']):.3f}",
+                         *(f"{psnr:.1f}" for psnr in c["psnr_db"])])  # fmt: skip
+    return table(["material", "extras", "bytes", "C, dB", "FLIP", *(f"L{i}" for i in range(6))], rows)
+
+
 def shading_renders() -> str:
     """Return errors and times of whole renders, bytes, and the time of a training step over that of the first row."""
     study = measured("tradeoff_shading_renders")
@@ -352,19 +365,33 @@ def shading_distances() -> str:
     return table(["material", "level bias", "fine levels fixed", "near, dB", "middle, dB", "far, dB"], rows)
 
 
+def rust() -> str:
+    """Return the errors of the scene rust at one sample a pixel, before and after training for its shading."""
+    figures, rows = measured("rust"), []
+    for name in ("rust_plain.npz", "rust_shaded.npz"):
+        f = figures[name]
+        brightness = f"{100 * (f['brightness'] - 1):+.1f}%"
+        rows.append([f"`{name}`", f"{f['bytes']:,}", f"{f['psnr_db']:.1f}", f"{f['flip']:.3f}", brightness])
+    return table(["texture", "bytes", "PSNR, dB", "FLIP", "brightness"], rows)
+
+
 def scene_training() -> str:
     """Return errors of held-out views and lights after training inside a scene and over the hemisphere."""
     rows = []
     for path in sorted((DOCS / "measured").glob("tradeoff_scene_training_*.json")):
-        for record in measured(path.stem)["jobs"].values():
-            d = record["details"]
-            times = [f"{d[key]:.{digits}f}" if key in d else "–" for key, digits in TRAINING_TIMES.items()]
-            rows.append([d["scene"], d["way"], f"{d['psnr_db']:.2f}", f"{d['flip']:.3f}", *times, d["peak_mib"]])
-    return table(["scene", "run", "PSNR, dB", "FLIP", "seconds", "ms a step", "level bias", "peak MiB"], rows)
+        runs = [record["details"] for record in measured(path.stem)["jobs"].values()]
+        weights = [d["lambda"] for d in runs if d["lambda"] is not None]
+        for d in runs:
+            name = d["way"]
+            name += f", λ {d['lambda']:g}" if d["lambda"] not in (None, *weights[:1]) else ""
+            name += f", {d['spp']} samples a pixel" if d["spp"] != runs[0]["spp"] else ""
+            times = [f"{d[key]:.{digits}f}" if key in d else "–" for key, digits in TRAINING_FIGURES.items()]
+            rows.append([d["scene"], name, f"{d['psnr_db']:.2f}", f"{d['flip']:.3f}", *times])
+    return table(["scene", "run", "PSNR, dB", "FLIP", "steps", "processor s", "level bias"], rows)
 
 
 #: Figures of a training in the table above, and their digits.
-TRAINING_TIMES = {"training_seconds": 0, "step_ms": 0, "level_bias": 1}
+TRAINING_FIGURES = {"steps": 0, "processor_seconds": 0, "level_bias": 1}
 
 
 def sdf_errors(study: str) -> str:
@@ -516,8 +543,10 @@ for source in ("", "_boombox"):
     for make in (texture_renders, texture_factors):
         TABLES[make.__name__ + source] = lambda make=make, source=source: make(measured(f"tradeoff_texture{source}"))
 TABLES |= {
+    "rust": rust,
     "shading_best": lambda: shading_best("tradeoff_shading", "tradeoff_shading_boombox"),
     "shading_shares": lambda: shading_shares("tradeoff_shading_lambda"),
+    "shading_extras": lambda: shading_extras("tradeoff_shading_lambda"),
     "shading_shares_paper": lambda: shading_shares("tradeoff_shading_paper"),
     "shading_renders": shading_renders,
 }

@@ -340,6 +340,10 @@ class Task:
             lines.append(f'    <string name="channels" value="{maps[0]}"/>  <!-- or {", ".join(maps[1:])} -->')
         return [f'<{tag} type="{name}">', *lines, f"</{tag}>"]
 
+    def output_path(self, path: str | os.PathLike) -> Path:
+        """Return the path of the output. Raises :class:`UsageError` if it is no table file."""
+        return table_path(path)
+
     def check(self, request: FitRequest) -> None:
         """Raise :class:`~mi_diffind.errors.UsageError` for options that exclude each other, before any work.
 
@@ -545,7 +549,7 @@ def fit(
     - ``seconds``: duration of everything in place of ``steps``: reading, preparation, training and measurement.
     - ``checkpoint``: file that keeps the state of the training, with which ``resume`` continues it.
     - ``progress``: show a progress bar in a terminal.
-    - ``output``: file in which the table will be saved; nothing is written there.
+    - ``output``: file in which the table will be saved, a folder for several textures of a scene; nothing is written.
     - ``given``: the other options of the command line as keywords (``mi-diffind fit TASK --help``): settings of the
       training (``steps``, ``lr``, ``batch``, ``seed``, …) and the task's own (``compression=12``).
 
@@ -579,7 +583,7 @@ def fit(
     request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options)
     request.deadline, request.seconds = deadline, None if deadline is None else deadline.seconds
     request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
-    request.output = None if output is None else table_path(output)
+    request.output = None if output is None else chosen.output_path(output)
     if resume and seconds is not None:
         raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
     request.task = task

@@ -2,15 +2,20 @@
 
 ``-D metal=rust_plain.npz`` shows the same with the texture that is not trained for its shading. The maps are compressed
 by ``mi-diffind fit texture`` and ``mi-diffind fit shading``, see README.md.
+
+``--picture`` renders rust.jpg instead, the picture of the page on shading, and ``--json FILE`` writes its errors.
 """
 
+import argparse
 import json
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 from scene_xml import element, head, lying, plugin, transform, write
 
 import mi_diffind as md
+from mi_diffind import metrics, scenes
 
 ABOUT = """Hammered metal with rust, minified: what a texture that is trained for its shading is for. Written by
 make_rust.py: change that file.
@@ -40,8 +45,44 @@ def metal(repeats: float, id: str):
                   storage="$storage", filter="$filter")  # fmt: skip
 
 
+#: Settings of the picture, its first row and column that are shown, and the zoomed rows and columns.
+PICTURE = {"sky": 0, "max_depth": 2, "width": 640, "height": 360}
+CROP, ZOOM = (slice(60, 300), slice(250, 640)), (slice(45, 135), slice(500, 630))
+
+
+def picture(json_file: str | None) -> None:
+    """Render rust.jpg, and write the errors of both textures against 256 samples of bitmaps."""
+    mi.set_variant("llvm_ad_rgb")
+
+    def rendered(file: str, spp: int, exact: bool = False) -> np.ndarray:
+        defines = {**PICTURE, "spp": spp, "metal": file}  # the scene's samples scale the footprints
+        return scenes.render(scenes.load(FOLDER / "rust.xml", defines, exact=exact), passes=max(1, spp // 16))[0]
+
+    files = ("rust_plain.npz", "rust_shaded.npz")
+    images, truth = {file: rendered(file, 1) for file in files}, rendered(files[0], 256, exact=True)
+    figures = {"settings": {**PICTURE, "spp": 1, "truth_spp": 256}}
+    for file, image in images.items():
+        brightness = float(image.mean(dtype=np.float64) / truth.mean(dtype=np.float64))
+        figures[file] = {"bytes": md.open(FOLDER / "assets" / file).table.nbytes, "brightness": brightness,
+                         **metrics.compare(truth, image)}  # fmt: skip
+    columns = [[image[CROP], image[ZOOM].repeat(3, axis=0).repeat(3, axis=1)] for image in (*images.values(), truth)]
+    shown = mi.Bitmap(np.concatenate([np.concatenate(column) for column in columns], axis=1))
+    shown = shown.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    shown.write(str(FOLDER / "rust.jpg"), quality=85)
+    text = json.dumps(figures, indent=2) + "\n"
+    print(text, end="")
+    if json_file:
+        Path(json_file).write_text(text, encoding="utf-8")
+
+
 def main() -> None:
     """Write the files."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--picture", action="store_true", help="render rust.jpg, and write nothing else")
+    parser.add_argument("--json", metavar="FILE", help="file for the errors of the picture")
+    arguments = parser.parse_args()
+    if arguments.picture:
+        return picture(arguments.json)
     mi.set_variant("scalar_rgb")
     write_maps()
     camera = {"origin": (0, 4.2, 7.5), "target": (0, 0.35, 0.2), "up": (0, 1, 0)}

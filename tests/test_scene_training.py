@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from shading_scenes import fitted, material, scene_file
 
+import mi_diffind
 from mi_diffind import scenes
 from mi_diffind.arguments import add_arguments
-from mi_diffind.compat import use_threads
+from mi_diffind.compat import use_threads, was_compiled
 from mi_diffind.deadline import Deadline
 from mi_diffind.errors import UsageError
 from mi_diffind.files import OutputError
@@ -23,16 +24,23 @@ from mi_diffind.plugins.support import footprint
 from mi_diffind.runtime import array_module
 from mi_diffind.scene_training import recipe as scene_recipe
 from mi_diffind.scene_training import reference_renders
-from mi_diffind.scene_training.fit import fit_scene, limit
+from mi_diffind.scene_training.fit import fit_scene, joined, limit
 from mi_diffind.scene_training.problem import SceneProblem, exposure_of
 from mi_diffind.scene_training.recipe import SCENE_ARGUMENTS, SceneRecipe
 from mi_diffind.scene_training.reference_renders import ReferenceRenders
 from mi_diffind.scene_training.rig import Rig
-from mi_diffind.scene_training.stored_texture import budget_of, recipe_of, texture_file, texture_problem
+from mi_diffind.scene_training.stored_texture import (
+    budget_of,
+    recipe_of,
+    stored_textures,
+    texture_file,
+    texture_files,
+    texture_problem,
+)
 from mi_diffind.scene_training.trained_scene import TrainedScene
 from mi_diffind.scene_training.views import View, ViewDistribution, views_of
 from mi_diffind.settings import FitSettings
-from mi_diffind.tables import load_table, save_table
+from mi_diffind.tables import TableError, load_table, save_table
 from mi_diffind.task import FitRequest
 from mi_diffind.tasks.texture.compressed import CompressedTexture, load, to_table
 from mi_diffind.tasks.texture.memory_budget import PaperBudget, TextureBudget, parse_structure
@@ -76,7 +84,7 @@ def trained(folder, path):
     file, _ = texture_file(parsed)
     table = load(file)
     problem = texture_problem(table, load_source(folder / "material.json"))
-    scene = TrainedScene(parsed, file, ORBIT, 1, table)
+    scene = TrainedScene(parsed, {file: table}, ORBIT, 1)
     return scene, problem
 
 
@@ -122,7 +130,8 @@ def test_bad_views(change, match):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"share": 1.5}, "share: found 1.5"), ({"spp": 0}, "spp: found 0"), ({"bound": -1.0}, "bound: found -1"),
+        ({"share": 1.5}, "share: found 1.5"), ({"spp": 0}, "spp: found 0"), ({"samples": 0}, "samples: found 0"),
+        ({"bound": -1.0}, "bound: found -1"),
         ({"start": "there"}, 'start: found "there"'), ({"exposure": float("nan")}, "exposure: found nan"),
     ],
 )  # fmt: skip
@@ -171,6 +180,8 @@ LIGHTS = {
     "lamp": {"type": "point", "position": [1, 0, 1]},
     "sky": {"type": "envmap", "bitmap": None},
     "shape": {"type": "rectangle", "emitter": {"type": "area"}},
+    "ambient": {"type": "constant"},
+    "noon": {"type": "sunsky", "hour": 12.0},
 }
 
 
@@ -227,6 +238,75 @@ def test_camera_and_lights_are_where_a_view_has_them():
     np.testing.assert_allclose(matrix(emitters(scene)["sun"])[:3, 2], before["sun"][:3, 2], atol=1e-5)
 
 
+@pytest.fixture
+def tilted(tmp_path):
+    """A mesh whose normals are not those of its faces, in a file."""
+    vertices, normals = np.float32([[0, 0, 0], [0, 1, 0], [1, 0, 0]]), np.float32([[0.6, 0, -0.8]] * 3)
+    mesh = mi.Mesh("tilted", 3, 1, has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"], parameters["faces"] = vertices.ravel(), [0, 1, 2]
+    parameters["vertex_normals"] = normals.ravel()
+    mesh.write_ply(str(tmp_path / "tilted.ply"))
+    return str(tmp_path / "tilted.ply")
+
+
+def test_area_lights_are_where_a_view_has_them(tilted):
+    """As images of a scene that is written so, by Mitsuba's own rotations; no kernel depends on the place."""
+    t = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "to_world": t().look_at([0, -4, 4], [0, 0, 0], [0, 0, 1]), "film": film}
+    lights = {
+        "rectangle": ({"type": "rectangle"}, t().translate([1, 1, 1]).rotate([1, 0, 0], 180).scale(0.3)),
+        "sphere": ({"type": "sphere"}, t().translate([-1, 1, 1]).scale(0.2)),
+        "mesh": ({"type": "ply", "filename": tilted}, t().translate([-1.5, -1.5, 1])),
+    }
+
+    def scene(places):
+        glow = {"type": "area", "radiance": {"type": "rgb", "value": 9}}
+        content = {name: {**lights[name][0], "to_world": place, "emitter": glow} for name, place in places.items()}
+        content |= {"floor": {"type": "rectangle", "to_world": t().scale(3)}, "sensor": sensor}
+        return mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **content}, parallel=False)
+
+    def image(scene):
+        return mi.render(scene, spp=16, seed=opaque(3)).numpy()
+
+    moved = scene({name: place for name, (_, place) in lights.items()})
+    rig = Rig(moved, ViewDistribution(target=(0, 0, 0), up=(0, 0, 1), light_azimuth=(0, 9), light_elevation=(0, 9)))
+    rig.place(View())
+    before = image(moved)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        rig.place(View(light_azimuth=40, light_elevation=50))
+        after = image(moved)
+        assert not any(was_compiled([entry]) for entry in dr.kernel_history() if entry.get("operation_count", 0) > 500)
+    places = {}
+    for (name, (_, place)), middle in zip(lights.items(), ([1, 1, 1], [-1, 1, 1], [-1, -1, 1]), strict=True):
+        turned = np.array(t().rotate([0, 0, 1], 40) @ mi.ScalarPoint3f(middle)).ravel()
+        angle = 50 - np.degrees(np.arcsin(turned[2] / np.linalg.norm(turned)))
+        axis = np.cross(turned, [0, 0, 1])
+        places[name] = t().rotate(list(axis / np.linalg.norm(axis)), angle) @ t().rotate([0, 0, 1], 40) @ place
+    expected = image(scene(places))
+    np.testing.assert_allclose(after, expected, atol=1e-4 * expected.max())
+    assert np.abs(after - before).mean() > 0.3 * before.mean()
+    rig.place(View())
+    np.testing.assert_allclose(image(moved), before, atol=1e-4 * before.max())
+
+
+def test_the_sun_of_a_sky_is_where_a_view_has_it():
+    """It turns with its sky, and rises in it, whose zenith is the vertical."""
+    t = mi.ScalarTransform4f
+    upright = t().rotate([1, 0, 0], -90)
+    sky = {"type": "sunsky", "sun_direction": [0.6, 0, 0.8], "to_world": upright, "sun_scale": 0.5}
+    scene = mi.load_dict({"type": "scene", "sky": sky, "sensor": {"type": "perspective"}})
+    rig = Rig(scene, ViewDistribution(up=(0, 1, 0), light_azimuth=(0, 9), light_elevation=(0, 9)))
+    (emitter,) = scene.emitters()
+    for view, azimuth, direction in (
+        (View(light_azimuth=90, light_elevation=30), 90, [np.sqrt(0.75), 0, 0.5]), (View(), 0, [0.6, 0, 0.8])
+    ):  # fmt: skip
+        rig.place(view)
+        np.testing.assert_allclose(np.array(mi.traverse(emitter)["sun_direction"]).ravel(), direction, atol=1e-5)
+        np.testing.assert_allclose(matrix(emitter), (t().rotate([0, 1, 0], azimuth) @ upright).matrix, atol=1e-5)
+
+
 def test_a_camera_in_a_box_looks_at_the_target():
     scene = lit("sun")
     Rig(scene, ViewDistribution(origins=((0, 0, 0), (1, 1, 1)), target=(0, 0, 0))).place(View(origin=(3, 4, 5)))
@@ -237,10 +317,12 @@ def test_a_camera_in_a_box_looks_at_the_target():
 
 def test_rigs_that_cannot_be():
     turn = ViewDistribution(light_azimuth=(0, 90))
-    with pytest.raises(scenes.SceneError, match=r"light_azimuth: no light of the scene can be moved so \(AreaLight\)"):
-        Rig(lit("shape"), turn)
-    with pytest.raises(scenes.SceneError, match="light_elevation: no light"):
-        Rig(lit("sky"), dataclasses.replace(turn, light_elevation=(0, 9)))
+    with pytest.raises(scenes.SceneError, match=r"light_azimuth: no light .* \(ConstantBackgroundEmitter\)"):
+        Rig(lit("ambient"), turn)
+    raised = dataclasses.replace(turn, light_elevation=(0, 9))
+    for name in ("sky", "noon"):
+        with pytest.raises(scenes.SceneError, match="light_elevation: no light"):
+            Rig(lit(name), raised)
     Rig(lit("sky"), turn)
     with pytest.raises(scenes.SceneError, match="target: not given, and the middle"):
         Rig(lit("sky"), ViewDistribution(azimuth=(0, 9)))
@@ -351,7 +433,7 @@ def test_a_scene_may_be_a_dictionary(folder, trained):
     floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
     parsed = scenes.ParsedScene({"type": "scene", "sensor": {"type": "perspective"}, "floor": floor})
     assert texture_file(parsed) == (file, "")
-    assert TrainedScene(parsed, file, ViewDistribution(), 1, load(file)).keys.keys() == trained[0].keys.keys()
+    assert TrainedScene(parsed, {file: load(file)}, ViewDistribution(), 1).keys.keys() == trained[0].keys.keys()
 
 
 class Timed:
@@ -412,13 +494,13 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
     save_table(tmp_path / "material.npz", table)
     scene = scene_file(tmp_path / "material.npz", NAMES)
     parsed = scenes.ParsedScene(scene)
-    recipe = SceneRecipe(share=1.0, reference_spp=16)
+    recipe = SceneRecipe(share=1.0, reference_spp=16, samples=1)
     changed = {"steps": 12, "measure_every": 6, "batch": 2048, "lr": 0.1, "schedule": "constant"}
     recipe = dataclasses.replace(recipe, settings=dataclasses.replace(recipe.settings, **changed))
 
     def fitted_scene(**more):
         request = FitRequest("ours", recipe.settings, None, progress=False, output=tmp_path / "trained.npz", **more)
-        return fit_scene(
+        tables, result = fit_scene(
             parsed,
             ORBIT,
             recipe,
@@ -426,6 +508,7 @@ def test_a_scene_is_trained(folder, tmp_path, monkeypatch):
             references=tmp_path / "kept",
             preview=tmp_path / "preview.png",
         )
+        return tables["material.npz"], result
 
     found, result = fitted_scene()
     history = [h["psnr_db"] for h in result.history]
@@ -539,6 +622,19 @@ def weights(one_core):
     return mi.TensorXf(np.random.default_rng(0).random((24, 24, 3), dtype=np.float32))
 
 
+def test_small_films_are_rendered_with_more_samples(trained, monkeypatch):
+    """A step draws as many samples as the recipe says, for values and derivatives alike; the footprints stay."""
+    (scene, texture), given = trained, []
+    black = np.zeros((24, 24, 3), np.float32)
+    monkeypatch.setattr(mi, "render", lambda *_, **options: given.append(options) or mi.TensorXf(black))
+    for samples, spp in ((1, 1), (576, 1), (577, 2), (2**15, 57)):
+        problem = SceneProblem(texture, scene, [(View(), black)], [], SceneRecipe(samples=samples))
+        problem.settings = problem.recipe.settings
+        problem.image_loss(problem.net, dr.rng(seed=0))
+        options = given.pop()
+        assert (options["spp"], options["spp_grad"], scene.spp) == (spp, spp, 1)
+
+
 def test_values_and_derivatives_have_their_own_samples(trained, weights):
     scene, problem = trained
     scene.place(View())
@@ -567,7 +663,7 @@ def test_a_material_is_trained_as_its_maps_are(folder, path, trained, weights):
     (folder / "whole.xml").write_text(text)
     parsed = scenes.ParsedScene(folder / "whole.xml")
     file, _ = texture_file(parsed)
-    whole, (scene, problem) = TrainedScene(parsed, file, ORBIT, 1, load(file)), trained
+    whole, (scene, problem) = TrainedScene(parsed, {file: load(file)}, ORBIT, 1), trained
     whole.place(View())
     scene.place(View())
     (a, da), (b, db) = (rendered(s, inside(problem.net), weights, 1, 2) for s in (whole, scene))
@@ -605,17 +701,122 @@ def test_gradients_against_differences(trained, weights):
         array.data = before
 
 
-def test_which_texture(path, folder):
-    assert texture_file(scenes.ParsedScene(path)) == (folder / "material.npz", "")
-    assert texture_file(scenes.ParsedScene(path), folder / "material.npz")[0] == folder / "material.npz"
+def test_which_textures(path, folder):
+    parsed = scenes.ParsedScene(path)
+    assert texture_files(parsed) == texture_files(parsed, [folder / "material.npz"]) == {folder / "material.npz": ""}
     with pytest.raises(
         UsageError, match=r"no neural_texture or neural_material reads .*other\.npz, the files are material\.npz"
     ):
-        texture_file(scenes.ParsedScene(path), folder / "other.npz")
+        texture_files(parsed, [folder / "other.npz"])
     plain = folder / "plain.xml"
     plain.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
-    with pytest.raises(UsageError, match="names 0 files of neural_texture or neural_material"):
-        texture_file(scenes.ParsedScene(plain))
+    with pytest.raises(UsageError, match="names no file of neural_texture or neural_material"):
+        texture_files(scenes.ParsedScene(plain))
+
+
+# -- several textures -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pair(path):
+    """A scene of two surfaces with textures of two files that hold the same arrays; of one file with ``b=a.npz``."""
+    folder = path.parent / "pair"
+    folder.mkdir()
+    for name in ("albedo.png", "roughness.png", "material.json"):
+        (folder / name).write_bytes(path.with_name(name).read_bytes())
+    for name in ("a.npz", "b.npz"):
+        (folder / name).write_bytes(path.with_name("material.npz").read_bytes())
+    text = path.read_text("utf-8")
+    surface = (
+        '<shape type="rectangle"><transform name="to_world"><translate x="{}"/></transform><bsdf type="diffuse">'
+        '<texture type="neural_texture" name="reflectance"><string name="filename" value="{}"/>'
+        '<string name="channels" value="albedo"/><string name="filter" value="off"/></texture></bsdf></shape>'
+    )
+    surfaces = surface.format(-1, "a.npz") + surface.format(1, "$b")
+    text = re.sub("<shape .*</shape>", surfaces, text)
+    (folder / "pair.xml").write_text(text.replace("<default", '<default name="b" value="b.npz"/><default', 1), "utf-8")
+    return folder / "pair.xml"
+
+
+def test_gradients_of_several_files(pair, weights):
+    """Together they are the gradients of one file that both surfaces show."""
+    images, gradients = {}, {}
+    for b in ("a.npz", "b.npz"):
+        parsed = scenes.ParsedScene(pair, {"b": b})
+        textures = stored_textures(parsed)
+        problem = joined({t.file.name: t.problem for t in textures})
+        scene = TrainedScene(parsed, {t.file: t.table for t in textures}, ViewDistribution(), 1)
+        images[b], gradients[b] = rendered(scene, inside(problem.net), weights, 1, 2)
+    np.testing.assert_allclose(images["a.npz"], images["b.npz"], atol=1e-5)
+    assert len(gradients["b.npz"]) == 2 * len(gradients["a.npz"])
+    assert np.abs(gradients["a.npz"]["level0"]).max() > 0
+    for name, gradient in gradients["a.npz"].items():
+        parts = [gradients["b.npz"][f"{file}/{name}"] for file in ("a.npz", "b.npz")]
+        assert all(np.abs(part).max() >= 0.1 * np.abs(gradient).max() for part in parts)
+        np.testing.assert_allclose(sum(parts), gradient, atol=1e-4 * np.abs(gradient).max())
+    # Both textures are the same, and so is the loss of both
+    losses = []
+    for each in (problem, textures[0].problem):
+        each.begin(0, 0.0)
+        losses.append(float(sum(dr.sum(part)[0] for part in each.loss(each.net, dr.rng(seed=1), 2**14))))
+    assert losses[0] == pytest.approx(losses[1], rel=0.1)
+    assert problem.measure(problem.net) == {
+        f"{t.file.name}_{key}": value for t in textures for key, value in t.problem.measure(t.problem.net).items()
+    }
+
+
+def test_several_files_are_trained(pair, tmp_path, monkeypatch):
+    """All that the scene names, in one run, into a folder; a checkpoint keeps all of them."""
+    checkpoint = tmp_path / "c.npz"
+    given = {
+        "defines": [("film", "6")], "views": 1, "held_out": 1, "reference_spp": 64, "progress": False,
+        "steps": 2, "measure_every": 2, "batch": 512, "lr": 0.02, "deterministic": True,
+    }  # fmt: skip
+
+    def trained_files(**more):
+        return mi_diffind.fit("scene", pair, checkpoint=checkpoint, output=tmp_path / "out", **given, **more)
+
+    fitted_files = trained_files()
+    folder = fitted_files.save(tmp_path / "out")
+    names = ["a.npz", "b.npz"]
+    assert sorted(file.name for file in folder.iterdir()) == sorted(fitted_files.report["files"]) == names
+    assert fitted_files.report["bytes"] == sum(model.nbytes for model in fitted_files.models.values())
+    assert f"{folder / 'b.npz'}: " in "\n".join(fitted_files.summary(folder))
+    with pytest.raises(UsageError, match="2 files were trained"):
+        _ = fitted_files.model
+    resumed = trained_files(resume=True)
+    for name in names:
+        table = load(folder / name)
+        assert table.settings["trained_with"] == names and table.settings["source_path"].endswith("pair/material.json")
+        assert ((folder / table.settings["source_path"]).resolve()) == pair.with_name("material.json")
+        changed = {key for key, array in table.arrays.items() if not np.array_equal(
+            array.entries, load(pair.with_name(name)).arrays[key].entries)}  # fmt: skip
+        assert "coarse" in changed and "kept_start" not in table.settings
+        for key, array in resumed.tables[name].arrays.items():
+            np.testing.assert_array_equal(array.entries, table.arrays[key].entries)
+    # Nothing is replaced if one of them cannot be written
+    before = {name: (folder / name).read_bytes() for name in names}
+    fitted_files.tables["a.npz"].seed = 5
+    fitted_files.tables["b.npz"].seed = object()
+    with pytest.raises(TableError):
+        fitted_files.save(folder)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"output": "x.npz"}, r"2 textures are trained \(a.npz, b.npz\): give a folder"),
+        ({"output": "."}, "found the folder of the trained textures"),
+        ({"texture": "b.npz", "output": "x"}, 'found the extension ""'),
+        ({"start": ["a.npz"]}, "--start: a.npz is not the only one for a.npz, or belongs to several"),
+        ({"texture": "b.npz", "start": ["b.npz", "a.npz"]}, "--start: a.npz is not the only one for b.npz"),
+    ],
+)
+def test_several_files_that_cannot_be(pair, monkeypatch, change, match):
+    monkeypatch.chdir(pair.parent)
+    with pytest.raises(UsageError, match=match):
+        mi_diffind.fit("scene", pair, progress=False, **change)
 
 
 # -- its parts --------------------------------------------------------------------------------------------------------
@@ -670,7 +871,8 @@ def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
     recipe, before = SceneRecipe(reference_spp=4, settings=settings), load(folder / "material.npz")
     request = FitRequest("ours", settings, array_module("llvm"), progress=False)
     parsed, views = scenes.ParsedScene(path, {"film": 4}), ViewDistribution(1, 1)
-    table, result = fit_scene(parsed, views, recipe, request)
+    tables, result = fit_scene(parsed, views, recipe, request)
+    table = tables["material.npz"]
     assert table.settings["kept_start"] and result.step == 0
     for name, array in table.arrays.items():
         np.testing.assert_array_equal(array.values, before.arrays[name].values)
@@ -678,4 +880,4 @@ def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
     other.settings["source"] = "other"
     save_table(folder / "other.npz", other)
     with pytest.raises(UsageError, match=r"--start: .*other\.npz holds other maps"):
-        fit_scene(parsed, views, recipe, request, start=folder / "other.npz")
+        fit_scene(parsed, views, recipe, request, starts=[folder / "other.npz"])

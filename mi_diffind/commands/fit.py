@@ -7,9 +7,9 @@ from pathlib import Path
 from ..arguments import add_arguments, natural, positive
 from ..deadline import Deadline
 from ..errors import UsageError
-from ..files import writable_file
+from ..files import writable_file, writable_folder
 from ..settings import LOSSES, SCHEDULES, FittingError
-from ..task import Task, fit, table_path, tasks
+from ..task import Task, fit, tasks
 from .common import alternative, alternatives, set_variant, variant_option, verb
 
 #: Settings of a training that every task has: what they are, and the options of their parsers.
@@ -73,11 +73,14 @@ def run(arguments) -> dict:
     :class:`~mi_diffind.files.OutputError`, :class:`FittingError` and what the task's own input raises.
     """
     deadline = None if arguments.seconds is None else Deadline(arguments.seconds)
-    output = table_path(arguments.output)
+    task = tasks()[arguments.task]
+    output = task.output_path(arguments.output)
     if arguments.checkpoint is not None and Path(arguments.checkpoint).resolve() == output.resolve():
         raise UsageError(f'"{output}" cannot be the output and the checkpoint')
-    writable_file(output)
-    task = tasks()[arguments.task]
+    if output.suffix.lower() == ".npz":
+        writable_file(output)
+    else:  # a folder, for the tables of several files
+        writable_folder(output if output.exists() else output.parent)
     given = {name: getattr(arguments, name) for name in ("steps", *(name for name, *_ in SETTINGS))}
     given = {name: value for name, value in given.items() if value is not None}
     given |= {argument.name: getattr(arguments, argument.name) for argument in task.arguments}

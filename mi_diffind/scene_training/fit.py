@@ -1,14 +1,12 @@
-"""``fit scene SCENE.xml``: training of a texture by differentiating renders of a scene that shows it."""
+"""``fit scene SCENE.xml``: training of textures by differentiating renders of a scene that shows them."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-
-import mitsuba as mi
 
 from .. import compat, scenes
 from ..conversion import cache_folder
@@ -17,15 +15,15 @@ from ..errors import UsageError
 from ..files import writable_folder
 from ..fitting import FitResult, cores
 from ..maps.arguments import preview_path
-from ..maps.source import load_source
 from ..tables import Table
-from ..task import FitRequest, Fitted
-from ..tasks.texture.compressed import CompressedTexture, bias_of, load, to_table
-from ..tasks.texture.training import problem_of, stored_form
+from ..task import FitRequest, Fitted, table_path
+from ..tasks.texture.training import TextureProblem
+from .fitted_files import FittedFiles
+from .joint_problem import JointProblem
 from .problem import SceneProblem
 from .recipe import SceneRecipe, recipe_of
 from .reference_renders import ReferenceRenders
-from .stored_texture import budget_of, original_of, texture_file, texture_problem
+from .stored_texture import SceneTexture, stored_textures
 from .trained_scene import TrainedScene
 from .views import ViewDistribution, views_of
 
@@ -41,19 +39,18 @@ OPERATION = 3e-4
 
 
 def fit(request: FitRequest) -> Fitted:
-    """Train a texture of a scene as requested on the command line, in the active variant."""
+    """Train textures of a scene as requested on the command line, in the active variant.
+
+    The result of several is a :class:`.fitted_files.FittedFiles`.
+    """
     options = request.options
     views, recipe = views_of(options, request.settings.seed), recipe_of(options, request.settings)
     parsed = scenes.ParsedScene(options["source"], dict(options["defines"] or ()))
-    table, result = fit_scene(
-        parsed, views, recipe, request, options["texture"], options["references"], preview_path(request),
-        options["start"],
+    tables, result = fit_scene(
+        parsed, views, recipe, request, listed(options["texture"]), options["references"], preview_path(request),
+        listed(options["start"]),
     )  # fmt: skip
-    figures = {
-        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
-        "bits": {name: a.bits for name, a in table.arrays.items()},
-        "views": dataclasses.asdict(views),
-    }
+    table = next(iter(tables.values()))
     count = len(views.trained())
     lines = [
         f"{count} view{'s' if count != 1 else ''}, {recipe.spp} sample{'s' if recipe.spp != 1 else ''} a pixel",
@@ -63,7 +60,19 @@ def fit(request: FitRequest) -> Fitted:
         lines.append("training inside the scene gained nothing: these are the arrays that it started from")
     if (samples := table.settings.get("reference_samples", recipe.reference_spp)) < recipe.reference_spp:
         lines.append(f"the time allowed references of {samples} samples a pixel in place of {recipe.reference_spp}")
+    if len(tables) > 1:
+        return FittedFiles(table, result, lines, {"views": dataclasses.asdict(views)}, tables=tables)
+    figures = {
+        "arrays": {name: list(a.shape) for name, a in table.arrays.items()},
+        "bits": {name: a.bits for name, a in table.arrays.items()},
+        "views": dataclasses.asdict(views),
+    }
     return Fitted(table, result, lines, figures)
+
+
+def listed(files) -> list:
+    """Return the files of an option that may be repeated; from Python, also a single one."""
+    return [files] if isinstance(files, (str, os.PathLike)) else list(files or ())
 
 
 def fit_scene(
@@ -71,53 +80,46 @@ def fit_scene(
     views: ViewDistribution,
     recipe: SceneRecipe,
     request: FitRequest,
-    file: str | os.PathLike | None = None,
+    files: Sequence[str | os.PathLike] = (),
     references: str | os.PathLike | None = None,
     preview: Path | None = None,
-    start: str | os.PathLike | None = None,
-) -> tuple[Table, FitResult]:
-    """Train the arrays of a texture of a scene for the ``views``, and return the stored table and the run's record.
+    starts: Sequence[str | os.PathLike] = (),
+) -> tuple[dict[str, Table], FitResult]:
+    """Train the arrays of textures of a scene for the ``views``.
 
-    ``file`` is the texture's file, needed if the scene reads several. ``request`` gives duration and checkpoint; its
-    settings are those of the ``recipe``. ``references`` is a folder that keeps the reference images; ``preview`` a
-    picture that is written at each measurement; ``start`` a file whose arrays and level bias the training starts from,
-    in place of the texture's. If no state renders the held-out views better than the start, the table holds the start
-    (setting ``kept_start``). Runs in the variant that is set.
+    Returns the stored tables, by the names of their files, and the run's record. ``files`` are those of the textures,
+    by default all that the scene reads and that hold arrays. They are trained together, through the same renders.
+    ``request`` gives duration and checkpoint; its settings are those of the ``recipe``. ``references`` is a folder that
+    keeps the reference images; ``preview`` a picture that is written at each measurement; ``starts`` files whose arrays
+    and level bias the training starts from, in place of the textures'. If no state renders the held-out views better
+    than the start, the tables hold the start (setting ``kept_start``). Runs in the variant that is set.
 
     Raises :class:`~mi_diffind.scenes.SceneError`, :class:`~mi_diffind.errors.UsageError`,
     :class:`~mi_diffind.tables.TableError`, :class:`~mi_diffind.maps.source.SourceError`,
     :class:`~mi_diffind.fitting.FittingError` and :class:`~mi_diffind.files.OutputError`.
     """
     request = dataclasses.replace(request, settings=recipe.settings)
-    file, given = texture_file(parsed, file)
-    table = load(file)
-    source_path = original_of(table, file, given)
-    source = load_source(source_path, nonfinite="clean")
-    if start is not None:
-        table = started(start, table)
-    texture = texture_problem(table, source)
-    bias = bias_of(table.settings)
-    if recipe.start == "untrained":
-        texture = problem_of(source, budget_of(table), texture.recipe, texture.pyramid)
-        table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(texture.net), bias), {})
+    textures = stored_textures(parsed, files, starts, recipe.start == "file")
+    check_output(request.output, [texture.file for texture in textures])
     rendered = ReferenceRenders(
         parsed, views, recipe.reference_spp, references, recipe.against,
-        without=(file,), inputs=(source.digest,), progress=request.progress,
-        deadline=request.part(REFERENCES).deadline,
+        without=[texture.file for texture in textures], inputs=[texture.source.digest for texture in textures],
+        progress=request.progress, deadline=request.part(REFERENCES).deadline,
     )  # fmt: skip
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
-    scene = TrainedScene(parsed, file, views, recipe.spp, table)
+    scene = TrainedScene(parsed, {texture.file: texture.table for texture in textures}, views, recipe.spp)
     problem = SceneProblem(
-        texture, scene, [*zip(trained, images, strict=False)],
-        [*zip(measured, images[len(trained) :], strict=True)], recipe, rendered.digest, preview,
+        joined({texture.file.name: texture.problem for texture in textures}), scene,
+        [*zip(trained, images, strict=False)], [*zip(measured, images[len(trained) :], strict=True)],
+        recipe, rendered.digest, preview,
     )  # fmt: skip
-    problem.identity |= {"views": dataclasses.asdict(views)}
-    identity = {k: v for k, v in problem.identity.items() if k not in ("structure", "border")}
+    problem.common |= {"views": dataclasses.asdict(views)}
+    problem.identity |= problem.common
 
-    def stored(settings: Mapping) -> tuple[Table, dict[str, float]]:
-        trained_table = to_table(CompressedTexture(texture.pyramid.layout, stored_form(problem.net), bias), settings)
-        return trained_table, CompressedTexture.of(trained_table, mi.TensorXf).measure(source)
+    def stored(texture: SceneTexture, recorded: Mapping, more: Mapping) -> tuple[Table, dict[str, float]]:
+        table = texture.stored({**recorded, **texture.identity, **problem.common, **more})
+        return table, texture.measure(table)
 
     remark, before = "", None
     if request.deadline is not None:
@@ -126,7 +128,7 @@ def fit_scene(
     elif recipe.start == "file":
         before = problem.measure(problem.net)
     arrays = {name: array.data for name, array in problem.net.arrays.items()}
-    result = request.train(problem, finish=lambda: stored(identity))
+    result = request.train(problem, finish=lambda: [stored(texture, {}, {}) for texture in textures])
     kept = recipe.start == "file" and before["psnr_db"] > result.measured["psnr_db"]
     if kept:
         for name, data in arrays.items():
@@ -134,27 +136,43 @@ def fit_scene(
         result.measured, result.step = before, 0
     if request.deadline is not None and compiled is not None and problem.recipe.share > 0:
         compiled.touch()
-    file = None if parsed.description else parsed.path
-    settings = {**request.recorded(result), **identity, **request.paths(scene_path=file)}
-    settings |= {"kept_start": True} if kept else {}
-    if remark:
-        settings["remark"], result.unfinished = remark, True
-    if rendered.samples < recipe.reference_spp:
-        settings["reference_samples"] = rendered.samples
-    trained_table, errors = stored(settings)
-    trained_table.settings |= request.paths(source_path=source_path)
-    trained_table.preset, trained_table.seed = request.preset, recipe.settings.seed
-    errors["psnr_scene_db"] = result.measured["psnr_db"]
-    trained_table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
-    return trained_table, result
+    result.unfinished = result.unfinished or bool(remark)
+    more = request.paths(scene_path=None if parsed.description else parsed.path)
+    more |= {"kept_start": True} if kept else {}
+    more |= {"remark": remark} if remark else {}
+    more |= {"reference_samples": rendered.samples} if rendered.samples < recipe.reference_spp else {}
+    more |= {"trained_with": [t.file.name for t in textures]} if len(textures) > 1 else {}
+    tables = {}
+    for texture in textures:
+        table, errors = stored(texture, request.recorded(result), more)
+        table.settings |= request.paths(source_path=texture.source_path)
+        table.preset, table.seed = request.preset, recipe.settings.seed
+        errors["psnr_scene_db"] = result.measured["psnr_db"]
+        table.measured = {k: float(f"{v:.5g}") for k, v in errors.items()}
+        tables[texture.file.name] = table
+    return tables, result
 
 
-def started(start: str | os.PathLike, table: Table) -> Table:
-    """Return the table of a file to start from. Raises :class:`UsageError` if its maps are not those of ``table``."""
-    other = load(start)
-    if any(other.settings.get(key) != table.settings.get(key) for key in ("layout", "source")):
-        raise UsageError(f"--start: {start} holds other maps, or is of another source, than {table.path}")
-    return other
+def joined(problems: Mapping[str, TextureProblem]) -> TextureProblem | JointProblem:
+    """Return the problem of all textures, by name: that of a single one as it is."""
+    return JointProblem(problems) if len(problems) > 1 else next(iter(problems.values()))
+
+
+def check_output(output: Path | None, files: Sequence[Path]) -> None:
+    """Raise :class:`UsageError` unless the ``output`` suits the number of trained ``files``: one is a file."""
+    if output is None:
+        return
+    if len(files) == 1:
+        table_path(output)
+        return
+    names = ", ".join(file.name for file in files)
+    if output.suffix.lower() == ".npz":
+        raise UsageError(
+            f'output "{output}": found a file, but {len(files)} textures are trained ({names}): give a '
+            f"folder, as in -o trained/, or choose one by --texture"
+        )
+    if any(output.resolve() == file.parent for file in files):
+        raise UsageError(f'output "{output}": found the folder of the trained textures ({names}): give another one')
 
 
 def compiled_file(key: str) -> Path | None:

@@ -26,6 +26,7 @@ from ..fitting import Problem
 from ..indirection import unfolded
 from ..tasks.shading.preview import titled
 from ..tasks.texture.training import TextureProblem, rounded
+from .joint_problem import JointProblem
 from .recipe import SceneRecipe
 from .reference_renders import SEEDS
 from .trained_scene import TrainedScene
@@ -51,7 +52,8 @@ def exposure_of(references: Sequence[np.ndarray]) -> float:
 class SceneProblem(Problem):
     """Training problem (:mod:`mi_diffind.fitting`) of a texture in a scene.
 
-    ``texture`` is the problem of the same arrays without a scene, whose ``net`` is trained; ``scene`` reads the arrays.
+    ``texture`` is the problem of the same arrays without a scene, of one texture or several, whose ``net`` is trained;
+    ``scene`` reads the arrays.
     ``trained`` and ``measured`` are pairs of a view and its reference, ``(height, width, channels)``. ``preview`` is a
     picture of the first measured view, written at each measurement: reference | render | :data:`SHOWN` times their
     difference.
@@ -62,7 +64,7 @@ class SceneProblem(Problem):
 
     def __init__(
         self,
-        texture: TextureProblem,
+        texture: TextureProblem | JointProblem,
         scene: TrainedScene,
         trained: Sequence[tuple[View, np.ndarray]],
         measured: Sequence[tuple[View, np.ndarray]],
@@ -78,7 +80,11 @@ class SceneProblem(Problem):
         recorded = {k: v for k, v in dataclasses.asdict(recipe).items() if k != "settings"}
         #: Samples per pixel of each half of a measured render.
         self.samples = max(MEASURED // 2, scene.spp)
-        self.identity = {**texture.identity, "scene": digest, "shading": recorded, "exposure": self.exposure}
+        #: Samples per pixel of a trained render.
+        self.drawn = max(scene.spp, math.ceil(recipe.samples / math.prod(self.references[0].shape[:2])))
+        #: What the settings of all trained files have in common.
+        self.common = {"scene": digest, "shading": recorded, "exposure": self.exposure}
+        self.identity = {**texture.identity, **self.common}
         self._view = 0
 
     def begin(self, step: int, share: float) -> str:
@@ -91,7 +97,6 @@ class SceneProblem(Problem):
     def loss(self, net, rng, size: int):
         share, losses = self.recipe.share, []
         if share < 1:
-            self.texture.settings = self.texture.recipe.settings
             losses += [(1 - share) * values for values in self.texture.loss(net, rng, size)]
         if share > 0:
             losses.append(share * self.image_loss(net, rng))
@@ -103,7 +108,7 @@ class SceneProblem(Problem):
         value, derivative = (dr.gather(mi.UInt32, seeds, i) for i in range(2))
         self.scene.hold(self.texture.seen(unfolded(net)))
         self.scene.place(self.views[self._view])
-        error = self.exposure * self.scene.render(value, derivative) - self.references[self._view]
+        error = self.exposure * self.scene.render(value, derivative, self.drawn) - self.references[self._view]
         return self.errors(error.array) * (1 / math.prod(error.shape))
 
     def errors(self, error):

@@ -25,11 +25,13 @@ class SceneRecipe:
     """Recipe of a training inside a scene.
 
     ``share``: λ, the share of the loss of rendered images; the rest is the loss of the texture. ``spp``: samples a
-    pixel of the trained renders, at least 1, and of their footprints: choose the number with which the result will be
-    rendered. ``bound``: limit of an error, in units of ``exposure``, beyond which its derivative grows no further
-    (``None``: unlimited). ``reference_spp``: samples a pixel of a reference. ``against``: counterpart of learned
-    plugins in references, ``"exact"`` or the name of another one. ``exposure``: factor of all radiance that maps white
-    to 1 (``None``: maps the value that 5% of the references' pixels exceed). ``start``: one of :data:`STARTS`.
+    pixel of the trained renders, at least 1, and of their footprints: choose the number with which the result will
+    be rendered. ``samples``: smallest number of samples of a trained render; a small film gets more than ``spp`` a
+    pixel, with the footprints of ``spp``, since a step takes little longer and its gradient has less noise.
+    ``bound``: limit of an error, in units of ``exposure``, beyond which its derivative grows no further (``None``:
+    unlimited). ``reference_spp``: samples a pixel of a reference. ``against``: counterpart of learned plugins in
+    references, ``"exact"`` or the name of another one. ``exposure``: factor of all radiance that maps white to 1
+    (``None``: maps the value that 5% of the references' pixels exceed). ``start``: one of :data:`STARTS`.
     ``settings``: the rest; its ``loss`` is that of images, its ``batch`` the texture samples of a step.
 
     Only ``"mse"`` without a bound has gradients that are right on average at few samples; ``"mae"``, and squared errors
@@ -39,6 +41,7 @@ class SceneRecipe:
     share: float = 0.9
     spp: int = 1
     bound: float | None = 1.0
+    samples: int = 2**15
     reference_spp: int = 1024
     against: str = "exact"
     exposure: float | None = None
@@ -52,7 +55,7 @@ class SceneRecipe:
     def __post_init__(self):
         if not 0 <= self.share <= 1:
             raise UsageError(f"share: found {self.share}, allowed are numbers from 0 to 1")
-        for name in ("spp", "reference_spp"):
+        for name in ("spp", "samples", "reference_spp"):
             if getattr(self, name) < 1:
                 raise UsageError(f"{name}: found {getattr(self, name)}, at least 1 is needed")
         for name in ("bound", "exposure"):
@@ -68,6 +71,11 @@ _DEFAULT = SceneRecipe()
 #: Arguments of the recipe.
 RECIPE_ARGUMENTS = (
     Argument("--spp", type=positive, metavar="N", help="samples a pixel of renders with the result (default: 1)"),
+    Argument(
+        "--samples", type=positive, metavar="N",
+        help="smallest number of samples of a trained render: a small film gets more than --spp a pixel, with the "
+        f"footprints of --spp (default: {_DEFAULT.samples})",
+    ),
     Argument(
         "--reference-spp", type=positive, metavar="N",
         help=f"samples a pixel of the references (default: {_DEFAULT.reference_spp})",
@@ -87,10 +95,15 @@ FILE_ARGUMENTS = (
         "-D", dest="defines", action="append", type=define, metavar="NAME=VALUE", help="set a <default> of the scene"
     ),
     Argument(
-        "--start", metavar="FILE.npz",
-        help="arrays to start from, of the same maps, such as those of fit shading (default: the scene's file)",
+        "--start", action="append", metavar="FILE.npz",
+        help="arrays to start from, of the same maps, such as those of fit shading; may be repeated, once for each "
+        "texture (default: the scene's files)",
     ),
-    Argument("--texture", metavar="FILE.npz", help="file of the trained texture (default: the only one)"),
+    Argument(
+        "--texture", action="append", metavar="FILE.npz",
+        help="file of a trained texture, may be repeated (default: all that the scene reads); several are trained "
+        "together, and -o names a folder, in which each keeps its name",
+    ),
     Argument("--references", metavar="FOLDER", help="folder that keeps the references for later runs"),
     PREVIEW,
 )  # fmt: skip
@@ -101,7 +114,7 @@ SCENE_ARGUMENTS = (*VIEW_ARGUMENTS, *RECIPE_ARGUMENTS, *FILE_ARGUMENTS)
 
 def recipe_of(options: Mapping, settings) -> SceneRecipe:
     """Return the recipe of the given options. Raises :class:`~mi_diffind.errors.UsageError`."""
-    names = {"begin": "start", **{n: n for n in ("share", "spp", "reference_spp", "bound", "exposure")}}
+    names = {"begin": "start", **{n: n for n in ("share", "spp", "samples", "reference_spp", "bound", "exposure")}}
     given = {names[k]: options[k] for k in names if options.get(k) is not None}
     if given.get("bound") == math.inf:
         given["bound"] = None

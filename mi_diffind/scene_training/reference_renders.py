@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import inspect
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -39,8 +40,8 @@ class ReferenceRenders:
     ``against`` names other counterparts than the exact ones. ``folder`` (created if its parent exists; ``None``: keep
     nothing) holds one file for each image. The name of a file depends on everything that the image depends on: the
     scene and the files that it names, except those ``without`` influence, such as the table that is trained;
-    ``inputs``, texts that stand for further files; the view, the samples, versions and the code of plugins. Files are
-    replaced in one piece, after each pass. ``pass_samples``: samples of the whole image in one pass.
+    ``inputs``, texts that stand for further files; the view, the samples, versions, and the code of plugins and of the
+    rig. Files are replaced in one piece, after each pass. ``pass_samples``: samples of the whole image in one pass.
 
     With a ``deadline``, each view gets an equal part of the time, and as many samples as fit; such images are not
     kept. ``samples`` is the number of samples that all images have.
@@ -71,6 +72,7 @@ class ReferenceRenders:
     def _digest(self) -> str:
         """Return a hash of everything that the images of all views depend on."""
         code = [*Path(plugins.__file__).resolve().parent.rglob("*.py"), *Path(disney.__file__).parent.glob("*.py")]
+        code.append(Path(inspect.getfile(Rig)))
         common = {
             "defines": dict(sorted(self.scene.defines.items())), "against": self.against, "inputs": list(self.inputs),
             "spp": self.spp, "target": self.views.target, "up": self.views.up, "variant": mi.variant(),

@@ -1,9 +1,10 @@
-"""Stored texture of a scene: its file, its source, and its training problem."""
+"""Stored textures of a scene: their files, sources and training problems."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -13,22 +14,22 @@ from ..compat import module_of
 from ..errors import UsageError
 from ..maps.layout import Layout
 from ..maps.pyramid import Pyramid
-from ..maps.source import Source
+from ..maps.source import Source, load_source
 from ..tables import PAGES, Table, TableError
-from ..tasks.texture.compressed import CompressedTexture, structure_of
+from ..tasks.texture.compressed import CompressedTexture, bias_of, load, structure_of, to_table
 from ..tasks.texture.memory_budget import FineArray, PaperBudget, TextureBudget
 from ..tasks.texture.nets import PaperStructure
 from ..tasks.texture.presets import PRESETS, TextureRecipe
-from ..tasks.texture.training import TextureProblem
+from ..tasks.texture.training import TextureProblem, problem_of, stored_form
 
 #: Plugins whose arrays are trained.
 PLUGINS = ("neural_texture", "neural_material")
 
 
-def texture_file(parsed: scenes.ParsedScene, file: str | os.PathLike | None = None) -> tuple[Path, str]:
-    """Return the file of the texture that is trained, and the ``source`` that the scene gives for it ("": none).
+def texture_files(parsed: scenes.ParsedScene, files: Sequence[str | os.PathLike] = ()) -> dict[Path, str]:
+    """Return the files of trained textures, each with the ``source`` that the scene gives for it ("": none).
 
-    The file is ``file``, or the only one that textures of the scene read. Raises
+    They are the ``files``, by default all that textures of the scene read. Raises
     :class:`~mi_diffind.errors.UsageError` and :class:`~mi_diffind.scenes.SceneError`.
     """
     folder, sources = parsed.path.resolve().parent, {}
@@ -37,16 +38,25 @@ def texture_file(parsed: scenes.ParsedScene, file: str | os.PathLike | None = No
             source = entry.get("source", "")
             sources.setdefault((folder / entry["filename"]).resolve(), str(folder / source) if source else "")
     names, readers = ", ".join(f.name for f in sources) or "none", " or ".join(PLUGINS)
-    if file is None:
-        if len(sources) != 1:
-            raise UsageError(
-                f"{parsed.path}: names {len(sources)} files of {readers} ({names}): say which one is to be trained"
-            )
-        return next(iter(sources.items()))
-    wanted = Path(file).resolve()
-    if wanted not in sources:
-        raise UsageError(f"{parsed.path}: no {readers} reads {file}, the files are {names}")
-    return wanted, sources[wanted]
+    if not sources:
+        raise UsageError(f"{parsed.path}: names no file of {readers}, whose arrays could be trained")
+    for file in files:
+        if Path(file).resolve() not in sources:
+            raise UsageError(f"{parsed.path}: no {readers} reads {file}, the files are {names}")
+    wanted = {Path(file).resolve(): sources[Path(file).resolve()] for file in files} or sources
+    if len({file.name for file in wanted}) < len(wanted):
+        raise UsageError(f"{parsed.path}: two of its textures have the same name ({names}): train one by --texture")
+    return wanted
+
+
+def texture_file(parsed: scenes.ParsedScene) -> tuple[Path, str]:
+    """Return the only file of :func:`texture_files`, and its source. Raises as it does, also if there are several."""
+    files = texture_files(parsed)
+    if len(files) > 1:
+        raise UsageError(
+            f"{parsed.path}: names {len(files)} textures ({', '.join(f.name for f in files)}), one is needed"
+        )
+    return next(iter(files.items()))
 
 
 def original_of(table: Table, file: Path, given: str = "") -> Path:
@@ -67,7 +77,75 @@ def texture_problem(table: Table, source: Source) -> TextureProblem:
         raise UsageError(f"{table.path}: holds a texture of one colour, without arrays to train")
     texture = CompressedTexture.of(table, mi.TensorXf, "float32")
     pyramid = Pyramid.of(source, layout, module_of(mi.TensorXf), texture.border)
-    return TextureProblem(texture.net, pyramid, recipe_of(table), source.digest)
+    problem = TextureProblem(texture.net, pyramid, recipe_of(table), source.digest)
+    problem.settings = problem.recipe.settings
+    return problem
+
+
+class SceneTexture:
+    """Texture of a scene: its ``file``, the ``table`` that the training starts from, its source, and its ``problem``.
+
+    ``given``: source that the scene gives for it, if any. ``start``: another table of the same maps to start from.
+    Without a ``trained`` start, the arrays are those of an untrained texture.
+    """
+
+    def __init__(self, file: Path, table: Table, given: str = "", start: Table | None = None, trained: bool = True):
+        self.file, self.table = file, start or table
+        self.source_path = original_of(table, file, given)
+        self.source = load_source(self.source_path, nonfinite="clean")
+        self.problem = texture_problem(self.table, self.source)
+        self.level_bias = bias_of(self.table.settings)
+        if not trained:
+            recipe, pyramid = self.problem.recipe, self.problem.pyramid
+            self.problem = problem_of(self.source, budget_of(self.table), recipe, pyramid)
+            self.problem.settings = recipe.settings
+            self.table = self.stored({})
+
+    def stored(self, settings: Mapping) -> Table:
+        """Return the table of the arrays in their state, with ``settings``."""
+        texture = CompressedTexture(self.problem.pyramid.layout, stored_form(self.problem.net), self.level_bias)
+        return to_table(texture, dict(settings))
+
+    def measure(self, table: Table) -> dict[str, float]:
+        """Return the errors of a table against the source (:meth:`.CompressedTexture.measure`)."""
+        return CompressedTexture.of(table, mi.TensorXf).measure(self.source)
+
+    @property
+    def identity(self) -> dict:
+        """Settings of the texture's own training, as a table file keeps them."""
+        return {k: v for k, v in self.problem.identity.items() if k not in ("structure", "border")}
+
+
+def stored_textures(
+    parsed: scenes.ParsedScene,
+    files: Sequence[str | os.PathLike] = (),
+    starts: Sequence[str | os.PathLike] = (),
+    trained: bool = True,
+) -> list[SceneTexture]:
+    """Return the textures of a scene that are trained: of the ``files``, by default of all that hold arrays.
+
+    ``starts`` are files to start from; each belongs to the texture that has its maps and its source. Raises
+    :class:`~mi_diffind.errors.UsageError`, :class:`~mi_diffind.tables.TableError` and
+    :class:`~mi_diffind.maps.source.SourceError`.
+    """
+    given = texture_files(parsed, files)
+    tables = {file: load(file) for file in given}
+    if not files:
+        tables = {file: table for file, table in tables.items() if table.arrays} or tables
+    begin = {}
+    for start in starts:
+        other = load(start)
+        same = [
+            file for file, table in tables.items()
+            if all(other.settings.get(key) == table.settings.get(key) for key in ("layout", "source"))
+        ]  # fmt: skip
+        if not same:
+            names = " or ".join(file.name for file in tables)
+            raise UsageError(f"--start: {start} holds other maps, or is of another source, than {names}")
+        if len(same) > 1 or same[0] in begin:
+            raise UsageError(f"--start: {start} is not the only one for {same[0].name}, or belongs to several textures")
+        begin[same[0]] = other
+    return [SceneTexture(file, table, given[file], begin.get(file), trained) for file, table in tables.items()]
 
 
 def recipe_of(table: Table) -> TextureRecipe:

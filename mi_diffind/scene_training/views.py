@@ -37,7 +37,8 @@ class ViewDistribution:
     about the direction ``up``, ``elevation`` its height above the plane through the target, both in degrees, and
     ``distance`` its distance to the target. Alternatively, ``origins`` are two corners of a box that contains the
     camera, which looks at the target. ``light_azimuth`` is the turn of all movable lights about the same axis,
-    environments included; ``light_elevation`` the height of directional, point and spot lights.
+    environments included; ``light_elevation`` the height of all lights but environments, and of the sun of a sunsky.
+    Area lights move with their shapes.
 
     ``count`` views are trained and ``held_out`` others measured. They are points of a low-discrepancy sequence
     (Roberts' R₅) with a random offset from the ``seed``: the first views of a large set are those of a small one.
@@ -170,8 +171,18 @@ VIEW_ARGUMENTS = (
         help="point that the camera looks at (default: the middle of the image)",
     ),
     Argument("--up", type=point, metavar="X,Y,Z", help="the vertical of all angles (default: 0,1,0)"),
-    Argument("--light-azimuth", type=span, metavar="A:B", help="degrees by which lights and environments turn"),
-    Argument("--light-elevation", type=span, metavar="A:B", help="degrees of directional, point and spot lights"),
+    Argument(
+        "--light-azimuth",
+        type=span,
+        metavar="A:B",
+        help="degrees by which lights and environments turn; area lights take their shapes along",
+    ),
+    Argument(
+        "--light-elevation",
+        type=span,
+        metavar="A:B",
+        help="degrees of lights, and of the sun of a sunsky, above the target; environments stay",
+    ),
 )
 
 

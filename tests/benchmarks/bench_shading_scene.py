@@ -23,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+import mi_diffind
 from mi_diffind.compat import use_threads
 from mi_diffind.fitting import fit
 from mi_diffind.indirection import unfolded
@@ -66,7 +67,7 @@ def opened(folder: Path, light: str, names=NAMES, preset="ours", fine="0:2:4", d
     problem = texture_problem(table, load_source(folder / "material.json"))
     path = scene_file(file, names, light, FILM, depth)
     views = ORBIT if light == "directional" else ViewDistribution()
-    return TrainedScene(ParsedScene(path), file, views, 1, table), problem, path
+    return TrainedScene(ParsedScene(path), {file: table}, views, 1), problem, path
 
 
 def inside(net):
@@ -318,7 +319,8 @@ def steps(folder: Path, count=2000) -> dict:
     rendered = ReferenceRenders(ParsedScene(path), views, 64, progress=False)
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])
-    scene = TrainedScene(ParsedScene(path), path.parent / "material.npz", views, 1, load(path.parent / "material.npz"))
+    file = path.parent / "material.npz"
+    scene = TrainedScene(ParsedScene(path), {file: load(file)}, views, 1)
     problem = SceneProblem(texture, scene, [*zip(trained, images, strict=False)], [(measured[0], images[-1])], recipe)
     marks, begin = [], problem.begin
 
@@ -340,8 +342,53 @@ def steps(folder: Path, count=2000) -> dict:
     )  # fmt: skip
 
 
+def several(folder: Path, count=60) -> dict:
+    """Two textures of a scene: as they were fitted, trained together, and one after the other."""
+    files = []
+    for seed, name in enumerate(("first", "second")):
+        (folder / name).mkdir()
+        file = fitted(material(folder / name, 64, seed), 60)
+        files.append(file.rename(file.with_name(f"{name}.npz")))
+
+    def plate(file: Path, x: float) -> dict:
+        bsdf = {"type": "neural_material", "filename": str(file), "to_uv": mi.ScalarTransform3f().scale(6)}
+        return {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([x, 0, 0]), "bsdf": bsdf}
+
+    look = mi.ScalarTransform4f().look_at([0, -5, 3.5], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 64, "height": 40, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": 40, "to_world": look, "film": film}
+    sensor["sampler"] = {"type": "independent", "sample_count": 1}
+    sun = {"type": "directional", "direction": [0.3, 0.5, -1], "irradiance": {"type": "rgb", "value": 2.5}}
+    result = {}
+
+    def train(name: str, files: list, **more) -> mi_diffind.task.Fitted:
+        plates = {f"plate{i}": plate(file, 2 * i - 1) for i, file in enumerate(files)}
+        integrator = {"type": "path", "max_depth": 2}
+        scene = {"type": "scene", "integrator": integrator, "sensor": sensor, "sun": sun, **plates}
+        more |= {"references": folder / "kept", "reference_spp": 64, "samples": 2**13, "progress": False}
+        more |= {"views": 6, "held_out": 3, "azimuth": (-40, 40), "light_azimuth": (-60, 60)}
+        more |= {"up": (0, 0, 1), "target": (0, 0, 0)}
+        before = mi_diffind.fit("scene", scene, steps=1, lr=1e-9, **more)  # renders references, compiles kernels
+        begin = time.process_time()
+        trained = mi_diffind.fit("scene", scene, steps=count, **more)
+        result[name] = say(
+            what="several", run=name, steps=trained.result.step, processor_seconds=time.process_time() - begin,
+            psnr_db=[run.result.measured["psnr_db"] for run in (before, trained)],
+        )  # fmt: skip
+        gc.collect()
+        return trained
+
+    train("together", files)
+    first = train("first", files, texture=str(files[0])).save(folder / "first" / "trained.npz")
+    train("then second", [first, files[1]], texture=str(files[1]))
+    return result
+
+
 def main() -> None:
-    parts = {"differences": differences, "means": means, "convergence": convergence, "losses": losses, "steps": steps}
+    parts = {
+        "differences": differences, "means": means, "convergence": convergence, "losses": losses, "steps": steps,
+        "several": several,
+    }  # fmt: skip
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", default=list(parts), help=", ".join(parts))
     parser.add_argument("--json")

@@ -167,6 +167,29 @@ def test_seeds_of_the_sweep(mi_rgb):
         assert any("Toksvig" in job.name for job in jobs) == (preset == "ours")
 
 
+def test_extras_in_equal_bytes(mi_rgb, tmp_path, capsys):
+    """Extras and the smaller arrays beside them take the bytes of the arrays alone, or a sentence says they cannot."""
+    from mi_diffind.studies.shading import plan
+
+    settings = plan.ShadingStudySettings(
+        (0.0, 0.9), plan.REMEDIES[:1], 2, 0, 1, unit="steps", sweep_seeds=1, extras=True
+    )
+    jobs = plan.plan({"lacquer": materials.generated_source("lacquer", 64)}, settings).jobs
+    (run,) = (job for job in jobs if job.method == "extras")
+    assert run.start.extras and run.share == 0.9 and run.base.share == 0 and run.base.seed == run.seed == 0
+    sizes = []
+    for extras in (False, True):
+        table, _ = run.context.fit_texture(run.context.pyramid, 1, 0, False, extras)
+        sizes.append(table.nbytes)
+    budget = run.context.source.nbytes / 12
+    assert sizes[1] + 4 * 8 * 8 * 3 <= budget and sizes[0] <= budget and sizes[0] > sizes[1]
+    small = plan.plan({"lacquer": materials.generated_source("lacquer", 16)}, settings).jobs[-1].context
+    with pytest.raises(UsageError, match="--extras: found 149 bytes for all arrays, extras alone need"):
+        small.fit_texture(small.pyramid, 1, 0, False, True)
+    assert main(["tradeoff", "shading", "lacquer", "--preset", "paper", "--extras", "--out", str(tmp_path)]) == 2
+    assert "--extras: the arrays of the preset paper have none" in capsys.readouterr().err
+
+
 COMMAND = ["--quick", "--lambda", "1", "--remedies", "on", "--side", "16", "--frames", "2", "--steps", "2",
            "--pretrain-steps", "2"]  # fmt: skip
 

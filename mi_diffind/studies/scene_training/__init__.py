@@ -9,6 +9,8 @@ import argparse
 
 from ...arguments import fraction, positive
 from ...measure.study import Plan, Study
+from ..equal_memory import add_without_option, check_without
+from .conclusions import WAYS
 
 
 class SceneTrainingStudy(Study):
@@ -41,11 +43,13 @@ class SceneTrainingStudy(Study):
                             help="steps of each training inside a scene (default: 400; --quick: 2)")  # fmt: skip
         parser.add_argument("--width", type=positive, metavar="N",
                             help="pixels of a row of renders (default: 96; --quick: 16)")  # fmt: skip
+        add_without_option(parser)
 
     def check(self, arguments) -> None:
-        """Check that the scenes exist."""
+        """Check that the scenes and the runs to leave out exist."""
         from .plan import scenes_of
 
+        check_without(arguments.without, WAYS)
         arguments.paths = scenes_of(arguments.scenes, arguments.quick)
 
     def plan(self, arguments) -> Plan:
@@ -60,7 +64,7 @@ class SceneTrainingStudy(Study):
             "steps": arguments.steps or settings.steps,
             "width": arguments.width or settings.width,
         }
-        return plan(arguments.paths, settings.changed(**changed))
+        return plan(arguments.paths, settings.changed(**changed), arguments.without)
 
 
 STUDY = SceneTrainingStudy()

@@ -8,8 +8,13 @@ from ...measure.formatting import grid
 GAIN = 1.0
 
 #: Names of the runs.
-AFTER = "hemisphere, then scene"
-WAYS = ("start", "scene", "hemisphere", AFTER, "untrained, then scene")
+AFTER, LONGER = "hemisphere, then scene", "hemisphere, longer"
+FEW, OTHER = "scene, few samples", "another material"
+MENDED = f"{OTHER}, then hemisphere"
+WAYS = (
+    "start", "scene", "hemisphere", LONGER, AFTER, "untrained, then scene", FEW,
+    OTHER, f"{OTHER}, then scene", MENDED, f"{MENDED}, then scene",
+)  # fmt: skip
 
 
 def runs_of(result: dict) -> dict[str, list[dict]]:
@@ -34,23 +39,41 @@ def table(result: dict) -> list[str]:
     return grid(rows)
 
 
+#: Pairs of runs whose difference is a conclusion, and its words.
+COMPARED = {
+    ("scene", "hemisphere"): "over hemisphere training, training inside the scene for the same seconds gains",
+    (AFTER, "hemisphere"): "over hemisphere training, training inside the scene after it, with more seconds, gains",
+    (AFTER, LONGER): "over hemisphere training to its end, training inside the scene after a shorter one gains",
+}
+
+#: Starts that are compared with the right one.
+STARTS = {
+    ("untrained, then scene", "scene"): "an untrained start",
+    (f"{OTHER}, then scene", "scene"): "a start from another material",
+    (f"{MENDED}, then scene", AFTER): "a start from another material, after hemisphere training,",
+}
+
+
 def conclusions(result: dict) -> list[str]:
-    """Return a line for each scene, and two about the gains over hemisphere training."""
-    lines, alone, after = [], [], []
+    """Return a line for each scene, and lines about the gains over hemisphere training and about wrong starts."""
+    lines, gains = [], {pair: [] for pair in [*COMPARED, *STARTS]}
     for scene, runs in runs_of(result).items():
-        by_way = {}
-        for d in sorted((d for d in runs if d["spp"] == runs[0]["spp"]), key=lambda d: d["psnr_db"]):
-            by_way[d["way"]] = d["psnr_db"]
-        gains = [f"{way} {by_way[way] - by_way['start']:+.2f} dB" for way in WAYS[1:] if way in by_way]
-        lines += [f"{scene}, over the start: {'; '.join(gains)}"] if gains else []
-        if "hemisphere" in by_way:
-            alone += [by_way["scene"] - by_way["hemisphere"]] if "scene" in by_way else []
-            after += [by_way[AFTER] - by_way["hemisphere"]] if AFTER in by_way else []
-    texts = {"inside the scene for the same seconds": alone, "after the hemisphere, with more seconds": after}
-    for text, gains in texts.items():
-        if gains:
+        # The main weight is that of the first training
+        share = next((d["lambda"] for d in runs if d["lambda"] is not None), None)
+        main = [d for d in runs if d["spp"] == runs[0]["spp"] and d["lambda"] in (None, share)]
+        errors = {d["way"]: d["psnr_db"] for d in main}
+        over = [f"{way} {errors[way] - errors['start']:+.2f} dB" for way in WAYS[1:] if way in errors]
+        lines += [f"{scene}, over the start: {'; '.join(over)}"] if over else []
+        for (way, other), values in gains.items():
+            if way in errors and other in errors:
+                values.append(errors[way] - errors[other])
+    for pair, text in COMPARED.items():
+        if values := gains[pair]:
             lines.append(
-                f"over hemisphere training, training {text} gains {min(gains):+.2f} to {max(gains):+.2f} dB: "
-                f"{sum(gain >= GAIN for gain in gains)} of {len(gains)} scenes gain {GAIN:g} dB or more"
+                f"{text} {min(values):+.2f} to {max(values):+.2f} dB: "
+                f"{sum(gain >= GAIN for gain in values)} of {len(values)} scenes gain {GAIN:g} dB or more"
             )
+    for pair, text in STARTS.items():
+        if values := gains[pair]:
+            lines.append(f"{text} ends {min(values):+.2f} to {max(values):+.2f} dB from the right one")
     return lines

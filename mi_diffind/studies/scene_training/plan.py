@@ -1,9 +1,11 @@
 """Plan of the study of training inside a scene: the runs of each scene, and their errors in it.
 
 *Runs*: the file that the scene names (*start*); training for shading over the hemisphere (``fit shading``) from it, for
-as many seconds as the largest λ at one sample a pixel takes inside the scene (*hemisphere*); training inside the scene
-(``fit scene``) for each λ at one sample a pixel, and for the largest λ at more; from the result of the hemisphere
-(*hemisphere, then scene*); and from an untrained start.
+as many seconds as the largest λ at one sample a pixel takes inside the scene (*hemisphere*), and to its end
+(*hemisphere, longer*); training inside the scene (``fit scene``) from the start (*scene*; also with other λ, other
+samples a pixel, and without samples beyond these), from the result of the hemisphere, and from an untrained start.
+*Another material* is a texture of the same maps turned by 90° and inverted; training inside the scene starts from it,
+too, and from what hemisphere training makes of it.
 
 *Errors*: renders of views and lights that neither training nor its validation draws (the same ranges, another seed)
 against renders of exact plugins. The noise of both renders is not counted: the errors of two halves are multiplied.
@@ -27,11 +29,13 @@ import mitsuba as mi
 import numpy as np
 
 from ... import metrics, scenes, task
-from ...files import writable_folder
+from ...files import writable_folder, write_json
+from ...maps.source import load_source
 from ...measure import plot
 from ...measure.formatting import figure_caption
 from ...measure.study import Candidate, Plan
 from ...scene_training.problem import exposure_of
+from ...scene_training.recipe import SceneRecipe
 from ...scene_training.reference_renders import ReferenceRenders
 from ...scene_training.stored_texture import original_of, texture_file
 from ...scene_training.trained_scene import TrainedScene
@@ -40,7 +44,7 @@ from ...srgb import for_display
 from ...tables import Table
 from ...tasks.texture.compressed import load
 from ..equal_memory import Contender, StudyContext
-from .conclusions import conclusions, table
+from .conclusions import AFTER, FEW, LONGER, MENDED, OTHER, conclusions, table
 
 #: Ranges of camera and lights of the scenes that ship, by the name of the file.
 RANGES = {
@@ -53,6 +57,9 @@ RANGES = {
     },
 }  # fmt: skip
 
+#: Runs in the picture.
+SHOWN = ("start", "hemisphere", "scene", AFTER)
+
 #: Seed of the views that errors are measured on; trainings have seed 0.
 SEED = 1000
 
@@ -64,7 +71,8 @@ class SceneTrainingSettings:
     ``lambdas``: weights of the loss of renders. ``counts``: samples a pixel of trainings. ``steps`` of a training
     inside a scene, on ``views`` views, of which ``held_out`` others choose the state; ``tests`` views are measured.
     Renders are ``width`` pixels wide and 9/16 of this high, with paths of ``depth``. ``reference_spp`` and ``spp``:
-    samples a pixel of references, and of a measured render.
+    samples a pixel of references, and of a measured render. ``hemisphere_steps``: steps of a training over the
+    hemisphere to its end; ``texture_steps``: those of the texture of another material.
     """
 
     lambdas: tuple[float, ...] = (0.5, 0.9, 1.0)
@@ -77,11 +85,14 @@ class SceneTrainingSettings:
     depth: int = 3
     reference_spp: int = 512
     spp: int = 128
+    hemisphere_steps: int = 1500
+    texture_steps: int = 200
 
     @classmethod
     def quick(cls) -> SceneTrainingSettings:
         """Return the settings of a smoke run."""
-        return cls((0.9,), (1,), steps=2, views=2, held_out=1, tests=1, width=16, depth=2, reference_spp=8, spp=8)
+        small = {"views": 2, "held_out": 1, "tests": 1, "width": 16, "depth": 2, "reference_spp": 8, "spp": 8}
+        return cls((0.9,), (1,), steps=2, hemisphere_steps=2, texture_steps=2, **small)
 
     def changed(self, **values) -> SceneTrainingSettings:
         """Return a copy with other values."""
@@ -128,7 +139,7 @@ class SceneTrainingContext(StudyContext):
     def measure(self, table: Table, spp: int) -> dict[str, float]:
         """Return ``psnr_db`` and ``flip`` of a table in renders with footprints of ``spp`` samples a pixel."""
         distribution, views, references, exposure = self.tests
-        scene = TrainedScene(self.parsed, self.file, distribution, spp, table)
+        scene = TrainedScene(self.parsed, {self.file: table}, distribution, spp)
         errors, flips = [], []
         with dr.suspend_grad():
             for i, (view, reference) in enumerate(zip(views, references, strict=True)):
@@ -146,16 +157,19 @@ class SceneTrainingContext(StudyContext):
 
 
 def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[TrainingInScene], result: dict):
-    """Draw the first measured view of each scene: after each run with the smallest number of samples, and the truth."""
-    columns = max(len([r for r in runs if r.context is c and r.budget == c.settings.counts[0]]) for c in contexts) + 1
+    """Draw the first measured view of each scene: after each of the :data:`SHOWN` runs, and the truth."""
+    first = {}
+    for run in runs:
+        first.setdefault((run.context.name, run.method), run)
+    runs = [run for run in first.values() if run.method in SHOWN]
+    columns = max(len([r for r in runs if r.context is c]) for c in contexts) + 1
     figure = plot.figure(result["title"], figure_caption(result), 2.3 * columns, 1.7 * len(contexts))
     for row, context in enumerate(contexts):
         distribution, views, references, exposure = context.tests
-        shown = [r for r in runs if r.context is context and r.budget == context.settings.counts[0]]
         images = {}
-        for run in shown:
+        for run in (r for r in runs if r.context is context):
             share = "" if run.share is None else f", λ {run.share:g}"
-            scene = TrainedScene(context.parsed, context.file, distribution, int(run.budget), run.model)
+            scene = TrainedScene(context.parsed, {context.file: run.model}, distribution, int(run.budget))
             with dr.suspend_grad():
                 scene.place(views[0])
                 image = scene.render(0, 1, context.settings.spp).numpy()
@@ -170,85 +184,133 @@ def picture(contexts: Sequence[SceneTrainingContext], runs: Sequence[TrainingInS
 class TrainingInScene(Contender):
     """A file that is measured in a scene, after a training: ``method`` is the name of the way.
 
-    ``budget``: samples a pixel. ``share``: λ of a training inside the scene. ``begin``: its start, ``file`` or
-    ``untrained``; ``after``: the run whose result it starts from; for *hemisphere*, the run that gives the seconds.
+    ``budget``: samples a pixel. ``task``: that of the training, ``""`` for none. ``share``: λ of a training inside the
+    scene. ``begin``: its start, ``file`` or ``untrained``. ``after``: the run whose result it starts from (``None``:
+    the scene's file); ``as_long``: the run that gives its seconds (``None``: it has steps).
+
+    The record is kept beside the file of the result, so that further runs of the same scene can follow.
     """
 
+    task: str = ""
     share: float | None = None
     begin: str = "file"
+    samples: int = SceneRecipe.samples
     after: TrainingInScene | None = None
+    as_long: TrainingInScene | None = None
     record: dict | None = None
 
     def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         if folder is not None:
             self.context.references = writable_folder(folder / "references", create=True)
-        self.record = super().cached_record(folder, record)
-        return self.record
+        record = super().cached_record(folder, record)
+        if record is None and self.file is not None and self.file.is_file() and self._kept.is_file():
+            record = json.loads(self._kept.read_text(encoding="utf-8"))
+        self.record = record
+        return record
+
+    @property
+    def _kept(self) -> Path:
+        return self.file.with_suffix(".json")
 
     def load(self, path: Path) -> Table:
         return load(path)
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        settings, context, start = self.context.settings, self.context, time.perf_counter()
+        context, start, processor = self.context, time.perf_counter(), time.process_time()
         figures = {}
-        if self.method == "start":
+        if not self.task:
             self.model = context.start
         else:
-            fitted = self.fit(settings, context, progress)
+            fitted = self.fit(context, progress)
             if fitted.result.interrupted:
                 return None
             self.model, result = fitted.table, fitted.result
             figures = {"steps": result.steps, "kept_step": result.step, "training_seconds": result.seconds,
+                       "processor_seconds": time.process_time() - processor,
                        "step_ms": 1000 * result.seconds / max(1, result.steps), "history": result.history,
                        "level_bias": self.model.settings.get("level_bias", 0.0),
+                       "kept_start": self.model.settings.get("kept_start", False),
                        "validation_db": result.measured.get("psnr_db")}  # fmt: skip
             if self.file is not None:
                 fitted.save(self.file)
-        if self.method == "start" and self.file is not None:
+        if self.file is not None and not self.task:
             self.file.write_bytes(Path(context.file).read_bytes())
         seconds = time.perf_counter() - start
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
         details = {"scene": context.name, "way": self.method, "lambda": self.share, "spp": int(self.budget),
                    "peak_mib": peak, **figures, **context.measure(self.model, int(self.budget))}  # fmt: skip
         self.record = {"bytes": self.model.nbytes, "seconds": seconds, "details": details}
+        if self.file is not None:
+            write_json(self._kept, self.record)
         return self.record
 
-    def fit(self, settings: SceneTrainingSettings, context: SceneTrainingContext, progress: bool) -> task.Fitted:
-        """Train, over the hemisphere or inside the scene."""
+    def fit(self, context: SceneTrainingContext, progress: bool) -> task.Fitted:
+        """Train, as a texture, over the hemisphere or inside the scene."""
+        settings = context.settings
         common = {"progress": progress, "output": self.file, "variant": mi.variant(), "deterministic": False}
-        if self.method == "hemisphere":
-            seconds = max(1.0, self.after.record["details"]["training_seconds"])
-            return task.fit("shading", context.source, start=context.file, seconds=seconds, **common)
-        given = {} if self.after is None else {"start": self.after.file}
+        if self.task == "texture":
+            fitted = task.fit("texture", other_maps(context.source), bytes=context.start.nbytes,
+                              steps=settings.texture_steps, **common)  # fmt: skip
+            fitted.table.settings["source"] = context.start.settings["source"]
+            return fitted
+        start = context.file if self.after is None else self.after.file
+        if self.task == "shading":
+            limit = {"steps": settings.hemisphere_steps}
+            if self.as_long is not None:
+                limit = {"seconds": max(1.0, self.as_long.record["details"]["training_seconds"])}
+            return task.fit("shading", context.source, start=start, **limit, **common)
+        given = {} if self.after is None else {"start": start}
         ranges = {name: tuple(map(float, limits)) for name, limits in context.ranges.items()}
         return task.fit(
             "scene", context.path, defines=list(settings.defines.items()), steps=settings.steps,
             measure_every=max(1, settings.steps // 8), views=settings.views, held_out=settings.held_out,
             reference_spp=settings.reference_spp, references=context.references, spp=int(self.budget),
-            begin=self.begin, share=self.share, **ranges, **given, **common,
+            begin=self.begin, share=self.share, samples=self.samples, **ranges, **given, **common,
         )  # fmt: skip
 
 
-def _runs(context: SceneTrainingContext) -> list[TrainingInScene]:
-    def run(method: str, spp: int = context.settings.counts[0], **fields) -> TrainingInScene:
-        share = f", λ {fields['share']:g}" if fields.get("share") is not None else ""
-        return TrainingInScene(method, spp, context, f"{context.name}, {method}{share}, {spp} spp", **fields)
-
-    settings = context.settings
-    runs = [run("start", spp) for spp in settings.counts]
-    largest = run("scene", share=settings.lambdas[-1])
-    runs.append(largest)
-    hemisphere = run("hemisphere", after=largest)
-    runs += [hemisphere, run("hemisphere, then scene", share=largest.share, after=hemisphere)]
-    runs += [run("untrained, then scene", share=largest.share, begin="untrained")]
-    runs += [run("scene", share=share) for share in settings.lambdas[:-1]]
-    return runs + [run("scene", spp, share=largest.share) for spp in settings.counts[1:]]
+def other_maps(source: Path) -> dict[str, np.ndarray]:
+    """Return the maps of another material: those of ``source`` turned by 90°, and inverted but for normals, bytes."""
+    maps = {}
+    for entry in load_source(source).maps:
+        values = np.rot90(entry.values)
+        maps[entry.name] = np.rint(255 * (values if entry.role == "normal" else 1 - values)).astype(np.uint8)
+    return maps
 
 
-def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
-    """Return the plan for scene files in the current variant."""
+def planned_runs(context: SceneTrainingContext, without: Sequence[str]) -> list[TrainingInScene]:
+    """Return the runs of a scene in their order, ``without`` those of these names and those that start from them."""
+    settings, default = context.settings, SceneRecipe().share
+    share = default if default in settings.lambdas else settings.lambdas[-1]
+
+    def run(method: str, task: str = "", spp: int = settings.counts[0], **fields) -> TrainingInScene:
+        text = f", λ {fields['share']:g}" if "share" in fields else ""
+        return TrainingInScene(method, spp, context, f"{context.name}, {method}{text}, {spp} spp", task=task, **fields)
+
+    def inside(method: str, after: TrainingInScene | None = None, **fields) -> TrainingInScene:
+        return run(method, "scene", **{"share": share, "after": after, **fields})
+
+    scene, other = inside("scene"), run(OTHER, "texture")
+    hemisphere = run("hemisphere", "shading", as_long=scene)
+    mended = run(MENDED, "shading", after=other, as_long=scene)
+    runs = [
+        *(run("start", spp=spp) for spp in settings.counts), scene, hemisphere, run(LONGER, "shading"),
+        inside(AFTER, hemisphere), inside("untrained, then scene", begin="untrained"), inside(FEW, samples=1),
+        other, inside(f"{OTHER}, then scene", other), mended, inside(f"{MENDED}, then scene", mended),
+        *(inside("scene", share=s) for s in settings.lambdas if s != share),
+        *(inside("scene", spp=spp) for spp in settings.counts[1:]),
+    ]  # fmt: skip
+
+    def wanted(run: TrainingInScene) -> bool:
+        return run.method not in without and all(wanted(r) for r in (run.after, run.as_long) if r is not None)
+
+    return [run for run in runs if wanted(run)]
+
+
+def plan(paths: Sequence[Path], settings: SceneTrainingSettings, without: Sequence[str] = ()) -> Plan:
+    """Return the plan for scene files in the current variant, ``without`` the runs of these names."""
     contexts = [SceneTrainingContext(path, settings) for path in paths]
-    runs = [run for context in contexts for run in _runs(context)]
+    runs = [run for context in contexts for run in planned_runs(context, without)]
 
     def candidate(run: TrainingInScene) -> Candidate:
         def errors(samples: int) -> dict[str, float]:
@@ -257,6 +319,7 @@ def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
         return Candidate(run.name, run.method, f"{run.budget} spp", job=run.name, errors=errors)
 
     request = json.loads(json.dumps(asdict(settings)))
+    shared = {name: value for name, value in request.items() if name not in ("lambdas", "counts")}
     files = {c.name: c.parsed.description for c in contexts}
     return Plan(
         study="scene-training",
@@ -272,7 +335,7 @@ def plan(paths: Sequence[Path], settings: SceneTrainingSettings) -> Plan:
             f"errors: {settings.tests} other views and lights against {settings.reference_spp} spp"
         ],
         jobs=runs,
-        jobs_fingerprint=f"{files} {request}",
+        jobs_fingerprint=f"{files} {shared}",
         pictures={"png": lambda result: picture(contexts, runs, result)},
         sampled=False,
         table=table,

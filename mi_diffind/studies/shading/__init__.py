@@ -55,6 +55,8 @@ class ShadingStudy(Study):
                             help="clipped derivatives and a falling rate: all four combinations, both or none, both "
                             "only, or clipped derivatives with either rate (default: all)")  # fmt: skip
 
+        parser.add_argument("--extras", action="store_true",
+                            help="also train arrays with extras beside them, as fit shading --extras auto")  # fmt: skip
         parser.add_argument("--renders", action="append", metavar="FILE.npz",
                             help="measure whole renders of one MATERIAL.json instead, with a file that was trained on "
                             "it; may be repeated")  # fmt: skip
@@ -68,6 +70,8 @@ class ShadingStudy(Study):
             raise ValueError("--steps and --pretrain-steps: found one of them, both or none are allowed")
         if arguments.steps and (arguments.seconds or arguments.pretrain_seconds):
             raise ValueError("--steps: found beside seconds, only one of them is allowed")
+        if arguments.extras and arguments.preset == "paper":
+            raise ValueError("--extras: the arrays of the preset paper have none")
         arguments.ratio = parse_compression(arguments.compression)
         arguments.loaded = materials_of(arguments.materials, arguments.side or (64 if arguments.quick else 512),
                                         arguments.quick)  # fmt: skip
@@ -106,6 +110,7 @@ class ShadingStudy(Study):
             "steps" if arguments.steps else "s",
             arguments.sweep_seeds or arguments.seeds or 3,
             arguments.preset,
+            arguments.extras,
         )
         return plan(arguments.loaded, settings)
 

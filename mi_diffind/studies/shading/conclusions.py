@@ -24,7 +24,7 @@ COARSE = 2
 
 @dataclass
 class MaterialCurves:
-    """Records of a material: ``classical``, ``compressed`` (by label) and ``runs`` (by remedies and λ).
+    """Records of a material: ``classical``, ``compressed``, ``extras`` (by label), ``runs`` (by remedies and λ).
 
     ``runs`` has the details of all seeds; those of λ = 0 stand under all remedies that they are the base of.
     """
@@ -32,6 +32,7 @@ class MaterialCurves:
     name: str
     classical: dict[str, dict] = field(default_factory=dict)
     compressed: dict[str, dict] = field(default_factory=dict)
+    extras: dict[str, dict] = field(default_factory=dict)
     runs: dict[tuple[str, float], list[dict]] = field(default_factory=dict)
 
     @property
@@ -78,7 +79,7 @@ def curves(result: dict) -> dict[str, MaterialCurves]:
         if "material" not in d:
             continue
         material = materials.setdefault(d["material"], MaterialCurves(d["material"]))
-        if d["kind"] in ("classical", "compressed"):
+        if d["kind"] in ("classical", "compressed", "extras"):
             getattr(material, d["kind"])[d["label"]] = d
         elif d["kind"] == "run":
             material.runs.setdefault((d["way"], d["share"]), []).append(d)
@@ -103,7 +104,7 @@ def table(result: dict) -> list[str]:
                   "coarse", "FLIP", "trouble"]]  # fmt: skip
         for label, d in material.classical.items():
             cells.append([f"{label}, uncompressed", f"{nbytes[label]:,}", *_error_cells([d], levels), ""])
-        for label, d in material.compressed.items():
+        for label, d in {**material.compressed, **material.extras}.items():
             cells.append([label, f"{nbytes[label]:,}", *_error_cells([d], levels), ""])
         for remedy in material.remedies or dict.fromkeys(remedy for remedy, _ in material.runs):
             for share in material.shares(remedy):

@@ -41,6 +41,7 @@ from ...measure.store import file_name
 from ...measure.study import Candidate, Plan
 from ...settings import FitSettings, FittingError
 from ...tables import Table, save_table
+from ...tasks.shading import fit as shading_fit
 from ...tasks.shading import presets
 from ...tasks.shading.evaluation import ShadedEvaluation, ShadedReader, reader
 from ...tasks.shading.material import effects_of, frozen_decoder
@@ -89,7 +90,8 @@ class ShadingStudySettings:
 
     ``lambdas`` are the weights λ, 0 among them, ``ways`` the combinations of remedies, ``seeds`` the number of seeds,
     ``sweep_seeds`` that of weights other than 0 and the preset's. ``preset`` is the recipe: the paper's has neither
-    validation nor level bias, and ends in its last state.
+    validation nor level bias, and ends in its last state. ``extras``: also train, with the preset's λ, arrays
+    that leave room for extras, for as many seeds as the other weights.
     ``length`` is that of the training for shading, ``pretraining`` that of the training as a texture before it, in the
     ``unit`` ``"s"`` or ``"steps"``. ``frames`` is the length of the zoom; ``quick`` makes it a smoke run.
     """
@@ -105,6 +107,7 @@ class ShadingStudySettings:
     unit: str = "s"
     sweep_seeds: int = 3
     preset: str = "ours"
+    extras: bool = False
 
     @property
     def recipe(self) -> presets.ShadingRecipe:
@@ -179,11 +182,17 @@ class ShadingStudyContext(StudyContext):
         preset = self.settings.preset
         return task.FitRequest(preset, settings, self.types, seconds=seconds, progress=progress, options=options)
 
-    def fit_texture(self, pyramid: Pyramid, length: float, seed: int, progress: bool) -> tuple[Table, FitResult]:
-        """Train a texture at our rate, with which it converges soonest, on a pyramid in place of the source's."""
+    def fit_texture(
+        self, pyramid: Pyramid, length: float, seed: int, progress: bool, extras: bool = False
+    ) -> tuple[Table, FitResult]:
+        """Train a texture at our rate, with which it converges soonest, on a pyramid in place of the source's.
+
+        With ``extras``, the arrays leave room for them.
+        """
         request = self.request(texture_presets.PRESETS["ours"].settings, length, seed, progress)
         recipe = dataclasses.replace(self.recipe, settings=request.settings)
         nbytes = self.source.nbytes / self.settings.compression
+        nbytes = shading_fit.bytes_beside_extras(nbytes, pyramid) if extras else nbytes
         size = size_of(self.source, pyramid, nbytes, recipe, request.options)
         problem = textures.problem_of(self.source, size, recipe, pyramid)
         result = request.train(problem, f"{self.name}: texture, seed {seed}")
@@ -281,10 +290,11 @@ class TextureStart(ShadingTraining):
     """A texture trained as task 4 trains it: the start of the runs of a seed."""
 
     seed: int = 0
+    extras: bool = False
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        start, context = time.perf_counter(), self.context
-        trained, result = context.fit_texture(context.pyramid, context.settings.pretraining, self.seed, progress)
+        start, context, length = time.perf_counter(), self.context, self.context.settings.pretraining
+        trained, result = context.fit_texture(context.pyramid, length, self.seed, progress, self.extras)
         return self.measure_table(trained, result, start, seed=self.seed)
 
 
@@ -305,7 +315,8 @@ class CompressedFilter(ShadingTraining):
 class ShadingRun(ShadingTraining):
     """A training for shading with weight ``share``; ``base`` is the run of the same seed with λ = 0.
 
-    λ = 0 is read at the level of the footprint; for other λ, the training chooses the level bias.
+    λ = 0 is read at the level of the footprint; for other λ, the training chooses the level bias, and with ``extras``
+    whether there are any.
     """
 
     start: TextureStart | None = None
@@ -313,6 +324,7 @@ class ShadingRun(ShadingTraining):
     share: float = 0.0
     seed: int = 0
     base: ShadingRun | None = None
+    extras: bool = False
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
         begin, context, preset = time.perf_counter(), self.context, self.context.settings.recipe
@@ -321,7 +333,8 @@ class ShadingRun(ShadingTraining):
         request = context.request(settings, context.settings.length, self.seed, progress)
         clip = (preset.clip or CLIP) if self.remedies.clip else None
         bias = preset.level_bias if self.share else 0.0
-        recipe = dataclasses.replace(preset, share=self.share, clip=clip, level_bias=bias, settings=request.settings)
+        recipe = dataclasses.replace(preset, share=self.share, clip=clip, level_bias=bias, extras=self.extras,
+                                     settings=request.settings)  # fmt: skip
         net = start_of(self.start.table, context.pyramid)
         try:
             fit = fit_shading if preset.bounded else fit_to_the_end
@@ -331,6 +344,8 @@ class ShadingRun(ShadingTraining):
         details = {"share": self.share, "clip": self.remedies.clip, "schedule": self.remedies.schedule,
                    "seed": self.seed, "way": self.remedies.name,
                    "level_bias": trained.settings.get("level_bias", 0.0)}  # fmt: skip
+        if self.extras:
+            details["has_extras"] = trained.settings.get("shading", {}).get("extras", False)
         record = self.measure_table(trained, result, begin, **details)
         if record is not None:
             base = self.base.record["details"] if self.base is not None and self.base.record else None
@@ -509,6 +524,13 @@ def _jobs(context: ShadingStudyContext) -> list[ShadingContender]:
                                       base=run, biased=biased)
                         )  # fmt: skip
                     bases[way.schedule] = run
+        if settings.extras and seed < settings.sweep_seeds:
+            way, share, label = settings.ways[0], settings.recipe.share, f"extras, seed {seed}"
+            start = TextureStart("start", settings.compression, context, f"{name}, texture beside {label}", seed=seed,
+                                 extras=True)  # fmt: skip
+            run = ShadingRun("extras", settings.compression, context, f"{name}, {label}", label=label, start=start,
+                             remedies=way, share=share, seed=seed, base=bases[way.schedule], extras=True)  # fmt: skip
+            jobs += [start, run]
     return jobs
 
 

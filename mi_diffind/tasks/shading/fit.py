@@ -141,10 +141,17 @@ def size_of(source, pyramid: Pyramid, recipe: ShadingRecipe, options):
     """Return the memory budget of the arrays. Raises :class:`UsageError`."""
     options = {argument.name: argument.default for argument in TEXTURE.arguments} | dict(options)
     nbytes = requested_bytes(options, source)
-    if recipe.extras:
-        extras = neutral_extras(pyramid.layout.height, pyramid.layout.width, pyramid.border)
-        nbytes -= math.prod(extras.resolution) * extras.channels
+    nbytes = bytes_beside_extras(nbytes, pyramid) if recipe.extras else nbytes
     return texture_fit.size_of(source, pyramid, nbytes, TEXTURES[recipe.texture], options)
+
+
+def bytes_beside_extras(nbytes: float, pyramid: Pyramid) -> float:
+    """Return the part of ``nbytes`` that extras leave for the maps. Raises :class:`UsageError` if there is none."""
+    extras = neutral_extras(pyramid.layout.height, pyramid.layout.width, pyramid.border)
+    needed = math.prod(extras.resolution) * extras.channels
+    if needed >= nbytes:
+        raise UsageError(f"--extras: found {int(nbytes):,} bytes for all arrays, extras alone need {needed:,}")
+    return nbytes - needed
 
 
 def pretrained(source, pyramid: Pyramid, size, recipe: ShadingRecipe, request: FitRequest) -> tuple:
