@@ -538,7 +538,8 @@ def fit(
 ) -> Fitted:
     """Train the tables of a ``task`` (``"texture"``, ``"sdf"``, …): ``mi-diffind fit`` in Python.
 
-    - ``source``: what the tables are fitted to, as a file or as an object in memory. Of ``image``, ``texture`` and
+    - ``source``: what the tables are fitted to, as a file or as an object in memory. Of ``bsdf``: a scene or BSDF as a
+      file, a dictionary as of ``mi.load_dict``, a ``mi.BSDF``, or a measured file. Of ``image``, ``texture`` and
       ``shading``: an image file or a manifest, an array ``(height, width, channels)``, a ``mi.Bitmap``, or a dictionary
       of such maps by name. Of ``sdf``: a mesh file, a ``trimesh.Trimesh`` or a ``mi.Mesh``. Of ``field``: a folder of
       views. Of ``scene``: a scene file, or a dictionary as of ``mi.load_dict``. ``ggx`` and ``disney`` have none.

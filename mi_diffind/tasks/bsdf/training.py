@@ -73,7 +73,7 @@ class BSDFProblem(Problem):
 
     def begin(self, step: int, share: float) -> str:
         self._share = share
-        return ""
+        return "rounded" if share >= ROUNDED else ""
 
     def trained(self, net: BSDFArrays) -> LearnedBSDF:
         """Return the BSDF that a step evaluates."""

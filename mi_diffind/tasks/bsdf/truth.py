@@ -186,10 +186,14 @@ def _chosen(loaded, name, material: str):
         return loaded
     if not isinstance(loaded, mi.Scene):
         raise UsageError(f"{name}: is a {type(loaded).__name__}, a BSDF or a scene is needed")
-    bsdfs = {shape.bsdf().id(): shape.bsdf() for shape in loaded.shapes() if shape.bsdf() is not None}
-    if not material and len(bsdfs) == 1:
-        return next(iter(bsdfs.values()))
-    if material not in bsdfs:
-        names = ", ".join(sorted(bsdfs)) or "none"
-        raise UsageError(f'material: found "{material}", the materials of {name} are {names}')
-    return bsdfs[material]
+    bsdfs = list({id(b): b for b in (shape.bsdf() for shape in loaded.shapes()) if b is not None}.values())
+    chosen = [b for b in bsdfs if material in ("", b.id())]
+    if len(chosen) == 1:
+        return chosen[0]
+    ids = sorted({b.id() for b in bsdfs if b.id()})
+    names = ", ".join([*ids[:8], *(["…"] if len(ids) > 8 else [])]) or "none"
+    if len(chosen) > 1:
+        raise UsageError(
+            f"{name}: has {len(chosen)} materials: name one by its id (material), those with ids are {names}"
+        )
+    raise UsageError(f'material: found "{material}", the materials of {name} with ids are {names}')

@@ -175,7 +175,8 @@ def test_sources(types, tmp_path):
     assert truth_of(scene, types, "paint").name == "paint"
     assert truth_of({"type": "roughplastic"}, types).name == "roughplastic"
     refused = {
-        (scene, ""): 'found "", the materials of .* are glass, mirror, paint',
+        (scene, ""): r"has 3 materials: name one by its id \(material\), those with ids are glass, mirror, paint",
+        (scene, "wood"): 'found "wood", the materials of .* with ids are glass, mirror, paint',
         (scene, "glass"): "glass: transmits light, only BSDFs that reflect can be fitted",
         (scene, "mirror"): "mirror: reflects into single directions, only BSDFs without delta lobes can be fitted",
         (tmp_path / "none.xml", ""): "none.xml: no such file",
