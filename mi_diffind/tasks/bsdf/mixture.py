@@ -121,6 +121,7 @@ def second_moment(truth_value, mixture: Mixture, truth, types, cos: float, size:
     s = outgoing(rng, types, wi, truth)
     with dr.suspend_grad():
         mean = sum(truth_value(s.wi, s.wo)) / 3
-        square = s.weight * dr.square(mean) / mixture.density(s.wi, s.wo)
+        density = mixture.density(s.wi, s.wo)
+        square = dr.select(density > 0, s.weight * dr.square(mean) * dr.rcp(density), 0)
         first, second = dr.mean(s.weight * mean), dr.mean(square)
     return float((second / dr.square(first))[0])
