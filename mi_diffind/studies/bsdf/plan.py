@@ -12,7 +12,7 @@ from ...measure.bsdf import QUERIES, bsdf_queries, directions
 from ...measure.formatting import grid
 from ...measure.store import file_name, fingerprint
 from ...measure.study import Candidate, Case, Job, Plan
-from ...task import fit
+from ...task import fit, load_model
 from ...tasks.bsdf import fit as fitting
 from ...tasks.bsdf import mixture
 from ...tasks.bsdf.model import LearnedBSDF
@@ -42,13 +42,14 @@ class BSDFTraining(Job):
         self.path: Path | None = None
 
     def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
+        """Return the record if the folder holds the file of an uninterrupted fit; without ``record``, measure it."""
         if folder is None or not self._file(folder).is_file():
             return None
         self.path = self._file(folder)
-        return record
+        return record or {"seconds": None, **self._measured()}
 
     def run(self, folder: Path | None, progress: bool) -> dict | None:
-        """Fit, measure, and return the record; the errors of the proxy alone and of both samplings are among it."""
+        """Fit, write the file, and return the record; ``None`` after Ctrl-C."""
         source, nbytes = MATERIALS[self.material]
         start = time.perf_counter()
         options = QUICK_FIT if self.quick else {}
@@ -58,17 +59,22 @@ class BSDFTraining(Job):
         seconds = time.perf_counter() - start
         self.path = self._file(Path(folder or "."))
         fitted.save(self.path)
-        model = fitted.model
-        truth = truth_of(source, model.types)
-        errors = dict(fitted.table.measured)
+        return {"seconds": seconds, **self._measured()}
+
+    def _measured(self) -> dict:
+        """Return bytes, errors and details of the file: also the errors of the proxy alone and of both samplings."""
+        model = load_model(self.path, mi.TensorXf)
+        truth = truth_of(MATERIALS[self.material][0], model.types)
+        errors = dict(model.table.measured)
         if model.bsdf.proxy is not None:
             proxy = LearnedBSDF(model.form, None, model.bsdf.proxy)
             errors["psnr_proxy_db"] = SphereView(truth, model.types).psnr(fitting.cosine(proxy))
         for name, sampled in (("learned", model.mixture), ("native", truth)):
             moments = [mixture.second_moment(truth.value, sampled, truth, model.types, cos) for cos in COSINES]
             errors[f"moment_{name}"] = sum(moments) / len(moments)
-        details = {"form": model.form.to_json(), "symmetry": fitted.figures["symmetry"], "steps": fitted.result.steps}
-        return {"seconds": seconds, "bytes": fitted.table.nbytes, "errors": errors, "details": details}
+        settings = model.table.settings
+        details = {key: settings[key] for key in ("form", "symmetry", "steps")}
+        return {"bytes": model.table.nbytes, "errors": errors, "details": details}
 
     def _file(self, folder: Path) -> Path:
         return Path(folder) / f"{file_name(self.name)}.npz"
