@@ -770,7 +770,7 @@ def test_several_files_are_trained(pair, tmp_path, monkeypatch):
     checkpoint = tmp_path / "c.npz"
     given = {
         "defines": [("film", "6")], "views": 1, "held_out": 1, "reference_spp": 64, "progress": False,
-        "steps": 2, "measure_every": 2, "batch": 512, "lr": 0.02, "deterministic": True,
+        "steps": 2, "measure_every": 2, "batch": 512, "lr": 0.02, "deterministic": True, "begin": "untrained",
     }  # fmt: skip
 
     def trained_files(**more):

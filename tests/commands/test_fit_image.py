@@ -538,7 +538,7 @@ def test_what_decode_refuses(folder, capsys):
             'other.npz: holds tables for the task "ggx", which stand for nothing that could be decoded',
         ),
         (["other.npz", "-o", "b.png", "--map", "a"], "other.npz: --map does not apply to this file"),
-        (["unknown.npz", "-o", "b.png"], 'unknown.npz: holds tables for the task "cloth", installed are disney, field'),
+        (["unknown.npz", "-o", "b.png"], 'unknown.npz: holds tables for the task "cloth", installed are bsdf, disney'),
         (["many.npz", "-o", "b.png"], 'many.npz: "many" has 6 channels, PNG holds 4: use .exr'),
     ):
         assert sentence in refused(capsys, "decode", *arguments)

@@ -65,6 +65,7 @@ def small(tmp_path, monkeypatch):
 
 def test_studies_are_found():
     assert list(studies()) == [
+        "bsdf",
         "disney",
         "field",
         "ggx",
@@ -80,6 +81,7 @@ def test_studies_are_found():
 def test_studies_of_others_are_found(small):
     with pytest.warns(RuntimeWarning) as warned:
         assert list(studies()) == [
+            "bsdf",
             "disney",
             "field",
             "ggx",
