@@ -331,6 +331,27 @@ def material_times() -> str:
     return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640", "training step"], rows)
 
 
+def bsdf() -> str:
+    """Return figures of learned BSDFs: errors, albedo, noise of sampling, times."""
+    result, rows = measured("tradeoff_bsdf"), []
+    for name, candidate in result["candidates"].items():
+        errors = candidate["errors"]
+        if "albedo_excess" not in errors:
+            continue
+        material, preset = name.rsplit(": ", 1)
+        ratios = result["cases"][material]["ratios"]
+        pair = f"{name} / {material}: principled"
+        times = (f"{ratios[query][pair]['median']:.2f}" for query in ("eval", "sample"))
+        proxy = f"{errors['psnr_proxy_db']:.1f}" if "psnr_proxy_db" in errors else "–"
+        moments = f"{errors['moment_learned']:.2f} / {errors['moment_native']:.2f}"
+        albedo = f"{100 * errors['albedo_excess']:.2f}%"
+        rows.append(
+            [material, preset, f"{candidate['bytes']:,}", f"{errors['psnr_db']:.1f}", proxy, albedo, moments, *times]
+        )
+    head = ["material", "preset", "bytes", "PSNR, dB", "proxy, dB", "albedo", "moment", "eval", "sample"]
+    return table(head, rows)
+
+
 def shading_distances() -> str:
     """Return the PSNR of materials before and after training for their shading, as seen from three distances."""
     rows = []
@@ -507,6 +528,7 @@ TABLES = {
         image_pages,
         image_seen,
         material_times,
+        bsdf,
         shading_distances,
         scene_training,
         texture_memory,
