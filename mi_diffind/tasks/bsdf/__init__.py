@@ -4,6 +4,7 @@
 - :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.symmetry`: symmetries, measured;
 - :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
+- :mod:`.measurement`: errors against a source; :mod:`.outputs`, :mod:`.tensor_file`: other formats;
 - :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo; :mod:`.files`: table files.
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 
-from ...arguments import Argument, checked
+from ...arguments import Argument, checked, natural, positive
 from ...settings import FitSettings
 from ...task import Task
 from ...units import parse_bytes
@@ -52,6 +53,10 @@ class BSDFTask(Task):
             help="limit the albedo to the source's, or leave it as it was fitted (default: source)",
         ),
     )  # fmt: skip
+    decode_arguments = (
+        Argument("--rows", type=positive, metavar="N", help="rows of a .csv file (default: 10000)"),
+        Argument("--seed", type=natural, help="seed of the random directions of a .csv file (default: 0)"),
+    )
 
 
 TASK = BSDFTask()
