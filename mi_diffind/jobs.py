@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
-from .arguments import Argument, positive
 from .errors import DiffindError, UsageError, reason
 from .interrupt import interruptible
 from .progress import progress_bar
@@ -33,17 +32,6 @@ POLL, TIMEOUT = 0.2, 20
 
 #: Seconds after which an idle process of a Dask worker ends.
 IDLE = 60.0
-
-#: Options of commands whose work falls apart into jobs.
-WORKER_ARGUMENTS = (
-    Argument(
-        "--workers", type=positive, metavar="N", help="share the work among N processes (default: this process alone)"
-    ),
-    Argument(
-        "--scheduler", default="", metavar="ADDRESS",
-        help="share the work among the workers of a Dask cluster, as in tcp://host:8786, with the same folders",
-    ),
-)  # fmt: skip
 
 
 @dataclass

@@ -14,8 +14,7 @@ import argparse
 import os
 from pathlib import Path
 
-from ...arguments import Argument, checked
-from ...jobs import WORKER_ARGUMENTS
+from ...arguments import WORKER_ARGUMENTS, Argument, checked
 from ...settings import FitSettings
 from ...task import FitRequest, Fitted, Task, table_path
 from ...units import parse_bytes
