@@ -22,6 +22,13 @@ from .view import SphereView
 PRETRAINING = 0.3
 
 
+@dataclasses.dataclass
+class FittedBSDF(Fitted):
+    """Result of a fit, with its source."""
+
+    truth: Truth | None = None
+
+
 def check(request: FitRequest) -> None:
     """Raise :class:`UsageError` for options that exclude each other."""
     if request.options["source"] is None:
@@ -45,7 +52,7 @@ def use_rgb_variant(request: FitRequest) -> None:
         mi.set_variant("cuda_ad_rgb" if ".cuda." in request.types.__name__ else "llvm_ad_rgb")
 
 
-def fit_truth(truth: Truth, request: FitRequest) -> Fitted:
+def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     """Fit a learned BSDF to a source, measure it, and return its table and the record of its training."""
     types, options, settings = request.types, request.options, request.settings
     with dr.suspend_grad():
@@ -96,7 +103,7 @@ def fit_truth(truth: Truth, request: FitRequest) -> Fitted:
         "form": form.to_json(),
         "arrays": {n: list(a.shape) for n, a in table.arrays.items()},
     }
-    return Fitted(table, result, lines, figures)
+    return FittedBSDF(table, result, lines, figures, truth=truth)
 
 
 def symmetry_line(symmetries: dict[str, float]) -> str:

@@ -14,6 +14,9 @@ from ...errors import UsageError, reason
 from ...lookup import clamp
 from ...tables import Table, TableError
 
+#: Extensions of files that are sources.
+SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary")
+
 #: Largest value f cos θ that counts; a plugin may exceed it next to the horizon.
 LARGEST = 1e8
 
@@ -222,7 +225,7 @@ def _chosen(loaded, name, material: str):
         return loaded
     if not isinstance(loaded, mi.Scene):
         raise UsageError(f"{name}: is a {type(loaded).__name__}, a BSDF or a scene is needed")
-    bsdfs = list({id(b): b for b in (shape.bsdf() for shape in loaded.shapes()) if b is not None}.values())
+    bsdfs = _bsdfs(loaded)
     chosen = [b for b in bsdfs if material in ("", b.id())]
     if len(chosen) == 1:
         return chosen[0]
@@ -233,3 +236,22 @@ def _chosen(loaded, name, material: str):
             f"{name}: has {len(chosen)} materials: name one by its id (material), those with ids are {names}"
         )
     raise UsageError(f'material: found "{material}", the materials of {name} with ids are {names}')
+
+
+def _bsdfs(scene) -> list:
+    """Return the BSDFs of a scene's shapes, each once."""
+    return list({id(b): b for b in (shape.bsdf() for shape in scene.shapes()) if b is not None}.values())
+
+
+def material_ids(path) -> list[str]:
+    """Return the ids of the materials of a scene file, sorted, or ``[""]`` for a file of one BSDF.
+
+    Raises :class:`~mi_diffind.errors.UsageError`.
+    """
+    import mitsuba as mi
+
+    loaded = _built(path, lambda: mi.load_file(str(path), optimize=False))
+    ids = sorted({b.id() for b in _bsdfs(loaded) if b.id()}) if isinstance(loaded, mi.Scene) else [""]
+    if not ids:
+        raise UsageError(f"{path}: its materials have no ids")
+    return ids
