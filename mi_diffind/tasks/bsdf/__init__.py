@@ -4,7 +4,9 @@
 - :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.symmetry`: symmetries, measured;
 - :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
-from ...arguments import WORKER_ARGUMENTS, Argument, checked, natural, positive
+- :mod:`.measurement`: errors against a source; :mod:`.outputs`, :mod:`.tensor_file`: other formats;
+- :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo; :mod:`.files`: table files;
+- :mod:`.library`: many materials at once; :mod:`.contact_sheet`: their pictures.
 """
 
 from __future__ import annotations
