@@ -4,6 +4,7 @@
 - :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.symmetry`: symmetries, measured;
 - :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
+- :mod:`.measurement`: errors against a source; :mod:`.outputs`, :mod:`.tensor_file`: other formats;
 - :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo; :mod:`.files`: table files;
 - :mod:`.library`: many materials at once; :mod:`.contact_sheet`: their pictures.
 """
@@ -14,7 +15,7 @@ import argparse
 import os
 from pathlib import Path
 
-from ...arguments import WORKER_ARGUMENTS, Argument, checked
+from ...arguments import WORKER_ARGUMENTS, Argument, checked, natural, positive
 from ...settings import FitSettings
 from ...task import FitRequest, Fitted, Task, table_path
 from ...units import parse_bytes
@@ -59,6 +60,10 @@ class BSDFTask(Task):
         ),
         *WORKER_ARGUMENTS,
     )  # fmt: skip
+    decode_arguments = (
+        Argument("--rows", type=positive, metavar="N", help="rows of a .csv file (default: 10000)"),
+        Argument("--seed", type=natural, help="seed of the random directions of a .csv file (default: 0)"),
+    )
 
     def output_path(self, path: str | os.PathLike) -> Path:
         """Return the path of the output: a table file, or a folder for a library, which exists or has no extension."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from ...errors import UsageError, reason
 from ...lookup import clamp
+from ...tables import Table, TableError
 
 #: Extensions of files that are sources.
 SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary")
@@ -168,6 +170,40 @@ def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 
     loaded = _built(path, lambda: mi.load_file(str(path), optimize=False))
     bsdf = _chosen(loaded, path, material)
     return MitsubaTruth(bsdf, bsdf.id() or path.name, _hash(path.read_bytes() + material.encode()), uv)
+
+
+def recorded_source(options) -> dict:
+    """Return what a table file keeps of a source beside the path of its file, so that it can be opened again."""
+    recorded = {"material": options["material"], "uv": [float(x) for x in options["uv"]]}
+    source = options["source"]
+    try:
+        if isinstance(source, dict) and json.loads(json.dumps(source)) == source:
+            recorded["dictionary"] = source
+    except (TypeError, ValueError):
+        pass  # it holds objects
+    return recorded
+
+
+def recorded_truth(table: Table, types) -> Truth:
+    """Return the source that a table file was fitted to.
+
+    Raises :class:`TableError` if it cannot be opened again, or has changed since.
+    """
+    settings, name = table.settings, table.path or "BSDF"
+    if "dictionary" in settings:
+        source = settings["dictionary"]
+    elif "source_path" in settings:
+        source = Path(table.path or "x").resolve().parent / str(settings["source_path"])
+    else:
+        raise TableError(f"{name}: was fitted to an object in memory, which cannot be opened again")
+    try:
+        u, v = settings.get("uv", (0.5, 0.5))
+        truth = truth_of(source, types, str(settings.get("material", "")), (float(u), float(v)))
+    except (TypeError, ValueError, UsageError) as e:
+        raise TableError(f"{name}: its source cannot be opened again: {reason(e)}") from None
+    if settings.get("source") not in (None, truth.digest):
+        raise TableError(f"{name}: its source, {truth.name}, has changed since")
+    return truth
 
 
 def _hash(content: bytes) -> str:
