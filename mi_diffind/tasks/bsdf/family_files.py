@@ -7,11 +7,13 @@ import os
 
 import numpy as np
 
+from ...errors import UsageError, reason
 from ...indirection import Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
-from ...task import Model
+from . import family_measurement
 from .family import CHANNELS, MOST, FamilyArrays, Parameter, member, widths
-from .files import RESIDUAL, form_of
+from .family_truth import FamilyTruth
+from .files import RESIDUAL, BSDFModel, form_of
 from .mixture import Mixture
 from .model import Form
 
@@ -90,10 +92,11 @@ def _is_factor(value) -> bool:
     return isinstance(value, (int, float)) and math.isfinite(value) and 0.1 <= value <= 10
 
 
-class FamilyModel(Model):
-    """A table file of a family, whose members :meth:`at` returns; ``bsdf`` and ``mixture`` are the middle's."""
+class FamilyModel(BSDFModel):
+    """A table file of a family, whose members :meth:`at` returns; ``bsdf`` and ``mixture`` are the middle's.
 
-    forms = ("float32", "uint8")
+    So is what :meth:`decode` writes.
+    """
 
     def build(self):
         self.form, self.parameters = form_of(self.table), parameters_of(self.table)
@@ -120,3 +123,17 @@ class FamilyModel(Model):
     def entries(self) -> dict:
         """Return what can be optimised: the residual's arrays and the proxy's, in single precision."""
         return {n: a for n, a in self.arrays.items() if a.storage == "float32" and n in (*ARRAYS, "proxy")}
+
+    def family(self) -> FamilyTruth:
+        """Return the source of all members. Raises :class:`TableError` if it cannot be opened again."""
+        try:
+            return FamilyTruth(super().source(), self.table.settings["over"])
+        except (KeyError, UsageError) as e:
+            raise TableError(f"{self.table.path}: its source cannot be opened again: {reason(e)}") from None
+
+    def source(self):
+        return self.family().at([0.5] * len(self.parameters))
+
+    def measure(self) -> dict[str, float]:
+        """Return errors against the source (:func:`.family_measurement.measure`)."""
+        return family_measurement.measure(self, self.family())

@@ -14,7 +14,7 @@ from ...indirection import DifferentiableArray
 from ...settings import FitSettings
 from ...task import FitRequest, Fitted
 from ...units import parse_bytes
-from . import energy, mixture, symmetry, training
+from . import family_measurement, symmetry, training
 from .family import (
     CHANNELS,
     PROXY_NODES,
@@ -26,18 +26,19 @@ from .family import (
     sizes_of,
 )  # fmt: skip
 from .family_files import FamilyModel, to_table
-from .family_sampling import constants, fitted_mixture, fitted_scale
-from .family_truth import MEMBERS, FamilySamples, FamilyTruth, draw, parameters_of, points
+from .family_sampling import fitted_mixture, fitted_scale
+from .family_truth import MEMBERS, FamilySamples, FamilyTruth, constants, draw, parameters_of, points
 from .files import allocate
 from .fit import requested_truth, symmetry_line
 from .model import ALPHA_MIN, BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, Form, LearnedBSDF
+from .truth import recorded_source
 from .view import SphereView
 
 #: Samples of the family's members, and those that measure the proxy.
 SAMPLES, VALIDATION = 2**20, 2**16
 
-#: Members whose pictures are compared: during the training, and at its end.
-VIEWS, FINAL_VIEWS = 8, 24
+#: Members whose pictures are compared during the training.
+VIEWS = 8
 
 #: Training of the proxy's table from the proxy of the middle.
 PROXY = FitSettings(steps=1000, batch=2**13, lr=0.05, schedule="cosine", measure_every=250, check_every=50)
@@ -94,11 +95,12 @@ def _fitted(truth: FamilyTruth, request: FitRequest) -> Fitted:
     table = to_table(problem.net, form, parameters, factors, weights, scale, {
         **request.recorded(result), "source": truth.truth.digest, "name": truth.truth.name, "symmetry": symmetries,
         "structure": dataclasses.asdict(sizes),
+        "over": {key: [p.low, p.high] for key, p in zip(truth.keys, parameters, strict=True)},
     })  # fmt: skip
     table.preset, table.seed = request.preset, settings.seed
-    table.settings |= request.paths(source_path=options["source"])
+    table.settings |= request.paths(source_path=options["source"]) | recorded_source(options)
     model = FamilyModel(table, allocate(table, types.TensorXf), types.TensorXf)
-    measured = measure(model, truth)
+    measured = family_measurement.measure(model, truth)
     table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
     lines = [symmetry_line(symmetries)]
     lines += [f"over {p.name} from {p.low:g} to {p.high:g}, by default {p.middle:.3g}" for p in parameters]
@@ -199,33 +201,3 @@ def residual_problem(
         return {"psnr_db": float(np.mean(figures))}
 
     return FamilyProblem(net, form, samples, measure_views, identity)
-
-
-def measure(model: FamilyModel, truth: FamilyTruth) -> dict[str, float]:
-    """Return figures of a family at random parameters.
-
-    ``psnr_db``, ``psnr_median_db`` and ``psnr_minimum_db`` are those of the pictures of :mod:`.view`; ``albedo_excess``
-    the largest relative difference by which a directional albedo, from 0° to 89°, lies above the source's;
-    ``sample_weight_moment`` the mean of E[w²]/E[w]² of the weights of samples at 0°, 45° and 80°.
-    """
-    types = model.types
-    cos = np.cos(np.radians([0, 15, 30, 45, 60, 70, 80, 85, 89]))
-    psnr, excess, moments = [], [], []
-    for coordinates in np.random.default_rng(17).random((FINAL_VIEWS, len(truth.parameters))):
-        values = [p.value(x) for p, x in zip(truth.parameters, coordinates, strict=True)]
-        source, (bsdf, mixed) = truth.at(coordinates), model.at(constants(types, values))
-
-        def value(wi, wo, bsdf=bsdf):
-            return [v * wo.z for v in bsdf.value(wi, wo)]
-
-        psnr.append(SphereView(source, types, side=48, samples=32).psnr(value))
-        albedo = energy.albedos([source.value, value], source, types, cos)
-        excess.append(((albedo[1] - albedo[0]) / np.maximum(albedo[0], 1e-3)).max())
-        moments += [mixture.second_moment(source.value, mixed, source, types, float(c), 2**13) for c in cos[[0, 3, 6]]]
-    return {
-        "psnr_db": float(np.mean(psnr)),
-        "psnr_median_db": float(np.median(psnr)),
-        "psnr_minimum_db": float(np.min(psnr)),
-        "albedo_excess": float(np.max(excess)),
-        "sample_weight_moment": float(np.mean(moments)),
-    }

@@ -12,7 +12,8 @@ import numpy as np
 from ...indirection import device_array
 from . import energy, mixture
 from .family import SAMPLING_NODES, FamilyMember, grid, nodes_of, widths
-from .family_truth import FamilyTruth, points
+from .family_truth import FamilyTruth, constants, points
+from .measurement import cosine
 
 #: Factors of the widths of the proxy's lobes that are tried for the lobes that sample.
 FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
@@ -22,11 +23,6 @@ MIXTURE_SAMPLES, ENERGY_SAMPLES, ANGLES = 1024, 2048, 2
 
 #: Members between nodes at which the energy is limited, for each node.
 BETWEEN = 3
-
-
-def constants(types, coordinates) -> list:
-    """Return coordinates of one member as arrays that no kernel contains."""
-    return [dr.opaque(types.Float, float(x)) for x in coordinates]
 
 
 def fitted_mixture(truth: FamilyTruth, member_at: Callable, types, isotropic: bool) -> tuple[tuple, np.ndarray]:
@@ -73,10 +69,7 @@ def fitted_scale(truth: FamilyTruth, member_at: Callable, types, azimuths: tuple
 
         bsdf = FamilyMember(bsdf.form, bsdf.residual, bsdf.proxy, factor, bsdf.scale)
 
-        def value(wi, wo):
-            return [v * wo.z for v in bsdf.value(wi, wo)]
-
-        return energy.fitted_scale(value, source, types, azimuths, ANGLES, ENERGY_SAMPLES)
+        return energy.fitted_scale(cosine(bsdf), source, types, azimuths, ANGLES, ENERGY_SAMPLES)
 
     for index, coordinates in zip(np.ndindex(nodes), grid(nodes), strict=True):
         scale[(slice(None), *index)] *= fitted(coordinates)

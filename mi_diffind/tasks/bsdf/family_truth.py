@@ -116,6 +116,11 @@ def points(count: int, dims: int, seed: int) -> np.ndarray:
     return np.clip(1.08 * x - 0.04, 0, 1)
 
 
+def constants(types, numbers) -> list:
+    """Return numbers, as of the parameters of one member, as arrays that no kernel contains."""
+    return [dr.opaque(types.Float, float(x)) for x in numbers]
+
+
 class FamilySamples(Samples):
     """Samples of members of a family; ``coordinates`` are those of their parameters."""
 

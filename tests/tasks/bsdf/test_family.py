@@ -12,7 +12,7 @@ import mi_diffind
 from mi_diffind.errors import UsageError
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
-from mi_diffind.tasks.bsdf import TASK, family_fit, family_sampling, family_truth, training
+from mi_diffind.tasks.bsdf import TASK, family_fit, family_measurement, family_sampling, family_truth, training
 from mi_diffind.tasks.bsdf.family import Parameter, sizes_of
 
 MEMBERS = ((0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9))
@@ -122,7 +122,7 @@ def test_a_family_of_conductors_is_fitted(types, monkeypatch, tmp_path):
     """A file stands for all roughnesses of its range, and the source is left as it was."""
     for module, name, value in (
         (family_fit, "SAMPLES", 2**15), (family_fit, "VALIDATION", 2**13), (family_fit, "MEMBERS", 16),
-        (family_fit, "VIEWS", 2), (family_fit, "FINAL_VIEWS", 3), (training, "STARTS", 1),
+        (family_fit, "VIEWS", 2), (family_measurement, "MEMBERS", 3), (training, "STARTS", 1),
         (family_sampling, "BETWEEN", 1), (family_sampling, "ENERGY_SAMPLES", 512),
         (family_sampling, "MIXTURE_SAMPLES", 256), (family_sampling, "FACTORS", (0.7, 1.0)),
         (training, "PROXY", dataclasses.replace(training.PROXY, steps=60, batch=2**11)),
@@ -138,7 +138,9 @@ def test_a_family_of_conductors_is_fitted(types, monkeypatch, tmp_path):
     assert measured["psnr_minimum_db"] > 45 and measured["psnr_db"] >= measured["psnr_minimum_db"]
     assert measured["albedo_excess"] < 5e-3 and measured["sample_weight_moment"] < 1.2
     assert float(mi.traverse(source)["alpha.value"][0]) == pytest.approx(0.2)
-    saved = TASK.load(fitted.save(tmp_path / "a.npz"))
+    with pytest.raises(TableError, match="was fitted to an object in memory"):
+        mi_diffind.open(fitted.save(tmp_path / "a.npz")).measure()
+    saved = TASK.load(tmp_path / "a.npz")
     assert saved.nbytes < 6000 and saved.settings["family"] == [{"name": "alpha", "low": 0.1, "high": 0.4}]
 
 
