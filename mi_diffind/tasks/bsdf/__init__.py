@@ -104,6 +104,14 @@ class BSDFTask(Task):
 
         return fit_family(request)
 
+    def usage(self, table, file):
+        lines = super().usage(table, file)
+        for parameter in table.settings.get("family", ()):
+            low, high = parameter["low"], parameter["high"]
+            comment = f"<!-- or a texture, {low:g} to {high:g} -->"
+            lines.insert(-1, f'    <float name="{parameter["name"]}" value="{low:g}"/>  {comment}')
+        return lines
+
     def load(self, path):
         from ...tables import load_table
 

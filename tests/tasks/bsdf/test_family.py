@@ -138,6 +138,7 @@ def test_a_family_of_conductors_is_fitted(types, monkeypatch, tmp_path):
     assert measured["psnr_minimum_db"] > 45 and measured["psnr_db"] >= measured["psnr_minimum_db"]
     assert measured["albedo_excess"] < 5e-3 and measured["sample_weight_moment"] < 1.2
     assert float(mi.traverse(source)["alpha.value"][0]) == pytest.approx(0.2)
+    assert '<float name="alpha" value="0.1"/>  <!-- or a texture, 0.1 to 0.4 -->' in "\n".join(fitted.summary())
     with pytest.raises(TableError, match="was fitted to an object in memory"):
         mi_diffind.open(fitted.save(tmp_path / "a.npz")).measure()
     saved = TASK.load(tmp_path / "a.npz")
