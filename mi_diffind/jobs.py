@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import ctypes
 import os
 import pickle
 import queue
@@ -26,6 +27,12 @@ from .progress import progress_bar
 
 #: Processes that may be lost with a job, one after the other, before the job has failed.
 ATTEMPTS = 3
+
+#: Least number of threads of a process: with a single one, Mitsuba waits forever for the content of an EXR file.
+THREADS = 2
+
+#: Option of Linux's ``prctl``.
+PR_SET_PDEATHSIG = 1
 
 #: Seconds between two looks at Ctrl-C, and seconds until a Dask scheduler counts as out of reach.
 POLL, TIMEOUT = 0.2, 20
@@ -146,6 +153,8 @@ class WorkerProcess:
 def serve(descriptor: int, threads: int, idle: float | None) -> None:
     """Carry out the jobs that a :class:`WorkerProcess` sends, in its process."""
     pipe, jobs = Connection(descriptor), queue.SimpleQueue()
+    if sys.platform == "linux":  # the kernel ends this process with the other one, whatever it is busy with
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
     def receive() -> None:
         try:
@@ -173,7 +182,7 @@ def serve(descriptor: int, threads: int, idle: float | None) -> None:
 
 
 def _in_processes(function, jobs: Mapping[str, object], workers: int, stop: threading.Event) -> Iterator[Outcome]:
-    threads = max(1, (os.cpu_count() or 1) // workers)
+    threads = max(THREADS, (os.cpu_count() or 1) // workers)
     left = collections.deque((name, 1) for name in jobs)
     idle: list[WorkerProcess] = []
     running: dict[Connection, tuple[WorkerProcess, str, int]] = {}
@@ -219,7 +228,7 @@ def _beside(name: str, function, value, slots: Mapping[str, int]) -> Outcome:
     import distributed
 
     host = distributed.get_worker().address.rpartition(":")[0]
-    threads = max(1, (os.cpu_count() or 1) // slots.get(host, 1))
+    threads = max(THREADS, (os.cpu_count() or 1) // slots.get(host, 1))
     for _ in range(ATTEMPTS):
         process = getattr(_spare, "process", None)
         if process is None or process.process.poll() is not None:
