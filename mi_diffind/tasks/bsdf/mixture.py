@@ -38,27 +38,10 @@ def fitted_mixture(truth, types, isotropic: bool, seed: int = 3) -> tuple[tuple[
     They minimise the mean square of the weights f cos θ / p of a sample, whose lower bound is the squared albedo.
     Each node's weights sum to 1.
     """
-    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
-    node = dr.arange(types.UInt32, NODES * SAMPLES) // SAMPLES
-    cos = dr.gather(types.Float, types.Float(cosines(NODES).astype(np.float32)), node)
-    sin = dr.sqrt(1 - dr.square(cos))
-    azimuth = incident(rng, types, NODES * SAMPLES, isotropic)
-    r = dr.rsqrt(dr.maximum(dr.square(azimuth.x) + dr.square(azimuth.y), 1e-12))
-    wi = types.Array3f(sin * azimuth.x * r, sin * azimuth.y * r, cos)
-    s = outgoing(rng, types, wi, truth)
-    with dr.suspend_grad():
-        value = truth.value(s.wi, s.wo)
-        mean = (value[0] + value[1] + value[2]) / 3
-        lobes = [density_ggx(s.wi, s.wo, types.Float(a), types.Float(a)) for a in CANDIDATES]
-        columns = [s.weight, mean, s.wo.z * dr.inv_pi, *lobes]
-        dr.eval(columns)
-    weight, mean, *densities = (np.asarray(c.numpy(), np.float64).reshape(NODES, SAMPLES) for c in columns)
-    square = weight * mean**2
-    square /= np.maximum(square.mean(axis=1, keepdims=True), 1e-30)
-    densities = np.stack(densities)
+    densities, square = candidate_densities(truth, types, isotropic, CANDIDATES, SAMPLES, seed)
     best = None
     for pair in itertools.combinations(range(len(CANDIDATES)), 2):
-        weights, cost = _weights(densities[[0, 1 + pair[0], 1 + pair[1]]], square)
+        weights, cost = optimal_weights(densities[[0, 1 + pair[0], 1 + pair[1]]], square)
         total = float(np.mean(np.log(cost)))
         if best is None or total < best[0]:
             best = total, pair, weights
@@ -66,7 +49,32 @@ def fitted_mixture(truth, types, isotropic: bool, seed: int = 3) -> tuple[tuple[
     return tuple(CANDIDATES[k] for k in pair), weights
 
 
-def _weights(densities: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def candidate_densities(truth, types, isotropic: bool, alphas, size: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return densities of the cosine and of lobes of roughness ``alphas``, ``(1 + K, NODES, size)``, and f²/density.
+
+    The squares, of ``size`` samples of a source at each of :data:`NODES` cosines, have a mean of 1 at each.
+    """
+    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
+    node = dr.arange(types.UInt32, NODES * size) // size
+    cos = dr.gather(types.Float, types.Float(cosines(NODES).astype(np.float32)), node)
+    sin = dr.sqrt(1 - dr.square(cos))
+    azimuth = incident(rng, types, NODES * size, isotropic)
+    r = dr.rsqrt(dr.maximum(dr.square(azimuth.x) + dr.square(azimuth.y), 1e-12))
+    wi = types.Array3f(sin * azimuth.x * r, sin * azimuth.y * r, cos)
+    s = outgoing(rng, types, wi, truth)
+    with dr.suspend_grad():
+        value = truth.value(s.wi, s.wo)
+        mean = (value[0] + value[1] + value[2]) / 3
+        lobes = [density_ggx(s.wi, s.wo, types.Float(a), types.Float(a)) for a in alphas]
+        columns = [s.weight, mean, s.wo.z * dr.inv_pi, *lobes]
+        dr.eval(columns)
+    weight, mean, *densities = (np.asarray(c.numpy(), np.float64).reshape(NODES, size) for c in columns)
+    square = weight * mean**2
+    square /= np.maximum(square.mean(axis=1, keepdims=True), 1e-30)
+    return np.stack(densities), square
+
+
+def optimal_weights(densities: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of three densities, ``(NODES, 3)``, that minimise E[f²/p], and that mean."""
     weights = np.full((densities.shape[1], 3), 1 / 3)
     for _ in range(ITERATIONS):
