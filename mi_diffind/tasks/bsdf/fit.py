@@ -71,12 +71,13 @@ def fit_truth(truth: Truth, request: FitRequest) -> Fitted:
     result = request.train(problem)
     bsdf = LearnedBSDF.of(form, problem.net.rounded())
 
-    alphas, weights = mixture.fitted_mixture(truth, types, isotropic)
+    stretch = form.scale[1] / form.scale[0]
+    lobes, weights = mixture.fitted_mixture(truth, types, isotropic, stretch)
     scale, raw = None, view.psnr(cosine(bsdf))
     if options["energy"] == "source":
         azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
         scale = energy.fitted_scale(cosine(bsdf), truth, types, azimuths)
-    table = to_table(problem.net, form, alphas, weights, scale, {
+    table = to_table(problem.net, form, lobes, weights, scale, {
         **request.recorded(result), "source": truth.digest, "name": truth.name, "symmetry": symmetries,
         "structure": dataclasses.asdict(structure),
     })  # fmt: skip

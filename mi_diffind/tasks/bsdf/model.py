@@ -6,14 +6,14 @@ the angle θ_d between h and either direction,
     f(wi, wo) = proxy(wi, wo) · exp(C[P₁(u, v), P₂(v, w)]).
 
 The *proxy* is the sum of a Lambertian lobe with an edge term, ρ/π (1 + (e − 1)(1 − cos θ_i)⁵)(1 + (e − 1)(1 − cos
-θ_o)⁵), and of two microfacet lobes D V F. D is the generalised Trowbridge–Reitz distribution of exponent γ (Burley
-2012, appendix B; γ = 2 is GGX), V Smith's masking over 4 cos θ_i cos θ_o, and F = F₀ + (F₉₀ − F₀)(1 − cos θ_d)⁵ with
-free F₀ and F₉₀.
+θ_o)⁵), and of two microfacet lobes D V F. D ∝ cos⁻⁴θ_h (1 + 2 tan²θ_h/(γα²))^−γ is Student's distribution of slopes
+(Ribardière et al. 2017): GGX of roughness α for γ = 2, Beckmann's of roughness α/√2 for large γ. V is Smith's masking of GGX over 4 cos θ_i cos θ_o, and F = F₀ + (F₉₀ − F₀)(1 − cos θ_d)⁵ with free F₀ and
+F₉₀.
 
 The *residual* is an indirection (two primary arrays, one cascaded array) in three coordinates in [0, 1]:
 
-- u = log(1 + t) / log(1 + 1/a²), t = h_x²/a_x² + h_y²/a_y², where a = α/√γ of the narrowest lobe: entries are dense in
-  the peak;
+- u = log(1 + t) / log(1 + 1/a²), t = h_x²/a_x² + h_y²/a_y², where a = α of the narrowest lobe: entries are dense in the
+  peak;
 - v = √(1 − cos θ_d), nearly linear in θ_d;
 - w = cos²φ_d = (cos θ_i − cos θ_o)² / (4 sin²θ_h sin²θ_d), φ_d the azimuth of ``wi`` about h (Rusinkiewicz 1998).
 
@@ -36,6 +36,9 @@ from ...lookup import clamp
 
 #: Smallest roughness of a lobe, and smallest scale of the coordinate u.
 ALPHA_MIN = 1e-3
+
+#: Least squared cosine of the half vector that counts in the proxy: at 0, lobes with γ < 2 are infinite.
+LEAST_COS2 = 1e-6
 
 #: Parameters of the proxy: 3 of the diffuse colour, 1 edge, and for each of two lobes α_u, α_v, γ/2, F₀ and F₉₀ (RGB).
 DIFFUSE, EDGE, LOBE, PARAMETERS = slice(0, 3), 3, 9, 22
@@ -75,8 +78,8 @@ class Form:
 class DirectionPair:
     """Terms that the proxy and the coordinates share; all are even in exchanging ``wi`` and ``wo``.
 
-    ``hx2``, ``hy2`` and ``hz2`` are the squared components of the half vector, which sum to 1; ``cos_d`` = cos θ_d;
-    ``schlick`` = (1 − cos θ_d)⁵.
+    ``hx2``, ``hy2`` and ``hz2`` are the squared components of the half vector, which sum to 1, and ``log_hz2`` the
+    logarithm (base 2) of the last; ``cos_d`` = cos θ_d; ``schlick`` = (1 − cos θ_d)⁵.
     """
 
     wi: object
@@ -85,6 +88,7 @@ class DirectionPair:
     hx2: object
     hy2: object
     hz2: object
+    log_hz2: object
     cos_d: object
     schlick: object
 
@@ -94,7 +98,7 @@ class DirectionPair:
         h2 = dr.squared_norm(half)
         inverse, cos_d = dr.rcp(h2), dr.minimum(0.5 * dr.sqrt(h2), 1)
         x, y, z = (dr.square(c) * inverse for c in half)
-        return cls(wi, wo, half, x, y, z, cos_d, _fifth(1 - cos_d))
+        return cls(wi, wo, half, x, y, z, dr.log2(dr.maximum(z, LEAST_COS2)), cos_d, _fifth(1 - cos_d))
 
 
 def half_vector(wi, wo):
@@ -119,8 +123,12 @@ class ProxyLobe:
 
     def value(self, g: DirectionPair) -> list:
         """Return D V F, three arrays."""
-        slope = dr.fma(g.hx2, dr.rcp(dr.square(self.alpha_u)), dr.fma(g.hy2, dr.rcp(dr.square(self.alpha_v)), g.hz2))
-        d = dr.exp2(-self.gamma * dr.log2(slope)) * dr.rcp(dr.pi * self.alpha_u * self.alpha_v)
+        # q / cos²θ_h = 1 + 2 tan²θ_h / (γα²)
+        spread = dr.fma(g.hx2, dr.rcp(dr.square(self.alpha_u)), g.hy2 * dr.rcp(dr.square(self.alpha_v)))
+        q = dr.fma(spread, 2 * dr.rcp(self.gamma), g.hz2)
+        d = dr.exp2(dr.fma(self.gamma - 2, g.log_hz2, -self.gamma * dr.log2(q))) * dr.rcp(
+            dr.pi * self.alpha_u * self.alpha_v
+        )
         d = d * dr.rcp(masking(g.wi, self.alpha_u, self.alpha_v) * masking(g.wo, self.alpha_u, self.alpha_v))
         return [d * dr.fma(edge - normal, g.schlick, normal) for normal, edge in zip(self.f0, self.f90, strict=True)]
 

@@ -36,7 +36,7 @@ RATE = 0.3
 QUANTILE, MARGIN = 0.998, 0.25
 
 #: Least residual range, and the value relative to the mean below which a source counts as black.
-LEAST, DARK = 0.05, 1e-5
+LEAST, DARK = 0.05, 1e-3
 
 #: Share of the training after which entries are rounded to bytes in each step.
 ROUNDED = 0.5
@@ -136,11 +136,7 @@ def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: 
         a = 4 + k * LOBE
         if logarithms[a + 3 : a + 9].max() > BLACK:
             terms.append(name)
-            gamma = math.sqrt(2 * values[a + 2])
-            # GGX of this roughness is as wide as the lobe of exponent γ where half of the peak is reached
-            scales.append(
-                [float(np.clip(values[a + i] * math.sqrt(2) / gamma, 1e-3, 1)) for i in (0, 0 if isotropic else 1)]
-            )
+            scales.append([float(np.clip(values[a + i], 1e-3, 1)) for i in (0, 0 if isotropic else 1)])
     scale = min(scales, key=min) if scales else [1.0, 1.0]
     form = Form(tuple(terms), isotropic, azimuth, tuple(scale))
     return dataclasses.replace(form, range=residual_range(form, logarithms, samples))
