@@ -7,8 +7,8 @@ the angle θ_d between h and either direction,
 
 The *proxy* is the sum of a Lambertian lobe with an edge term, ρ/π (1 + (e − 1)(1 − cos θ_i)⁵)(1 + (e − 1)(1 − cos
 θ_o)⁵), and of two microfacet lobes D V F. D ∝ cos⁻⁴θ_h (1 + 2 tan²θ_h/(γα²))^−γ is Student's distribution of slopes
-(Ribardière et al. 2017): GGX of roughness α for γ = 2, Beckmann's of roughness α/√2 for large γ. V is Smith's masking of GGX over 4 cos θ_i cos θ_o, and F = F₀ + (F₉₀ − F₀)(1 − cos θ_d)⁵ with free F₀ and
-F₉₀.
+(Ribardière et al. 2017): GGX of roughness α for γ = 2, Beckmann's of roughness α/√2 for large γ. V is Smith's masking
+of GGX over 4 cos θ_i cos θ_o, and F = F₀ + (F₉₀ − F₀)(1 − cos θ_d)⁵ with free F₀ and F₉₀.
 
 The *residual* is an indirection (two primary arrays, one cascaded array) in three coordinates in [0, 1]:
 
