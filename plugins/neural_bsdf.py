@@ -128,6 +128,7 @@ class NeuralBSDF(mi.BSDF):
             self.model.arrays.pop("energy", None)
             self.model.refresh()
         self.proxy = _parameters(self.model) if self.model.form.terms else {}
+        self._compute_constants()
 
         side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
         flags = mi.BSDFFlags.GlossyReflection | side
@@ -154,13 +155,22 @@ class NeuralBSDF(mi.BSDF):
 
     def parameters_changed(self, keys: list[str] = ()):
         tables.check_shapes(tables.exposed(self._arrays()))
+        self._compute_constants()
 
     def _bsdf(self):
         """Return the BSDF with the present parameters of the proxy."""
         bsdf = self.model.bsdf
         if self.proxy:
-            bsdf.proxy = _proxy(self.proxy, self.model.form)
+            attached = dr.grad_enabled(list(self.proxy.values()))
+            bsdf.proxy = _proxy(self.proxy, self.model.form) if attached else self.constants
         return bsdf
+
+    def _compute_constants(self):
+        """Compute what depends on the parameters of the proxy alone, once for all lanes."""
+        if self.proxy:
+            with dr.suspend_grad():
+                self.constants = dr.detach(_proxy(self.proxy, self.model.form))
+                dr.make_opaque(self.constants)
 
     def _prepare(self, ctx, wi, wo, active):
         """Return both directions on the front side, and the mask of lanes whose result counts."""
@@ -175,14 +185,14 @@ class NeuralBSDF(mi.BSDF):
 
     def _value(self, si, wi, wo, active):
         """Return f cos θ_o."""
-        rgb = self._bsdf().value(wi, wo, active)
+        rgb = self._bsdf().value(wi, wo)
         factor = wo.z * clamp(self.scale, 0.0, 1.0)
         value = _spectrum([v * factor for v in rgb], si.wavelengths)
         return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
 
     def _density(self, wi, wo, active):
         with dr.suspend_grad():
-            return dr.detach(dr.select(active, self.model.mixture.density(wi, wo, active), 0))
+            return dr.detach(dr.select(active, self.model.mixture.density(wi, wo), 0))
 
     def eval(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(ctx, si.wi, wo, active)
@@ -199,7 +209,7 @@ class NeuralBSDF(mi.BSDF):
         up = mi.Vector3f(0, 0, 1)
         wi, _, active = self._prepare(ctx, si.wi, dr.select(si.wi.z < 0, -up, up) if self.two_sided else up, active)
         with dr.suspend_grad():
-            wo = dr.detach(self.model.mixture.sample(wi, sample1, sample2.x, sample2.y, active))
+            wo = dr.detach(self.model.mixture.sample(wi, sample1, sample2.x, sample2.y))
             active = active & (wo.z > 0) & (dr.squared_norm(wo) < 2)
             wo = dr.select(active, wo, up)
         pdf = self._density(wi, wo, active)
@@ -276,16 +286,16 @@ def _proxy(parameters: dict, form) -> Proxy:
     def limited(value):
         return clamp(value, low, high)
 
-    lobes = {}
+    lobes = []
     for name in TERMS[1:]:
         if name in form.terms:
-            axes = ("alpha_u", "alpha_u" if form.isotropic else "alpha_v")
-            alphas = [clamp(parameters[f"{name}.{axis}"], ALPHA_MIN, 1.0) for axis in axes]
+            axes = ("alpha_u",) if form.isotropic else ("alpha_u", "alpha_v")
+            alphas = tuple(clamp(parameters[f"{name}.{axis}"], ALPHA_MIN, 1.0) for axis in axes)
             colours = [[limited(c) for c in parameters[f"{name}.{key}"]] for key in ("f0", "f90")]
-            lobes[name] = ProxyLobe(*alphas, limited(parameters[f"{name}.gamma"]), *colours)
+            lobes.append(ProxyLobe(alphas, limited(parameters[f"{name}.gamma"]), *colours))
     if "diffuse" not in form.terms:
-        return Proxy(None, None, lobes)
-    return Proxy([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
+        return Proxy.of_parts(None, None, lobes)
+    return Proxy.of_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
 
 
 def _stored(parameters: dict) -> DifferentiableArray:

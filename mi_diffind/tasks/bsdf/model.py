@@ -113,60 +113,93 @@ def _fifth(x):
 
 @dataclass
 class ProxyLobe:
-    """Microfacet lobe of the proxy; roughness, exponent, and colours as lists of three arrays."""
+    """Microfacet lobe of the proxy: one or two roughnesses, exponent, and colours of three arrays each."""
 
-    alpha_u: object
-    alpha_v: object
+    alphas: tuple
     gamma: object
     f0: list
     f90: list
 
+    def constants(self) -> LobeConstants:
+        """Return what does not depend on directions."""
+        squares = tuple(map(dr.square, self.alphas))
+        return LobeConstants(
+            squares,
+            tuple(2 * dr.rcp(self.gamma * square) for square in squares),
+            self.gamma,
+            self.gamma - 2,
+            dr.inv_pi * dr.rcp(self.alphas[0] * self.alphas[-1]),
+            self.f0,
+            [edge - normal for normal, edge in zip(self.f0, self.f90, strict=True)],
+        )
+
+
+@dataclass
+class LobeConstants:
+    """Constants of a microfacet lobe: α² and 2/(γα²), γ, γ − 2, 1/(π α_u α_v), F₀ and F₉₀ − F₀."""
+
+    squares: tuple
+    slopes: tuple
+    gamma: object
+    excess: object
+    peak: object
+    f0: list
+    edge: list
+
     def value(self, g: DirectionPair) -> list:
         """Return D V F, three arrays."""
         # q / cos²θ_h = 1 + 2 tan²θ_h / (γα²)
-        spread = dr.fma(g.hx2, dr.rcp(dr.square(self.alpha_u)), g.hy2 * dr.rcp(dr.square(self.alpha_v)))
-        q = dr.fma(spread, 2 * dr.rcp(self.gamma), g.hz2)
-        d = dr.exp2(dr.fma(self.gamma - 2, g.log_hz2, -self.gamma * dr.log2(q))) * dr.rcp(
-            dr.pi * self.alpha_u * self.alpha_v
-        )
-        d = d * dr.rcp(masking(g.wi, self.alpha_u, self.alpha_v) * masking(g.wo, self.alpha_u, self.alpha_v))
-        return [d * dr.fma(edge - normal, g.schlick, normal) for normal, edge in zip(self.f0, self.f90, strict=True)]
+        if len(self.slopes) == 1:
+            q = dr.fma(g.hx2 + g.hy2, self.slopes[0], g.hz2)
+        else:
+            q = dr.fma(g.hx2, self.slopes[0], dr.fma(g.hy2, self.slopes[1], g.hz2))
+        d = dr.exp2(dr.fma(self.excess, g.log_hz2, -self.gamma * dr.log2(q))) * self.peak
+        d = d * dr.rcp(masking(g.wi, *self.squares) * masking(g.wo, *self.squares))
+        return [d * dr.fma(edge, g.schlick, normal) for normal, edge in zip(self.f0, self.edge, strict=True)]
 
 
-def masking(w, alpha_u, alpha_v):
-    """Return d(w), the denominator of Smith's masking G₁(w) = 2 cos θ / d(w); at least the smaller roughness."""
-    projected = dr.square(alpha_u * w.x) + dr.square(alpha_v * w.y)
-    return w.z + dr.sqrt(dr.fma(w.z, w.z, projected))
+def masking(w, square_u, square_v=None):
+    """Return d(w), the denominator of Smith's masking G₁(w) = 2 cos θ / d(w), for one or two squared roughnesses."""
+    z2 = dr.square(w.z)
+    if square_v is None:
+        return w.z + dr.sqrt(dr.fma(z2, 1 - square_u, square_u))
+    return w.z + dr.sqrt(dr.fma(square_u, dr.square(w.x), dr.fma(square_v, dr.square(w.y), z2)))
 
 
 @dataclass
 class Proxy:
-    """Analytic proxy: ``diffuse`` (three arrays) and ``edge``, and microfacet ``lobes`` by name."""
+    """Analytic proxy: ``diffuse`` (three arrays, over π) and ``edge`` less 1, and constants of microfacet lobes."""
 
     diffuse: list | None
     edge: object
-    lobes: dict[str, ProxyLobe]
+    lobes: list[LobeConstants]
 
     @classmethod
     def of(cls, logarithms: list, form: Form) -> Proxy:
         """Return the proxy of :data:`PARAMETERS` logarithms, arrays."""
         values = [dr.exp(clamp(x, *LOGARITHMS)) for x in logarithms]
-        lobes = {}
+        lobes = []
         for k, name in enumerate(TERMS[1:]):
             a = 4 + k * LOBE
             if name in form.terms:
-                alphas = [dr.clip(values[a + i], ALPHA_MIN, 1) for i in (0, 0 if form.isotropic else 1)]
-                lobes[name] = ProxyLobe(*alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9])
-        return cls(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
+                alphas = tuple(dr.clip(x, ALPHA_MIN, 1) for x in values[a : a + (1 if form.isotropic else 2)])
+                lobes.append(ProxyLobe(alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9]))
+        return cls.of_parts(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
+
+    @classmethod
+    def of_parts(cls, diffuse: list | None, edge, lobes: list[ProxyLobe]) -> Proxy:
+        """Return the proxy of an albedo (``None``: no diffuse lobe), its factor at the horizon, and lobes."""
+        if diffuse is not None:
+            diffuse, edge = [dr.inv_pi * c for c in diffuse], edge - 1
+        return cls(diffuse, edge, [lobe.constants() for lobe in lobes])
 
     def value(self, g: DirectionPair) -> list:
         """Return the proxy, without the cosine, three arrays."""
         result = [0, 0, 0]
         if self.diffuse is not None:
-            k = self.edge - 1
-            shape = dr.fma(k, _fifth(1 - g.wi.z), 1) * dr.fma(k, _fifth(1 - g.wo.z), 1) * dr.inv_pi
+            shape = dr.fma(self.edge, _fifth(1 - g.wi.z), 1) * dr.fma(self.edge, _fifth(1 - g.wo.z), 1)
             result = [colour * shape for colour in self.diffuse]
-        for lobe in self.lobes.values():
+        for lobe in self.lobes:
             result = [a + b for a, b in zip(result, lobe.value(g), strict=True)]
         return result
 
@@ -223,7 +256,7 @@ class LearnedBSDF:
 
     def coordinates(self, g: DirectionPair) -> list:
         """Return u, v and w."""
-        return [coordinate_u(g, self.form.scale), dr.sqrt(dr.maximum(1 - g.cos_d, 0)), coordinate_w(g, self.form)]
+        return [coordinate_u(g, self.form.scale), dr.sqrt(1 - g.cos_d), coordinate_w(g, self.form)]
 
     def value(self, wi, wo, active=True) -> list:
         """Return f without the cosine, three arrays, for unit directions above the surface."""
@@ -234,25 +267,29 @@ class LearnedBSDF:
             result = [scale * v for v in result]
         if self.residual is None:
             return result
-        low, high = self.form.range
+        low, step = fourth_roots(self.form.range)
         numbers = self.residual(self.coordinates(g), active)
-        factors = [dr.exp(dr.fma(clamp(x, 0, 1), high - low, low)) for x in numbers]
+        factors = [dr.square(dr.square(dr.fma(x, step, low))) for x in numbers]
         return [a * b for a, b in zip(result, factors, strict=True)]
 
 
+def fourth_roots(limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the fourth root of the least factor, and how much larger that of the largest is."""
+    low, high = (math.exp(x / 4) for x in limits)
+    return low, high - low
+
+
 def coordinate_u(g: DirectionPair, scale: tuple[float, float]):
-    """Return u in [0, 1], the coordinate of the half vector."""
+    """Return u, the coordinate of the half vector; at most 1 but for rounding."""
     t = dr.fma(g.hx2, scale[0] ** -2, g.hy2 * scale[1] ** -2)
-    return dr.minimum(dr.log2(1 + t) * (1 / math.log2(1 + min(scale) ** -2)), 1)
+    return dr.log2(1 + t) * (1 / math.log2(1 + min(scale) ** -2))
 
 
 def coordinate_w(g: DirectionPair, form: Form):
-    """Return w in [0, 1], the coordinate of the azimuth φ_d; 0 where the azimuth is undefined."""
-    sin2_h, sin2_d = g.hx2 + g.hy2, dr.maximum(1 - dr.square(g.cos_d), 0)
+    """Return w, the coordinate of the azimuth φ_d; where it is undefined, any number that reads as one in [0, 1]."""
+    sin2_h, sin2_d = g.hx2 + g.hy2, 1 - dr.square(g.cos_d)
     if form.azimuth == "mirror":
-        product = 4 * sin2_h * sin2_d
-        ratio = dr.square(g.wi.z - g.wo.z) * dr.rcp(dr.maximum(product, 1e-12))
-        return dr.select(product > 1e-12, dr.minimum(ratio, 1), 0)
+        return dr.square(g.wi.z - g.wo.z) * dr.rcp(dr.maximum(4 * sin2_h * sin2_d, 1e-12))
     # tan φ_d from components of wi along the tangents of h: towards the normal, and perpendicular to both
     along = 0.5 * (g.wo.z - g.wi.z)
     across = (g.wo.x * g.wi.y - g.wo.y * g.wi.x) * 0.5 * dr.rcp(dr.maximum(g.cos_d, 1e-6))

@@ -40,7 +40,7 @@ def density_ggx(wi, wo, alpha_u, alpha_v, gamma=None):
     With ``gamma``, the density if its number v is first mapped by :func:`shortened`.
     """
     half = half_vector(wi, wo)
-    inverse, visible = dr.rcp(dr.squared_norm(half)), masking(wi, alpha_u, alpha_v)
+    inverse, visible = dr.rcp(dr.squared_norm(half)), masking(wi, dr.square(alpha_u), dr.square(alpha_v))
     slope = inverse * (dr.square(half.x / alpha_u) + dr.square(half.y / alpha_v) + dr.square(half.z))
     density = dr.rcp(2 * dr.pi * alpha_u * alpha_v * dr.square(slope) * visible)
     if gamma is None:

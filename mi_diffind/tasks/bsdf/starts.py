@@ -27,7 +27,7 @@ def starts(samples: Samples, types, count: int) -> list[np.ndarray]:
     with dr.suspend_grad():
         for alpha, exponent in shapes:
             a, one = types.Float(alpha), [types.Float(1)] * 3
-            value = s.wo.z * ProxyLobe(a, a, types.Float(exponent), one, one).value(g)[0]
+            value = s.wo.z * ProxyLobe((a,), types.Float(exponent), one, one).constants().value(g)[0]
             columns += [value * (1 - g.schlick), value * g.schlick]
         dr.eval(columns, s.weight, s.value)
     weight = s.weight.numpy().astype(np.float64)

@@ -12,7 +12,7 @@ import numpy as np
 from ...fitting import Problem, fit
 from ...indirection import DifferentiableArray
 from ...settings import FitSettings
-from .model import BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, ResidualSizes
+from .model import BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, ResidualSizes, fourth_roots
 from .pool import Samples, incident, outgoing
 from .starts import starts
 from .view import SphereView
@@ -178,8 +178,8 @@ def residual_problem(
 ) -> BSDFProblem:
     """Return the problem of training proxy and residual together, which starts from the proxy alone."""
     types = module_types(samples)
-    low, high = form.range
-    start = float(np.clip(-low / (high - low), 0, 1))
+    low, step = fourth_roots(form.range)
+    start = float(np.clip((1 - low) / step, 0, 1))
     proxy = proxy_array(logarithms, RATE) if form.terms else None
     net = BSDFArrays(structure.residual(start, form.azimuth), proxy, RATE).alloc(types.TensorXf)
 
