@@ -74,7 +74,7 @@ class NeuralBSDF(mi.BSDF):
 
      * - first.alpha_u, first.alpha_v, first.gamma, first.f0, first.f90; second.…
        - |float|, |float|, |float|, |spectrum|, |spectrum|
-       - Roughness, exponent (2: GGX), and reflectance at normal and grazing incidence of the proxy's microfacet lobes.
+       - Roughness, exponent (2: GGX; large: Beckmann's distribution), and reflectance at normal and grazing incidence of the proxy's microfacet lobes.
          Of isotropic files, ``alpha_u`` alone counts.
        - |exposed|, |differentiable|
 
@@ -83,8 +83,8 @@ class NeuralBSDF(mi.BSDF):
        - The entries of the residual's arrays.
        - |exposed|, |differentiable|
 
-    Any reflecting BSDF in two kilobytes: an analytic proxy (a diffuse lobe and two microfacet lobes) times the
-    exponential of a residual that is read by *differentiable indirection* (Datta et al., *Efficient Graphics
+    Any reflecting BSDF in two kilobytes: an analytic proxy (a diffuse lobe and two microfacet lobes) times
+    the fourth power of a residual that is read by *differentiable indirection* (Datta et al., *Efficient Graphics
     Representation with Differentiable Indirection*, SIGGRAPH Asia 2023). ``mi-diffind fit bsdf`` makes the file of a
     material of a scene, of any of Mitsuba's BSDFs, or of measured data.
 

@@ -89,8 +89,8 @@ def formula(table: Table, wi, wo) -> np.ndarray:
     v = np.sqrt(1 - cos_d)
     first = interpolated(arrays["primary_uv"], np.stack([u, v], axis=1))
     second = interpolated(arrays["primary_vw"], np.stack([v, w], axis=1))
-    low, high = form["range"]
-    value *= np.exp(low + (high - low) * interpolated(arrays["cascaded"], np.concatenate([first, second], axis=1)))
+    low, high = np.exp(np.array(form["range"]) / 4)
+    value *= (low + (high - low) * interpolated(arrays["cascaded"], np.concatenate([first, second], axis=1))) ** 4
     for direction in (wi, wo):
         value *= interpolated(arrays["energy"], np.sqrt(direction[:, 2:]))
     return value

@@ -1,9 +1,12 @@
-"""Reflecting BSDF as an analytic proxy times the exponential of a learned residual.
+"""Reflecting BSDF as an analytic proxy times a learned residual.
 
 In the local frame, with the normal (0, 0, 1), directions ``wi`` and ``wo`` above the surface, their half vector h, and
 the angle θ_d between h and either direction,
 
-    f(wi, wo) = proxy(wi, wo) · exp(C[P₁(u, v), P₂(v, w)]).
+    f(wi, wo) = proxy(wi, wo) · (a + b C[P₁(u, v), P₂(v, w)])⁴,
+
+where a and b map the range [0, 1] of the residual to the fourth roots of its factors. (A fourth power is nearly an
+exponential over one step of a byte, and takes two products.)
 
 The *proxy* is the sum of a Lambertian lobe with an edge term, ρ/π (1 + (e − 1)(1 − cos θ_i)⁵)(1 + (e − 1)(1 − cos
 θ_o)⁵), and of two microfacet lobes D V F. D ∝ cos⁻⁴θ_h (1 + 2 tan²θ_h/(γα²))^−γ is Student's distribution of slopes

@@ -36,7 +36,7 @@ RATE = 0.3
 QUANTILE, MARGIN = 0.998, 0.25
 
 #: Least residual range, and the value relative to the mean below which a source counts as black.
-LEAST, DARK = 0.05, 1e-3
+LEAST, DARK = 0.01, 1e-3
 
 #: Share of the training after which entries are rounded to bytes in each step.
 ROUNDED = 0.5

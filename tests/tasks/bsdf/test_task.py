@@ -292,7 +292,7 @@ def test_a_plastic_is_fitted(types, short, tmp_path):
     source = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}}
     options = {"steps": 80, "batch": 2**11, "measure_every": 40, "progress": False}
     fitted = mi_diffind.fit("bsdf", source, **options)
-    assert fitted.history[-1]["psnr_db"] > fitted.history[0]["psnr_db"] - 1 and fitted.table.measured["psnr_db"] > 42
+    assert fitted.table.measured["psnr_db"] > max(65, fitted.history[0]["psnr_db"] - 1)
     assert fitted.table.measured["albedo_excess"] < 1e-3 and fitted.table.measured["sample_weight_moment"] < 1.3
     assert "isotropic" in fitted.lines[0] and "not reciprocal" not in fitted.lines[0]
     saved = load_table(fitted.save(tmp_path / "a.npz"))
