@@ -146,3 +146,15 @@ def decibels(text: str) -> float:
     if not 0 < value < 120:
         raise ValueError(f"{text!r} is no PSNR, allowed are numbers of dB between 0 and 120")
     return value
+
+
+#: Options of work that falls apart into jobs (:mod:`.jobs`).
+WORKER_ARGUMENTS = (
+    Argument(
+        "--workers", type=positive, metavar="N", help="share the work among N processes (default: this process alone)"
+    ),
+    Argument(
+        "--scheduler", default="", metavar="ADDRESS",
+        help="share the work among the workers of a Dask cluster, as in tcp://host:8786, with the same folders",
+    ),
+)  # fmt: skip

@@ -8,12 +8,14 @@ the scene's own coordinates. ``capture.json`` records the settings; the same cal
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import io
 import itertools
 import json
 import math
 import os
+import pickle
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +29,7 @@ from . import __version__, compat, scenes, srgb
 from .errors import DiffindError, UsageError, reason
 from .files import replacing, writable_folder, write_json
 from .interrupt import interruptible
+from .jobs import run_jobs
 from .plugins.support import footprint
 from .poses import frame_of, orbit_directions, pose, sphere_directions
 from .progress import progress_bar
@@ -211,17 +214,20 @@ def capture(
     *,
     defines: Mapping[str, object] | None = None,
     progress: bool = True,
+    workers: int | None = None,
+    scheduler: str = "",
     **given,
 ) -> Captured:
     """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
     The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden.
     ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
-    ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters. The folder is
-    created if its parent exists. Views of an earlier capture with the same settings of the same scene are kept, unless
-    a dictionary holds objects that exist already; after Ctrl-C the current view is the last. Raises
-    :class:`~mi_diffind.errors.UsageError` for bad settings, :class:`CaptureError`, also for a folder with other
-    settings, :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.files.OutputError`.
+    ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers``
+    processes share the views, or those of the Dask cluster ``scheduler``. The folder is created if its parent exists.
+    Views of an earlier capture with the same settings of the same scene are kept, unless a dictionary holds objects
+    that exist already; after Ctrl-C the current view is the last. Raises :class:`~mi_diffind.errors.UsageError` for bad
+    settings, :class:`CaptureError`, also for a folder with other settings, :class:`~mi_diffind.scenes.SceneError` and
+    :class:`~mi_diffind.files.OutputError`.
     """
     use_variant()
     settings = _settings(given)
@@ -242,20 +248,62 @@ def capture(
         writable_folder(folder / split, create=True)
         left += [(split, i) for i in range(len(views)) if not (folder / _name(split, i, settings)).is_file()]
     total, start, rendered, opaque = sum(map(len, splits.values())), time.perf_counter(), 0, bool(left)
-    bar = progress_bar("capture", total, "view", progress, initial=total - len(left))
     _write_lists(folder, settings, splits, box)
-    with interruptible() as stop, bar:
-        for split, i in left:
-            image = camera.render(splits[split][i], (settings.seed << 16) + 2 * i + (split == "test"))
-            opaque &= bool((image[..., 3] > 0.999).all())
-            _write(folder / _name(split, i, settings), image)
+    if left and (workers or scheduler):
+        views = _shared(scene, parsed, (settings, centre, radius), folder, left)
+        outcomes = run_jobs(
+            render_separately, views, workers, scheduler, progress, "capture", "view", total - len(left)
+        )
+        for outcome in outcomes:
+            if outcome.failure:
+                raise CaptureError(f"{outcome.name}: {outcome.failure}")
             rendered += 1
-            bar.update()
-            if stop.is_set():
-                break
+            opaque &= outcome.value
+    elif left:
+        bar = progress_bar("capture", total, "view", progress, initial=total - len(left))
+        with interruptible() as stop, bar:
+            for split, i in left:
+                opaque &= _render(camera, splits, folder, split, i)
+                rendered += 1
+                bar.update()
+                if stop.is_set():
+                    break
     seconds = time.perf_counter() - start
     files = _write_lists(folder, settings, splits, box)
     return Captured(folder, files, total, rendered, seconds, radius, centre, box, opaque)
+
+
+def _render(camera: CaptureCamera, splits: dict, folder: Path, split: str, i: int) -> bool:
+    """Render a view, write it, and return whether it is opaque everywhere."""
+    settings = camera.settings
+    image = camera.render(splits[split][i], (settings.seed << 16) + 2 * i + (split == "test"))
+    _write(folder / _name(split, i, settings), image)
+    return bool((image[..., 3] > 0.999).all())
+
+
+def _shared(scene, parsed: scenes.ParsedScene, given: tuple, folder: Path, left: list) -> dict[str, tuple]:
+    """Return the jobs of :func:`render_separately`. Raises :class:`~mi_diffind.errors.UsageError`."""
+    source = scene if parsed.description else str(parsed.path.resolve())
+    try:
+        content = pickle.dumps((source, parsed.defines, *given, mi.variant()))
+    except Exception:  # of the objects in a dictionary, each has its own
+        raise UsageError("workers: the scene holds objects of this process, a scene file is needed") from None
+    return {_name(split, i, given[0]): (content, str(folder.resolve()), split, i) for split, i in left}
+
+
+def render_separately(view: tuple[bytes, str, str, int]) -> bool:
+    """Render a view in this process, which loads the scene once, and write it; return whether it is opaque."""
+    content, folder, split, i = view
+    camera, splits = _camera_of(content)
+    return _render(camera, splits, Path(folder), split, i)
+
+
+@functools.lru_cache(maxsize=1)
+def _camera_of(content: bytes) -> tuple[CaptureCamera, dict]:
+    scene, defines, settings, centre, radius, variant = pickle.loads(content)
+    use_variant(variant)
+    camera = CaptureCamera(_load(scenes.ParsedScene(scene, defines)), settings)
+    return camera, _plan(settings, centre, radius)
 
 
 def _settings(given: dict) -> CaptureSettings:

@@ -74,8 +74,8 @@ class NeuralBSDF(mi.BSDF):
 
      * - first.alpha_u, first.alpha_v, first.gamma, first.f0, first.f90; second.…
        - |float|, |float|, |float|, |spectrum|, |spectrum|
-       - Roughness, exponent (2: GGX; large: Beckmann's distribution), and reflectance at normal and grazing incidence of the proxy's microfacet lobes.
-         Of isotropic files, ``alpha_u`` alone counts.
+       - Roughness, exponent (2: GGX; large: Beckmann's), and reflectance at normal and grazing incidence of
+         the proxy's microfacet lobes. Of isotropic files, ``alpha_u`` alone counts.
        - |exposed|, |differentiable|
 
      * - tables.primary_uv, tables.primary_vw, tables.cascaded

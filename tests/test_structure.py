@@ -9,7 +9,19 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Floors, from the lowest one up. A name is a module or a whole package; the longest that fits counts. Modules on the
 #: same floor may import one another, without a circle.
 FLOORS = (
-    ("errors", "arguments", "settings", "discovery", "interrupt", "files", "compat", "runtime", "deadline", "progress"),
+    (
+        "errors",
+        "arguments",
+        "settings",
+        "discovery",
+        "interrupt",
+        "files",
+        "compat",
+        "runtime",
+        "deadline",
+        "progress",
+        "jobs",
+    ),
     ("bits", "bounds", "metrics", "rays", "srgb", "units"),
     ("lookup",),
     ("indirection", "pages"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..arguments import WORKER_ARGUMENTS, add_arguments
 from ..files import writable_folder
 from .common import natural, positive, require_scene, scene_options, set_variant, verb
 
@@ -50,6 +51,7 @@ def add(commands) -> None:
         help="shapes to capture (default: all but lights); the others only cast light and shadow",
     )  # fmt: skip
     sub.add_argument("--format", choices=["png", "exr"], default="png", help="8 bits, or linear (default: png)")
+    add_arguments(sub, WORKER_ARGUMENTS)
     scene_options(sub, rendering=False)
     sub.add_argument("--spp", type=positive, default=256, help="samples per pixel (default: 256)")
     sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
@@ -66,7 +68,7 @@ def run(arguments) -> dict:
     set_variant(arguments.variant)
     from ..view_capture import capture
 
-    names = ("views", "test", "resolution", "spp", "fov", "radius", "path", "seed", "format")
+    names = ("views", "test", "resolution", "spp", "fov", "radius", "path", "seed", "format", "workers", "scheduler")
     given = {name: getattr(arguments, name) for name in (*names, "centre", "elevation", "up", "objects")}
     captured = capture(arguments.scene, arguments.output, defines=dict(arguments.defines), **given)
     print(captured)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .. import tradeoffs
+from ..arguments import WORKER_ARGUMENTS, add_arguments
 from ..studies import studies
 from .common import alternative, alternatives, require_scene, scene_options, set_variant, variant_option, verb
 
@@ -24,6 +25,7 @@ def add(commands) -> None:
             scene_options(sub, rendering=False)
         else:
             variant_option(sub)
+            add_arguments(sub, WORKER_ARGUMENTS)
         study.add_arguments(sub)
 
 

@@ -9,17 +9,23 @@ candidates is the median of the ratios of the rounds.
 
 from __future__ import annotations
 
+import functools
 import math
 import os
+import pickle
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import drjit as dr
 from tqdm import tqdm
 
 from ..interrupt import interruptible
+from ..jobs import run_jobs
+from ..runtime import use_variant
 from .clock import machine, timed, total
 from .operations import count_query
 from .statistics import pareto, ratio, spread, timing
@@ -53,14 +59,45 @@ class BenchmarkSettings:
         return cls(lanes // 4, 3, 2, 2**17, True) if quick else cls(lanes)
 
 
+@dataclass(frozen=True)
+class Workers:
+    """Other processes for the jobs of a plan: a number of ``workers``, or those of the Dask cluster ``scheduler``.
+
+    ``plan()`` makes the plan there; it can be pickled.
+    """
+
+    plan: Callable[[], Plan]
+    workers: int | None = None
+    scheduler: str = ""
+
+
+@functools.lru_cache(maxsize=1)
+def _plan_of(plan: bytes) -> Plan:
+    return pickle.loads(plan)()
+
+
+def run_separately(job: tuple[bytes, str, str, str]) -> dict | None:
+    """Run a job in this process; ``job``: its pickled plan, its name, the folder of models, and the variant."""
+    plan, name, folder, variant = job
+    use_variant(variant)
+    chosen = next(j for j in _plan_of(plan).jobs if j.name == name)
+    return chosen.cached_record(Path(folder), None) or chosen.run(Path(folder), False)
+
+
 class Stopped(Exception):
     """The first Ctrl-C stopped the measurement."""
 
 
 def measure(
-    plan: Plan, settings: BenchmarkSettings, folder: str | os.PathLike | None = None, progress: bool = True
+    plan: Plan,
+    settings: BenchmarkSettings,
+    folder: str | os.PathLike | None = None,
+    progress: bool = True,
+    workers: Workers | None = None,
 ) -> dict:
     """Measure a plan, or the rest of it if ``folder`` holds partial results of an interrupted run.
+
+    ``workers`` do the jobs that are separable; all that is timed runs in this process, one after the other.
 
     Partial results stay in ``folder`` until :func:`.report.write` has written the result.
 
@@ -86,7 +123,7 @@ def measure(
     with interruptible() as stop:
         steps = BenchmarkSteps(plan, settings, store, stop, progress)
         try:
-            steps.jobs()
+            steps.jobs(workers)
             with steps.bar(cases):
                 steps.errors()
                 for case in cases:
@@ -143,12 +180,14 @@ class BenchmarkSteps:
         if self.stop.is_set():
             raise Stopped
 
-    def jobs(self) -> None:
-        """Run the jobs; each has a progress bar of its own."""
+    def jobs(self, workers: Workers | None = None) -> None:
+        """Run the jobs: with ``workers`` first those that are separable, then the rest, each with a progress bar."""
         plan, done = self.plan, self.store.data["jobs"]
         folder = None
         if self.store.folder is not None and plan.jobs:
             folder = models_folder(self.store.folder, plan.study, plan.jobs_fingerprint)
+        if workers is not None and folder is not None:
+            self._separate_jobs(workers, folder)
         for i, job in enumerate(plan.jobs):
             record = job.cached_record(folder, done.get(job.name))
             if record is None:
@@ -160,6 +199,25 @@ class BenchmarkSteps:
                 self.store.save()
             if record is None or self.stop.is_set():
                 raise Stopped
+
+    def _separate_jobs(self, workers: Workers, folder: Path) -> None:
+        """Have separable jobs run elsewhere. What fails there is left to this process, where its error is raised."""
+        done = self.store.data["jobs"]
+        plan, path = pickle.dumps(workers.plan), str(folder.resolve())
+        todo = {
+            job.name: (plan, job.name, path, self.plan.variant)
+            for job in self.plan.jobs
+            if job.separable and job.cached_record(folder, done.get(job.name)) is None
+        }
+        run = (run_separately, todo, workers.workers, workers.scheduler, self.progress, "jobs")
+        for outcome in run_jobs(*run, finished=len(self.plan.jobs) - len(todo)) if todo else ():
+            if outcome.failure and self.progress:
+                print(f"{outcome.name}: {outcome.failure}", file=sys.stderr)
+            if outcome.value is not None:
+                done[outcome.name] = outcome.value
+                self.store.save()
+        if self.stop.is_set():
+            raise Stopped
 
     def errors(self) -> None:
         done = self.store.data["errors"]
@@ -267,7 +325,8 @@ def _assemble(plan: Plan, cases: list[Case], settings: BenchmarkSettings, data: 
                 _mark_front(measured["passes"][query], candidates, accuracy)
             measured["ratios"][query] = _ratios(plan.ratios, ms, 0.0)
         measured_cases[case.name] = measured
-    return {"candidates": candidates, "cases": measured_cases, "jobs": records}
+    in_order = {job.name: records[job.name] for job in plan.jobs if job.name in records}
+    return {"candidates": candidates, "cases": measured_cases, "jobs": in_order}
 
 
 def _by_name(rounds: list[dict], query: str, scale: float) -> dict[str, list[float]]:

@@ -92,9 +92,13 @@ class Job:
 
     Its record is a tree for JSON: ``seconds``, and optionally ``bytes``, ``errors``, ``converged``, ``details``, and
     ``runs``, the curves of trainings (:mod:`.training`).
+
+    A job that is ``separable`` may run in another process, where its plan is made anew, beside other jobs: it depends
+    on no other job and on no clock, and :meth:`cached_record` then gives what :meth:`run` left in the folder.
     """
 
     name: str
+    separable = False
 
     def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
         """Return the record if the work is done: ``record`` is that of the store, ``folder`` holds models."""

@@ -32,6 +32,8 @@ class ConvergenceTraining(Job):
     :meth:`cached_record`, ``net`` is the trained module of the best run.
     """
 
+    separable = True
+
     def __init__(
         self, name: str, problem: Callable[[], Problem], settings: FitSettings, longest: int, measurements: int = 20
     ):

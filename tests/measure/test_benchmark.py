@@ -1,6 +1,7 @@
 """The frame for time against accuracy: fronts, rounds, interruption, files, pictures."""
 
 import csv
+import functools
 import itertools
 import json
 import math
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_study import CALLS, KERNELS, SETTINGS, Log, small_plan
+from small_study import CALLS, KERNELS, SETTINGS, Log, separable_plan, small_plan
 
 from mi_diffind.measure import benchmark, plot, report
 from mi_diffind.measure.benchmark import measure
@@ -328,3 +329,19 @@ def test_jobs_come_first_and_can_be_interrupted(tmp_path):
     paths = report.write(result, tmp_path)
     assert Path(paths["training"]).stat().st_size > 10_000
     assert "not converged" in "\n".join(report.summary(result))
+
+
+def test_jobs_in_other_processes(tmp_path, capsys):
+    """Their records are those of one process, in the order of the plan; what fails there is done here."""
+    make = functools.partial(separable_plan, os.getpid())
+    (tmp_path / "one").mkdir()
+    alone = measure(make(), SETTINGS, tmp_path / "one", progress=False)
+    result = measure(make(), SETTINGS, tmp_path, workers=benchmark.Workers(make, 2))
+    assert list(result["jobs"]) == ["first", "here", "second"] and result["jobs"] == alone["jobs"]
+    models = tmp_path / "tradeoff_small_models"
+    here = {name: (models / name).read_text() == str(os.getpid()) for name in result["jobs"]}
+    assert here == {"first": False, "here": True, "second": False}
+    assert "here: ValueError: not in this process" in capsys.readouterr().err
+    before = (models / "first").stat().st_mtime_ns
+    measure(make(), SETTINGS, tmp_path, workers=benchmark.Workers(make, 2))
+    assert (models / "first").stat().st_mtime_ns == before

@@ -36,6 +36,8 @@ PEER = {"type": "principled", "roughness": 0.35, "clearcoat": 1.0, "sheen": 0.6}
 class BSDFTraining(Job):
     """Fit of one material with one preset, whose table file is kept."""
 
+    separable = True
+
     def __init__(self, material: str, preset: str, quick: bool):
         self.material, self.preset, self.quick = material, preset, quick
         self.name = f"{material}, {preset}"

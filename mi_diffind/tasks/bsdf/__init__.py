@@ -4,16 +4,20 @@
 - :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.symmetry`: symmetries, measured;
 - :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
-- :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo; :mod:`.files`: table files.
+- :mod:`.measurement`: errors against a source; :mod:`.outputs`, :mod:`.tensor_file`: other formats;
+- :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo; :mod:`.files`: table files;
+- :mod:`.library`: many materials at once; :mod:`.contact_sheet`: their pictures.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+from pathlib import Path
 
-from ...arguments import Argument, checked
+from ...arguments import WORKER_ARGUMENTS, Argument, checked, natural, positive
 from ...settings import FitSettings
-from ...task import Task
+from ...task import FitRequest, Fitted, Task, table_path
 from ...units import parse_bytes
 
 
@@ -37,8 +41,11 @@ class BSDFTask(Task):
     }
     storages = ()
     arguments = (
-        Argument("source", metavar="SOURCE", help="scene or BSDF (.xml), or measured file (.bsdf, .pbsdf, .binary)"),
-        Argument("--material", default="", metavar="ID", help="id of a BSDF of the scene"),
+        Argument(
+            "source", metavar="SOURCE",
+            help="scene or BSDF (.xml), measured file (.bsdf, .pbsdf, .binary), or a folder of such files",
+        ),
+        Argument("--material", default="", metavar="ID", help="id of a BSDF of the scene; all: each of them"),
         Argument(
             "--uv", nargs=2, type=_coordinate, default=(0.5, 0.5), metavar=("U", "V"),
             help="point of the textures at which the BSDF is fitted (default: 0.5 0.5)",
@@ -51,7 +58,29 @@ class BSDFTask(Task):
             "--energy", choices=("source", "raw"), default="source",
             help="limit the albedo to the source's, or leave it as it was fitted (default: source)",
         ),
+        *WORKER_ARGUMENTS,
     )  # fmt: skip
+    decode_arguments = (
+        Argument("--rows", type=positive, metavar="N", help="rows of a .csv file (default: 10000)"),
+        Argument("--seed", type=natural, help="seed of the random directions of a .csv file (default: 0)"),
+    )
+
+    def output_path(self, path: str | os.PathLike) -> Path:
+        """Return the path of the output: a table file, or a folder for a library, which exists or has no extension."""
+        is_folder = Path(path).is_dir() or not Path(path).suffix
+        return Path(path).absolute() if is_folder else table_path(path)
+
+    def check(self, request: FitRequest) -> None:
+        super().check(request)
+        from .library import check
+
+        check(request)
+
+    def fit(self, request: FitRequest) -> Fitted:
+        """Fit a BSDF, or all those of a library."""
+        from .library import fit_library, is_library
+
+        return fit_library(request) if is_library(request) else super().fit(request)
 
 
 TASK = BSDFTask()

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import os
 from dataclasses import astuple
+from pathlib import Path
 
 import numpy as np
 
 from ...indirection import DifferentiableArray, Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
 from ...task import Model
+from . import measurement, outputs, tensor_file
 from .mixture import Mixture, SampledLobe
 from .model import AZIMUTHS, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, Proxy
+from .truth import Truth, recorded_truth
+from .view import SphereView
 
 #: Arrays of the residual.
 RESIDUAL = ("primary_uv", "primary_vw", "cascaded")
@@ -150,6 +154,25 @@ class BSDFModel(Model):
     def entries(self) -> dict:
         """Return what can be optimised: the residual's arrays in single precision, and the proxy."""
         return {n: a for n, a in self.arrays.items() if a.storage == "float32" and n in (*RESIDUAL, "proxy")}
+
+    def source(self) -> Truth:
+        """Return the source that the file was fitted to. Raises :class:`TableError` if it cannot be opened again."""
+        return recorded_truth(self.table, self.types)
+
+    def measure(self) -> dict[str, float]:
+        """Return errors against the source (:func:`.measurement.measure`)."""
+        truth = self.source()
+        return measurement.measure(self, truth, SphereView(truth, self.types))
+
+    def decode(self, output: str | os.PathLike | None = None, rows: int | None = None, seed: int | None = None):
+        """Write a ``.bsdf``, ``.csv`` or ``.exr`` file (:mod:`.outputs`); without an ``output``, return its fields.
+
+        ``rows`` and ``seed``: number of rows of a ``.csv`` file, and seed of its random directions. Raises
+        :class:`~mi_diffind.errors.UsageError`.
+        """
+        if output is None:
+            return tensor_file.fields(self.bsdf, self.types, str(self.table.settings.get("name", "")))
+        return outputs.write(self, Path(output), self.source, rows, seed)
 
 
 MODEL = BSDFModel

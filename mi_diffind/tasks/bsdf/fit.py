@@ -13,12 +13,20 @@ from ...task import FitRequest, Fitted
 from ...units import parse_bytes
 from . import energy, mixture, symmetry, training
 from .files import BSDFModel, allocate, to_table
+from .measurement import cosine, measure
 from .model import Form, LearnedBSDF, structure_of
-from .truth import Truth, truth_of
+from .truth import Truth, recorded_source, truth_of
 from .view import SphereView
 
 #: Share of a limited time in which the proxy is fitted.
 PRETRAINING = 0.3
+
+
+@dataclasses.dataclass
+class FittedBSDF(Fitted):
+    """Result of a fit, with its source."""
+
+    truth: Truth | None = None
 
 
 def check(request: FitRequest) -> None:
@@ -44,7 +52,7 @@ def use_rgb_variant(request: FitRequest) -> None:
         mi.set_variant("cuda_ad_rgb" if ".cuda." in request.types.__name__ else "llvm_ad_rgb")
 
 
-def fit_truth(truth: Truth, request: FitRequest) -> Fitted:
+def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     """Fit a learned BSDF to a source, measure it, and return its table and the record of its training."""
     types, options, settings = request.types, request.options, request.settings
     with dr.suspend_grad():
@@ -82,7 +90,7 @@ def fit_truth(truth: Truth, request: FitRequest) -> Fitted:
         "structure": dataclasses.asdict(structure),
     })  # fmt: skip
     table.preset, table.seed = request.preset, settings.seed
-    table.settings |= request.paths(source_path=options["source"])
+    table.settings |= request.paths(source_path=options["source"]) | recorded_source(options)
     model = BSDFModel(table, allocate(table, types.TensorXf), types.TensorXf)
     measured = measure(model, truth, view)
     table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
@@ -96,7 +104,7 @@ def fit_truth(truth: Truth, request: FitRequest) -> Fitted:
         "form": form.to_json(),
         "arrays": {n: list(a.shape) for n, a in table.arrays.items()},
     }
-    return Fitted(table, result, lines, figures)
+    return FittedBSDF(table, result, lines, figures, truth=truth)
 
 
 def symmetry_line(symmetries: dict[str, float]) -> str:
@@ -111,26 +119,3 @@ def symmetry_line(symmetries: dict[str, float]) -> str:
         value = symmetries[name]
         parts.append(f"{yes if value <= symmetry.TOLERANCE else no} ({100 * value:.2g}%)")
     return "measured: " + ", ".join(parts)
-
-
-def cosine(bsdf: LearnedBSDF):
-    """Return the function f cos θ_o of a learned BSDF."""
-    return lambda wi, wo: [v * wo.z for v in bsdf.value(wi, wo)]
-
-
-def measure(model: BSDFModel, truth: Truth, view: SphereView) -> dict[str, float]:
-    """Return figures of a model: PSNR, albedo and sampling.
-
-    ``psnr_db`` is that of the picture of :mod:`.view`; ``albedo_excess`` the largest relative difference by which a
-    directional albedo, from 0° to 89°, lies above the source's; ``sample_weight_moment`` the mean of E[w²]/E[w]² of the
-    weights of samples at 0°, 45° and 80°.
-    """
-    types, value = model.types, cosine(model.bsdf)
-    cos = np.cos(np.radians([0, 15, 30, 45, 60, 70, 80, 85, 89]))
-    source, learned = energy.albedos([truth.value, value], truth, types, cos)
-    moments = [mixture.second_moment(truth.value, model.mixture, truth, types, float(c)) for c in cos[[0, 3, 6]]]
-    return {
-        "psnr_db": view.psnr(value),
-        "albedo_excess": float(((learned - source) / np.maximum(source, 1e-3)).max()),
-        "sample_weight_moment": float(np.mean(moments)),
-    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from pathlib import Path
 
@@ -11,6 +12,10 @@ import numpy as np
 
 from ...errors import UsageError, reason
 from ...lookup import clamp
+from ...tables import Table, TableError
+
+#: Extensions of files that are sources.
+SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary")
 
 #: Largest value f cos θ that counts; a plugin may exceed it next to the horizon.
 LARGEST = 1e8
@@ -167,6 +172,40 @@ def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 
     return MitsubaTruth(bsdf, bsdf.id() or path.name, _hash(path.read_bytes() + material.encode()), uv)
 
 
+def recorded_source(options) -> dict:
+    """Return what a table file keeps of a source beside the path of its file, so that it can be opened again."""
+    recorded = {"material": options["material"], "uv": [float(x) for x in options["uv"]]}
+    source = options["source"]
+    try:
+        if isinstance(source, dict) and json.loads(json.dumps(source)) == source:
+            recorded["dictionary"] = source
+    except (TypeError, ValueError):
+        pass  # it holds objects
+    return recorded
+
+
+def recorded_truth(table: Table, types) -> Truth:
+    """Return the source that a table file was fitted to.
+
+    Raises :class:`TableError` if it cannot be opened again, or has changed since.
+    """
+    settings, name = table.settings, table.path or "BSDF"
+    if "dictionary" in settings:
+        source = settings["dictionary"]
+    elif "source_path" in settings:
+        source = Path(table.path or "x").resolve().parent / str(settings["source_path"])
+    else:
+        raise TableError(f"{name}: was fitted to an object in memory, which cannot be opened again")
+    try:
+        u, v = settings.get("uv", (0.5, 0.5))
+        truth = truth_of(source, types, str(settings.get("material", "")), (float(u), float(v)))
+    except (TypeError, ValueError, UsageError) as e:
+        raise TableError(f"{name}: its source cannot be opened again: {reason(e)}") from None
+    if settings.get("source") not in (None, truth.digest):
+        raise TableError(f"{name}: its source, {truth.name}, has changed since")
+    return truth
+
+
 def _hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
@@ -186,7 +225,7 @@ def _chosen(loaded, name, material: str):
         return loaded
     if not isinstance(loaded, mi.Scene):
         raise UsageError(f"{name}: is a {type(loaded).__name__}, a BSDF or a scene is needed")
-    bsdfs = list({id(b): b for b in (shape.bsdf() for shape in loaded.shapes()) if b is not None}.values())
+    bsdfs = _bsdfs(loaded)
     chosen = [b for b in bsdfs if material in ("", b.id())]
     if len(chosen) == 1:
         return chosen[0]
@@ -197,3 +236,22 @@ def _chosen(loaded, name, material: str):
             f"{name}: has {len(chosen)} materials: name one by its id (material), those with ids are {names}"
         )
     raise UsageError(f'material: found "{material}", the materials of {name} with ids are {names}')
+
+
+def _bsdfs(scene) -> list:
+    """Return the BSDFs of a scene's shapes, each once."""
+    return list({id(b): b for b in (shape.bsdf() for shape in scene.shapes()) if b is not None}.values())
+
+
+def material_ids(path) -> list[str]:
+    """Return the ids of the materials of a scene file, sorted, or ``[""]`` for a file of one BSDF.
+
+    Raises :class:`~mi_diffind.errors.UsageError`.
+    """
+    import mitsuba as mi
+
+    loaded = _built(path, lambda: mi.load_file(str(path), optimize=False))
+    ids = sorted({b.id() for b in _bsdfs(loaded) if b.id()}) if isinstance(loaded, mi.Scene) else [""]
+    if not ids:
+        raise UsageError(f"{path}: its materials have no ids")
+    return ids

@@ -1,0 +1,123 @@
+"""Jobs in this process, in others, and on a Dask cluster: outcomes, lost processes, Ctrl-C."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import worker_jobs
+
+from mi_diffind import jobs
+from mi_diffind.errors import UsageError
+from mi_diffind.jobs import run_jobs
+
+#: A number, a word that is refused, and what raises another error.
+VALUES = {"three": 3, "word": "abc", "none": None, "four": 4}
+
+
+def run(function, values, *arguments, **options) -> dict:
+    """Return the outcomes by name; each name comes once."""
+    outcomes = list(run_jobs(function, values, *arguments, progress=False, **options))
+    assert len({outcome.name for outcome in outcomes}) == len(outcomes)
+    return {outcome.name: outcome for outcome in outcomes}
+
+
+def check(outcomes: dict) -> set:
+    """Check the outcomes of :data:`VALUES` and return the processes."""
+    assert set(outcomes) == set(VALUES)
+    assert (outcomes["three"].value[0], outcomes["four"].value[0]) == (9, 16)
+    assert outcomes["word"].failure == "found the word abc" and outcomes["three"].failure == ""
+    assert outcomes["none"].failure.startswith("TypeError: unsupported operand")
+    return {outcomes["three"].value[1], outcomes["four"].value[1]}
+
+
+def test_in_this_process():
+    outcomes = run(worker_jobs.square, VALUES)
+    assert list(outcomes) == list(VALUES) and check(outcomes) == {os.getpid()}
+
+
+def test_in_processes(tmp_path):
+    """Results are those of one process; what cannot be sent has failed; a job whose process is lost is tried again."""
+    assert os.getpid() not in check(run(worker_jobs.square, VALUES, 2))
+    assert "cannot be sent" in run(open, {"file": os.devnull}, 1)["file"].failure
+    killed = run(worker_jobs.kill_once, {"a": str(tmp_path / "mark"), "b": __file__}, 2)
+    assert (tmp_path / "mark").exists() and killed["a"].value and not killed["a"].failure
+    assert run(os._exit, {"a": 3}, 1)["a"].failure == "the process of this job ended 3 times (exit code 3)"
+
+
+def test_interrupted_here():
+    assert list(run(worker_jobs.interrupt, {"a": 1, "b": 2, "c": 3})) == ["a", "b"]
+
+
+def test_processes_are_interrupted(tmp_path):
+    """Ctrl-C gives up what runs, and no process stays behind."""
+    file = tmp_path / "process"
+
+    def interrupt():
+        wait_for(lambda: file.is_file() and file.read_text())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    assert run(worker_jobs.write_process_and_sleep, {"a": str(file)}, 1) == {}
+    thread.join()
+    assert not exists(int(file.read_text()))
+
+
+def test_processes_end_with_the_one_that_began_them(tmp_path):
+    file = tmp_path / "process"
+    code = (
+        f"import sys; sys.path[:] = {sys.path}; import worker_jobs; from mi_diffind.jobs import run_jobs\n"
+        f"list(run_jobs(worker_jobs.write_process_and_sleep, {{'a': {str(file)!r}}}, 1))"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code])
+    wait_for(lambda: file.is_file() and file.read_text())
+    assert exists(int(file.read_text()))
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not exists(int(file.read_text())))
+
+
+def exists(process: int) -> bool:
+    """Return whether a process runs; one that has ended and was not waited for does not."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for(condition):
+    for _ in range(600):
+        if condition():
+            return
+        time.sleep(0.1)
+    raise AssertionError("waited in vain")
+
+
+def test_on_a_cluster(tmp_path):
+    """Results are those of one process, also if a worker of the cluster is lost."""
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install '.[cluster]'")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=":0") as cluster:
+        address = cluster.scheduler_address
+        assert os.getpid() not in check(run(worker_jobs.square, VALUES, scheduler=address))
+        assert "ended 3 times" in run(os._exit, {"a": 3}, scheduler=address)["a"].failure
+        killed = run(worker_jobs.kill_parent_once, {"a": str(tmp_path / "mark")}, scheduler=address)
+        assert (tmp_path / "mark").exists() and killed["a"].value and not killed["a"].failure
+
+
+def test_clusters_out_of_reach(monkeypatch):
+    with pytest.raises(UsageError, match="workers: given together with a scheduler"):
+        run(worker_jobs.square, VALUES, 2, scheduler="tcp://127.0.0.1:1")
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "distributed", None)
+        with pytest.raises(UsageError, match="distributed, which is not installed: pip install"):
+            run(worker_jobs.square, VALUES, scheduler="tcp://127.0.0.1:1")
+    pytest.importorskip("distributed", reason="distributed is not installed: pip install '.[cluster]'")
+    monkeypatch.setattr(jobs, "TIMEOUT", 0.3)
+    for address in ("tcp://127.0.0.1:1", "nonsense", "http://nonsense:80"):
+        with pytest.raises(UsageError, match=f'scheduler: "{address}" cannot be reached'):
+            run(worker_jobs.square, VALUES, scheduler=address)
