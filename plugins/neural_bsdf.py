@@ -9,6 +9,7 @@ import numpy as np
 from mi_diffind.indirection import DifferentiableArray
 from mi_diffind.lookup import clamp
 from mi_diffind.tasks.bsdf import TASK
+from mi_diffind.tasks.bsdf.family_files import ARRAYS
 from mi_diffind.tasks.bsdf.files import RESIDUAL
 from mi_diffind.tasks.bsdf.model import (
     ALPHA_MIN,
@@ -78,9 +79,15 @@ class NeuralBSDF(mi.BSDF):
          the proxy's microfacet lobes. Of isotropic files, ``alpha_u`` alone counts.
        - |exposed|, |differentiable|
 
+     * - roughness, metallic, …
+       - |float| or |texture|
+       - Of a file that was fitted ``--over`` parameters: each of them by its name. Numbers outside of the range of the
+         fit are refused, textures are clamped. (Default: the middle of the range)
+       - |exposed|, |differentiable|
+
      * - tables.primary_uv, tables.primary_vw, tables.cascaded
        - |tensor|
-       - The entries of the residual's arrays.
+       - The entries of the residual's arrays; of a family, also ``tables.mixing`` and ``tables.proxy``.
        - |exposed|, |differentiable|
 
     Any reflecting BSDF in two kilobytes: an analytic proxy (a diffuse lobe and two microfacet lobes) times
@@ -111,6 +118,28 @@ class NeuralBSDF(mi.BSDF):
 
             'type': 'neural_bsdf',
             'filename': 'paint.npz'
+
+    **Families**: a file that ``mi-diffind fit bsdf plastic.xml --over alpha=0.02:0.8 -o plastic.npz`` wrote holds a
+    BSDF that depends on parameters. Each is a property, and may be a texture, also where the plugin that was fitted
+    takes a number only, as ``roughplastic`` does. Its proxy is a table, not named parameters.
+
+    .. tabs::
+        .. code-tab:: xml
+            :name: neural_bsdf-family
+
+            <bsdf type="neural_bsdf">
+                <string name="filename" value="plastic.npz"/>
+                <texture name="alpha" type="bitmap">
+                    <string name="filename" value="scratches.png"/>
+                    <boolean name="raw" value="true"/>
+                </texture>
+            </bsdf>
+
+        .. code-tab:: python
+
+            'type': 'neural_bsdf',
+            'filename': 'plastic.npz',
+            'alpha': {'type': 'bitmap', 'filename': 'scratches.png', 'raw': True}
     """
 
     def __init__(self, props: mi.Properties):
@@ -127,18 +156,25 @@ class NeuralBSDF(mi.BSDF):
         if self.energy == "raw":
             self.model.arrays.pop("energy", None)
             self.model.refresh()
-        self.proxy = _parameters(self.model) if self.model.form.terms else {}
+        self.textures = {}
+        for parameter in getattr(self.model, "parameters", ()):
+            properties.check_range(props, parameter.name, parameter.low, parameter.high)
+            self.textures[parameter.name] = props.get_unbounded_texture(parameter.name, parameter.middle)
+        self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
         self._compute_constants()
 
         side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
         flags = mi.BSDFFlags.GlossyReflection | side
         if not self.model.form.isotropic:
             flags = flags | mi.BSDFFlags.Anisotropic
+        if any(texture.is_spatially_varying() for texture in self.textures.values()):
+            flags = flags | mi.BSDFFlags.SpatiallyVarying
         self.m_components = [flags]
         self.m_flags = flags
 
     def _arrays(self) -> dict:
-        return {name: self.model.arrays[name] for name in RESIDUAL if name in self.model.arrays}
+        names = (*ARRAYS, "proxy") if self.textures else RESIDUAL
+        return {name: self.model.arrays[name] for name in names if name in self.model.arrays}
 
     def trained(self) -> tuple:
         """Return the table of the file, and the arrays that can be optimised, by name."""
@@ -149,7 +185,7 @@ class NeuralBSDF(mi.BSDF):
 
     def traverse(self, cb: mi.TraversalCallback):
         cb.put("scale", self.scale, mi.ParamFlags.Differentiable)
-        for name, value in self.proxy.items():
+        for name, value in (*self.proxy.items(), *self.textures.items()):
             cb.put(name, value, mi.ParamFlags.Differentiable)
         tables.traverse(cb, tables.exposed(self._arrays()))
 
@@ -157,13 +193,15 @@ class NeuralBSDF(mi.BSDF):
         tables.check_shapes(tables.exposed(self._arrays()))
         self._compute_constants()
 
-    def _bsdf(self):
-        """Return the BSDF with the present parameters of the proxy."""
+    def _at(self, si, active):
+        """Return the BSDF with its present parameters, and the mixture that samples it."""
+        if self.textures:
+            return self.model.at([texture.eval_1(si, active) for texture in self.textures.values()], active)
         bsdf = self.model.bsdf
         if self.proxy:
             attached = dr.grad_enabled(list(self.proxy.values()))
             bsdf.proxy = _proxy(self.proxy, self.model.form) if attached else self.constants
-        return bsdf
+        return bsdf, self.model.mixture
 
     def _compute_constants(self):
         """Compute what depends on the parameters of the proxy alone, once for all lanes."""
@@ -183,38 +221,44 @@ class NeuralBSDF(mi.BSDF):
         up = mi.Vector3f(0, 0, 1)
         return dr.select(active, wi, up), dr.select(active, wo, up), active
 
-    def _value(self, si, wi, wo, active):
+    def _value(self, bsdf, si, wi, wo, active):
         """Return f cos θ_o."""
-        rgb = self._bsdf().value(wi, wo)
+        rgb = bsdf.value(wi, wo)
         factor = wo.z * clamp(self.scale, 0.0, 1.0)
         value = _spectrum([v * factor for v in rgb], si.wavelengths)
         return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
 
-    def _density(self, wi, wo, active):
+    @staticmethod
+    def _density(mixture, wi, wo, active):
         with dr.suspend_grad():
-            return dr.detach(dr.select(active, self.model.mixture.density(wi, wo), 0))
+            return dr.detach(dr.select(active, mixture.density(wi, wo), 0))
 
     def eval(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(ctx, si.wi, wo, active)
-        return self._value(si, wi, wo, active)
+        bsdf, _ = self._at(si, active)
+        return self._value(bsdf, si, wi, wo, active)
 
     def pdf(self, ctx, si, wo, active=True):
-        return self._density(*self._prepare(ctx, si.wi, wo, active))
+        wi, wo, active = self._prepare(ctx, si.wi, wo, active)
+        _, mixture = self._at(si, active)
+        return self._density(mixture, wi, wo, active)
 
     def eval_pdf(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(ctx, si.wi, wo, active)
-        return self._value(si, wi, wo, active), self._density(wi, wo, active)
+        bsdf, mixture = self._at(si, active)
+        return self._value(bsdf, si, wi, wo, active), self._density(mixture, wi, wo, active)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         up = mi.Vector3f(0, 0, 1)
         wi, _, active = self._prepare(ctx, si.wi, dr.select(si.wi.z < 0, -up, up) if self.two_sided else up, active)
+        bsdf, mixture = self._at(si, active)
         with dr.suspend_grad():
-            wo = dr.detach(self.model.mixture.sample(wi, sample1, sample2.x, sample2.y))
+            wo = dr.detach(mixture.sample(wi, sample1, sample2.x, sample2.y))
             active = active & (wo.z > 0) & (dr.squared_norm(wo) < 2)
             wo = dr.select(active, wo, up)
-        pdf = self._density(wi, wo, active)
+        pdf = self._density(mixture, wi, wo, active)
         active = active & (pdf > SMALLEST_DENSITY)
-        value = self._value(si, wi, wo, active)
+        value = self._value(bsdf, si, wi, wo, active)
         bs = dr.zeros(mi.BSDFSample3f)
         bs.wo = mi.Vector3f(wo.x, wo.y, dr.mulsign(wo.z, si.wi.z)) if self.two_sided else wo
         bs.eta = 1.0
@@ -246,6 +290,7 @@ class NeuralBSDF(mi.BSDF):
         lines = (
             f"source = {self.model.table.settings.get('name', '')}",
             f"scale = {self.scale}",
+            *(f"{name} = {texture!s}" for name, texture in self.textures.items()),
             f"{report['table_bytes']} bytes as {report['storage']}",
             f"effects = {', '.join(report['effects_in_use'])}",
         )
@@ -286,13 +331,13 @@ def _proxy(parameters: dict, form) -> Proxy:
     def limited(value):
         return clamp(value, low, high)
 
-    lobes = []
+    lobes = {}
     for name in TERMS[1:]:
         if name in form.terms:
             axes = ("alpha_u",) if form.isotropic else ("alpha_u", "alpha_v")
             alphas = tuple(clamp(parameters[f"{name}.{axis}"], ALPHA_MIN, 1.0) for axis in axes)
             colours = [[limited(c) for c in parameters[f"{name}.{key}"]] for key in ("f0", "f90")]
-            lobes.append(ProxyLobe(alphas, limited(parameters[f"{name}.gamma"]), *colours))
+            lobes[name] = ProxyLobe(alphas, limited(parameters[f"{name}.gamma"]), *colours)
     if "diffuse" not in form.terms:
         return Proxy.of_parts(None, None, lobes)
     return Proxy.of_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)

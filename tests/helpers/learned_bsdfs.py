@@ -94,3 +94,57 @@ def formula(table: Table, wi, wo) -> np.ndarray:
     for direction in (wi, wo):
         value *= interpolated(arrays["energy"], np.sqrt(direction[:, 2:]))
     return value
+
+
+#: Parameters of a family: a logarithmic and a linear one.
+FAMILY = ({"name": "roughness", "low": 0.05, "high": 0.8}, {"name": "metallic", "low": 0.0, "high": 1.0})
+
+
+def handmade_family(rank=2, **changes) -> Table:
+    """Return a table of a family over :data:`FAMILY` with smooth proxies and random bytes; ``changes`` of its form."""
+    rng = np.random.default_rng(6)
+    form = Form(**{"range": (-0.6, 0.5), **changes})
+    arrays = {name: byte_array(rng.integers(0, 256, shape), 1 / 255) for name, shape in SIZES.items()}
+    arrays["cascaded"] = byte_array(rng.integers(0, 256, (*SIZES["cascaded"][:3], 3 * rank)), 1 / 255)
+    arrays["mixing"] = byte_array(rng.integers(80, 176, (4, 3, rank)), 1 / 255)
+    values = np.exp(logarithms())
+    proxy = np.empty((4, 3, PARAMETERS + 2))
+    for i, j in np.ndindex(4, 3):
+        alpha = 0.05 * 4 ** (i / 1.5)
+        proxy[i, j, :PARAMETERS] = values * (1 - 0.3 * j / 2)
+        for channel in (3, 4, 5, 6, 13, 14, 15):
+            proxy[i, j, channel] = np.log(values[channel] * (1 + 0.1 * j))
+        proxy[i, j, 4:6], proxy[i, j, 13:15] = np.log(alpha), np.log(min(1, 2.5 * alpha))
+        proxy[i, j, PARAMETERS:] = np.log(0.8 * alpha)
+    arrays["proxy"] = StoredArray(proxy.astype(np.float16))
+    arrays["weights"] = byte_array(rng.integers(50, 256, (16, 3, 2, 3)), 1 / 255)
+    arrays["energy"] = byte_array(rng.integers(0, 256, (32, 3, 2, 1)), 0.1 / 255, 0.9)
+    settings = {"form": form.to_json(), "family": list(FAMILY), "factors": [1.0, 1.4]}
+    return Table("bsdf", arrays, "ours", settings)
+
+
+def member(table: Table, roughness: float, metallic: float) -> Table:
+    """Return the table of one material that a member of :func:`handmade_family` is, of entries as floats."""
+    low, high = FAMILY[0]["low"], FAMILY[0]["high"]
+    x = np.array([[math.log(roughness / low) / math.log(high / low), metallic]])
+
+    def at(name):
+        return interpolated(table.arrays[name], x)[0]
+
+    form = dict(table.settings["form"])
+    proxy = at("proxy")
+    form["scale"] = np.exp(proxy[PARAMETERS:]).tolist()
+    for channel in (0, 1, 2, *range(7, 13), *range(16, 22)):
+        proxy[channel] = np.log(proxy[channel])
+    arrays = {name: table.arrays[name] for name in ("primary_uv", "primary_vw")}
+    arrays["proxy"] = StoredArray(proxy[:PARAMETERS, None].astype(np.float32))
+    low, high = np.exp(np.array(form["range"]) / 4)
+    zero = (1 - low) / (high - low)
+    residuals = table.arrays["cascaded"].values.astype(np.float64)
+    residuals = residuals.reshape(*residuals.shape[:3], -1, 3) - zero
+    factors = 2 * at("mixing") - 1
+    arrays["cascaded"] = StoredArray((zero + np.einsum("r,uvwrc->uvwc", factors, residuals)).astype(np.float32))
+    energy = table.arrays["energy"].values
+    columns = [interpolated(StoredArray(row), x)[0] for row in energy]
+    arrays["energy"] = StoredArray(np.float32(columns))
+    return Table("bsdf", arrays, settings={"form": form})

@@ -6,7 +6,10 @@
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
 - :mod:`.measurement`: errors against a source; :mod:`.outputs`, :mod:`.tensor_file`: other formats;
 - :mod:`.mixture`: importance sampling; :mod:`.energy`: the limit of the albedo; :mod:`.files`: table files;
-- :mod:`.library`: many materials at once; :mod:`.contact_sheet`: their pictures.
+- :mod:`.library`: many materials at once; :mod:`.contact_sheet`: their pictures;
+- :mod:`.family`: BSDFs that depend on parameters, :mod:`.family_truth`, :mod:`.family_fit`,
+  :mod:`.family_sampling`, :mod:`.family_measurement` and :mod:`.family_files`: their sources, training, sampling,
+  errors and files.
 """
 
 from __future__ import annotations
@@ -26,6 +29,15 @@ def _coordinate(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"found {text!r}, a number is needed") from None
+
+
+def _range(text: str) -> tuple[str, tuple[float, float]]:
+    name, _, ends = text.partition("=")
+    low, _, high = ends.partition(":")
+    try:
+        return name, (float(low), float(high))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected NAME=LOW:HIGH, as in roughness=0.05:1") from None
 
 
 class BSDFTask(Task):
@@ -51,8 +63,12 @@ class BSDFTask(Task):
             help="point of the textures at which the BSDF is fitted (default: 0.5 0.5)",
         ),
         Argument(
-            "--bytes", type=checked(parse_bytes), default="2k", metavar="SIZE",
-            help="size of the residual's arrays (default: 2k)",
+            "--bytes", type=checked(parse_bytes), metavar="SIZE",
+            help="size of the residual's arrays (default: 2k; of families of 1, 2 and 3 parameters 4k, 9k and 12k)",
+        ),
+        Argument(
+            "--over", nargs="+", type=_range, metavar="NAME=LOW:HIGH",
+            help="fit a family over up to three parameters of the source, such as roughness=0.05:1 metallic=0:1",
         ),
         Argument(
             "--energy", choices=("source", "raw"), default="source",
@@ -77,10 +93,40 @@ class BSDFTask(Task):
         check(request)
 
     def fit(self, request: FitRequest) -> Fitted:
-        """Fit a BSDF, or all those of a library."""
+        """Fit a BSDF, a family, or all BSDFs of a library."""
         from .library import fit_library, is_library
 
-        return fit_library(request) if is_library(request) else super().fit(request)
+        if is_library(request):
+            return fit_library(request)
+        if not request.options["over"]:
+            return super().fit(request)
+        from .family_fit import fit_family
+
+        return fit_family(request)
+
+    def usage(self, table, file):
+        lines = super().usage(table, file)
+        for parameter in table.settings.get("family", ()):
+            low, high = parameter["low"], parameter["high"]
+            comment = f"<!-- or a texture, {low:g} to {high:g} -->"
+            lines.insert(-1, f'    <float name="{parameter["name"]}" value="{low:g}"/>  {comment}')
+        return lines
+
+    def load(self, path):
+        from ...tables import load_table
+
+        if "family" not in load_table(path, self.name).settings:
+            return super().load(path)
+        from .family_files import load
+
+        return load(path)
+
+    def model(self, table, dtype, storage=""):
+        if "family" not in table.settings:
+            return super().model(table, dtype, storage)
+        from .family_files import FamilyModel
+
+        return FamilyModel(table, self.allocate(table, dtype, storage), dtype, storage)
 
 
 TASK = BSDFTask()

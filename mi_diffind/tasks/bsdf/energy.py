@@ -18,14 +18,16 @@ NODES, ANGLES, SAMPLES = 32, 4, 8192
 CORRECTIONS = 40
 
 
-def contributions(values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, seed: int = 5):
+def contributions(
+    values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, seed: int = 5, size: int = SAMPLES
+):
     """Return the contributions of samples to the albedos of functions ``value(wi, wo)`` = f cos θ_o.
 
-    ``cos``: cosines of ``wi``. Returns the cosines of ``wo``, ``(len(cos), SAMPLES)``, and for each function an array
-    ``(len(cos), SAMPLES, 3)``, of the same samples, whose mean over the samples is the albedo.
+    ``cos``: cosines of ``wi``. Returns the cosines of ``wo``, ``(len(cos), size)``, and for each function an array
+    ``(len(cos), size, 3)``, of the same samples, whose mean over the samples is the albedo.
     """
     count = len(cos)
-    lane = dr.arange(types.UInt32, count * SAMPLES) // SAMPLES
+    lane = dr.arange(types.UInt32, count * size) // size
     z = dr.gather(types.Float, types.Float(np.ascontiguousarray(cos, np.float32)), lane)
     sin = dr.sqrt(1 - dr.square(z))
     wi = types.Array3f(sin * float(np.cos(azimuth)), sin * float(np.sin(azimuth)), z)
@@ -35,30 +37,34 @@ def contributions(values: list, truth, types, cos: np.ndarray, azimuth: float = 
         for value in values:
             channels = [samples.weight * v for v in value(samples.wi, samples.wo)]
             dr.eval(channels)
-            result.append(np.stack([c.numpy().reshape(count, SAMPLES) for c in channels], axis=-1))
-    return samples.wo.z.numpy().reshape(count, SAMPLES), result
+            result.append(np.stack([c.numpy().reshape(count, size) for c in channels], axis=-1))
+    return samples.wo.z.numpy().reshape(count, size), result
 
 
-def albedos(values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, seed: int = 5) -> np.ndarray:
+def albedos(
+    values: list, truth, types, cos: np.ndarray, azimuth: float = 0.0, seed: int = 5, size: int = SAMPLES
+) -> np.ndarray:
     """Return the directional albedos of functions ``value(wi, wo)`` = f cos θ_o, from the same samples.
 
     ``cos``: cosines of ``wi``; the result has the shape ``(len(values), len(cos), 3)``.
     """
-    _, parts = contributions(values, truth, types, cos, azimuth, seed)
+    _, parts = contributions(values, truth, types, cos, azimuth, seed, size)
     return np.stack([part.mean(axis=1, dtype=np.float64) for part in parts])
 
 
-def fitted_scale(value, truth, types, azimuths: tuple[float, ...] = (0.0,)) -> np.ndarray:
+def fitted_scale(
+    value, truth, types, azimuths: tuple[float, ...] = (0.0,), angles: int = ANGLES, size: int = SAMPLES
+) -> np.ndarray:
     """Return s(θ) ≤ 1 at :data:`NODES` cosines, so that s(θ_i) s(θ_o) f has at most the source's albedo + 0.1%.
 
     ``value`` is f cos θ_o of the learned BSDF. s starts at 1; where the albedo is too high in a channel, the nodes next
     to the angle are lowered, until no angle is left.
     """
-    fine = np.maximum(np.linspace(0, 1, (NODES - 1) * ANGLES + 1) ** 2, 2e-3)
+    fine = np.maximum(np.linspace(0, 1, (NODES - 1) * angles + 1) ** 2, 2e-3)
     position, nodes = np.sqrt(fine), np.linspace(0, 1, NODES)
     parts = []
     for azimuth in azimuths:
-        cos, (source, learned) = contributions([truth.value, value], truth, types, fine, azimuth)
+        cos, (source, learned) = contributions([truth.value, value], truth, types, fine, azimuth, size=size)
         parts.append((np.sqrt(np.clip(cos, 0, 1)), ALLOWED * source.mean(axis=1, dtype=np.float64), learned))
     scale = np.ones(NODES)
     for k in range(CORRECTIONS):
@@ -71,6 +77,6 @@ def fitted_scale(value, truth, types, azimuths: tuple[float, ...] = (0.0,)) -> n
             break
         lowered = np.sqrt(ratio) if k < CORRECTIONS // 2 else ratio
         for node in range(NODES):
-            near = slice(max(0, (node - 1) * ANGLES + 1), (node + 1) * ANGLES)
+            near = slice(max(0, (node - 1) * angles + 1), (node + 1) * angles)
             scale[node] *= lowered[near].min()
     return scale

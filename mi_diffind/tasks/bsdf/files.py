@@ -128,8 +128,9 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     """Return the arrays; ``storage`` is the form of those of the residual, ``proxy`` is always in single precision."""
     result = {}
     for name, array in table.arrays.items():
-        form = storage if name in RESIDUAL else "float32"
-        result[name] = array.allocate(dtype, form, fold=name in RESIDUAL)
+        is_residual = name in (*RESIDUAL, "mixing")
+        form = storage if is_residual else "float32"
+        result[name] = array.allocate(dtype, form, fold=is_residual)
     return result
 
 

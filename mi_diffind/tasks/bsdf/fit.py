@@ -37,11 +37,15 @@ def check(request: FitRequest) -> None:
 
 def fit(request: FitRequest) -> Fitted:
     """Fit a BSDF as requested on the command line, in the active variant. Raises :class:`UsageError`."""
+    return fit_truth(requested_truth(request), request)
+
+
+def requested_truth(request: FitRequest) -> Truth:
+    """Return the source of a request. Raises :class:`UsageError`."""
     use_rgb_variant(request)
     options = request.options
     u, v = options["uv"]
-    truth = truth_of(options["source"], request.types, options["material"], (float(u), float(v)))
-    return fit_truth(truth, request)
+    return truth_of(options["source"], request.types, options["material"], (float(u), float(v)))
 
 
 def use_rgb_variant(request: FitRequest) -> None:
@@ -62,7 +66,7 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     lines = [symmetry_line(symmetries)]
     plain = request.preset == "table"
     try:
-        structure = structure_of(parse_bytes(options["bytes"]), plain)
+        structure = structure_of(parse_bytes(options["bytes"] or "2k"), plain)
     except ValueError as e:
         raise UsageError(f"--bytes: {e}") from None
     samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)

@@ -126,6 +126,8 @@ def check(request: FitRequest) -> None:
         return
     if request.output is None or request.output.suffix.lower() == ".npz":
         raise UsageError(f"output: found {request.output or 'none'}, a library is written to a folder")
+    if request.options["over"]:
+        raise UsageError("over: given for a library, a family is fitted to a single BSDF")
     for name in ("checkpoint", "seconds"):
         if getattr(request, name) is not None:
             raise UsageError(f"{name}: given for a library, which {_INSTEAD[name]}")

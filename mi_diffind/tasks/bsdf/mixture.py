@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from dataclasses import dataclass
@@ -37,19 +36,24 @@ def cosines(nodes: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SampledLobe:
-    """Lobe of visible GGX normals of the roughnesses ``alpha_u`` and ``alpha_v``.
+    """Lobe of visible GGX normals of the roughnesses ``alpha_u`` and ``alpha_v``, numbers or arrays.
 
     ``gamma`` is the exponent of its tails: 2 for those of GGX, larger for shorter ones (:func:`.pool.shortened`).
     """
 
-    alpha_u: float
-    alpha_v: float
-    gamma: float = 2.0
+    alpha_u: object
+    alpha_v: object
+    gamma: object = 2.0
+
+    @property
+    def is_ggx(self) -> bool:
+        """Whether the tails are known to be those of GGX."""
+        return isinstance(self.gamma, float) and self.gamma == 2
 
     def density(self, wi, wo):
         """Return the density of its samples per solid angle."""
         Float = type(wo.z)
-        gamma = None if self.gamma == 2 else Float(self.gamma)
+        gamma = None if self.is_ggx else Float(self.gamma)
         return density_ggx(wi, wo, Float(self.alpha_u), Float(self.alpha_v), gamma)
 
 
@@ -61,44 +65,52 @@ def fitted_mixture(
     They minimise the mean square of the weights f cos θ / p of a sample, whose lower bound is the squared albedo.
     Each node's weights sum to 1. ``stretch`` is α_v/α_u of the lobes.
     """
-    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
-    node = dr.arange(types.UInt32, NODES * SAMPLES) // SAMPLES
-    cos = dr.gather(types.Float, types.Float(cosines(NODES).astype(np.float32)), node)
-    sin = dr.sqrt(1 - dr.square(cos))
-    azimuth = incident(rng, types, NODES * SAMPLES, isotropic)
-    r = dr.rsqrt(dr.maximum(dr.square(azimuth.x) + dr.square(azimuth.y), 1e-12))
-    wi = types.Array3f(sin * azimuth.x * r, sin * azimuth.y * r, cos)
-    s = outgoing(rng, types, wi, truth)
     root = math.sqrt(stretch)
     lobes = [
         SampledLobe(*(float(np.clip(a, 1e-3, 1)) for a in (alpha / root, alpha * root)), gamma)
         for alpha in ALPHAS
         for gamma in EXPONENTS
     ]
-    with dr.suspend_grad():
-        value = truth.value(s.wi, s.wo)
-        mean = (value[0] + value[1] + value[2]) / 3
-        columns = [s.weight, mean, s.wo.z * dr.inv_pi, *(lobe.density(s.wi, s.wo) for lobe in lobes)]
-        dr.eval(columns)
-    weight, mean, *densities = (c.numpy().reshape(NODES, SAMPLES) for c in columns)
-    square = weight * mean**2
-    square /= np.maximum(square.mean(axis=1, keepdims=True), 1e-30)
-    densities = np.stack(densities)
+    densities, square = candidate_densities(truth, types, isotropic, lobes, SAMPLES, seed)
     some = slice(0, RANKING[0])
-    ranked = sorted(
-        (float(np.log(_weights(densities[[0, 1 + i, 1 + j], :, some], square[:, some], RANKING[1])[1]).mean()), i, j)
-        for i, j in itertools.combinations(range(len(lobes)), 2)
-    )
+    ranked = []
+    for i, j in itertools.combinations(range(len(lobes)), 2):
+        _, cost = optimal_weights(densities[[0, 1 + i, 1 + j], :, some], square[:, some], RANKING[1])
+        ranked.append((float(np.log(cost).mean()), i, j))
     best = None
-    for _, i, j in ranked[:KEPT]:
-        weights, cost = _weights(densities[[0, 1 + i, 1 + j]].astype(np.float64), square, ITERATIONS)
+    for _, i, j in sorted(ranked)[:KEPT]:
+        weights, cost = optimal_weights(densities[[0, 1 + i, 1 + j]].astype(np.float64), square)
         total = float(np.mean(np.log(cost)))
         if best is None or total < best[0]:
             best = total, (lobes[i], lobes[j]), weights
     return best[1:]
 
 
-def _weights(densities: np.ndarray, square: np.ndarray, iterations: int) -> tuple[np.ndarray, np.ndarray]:
+def candidate_densities(truth, types, isotropic: bool, lobes: list, size: int, seed: int) -> tuple:
+    """Return densities of the cosine and of ``lobes``, ``(1 + K, NODES, size)``, and f²/density, ``(NODES, size)``.
+
+    The squares, of ``size`` samples of a source at each of :data:`NODES` cosines, have a mean of 1 at each.
+    """
+    rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
+    node = dr.arange(types.UInt32, NODES * size) // size
+    cos = dr.gather(types.Float, types.Float(cosines(NODES).astype(np.float32)), node)
+    sin = dr.sqrt(1 - dr.square(cos))
+    azimuth = incident(rng, types, NODES * size, isotropic)
+    r = dr.rsqrt(dr.maximum(dr.square(azimuth.x) + dr.square(azimuth.y), 1e-12))
+    wi = types.Array3f(sin * azimuth.x * r, sin * azimuth.y * r, cos)
+    s = outgoing(rng, types, wi, truth)
+    with dr.suspend_grad():
+        value = truth.value(s.wi, s.wo)
+        mean = (value[0] + value[1] + value[2]) / 3
+        columns = [s.weight, mean, s.wo.z * dr.inv_pi, *(lobe.density(s.wi, s.wo) for lobe in lobes)]
+        dr.eval(columns)
+    weight, mean, *densities = (c.numpy().reshape(NODES, size) for c in columns)
+    square = weight * mean**2
+    square /= np.maximum(square.mean(axis=1, keepdims=True), 1e-30)
+    return np.stack(densities), square
+
+
+def optimal_weights(densities: np.ndarray, square: np.ndarray, iterations: int = ITERATIONS) -> tuple:
     """Return the weights of three densities, ``(NODES, 3)``, that minimise E[f²/p], and that mean."""
     weights = np.full((densities.shape[1], 3), 1 / 3, densities.dtype)
     for _ in range(iterations):
@@ -131,11 +143,11 @@ class Mixture:
         """Return directions ``wo`` from three uniform numbers each; some lie below the surface."""
         cosine, first, _ = self.shares(wi, active)
         is_first = w < cosine + first
-        pairs = zip(*(dataclasses.astuple(lobe) for lobe in self.lobes), strict=True)
+        pairs = zip(*((lobe.alpha_u, lobe.alpha_v, lobe.gamma) for lobe in self.lobes), strict=True)
         alpha_u, alpha_v, gamma = (dr.select(is_first, type(w)(a), type(w)(b)) for a, b in pairs)
         r, (sin, cos) = dr.sqrt(u), dr.sincos(2 * dr.pi * v)
         diffuse = type(wi)(r * cos, r * sin, dr.sqrt(dr.maximum(1 - u, 0)))
-        if any(lobe.gamma != 2 for lobe in self.lobes):
+        if not all(lobe.is_ggx for lobe in self.lobes):
             v = shortened(v, gamma)
         return dr.select(w < cosine, diffuse, sample_ggx(wi, alpha_u, alpha_v, u, v))
 

@@ -171,30 +171,30 @@ def masking(w, square_u, square_v=None):
 
 @dataclass
 class Proxy:
-    """Analytic proxy: ``diffuse`` (three arrays, over π) and ``edge`` less 1, and constants of microfacet lobes."""
+    """Analytic proxy: ``diffuse`` (three arrays, over π) and ``edge`` less 1, and lobes by name."""
 
     diffuse: list | None
     edge: object
-    lobes: list[LobeConstants]
+    lobes: dict[str, LobeConstants]
 
     @classmethod
     def of(cls, logarithms: list, form: Form) -> Proxy:
         """Return the proxy of :data:`PARAMETERS` logarithms, arrays."""
         values = [dr.exp(clamp(x, *LOGARITHMS)) for x in logarithms]
-        lobes = []
+        lobes = {}
         for k, name in enumerate(TERMS[1:]):
             a = 4 + k * LOBE
             if name in form.terms:
                 alphas = tuple(dr.clip(x, ALPHA_MIN, 1) for x in values[a : a + (1 if form.isotropic else 2)])
-                lobes.append(ProxyLobe(alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9]))
+                lobes[name] = ProxyLobe(alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9])
         return cls.of_parts(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
 
     @classmethod
-    def of_parts(cls, diffuse: list | None, edge, lobes: list[ProxyLobe]) -> Proxy:
+    def of_parts(cls, diffuse: list | None, edge, lobes: dict[str, ProxyLobe]) -> Proxy:
         """Return the proxy of an albedo (``None``: no diffuse lobe), its factor at the horizon, and lobes."""
         if diffuse is not None:
             diffuse, edge = [dr.inv_pi * c for c in diffuse], edge - 1
-        return cls(diffuse, edge, [lobe.constants() for lobe in lobes])
+        return cls(diffuse, edge, {name: lobe.constants() for name, lobe in lobes.items()})
 
     def value(self, g: DirectionPair) -> list:
         """Return the proxy, without the cosine, three arrays."""
@@ -202,7 +202,7 @@ class Proxy:
         if self.diffuse is not None:
             shape = dr.fma(self.edge, _fifth(1 - g.wi.z), 1) * dr.fma(self.edge, _fifth(1 - g.wo.z), 1)
             result = [colour * shape for colour in self.diffuse]
-        for lobe in self.lobes:
+        for lobe in self.lobes.values():
             result = [a + b for a, b in zip(result, lobe.value(g), strict=True)]
         return result
 

@@ -81,12 +81,16 @@ class BSDFProblem(Problem):
             net = net.rounded() if self._share >= ROUNDED else net.unfolded()
         return LearnedBSDF.of(self.form, net)
 
+    def value(self, net: BSDFArrays, s: Samples) -> list:
+        """Return f of samples in a step."""
+        return self.trained(net).value(s.wi, s.wo)
+
     def loss(self, net, rng, size: int):
         # The samples are in random order: a run of them is a batch, and is read from memory in order
         Float, count = type(self.samples.weight), dr.width(self.samples.weight)
         UInt32 = dr.uint32_array_t(Float)
         s = self.samples.at((UInt32(rng.random(Float, 1) * count) + dr.arange(UInt32, size)) % count)
-        value = self.trained(net).value(s.wi, s.wo)
+        value = self.value(net, s)
         weight = s.weight * (1 / (3 * size))
         errors = [dr.abs(dr.fma(v, s.wo.z, -t)) for v, t in zip(value, s.value, strict=True)]
         return weight * sum(errors[1:], errors[0])
@@ -149,6 +153,11 @@ def residual_range(form: Form, logarithms: np.ndarray, samples: Samples) -> tupl
     if form.terms:
         net = BSDFArrays(None, proxy_array(logarithms, 1.0)).alloc(types.TensorXf)
         value = LearnedBSDF.of(form, net).value(samples.wi, samples.wo)
+    return range_above(value, samples)
+
+
+def range_above(value: list, samples: Samples) -> tuple[float, float]:
+    """Return the range of log(f / ``value``) over samples of f, from quantiles; ``value`` has no cosine."""
     with dr.suspend_grad():
         least = DARK * sum(float(dr.mean(samples.weight * t)[0]) for t in samples.value) / 3
         ratios = [

@@ -1,0 +1,169 @@
+"""Families of learned BSDFs: parameters, their formula, sources, files, and a training."""
+
+import dataclasses
+
+import drjit as dr
+import numpy as np
+import pytest
+from arrays import aligned, numpy_of
+from learned_bsdfs import formula, handmade_family, member
+
+import mi_diffind
+from mi_diffind.errors import UsageError
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import StoredArray, TableError, load_table, save_table
+from mi_diffind.tasks.bsdf import TASK, family_fit, family_measurement, family_sampling, family_truth, training
+from mi_diffind.tasks.bsdf.family import Parameter, sizes_of
+
+MEMBERS = ((0.05, 0.0), (0.8, 1.0), (0.13, 0.4), (0.5, 0.9))
+
+
+@pytest.fixture
+def types(mi_rgb):
+    return array_module()
+
+
+@pytest.fixture
+def model(types, tmp_path):
+    save_table(tmp_path / "family.npz", handmade_family())
+    return mi_diffind.open(tmp_path / "family.npz")
+
+
+def directions(rng, n, horizon=0.02):
+    pair = []
+    for _ in range(2):
+        z, phi = horizon + (1 - horizon) * rng.random(n), 2 * np.pi * rng.random(n)
+        r = np.sqrt(1 - z * z)
+        pair.append(np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1))
+    return pair
+
+
+def test_coordinates(types):
+    """Wide ranges of positive numbers are logarithmic; numbers outside and NaN count as the ends."""
+    values = types.Float(aligned(np.float32([0.05, 0.2, 0.8, 3, -1, np.inf, np.nan])))
+    rough, metal = Parameter("roughness", 0.05, 0.8), Parameter("metallic", -1.0, 3.0)
+    np.testing.assert_allclose(rough.coordinate(values), [0, 0.5, 1, 1, 0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(metal.coordinate(values), [0.2625, 0.3, 0.45, 1, 0, 1, 0], atol=1e-6)
+    assert rough.middle == pytest.approx(0.2) and metal.middle == 1
+
+
+def test_the_formula(types, model, rng):
+    """A member is the learned BSDF of the proxy, residual and energy that its parameters give, lane by lane."""
+    n = 1200
+    wi, wo = directions(rng, n)
+    given = np.repeat(MEMBERS, n // len(MEMBERS), axis=0)
+    bsdf, _ = model.at([types.Float(aligned(column)) for column in given.T.astype(np.float32)])
+    values = numpy_of(bsdf.value(*(types.Array3f(aligned(w.T)) for w in (wi, wo))))
+    backwards = numpy_of(bsdf.value(*(types.Array3f(aligned(w.T)) for w in (wo, wi))))
+    for roughness, metallic in MEMBERS:
+        lanes = (given == (roughness, metallic)).all(axis=1)
+        expected = formula(member(load_table(model.table.path), roughness, metallic), wi[lanes], wo[lanes])
+        np.testing.assert_allclose(values[lanes], expected, rtol=3e-3)
+    np.testing.assert_allclose(values, backwards, rtol=1e-4)
+
+
+def test_sizes_follow_the_bytes():
+    parameters = [Parameter("a", 0.01, 1.0), Parameter("b", 0.0, 1.0), Parameter("c", 0.0, 1.0)]
+    for count, nbytes in ((1, 4000), (2, 9000), (3, 12000)):
+        assert 0.85 * nbytes < sizes_of(nbytes, parameters[:count]).nbytes <= nbytes
+    with pytest.raises(ValueError, match="found 10 bytes, the smallest arrays of this family need"):
+        sizes_of(10, parameters)
+
+
+REFUSED = {
+    "unknown": ({"rough": (0, 1)}, 'found "rough", the parameters of principled are .*roughness'),
+    "order": ({"roughness": (1, 0)}, r"found roughness = \(1, 0\), a pair of finite numbers \(low, high\) is needed"),
+    "number": ({"roughness": 3}, "found roughness = 3, a pair"),
+    "twice": ({"roughness": (0, 1), "roughness.value": (0, 1)}, "which name a parameter twice"),
+    "four": (dict.fromkeys("abcd", (0, 1)), "found 4 parameters, allowed are 1 to 3"),
+    "idle": ({"sheen_tint": (0, 1)}, "sheen_tint changes nothing of principled, which may need it in the source, too"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_parameters_that_are_refused(mi_rgb, case):
+    over, message = REFUSED[case]
+    with pytest.raises(UsageError, match=message):
+        mi_diffind.fit("bsdf", {"type": "principled"}, over=over, progress=False)
+
+
+def test_the_command_line_names_ranges(capsys):
+    from mi_diffind import cli
+
+    with pytest.raises(SystemExit):
+        cli.main(["fit", "bsdf", "a.xml", "--over", "roughness=1", "-o", "a.npz"])
+    assert "found 'roughness=1', expected NAME=LOW:HIGH" in capsys.readouterr().err
+
+
+DAMAGES = {
+    "name": (lambda t: t.settings.update(family=[{"name": "a b", "low": 0, "high": 1}]), "which are no parameters"),
+    "range": (lambda t: t.settings["family"].__setitem__(0, {"name": "a", "low": 1, "high": 1}), "are no parameters"),
+    "fewer": (lambda t: t.settings["family"].pop(), "expected 1 dimension"),
+    "factors": (lambda t: t.settings.update(factors=[1]), r'its setting "factors" is \[1\]'),
+    "mixing": (lambda t: t.arrays.pop("mixing"), 'the array "mixing" is missing'),
+    "rank": (lambda t: t.arrays.update(mixing=t.arrays["energy"]), 'the array "mixing" has the shape'),
+    "proxy": (lambda t: t.arrays.update(proxy=StoredArray(np.zeros((4, 3, 5), np.float16))), "and 24 channel"),
+    "terms": (lambda t: t.settings["form"].update(terms=[]), "a family needs a proxy"),
+    "other": (lambda t: t.arrays.update(more=t.arrays["energy"]), 'has an unexpected array "more"'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_files_are_refused(tmp_path, damage):
+    table = handmade_family()
+    change, message = DAMAGES[damage]
+    change(table)
+    save_table(tmp_path / "damaged.npz", table)
+    with pytest.raises(TableError, match=message):
+        TASK.load(tmp_path / "damaged.npz")
+
+
+def test_a_family_of_conductors_is_fitted(types, monkeypatch, tmp_path):
+    """A file stands for all roughnesses of its range, and the source is left as it was."""
+    for module, name, value in (
+        (family_fit, "SAMPLES", 2**15), (family_fit, "VALIDATION", 2**13), (family_fit, "MEMBERS", 16),
+        (family_fit, "VIEWS", 2), (family_measurement, "MEMBERS", 3), (training, "STARTS", 1),
+        (family_sampling, "BETWEEN", 1), (family_sampling, "ENERGY_SAMPLES", 512),
+        (family_sampling, "MIXTURE_SAMPLES", 256), (family_sampling, "FACTORS", (0.7, 1.0)),
+        (training, "PROXY", dataclasses.replace(training.PROXY, steps=60, batch=2**11)),
+        (family_fit, "PROXY", dataclasses.replace(family_fit.PROXY, steps=150, batch=2**11)),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, value)
+    import mitsuba as mi
+
+    source = mi.load_dict({"type": "roughconductor", "material": "Cu", "alpha": 0.2, "distribution": "ggx"})
+    over = {"alpha": (0.1, 0.4)}
+    fitted = mi_diffind.fit("bsdf", source, over=over, steps=100, batch=2**12, measure_every=50, progress=False)
+    measured = fitted.table.measured
+    assert measured["psnr_minimum_db"] > 45 and measured["psnr_db"] >= measured["psnr_minimum_db"]
+    assert measured["albedo_excess"] < 5e-3 and measured["sample_weight_moment"] < 1.2
+    assert float(mi.traverse(source)["alpha.value"][0]) == pytest.approx(0.2)
+    assert '<float name="alpha" value="0.1"/>  <!-- or a texture, 0.1 to 0.4 -->' in "\n".join(fitted.summary())
+    with pytest.raises(TableError, match="was fitted to an object in memory"):
+        mi_diffind.open(fitted.save(tmp_path / "a.npz")).measure()
+    saved = TASK.load(tmp_path / "a.npz")
+    assert saved.nbytes < 6000 and saved.settings["family"] == [{"name": "alpha", "low": 0.1, "high": 0.4}]
+
+
+def test_members_are_sampled_evenly():
+    """Coordinates of members fill the square, and reach its ends."""
+    x = family_truth.points(64, 2, 3)
+    counts, _, _ = np.histogram2d(*x.T, bins=4)
+    assert counts.min() >= 2 and x.min() == 0 and x.max() == 1
+
+
+def test_samples_are_those_of_their_members(types):
+    """Each sample has the value of the source at its own parameters."""
+    from mi_diffind.tasks.bsdf.truth import truth_of
+
+    truth = family_truth.FamilyTruth(
+        truth_of({"type": "roughconductor", "alpha": 0.2}, types), {"alpha": (0.05, 0.8)}
+    )  # fmt: skip
+    samples = family_truth.draw(truth, types, 2**10, 4, 2, True)
+    x = samples.coordinates[0].numpy()
+    for coordinate in np.unique(x):
+        lanes = types.UInt32(np.flatnonzero(x == coordinate).astype(np.uint32))
+        s = samples.at(lanes)
+        expected = truth.at([coordinate]).value(s.wi, s.wo)
+        np.testing.assert_allclose(numpy_of(s.value), numpy_of(expected), rtol=1e-4)
+    assert len(np.unique(x)) == 4 and dr.width(samples.weight) == 2**10
