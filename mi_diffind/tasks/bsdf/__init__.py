@@ -1,7 +1,8 @@
 """Learned BSDFs: any reflecting BSDF as an analytic proxy times a learned residual.
 
 - :mod:`.model`: the form of a learned BSDF, its proxy and coordinates;
-- :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.symmetry`: symmetries, measured;
+- :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.scattered`: rows of measured values;
+- :mod:`.source`: their base class; :mod:`.symmetry`: symmetries, measured;
 - :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
 - :mod:`.measurement`: errors against a source; :mod:`.outputs`, :mod:`.tensor_file`: other formats;
@@ -55,12 +56,17 @@ class BSDFTask(Task):
     arguments = (
         Argument(
             "source", metavar="SOURCE",
-            help="scene or BSDF (.xml), measured file (.bsdf, .pbsdf, .binary), or a folder of such files",
+            help="scene or BSDF (.xml), measured file (.bsdf, .pbsdf, .binary), table of measurements (.csv), or a "
+            "folder of such files",
         ),
         Argument("--material", default="", metavar="ID", help="id of a BSDF of the scene; all: each of them"),
         Argument(
             "--uv", nargs=2, type=_coordinate, default=(0.5, 0.5), metavar=("U", "V"),
             help="point of the textures at which the BSDF is fitted (default: 0.5 0.5)",
+        ),
+        Argument(
+            "--angles", choices=("degrees", "radians"), default="",
+            help="unit of the angles of a .csv file (default: degrees, if any is above 2π)",
         ),
         Argument(
             "--bytes", type=checked(parse_bytes), metavar="SIZE",

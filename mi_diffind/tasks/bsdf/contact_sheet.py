@@ -11,7 +11,7 @@ from ...files import replacing
 from ...srgb import for_display
 from .files import BSDFModel
 from .fit import cosine
-from .truth import Truth
+from .source import FunctionTruth, Truth
 from .view import SphereView
 
 #: Folder of the pictures, beside the tables.
@@ -33,9 +33,12 @@ def save_pair(table: Path, truth: Truth, model: BSDFModel) -> None:
     """Write the spheres of a source and, on its right, of the learned BSDF of a table file, in the same light."""
     from PIL import Image
 
-    views = [SphereView(truth, model.types, seed) for seed in range(SEED, SEED + VIEWS)]
+    source = truth if truth.function else FunctionTruth(truth.name, cosine(model.bsdf))
+    views = [SphereView(source, model.types, seed) for seed in range(SEED, SEED + VIEWS)]
     images = [sum(v.halves.mean(axis=0) for v in views), sum(v.images(cosine(model.bsdf)).mean(axis=0) for v in views)]
     shown = [np.where(views[0].hit[..., None], for_display(image / VIEWS), 1.0) for image in images]
+    if not truth.function:
+        shown[0][:] = 1.0  # rows of measured values show no sphere
     with replacing(picture_path(table)) as temporary:
         Image.fromarray(np.round(255 * np.concatenate(shown, axis=1)).astype(np.uint8)).save(temporary)
 

@@ -11,10 +11,12 @@ import numpy as np
 from ...indirection import DifferentiableArray, Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
 from ...task import Model
-from . import measurement, outputs, tensor_file
+from . import measurement, outputs, scattered, tensor_file
 from .mixture import Mixture, SampledLobe
 from .model import AZIMUTHS, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, Proxy
-from .truth import Truth, recorded_truth
+from .source import Truth
+from .training import LIMIT
+from .truth import recorded_truth
 from .view import SphereView
 
 #: Arrays of the residual.
@@ -163,6 +165,9 @@ class BSDFModel(Model):
     def measure(self) -> dict[str, float]:
         """Return errors against the source (:func:`.measurement.measure`)."""
         truth = self.source()
+        if not truth.function:
+            rows = scattered.split(truth, self.types, self.form.isotropic, LIMIT, self.table.seed or 0)[1]
+            return measurement.measure_samples(self, scattered.without_outliers(rows, self.form, self.bsdf)[0])
         return measurement.measure(self, truth, SphereView(truth, self.types))
 
     def decode(self, output: str | os.PathLike | None = None, rows: int | None = None, seed: int | None = None):

@@ -11,11 +11,12 @@ import numpy as np
 from ...errors import UsageError
 from ...task import FitRequest, Fitted
 from ...units import parse_bytes
-from . import energy, mixture, symmetry, training
+from . import energy, mixture, scattered, symmetry, training
 from .files import BSDFModel, allocate, to_table
-from .measurement import cosine, measure
+from .measurement import cosine, measure, measure_samples
 from .model import Form, LearnedBSDF, structure_of
-from .truth import Truth, recorded_source, truth_of
+from .source import WHITE, FunctionTruth, Truth
+from .truth import recorded_source, truth_of
 from .view import SphereView
 
 #: Share of a limited time in which the proxy is fitted.
@@ -45,7 +46,7 @@ def requested_truth(request: FitRequest) -> Truth:
     use_rgb_variant(request)
     options = request.options
     u, v = options["uv"]
-    return truth_of(options["source"], request.types, options["material"], (float(u), float(v)))
+    return truth_of(options["source"], request.types, options["material"], (float(u), float(v)), options["angles"])
 
 
 def use_rgb_variant(request: FitRequest) -> None:
@@ -60,35 +61,43 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     """Fit a learned BSDF to a source, measure it, and return its table and the record of its training."""
     types, options, settings = request.types, request.options, request.settings
     with dr.suspend_grad():
-        symmetries = symmetry.measured_symmetry(truth, types)
-    isotropic = symmetries["isotropy"] <= symmetry.TOLERANCE
-    azimuth = "mirror" if symmetries["mirror"] <= symmetry.TOLERANCE else "half"
+        symmetries = symmetry.measured_symmetry(truth, types) if truth.function else scattered.measured_symmetry(truth)
+    isotropic = (symmetries["isotropy"] or 0) <= symmetry.TOLERANCE
+    azimuth = "mirror" if (symmetries["mirror"] or 0) <= symmetry.TOLERANCE else "half"
     lines = [symmetry_line(symmetries)]
     plain = request.preset == "table"
     try:
         structure = structure_of(parse_bytes(options["bytes"] or "2k"), plain)
     except ValueError as e:
         raise UsageError(f"--bytes: {e}") from None
-    samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)
-    validation = training.draw(truth, types, training.VALIDATION, settings.seed + 2, isotropic)
-    view = SphereView(truth, types)
+    if truth.function:
+        samples = training.draw(truth, types, training.SAMPLES, settings.seed + 1, isotropic)
+        validation = training.draw(truth, types, training.VALIDATION, settings.seed + 2, isotropic)
+        view, smooth = SphereView(truth, types), validation
+    else:
+        samples, validation, smooth = scattered.split(truth, types, isotropic, training.LIMIT, settings.seed)
+        view = None
     if request.preset == "paper":
         logarithms, form = np.zeros(22, np.float32), Form((), isotropic, azimuth, (0.05, 0.05))
         form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
     else:
-        logarithms, _ = training.fit_proxy(samples, validation, types, isotropic, request.progress)
+        logarithms, _ = training.fit_proxy(samples, validation, types, isotropic, request.progress, smooth)
         form = training.form_of(logarithms, validation, isotropic, azimuth)
+    if not truth.function:
+        (samples, validation), form, line = scattered.cleaned(truth, [samples, validation], form, logarithms)
+        lines.append(line)
     identity = {"source": truth.digest, "structure": dataclasses.asdict(structure), "form": form.to_json()}
-    problem = training.residual_problem(logarithms, form, structure, samples, view, identity)
+    measured = training.proxy_loss(validation) if view is None else training.view_psnr(view)
+    problem = training.residual_problem(logarithms, form, structure, samples, measured, identity)
     result = request.train(problem)
     bsdf = LearnedBSDF.of(form, problem.net.rounded())
 
-    stretch = form.scale[1] / form.scale[0]
-    lobes, weights = mixture.fitted_mixture(truth, types, isotropic, stretch)
-    scale, raw = None, view.psnr(cosine(bsdf))
+    sampled = truth if truth.function else FunctionTruth(truth.name, cosine(bsdf))
+    lobes, weights = mixture.fitted_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
+    scale, raw = None, None if view is None else view.psnr(cosine(bsdf))
     if options["energy"] == "source":
         azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
-        scale = energy.fitted_scale(cosine(bsdf), truth, types, azimuths)
+        scale = energy.fitted_scale(cosine(bsdf), truth if truth.function else WHITE, types, azimuths)
     table = to_table(problem.net, form, lobes, weights, scale, {
         **request.recorded(result), "source": truth.digest, "name": truth.name, "symmetry": symmetries,
         "structure": dataclasses.asdict(structure),
@@ -96,10 +105,12 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     table.preset, table.seed = request.preset, settings.seed
     table.settings |= request.paths(source_path=options["source"]) | recorded_source(options)
     model = BSDFModel(table, allocate(table, types.TensorXf), types.TensorXf)
-    measured = measure(model, truth, view)
+    measured = measure_samples(model, validation) if view is None else measure(model, truth, view)
     table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
     if scale is not None:
-        lines.append(f"albedo limited to the source's: factors down to {scale.min():.4f}; {raw:.2f} dB without")
+        limit = "1" if raw is None else "the source's"
+        without = "" if raw is None else f"; {raw:.2f} dB without"
+        lines.append(f"albedo limited to {limit}: factors down to {scale.min():.4f}{without}")
     left_out = [name for name in ("diffuse", "first", "second") if name not in form.terms]
     if left_out and form.terms:
         lines.append(f"the proxy has no {' and no '.join(left_out)} lobe: the source does not need it")
@@ -111,7 +122,7 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     return FittedBSDF(table, result, lines, figures, truth=truth)
 
 
-def symmetry_line(symmetries: dict[str, float]) -> str:
+def symmetry_line(symmetries: dict[str, float | None]) -> str:
     """Return the measured symmetries as a line of text."""
     assumed = {
         "isotropy": ("isotropic", "anisotropic"),
@@ -121,5 +132,8 @@ def symmetry_line(symmetries: dict[str, float]) -> str:
     parts = []
     for name, (yes, no) in assumed.items():
         value = symmetries[name]
-        parts.append(f"{yes if value <= symmetry.TOLERANCE else no} ({100 * value:.2g}%)")
+        if value is None:
+            parts.append(f"{yes} (assumed: no rows to compare)")
+        else:
+            parts.append(f"{yes if value <= symmetry.TOLERANCE else no} ({100 * value:.2g}%)")
     return "measured: " + ", ".join(parts)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import numpy as np
 
 from . import energy, mixture
 from .model import LearnedBSDF
-from .truth import Truth
+from .source import FunctionTruth, Truth
 from .view import SphereView
 
 
@@ -29,5 +30,27 @@ def measure(model, truth: Truth, view: SphereView) -> dict[str, float]:
     return {
         "psnr_db": view.psnr(value),
         "albedo_excess": float(((learned - source) / np.maximum(source, 1e-3)).max()),
+        "sample_weight_moment": float(np.mean(moments)),
+    }
+
+
+def measure_samples(model, samples) -> dict[str, float]:
+    """Return figures of a model of which only samples are known (:class:`.pool.Samples`).
+
+    ``relative_error`` is the weighted mean of |f̂ − f| cos θ_o over that of f cos θ_o, ``albedo_largest`` the largest
+    directional albedo from 0° to 89°, ``sample_weight_moment`` as in :func:`measure`, of f̂.
+    """
+    types, value = model.types, cosine(model.bsdf)
+    with dr.suspend_grad():
+        pairs = list(zip(value(samples.wi, samples.wo), samples.value, strict=True))
+        error = sum(dr.sum(samples.weight * dr.abs(v - t)) for v, t in pairs)
+        total = sum(dr.sum(samples.weight * t) for _, t in pairs)
+    fitted = FunctionTruth("", value)
+    albedo = energy.albedos([value], fitted, types, np.cos(np.radians([0, 15, 30, 45, 60, 70, 80, 85, 89])))
+    cosines = np.cos(np.radians([0, 45, 80]))
+    moments = [mixture.second_moment(value, model.mixture, fitted, types, float(c)) for c in cosines]
+    return {
+        "relative_error": float((error / total)[0]),
+        "albedo_largest": float(albedo.max()),
         "sample_weight_moment": float(np.mean(moments)),
     }

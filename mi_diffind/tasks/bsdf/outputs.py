@@ -13,14 +13,14 @@ from ...files import replacing
 from . import tensor_file
 from .measurement import cosine
 from .pool import incident, outgoing
-from .truth import Truth
+from .source import Truth
 from .view import SphereView
 
 #: Extensions of the outputs.
 EXTENSIONS = (".bsdf", ".csv", ".exr")
 
 #: Columns of a table of numbers; angles in degrees.
-COLUMNS = ("theta_i", "phi_i", "theta_o", "phi_o", "r", "g", "b", "weight")
+COLUMNS = ("theta_i", "phi_i", "theta_o", "phi_o", "r", "g", "b", "solid_angle")
 
 #: Rows of a table of numbers; side of a picture in pixels, its passes of 64 samples a pixel, and factor on its errors.
 ROWS, SIDE, PASSES, ENLARGED = 10_000, 256, 8, 8
@@ -70,7 +70,7 @@ def samples(model, rows: int, seed: int) -> np.ndarray:
     """Return values of a model at random directions, ``(rows, 8)`` in the order of :data:`COLUMNS`.
 
     Directions of incidence are those of trainings; ``wo`` is drawn from the lobes that sample the model, from wider and
-    from narrower ones. The weight is the inverse of its density per solid angle.
+    from narrower ones. The solid angle is the inverse of its density.
     """
     types, truth, parts, count = model.types, LearnedTruth(model), [], 0
     rng = dr.rng(seed=dr.opaque(types.UInt64, seed))
@@ -97,6 +97,8 @@ def picture(model, source) -> tuple[np.ndarray, str]:
 
     try:
         truth, alone = source(), ""
+        if not truth.function:
+            raise TableError(f"{truth.name}: its rows show no picture")
     except TableError as e:
         truth, alone = LearnedTruth(model), str(e)
     learned, exact = 0, 0

@@ -114,13 +114,21 @@ def proxy_loss(samples: Samples) -> Callable:
     return measure
 
 
+def view_psnr(view: SphereView) -> Callable:
+    """Return a measurement: the PSNR of a picture."""
+    return lambda bsdf: {"psnr_db": view.psnr(lambda wi, wo: [v * wo.z for v in bsdf.value(wi, wo)])}
+
+
 def fit_proxy(
-    samples: Samples, validation: Samples, types, isotropic: bool, progress: bool
+    samples: Samples, validation: Samples, types, isotropic: bool, progress: bool, smooth: Samples | None = None
 ) -> tuple[np.ndarray, float]:
-    """Return the logarithms of the best proxy of :data:`STARTS` trainings, and its error in dB."""
+    """Return the logarithms of the best proxy of :data:`STARTS` trainings, and its error in dB.
+
+    The starts are found from ``smooth`` samples (default: those of the ``validation``).
+    """
     best = None
     form = Form(isotropic=isotropic)
-    for k, start in enumerate(starts(validation, types, STARTS)):
+    for k, start in enumerate(starts(smooth or validation, types, STARTS)):
         net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
         problem = BSDFProblem(net, form, samples, proxy_loss(validation))
         title = f"proxy, start {k + 1} of {STARTS}"
@@ -183,16 +191,15 @@ def module_types(samples: Samples):
 
 
 def residual_problem(
-    logarithms: np.ndarray, form: Form, structure: ResidualSizes, samples: Samples, view: SphereView, identity: dict
+    logarithms: np.ndarray, form: Form, structure: ResidualSizes, samples: Samples, measure: Callable, identity: dict
 ) -> BSDFProblem:
-    """Return the problem of training proxy and residual together, which starts from the proxy alone."""
+    """Return the problem of training proxy and residual together, which starts from the proxy alone.
+
+    The first number of ``measure(bsdf)`` decides which state is the best.
+    """
     types = module_types(samples)
     low, step = fourth_roots(form.range)
     start = float(np.clip((1 - low) / step, 0, 1))
     proxy = proxy_array(logarithms, RATE) if form.terms else None
     net = BSDFArrays(structure.residual(start, form.azimuth), proxy, RATE).alloc(types.TensorXf)
-
-    def measure(bsdf):
-        return {"psnr_db": view.psnr(lambda wi, wo: [v * wo.z for v in bsdf.value(wi, wo)])}
-
     return BSDFProblem(net, form, samples, measure, identity)

@@ -13,37 +13,14 @@ import numpy as np
 from ...errors import UsageError, reason
 from ...lookup import clamp
 from ...tables import Table, TableError
+from .scattered import ScatteredTruth
+from .source import Truth
 
 #: Extensions of files that are sources.
-SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary")
+SUFFIXES = (".xml", ".bsdf", ".pbsdf", ".binary", ".csv")
 
 #: Largest value f cos θ that counts; a plugin may exceed it next to the horizon.
 LARGEST = 1e8
-
-
-class Truth:
-    """Base class of sources.
-
-    ``name`` describes the source; ``digest`` changes when its content does; ``samples``: it samples directions itself;
-    ``isotropic``: it is isotropic by its format (``None``: it has to be measured).
-    """
-
-    name: str
-    digest: str
-    samples = False
-    isotropic: bool | None = None
-
-    def value(self, wi, wo) -> list:
-        """Return f cos θ_o in linear sRGB, three arrays, for unit directions above the surface."""
-        raise NotImplementedError
-
-    def sample(self, wi, w, u, v):
-        """Return directions ``wo`` from three uniform numbers each."""
-        raise NotImplementedError
-
-    def density(self, wi, wo):
-        """Return the density of :meth:`sample` per solid angle."""
-        raise NotImplementedError
 
 
 class MitsubaTruth(Truth):
@@ -139,11 +116,12 @@ class MERLTruth(Truth):
         return result
 
 
-def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 0.5)) -> Truth:
+def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 0.5), angles: str = "") -> Truth:
     """Return the source of a BSDF.
 
     ``source`` is a scene or a single BSDF as a file (``.xml``) or as a dictionary of ``mi.load_dict``, a ``mi.BSDF``,
-    or a measured file (``.bsdf``, ``.pbsdf``, ``.binary``). ``material`` is the id of a BSDF of a scene. Raises
+    a measured file (``.bsdf``, ``.pbsdf``, ``.binary``), or a table of measurements (``.csv``), whose ``angles`` are
+    degrees or radians ("": as :mod:`.scattered` decides). ``material`` is the id of a BSDF of a scene. Raises
     :class:`~mi_diffind.errors.UsageError`.
     """
     import mitsuba as mi
@@ -161,12 +139,14 @@ def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 
     suffix = path.suffix.lower()
     if suffix == ".binary":
         return MERLTruth(path, types)
+    if suffix == ".csv":
+        return ScatteredTruth(path, angles)
     if suffix in (".bsdf", ".pbsdf"):
         plugin = "measured" if suffix == ".bsdf" else "measured_polarized"
         bsdf = _built(path, lambda: mi.load_dict({"type": plugin, "filename": str(path)}))
         return MitsubaTruth(bsdf, path.name, _hash(path.read_bytes()), uv)
     if suffix != ".xml":
-        raise UsageError(f'{path}: found the extension "{path.suffix}", allowed are .xml, .bsdf, .pbsdf and .binary')
+        raise UsageError(f'{path}: found the extension "{path.suffix}", allowed are {", ".join(SUFFIXES)}')
     loaded = _built(path, lambda: mi.load_file(str(path), optimize=False))
     bsdf = _chosen(loaded, path, material)
     return MitsubaTruth(bsdf, bsdf.id() or path.name, _hash(path.read_bytes() + material.encode()), uv)
@@ -174,7 +154,7 @@ def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 
 
 def recorded_source(options) -> dict:
     """Return what a table file keeps of a source beside the path of its file, so that it can be opened again."""
-    recorded = {"material": options["material"], "uv": [float(x) for x in options["uv"]]}
+    recorded = {"material": options["material"], "uv": [float(x) for x in options["uv"]], "angles": options["angles"]}
     source = options["source"]
     try:
         if isinstance(source, dict) and json.loads(json.dumps(source)) == source:
@@ -198,7 +178,8 @@ def recorded_truth(table: Table, types) -> Truth:
         raise TableError(f"{name}: was fitted to an object in memory, which cannot be opened again")
     try:
         u, v = settings.get("uv", (0.5, 0.5))
-        truth = truth_of(source, types, str(settings.get("material", "")), (float(u), float(v)))
+        texts = {name: str(settings.get(name, "")) for name in ("material", "angles")}
+        truth = truth_of(source, types, uv=(float(u), float(v)), **texts)
     except (TypeError, ValueError, UsageError) as e:
         raise TableError(f"{name}: its source cannot be opened again: {reason(e)}") from None
     if settings.get("source") not in (None, truth.digest):

@@ -1,0 +1,44 @@
+"""Base class of sources of learned BSDFs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+
+
+class Truth:
+    """Base class of sources.
+
+    ``name`` describes the source; ``digest`` changes when its content does; ``samples``: it samples directions itself;
+    ``isotropic``: it is isotropic by its format (``None``: it has to be measured). ``function``: its values are known
+    for all directions.
+    """
+
+    name: str
+    digest: str
+    samples, function = False, True
+    isotropic: bool | None = None
+
+    def value(self, wi, wo) -> list:
+        """Return f cos θ_o in linear sRGB, three arrays, for unit directions above the surface."""
+        raise NotImplementedError
+
+    def sample(self, wi, w, u, v):
+        """Return directions ``wo`` from three uniform numbers each."""
+        raise NotImplementedError
+
+    def density(self, wi, wo):
+        """Return the density of :meth:`sample` per solid angle."""
+        raise NotImplementedError
+
+
+class FunctionTruth(Truth):
+    """Source whose values f cos θ_o are those of a function ``value(wi, wo)``."""
+
+    def __init__(self, name: str, value: Callable):
+        self.name, self.digest, self.value = name, "", value
+
+
+#: Diffuse source of albedo 1.
+WHITE = FunctionTruth("white", lambda wi, wo: [wo.z * dr.inv_pi] * 3)
