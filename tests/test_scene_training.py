@@ -384,6 +384,19 @@ def test_references_are_rendered_once(path, tmp_path, passes):
     np.testing.assert_array_equal(images, references().images(views))
 
 
+def test_references_of_other_processes(path, tmp_path, passes):
+    """The same images, rendered elsewhere, and kept in the same files."""
+    views = ORBIT.trained()[:3]
+    alone = references_of(path, ORBIT, 10, pass_samples=FOUR).images(views)
+    seeds = list(passes.seeds)
+    shared = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR, workers=1)
+    np.testing.assert_array_equal(shared.images(views), alone)
+    assert (shared.rendered, shared.reused) == (9, 0) and passes.seeds == seeds
+    again = references_of(path, ORBIT, 10, tmp_path, pass_samples=FOUR)
+    np.testing.assert_array_equal(again.images(views), alone)
+    assert (again.rendered, again.reused) == (0, 3)
+
+
 def test_references_go_on_after_an_interruption(path, tmp_path, passes):
     view, uninterrupted = (
         ORBIT.trained()[0],

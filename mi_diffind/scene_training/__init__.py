@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from ..arguments import Argument, fraction
+from ..arguments import WORKER_ARGUMENTS, Argument, fraction
 from ..errors import UsageError
 from ..task import FitRequest, Fitted, Task, table_path
 from .recipe import SCENE_ARGUMENTS, SceneRecipe
@@ -41,6 +41,7 @@ class SceneTraining(Task):
             help=f"share of the loss of rendered images, 0 to 1 (default: {SceneRecipe().share:g})",
         ),
         *SCENE_ARGUMENTS,
+        *WORKER_ARGUMENTS,
     )  # fmt: skip
 
     def check(self, request: FitRequest) -> None:

@@ -105,6 +105,7 @@ def fit_scene(
         parsed, views, recipe.reference_spp, references, recipe.against,
         without=[texture.file for texture in textures], inputs=[texture.source.digest for texture in textures],
         progress=request.progress, deadline=request.part(REFERENCES).deadline,
+        workers=request.options.get("workers"), scheduler=request.options.get("scheduler", ""),
     )  # fmt: skip
     trained, measured = views.trained(), views.measured()
     images = rendered.images([*trained, *measured])

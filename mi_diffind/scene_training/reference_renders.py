@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import hashlib
 import inspect
 import json
+import pickle
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,10 +17,13 @@ import numpy as np
 
 from .. import __version__, plugins, scenes
 from ..deadline import Deadline
+from ..errors import DiffindError
 from ..files import replacing, writable_folder
+from ..jobs import run_jobs
 from ..measure.store import fingerprint
 from ..plugins.support import footprint
 from ..progress import progress_bar
+from ..runtime import use_variant
 from ..tasks import disney
 from .rig import Rig
 from .views import View, ViewDistribution
@@ -46,6 +51,8 @@ class ReferenceRenders:
     With a ``deadline``, each view gets an equal part of the time, and as many samples as fit; such images are not
     kept. ``samples`` is the number of samples that all images have.
 
+    ``workers`` processes share the views of a scene file, or those of the Dask cluster ``scheduler``.
+
     Raises :class:`~mi_diffind.scenes.SceneError` and :class:`~mi_diffind.files.OutputError`.
     """
 
@@ -59,6 +66,8 @@ class ReferenceRenders:
     progress: bool = True
     pass_samples: int = PASS
     deadline: Deadline | None = None
+    workers: int | None = None
+    scheduler: str = ""
     #: Number of passes that were rendered, and of images that were kept from an earlier run.
     rendered: int = 0
     reused: int = 0
@@ -96,6 +105,8 @@ class ReferenceRenders:
 
         The exact scene is dropped afterwards: Dr.Jit compiles the materials of all loaded scenes into every kernel.
         """
+        if (self.workers or self.scheduler) and self.deadline is None and not self.scene.description:
+            return self._shared(views)
         bar = progress_bar("references", len(views) * self.spp, "spp", self.progress)
         try:
             with bar:
@@ -103,6 +114,25 @@ class ReferenceRenders:
         finally:
             self._loaded = None
             gc.collect()
+
+    def _shared(self, views: Sequence[View]) -> list[np.ndarray]:
+        """Return the images, rendered by other processes. Raises :class:`.errors.DiffindError` if one fails."""
+        given = {name: getattr(self, name) for name in SHARED}
+        if self.folder is not None:
+            given["folder"] = self.folder.resolve()
+        content = pickle.dumps((str(self.scene.path.resolve()), self.scene.defines, mi.variant(), given))
+        jobs = {self._key(view): (content, view) for view in views}
+        images = {}
+        for outcome in run_jobs(
+            render_separately, jobs, self.workers, self.scheduler, self.progress, "references", "view"
+        ):
+            if outcome.failure:
+                raise DiffindError(f"references: {outcome.failure}")
+            images[outcome.name], rendered, reused = outcome.value
+            self.rendered, self.reused = self.rendered + rendered, self.reused + reused
+        if len(images) < len(jobs):
+            raise KeyboardInterrupt
+        return [images[self._key(view)] for view in views]
 
     def _image(self, view: View, bar, left: int) -> np.ndarray:
         """Return the image of a view; ``left`` views, this one included, share the time that is left."""
@@ -150,3 +180,23 @@ class ReferenceRenders:
             width, height = scenes.film_size(scene)
             self._loaded = scene, Rig(scene, self.views), max(1, self.pass_samples // (width * height))
         return self._loaded
+
+
+#: Fields that the references of other processes share.
+SHARED = ("views", "spp", "folder", "against", "without", "inputs", "pass_samples")
+
+
+def render_separately(job: tuple[bytes, View]) -> tuple[np.ndarray, int, int]:
+    """Return the image of a view, and the numbers of passes and kept images, in a process that loads the scene once."""
+    content, view = job
+    references = _references(content)
+    references.rendered = references.reused = 0
+    image = references._image(view, progress_bar(None, references.spp, progress=False), 1)
+    return image, references.rendered, references.reused
+
+
+@functools.lru_cache(maxsize=1)
+def _references(content: bytes) -> ReferenceRenders:
+    path, defines, variant, given = pickle.loads(content)
+    use_variant(variant)
+    return ReferenceRenders(scenes.ParsedScene(path, defines), **given, progress=False)

@@ -107,11 +107,11 @@ def main() -> None:
     kept = {file.name: file.stat().st_mtime_ns for file in output.glob("*.npz") if file.name in before} == before
     report = json.loads((output / "report.json").read_text())
 
-    some = arguments.folder / "some"
-    some.mkdir(exist_ok=True)
+    some = arguments.folder / "alone" / "materials"  # files name their sources relative to themselves
+    some.mkdir(exist_ok=True, parents=True)
     for source in sorted(sources.glob("*.xml"))[:: max(1, arguments.materials // 5)]:
         (some / source.name).write_bytes(source.read_bytes())
-    alone = arguments.folder / "alone"
+    alone = arguments.folder / "alone" / "learned"
     subprocess.run([*command, str(some), "-o", str(alone)], stdout=subprocess.DEVNULL, check=True)
     same = [file.read_bytes() == (output / file.name).read_bytes() for file in alone.glob("*.npz")]
     quality = sorted(m["psnr_db"] for m in report["materials"].values())

@@ -14,10 +14,10 @@ from . import family_measurement
 from .family import CHANNELS, MOST, FamilyArrays, Parameter, member, widths
 from .family_truth import FamilyTruth
 from .files import RESIDUAL, BSDFModel, form_of
-from .mixture import Mixture
+from .mixture import Mixture, SampledLobe
 from .model import Form
 
-#: Arrays of a residual: those of one material, and the factors of its logarithms.
+#: Arrays of a residual: those of one material, and the factors of its terms.
 ARRAYS = (*RESIDUAL, "mixing")
 
 
@@ -118,7 +118,8 @@ class FamilyModel(BSDFModel):
             return arrays["weights"]([*angle, *x], active)
 
         factors = self.table.settings["factors"]
-        return bsdf, Mixture(weights, [f * w for f, w in zip(factors, widths(bsdf.proxy, bsdf.scale), strict=True)])
+        alphas = [f * w for f, w in zip(factors, widths(bsdf.proxy, bsdf.scale), strict=True)]
+        return bsdf, Mixture(weights, tuple(SampledLobe(a, a) for a in alphas))
 
     def entries(self) -> dict:
         """Return what can be optimised: the residual's arrays and the proxy's, in single precision."""

@@ -38,7 +38,8 @@ def fitted_mixture(truth: FamilyTruth, member_at: Callable, types, isotropic: bo
         lobes = widths(fitted.proxy, fitted.scale)
         alphas = [dr.clip(types.Float(factor * w), 1e-3, 1) for w in lobes for factor in FACTORS]
         dr.eval(alphas)
-        densities, square = mixture.candidate_densities(source, types, isotropic, alphas, MIXTURE_SAMPLES, 3)
+        sampled = [mixture.SampledLobe(a, a) for a in alphas]
+        densities, square = mixture.candidate_densities(source, types, isotropic, sampled, MIXTURE_SAMPLES, 3)
         tried = [
             mixture.optimal_weights(densities[[0, 1 + i, 1 + len(FACTORS) + j]], square) for i, j in pairs
         ]  # fmt: skip
