@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
 from mi_diffind.errors import UsageError
 from mi_diffind.indirection import DifferentiableArray
 from mi_diffind.lookup import clamp
@@ -414,12 +415,18 @@ def _learned_or_source(props: mi.Properties):
         truth = _source(learned, props)
     except (TableError, UsageError) as e:
         raise RuntimeError(str(e)) from None
-    flags = getattr(truth, "bsdf", learned).flags()
-    if isinstance(truth, MitsubaTruth) and not mi.has_flag(flags, mi.BSDFFlags.SpatiallyVarying):
-        if learned.two_sided and not mi.has_flag(flags, mi.BSDFFlags.BackSide):
+    if isinstance(truth, MitsubaTruth) and not _is_textured(truth.bsdf):
+        if learned.two_sided and not mi.has_flag(truth.bsdf.flags(), mi.BSDFFlags.BackSide):
             return mi.load_dict({"type": "twosided", "bsdf": truth.bsdf})
         return truth.bsdf
     return SourceBSDF(props, truth)
+
+
+def _is_textured(bsdf) -> bool:
+    """Return whether a BSDF differs from place to place; plugins of Mitsuba do not all set a flag."""
+    nodes = compat.objects_of(bsdf)
+    varies = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
+    return varies or mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
 
 
 def _source(learned: NeuralBSDF, props: mi.Properties):

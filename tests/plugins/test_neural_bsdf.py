@@ -192,9 +192,9 @@ def test_bad_parameters(mi_rgb, files, changes, message):
         mi_rgb.load_dict(given)
 
 
-def recorded(folder, source, family=False, **settings):
+def recorded(folder, source, **settings):
     """A file that says it was fitted to a dictionary."""
-    table = (handmade_family if family else handmade)()
+    table = handmade()
     table.settings |= {"dictionary": source, **settings}
     save_table(folder / "recorded.npz", table)
     return {"type": "neural_bsdf", "filename": str(folder / "recorded.npz"), "evaluate": "source"}
@@ -248,12 +248,19 @@ def test_compare_shows_the_source(mi_rgb, tmp_path):
     """A comparison puts the source in the file's place."""
     given = recorded(tmp_path, {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.1]}})
     del given["evaluate"]
+    transform = mi_rgb.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
     scene = {
-        "type": "scene", "integrator": {"type": "direct"}, "light": {"type": "constant"},
-        "sensor": {"type": "perspective", "to_world": mi_rgb.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
-                   "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}},
-        "ball": {"type": "rectangle", "to_world": mi_rgb.ScalarTransform4f().scale(5), "bsdf": {**given, "energy": "raw"}},
-    }  # fmt: skip
+        "type": "scene",
+        "integrator": {"type": "direct"},
+        "light": {"type": "constant"},
+        "sensor": {
+            "type": "perspective",
+            "to_world": transform().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+            "film": film,
+        },
+        "wall": {"type": "rectangle", "to_world": transform().scale(5), "bsdf": {**given, "energy": "raw"}},
+    }
     result = mi_diffind.compare(scene, 64, passes=2, progress=False)
     assert result.figures["counterparts"] == ["source"] and result.figures["learned_plugins"] == 1
     np.testing.assert_allclose(result.reference.mean(axis=(0, 1)), [0.2, 0.5, 0.1], rtol=0.05)
