@@ -2,6 +2,7 @@
 
 - :mod:`.model`: the form of a learned BSDF, its proxy and coordinates;
 - :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.scattered`: rows of measured values;
+- :mod:`.measured_files`: measured spectra;
 - :mod:`.source`: their base class; :mod:`.symmetry`: symmetries, measured;
 - :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
@@ -66,6 +67,10 @@ class BSDFTask(Task):
         Argument(
             "--uv", nargs=2, type=_coordinate, default=(0.5, 0.5), metavar=("U", "V"),
             help="point of the textures at which the BSDF is fitted (default: 0.5 0.5)",
+        ),
+        Argument(
+            "--illuminant", choices=("D65", "E"), default="D65",
+            help="light in which spectra of measured files have their colours (default: D65)",
         ),
         Argument(
             "--angles", choices=("degrees", "radians"), default="",

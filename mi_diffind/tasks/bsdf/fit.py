@@ -45,7 +45,14 @@ def requested_truth(request: FitRequest) -> Truth:
     use_rgb_variant(request)
     options = request.options
     u, v = options["uv"]
-    return truth_of(options["source"], request.types, options["material"], (float(u), float(v)), options["angles"])
+    return truth_of(
+        options["source"],
+        request.types,
+        options["material"],
+        (float(u), float(v)),
+        options["angles"],
+        options["illuminant"],
+    )
 
 
 def use_rgb_variant(request: FitRequest) -> None:
@@ -63,7 +70,7 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
         symmetries = symmetry.measured_symmetry(truth, types) if truth.function else scattered.measured_symmetry(truth)
     isotropic = (symmetries["isotropy"] or 0) <= symmetry.TOLERANCE
     azimuth = "mirror" if (symmetries["mirror"] or 0) <= symmetry.TOLERANCE else "half"
-    lines = [symmetry_line(symmetries)]
+    lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
     plain = request.preset in ("table", "plain")
     try:
         structure = structure_of(parse_bytes(options["bytes"] or "2k"), plain)
