@@ -133,7 +133,7 @@ class FitRequest:
         return {name: os.path.relpath(Path(file).resolve(), self.folder) for name, file in files.items()}
 
 
-@dataclass
+@dataclass(repr=False)
 class Fitted:
     """Result of a training, as :func:`fit` returns it.
 
@@ -200,10 +200,13 @@ class Fitted:
         usage = tasks()[table.task].usage(table, Path(path).name) if table.task in tasks() else []
         return [*lines, *(["in a scene:"] if usage else []), *(f"  {line}" for line in usage)]
 
+    def __repr__(self) -> str:
+        return "\n".join(self.summary())
+
     def _repr_html_(self) -> str:
         from html import escape
 
-        return f"<pre>{escape(chr(10).join(self.summary()))}</pre>"
+        return f"<pre>{escape(repr(self))}</pre>"
 
 
 def table_path(path: str | os.PathLike) -> Path:

@@ -15,7 +15,7 @@ from ..task import Fitted, Model, task_of, tasks
 from ..units import labelled
 
 
-@dataclass
+@dataclass(repr=False)
 class FittedFiles(Fitted):
     """Result of a training of several files: ``tables`` by the name of the file; ``table`` is the first of them."""
 

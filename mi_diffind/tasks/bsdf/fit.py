@@ -22,7 +22,7 @@ from .view import SphereView
 PRETRAINING = 0.3
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(repr=False)
 class FittedBSDF(Fitted):
     """Result of a fit, with its source."""
 

@@ -50,7 +50,7 @@ class LibraryMaterial:
     identity: str = ""
 
 
-@dataclass
+@dataclass(repr=False)
 class FittedLibrary(Fitted):
     """Result of a library: one table file in ``folder`` for each of the ``materials`` (name → figures) that succeeded.
 
