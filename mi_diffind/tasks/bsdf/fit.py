@@ -6,7 +6,6 @@ import dataclasses
 import math
 
 import drjit as dr
-import numpy as np
 
 from ...errors import UsageError
 from ...task import FitRequest, Fitted
@@ -14,7 +13,7 @@ from ...units import parse_bytes
 from . import energy, mixture, scattered, symmetry, training
 from .files import BSDFModel, allocate, to_table
 from .measurement import cosine, measure, measure_samples
-from .model import Form, LearnedBSDF, structure_of
+from .model import LearnedBSDF, structure_of
 from .source import WHITE, FunctionTruth, Truth
 from .truth import recorded_source, truth_of
 from .view import SphereView
@@ -72,7 +71,7 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     isotropic = (symmetries["isotropy"] or 0) <= symmetry.TOLERANCE
     azimuth = "mirror" if (symmetries["mirror"] or 0) <= symmetry.TOLERANCE else "half"
     lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
-    plain = request.preset == "table"
+    plain = request.preset in ("table", "plain")
     try:
         structure = structure_of(parse_bytes(options["bytes"] or "2k"), plain)
     except ValueError as e:
@@ -84,12 +83,11 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     else:
         samples, validation, smooth = scattered.split(truth, types, isotropic, training.LIMIT, settings.seed)
         view = None
-    if request.preset == "paper":
-        logarithms, form = np.zeros(22, np.float32), Form((), isotropic, azimuth, (0.05, 0.05))
+    logarithms, _ = training.fit_proxy(samples, validation, types, isotropic, request.progress, smooth)
+    form = training.form_of(logarithms, validation, isotropic, azimuth)
+    if request.preset in ("paper", "plain"):  # the proxy gives the scale of u alone
+        form = dataclasses.replace(form, terms=())
         form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
-    else:
-        logarithms, _ = training.fit_proxy(samples, validation, types, isotropic, request.progress, smooth)
-        form = training.form_of(logarithms, validation, isotropic, azimuth)
     if not truth.function:
         (samples, validation), form, line = scattered.cleaned(truth, [samples, validation], form, logarithms)
         lines.append(line)
