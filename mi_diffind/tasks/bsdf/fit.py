@@ -8,18 +8,16 @@ import os
 from threading import Event
 
 import drjit as dr
-import numpy as np
 
 from ...errors import UsageError
 from ...fitting import FitResult
 from ...interrupt import interruptible
-from ...tables import Table
 from ...task import FitRequest, Fitted
 from ...units import parse_bytes
 from . import energy, mixture, scattered, symmetry, training
 from .files import BSDFModel, allocate, to_table
 from .measurement import cosine, measure, measure_samples
-from .model import Form, LearnedBSDF, structure_of
+from .model import LearnedBSDF, structure_of
 from .source import WHITE, FunctionTruth, Truth
 from .truth import recorded_source, truth_of
 from .view import SphereView
@@ -85,7 +83,7 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
     isotropic = (symmetries["isotropy"] or 0) <= symmetry.TOLERANCE
     azimuth = "mirror" if (symmetries["mirror"] or 0) <= symmetry.TOLERANCE else "half"
     lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
-    plain = request.preset == "table"
+    plain = request.preset in ("table", "plain")
     try:
         structure = structure_of(parse_bytes(options["bytes"] or "2k"), plain)
     except ValueError as e:
@@ -97,13 +95,12 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
     else:
         samples, validation, smooth = scattered.split(truth, types, isotropic, training.LIMIT, settings.seed)
         view = None
-    if request.preset == "paper":
-        logarithms, form = np.zeros(22, np.float32), Form((), isotropic, azimuth, (0.05, 0.05))
+    first, identity = request.part(PRETRAINING), {"source": truth.digest}
+    logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth)
+    form = training.form_of(logarithms, validation, isotropic, azimuth)
+    if request.preset in ("paper", "plain"):  # the proxy gives the scale of u alone
+        form = dataclasses.replace(form, terms=())
         form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
-    else:
-        first, identity = request.part(PRETRAINING), {"source": truth.digest}
-        logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth)
-        form = training.form_of(logarithms, validation, isotropic, azimuth)
     if not truth.function:
         (samples, validation), form, line = scattered.cleaned(truth, [samples, validation], form, logarithms)
         lines.append(line)
@@ -112,7 +109,7 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
     problem = training.residual_problem(logarithms, form, structure, samples, measured, identity)
     azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
 
-    def stored(result: FitResult | None = None) -> tuple[Table, np.ndarray | None, float | None]:
+    def stored(result: FitResult | None = None) -> tuple:
         """Return the table of the arrays as they are, its limit of the albedo, and the PSNR without."""
         bsdf = LearnedBSDF.of(form, problem.net.rounded())
         sampled = truth if truth.function else FunctionTruth(truth.name, cosine(bsdf))

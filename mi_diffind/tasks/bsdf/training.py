@@ -93,10 +93,12 @@ class BSDFProblem(Problem):
         Float, count = type(self.samples.weight), dr.width(self.samples.weight)
         UInt32 = dr.uint32_array_t(Float)
         s = self.samples.at((UInt32(rng.random(Float, 1) * count) + dr.arange(UInt32, size)) % count)
-        value = self.value(net, s)
-        weight = s.weight * (1 / (3 * size))
+        return self.error(self.value(net, s), s) * (1 / (3 * size))
+
+    def error(self, value: list, s: Samples):
+        """Return the errors of f at samples, by their weight, the sum of all channels."""
         errors = [dr.abs(dr.fma(v, s.wo.z, -t)) for v, t in zip(value, s.value, strict=True)]
-        return weight * sum(errors[1:], errors[0])
+        return s.weight * sum(errors[1:], errors[0])
 
     def measure(self, net) -> dict[str, float]:
         with dr.suspend_grad():
