@@ -35,10 +35,10 @@ LOGARITHMIC = 4.0
 
 #: Nodes of a coordinate (linear, logarithmic), for one, two and three parameters: in the table of the proxy,
 #: and in those of sampling and energy.
-PROXY_NODES, SAMPLING_NODES = ((9, 9), (5, 9), (4, 6)), ((5, 9), (3, 7), (3, 5))
+PROXY_NODES, SAMPLING_NODES = ((9, 9), (5, 9), (3, 8)), ((5, 9), (3, 7), (3, 5))
 
 #: Number of logarithms R of a residual, and default size of its arrays in bytes, for one, two and three parameters.
-RANKS, SIZES = (5, 6, 8), ("4k", "9k", "12k")
+RANKS, SIZES = (4, 4, 5), ("4k", "9k", "12k")
 
 #: Channels of the proxy's table: its parameters, and the logarithms of (a_x, a_y).
 CHANNELS, SCALE = PARAMETERS + 2, PARAMETERS
