@@ -26,6 +26,7 @@ from mi_diffind.tasks.bsdf.model import (
 from . import Plugin
 from .support import properties, tables, upsampling
 from .support.manual import shared_parts
+from .support.tracked_parameter import TrackedParameter, when_outermost
 
 #: Smallest density of a sample that counts.
 SMALLEST_DENSITY = 1e-20
@@ -75,8 +76,8 @@ class NeuralBSDF(mi.BSDF):
 
      * - first.alpha_u, first.alpha_v, first.gamma, first.f0, first.f90; second.…
        - |float|, |float|, |float|, |spectrum|, |spectrum|
-       - Roughness, exponent (2: GGX), and reflectance at normal and grazing incidence of the proxy's microfacet lobes.
-         Of isotropic files, ``alpha_u`` alone counts.
+       - Roughness, exponent (2: GGX; large: Beckmann's), and reflectance at normal and grazing incidence of
+         the proxy's microfacet lobes. Of isotropic files, ``alpha_u`` alone counts.
        - |exposed|, |differentiable|
 
      * - roughness, metallic, …
@@ -90,8 +91,8 @@ class NeuralBSDF(mi.BSDF):
        - The entries of the residual's arrays; of a family, also ``tables.mixing`` and ``tables.proxy``.
        - |exposed|, |differentiable|
 
-    Any reflecting BSDF in two kilobytes: an analytic proxy (a diffuse lobe and two microfacet lobes) times the
-    exponential of a residual that is read by *differentiable indirection* (Datta et al., *Efficient Graphics
+    Any reflecting BSDF in two kilobytes: an analytic proxy (a diffuse lobe and two microfacet lobes) times
+    the fourth power of a residual that is read by *differentiable indirection* (Datta et al., *Efficient Graphics
     Representation with Differentiable Indirection*, SIGGRAPH Asia 2023). ``mi-diffind fit bsdf`` makes the file of a
     material of a scene, of any of Mitsuba's BSDFs, or of measured data.
 
@@ -161,6 +162,11 @@ class NeuralBSDF(mi.BSDF):
             properties.check_range(props, parameter.name, parameter.low, parameter.high)
             self.textures[parameter.name] = props.get_unbounded_texture(parameter.name, parameter.middle)
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
+        self._tracked = [TrackedParameter(texture) for texture in self.textures.values()]
+        self.member = None
+        self._compute_constants()
+        if self.textures:
+            when_outermost(self._compute_member)
 
         side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
         flags = mi.BSDFFlags.GlossyReflection | side
@@ -190,15 +196,44 @@ class NeuralBSDF(mi.BSDF):
 
     def parameters_changed(self, keys: list[str] = ()):
         tables.check_shapes(tables.exposed(self._arrays()))
+        self._compute_constants()
+        if self.textures:
+            when_outermost(self._compute_member)
 
     def _at(self, si, active):
         """Return the BSDF with its present parameters, and the mixture that samples it."""
+        if self.member is not None and self._is_constant():
+            return self.member
         if self.textures:
             return self.model.at([texture.eval_1(si, active) for texture in self.textures.values()], active)
         bsdf = self.model.bsdf
         if self.proxy:
-            bsdf.proxy = _proxy(self.proxy, self.model.form)
+            attached = dr.grad_enabled(list(self.proxy.values()))
+            bsdf.proxy = _proxy(self.proxy, self.model.form) if attached else self.constants
         return bsdf, self.model.mixture
+
+    def _is_constant(self) -> bool:
+        """Return whether a family's parameters are constant, and neither changed nor, like the tables, optimised."""
+        is_fixed = all(p.constant and not (p.optimised() or p.changed()) for p in self._tracked)
+        return is_fixed and not tables.optimised(tables.exposed(self._arrays()))
+
+    def _compute_member(self):
+        """Compute the member of a family whose parameters are constant."""
+        for parameter in self._tracked:
+            parameter.update()
+        self.member = None
+        if self._is_constant():
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            with dr.suspend_grad():
+                values = [mi.Float(texture.eval_1(si)) for texture in self.textures.values()]
+            self.member = self.model.fixed([float(v[0]) for v in values])
+
+    def _compute_constants(self):
+        """Compute what depends on the parameters of the proxy alone, once for all lanes."""
+        if self.proxy:
+            with dr.suspend_grad():
+                self.constants = dr.detach(_proxy(self.proxy, self.model.form))
+                dr.make_opaque(self.constants)
 
     def _prepare(self, ctx, wi, wo, active):
         """Return both directions on the front side, and the mask of lanes whose result counts."""
@@ -213,7 +248,7 @@ class NeuralBSDF(mi.BSDF):
 
     def _value(self, bsdf, si, wi, wo, active):
         """Return f cos θ_o."""
-        rgb = bsdf.value(wi, wo, active)
+        rgb = bsdf.value(wi, wo)
         factor = wo.z * clamp(self.scale, 0.0, 1.0)
         value = _spectrum([v * factor for v in rgb], si.wavelengths)
         return mi.depolarizer(mi.Spectrum(dr.select(active, value, 0)))
@@ -221,7 +256,7 @@ class NeuralBSDF(mi.BSDF):
     @staticmethod
     def _density(mixture, wi, wo, active):
         with dr.suspend_grad():
-            return dr.detach(dr.select(active, mixture.density(wi, wo, active), 0))
+            return dr.detach(dr.select(active, mixture.density(wi, wo), 0))
 
     def eval(self, ctx, si, wo, active=True):
         wi, wo, active = self._prepare(ctx, si.wi, wo, active)
@@ -243,7 +278,7 @@ class NeuralBSDF(mi.BSDF):
         wi, _, active = self._prepare(ctx, si.wi, dr.select(si.wi.z < 0, -up, up) if self.two_sided else up, active)
         bsdf, mixture = self._at(si, active)
         with dr.suspend_grad():
-            wo = dr.detach(mixture.sample(wi, sample1, sample2.x, sample2.y, active))
+            wo = dr.detach(mixture.sample(wi, sample1, sample2.x, sample2.y))
             active = active & (wo.z > 0) & (dr.squared_norm(wo) < 2)
             wo = dr.select(active, wo, up)
         pdf = self._density(mixture, wi, wo, active)
@@ -324,13 +359,13 @@ def _proxy(parameters: dict, form) -> Proxy:
     lobes = {}
     for name in TERMS[1:]:
         if name in form.terms:
-            axes = ("alpha_u", "alpha_u" if form.isotropic else "alpha_v")
-            alphas = [clamp(parameters[f"{name}.{axis}"], ALPHA_MIN, 1.0) for axis in axes]
+            axes = ("alpha_u",) if form.isotropic else ("alpha_u", "alpha_v")
+            alphas = tuple(clamp(parameters[f"{name}.{axis}"], ALPHA_MIN, 1.0) for axis in axes)
             colours = [[limited(c) for c in parameters[f"{name}.{key}"]] for key in ("f0", "f90")]
-            lobes[name] = ProxyLobe(*alphas, limited(parameters[f"{name}.gamma"]), *colours)
+            lobes[name] = ProxyLobe(alphas, limited(parameters[f"{name}.gamma"]), *colours)
     if "diffuse" not in form.terms:
-        return Proxy(None, None, lobes)
-    return Proxy([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
+        return Proxy.of_parts(None, None, lobes)
+    return Proxy.of_parts([limited(c) for c in parameters["diffuse"]], limited(parameters["edge"]), lobes)
 
 
 def _stored(parameters: dict) -> DifferentiableArray:

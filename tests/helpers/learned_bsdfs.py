@@ -9,8 +9,8 @@ from mi_diffind.tasks.bsdf.model import PARAMETERS, Form
 
 SIZES = {"primary_uv": (7, 5, 2), "primary_vw": (4, 3, 1), "cascaded": (6, 5, 4, 3)}
 
-#: Roughness of the lobes that sample.
-ALPHAS = (0.1, 0.4)
+#: Lobes that sample: roughnesses and exponent.
+LOBES = ((0.1, 0.1, 2.0), (0.4, 0.3, 6.0))
 
 
 def logarithms(alpha_u=0.15, alpha_v=0.15) -> np.ndarray:
@@ -36,7 +36,7 @@ def handmade(**changes) -> Table:
         arrays["proxy"] = StoredArray(proxy[:, None])
     arrays["weights"] = byte_array(rng.integers(50, 256, (16, 3)), 1 / 255)
     arrays["energy"] = byte_array(rng.integers(0, 256, (32, 1)), 0.1 / 255, 0.9)
-    return Table("bsdf", arrays, "ours", {"form": form.to_json(), "alphas": list(ALPHAS)})
+    return Table("bsdf", arrays, "ours", {"form": form.to_json(), "lobes": list(map(list, LOBES))})
 
 
 def interpolated(array: StoredArray, coordinates) -> np.ndarray:
@@ -72,8 +72,8 @@ def formula(table: Table, wi, wo) -> np.ndarray:
             if name not in form["terms"]:
                 continue
             a = np.array([p[k], p[k] if form["isotropic"] else p[k + 1]])
-            slope = (h[:, 0] / a[0]) ** 2 + (h[:, 1] / a[1]) ** 2 + h[:, 2] ** 2
-            d = slope ** (-2 * p[k + 2]) / (np.pi * a[0] * a[1])
+            gamma, tan2 = 2 * p[k + 2], ((h[:, 0] / a[0]) ** 2 + (h[:, 1] / a[1]) ** 2) / h[:, 2] ** 2
+            d = (1 + 2 / gamma * tan2) ** -gamma / (h[:, 2] ** 4 * np.pi * a[0] * a[1])
             for w in (wi, wo):
                 d /= w[:, 2] + np.sqrt(w[:, 2] ** 2 + (a[0] * w[:, 0]) ** 2 + (a[1] * w[:, 1]) ** 2)
             f0, f90 = p[k + 3 : k + 6], p[k + 6 : k + 9]
@@ -89,8 +89,8 @@ def formula(table: Table, wi, wo) -> np.ndarray:
     v = np.sqrt(1 - cos_d)
     first = interpolated(arrays["primary_uv"], np.stack([u, v], axis=1))
     second = interpolated(arrays["primary_vw"], np.stack([v, w], axis=1))
-    low, high = form["range"]
-    value *= np.exp(low + (high - low) * interpolated(arrays["cascaded"], np.concatenate([first, second], axis=1)))
+    low, high = np.exp(np.array(form["range"]) / 4)
+    value *= (low + (high - low) * interpolated(arrays["cascaded"], np.concatenate([first, second], axis=1))) ** 4
     for direction in (wi, wo):
         value *= interpolated(arrays["energy"], np.sqrt(direction[:, 2:]))
     return value
@@ -138,7 +138,8 @@ def member(table: Table, roughness: float, metallic: float) -> Table:
         proxy[channel] = np.log(proxy[channel])
     arrays = {name: table.arrays[name] for name in ("primary_uv", "primary_vw")}
     arrays["proxy"] = StoredArray(proxy[:PARAMETERS, None].astype(np.float32))
-    zero = -form["range"][0] / (form["range"][1] - form["range"][0])
+    low, high = np.exp(np.array(form["range"]) / 4)
+    zero = (1 - low) / (high - low)
     residuals = table.arrays["cascaded"].values.astype(np.float64)
     residuals = residuals.reshape(*residuals.shape[:3], -1, 3) - zero
     factors = 2 * at("mixing") - 1

@@ -16,7 +16,7 @@ QUICK = {
     (training, "PROXY"): dataclasses.replace(training.PROXY, steps=10, measure_every=10),
     (training, "SAMPLES"): 2**16,
     (starts, "ALPHAS"): (0.1, 0.4),
-    (mixture, "CANDIDATES"): (0.05, 0.3),
+    (mixture, "ALPHAS"): (0.05, 0.3),
     (energy, "CORRECTIONS"): 2,
     (contact_sheet, "VIEWS"): 1,
 }

@@ -2,6 +2,7 @@
 
 - :mod:`.model`: the form of a learned BSDF, its proxy and coordinates;
 - :mod:`.truth`: sources: plugins of Mitsuba, scenes, measured files; :mod:`.scattered`: rows of measured values;
+- :mod:`.measured_files`: measured spectra;
 - :mod:`.source`: their base class; :mod:`.symmetry`: symmetries, measured;
 - :mod:`.pool`: directions at which a source is sampled; :mod:`.view`: the picture that measures;
 - :mod:`.training`: samples, proxy and residual; :mod:`.fit`: ``fit bsdf``;
@@ -63,6 +64,10 @@ class BSDFTask(Task):
         Argument(
             "--uv", nargs=2, type=_coordinate, default=(0.5, 0.5), metavar=("U", "V"),
             help="point of the textures at which the BSDF is fitted (default: 0.5 0.5)",
+        ),
+        Argument(
+            "--illuminant", choices=("D65", "E"), default="D65",
+            help="light in which spectra of measured files have their colours (default: D65)",
         ),
         Argument(
             "--angles", choices=("degrees", "radians"), default="",
@@ -130,9 +135,9 @@ class BSDFTask(Task):
     def model(self, table, dtype, storage=""):
         if "family" not in table.settings:
             return super().model(table, dtype, storage)
-        from .family_files import FamilyModel
+        from .family_files import FamilyModel, allocate
 
-        return FamilyModel(table, self.allocate(table, dtype, storage), dtype, storage)
+        return FamilyModel(table, allocate(table, dtype, storage), dtype, storage)
 
 
 TASK = BSDFTask()

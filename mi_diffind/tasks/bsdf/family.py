@@ -2,12 +2,12 @@
 
 For parameters p, each in its coordinate in [0, 1],
 
-    f(wi, wo; p) = proxy(wi, wo; p) · exp(Σ_r m_r(p) L_r[P₁(u, v), P₂(v, w)]).
+    f(wi, wo; p) = proxy(wi, wo; p) · (1 + Σ_r m_r(p) L_r[P₁(u, v), P₂(v, w)])⁴.
 
 - The *proxy* (:mod:`.model`) has a table over the parameters: colours, and logarithms of roughnesses, exponents and
   edges, are interpolated linearly. So are the logarithms of the roughnesses a by which u is scaled: entries of the
   residual are dense in the peak of each member.
-- The *residual* is a sum of R logarithms. The cascaded array holds all of them, 3R channels, and a table over the
+- The *residual* is a sum of R terms. The cascaded array holds all of them, 3R channels, and a table over the
   parameters their factors m ∈ [-1, 1].
 
 At fixed parameters, a family is a :class:`.model.LearnedBSDF` whose numbers may differ from lane to lane.
@@ -24,7 +24,19 @@ from drjit import nn
 
 from ...indirection import DifferentiableArray, Indirection, device_array, rounded, unfolded
 from ...lookup import clamp
-from .model import ALPHA_MIN, LOBE, LOGARITHMS, PARAMETERS, TERMS, DirectionPair, Form, LearnedBSDF, Proxy, ProxyLobe
+from .model import (
+    ALPHA_MIN,
+    LOBE,
+    LOGARITHMS,
+    PARAMETERS,
+    TERMS,
+    DirectionPair,
+    Form,
+    LearnedBSDF,
+    Proxy,
+    ProxyLobe,
+    fourth_roots,
+)
 from .model import ResidualSizes as Sizes
 
 #: Most parameters of a family.
@@ -37,7 +49,7 @@ LOGARITHMIC = 4.0
 #: and in those of sampling and energy.
 PROXY_NODES, SAMPLING_NODES = ((9, 9), (5, 9), (3, 8)), ((5, 9), (3, 7), (3, 5))
 
-#: Number of logarithms R of a residual, and default size of its arrays in bytes, for one, two and three parameters.
+#: Number of terms R of a residual, and default size of its arrays in bytes, for one, two and three parameters.
 RANKS, SIZES = (4, 4, 5), ("4k", "9k", "12k")
 
 #: Channels of the proxy's table: its parameters, and the logarithms of (a_x, a_y).
@@ -100,9 +112,21 @@ def grid(nodes: tuple[int, ...]) -> np.ndarray:
     return np.stack([a.ravel() for a in axes], axis=-1)
 
 
+def interpolation(coordinates, nodes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the nodes around coordinates, the last axis fastest, and their weights above 0."""
+    index, weight = np.zeros(1, int), np.ones(1)
+    for x, n in zip(coordinates, nodes, strict=True):
+        position = float(x) * (n - 1)
+        lower = min(int(position), n - 2)
+        ends = np.array([1 - (position - lower), position - lower])
+        index = (index[:, None] * n + lower + np.arange(2)).ravel()
+        weight = (weight[:, None] * ends).ravel()
+    return index[weight > 0], weight[weight > 0]
+
+
 @dataclass(frozen=True)
 class FamilySizes:
-    """Sizes of the arrays of a residual: P₁, P₂ and one of the R logarithms; and nodes of the table of factors."""
+    """Sizes of the arrays of a residual: P₁, P₂ and one of the R terms; and nodes of the table of factors."""
 
     sizes: Sizes
     mixing: tuple[int, ...]
@@ -183,7 +207,7 @@ class FamilyArrays(nn.Module):
 
 
 class FamilyMember(LearnedBSDF):
-    """Learned BSDF whose u is scaled by roughnesses ``scale`` = (a_x, a_y), arrays."""
+    """Learned BSDF whose u is scaled by roughnesses ``scale``, (a_x, a_y) or one for both, arrays."""
 
     def __init__(self, form: Form, residual, proxy: Proxy, energy, scale: tuple):
         super().__init__(form, residual, proxy, energy)
@@ -191,7 +215,7 @@ class FamilyMember(LearnedBSDF):
 
     def coordinates(self, g: DirectionPair) -> list:
         _, v, w = super().coordinates(g)
-        x, y = (dr.rcp(dr.square(a)) for a in self.scale)
+        x, y = (dr.rcp(dr.square(a)) for a in (self.scale[0], self.scale[-1]))
         t = dr.fma(g.hx2, x, g.hy2 * y)
         return [dr.minimum(dr.log2(1 + t) * dr.rcp(dr.log2(1 + dr.maximum(x, y))), 1), v, w]
 
@@ -199,20 +223,20 @@ class FamilyMember(LearnedBSDF):
 def member(form: Form, table, residual, mixing, energy, coordinates: list, active=True) -> FamilyMember:
     """Return the members of a family at ``coordinates``, arrays.
 
-    ``table`` is that of the proxy, ``mixing`` the factors of the residual's logarithms, and ``energy`` an array of the
+    ``table`` is that of the proxy, ``mixing`` the factors of the residual's terms, and ``energy`` an array of the
     scale of energy over the cosine's coordinate and those of the parameters (``None``: 1).
     """
     numbers = table(coordinates, active)
     proxy, scale = proxy_of(numbers, form)
 
     def combined(x, active=True):
-        low, high = form.range
-        start = -low / (high - low)
+        low, step = fourth_roots(form.range)
+        start = (1 - low) / step
         factors = [2 * m - 1 for m in mixing(coordinates, active)]
         values, result = residual(x, active), []
         for k in range(3):
             terms = zip(factors, values[k::3], strict=True)
-            result.append(sum((m * (value - start) for m, value in terms), start))
+            result.append(clamp(sum((m * (value - start) for m, value in terms), start), 0, 1))
         return result
 
     def limit(x, active=True):
@@ -228,7 +252,7 @@ def proxy_of(numbers: list, form: Form) -> tuple[Proxy, tuple]:
     low, high = (math.exp(x) for x in LOGARITHMS)
 
     def roughness(channel):
-        channels = (channel, channel if form.isotropic else channel + 1)
+        channels = (channel,) if form.isotropic else (channel, channel + 1)
         return tuple(dr.exp(clamp(numbers[c], math.log(ALPHA_MIN), 0.0)) for c in channels)
 
     def shape(channel):
@@ -239,9 +263,9 @@ def proxy_of(numbers: list, form: Form) -> tuple[Proxy, tuple]:
         a = 4 + k * LOBE
         if name in form.terms:
             colours = [[clamp(c, low, high) for c in numbers[i : i + 3]] for i in (a + 3, a + 6)]
-            lobes[name] = ProxyLobe(*roughness(a), 2 * shape(a + 2), *colours)
+            lobes[name] = ProxyLobe(roughness(a), 2 * shape(a + 2), *colours)
     diffuse = [clamp(c, low, high) for c in numbers[:3]] if "diffuse" in form.terms else None
-    return Proxy(diffuse, shape(3), lobes), roughness(SCALE)
+    return Proxy.of_parts(diffuse, shape(3), lobes), roughness(SCALE)
 
 
 def widths(proxy: Proxy, scale: tuple) -> list:
@@ -249,6 +273,6 @@ def widths(proxy: Proxy, scale: tuple) -> list:
     result = []
     for name in TERMS[1:]:
         lobe = proxy.lobes.get(name)
-        wide = dr.minimum(4 * scale[0], 1) if lobe is None else lobe.alpha_u * dr.sqrt(2 * dr.rcp(lobe.gamma))
+        wide = dr.minimum(4 * scale[0], 1) if lobe is None else dr.sqrt(lobe.squares[0])
         result.append(dr.detach(clamp(wide, ALPHA_MIN, 1.0)))
     return result

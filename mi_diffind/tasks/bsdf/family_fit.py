@@ -25,12 +25,11 @@ from .family import (
     nodes_of,
     sizes_of,
 )  # fmt: skip
-from .family_files import FamilyModel, to_table
+from .family_files import FamilyModel, allocate, to_table
 from .family_sampling import fitted_mixture, fitted_scale
 from .family_truth import MEMBERS, FamilySamples, FamilyTruth, constants, draw, parameters_of, points
-from .files import allocate
 from .fit import requested_truth, symmetry_line
-from .model import ALPHA_MIN, BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, Form, LearnedBSDF
+from .model import ALPHA_MIN, BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, Form, LearnedBSDF, fourth_roots
 from .truth import recorded_source
 from .view import SphereView
 
@@ -162,8 +161,7 @@ def with_scale(table: np.ndarray, isotropic: bool) -> np.ndarray:
         a = 4 + k * LOBE
         used = table[..., a + 3 : a + 9].max(axis=-1) > BLACK
         axes = [a, a if isotropic else a + 1]
-        width = table[..., axes] - 0.5 * table[..., [a + 2]]  # α √2 / √(2 · γ/2)
-        scales.append(np.where(used[..., None], width, 0))
+        scales.append(np.where(used[..., None], table[..., axes], 0))
     narrower = scales[0].min(axis=-1) < scales[1].min(axis=-1)
     table[..., SCALE : SCALE + 2] = np.clip(np.where(narrower[..., None], *scales), math.log(ALPHA_MIN), 0)
     return table
@@ -188,8 +186,8 @@ def residual_problem(
 ) -> FamilyProblem:
     """Return the problem of training proxies and residuals together, which starts from the proxies."""
     types = training.module_types(samples)
-    low, high = form.range
-    residual, mixing = sizes.arrays(float(np.clip(-low / (high - low), 0, 1)), form.azimuth)
+    low, step = fourth_roots(form.range)
+    residual, mixing = sizes.arrays(float(np.clip((1 - low) / step, 0, 1)), form.azimuth)
     proxy = DifferentiableArray(table.shape[:-1], CHANNELS, table / training.RATE)
     net = FamilyArrays(proxy, residual, mixing, training.RATE).alloc(types.TensorXf)
 

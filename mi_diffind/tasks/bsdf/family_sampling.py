@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from . import energy, mixture
-from .family import SAMPLING_NODES, grid, nodes_of, widths
+from .family import SAMPLING_NODES, grid, interpolation, nodes_of, widths
 from .family_truth import FamilyTruth, constants, points
 from .measurement import cosine
 
@@ -37,7 +37,8 @@ def fitted_mixture(truth: FamilyTruth, member_at: Callable, types, isotropic: bo
         lobes = widths(fitted.proxy, fitted.scale)
         alphas = [dr.clip(types.Float(factor * w), 1e-3, 1) for w in lobes for factor in FACTORS]
         dr.eval(alphas)
-        densities, square = mixture.candidate_densities(source, types, isotropic, alphas, MIXTURE_SAMPLES, 3)
+        sampled = [mixture.SampledLobe(a, a) for a in alphas]
+        densities, square = mixture.candidate_densities(source, types, isotropic, sampled, MIXTURE_SAMPLES, 3)
         tried = [
             mixture.optimal_weights(densities[[0, 1 + i, 1 + len(FACTORS) + j]], square) for i, j in pairs
         ]  # fmt: skip
@@ -109,15 +110,3 @@ def lowering(column: np.ndarray, limits: list) -> np.ndarray | None:
     # Both directions are scaled: half of the excess (of its logarithm) is left to the other
     wide = np.concatenate([[1] * (ANGLES - 1), np.sqrt(ratio), [1] * (ANGLES - 1)])
     return np.array([wide[k * ANGLES : (k + 2) * ANGLES - 1].min() for k in range(energy.NODES)])
-
-
-def interpolation(coordinates, nodes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the nodes around coordinates, the last axis fastest, and their weights above 0."""
-    index, weight = np.zeros(1, int), np.ones(1)
-    for x, n in zip(coordinates, nodes, strict=True):
-        position = float(x) * (n - 1)
-        lower = min(int(position), n - 2)
-        ends = np.array([1 - (position - lower), position - lower])
-        index = (index[:, None] * n + lower + np.arange(2)).ravel()
-        weight = (weight[:, None] * ends).ravel()
-    return index[weight > 0], weight[weight > 0]

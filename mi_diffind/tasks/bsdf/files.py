@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from ...indirection import DifferentiableArray, Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
 from ...task import Model
 from . import measurement, outputs, scattered, tensor_file
-from .mixture import Mixture
+from .mixture import Mixture, SampledLobe
 from .model import AZIMUTHS, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, Proxy
 from .source import Truth
 from .training import LIMIT
@@ -27,7 +27,7 @@ WIDEST = 40.0
 
 
 def to_table(
-    net: BSDFArrays, form: Form, alphas, weights: np.ndarray, scale: np.ndarray | None, settings: dict
+    net: BSDFArrays, form: Form, lobes, weights: np.ndarray, scale: np.ndarray | None, settings: dict
 ) -> Table:
     """Return the table of trained arrays: residual, weights and scale as bytes, the proxy in single precision."""
     arrays = {}
@@ -45,7 +45,9 @@ def to_table(
         low = min(float(scale.min()), 1 - 1e-6)
         step = (1 - low) / 255
         arrays["energy"] = byte_array(np.floor((scale[:, None] - low) / step + 1e-9), step, low)
-    return Table("bsdf", arrays, settings={"form": form.to_json(), "alphas": list(alphas), **settings})
+    return Table(
+        "bsdf", arrays, settings={"form": form.to_json(), "lobes": list(map(list, map(astuple, lobes))), **settings}
+    )
 
 
 def form_of(table: Table) -> Form:
@@ -98,23 +100,38 @@ def load(path: str | os.PathLike) -> Table:
         raise TableError(f'{path}: the array "proxy" has the shape {table.arrays["proxy"].shape}, expected (22, 1)')
     unit = (0.0, 1.0)
     check_ranges(table, {n: unit for n in table.arrays if n != "proxy"})
-    alphas = table.settings.get("alphas")
-    if not (isinstance(alphas, list) and len(alphas) == 2 and all(_is_alpha(a) for a in alphas)):
-        raise TableError(f'{path}: its setting "alphas" is {alphas!r}, expected 2 numbers from 0.001 to 1')
+    lobes_of(table)
     return table
 
 
-def _is_alpha(value) -> bool:
-    return isinstance(value, (int, float)) and math.isfinite(value) and 1e-3 <= value <= 1
+def lobes_of(table: Table) -> tuple[SampledLobe, SampledLobe]:
+    """Return the lobes that sample, in a table's settings. Raises :class:`TableError`."""
+    given = table.settings.get("lobes")
+    limits = ((1e-3, 1), (1e-3, 1), (2, 200))
+    valid = (
+        isinstance(given, list)
+        and len(given) == 2
+        and all(isinstance(lobe, list) and len(lobe) == 3 for lobe in given)
+        and all(_in_range(x, *limit) for lobe in given for x, limit in zip(lobe, limits, strict=True))
+    )
+    if not valid:
+        raise TableError(
+            f'{table.path}: its setting "lobes" is {str(given)[:80]!r}, expected 2 lists of two roughnesses from 0.001 '
+            "to 1 and an exponent from 2 to 200"
+        )
+    return tuple(SampledLobe(*map(float, lobe)) for lobe in given)
+
+
+def _in_range(value, low: float, high: float) -> bool:
+    return isinstance(value, (int, float)) and low <= value <= high
 
 
 def allocate(table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
     """Return the arrays; ``storage`` is the form of those of the residual, ``proxy`` is always in single precision."""
     result = {}
     for name, array in table.arrays.items():
-        is_residual = name in (*RESIDUAL, "mixing")
-        form = storage if is_residual else "float32"
-        result[name] = array.allocate(dtype, form, fold=is_residual)
+        form = storage if name in RESIDUAL else "float32"
+        result[name] = array.allocate(dtype, form, fold=name in RESIDUAL)
     return result
 
 
@@ -125,7 +142,7 @@ class BSDFModel(Model):
 
     def build(self):
         self.form = form_of(self.table)
-        self.mixture = Mixture(self.arrays["weights"], tuple(self.table.settings["alphas"]))
+        self.mixture = Mixture(self.arrays["weights"], lobes_of(self.table))
         self.refresh()
 
     def refresh(self) -> None:

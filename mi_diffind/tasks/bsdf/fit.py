@@ -46,7 +46,14 @@ def requested_truth(request: FitRequest) -> Truth:
     use_rgb_variant(request)
     options = request.options
     u, v = options["uv"]
-    return truth_of(options["source"], request.types, options["material"], (float(u), float(v)), options["angles"])
+    return truth_of(
+        options["source"],
+        request.types,
+        options["material"],
+        (float(u), float(v)),
+        options["angles"],
+        options["illuminant"],
+    )
 
 
 def use_rgb_variant(request: FitRequest) -> None:
@@ -64,7 +71,7 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
         symmetries = symmetry.measured_symmetry(truth, types) if truth.function else scattered.measured_symmetry(truth)
     isotropic = (symmetries["isotropy"] or 0) <= symmetry.TOLERANCE
     azimuth = "mirror" if (symmetries["mirror"] or 0) <= symmetry.TOLERANCE else "half"
-    lines = [symmetry_line(symmetries)]
+    lines = [*filter(None, [truth.remark]), symmetry_line(symmetries)]
     plain = request.preset == "table"
     try:
         structure = structure_of(parse_bytes(options["bytes"] or "2k"), plain)
@@ -93,12 +100,12 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     bsdf = LearnedBSDF.of(form, problem.net.rounded())
 
     sampled = truth if truth.function else FunctionTruth(truth.name, cosine(bsdf))
-    alphas, weights = mixture.fitted_mixture(sampled, types, isotropic)
+    lobes, weights = mixture.fitted_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
     scale, raw = None, None if view is None else view.psnr(cosine(bsdf))
     if options["energy"] == "source":
         azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
         scale = energy.fitted_scale(cosine(bsdf), truth if truth.function else WHITE, types, azimuths)
-    table = to_table(problem.net, form, alphas, weights, scale, {
+    table = to_table(problem.net, form, lobes, weights, scale, {
         **request.recorded(result), "source": truth.digest, "name": truth.name, "symmetry": symmetries,
         "structure": dataclasses.asdict(structure),
     })  # fmt: skip

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import math
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 
-from .pool import density_ggx, incident, outgoing, sample_ggx
+from .pool import density_ggx, incident, outgoing, sample_ggx, shortened
 
 #: Directions of incidence for which weights are stored, and samples of each that determine them.
 NODES, SAMPLES = 16, 4096
 
-#: Roughness of the lobes that are tried.
-CANDIDATES = tuple(float(a) for a in np.geomspace(0.002, 1.0, 14))
+#: Roughness and exponent of the lobes that are tried.
+ALPHAS, EXPONENTS = tuple(float(a) for a in np.geomspace(0.002, 1.0, 16)), (2.0, 5.0, 20.0)
 
-#: Iterations of the weights of a mixture.
-ITERATIONS = 30
+#: Iterations of the weights of a mixture; samples of a node and iterations that rank pairs of lobes, and pairs kept.
+ITERATIONS, RANKING, KEPT = 30, (256, 8), 6
 
 #: Least weight of the cosine: every direction can be drawn.
 FLOOR = 0.02
@@ -32,25 +34,60 @@ def cosines(nodes: int) -> np.ndarray:
     return np.maximum(np.linspace(0, 1, nodes) ** 2, 2e-3)
 
 
-def fitted_mixture(truth, types, isotropic: bool, seed: int = 3) -> tuple[tuple[float, float], np.ndarray]:
-    """Return the roughness of both lobes, and the weights of cosine and lobes, ``(NODES, 3)``.
+@dataclass(frozen=True)
+class SampledLobe:
+    """Lobe of visible GGX normals of the roughnesses ``alpha_u`` and ``alpha_v``, numbers or arrays.
+
+    ``gamma`` is the exponent of its tails: 2 for those of GGX, larger for shorter ones (:func:`.pool.shortened`).
+    """
+
+    alpha_u: object
+    alpha_v: object
+    gamma: object = 2.0
+
+    @property
+    def is_ggx(self) -> bool:
+        """Whether the tails are known to be those of GGX."""
+        return isinstance(self.gamma, float) and self.gamma == 2
+
+    def density(self, wi, wo):
+        """Return the density of its samples per solid angle."""
+        Float = type(wo.z)
+        gamma = None if self.is_ggx else Float(self.gamma)
+        return density_ggx(wi, wo, Float(self.alpha_u), Float(self.alpha_v), gamma)
+
+
+def fitted_mixture(
+    truth, types, isotropic: bool, stretch: float = 1.0, seed: int = 3
+) -> tuple[tuple[SampledLobe, SampledLobe], np.ndarray]:
+    """Return both lobes, and the weights of cosine and lobes, ``(NODES, 3)``.
 
     They minimise the mean square of the weights f cos θ / p of a sample, whose lower bound is the squared albedo.
-    Each node's weights sum to 1.
+    Each node's weights sum to 1. ``stretch`` is α_v/α_u of the lobes.
     """
-    densities, square = candidate_densities(truth, types, isotropic, CANDIDATES, SAMPLES, seed)
+    root = math.sqrt(stretch)
+    lobes = [
+        SampledLobe(*(float(np.clip(a, 1e-3, 1)) for a in (alpha / root, alpha * root)), gamma)
+        for alpha in ALPHAS
+        for gamma in EXPONENTS
+    ]
+    densities, square = candidate_densities(truth, types, isotropic, lobes, SAMPLES, seed)
+    some = slice(0, RANKING[0])
+    ranked = []
+    for i, j in itertools.combinations(range(len(lobes)), 2):
+        _, cost = optimal_weights(densities[[0, 1 + i, 1 + j], :, some], square[:, some], RANKING[1])
+        ranked.append((float(np.log(cost).mean()), i, j))
     best = None
-    for pair in itertools.combinations(range(len(CANDIDATES)), 2):
-        weights, cost = optimal_weights(densities[[0, 1 + pair[0], 1 + pair[1]]], square)
+    for _, i, j in sorted(ranked)[:KEPT]:
+        weights, cost = optimal_weights(densities[[0, 1 + i, 1 + j]].astype(np.float64), square)
         total = float(np.mean(np.log(cost)))
         if best is None or total < best[0]:
-            best = total, pair, weights
-    _, pair, weights = best
-    return tuple(CANDIDATES[k] for k in pair), weights
+            best = total, (lobes[i], lobes[j]), weights
+    return best[1:]
 
 
-def candidate_densities(truth, types, isotropic: bool, alphas, size: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return densities of the cosine and of lobes of roughness ``alphas``, ``(1 + K, NODES, size)``, and f²/density.
+def candidate_densities(truth, types, isotropic: bool, lobes: list, size: int, seed: int) -> tuple:
+    """Return densities of the cosine and of ``lobes``, ``(1 + K, NODES, size)``, and f²/density, ``(NODES, size)``.
 
     The squares, of ``size`` samples of a source at each of :data:`NODES` cosines, have a mean of 1 at each.
     """
@@ -65,19 +102,18 @@ def candidate_densities(truth, types, isotropic: bool, alphas, size: int, seed: 
     with dr.suspend_grad():
         value = truth.value(s.wi, s.wo)
         mean = (value[0] + value[1] + value[2]) / 3
-        lobes = [density_ggx(s.wi, s.wo, types.Float(a), types.Float(a)) for a in alphas]
-        columns = [s.weight, mean, s.wo.z * dr.inv_pi, *lobes]
+        columns = [s.weight, mean, s.wo.z * dr.inv_pi, *(lobe.density(s.wi, s.wo) for lobe in lobes)]
         dr.eval(columns)
-    weight, mean, *densities = (np.asarray(c.numpy(), np.float64).reshape(NODES, size) for c in columns)
+    weight, mean, *densities = (c.numpy().reshape(NODES, size) for c in columns)
     square = weight * mean**2
     square /= np.maximum(square.mean(axis=1, keepdims=True), 1e-30)
     return np.stack(densities), square
 
 
-def optimal_weights(densities: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def optimal_weights(densities: np.ndarray, square: np.ndarray, iterations: int = ITERATIONS) -> tuple:
     """Return the weights of three densities, ``(NODES, 3)``, that minimise E[f²/p], and that mean."""
-    weights = np.full((densities.shape[1], 3), 1 / 3)
-    for _ in range(ITERATIONS):
+    weights = np.full((densities.shape[1], 3), 1 / 3, densities.dtype)
+    for _ in range(iterations):
         density = np.einsum("nk,kns->ns", weights, densities)
         gain = np.einsum("kns,ns->nk", densities, square / np.maximum(density, 1e-12) ** 2)
         weights = weights * np.sqrt(np.maximum(gain, 1e-30))
@@ -91,12 +127,11 @@ def optimal_weights(densities: np.ndarray, square: np.ndarray) -> tuple[np.ndarr
 class Mixture:
     """Mixture of a cosine and two lobes of visible GGX normals.
 
-    ``weights`` is an array of three channels that is read at :func:`coordinate` of cos θ_i; ``alphas`` are the
-    roughnesses of both lobes.
+    ``weights`` is an array of three channels that is read at :func:`coordinate` of cos θ_i.
     """
 
-    def __init__(self, weights, alphas: tuple[float, float]):
-        self.weights, self.alphas = weights, alphas
+    def __init__(self, weights, lobes: tuple[SampledLobe, SampledLobe]):
+        self.weights, self.lobes = weights, lobes
 
     def shares(self, wi, active=True) -> list:
         """Return the probabilities of cosine and lobes, which sum to 1."""
@@ -107,18 +142,21 @@ class Mixture:
     def sample(self, wi, w, u, v, active=True):
         """Return directions ``wo`` from three uniform numbers each; some lie below the surface."""
         cosine, first, _ = self.shares(wi, active)
-        Float = type(w)
-        alpha = dr.select(w < cosine + first, Float(self.alphas[0]), Float(self.alphas[1]))
+        is_first = w < cosine + first
+        pairs = zip(*((lobe.alpha_u, lobe.alpha_v, lobe.gamma) for lobe in self.lobes), strict=True)
+        alpha_u, alpha_v, gamma = (dr.select(is_first, type(w)(a), type(w)(b)) for a, b in pairs)
         r, (sin, cos) = dr.sqrt(u), dr.sincos(2 * dr.pi * v)
         diffuse = type(wi)(r * cos, r * sin, dr.sqrt(dr.maximum(1 - u, 0)))
-        return dr.select(w < cosine, diffuse, sample_ggx(wi, alpha, alpha, u, v))
+        if not all(lobe.is_ggx for lobe in self.lobes):
+            v = shortened(v, gamma)
+        return dr.select(w < cosine, diffuse, sample_ggx(wi, alpha_u, alpha_v, u, v))
 
     def density(self, wi, wo, active=True):
         """Return the density of :meth:`sample` per solid angle, for directions above the surface."""
         cosine, *lobes = self.shares(wi, active)
-        Float, density = type(cosine), cosine * wo.z * dr.inv_pi
-        for share, alpha in zip(lobes, self.alphas, strict=True):
-            density = dr.fma(share, density_ggx(wi, wo, Float(alpha), Float(alpha)), density)
+        density = cosine * wo.z * dr.inv_pi
+        for share, lobe in zip(lobes, self.lobes, strict=True):
+            density = dr.fma(share, lobe.density(wi, wo), density)
         return density
 
 

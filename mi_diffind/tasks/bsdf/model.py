@@ -1,19 +1,22 @@
-"""Reflecting BSDF as an analytic proxy times the exponential of a learned residual.
+"""Reflecting BSDF as an analytic proxy times a learned residual.
 
 In the local frame, with the normal (0, 0, 1), directions ``wi`` and ``wo`` above the surface, their half vector h, and
 the angle θ_d between h and either direction,
 
-    f(wi, wo) = proxy(wi, wo) · exp(C[P₁(u, v), P₂(v, w)]).
+    f(wi, wo) = proxy(wi, wo) · (a + b C[P₁(u, v), P₂(v, w)])⁴,
+
+where a and b map the range [0, 1] of the residual to the fourth roots of its factors. (A fourth power is nearly an
+exponential over one step of a byte, and takes two products.)
 
 The *proxy* is the sum of a Lambertian lobe with an edge term, ρ/π (1 + (e − 1)(1 − cos θ_i)⁵)(1 + (e − 1)(1 − cos
-θ_o)⁵), and of two microfacet lobes D V F. D is the generalised Trowbridge–Reitz distribution of exponent γ (Burley
-2012, appendix B; γ = 2 is GGX), V Smith's masking over 4 cos θ_i cos θ_o, and F = F₀ + (F₉₀ − F₀)(1 − cos θ_d)⁵ with
-free F₀ and F₉₀.
+θ_o)⁵), and of two microfacet lobes D V F. D ∝ cos⁻⁴θ_h (1 + 2 tan²θ_h/(γα²))^−γ is Student's distribution of slopes
+(Ribardière et al. 2017): GGX of roughness α for γ = 2, Beckmann's of roughness α/√2 for large γ. V is Smith's masking
+of GGX over 4 cos θ_i cos θ_o, and F = F₀ + (F₉₀ − F₀)(1 − cos θ_d)⁵ with free F₀ and F₉₀.
 
 The *residual* is an indirection (two primary arrays, one cascaded array) in three coordinates in [0, 1]:
 
-- u = log(1 + t) / log(1 + 1/a²), t = h_x²/a_x² + h_y²/a_y², where a = α/√γ of the narrowest lobe: entries are dense in
-  the peak;
+- u = log(1 + t) / log(1 + 1/a²), t = h_x²/a_x² + h_y²/a_y², where a = α of the narrowest lobe: entries are dense in the
+  peak;
 - v = √(1 − cos θ_d), nearly linear in θ_d;
 - w = cos²φ_d = (cos θ_i − cos θ_o)² / (4 sin²θ_h sin²θ_d), φ_d the azimuth of ``wi`` about h (Rusinkiewicz 1998).
 
@@ -36,6 +39,9 @@ from ...lookup import clamp
 
 #: Smallest roughness of a lobe, and smallest scale of the coordinate u.
 ALPHA_MIN = 1e-3
+
+#: Least squared cosine of the half vector that counts in the proxy: at 0, lobes with γ < 2 are infinite.
+LEAST_COS2 = 1e-6
 
 #: Parameters of the proxy: 3 of the diffuse colour, 1 edge, and for each of two lobes α_u, α_v, γ/2, F₀ and F₉₀ (RGB).
 DIFFUSE, EDGE, LOBE, PARAMETERS = slice(0, 3), 3, 9, 22
@@ -75,8 +81,8 @@ class Form:
 class DirectionPair:
     """Terms that the proxy and the coordinates share; all are even in exchanging ``wi`` and ``wo``.
 
-    ``hx2``, ``hy2`` and ``hz2`` are the squared components of the half vector, which sum to 1; ``cos_d`` = cos θ_d;
-    ``schlick`` = (1 − cos θ_d)⁵.
+    ``hx2``, ``hy2`` and ``hz2`` are the squared components of the half vector, which sum to 1, and ``log_hz2`` the
+    logarithm (base 2) of the last; ``cos_d`` = cos θ_d; ``schlick`` = (1 − cos θ_d)⁵.
     """
 
     wi: object
@@ -85,6 +91,7 @@ class DirectionPair:
     hx2: object
     hy2: object
     hz2: object
+    log_hz2: object
     cos_d: object
     schlick: object
 
@@ -94,7 +101,7 @@ class DirectionPair:
         h2 = dr.squared_norm(half)
         inverse, cos_d = dr.rcp(h2), dr.minimum(0.5 * dr.sqrt(h2), 1)
         x, y, z = (dr.square(c) * inverse for c in half)
-        return cls(wi, wo, half, x, y, z, cos_d, _fifth(1 - cos_d))
+        return cls(wi, wo, half, x, y, z, dr.log2(dr.maximum(z, LEAST_COS2)), cos_d, _fifth(1 - cos_d))
 
 
 def half_vector(wi, wo):
@@ -109,35 +116,66 @@ def _fifth(x):
 
 @dataclass
 class ProxyLobe:
-    """Microfacet lobe of the proxy; roughness, exponent, and colours as lists of three arrays."""
+    """Microfacet lobe of the proxy: one or two roughnesses, exponent, and colours of three arrays each."""
 
-    alpha_u: object
-    alpha_v: object
+    alphas: tuple
     gamma: object
     f0: list
     f90: list
 
+    def constants(self) -> LobeConstants:
+        """Return what does not depend on directions."""
+        squares = tuple(map(dr.square, self.alphas))
+        return LobeConstants(
+            squares,
+            tuple(2 * dr.rcp(self.gamma * square) for square in squares),
+            self.gamma,
+            self.gamma - 2,
+            dr.inv_pi * dr.rcp(self.alphas[0] * self.alphas[-1]),
+            self.f0,
+            [edge - normal for normal, edge in zip(self.f0, self.f90, strict=True)],
+        )
+
+
+@dataclass
+class LobeConstants:
+    """Constants of a microfacet lobe: α² and 2/(γα²), γ, γ − 2, 1/(π α_u α_v), F₀ and F₉₀ − F₀."""
+
+    squares: tuple
+    slopes: tuple
+    gamma: object
+    excess: object
+    peak: object
+    f0: list
+    edge: list
+
     def value(self, g: DirectionPair) -> list:
         """Return D V F, three arrays."""
-        slope = dr.fma(g.hx2, dr.rcp(dr.square(self.alpha_u)), dr.fma(g.hy2, dr.rcp(dr.square(self.alpha_v)), g.hz2))
-        d = dr.exp2(-self.gamma * dr.log2(slope)) * dr.rcp(dr.pi * self.alpha_u * self.alpha_v)
-        d = d * dr.rcp(masking(g.wi, self.alpha_u, self.alpha_v) * masking(g.wo, self.alpha_u, self.alpha_v))
-        return [d * dr.fma(edge - normal, g.schlick, normal) for normal, edge in zip(self.f0, self.f90, strict=True)]
+        # q / cos²θ_h = 1 + 2 tan²θ_h / (γα²)
+        if len(self.slopes) == 1:
+            q = dr.fma(g.hx2 + g.hy2, self.slopes[0], g.hz2)
+        else:
+            q = dr.fma(g.hx2, self.slopes[0], dr.fma(g.hy2, self.slopes[1], g.hz2))
+        d = dr.exp2(dr.fma(self.excess, g.log_hz2, -self.gamma * dr.log2(q))) * self.peak
+        d = d * dr.rcp(masking(g.wi, *self.squares) * masking(g.wo, *self.squares))
+        return [d * dr.fma(edge, g.schlick, normal) for normal, edge in zip(self.f0, self.edge, strict=True)]
 
 
-def masking(w, alpha_u, alpha_v):
-    """Return d(w), the denominator of Smith's masking G₁(w) = 2 cos θ / d(w); at least the smaller roughness."""
-    projected = dr.square(alpha_u * w.x) + dr.square(alpha_v * w.y)
-    return w.z + dr.sqrt(dr.fma(w.z, w.z, projected))
+def masking(w, square_u, square_v=None):
+    """Return d(w), the denominator of Smith's masking G₁(w) = 2 cos θ / d(w), for one or two squared roughnesses."""
+    z2 = dr.square(w.z)
+    if square_v is None:
+        return w.z + dr.sqrt(dr.fma(z2, 1 - square_u, square_u))
+    return w.z + dr.sqrt(dr.fma(square_u, dr.square(w.x), dr.fma(square_v, dr.square(w.y), z2)))
 
 
 @dataclass
 class Proxy:
-    """Analytic proxy: ``diffuse`` (three arrays) and ``edge``, and microfacet ``lobes`` by name."""
+    """Analytic proxy: ``diffuse`` (three arrays, over π) and ``edge`` less 1, and lobes by name."""
 
     diffuse: list | None
     edge: object
-    lobes: dict[str, ProxyLobe]
+    lobes: dict[str, LobeConstants]
 
     @classmethod
     def of(cls, logarithms: list, form: Form) -> Proxy:
@@ -147,16 +185,22 @@ class Proxy:
         for k, name in enumerate(TERMS[1:]):
             a = 4 + k * LOBE
             if name in form.terms:
-                alphas = [dr.clip(values[a + i], ALPHA_MIN, 1) for i in (0, 0 if form.isotropic else 1)]
-                lobes[name] = ProxyLobe(*alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9])
-        return cls(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
+                alphas = tuple(dr.clip(x, ALPHA_MIN, 1) for x in values[a : a + (1 if form.isotropic else 2)])
+                lobes[name] = ProxyLobe(alphas, 2 * values[a + 2], values[a + 3 : a + 6], values[a + 6 : a + 9])
+        return cls.of_parts(values[DIFFUSE] if "diffuse" in form.terms else None, values[EDGE], lobes)
+
+    @classmethod
+    def of_parts(cls, diffuse: list | None, edge, lobes: dict[str, ProxyLobe]) -> Proxy:
+        """Return the proxy of an albedo (``None``: no diffuse lobe), its factor at the horizon, and lobes."""
+        if diffuse is not None:
+            diffuse, edge = [dr.inv_pi * c for c in diffuse], edge - 1
+        return cls(diffuse, edge, {name: lobe.constants() for name, lobe in lobes.items()})
 
     def value(self, g: DirectionPair) -> list:
         """Return the proxy, without the cosine, three arrays."""
         result = [0, 0, 0]
         if self.diffuse is not None:
-            k = self.edge - 1
-            shape = dr.fma(k, _fifth(1 - g.wi.z), 1) * dr.fma(k, _fifth(1 - g.wo.z), 1) * dr.inv_pi
+            shape = dr.fma(self.edge, _fifth(1 - g.wi.z), 1) * dr.fma(self.edge, _fifth(1 - g.wo.z), 1)
             result = [colour * shape for colour in self.diffuse]
         for lobe in self.lobes.values():
             result = [a + b for a, b in zip(result, lobe.value(g), strict=True)]
@@ -215,7 +259,7 @@ class LearnedBSDF:
 
     def coordinates(self, g: DirectionPair) -> list:
         """Return u, v and w."""
-        return [coordinate_u(g, self.form.scale), dr.sqrt(dr.maximum(1 - g.cos_d, 0)), coordinate_w(g, self.form)]
+        return [coordinate_u(g, self.form.scale), dr.sqrt(1 - g.cos_d), coordinate_w(g, self.form)]
 
     def value(self, wi, wo, active=True) -> list:
         """Return f without the cosine, three arrays, for unit directions above the surface."""
@@ -226,25 +270,29 @@ class LearnedBSDF:
             result = [scale * v for v in result]
         if self.residual is None:
             return result
-        low, high = self.form.range
+        low, step = fourth_roots(self.form.range)
         numbers = self.residual(self.coordinates(g), active)
-        factors = [dr.exp(dr.fma(clamp(x, 0, 1), high - low, low)) for x in numbers]
+        factors = [dr.square(dr.square(dr.fma(x, step, low))) for x in numbers]
         return [a * b for a, b in zip(result, factors, strict=True)]
 
 
+def fourth_roots(limits: tuple[float, float]) -> tuple[float, float]:
+    """Return the fourth root of the least factor, and how much larger that of the largest is."""
+    low, high = (math.exp(x / 4) for x in limits)
+    return low, high - low
+
+
 def coordinate_u(g: DirectionPair, scale: tuple[float, float]):
-    """Return u in [0, 1], the coordinate of the half vector."""
+    """Return u, the coordinate of the half vector; at most 1 but for rounding."""
     t = dr.fma(g.hx2, scale[0] ** -2, g.hy2 * scale[1] ** -2)
-    return dr.minimum(dr.log2(1 + t) * (1 / math.log2(1 + min(scale) ** -2)), 1)
+    return dr.log2(1 + t) * (1 / math.log2(1 + min(scale) ** -2))
 
 
 def coordinate_w(g: DirectionPair, form: Form):
-    """Return w in [0, 1], the coordinate of the azimuth φ_d; 0 where the azimuth is undefined."""
-    sin2_h, sin2_d = g.hx2 + g.hy2, dr.maximum(1 - dr.square(g.cos_d), 0)
+    """Return w, the coordinate of the azimuth φ_d; where it is undefined, any number that reads as one in [0, 1]."""
+    sin2_h, sin2_d = g.hx2 + g.hy2, 1 - dr.square(g.cos_d)
     if form.azimuth == "mirror":
-        product = 4 * sin2_h * sin2_d
-        ratio = dr.square(g.wi.z - g.wo.z) * dr.rcp(dr.maximum(product, 1e-12))
-        return dr.select(product > 1e-12, dr.minimum(ratio, 1), 0)
+        return dr.square(g.wi.z - g.wo.z) * dr.rcp(dr.maximum(4 * sin2_h * sin2_d, 1e-12))
     # tan φ_d from components of wi along the tangents of h: towards the normal, and perpendicular to both
     along = 0.5 * (g.wo.z - g.wi.z)
     across = (g.wo.x * g.wi.y - g.wo.y * g.wi.x) * 0.5 * dr.rcp(dr.maximum(g.cos_d, 1e-6))

@@ -14,6 +14,9 @@ ALPHAS, COSINE = (0.003, 0.015, 0.06, 0.2, 0.6), 0.3
 #: Share of the directions that the BSDF samples itself, if it can.
 NATIVE = 0.2
 
+#: Least 1 − v at which the density of a lobe with an exponent is not 0.
+SMALLEST_REST = 1e-12
+
 #: Smallest cosine of a direction of the pool.
 HORIZON = 1e-4
 
@@ -31,12 +34,31 @@ def sample_ggx(wi, alpha_u, alpha_v, u, v):
     return 2 * dr.dot(wi, m) * m - wi
 
 
-def density_ggx(wi, wo, alpha_u, alpha_v):
-    """Return the density of :func:`sample_ggx` per solid angle, D / (2 d(wi))."""
+def density_ggx(wi, wo, alpha_u, alpha_v, gamma=None):
+    """Return the density of :func:`sample_ggx` per solid angle, D / (2 d(wi)).
+
+    With ``gamma``, the density if its number v is first mapped by :func:`shortened`.
+    """
     half = half_vector(wi, wo)
-    inverse = dr.rcp(dr.squared_norm(half))
-    stretched = dr.square(half.x / alpha_u) + dr.square(half.y / alpha_v) + dr.square(half.z)
-    return dr.rcp(2 * dr.pi * alpha_u * alpha_v * dr.square(stretched * inverse) * masking(wi, alpha_u, alpha_v))
+    inverse, visible = dr.rcp(dr.squared_norm(half)), masking(wi, dr.square(alpha_u), dr.square(alpha_v))
+    slope = inverse * (dr.square(half.x / alpha_u) + dr.square(half.y / alpha_v) + dr.square(half.z))
+    density = dr.rcp(2 * dr.pi * alpha_u * alpha_v * dr.square(slope) * visible)
+    if gamma is None:
+        return density
+    rest = dr.minimum(half.z * dr.rcp(slope * visible), 1)  # 1 - v of the sample
+    q = dr.fma(2 * dr.rcp(gamma), dr.rcp(rest) - 1, 1)
+    factor = 2 * (1 - dr.rcp(gamma)) * dr.exp2(-gamma * dr.log2(q)) * dr.rcp(dr.square(rest))
+    return density * dr.select(rest > SMALLEST_REST, factor, 0)
+
+
+def shortened(v, gamma):
+    """Return the number v for which a lobe of :func:`sample_ggx` has tails of the exponent ``gamma`` (2: ``v``).
+
+    At normal incidence, slopes then have the distribution of the proxy's lobes. The map is t / (1 + t) with t = γ/2 ((1
+    − v)^(−1/(γ − 1)) − 1), the squared slope over α².
+    """
+    t = 0.5 * gamma * (dr.exp2(-dr.log2(dr.maximum(1 - v, 1e-7)) * dr.rcp(gamma - 1)) - 1)
+    return t * dr.rcp(1 + t)
 
 
 def cosine_hemisphere(types, u, v):

@@ -12,12 +12,12 @@ class Truth:
 
     ``name`` describes the source; ``digest`` changes when its content does; ``samples``: it samples directions itself;
     ``isotropic``: it is isotropic by its format (``None``: it has to be measured). ``function``: its values are known
-    for all directions.
+    for all directions. ``remark``: line about how it was read, for people.
     """
 
     name: str
     digest: str
-    samples, function = False, True
+    samples, function, remark = False, True, ""
     isotropic: bool | None = None
 
     def value(self, wi, wo) -> list:

@@ -10,8 +10,8 @@ import numpy as np
 from .model import EDGE, LOBE, PARAMETERS, DirectionPair, ProxyLobe
 from .pool import Samples
 
-#: Shapes that are tried: roughness, of GGX (exponent 2) and of a lobe with a shorter tail.
-ALPHAS, EXPONENTS = tuple(float(a) for a in np.geomspace(0.005, 0.9, 12)), (2.0, 5.0)
+#: Shapes that are tried: roughness, and exponents of GGX, of a lobe with a shorter tail, and nearly Beckmann's.
+ALPHAS, EXPONENTS = tuple(float(a) for a in np.geomspace(0.005, 0.9, 12)), (2.0, 6.0, 30.0)
 
 #: Samples, sweeps of the least squares, and the least colour of a term.
 SAMPLES, SWEEPS, LEAST = 2**13, 60, 1e-5
@@ -26,9 +26,8 @@ def starts(samples: Samples, types, count: int) -> list[np.ndarray]:
     columns = [s.wo.z * dr.inv_pi]
     with dr.suspend_grad():
         for alpha, exponent in shapes:
-            # A lobe of exponent γ is as wide as GGX if its α is larger by √(γ/2)
-            a, one = types.Float(min(1.0, alpha * (exponent / 2) ** 0.5)), [types.Float(1)] * 3
-            value = s.wo.z * ProxyLobe(a, a, types.Float(exponent), one, one).value(g)[0]
+            a, one = types.Float(alpha), [types.Float(1)] * 3
+            value = s.wo.z * ProxyLobe((a,), types.Float(exponent), one, one).constants().value(g)[0]
             columns += [value * (1 - g.schlick), value * g.schlick]
         dr.eval(columns, s.weight, s.value)
     weight = s.weight.numpy().astype(np.float64)
@@ -63,7 +62,7 @@ def _logarithms(first: tuple[float, float], second: tuple[float, float], colours
     result[:3], result[EDGE] = colours[0], 0.0
     for k, (alpha, exponent) in enumerate((first, second)):
         a = 4 + k * LOBE
-        result[a : a + 2] = np.log(min(1.0, alpha * (exponent / 2) ** 0.5))
+        result[a : a + 2] = np.log(alpha)
         result[a + 2] = np.log(exponent / 2)
         result[a + 3 : a + 6], result[a + 6 : a + 9] = colours[1 + 2 * k], colours[2 + 2 * k]
     return result

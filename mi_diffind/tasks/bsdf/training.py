@@ -12,7 +12,7 @@ import numpy as np
 from ...fitting import Problem, fit
 from ...indirection import DifferentiableArray
 from ...settings import FitSettings
-from .model import BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, ResidualSizes
+from .model import BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, ResidualSizes, fourth_roots
 from .pool import Samples, incident, outgoing
 from .starts import starts
 from .view import SphereView
@@ -36,7 +36,7 @@ RATE = 0.3
 QUANTILE, MARGIN = 0.998, 0.25
 
 #: Least residual range, and the value relative to the mean below which a source counts as black.
-LEAST, DARK = 0.05, 1e-5
+LEAST, DARK = 0.01, 1e-3
 
 #: Share of the training after which entries are rounded to bytes in each step.
 ROUNDED = 0.5
@@ -148,11 +148,7 @@ def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: 
         a = 4 + k * LOBE
         if logarithms[a + 3 : a + 9].max() > BLACK:
             terms.append(name)
-            gamma = math.sqrt(2 * values[a + 2])
-            # GGX of this roughness is as wide as the lobe of exponent γ where half of the peak is reached
-            scales.append(
-                [float(np.clip(values[a + i] * math.sqrt(2) / gamma, 1e-3, 1)) for i in (0, 0 if isotropic else 1)]
-            )
+            scales.append([float(np.clip(values[a + i], 1e-3, 1)) for i in (0, 0 if isotropic else 1)])
     scale = min(scales, key=min) if scales else [1.0, 1.0]
     form = Form(tuple(terms), isotropic, azimuth, tuple(scale))
     return dataclasses.replace(form, range=residual_range(form, logarithms, samples))
@@ -202,8 +198,8 @@ def residual_problem(
     The first number of ``measure(bsdf)`` decides which state is the best.
     """
     types = module_types(samples)
-    low, high = form.range
-    start = float(np.clip(-low / (high - low), 0, 1))
+    low, step = fourth_roots(form.range)
+    start = float(np.clip((1 - low) / step, 0, 1))
     proxy = proxy_array(logarithms, RATE) if form.terms else None
     net = BSDFArrays(structure.residual(start, form.azimuth), proxy, RATE).alloc(types.TensorXf)
     return BSDFProblem(net, form, samples, measure, identity)

@@ -13,6 +13,7 @@ import numpy as np
 from ...errors import UsageError, reason
 from ...lookup import clamp
 from ...tables import Table, TableError
+from .measured_files import ILLUMINANTS, PolarisedTruth, measured_bsdf
 from .scattered import ScatteredTruth
 from .source import Truth
 
@@ -116,12 +117,15 @@ class MERLTruth(Truth):
         return result
 
 
-def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 0.5), angles: str = "") -> Truth:
+def truth_of(
+    source, types, material: str = "", uv: tuple[float, float] = (0.5, 0.5), angles: str = "", illuminant: str = ""
+) -> Truth:
     """Return the source of a BSDF.
 
     ``source`` is a scene or a single BSDF as a file (``.xml``) or as a dictionary of ``mi.load_dict``, a ``mi.BSDF``,
     a measured file (``.bsdf``, ``.pbsdf``, ``.binary``), or a table of measurements (``.csv``), whose ``angles`` are
-    degrees or radians ("": as :mod:`.scattered` decides). ``material`` is the id of a BSDF of a scene. Raises
+    degrees or radians ("": as :mod:`.scattered` decides). ``material`` is the id of a BSDF of a scene. Spectra of
+    measured files have colours under an ``illuminant`` (:mod:`.measured_files`; "": D65). Raises
     :class:`~mi_diffind.errors.UsageError`.
     """
     import mitsuba as mi
@@ -141,10 +145,14 @@ def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 
         return MERLTruth(path, types)
     if suffix == ".csv":
         return ScatteredTruth(path, angles)
-    if suffix in (".bsdf", ".pbsdf"):
-        plugin = "measured" if suffix == ".bsdf" else "measured_polarized"
-        bsdf = _built(path, lambda: mi.load_dict({"type": plugin, "filename": str(path)}))
-        return MitsubaTruth(bsdf, path.name, _hash(path.read_bytes()), uv)
+    illuminant = illuminant or ILLUMINANTS[0]
+    if suffix == ".pbsdf":
+        return PolarisedTruth(path, illuminant)
+    if suffix == ".bsdf":
+        bsdf, remark = _built(path, lambda: measured_bsdf(path, illuminant))
+        truth = MitsubaTruth(bsdf, path.name, _hash(path.read_bytes() + (illuminant.encode() if remark else b"")), uv)
+        truth.remark = remark
+        return truth
     if suffix != ".xml":
         raise UsageError(f'{path}: found the extension "{path.suffix}", allowed are {", ".join(SUFFIXES)}')
     loaded = _built(path, lambda: mi.load_file(str(path), optimize=False))
@@ -155,6 +163,7 @@ def truth_of(source, types, material: str = "", uv: tuple[float, float] = (0.5, 
 def recorded_source(options) -> dict:
     """Return what a table file keeps of a source beside the path of its file, so that it can be opened again."""
     recorded = {"material": options["material"], "uv": [float(x) for x in options["uv"]], "angles": options["angles"]}
+    recorded["illuminant"] = options["illuminant"]
     source = options["source"]
     try:
         if isinstance(source, dict) and json.loads(json.dumps(source)) == source:
@@ -178,7 +187,7 @@ def recorded_truth(table: Table, types) -> Truth:
         raise TableError(f"{name}: was fitted to an object in memory, which cannot be opened again")
     try:
         u, v = settings.get("uv", (0.5, 0.5))
-        texts = {name: str(settings.get(name, "")) for name in ("material", "angles")}
+        texts = {name: str(settings.get(name, "")) for name in ("material", "angles", "illuminant")}
         truth = truth_of(source, types, uv=(float(u), float(v)), **texts)
     except (TypeError, ValueError, UsageError) as e:
         raise TableError(f"{name}: its source cannot be opened again: {reason(e)}") from None
@@ -194,6 +203,8 @@ def _hash(content: bytes) -> str:
 def _built(name, load):
     try:
         return load()
+    except UsageError:
+        raise
     except Exception as e:  # Mitsuba raises several types
         raise UsageError(f"{name}: cannot be loaded ({reason(e)})") from None
 

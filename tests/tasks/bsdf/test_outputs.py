@@ -72,7 +72,7 @@ def test_pictures(mi_rgb, types, model, tmp_path, monkeypatch):
     """A sphere stands beside its source if that can be opened again, else alone, with the reason."""
     monkeypatch.setattr(outputs, "PASSES", 1)
     source = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}}
-    settings = recorded_source({"source": source, "material": "", "uv": (0.5, 0.5), "angles": ""})
+    settings = recorded_source({"source": source, "material": "", "uv": (0.5, 0.5), "angles": "", "illuminant": ""})
     assert json.loads(json.dumps(settings)) == settings
     for recorded, width in (({}, 256), (settings, 768)):
         [(path, line)] = model(recorded).decode(tmp_path / f"{width}.exr")

@@ -202,14 +202,31 @@ def test_the_mixture_follows_the_source(types):
             )
             return [p, p, p]
 
-    alphas, weights = mixture.fitted_mixture(Sum(), types, True)
-    assert min(abs(math.log(a / alpha)) for a in alphas) < 0.5
+    lobes, weights = mixture.fitted_mixture(Sum(), types, True)
+    assert min(abs(math.log(lobe.alpha_u / alpha)) for lobe in lobes) < 0.5
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     array = StoredArray(weights.astype(np.float32)).allocate(types.TensorXf)
-    fitted = mixture.Mixture(array, alphas)
+    fitted = mixture.Mixture(array, lobes)
     assert mixture.second_moment(Sum().value, fitted, Sum(), types, 0.7, 2**14) < 1.03
-    one_lobe = mixture.Mixture(StoredArray(np.float32([[1e-3, 1, 1]] * 2)).allocate(types.TensorXf), (0.5, 0.5))
+    wide = (mixture.SampledLobe(0.5, 0.5),) * 2
+    one_lobe = mixture.Mixture(StoredArray(np.float32([[1e-3, 1, 1]] * 2)).allocate(types.TensorXf), wide)
     assert mixture.second_moment(Sum().value, one_lobe, Sum(), types, 0.7, 2**14) > 1.3
+
+
+@pytest.mark.parametrize("cos", [1.0, 0.3])
+def test_short_tails(types, cos):
+    """A lobe with an exponent is as wide as its samples: means of samples are integrals of the density."""
+    n, lobe = 2**17, mixture.SampledLobe(0.3, 0.2, 8.0)
+    rng = np.random.default_rng(1)
+    u, v, w = (types.Float(aligned(x)) for x in rng.random((3, n)))
+    wi = types.Array3f(dr.full(types.Float, math.sqrt(1 - cos**2), n), 0, dr.full(types.Float, cos, n))
+    samples = mixture.Mixture(lambda *_: [types.Float(x) for x in (1e-9, 1, 1)], (lobe, lobe)).sample(wi, w, u, v)
+    uniform = pool.cosine_hemisphere(types, u, v)
+    density = lobe.density(wi, uniform) * dr.pi / uniform.z
+    functions = [lambda d: dr.exp(-d.x), lambda d: dr.square(d.y), lambda d: d.z]
+    for f in functions:
+        sampled = dr.mean(dr.select(samples.z > 0, f(samples), 0))
+        assert float(sampled[0]) == pytest.approx(float(dr.mean(density * f(uniform))[0]), rel=0.02)
 
 
 def test_the_albedo_is_limited(types):
@@ -240,7 +257,7 @@ DAMAGES = {
     "range": (lambda t: t.settings["form"].update(range=[3, -3]), "which is no form of a BSDF"),
     "scale": (lambda t: t.settings["form"].update(scale=[0, 0.1]), "which is no form of a BSDF"),
     "terms": (lambda t: t.settings["form"].update(terms=["third"]), "which is no form of a BSDF"),
-    "alphas": (lambda t: t.settings.update(alphas=[0.1, "x"]), r'its setting "alphas" is \[0.1, \'x\'\]'),
+    "lobes": (lambda t: t.settings.update(lobes=[0.1, "x"]), r'its setting "lobes" is "\[0.1, \'x\'\]"'),
     "proxy": (lambda t: t.arrays.pop("proxy"), 'the array "proxy" is missing'),
     "length": (lambda t: t.arrays.update(proxy=StoredArray(np.zeros((5, 1), np.float32))), r"expected \(22, 1\)"),
     "shape": (lambda t: t.arrays.update(cascaded=t.arrays["primary_uv"]), "expected 3 dimension"),
@@ -275,7 +292,7 @@ def test_a_plastic_is_fitted(types, short, tmp_path):
     source = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}}
     options = {"steps": 80, "batch": 2**11, "measure_every": 40, "progress": False}
     fitted = mi_diffind.fit("bsdf", source, **options)
-    assert fitted.history[-1]["psnr_db"] > fitted.history[0]["psnr_db"] - 1 and fitted.table.measured["psnr_db"] > 42
+    assert fitted.table.measured["psnr_db"] > max(65, fitted.history[0]["psnr_db"] - 1)
     assert fitted.table.measured["albedo_excess"] < 1e-3 and fitted.table.measured["sample_weight_moment"] < 1.3
     assert "isotropic" in fitted.lines[0] and "not reciprocal" not in fitted.lines[0]
     saved = load_table(fitted.save(tmp_path / "a.npz"))
