@@ -6,8 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_diffind import compat
+from mi_diffind.errors import UsageError
 from mi_diffind.indirection import DifferentiableArray
 from mi_diffind.lookup import clamp
+from mi_diffind.tables import TableError
 from mi_diffind.tasks.bsdf import TASK
 from mi_diffind.tasks.bsdf.family_files import ARRAYS
 from mi_diffind.tasks.bsdf.files import RESIDUAL
@@ -22,8 +25,9 @@ from mi_diffind.tasks.bsdf.model import (
     Proxy,
     ProxyLobe,
 )
+from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 
-from . import Plugin
+from . import Counterpart, Plugin
 from .support import properties, tables, upsampling
 from .support.manual import shared_parts
 from .support.tracked_parameter import TrackedParameter, when_outermost
@@ -61,6 +65,12 @@ class NeuralBSDF(mi.BSDF):
        - |string|
        - ``source``: the directional albedo is at most about 0.1% above the source's, by a factor s(θ_i) s(θ_o) of the
          file; ``raw``: as it was fitted. (Default: ``source``)
+       - --
+
+     * - evaluate
+       - |string|
+       - ``learned``, or ``source``: what the file was fitted to, if it can be opened again, as ``mi-diffind compare``
+         shows it. (Default: ``learned``)
        - --
 
      * - storage
@@ -398,4 +408,82 @@ def _spectrum(rgb: list, wavelengths):
     return largest * upsampling.spectrum([v / largest for v in rgb], wavelengths)
 
 
-PLUGIN = Plugin("neural_bsdf", "bsdf", NeuralBSDF, task="bsdf", storage="uint8")
+class SourceBSDF(NeuralBSDF):
+    """Source of a table file in its place: at one point of its textures, or not a plugin of Mitsuba. The file samples.
+
+    ``truth`` is a :class:`mi_diffind.tasks.bsdf.source.Truth`.
+    """
+
+    def __init__(self, props: mi.Properties, truth):
+        super().__init__(props)
+        self.source = _Values(truth)
+
+    def _at(self, si, active):
+        return self.source, super()._at(si, active)[1]
+
+
+class _Values:
+    def __init__(self, truth):
+        self.truth = truth
+
+    def value(self, wi, wo) -> list:
+        """Return f without the cosine."""
+        return [v / wo.z for v in self.truth.value(wi, wo)]
+
+
+def _learned_or_source(props: mi.Properties):
+    """Return the learned BSDF, or with ``evaluate="source"`` its source. Raises ``RuntimeError``."""
+    if properties.one_of(props, "evaluate", ("learned", "source")) == "learned":
+        return NeuralBSDF(props)
+    learned = NeuralBSDF(props)  # checks the properties
+    try:
+        truth = _source(learned, props)
+    except (TableError, UsageError) as e:
+        raise RuntimeError(str(e)) from None
+    if isinstance(truth, MitsubaTruth) and not _is_textured(truth.bsdf):
+        if learned.two_sided and not mi.has_flag(truth.bsdf.flags(), mi.BSDFFlags.BackSide):
+            return mi.load_dict({"type": "twosided", "bsdf": truth.bsdf})
+        return truth.bsdf
+    return SourceBSDF(props, truth)
+
+
+def _is_textured(bsdf) -> bool:
+    """Return whether a BSDF differs from place to place; plugins of Mitsuba do not all set a flag."""
+    nodes = compat.objects_of(bsdf)
+    varies = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
+    return varies or mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
+
+
+def _source(learned: NeuralBSDF, props: mi.Properties):
+    """Return the source of a learned BSDF; of a family, with the parameters of the scene."""
+    model, name = learned.model, learned.model.table.path
+    if "scale" in props and props["scale"] != 1:
+        raise UsageError(f'parameter "scale": found {props["scale"]:g}, the source of {name} has none')
+    if not learned.textures:
+        truth = model.source()
+        if not truth.function:
+            raise UsageError(f"{name}: its source, {truth.name}, is rows of measured values, which show no picture")
+        return truth
+    numbers = [p.name for p in model.parameters if p.name in props and not properties.is_number(props, p.name)]
+    if numbers:
+        raise UsageError(f'parameter "{numbers[0]}": found a texture, the source of {name} is compared at numbers')
+    values = [float(props.get(p.name, p.middle)) for p in model.parameters]
+    return model.family().at(
+        [float(p.coordinate(mi.Float(v))[0]) for p, v in zip(model.parameters, values, strict=True)]
+    )
+
+
+def _to_source(props: mi.Properties) -> str:
+    """Change the properties to those of the source, and return the name of its plugin."""
+    props["evaluate"] = "source"
+    return "neural_bsdf"
+
+
+PLUGIN = Plugin(
+    "neural_bsdf",
+    "bsdf",
+    _learned_or_source,
+    task="bsdf",
+    storage="uint8",
+    exact=Counterpart("source", ("energy", "storage"), convert=_to_source),
+)

@@ -190,3 +190,78 @@ def test_bad_parameters(mi_rgb, files, changes, message):
         del given["filename"]
     with pytest.raises(RuntimeError, match=message):
         mi_rgb.load_dict(given)
+
+
+def recorded(folder, source, **settings):
+    """A file that says it was fitted to a dictionary."""
+    table = handmade()
+    table.settings |= {"dictionary": source, **settings}
+    save_table(folder / "recorded.npz", table)
+    return {"type": "neural_bsdf", "filename": str(folder / "recorded.npz"), "evaluate": "source"}
+
+
+CHECKER = {"type": "checkerboard", "color0": {"type": "rgb", "value": 0.1}, "color1": {"type": "rgb", "value": 0.8}}
+
+
+def test_sources_in_the_place_of_files(mi_rgb, tmp_path, rng):
+    """``evaluate="source"`` is the source: Mitsuba's own object, or of textures the point that was fitted."""
+    mi, ctx = mi_rgb, mi_rgb.BSDFContext()
+    wi, wo = directions(rng, 64), directions(rng, 64)
+    plastic = {"type": "roughplastic", "alpha": 0.2}
+    given = recorded(tmp_path, plastic)
+    expected = mi.load_dict(plastic)
+    for changes, sign in (({}, 1), ({"two_sided": True}, -1)):
+        source = mi.load_dict({**given, **changes})
+        side = np.float32([1, 1, sign])
+        shown = [b.eval(ctx, hits(mi, w), mi.Vector3f(aligned(v.T)))
+                 for b, w, v in ((source, wi * side, wo * side), (expected, wi, wo))]  # fmt: skip
+        np.testing.assert_array_equal(numpy_of(shown[0]), numpy_of(shown[1]))
+        assert type(source).__name__ != "NeuralBSDF"
+    checked = {"type": "diffuse", "reflectance": CHECKER}
+    textured = mi.load_dict(recorded(tmp_path, checked, uv=[0.25, 0.75]))
+    si, towards = hits(mi, wi), mi.Vector3f(aligned(wo.T))
+    value, pdf = textured.eval_pdf(ctx, si, towards)
+    elsewhere, there = hits(mi, wi), hits(mi, wi)
+    there.uv = mi.Point2f(0.25, 0.75)
+    expected, other = (numpy_of(mi.load_dict(checked).eval(ctx, at, towards)) for at in (there, elsewhere))
+    np.testing.assert_allclose(numpy_of(value), expected, rtol=1e-5)
+    assert not np.allclose(expected, other)
+    bs, weight = textured.sample(ctx, si, *uniform(mi, rng, 64))
+    again, density = textured.eval_pdf(ctx, si, bs.wo)
+    ratio, valid = numpy_of(again) / numpy_of([density]), numpy_of([bs.pdf])[:, 0] > 0
+    np.testing.assert_allclose(numpy_of(weight)[valid], ratio[valid], rtol=1e-3)
+    assert numpy_of([pdf]).min() > 0
+
+
+def test_sources_that_cannot_stand_for_files(mi_rgb, files, tmp_path):
+    plastic = {"type": "roughplastic"}
+    for given, message in (
+        ({"type": "neural_bsdf", "filename": files["isotropic"], "evaluate": "source"}, "cannot be opened again"),
+        ({**recorded(tmp_path, plastic), "scale": 0.5}, r'parameter "scale": found 0.5, the source of .* has none'),
+        ({**recorded(tmp_path, plastic), "evaluate": "it"}, 'parameter "evaluate": found "it", allowed are learned'),
+    ):
+        with pytest.raises(RuntimeError, match=message):
+            mi_rgb.load_dict(given)
+
+
+def test_compare_shows_the_source(mi_rgb, tmp_path):
+    """A comparison puts the source in the file's place."""
+    given = recorded(tmp_path, {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.1]}})
+    del given["evaluate"]
+    transform = mi_rgb.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "direct"},
+        "light": {"type": "constant"},
+        "sensor": {
+            "type": "perspective",
+            "to_world": transform().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+            "film": film,
+        },
+        "wall": {"type": "rectangle", "to_world": transform().scale(5), "bsdf": {**given, "energy": "raw"}},
+    }
+    result = mi_diffind.compare(scene, 64, passes=2, progress=False)
+    assert result.figures["counterparts"] == ["source"] and result.figures["learned_plugins"] == 1
+    np.testing.assert_allclose(result.reference.mean(axis=(0, 1)), [0.2, 0.5, 0.1], rtol=0.05)
+    assert abs(result.written.mean() - result.reference.mean()) > 0.05

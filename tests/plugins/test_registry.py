@@ -148,6 +148,7 @@ def test_plugins_of_this_package_say_what_they_are(mi_rgb):
         "path_sdf": "integrator",
     }  # fmt: skip
     assert plugins.with_counterpart() == (
+        "neural_bsdf",
         "neural_disney",
         "neural_field",
         "neural_ggx",
