@@ -25,10 +25,9 @@ from .family import (
     nodes_of,
     sizes_of,
 )  # fmt: skip
-from .family_files import FamilyModel, to_table
+from .family_files import FamilyModel, allocate, to_table
 from .family_sampling import fitted_mixture, fitted_scale
 from .family_truth import MEMBERS, FamilySamples, FamilyTruth, constants, draw, parameters_of, points
-from .files import allocate
 from .fit import requested_truth, symmetry_line
 from .model import ALPHA_MIN, BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, Form, LearnedBSDF, fourth_roots
 from .truth import recorded_source
