@@ -34,9 +34,10 @@ def directions(lanes: int, seed: int = 7):
 
 
 def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dict[str, dict]:
-    """Return query (:data:`QUERIES`) → name of a BSDF → function; ``inputs`` are those of :func:`directions`.
+    """Return query (:data:`QUERIES`, ``eval_pdf``) → name of a BSDF → function.
 
-    The floor has the same inputs, ``uv`` among them if the materials are ``textured``.
+    ``inputs`` are those of :func:`directions`. The floor has the same inputs, ``uv`` among them if the materials are
+    ``textured``.
     """
     si, wo, sample1, sample2 = inputs
     context = mi.BSDFContext()
@@ -46,6 +47,7 @@ def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dic
         "sample": [si.wi, sample1, sample2, *uv, *wavelengths],
         "pdf": [si.wi, wo, *uv],
     }
+    floors["eval_pdf"] = floors["eval"]
     queries = {query: {FLOOR: lambda values=values: values} for query, values in floors.items()}
 
     def sample(bsdf):
@@ -54,6 +56,7 @@ def bsdf_queries(bsdfs: dict[str, object], inputs: tuple, textured: bool) -> dic
 
     for name, bsdf in bsdfs.items():
         queries["eval"][name] = lambda b=bsdf: b.eval(context, si, wo)
+        queries["eval_pdf"][name] = lambda b=bsdf: list(b.eval_pdf(context, si, wo))
         queries["sample"][name] = lambda b=bsdf: sample(b)
         queries["pdf"][name] = lambda b=bsdf: b.pdf(context, si, wo)
     return queries

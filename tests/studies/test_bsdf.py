@@ -27,7 +27,7 @@ def test_quick_run_writes_what_it_promises(finished):
     assert ours["bytes"] < 2300 and ours["errors"]["psnr_db"] > ours["errors"]["psnr_proxy_db"] > 35
     assert 1 <= ours["errors"]["moment_learned"] < 1.5
     queries = found["cases"]["plastic, nonlinear"]["queries"]
-    assert set(queries) == {"eval", "sample", "pdf"}
+    assert set(queries) == {"eval", "eval_pdf", "sample"}
     assert {name.split(": ")[1] for name in queries["eval"]} >= {"source", "principled", "ours"}
 
 

@@ -13,19 +13,28 @@ from ...measure.operations import Operations
 
 
 class Network(nn.Module):
-    """Multilayer perceptron from ``inputs`` coordinates to one number.
+    """Multilayer perceptron from ``inputs`` coordinates to one number, or as many as ``outputs``.
 
     There are ``layers`` hidden layers of ``width`` leaky rectified units. With ``grid``, the options of
     ``nn.HashGridEncoding``, a hash grid encodes the coordinates. With ``table``, a number of entries on a side, the
     network's outputs point into a square :class:`~mi_diffind.indirection.DifferentiableArray`, as the primary array of
-    an indirection does. A call with a list of coordinates returns a list of one array. As allocated, the network
+    an indirection does. A call with a list of coordinates returns a list of arrays. As allocated, the network
     computes with tensors, the faster form to train; :meth:`cooperative` returns it in cooperative vectors.
     """
 
     DRJIT_STRUCT = {"entries": object, "mlp": nn.Module, "table": object}  # noqa: RUF012
 
-    def __init__(self, inputs: int = 2, width: int = 16, layers: int = 2, grid: dict | None = None, table: int = 0):
+    def __init__(
+        self,
+        inputs: int = 2,
+        width: int = 16,
+        layers: int = 2,
+        grid: dict | None = None,
+        table: int = 0,
+        outputs: int = 1,
+    ):
         self.inputs, self.width, self.layers, self.grid, self.table_size = inputs, width, layers, grid, table
+        self.outputs = 2 if table else outputs
         self.entries = self.mlp = self.table = self.encoding = None
         self.is_cooperative = False
 
@@ -36,15 +45,14 @@ class Network(nn.Module):
             result.encoding = nn.HashGridEncoding(Float, self.inputs, rng=rng, **self.grid)
             result.entries = dtype(result.encoding.params)
             size = self.grid["n_levels"] * self.grid["n_features_per_level"]
-        outputs = 2 if self.table_size else 1
         hidden = []
         for _ in range(self.layers):
             hidden += [nn.Linear(-1, self.width), nn.LeakyReLU()]
-        result.mlp = nn.Sequential(*hidden, nn.Linear(self.width, outputs)).alloc(dtype, size, rng)
+        result.mlp = nn.Sequential(*hidden, nn.Linear(self.width, self.outputs)).alloc(dtype, size, rng)
         if self.table_size:
             array = DifferentiableArray((self.table_size,) * 2, 1, "constant", 0.5)
             result.table = array.alloc(dtype)
-        return result, 1
+        return result, self.outputs
 
     def __call__(self, x, active=True):
         n = max(dr.width(v) for v in x)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from pathlib import Path
 
 import mitsuba as mi
 
-from ...measure.bsdf import QUERIES, bsdf_queries, directions
+from ...measure.bsdf import bsdf_queries, directions
 from ...measure.formatting import grid
 from ...measure.store import file_name, fingerprint
 from ...measure.study import Candidate, Case, Job, Plan
@@ -19,9 +18,13 @@ from ...tasks.bsdf.model import LearnedBSDF
 from ...tasks.bsdf.truth import truth_of
 from ...tasks.bsdf.view import SphereView
 from .materials import MATERIALS, QUICK
+from .networks import INPUTS, NetworkTraining
 
 #: Presets, the first is compared with the others.
-PRESETS = ("ours", "table", "paper")
+PRESETS = ("ours", "table", "paper", "plain")
+
+#: Methods that are timed.
+QUERIES = ("eval", "eval_pdf", "sample")
 
 #: Steps and batch of the fits of a quick study.
 QUICK_FIT = {"steps": 40, "batch": 2**11, "measure_every": 40}
@@ -85,32 +88,49 @@ class BSDFTraining(Job):
         """Return the plugin that reads the file."""
         return mi.load_dict({"type": "neural_bsdf", "filename": str(self.path)})
 
+    def scale(self) -> tuple[float, float]:
+        """Return the scale of the coordinate u of the fitted file."""
+        return load_model(self.path, mi.TensorXf).form.scale
+
+
+class TensorFile(Job):
+    """Tensor file for ``measured``, written from the file of a learned BSDF."""
+
+    def __init__(self, training: BSDFTraining):
+        self.training, self.name = training, f"{training.material}, measured"
+        self.path: Path | None = None
+
+    def cached_record(self, folder: Path | None, record: dict | None) -> dict | None:
+        self.path = Path(folder or ".") / f"{file_name(self.name)}.bsdf"
+        return record if self.path.is_file() else None
+
+    def run(self, folder: Path | None, progress: bool) -> dict | None:
+        model = load_model(self.training.path, mi.TensorXf)
+        start = time.perf_counter()
+        model.decode(self.path)
+        seconds = time.perf_counter() - start
+        view = SphereView(truth_of(MATERIALS[self.training.material][0], model.types), model.types)
+        errors = {"psnr_db": view.psnr(truth_of(self.path, model.types).value)}
+        return {"seconds": seconds, "bytes": self.path.stat().st_size, "errors": errors}
+
+    def load(self):
+        """Return the plugin that reads the file."""
+        return mi.load_dict({"type": "measured", "filename": str(self.path)})
+
 
 def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
     """Return the plan for some materials (default: all), in the current variant."""
     names = materials or (QUICK if quick else tuple(MATERIALS))
     candidates, cases, jobs, ratios = [], [], [], []
     for material in names:
-        source = f"{material}: source"
-        peer = f"{material}: principled"
-        trainings = [BSDFTraining(material, preset, quick) for preset in (PRESETS[:1] if quick else PRESETS)]
-        jobs += trainings
-        candidates.append(Candidate(source, "source", is_truth=True, in_passes=False, label="source"))
-        candidates.append(
-            Candidate(
-                peer, "Mitsuba", is_reference=True, in_passes=False, label="principled", note="another material"
-            )
-        )  # fmt: skip
-        for job in trainings:
-            candidate = Candidate(
-                f"{material}: {job.preset}", "learned", job.preset, job=job.name, in_passes=False, label=job.preset
-            )
-            candidates.append(candidate)
-            ratios += [(candidate.name, source), (candidate.name, peer)]
-        members = (source, peer, *(f"{material}: {job.preset}" for job in trainings))
-        details = {"material": MATERIALS[material][0]}
-        queries = functools.partial(_queries, material, trainings)
-        cases.append(Case(material, queries, None, details, members, QUERIES))
+        case, its_candidates, its_jobs = _material(material, quick)
+        cases.append(case)
+        candidates += its_candidates
+        jobs += its_jobs
+        references = [c.name for c in its_candidates if c.is_truth or c.is_reference]
+        learned = [c.name for c in its_candidates if c.name not in references]
+        ratios += [(name, reference) for name in learned for reference in references]
+        ratios += [(f"{material}: ours", f"{material}: measured")]
     package = Path(__file__).resolve().parents[2]
     code = [package / f"{name}.py" for name in ("lookup", "indirection", "fitting")]
     code += [*(package / "tasks" / "bsdf").glob("*.py"), Path(__file__).with_name("materials.py")]
@@ -131,10 +151,46 @@ def plan(materials: tuple[str, ...] = (), quick: bool = False) -> Plan:
     )
 
 
-def _queries(material: str, trainings: list[BSDFTraining], lanes: int) -> dict:
-    bsdfs = {f"{material}: source": mi.load_dict(MATERIALS[material][0]), f"{material}: principled": mi.load_dict(PEER)}
-    bsdfs |= {f"{material}: {job.preset}": job.load() for job in trainings}
-    return bsdf_queries(bsdfs, directions(lanes), False)
+def _material(material: str, quick: bool) -> tuple[Case, list[Candidate], list[Job]]:
+    """Return the case of a material, its candidates and their jobs."""
+    source, nbytes = MATERIALS[material]
+    trainings = [BSDFTraining(material, preset, quick) for preset in (PRESETS[:1] if quick else PRESETS)]
+    files, networks = [TensorFile(trainings[0])], []
+    if not quick and nbytes == "2k":
+        networks = [NetworkTraining(material, source, inputs, trainings[0].scale) for inputs in INPUTS]
+
+    def learned(job, label: str, representation: str, **options) -> Candidate:
+        return Candidate(
+            f"{material}: {label}", representation, label, job=job.name, in_passes=False, label=label, **options
+        )
+
+    candidates = [
+        Candidate(f"{material}: source", "source", is_truth=True, in_passes=False, label="source"),
+        Candidate(
+            f"{material}: principled", "Mitsuba", is_reference=True, in_passes=False, label="principled",
+            note="another material",
+        ),
+        *(learned(job, job.preset, "learned") for job in trainings),
+        *(learned(job, "measured", "tensor file") for job in files),
+        *(
+            learned(job, f"network, {inputs}", "network", queries=("eval",))
+            for job, inputs in zip(networks, INPUTS, strict=False)
+        ),
+    ]  # fmt: skip
+
+    def queries(lanes: int) -> dict:
+        bsdfs = {f"{material}: source": mi.load_dict(source), f"{material}: principled": mi.load_dict(PEER)}
+        bsdfs |= {f"{material}: {job.preset}": job.load() for job in trainings}
+        bsdfs |= {f"{material}: measured": job.load() for job in files}
+        bsdfs |= {f"{material}: network, {i}": job.bsdf() for job, i in zip(networks, INPUTS, strict=False)}
+        return bsdf_queries(bsdfs, directions(lanes), False)
+
+    members = tuple(candidate.name for candidate in candidates)
+    return (
+        Case(material, queries, None, {"material": source}, members, QUERIES),
+        candidates,
+        [*trainings, *files, *networks],
+    )
 
 
 def rows(result: dict) -> list[str]:
@@ -142,11 +198,12 @@ def rows(result: dict) -> list[str]:
     cells = [["", "bytes", "PSNR, dB", "proxy, dB", "albedo", "E[w²]/E[w]²", "source's"]]
     for name, candidate in result["candidates"].items():
         e = candidate["errors"]
-        if "albedo_excess" not in e:
+        if "psnr_db" not in e:
             continue
-        proxy = f"{e['psnr_proxy_db']:.1f}" if "psnr_proxy_db" in e else "–"
-        cells.append(
-            [name, f"{candidate['bytes']:,}", f"{e['psnr_db']:.1f}", proxy, f"{100 * e['albedo_excess']:.2f}%",
-             f"{e['moment_learned']:.2f}", f"{e['moment_native']:.2f}"]
-        )  # fmt: skip
+        cells.append([
+            name, f"{candidate['bytes']:,}", f"{e['psnr_db']:.1f}",
+            f"{e['psnr_proxy_db']:.1f}" if "psnr_proxy_db" in e else "–",
+            f"{100 * e['albedo_excess']:.2f}%" if "albedo_excess" in e else "–",
+            *(f"{e[m]:.2f}" if m in e else "–" for m in ("moment_learned", "moment_native")),
+        ])  # fmt: skip
     return grid(cells) if len(cells) > 1 else []

@@ -43,7 +43,10 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
 
 
 class BSDFTask(Task):
-    """The task. ``ours``: proxy × indirection; ``table``: proxy × one array; ``paper``: indirection alone."""
+    """The task.
+
+    ``ours``: proxy × indirection; ``table``: proxy × one array; ``paper``: indirection alone; ``plain``: one array.
+    """
 
     name = "bsdf"
     title = "any reflecting BSDF"
@@ -51,7 +54,7 @@ class BSDFTask(Task):
     plugin = ("bsdf", "neural_bsdf")
     presets = {  # noqa: RUF012
         name: FitSettings(steps=1500, batch=2**14, lr=2e-2, schedule="cosine", seed=1, measure_every=150)
-        for name in ("ours", "table", "paper")
+        for name in ("ours", "table", "paper", "plain")
     }
     storages = ()
     arguments = (
@@ -135,9 +138,9 @@ class BSDFTask(Task):
     def model(self, table, dtype, storage=""):
         if "family" not in table.settings:
             return super().model(table, dtype, storage)
-        from .family_files import FamilyModel
+        from .family_files import FamilyModel, allocate
 
-        return FamilyModel(table, self.allocate(table, dtype, storage), dtype, storage)
+        return FamilyModel(table, allocate(table, dtype, storage), dtype, storage)
 
 
 TASK = BSDFTask()

@@ -25,10 +25,9 @@ from .family import (
     nodes_of,
     sizes_of,
 )  # fmt: skip
-from .family_files import FamilyModel, to_table
+from .family_files import FamilyModel, allocate, to_table
 from .family_sampling import fitted_mixture, fitted_scale
 from .family_truth import MEMBERS, FamilySamples, FamilyTruth, constants, draw, parameters_of, points
-from .files import allocate
 from .fit import requested_truth, symmetry_line
 from .model import ALPHA_MIN, BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, Form, LearnedBSDF, fourth_roots
 from .truth import recorded_source
@@ -134,7 +133,7 @@ def fit_proxy(
 ) -> np.ndarray:
     """Return the table of the proxy, ``(nodes…, CHANNELS)`` logarithms, trained from the proxy of the middle."""
     middle = training.draw(truth.at([0.5] * len(truth.parameters)), types, VALIDATION, request.settings.seed, isotropic)
-    start, _ = training.fit_proxy(middle, middle, types, isotropic, request.progress)
+    start = training.fit_proxy(middle, middle, types, isotropic, request, {"source": truth.truth.digest})
     nodes = nodes_of(truth.parameters, PROXY_NODES)
     table = np.broadcast_to(np.concatenate([start, np.zeros(CHANNELS - PARAMETERS)]), (*nodes, CHANNELS))
     net = FamilyArrays(DifferentiableArray(nodes, CHANNELS, table.astype(np.float32))).alloc(types.TensorXf)
