@@ -133,7 +133,7 @@ def fit_proxy(
 ) -> np.ndarray:
     """Return the table of the proxy, ``(nodes…, CHANNELS)`` logarithms, trained from the proxy of the middle."""
     middle = training.draw(truth.at([0.5] * len(truth.parameters)), types, VALIDATION, request.settings.seed, isotropic)
-    start, _ = training.fit_proxy(middle, middle, types, isotropic, request.progress)
+    start = training.fit_proxy(middle, middle, types, isotropic, request, {"source": truth.truth.digest})
     nodes = nodes_of(truth.parameters, PROXY_NODES)
     table = np.broadcast_to(np.concatenate([start, np.zeros(CHANNELS - PARAMETERS)]), (*nodes, CHANNELS))
     net = FamilyArrays(DifferentiableArray(nodes, CHANNELS, table.astype(np.float32))).alloc(types.TensorXf)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable
 
 import drjit as dr
 import numpy as np
 
-from ...fitting import Problem, fit
+from ...fitting import Problem
 from ...indirection import DifferentiableArray
+from ...interrupt import interruptible
 from ...settings import FitSettings
+from ...task import FitRequest
 from .model import BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, ResidualSizes, fourth_roots
 from .pool import Samples, incident, outgoing
 from .starts import starts
@@ -122,23 +125,31 @@ def view_psnr(view: SphereView) -> Callable:
 
 
 def fit_proxy(
-    samples: Samples, validation: Samples, types, isotropic: bool, progress: bool, smooth: Samples | None = None
-) -> tuple[np.ndarray, float]:
-    """Return the logarithms of the best proxy of :data:`STARTS` trainings, and its error in dB.
+    samples: Samples, validation: Samples, types, isotropic: bool, request: FitRequest, identity: dict,
+    smooth: Samples | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Return the logarithms of the best proxy of :data:`STARTS` trainings.
 
-    The starts are found from ``smooth`` samples (default: those of the ``validation``).
+    The starts are found from ``smooth`` samples (default: those of the ``validation``). With a checkpoint, each
+    training has one of its own beside it; a limited time is shared; after Ctrl-C, no further start is trained.
     """
-    best = None
-    form = Form(isotropic=isotropic)
-    for k, start in enumerate(starts(smooth or validation, types, STARTS)):
-        net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
-        problem = BSDFProblem(net, form, samples, proxy_loss(validation))
-        title = f"proxy, start {k + 1} of {STARTS}"
-        result = fit(problem, dataclasses.replace(PROXY, seed=k), progress=progress, title=title)
-        error = result.measured["error_db"]
-        if best is None or error > best[1]:
-            best = net.proxy.numpy().ravel().copy(), error
-    return best
+    best, form = None, Form(isotropic=isotropic)
+    with interruptible() as stop:
+        for k, start in enumerate(starts(smooth or validation, types, STARTS)):
+            net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
+            problem = BSDFProblem(net, form, samples, proxy_loss(validation), {**identity, "start": k})
+            checkpoint = f"{request.checkpoint}.start{k + 1}" if request.checkpoint else None
+            settings = dataclasses.replace(PROXY, seed=k, deterministic=request.settings.deterministic)
+            limited = dataclasses.replace(
+                request.part(1 / (STARTS - k)), settings=settings, checkpoint=checkpoint,
+                resume=request.resume and os.path.exists(checkpoint or ""),
+            )  # fmt: skip
+            error = limited.train(problem, f"proxy, start {k + 1} of {STARTS}").measured["error_db"]
+            if best is None or error > best[0]:
+                best = error, net.proxy.numpy().ravel().copy()
+            if stop.is_set():
+                break
+    return best[1]
 
 
 def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: str) -> Form:
