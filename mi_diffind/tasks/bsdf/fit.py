@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from threading import Event
 
 import drjit as dr
@@ -128,12 +127,7 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
         table.measured = {k: float(f"{v:.5g}") for k, v in figures.items()}
         return table, scale, raw
 
-    if stop.is_set():
-        figures = {name: float(value) for name, value in problem.measure(problem.net).items()}
-        result = FitResult(figures, 0, 0, 0.0, True, 0, asked_to_stop=True)
-    else:
-        begun = os.path.exists(request.checkpoint or "") or not os.path.exists(f"{request.checkpoint}.start1")
-        result = dataclasses.replace(request, resume=request.resume and begun).train(problem, finish=stored)
+    result = training.train_last(problem, request, stored, stop)
     table, scale, raw = stored(result)
     if scale is not None:
         limit = "1" if raw is None else "the source's"

@@ -6,11 +6,12 @@ import dataclasses
 import math
 import os
 from collections.abc import Callable
+from threading import Event
 
 import drjit as dr
 import numpy as np
 
-from ...fitting import Problem
+from ...fitting import FitResult, Problem
 from ...indirection import DifferentiableArray
 from ...interrupt import interruptible
 from ...settings import FitSettings
@@ -124,6 +125,24 @@ def view_psnr(view: SphereView) -> Callable:
     return lambda bsdf: {"psnr_db": view.psnr(lambda wi, wo: [v * wo.z for v in bsdf.value(wi, wo)])}
 
 
+def train_stage(problem: Problem, settings: FitSettings, request: FitRequest, name: str, title: str) -> FitResult:
+    """Train a stage before the last one, with its checkpoint beside that of the request: ``FILE.name``."""
+    checkpoint = f"{request.checkpoint}.{name}" if request.checkpoint else None
+    settings = dataclasses.replace(settings, deterministic=request.settings.deterministic)
+    resume = request.resume and os.path.exists(checkpoint or "")
+    stage = dataclasses.replace(request, settings=settings, checkpoint=checkpoint, resume=resume)
+    return stage.train(problem, title)
+
+
+def train_last(problem: Problem, request: FitRequest, finish: Callable, stop: Event) -> FitResult:
+    """Train the last stage, or return a record without steps if an earlier one was interrupted (``stop``)."""
+    if stop.is_set():
+        figures = {name: float(value) for name, value in problem.measure(problem.net).items()}
+        return FitResult(figures, 0, 0, 0.0, True, 0, asked_to_stop=True)
+    begun = os.path.exists(request.checkpoint or "") or not os.path.exists(f"{request.checkpoint}.start1")
+    return dataclasses.replace(request, resume=request.resume and begun).train(problem, finish=finish)
+
+
 def fit_proxy(
     samples: Samples, validation: Samples, types, isotropic: bool, request: FitRequest, identity: dict,
     smooth: Samples | None = None,
@@ -138,13 +157,9 @@ def fit_proxy(
         for k, start in enumerate(starts(smooth or validation, types, STARTS)):
             net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
             problem = BSDFProblem(net, form, samples, proxy_loss(validation), {**identity, "start": k})
-            checkpoint = f"{request.checkpoint}.start{k + 1}" if request.checkpoint else None
-            settings = dataclasses.replace(PROXY, seed=k, deterministic=request.settings.deterministic)
-            limited = dataclasses.replace(
-                request.part(1 / (STARTS - k)), settings=settings, checkpoint=checkpoint,
-                resume=request.resume and os.path.exists(checkpoint or ""),
-            )  # fmt: skip
-            error = limited.train(problem, f"proxy, start {k + 1} of {STARTS}").measured["error_db"]
+            settings, limited = dataclasses.replace(PROXY, seed=k), request.part(1 / (STARTS - k))
+            result = train_stage(problem, settings, limited, f"start{k + 1}", f"proxy, start {k + 1} of {STARTS}")
+            error = result.measured["error_db"]
             if best is None or error > best[0]:
                 best = error, net.proxy.numpy().ravel().copy()
             if stop.is_set():
