@@ -30,6 +30,7 @@ from mi_diffind.tasks.bsdf.truth import MitsubaTruth
 from . import Counterpart, Plugin
 from .support import properties, tables, upsampling
 from .support.manual import shared_parts
+from .support.tracked_parameter import TrackedParameter, when_outermost
 
 #: Smallest density of a sample that counts.
 SMALLEST_DENSITY = 1e-20
@@ -171,7 +172,11 @@ class NeuralBSDF(mi.BSDF):
             properties.check_range(props, parameter.name, parameter.low, parameter.high)
             self.textures[parameter.name] = props.get_unbounded_texture(parameter.name, parameter.middle)
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
+        self._tracked = [TrackedParameter(texture) for texture in self.textures.values()]
+        self.member = None
         self._compute_constants()
+        if self.textures:
+            when_outermost(self._compute_member)
 
         side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide if self.two_sided else mi.BSDFFlags.FrontSide
         flags = mi.BSDFFlags.GlossyReflection | side
@@ -202,9 +207,13 @@ class NeuralBSDF(mi.BSDF):
     def parameters_changed(self, keys: list[str] = ()):
         tables.check_shapes(tables.exposed(self._arrays()))
         self._compute_constants()
+        if self.textures:
+            when_outermost(self._compute_member)
 
     def _at(self, si, active):
         """Return the BSDF with its present parameters, and the mixture that samples it."""
+        if self.member is not None and self._is_constant():
+            return self.member
         if self.textures:
             return self.model.at([texture.eval_1(si, active) for texture in self.textures.values()], active)
         bsdf = self.model.bsdf
@@ -212,6 +221,22 @@ class NeuralBSDF(mi.BSDF):
             attached = dr.grad_enabled(list(self.proxy.values()))
             bsdf.proxy = _proxy(self.proxy, self.model.form) if attached else self.constants
         return bsdf, self.model.mixture
+
+    def _is_constant(self) -> bool:
+        """Return whether a family's parameters are constant, and neither changed nor, like the tables, optimised."""
+        is_fixed = all(p.constant and not (p.optimised() or p.changed()) for p in self._tracked)
+        return is_fixed and not tables.optimised(tables.exposed(self._arrays()))
+
+    def _compute_member(self):
+        """Compute the member of a family whose parameters are constant."""
+        for parameter in self._tracked:
+            parameter.update()
+        self.member = None
+        if self._is_constant():
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            with dr.suspend_grad():
+                values = [mi.Float(texture.eval_1(si)) for texture in self.textures.values()]
+            self.member = self.model.fixed([float(v[0]) for v in values])
 
     def _compute_constants(self):
         """Compute what depends on the parameters of the proxy alone, once for all lanes."""

@@ -150,7 +150,7 @@ def test_materials_cover_the_ten_parameters(mi_rgb):
         assert np.allclose(sorted(row), np.linspace(0, 1, 6), atol=1e-3), name
 
 
-@pytest.mark.parametrize("name", ["materials", "metals"])
+@pytest.mark.parametrize("name", ["library", "materials", "metals"])
 def test_scenes_are_what_their_scripts_write(tmp_path, name):
     """Both files of a pair are in the repository: they must not drift apart."""
     text = (SCENES / f"{name}.xml").read_bytes()

@@ -1,5 +1,7 @@
 """The plugin ``neural_bsdf`` inside Mitsuba: values, sampling, derivatives, parameters, variants."""
 
+from pathlib import Path
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ from variants import VARIANTS, set_variant
 
 import mi_diffind
 from mi_diffind.tables import load_table, save_table
+
+LIBRARY = Path(__file__).resolve().parents[2] / "scenes" / "assets" / "library"
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +79,22 @@ def test_chi2(mi_rgb, files, tmp_path, monkeypatch):
         sample, pdf = BSDFAdapter("neural_bsdf", xml, wi=wi)
         test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=61, ires=32)
         assert test.run(test_count=3, quiet=True), test.messages
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted(LIBRARY.glob("*.npz")), ids=lambda path: path.stem)
+def test_chi2_of_the_library(mi_rgb, path, tmp_path, monkeypatch):
+    """Samples of the materials of scenes/library.xml follow their density at six angles of incidence."""
+    from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
+
+    monkeypatch.chdir(tmp_path)
+    xml = f'<string name="filename" value="{path}"/>'
+    for angle in (1, 20, 40, 60, 75, 85):
+        theta = np.radians(angle)
+        wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])
+        sample, pdf = BSDFAdapter("neural_bsdf", xml, wi=wi)
+        test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=61, ires=32)
+        assert test.run(test_count=72, quiet=True), f"{angle} degrees: {test.messages}"
 
 
 def test_sides(mi_rgb, files, rng):

@@ -131,6 +131,34 @@ def test_derivatives(mi_rgb, file, rng):
     assert min(np.abs(dr.grad(params[key]).numpy()).max() for key in ("tables.mixing", "tables.proxy")) > 1e-3
 
 
+def test_a_constant_member_is_computed_once(mi_rgb, file, rng):
+    """A member of constant parameters has the values of the tables, follows changes, and is differentiable."""
+    mi, ctx = mi_rgb, mi_rgb.BSDFContext()
+    bsdf = mi.load_dict({"type": "neural_bsdf", "filename": file, "roughness": 0.2, "metallic": 0.3})
+    wi, wo = directions(rng, 200, 0.2), directions(rng, 200, 0.2)
+    si, towards = hits(mi, wi), mi.Vector3f(aligned(wo.T))
+    params, ends = mi.traverse(bsdf), []
+
+    def value():
+        return sum(bsdf.eval_pdf(ctx, si, towards)[0])
+
+    for roughness in (0.151, 0.149):
+        params["roughness.value"] = mi.Float(roughness)
+        params.update()
+        assert bsdf.member is not None
+        ends.append(value())
+    params["roughness.value"] = mi.Float(0.15)
+    dr.enable_grad(params["roughness.value"])
+    params.update()
+    assert bsdf.member is None
+    attached = value()
+    dr.backward(dr.sum(attached))
+    slope = float(dr.grad(params["roughness.value"])[0])
+    assert slope == pytest.approx(float(dr.sum(ends[0] - ends[1])[0]) / 2e-3, rel=0.02)
+    middle = 0.5 * (ends[0] + ends[1])
+    np.testing.assert_allclose(dr.detach(attached).numpy(), middle.numpy(), rtol=5e-3)
+
+
 def test_changed_tables_are_saved(mi_rgb, file, tmp_path):
     mi = mi_rgb
     bsdf = mi.load_dict({"type": "neural_bsdf", "filename": file, "storage": "float32"})

@@ -138,9 +138,9 @@ class BSDFTask(Task):
     def model(self, table, dtype, storage=""):
         if "family" not in table.settings:
             return super().model(table, dtype, storage)
-        from .family_files import FamilyModel
+        from .family_files import FamilyModel, allocate
 
-        return FamilyModel(table, self.allocate(table, dtype, storage), dtype, storage)
+        return FamilyModel(table, allocate(table, dtype, storage), dtype, storage)
 
 
 TASK = BSDFTask()

@@ -52,19 +52,17 @@ def albedos(
     return np.stack([part.mean(axis=1, dtype=np.float64) for part in parts])
 
 
-def fitted_scale(
-    value, truth, types, azimuths: tuple[float, ...] = (0.0,), angles: int = ANGLES, size: int = SAMPLES
-) -> np.ndarray:
+def fitted_scale(value, truth, types, azimuths: tuple[float, ...] = (0.0,)) -> np.ndarray:
     """Return s(θ) ≤ 1 at :data:`NODES` cosines, so that s(θ_i) s(θ_o) f has at most the source's albedo + 0.1%.
 
     ``value`` is f cos θ_o of the learned BSDF. s starts at 1; where the albedo is too high in a channel, the nodes next
     to the angle are lowered, until no angle is left.
     """
-    fine = np.maximum(np.linspace(0, 1, (NODES - 1) * angles + 1) ** 2, 2e-3)
+    fine = np.maximum(np.linspace(0, 1, (NODES - 1) * ANGLES + 1) ** 2, 2e-3)
     position, nodes = np.sqrt(fine), np.linspace(0, 1, NODES)
     parts = []
     for azimuth in azimuths:
-        cos, (source, learned) = contributions([truth.value, value], truth, types, fine, azimuth, size=size)
+        cos, (source, learned) = contributions([truth.value, value], truth, types, fine, azimuth)
         parts.append((np.sqrt(np.clip(cos, 0, 1)), ALLOWED * source.mean(axis=1, dtype=np.float64), learned))
     scale = np.ones(NODES)
     for k in range(CORRECTIONS):
@@ -77,6 +75,6 @@ def fitted_scale(
             break
         lowered = np.sqrt(ratio) if k < CORRECTIONS // 2 else ratio
         for node in range(NODES):
-            near = slice(max(0, (node - 1) * angles + 1), (node + 1) * angles)
+            near = slice(max(0, (node - 1) * ANGLES + 1), (node + 1) * ANGLES)
             scale[node] *= lowered[near].min()
     return scale

@@ -47,10 +47,10 @@ LOGARITHMIC = 4.0
 
 #: Nodes of a coordinate (linear, logarithmic), for one, two and three parameters: in the table of the proxy,
 #: and in those of sampling and energy.
-PROXY_NODES, SAMPLING_NODES = ((9, 9), (5, 9), (4, 6)), ((5, 9), (3, 7), (3, 5))
+PROXY_NODES, SAMPLING_NODES = ((9, 9), (5, 9), (3, 8)), ((5, 9), (3, 7), (3, 5))
 
 #: Number of terms R of a residual, and default size of its arrays in bytes, for one, two and three parameters.
-RANKS, SIZES = (5, 6, 8), ("4k", "9k", "12k")
+RANKS, SIZES = (4, 4, 5), ("4k", "9k", "12k")
 
 #: Channels of the proxy's table: its parameters, and the logarithms of (a_x, a_y).
 CHANNELS, SCALE = PARAMETERS + 2, PARAMETERS
@@ -110,6 +110,18 @@ def grid(nodes: tuple[int, ...]) -> np.ndarray:
     """Return the coordinates of all nodes, ``(N, d)``, the last axis fastest."""
     axes = np.meshgrid(*(np.linspace(0, 1, n) for n in nodes), indexing="ij")
     return np.stack([a.ravel() for a in axes], axis=-1)
+
+
+def interpolation(coordinates, nodes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the nodes around coordinates, the last axis fastest, and their weights above 0."""
+    index, weight = np.zeros(1, int), np.ones(1)
+    for x, n in zip(coordinates, nodes, strict=True):
+        position = float(x) * (n - 1)
+        lower = min(int(position), n - 2)
+        ends = np.array([1 - (position - lower), position - lower])
+        index = (index[:, None] * n + lower + np.arange(2)).ravel()
+        weight = (weight[:, None] * ends).ravel()
+    return index[weight > 0], weight[weight > 0]
 
 
 @dataclass(frozen=True)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 
+import drjit as dr
 import numpy as np
 
 from ...errors import UsageError, reason
-from ...indirection import Indirection
+from ...indirection import DifferentiableArray, Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
 from . import family_measurement
-from .family import CHANNELS, MOST, FamilyArrays, Parameter, member, widths
+from .family import CHANNELS, MOST, FamilyArrays, Parameter, interpolation, member, proxy_of, widths
 from .family_truth import FamilyTruth
 from .files import RESIDUAL, BSDFModel, form_of
 from .mixture import Mixture, SampledLobe
-from .model import Form
+from .model import Form, LearnedBSDF, fourth_roots
 
 #: Arrays of a residual: those of one material, and the factors of its terms.
 ARRAYS = (*RESIDUAL, "mixing")
@@ -92,6 +94,15 @@ def _is_factor(value) -> bool:
     return isinstance(value, (int, float)) and math.isfinite(value) and 0.1 <= value <= 10
 
 
+def allocate(table: Table, dtype, storage: str = "") -> dict[str, DifferentiableArray]:
+    """Return the arrays; ``storage`` is the form of those of the residual, ``proxy`` is always in single precision."""
+    result = {}
+    for name, array in table.arrays.items():
+        form = "float32" if name == "proxy" else storage if name in ARRAYS else ""
+        result[name] = array.allocate(dtype, form, fold=name in ARRAYS)
+    return result
+
+
 class FamilyModel(BSDFModel):
     """A table file of a family, whose members :meth:`at` returns; ``bsdf`` and ``mixture`` are the middle's.
 
@@ -120,6 +131,42 @@ class FamilyModel(BSDFModel):
         factors = self.table.settings["factors"]
         alphas = [f * w for f, w in zip(factors, widths(bsdf.proxy, bsdf.scale), strict=True)]
         return bsdf, Mixture(weights, tuple(SampledLobe(a, a) for a in alphas))
+
+    def fixed(self, values: list[float]) -> tuple[LearnedBSDF, Mixture]:
+        """Return the BSDF and the mixture of one member, a single material, without derivatives.
+
+        What the parameters determine is computed once, so that it takes no more time than any learned BSDF.
+        """
+        x = [float(p.coordinate(float(v))) for p, v in zip(self.parameters, values, strict=True)]
+        at_nodes = {name: self.arrays[name].numpy().astype(np.float64) for name in self.arrays}
+
+        def at(name: str, axis: int = 0) -> np.ndarray:
+            """Return a table at the member, of the axes before the first of the parameters."""
+            array = at_nodes[name]
+            index, weight = interpolation(x, array.shape[axis:-1])
+            flat = array.reshape(*array.shape[:axis], -1, array.shape[-1])
+            return np.einsum("n,...nc->...c", weight, flat[..., index, :])
+
+        def stored(values: np.ndarray, border="clamp") -> DifferentiableArray:
+            return DifferentiableArray.from_numpy(values.astype(np.float32), self.dtype, border)
+
+        Float = self.types.Float
+        with dr.suspend_grad():
+            numbers = [dr.opaque(Float, float(v)) for v in at("proxy")]
+            proxy, scale = proxy_of(numbers, self.form)
+            factors = self.table.settings["factors"]
+            lobes = tuple(f * w for f, w in zip(factors, widths(proxy, scale), strict=True))
+            dr.make_opaque(proxy, lobes)
+        form = dataclasses.replace(self.form, scale=tuple(float(scale[k][0]) for k in (0, -1)))
+        low, step = fourth_roots(form.range)
+        start, cascaded = (1 - low) / step, at_nodes["cascaded"]
+        terms = cascaded.reshape(*cascaded.shape[:3], -1, 3) - start
+        combined = np.clip(start + np.einsum("r,uvwrc->uvwc", 2 * at("mixing") - 1, terms), 0, 1)
+        parts = [self.arrays[n] for n in RESIDUAL[:2]]
+        residual = Indirection(parts, stored(combined, self.arrays["cascaded"].border), [(0, 1), (1, 2)])
+        energy = stored(at("energy", 1)) if "energy" in self.arrays else None
+        mixture = Mixture(stored(at("weights", 1)), tuple(SampledLobe(a, a) for a in lobes))
+        return LearnedBSDF(form, residual, proxy, energy), mixture
 
     def entries(self) -> dict:
         """Return what can be optimised: the residual's arrays and the proxy's, in single precision."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from threading import Event
 
 import drjit as dr
 import numpy as np
 
 from ...errors import UsageError
-from ...fitting import fit
+from ...fitting import FitResult
 from ...indirection import DifferentiableArray
+from ...interrupt import interruptible
 from ...settings import FitSettings
 from ...task import FitRequest, Fitted
 from ...units import parse_bytes
@@ -25,11 +27,10 @@ from .family import (
     nodes_of,
     sizes_of,
 )  # fmt: skip
-from .family_files import FamilyModel, to_table
+from .family_files import FamilyModel, allocate, to_table
 from .family_sampling import fitted_mixture, fitted_scale
 from .family_truth import MEMBERS, FamilySamples, FamilyTruth, constants, draw, parameters_of, points
-from .files import allocate
-from .fit import requested_truth, symmetry_line
+from .fit import PRETRAINING, requested_truth, symmetry_line
 from .model import ALPHA_MIN, BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, Form, LearnedBSDF, fourth_roots
 from .truth import recorded_source
 from .view import SphereView
@@ -54,12 +55,13 @@ def fit_family(request: FitRequest) -> Fitted:
     over = parameters_of(request.options["over"])
     family = FamilyTruth(requested_truth(request), over)
     try:
-        return _fitted(family, request)
+        with interruptible() as stop:
+            return _fitted(family, request, stop)
     finally:
         family.restore()
 
 
-def _fitted(truth: FamilyTruth, request: FitRequest) -> Fitted:
+def _fitted(truth: FamilyTruth, request: FitRequest, stop: Event) -> Fitted:
     types, options, settings = request.types, request.options, request.settings
     parameters, count = truth.parameters, len(truth.parameters)
     try:
@@ -73,7 +75,7 @@ def _fitted(truth: FamilyTruth, request: FitRequest) -> Fitted:
     azimuth = "mirror" if symmetries["mirror"] <= symmetry.TOLERANCE else "half"
     samples = draw(truth, types, SAMPLES, MEMBERS, settings.seed + 1, isotropic)
     validation = draw(truth, types, VALIDATION, MEMBERS // 4, settings.seed + 2, isotropic)
-    proxy = fit_proxy(truth, samples, validation, types, isotropic, request)
+    proxy = fit_proxy(truth, samples, validation, types, isotropic, request, stop)
     form = form_of(proxy, validation, isotropic, azimuth)
     members = [(x, SphereView(truth.at(x), types, side=48, samples=32)) for x in points(VIEWS, count, seed=5)]
     identity = {
@@ -81,27 +83,32 @@ def _fitted(truth: FamilyTruth, request: FitRequest) -> Fitted:
         "structure": dataclasses.asdict(sizes),
     }  # fmt: skip
     problem = residual_problem(proxy, form, sizes, samples, members, identity)
-    result = request.train(problem)
 
     def at(coordinates):
         with dr.suspend_grad():
             return problem.net.at(form, coordinates, True)
 
-    factors, weights = fitted_mixture(truth, at, types, isotropic)
-    scale = None
-    if options["energy"] == "source":
-        azimuths = (0.0,) if isotropic else tuple(math.pi * k / 4 for k in range(4))
-        scale = fitted_scale(truth, at, types, azimuths)
-    table = to_table(problem.net, form, parameters, factors, weights, scale, {
-        **request.recorded(result), "source": truth.truth.digest, "name": truth.truth.name, "symmetry": symmetries,
-        "structure": dataclasses.asdict(sizes),
-        "over": {key: [p.low, p.high] for key, p in zip(truth.keys, parameters, strict=True)},
-    })  # fmt: skip
-    table.preset, table.seed = request.preset, settings.seed
-    table.settings |= request.paths(source_path=options["source"]) | recorded_source(options)
-    model = FamilyModel(table, allocate(table, types.TensorXf), types.TensorXf)
-    measured = family_measurement.measure(model, truth)
-    table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
+    def stored(result: FitResult | None = None) -> tuple:
+        """Return the table of the arrays as they are, and its limit of the albedo."""
+        factors, weights = fitted_mixture(truth, at, types, isotropic)
+        scale = None
+        if options["energy"] == "source":
+            azimuths = (0.0,) if isotropic else tuple(math.pi * k / 4 for k in range(4))
+            scale = fitted_scale(truth, at, types, azimuths)
+        table = to_table(problem.net, form, parameters, factors, weights, scale, {
+            **request.recorded(result), "source": truth.truth.digest, "name": truth.truth.name, "symmetry": symmetries,
+            "structure": dataclasses.asdict(sizes),
+            "over": {key: [p.low, p.high] for key, p in zip(truth.keys, parameters, strict=True)},
+        })  # fmt: skip
+        table.preset, table.seed = request.preset, settings.seed
+        table.settings |= request.paths(source_path=options["source"]) | recorded_source(options)
+        model = FamilyModel(table, allocate(table, types.TensorXf), types.TensorXf)
+        measured = family_measurement.measure(model, truth)
+        table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
+        return table, scale
+
+    result = training.train_last(problem, request, stored, stop)
+    table, scale = stored(result)
     lines = [symmetry_line(symmetries)]
     lines += [f"over {p.name} from {p.low:g} to {p.high:g}, by default {p.middle:.3g}" for p in parameters]
     if scale is not None:
@@ -130,11 +137,13 @@ class FamilyProblem(training.BSDFProblem):
 
 
 def fit_proxy(
-    truth: FamilyTruth, samples: FamilySamples, validation: FamilySamples, types, isotropic: bool, request: FitRequest
-) -> np.ndarray:
+    truth: FamilyTruth, samples: FamilySamples, validation: FamilySamples, types, isotropic: bool, request: FitRequest,
+    stop: Event,
+) -> np.ndarray:  # fmt: skip
     """Return the table of the proxy, ``(nodes…, CHANNELS)`` logarithms, trained from the proxy of the middle."""
     middle = training.draw(truth.at([0.5] * len(truth.parameters)), types, VALIDATION, request.settings.seed, isotropic)
-    start, _ = training.fit_proxy(middle, middle, types, isotropic, request.progress)
+    identity = {"source": truth.truth.digest, "over": [p.to_json() for p in truth.parameters]}
+    start = training.fit_proxy(middle, middle, types, isotropic, request.part(PRETRAINING / 2), identity)
     nodes = nodes_of(truth.parameters, PROXY_NODES)
     table = np.broadcast_to(np.concatenate([start, np.zeros(CHANNELS - PARAMETERS)]), (*nodes, CHANNELS))
     net = FamilyArrays(DifferentiableArray(nodes, CHANNELS, table.astype(np.float32))).alloc(types.TensorXf)
@@ -149,8 +158,9 @@ def fit_proxy(
 
         return training.proxy_loss(validation)(Validation())
 
-    problem = FamilyProblem(net, Form(isotropic=isotropic), samples, measure_proxy)
-    fit(problem, PROXY, progress=request.progress, title="proxies")
+    problem = FamilyProblem(net, Form(isotropic=isotropic), samples, measure_proxy, identity)
+    if not stop.is_set():
+        training.train_stage(problem, PROXY, request.part(PRETRAINING), "proxies", "proxies")
     table = net.proxy.numpy().astype(np.float64)
     return with_scale(table, isotropic).astype(np.float32)
 

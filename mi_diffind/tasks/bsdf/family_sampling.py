@@ -9,9 +9,8 @@ from collections.abc import Callable
 import drjit as dr
 import numpy as np
 
-from ...indirection import device_array
 from . import energy, mixture
-from .family import SAMPLING_NODES, FamilyMember, grid, nodes_of, widths
+from .family import SAMPLING_NODES, grid, interpolation, nodes_of, widths
 from .family_truth import FamilyTruth, constants, points
 from .measurement import cosine
 
@@ -19,10 +18,10 @@ from .measurement import cosine
 FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
 
 #: Samples of an angle for a node's weights, and for its energy; angles between two entries of the scale of energy.
-MIXTURE_SAMPLES, ENERGY_SAMPLES, ANGLES = 1024, 2048, 2
+MIXTURE_SAMPLES, ENERGY_SAMPLES, ANGLES = 1024, 1024, 2
 
-#: Members between nodes at which the energy is limited, for each node.
-BETWEEN = 3
+#: Members between nodes at which the energy is limited, for each node; corrections of all, and the last ones.
+BETWEEN, SWEEPS, LAST = 3, 60, 20
 
 
 def fitted_mixture(truth: FamilyTruth, member_at: Callable, types, isotropic: bool) -> tuple[tuple, np.ndarray]:
@@ -53,39 +52,61 @@ def fitted_mixture(truth: FamilyTruth, member_at: Callable, types, isotropic: bo
 def fitted_scale(truth: FamilyTruth, member_at: Callable, types, azimuths: tuple[float, ...]) -> np.ndarray:
     """Return the scale of energy, ``(energy.NODES, nodes of the parameters…, 1)``, of members without one.
 
-    It is that of :func:`.energy.fitted_scale` at each node; members between nodes then lower the nodes around them.
+    It limits the albedo of members at the nodes and between them. Where that of a member is too high, the nodes around
+    it are lowered by the least change, of logarithms, that limits it; at the end all of them by the whole excess.
     """
     nodes = nodes_of(truth.parameters, SAMPLING_NODES)
-    scale = np.ones((energy.NODES, *nodes))
-
-    def fitted(coordinates) -> np.ndarray:
-        source, bsdf = truth.at(coordinates), member_at(constants(types, coordinates))
-        column = device_array(types.Float, interpolated(scale, coordinates))
-
-        def factor(x, active=True):
-            position = x[0] * (energy.NODES - 1)
-            lower = dr.minimum(dr.uint32_array_t(position)(position), energy.NODES - 2)
-            low, high = (dr.gather(types.Float, column, lower + k) for k in (0, 1))
-            return [dr.lerp(low, high, position - lower)]
-
-        bsdf = FamilyMember(bsdf.form, bsdf.residual, bsdf.proxy, factor, bsdf.scale)
-
-        return energy.fitted_scale(cosine(bsdf), source, types, azimuths, ANGLES, ENERGY_SAMPLES)
-
-    for index, coordinates in zip(np.ndindex(nodes), grid(nodes), strict=True):
-        scale[(slice(None), *index)] *= fitted(coordinates)
-    for coordinates in points(BETWEEN * math.prod(nodes), len(nodes), seed=21):
-        lowered = fitted(coordinates)
-        positions = coordinates * (np.array(nodes) - 1)
-        cell = [np.unique([math.floor(x), math.ceil(x)]) for x in positions]
-        scale[(slice(None), *np.ix_(*cell))] *= lowered.reshape(-1, *([1] * len(nodes)))
-    return scale[..., None]
+    members = np.concatenate([grid(nodes), points(BETWEEN * math.prod(nodes), len(nodes), seed=21)])
+    limits, corners = [], [interpolation(x, nodes) for x in members]
+    for coordinates in members:
+        value = cosine(member_at(constants(types, coordinates)))
+        limits.append([energy_limit(value, truth.at(coordinates), types, azimuth) for azimuth in azimuths])
+    scale = np.ones((math.prod(nodes), energy.NODES))
+    for sweep in range(SWEEPS):
+        is_low = True
+        for limit, (index, weight) in zip(limits, corners, strict=True):
+            factors = lowering(weight @ scale[index], limit)
+            if factors is not None:
+                is_low = False
+                powers = weight / np.sum(weight**2) if sweep < SWEEPS - LAST else np.ones(len(weight))
+                scale[index] *= factors ** powers[:, None]
+        if is_low:
+            break
+    return scale.T.reshape(energy.NODES, *nodes, 1)
 
 
-def interpolated(table: np.ndarray, coordinates) -> np.ndarray:
-    """Return the column of a table over the cosine and the parameters at coordinates, ``(energy.NODES,)``."""
-    for x in reversed(list(coordinates)):
-        position = float(x) * (table.shape[-1] - 1)
-        lower = min(int(position), table.shape[-1] - 2)
-        table = table[..., lower] + (position - lower) * (table[..., lower + 1] - table[..., lower])
-    return table
+def energy_limit(value: Callable, source, types, azimuth: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return albedos of a function ``value(wi, wo)`` = f cos θ_o as a product, and those that are allowed.
+
+    ``A``, ``(angles, energy.NODES, 3)``: the albedo at angle i under a scale s is s(θ_i) Σ_k A_ik s_k. Allowed are
+    ``(angles, 3)``. Angles are those of the nodes, and :data:`ANGLES` - 1 between each two.
+    """
+    last = energy.NODES - 1
+    fine = np.maximum(np.linspace(0, 1, last * ANGLES + 1) ** 2, 2e-3)
+    cos, (exact, learned) = energy.contributions(
+        [source.value, value], source, types, fine, azimuth, size=ENERGY_SAMPLES
+    )
+    position = np.sqrt(np.clip(cos, 0, 1)) * last
+    lower = np.minimum(position.astype(int), last - 1)
+    share, row = position - lower, np.arange(len(fine))[:, None] * energy.NODES
+    products = np.empty((len(fine), energy.NODES, 3))
+    for channel in range(3):
+        x, total = learned[..., channel] / ENERGY_SAMPLES, len(fine) * energy.NODES
+        low = np.bincount((row + lower).ravel(), ((1 - share) * x).ravel(), total)
+        high = np.bincount((row + lower + 1).ravel(), (share * x).ravel(), total)
+        products[..., channel] = (low + high).reshape(len(fine), energy.NODES)
+    return products, energy.ALLOWED * exact.mean(axis=1, dtype=np.float64)
+
+
+def lowering(column: np.ndarray, limits: list) -> np.ndarray | None:
+    """Return the factors of a member's scale ``column``, ``(energy.NODES,)``, that limit its albedo, or ``None``."""
+    at_angles = np.interp(np.linspace(0, 1, len(limits[0][1])), np.linspace(0, 1, energy.NODES), column)
+    ratio = np.ones(len(at_angles))
+    for products, allowed in limits:
+        albedo = at_angles[:, None] * np.einsum("akc,k->ac", products, column)
+        ratio = np.minimum(ratio, (allowed / np.maximum(albedo, 1e-9)).min(axis=1))
+    if ratio.min() >= 1 - 1e-5:
+        return None
+    # Both directions are scaled: half of the excess (of its logarithm) is left to the other
+    wide = np.concatenate([[1] * (ANGLES - 1), np.sqrt(ratio), [1] * (ANGLES - 1)])
+    return np.array([wide[k * ANGLES : (k + 2) * ANGLES - 1].min() for k in range(energy.NODES)])

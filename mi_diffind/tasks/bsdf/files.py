@@ -130,9 +130,8 @@ def allocate(table: Table, dtype, storage: str = "") -> dict[str, Differentiable
     """Return the arrays; ``storage`` is the form of those of the residual, ``proxy`` is always in single precision."""
     result = {}
     for name, array in table.arrays.items():
-        is_residual = name in (*RESIDUAL, "mixing")
-        form = storage if is_residual else "float32"
-        result[name] = array.allocate(dtype, form, fold=is_residual)
+        form = storage if name in RESIDUAL else "float32"
+        result[name] = array.allocate(dtype, form, fold=name in RESIDUAL)
     return result
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from threading import Event
 
 import drjit as dr
 
 from ...errors import UsageError
+from ...fitting import FitResult
+from ...interrupt import interruptible
 from ...task import FitRequest, Fitted
 from ...units import parse_bytes
 from . import energy, mixture, scattered, symmetry, training
@@ -64,7 +67,15 @@ def use_rgb_variant(request: FitRequest) -> None:
 
 
 def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
-    """Fit a learned BSDF to a source, measure it, and return its table and the record of its training."""
+    """Fit a learned BSDF to a source, measure it, and return its table and the record of its training.
+
+    Ctrl-C while the proxy is trained leaves the residual out: the file then holds the best proxy so far.
+    """
+    with interruptible() as stop:
+        return _fitted(truth, request, stop)
+
+
+def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
     types, options, settings = request.types, request.options, request.settings
     with dr.suspend_grad():
         symmetries = symmetry.measured_symmetry(truth, types) if truth.function else scattered.measured_symmetry(truth)
@@ -83,7 +94,8 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     else:
         samples, validation, smooth = scattered.split(truth, types, isotropic, training.LIMIT, settings.seed)
         view = None
-    logarithms, _ = training.fit_proxy(samples, validation, types, isotropic, request.progress, smooth)
+    first, identity = request.part(PRETRAINING), {"source": truth.digest}
+    logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth)
     form = training.form_of(logarithms, validation, isotropic, azimuth)
     if request.preset in ("paper", "plain"):  # the proxy gives the scale of u alone
         form = dataclasses.replace(form, terms=())
@@ -94,24 +106,29 @@ def fit_truth(truth: Truth, request: FitRequest) -> FittedBSDF:
     identity = {"source": truth.digest, "structure": dataclasses.asdict(structure), "form": form.to_json()}
     measured = training.proxy_loss(validation) if view is None else training.view_psnr(view)
     problem = training.residual_problem(logarithms, form, structure, samples, measured, identity)
-    result = request.train(problem)
-    bsdf = LearnedBSDF.of(form, problem.net.rounded())
+    azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
 
-    sampled = truth if truth.function else FunctionTruth(truth.name, cosine(bsdf))
-    lobes, weights = mixture.fitted_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
-    scale, raw = None, None if view is None else view.psnr(cosine(bsdf))
-    if options["energy"] == "source":
-        azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
-        scale = energy.fitted_scale(cosine(bsdf), truth if truth.function else WHITE, types, azimuths)
-    table = to_table(problem.net, form, lobes, weights, scale, {
-        **request.recorded(result), "source": truth.digest, "name": truth.name, "symmetry": symmetries,
-        "structure": dataclasses.asdict(structure),
-    })  # fmt: skip
-    table.preset, table.seed = request.preset, settings.seed
-    table.settings |= request.paths(source_path=options["source"]) | recorded_source(options)
-    model = BSDFModel(table, allocate(table, types.TensorXf), types.TensorXf)
-    measured = measure_samples(model, validation) if view is None else measure(model, truth, view)
-    table.measured = {k: float(f"{v:.5g}") for k, v in measured.items()}
+    def stored(result: FitResult | None = None) -> tuple:
+        """Return the table of the arrays as they are, its limit of the albedo, and the PSNR without."""
+        bsdf = LearnedBSDF.of(form, problem.net.rounded())
+        sampled = truth if truth.function else FunctionTruth(truth.name, cosine(bsdf))
+        lobes, weights = mixture.fitted_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
+        scale, raw = None, None if view is None else view.psnr(cosine(bsdf))
+        if options["energy"] == "source":
+            scale = energy.fitted_scale(cosine(bsdf), truth if truth.function else WHITE, types, azimuths)
+        table = to_table(problem.net, form, lobes, weights, scale, {
+            **request.recorded(result), "source": truth.digest, "name": truth.name, "symmetry": symmetries,
+            "structure": dataclasses.asdict(structure),
+        })  # fmt: skip
+        table.preset, table.seed = request.preset, settings.seed
+        table.settings |= request.paths(source_path=options["source"]) | recorded_source(options)
+        model = BSDFModel(table, allocate(table, types.TensorXf), types.TensorXf)
+        figures = measure_samples(model, validation) if view is None else measure(model, truth, view)
+        table.measured = {k: float(f"{v:.5g}") for k, v in figures.items()}
+        return table, scale, raw
+
+    result = training.train_last(problem, request, stored, stop)
+    table, scale, raw = stored(result)
     if scale is not None:
         limit = "1" if raw is None else "the source's"
         without = "" if raw is None else f"; {raw:.2f} dB without"

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable
+from threading import Event
 
 import drjit as dr
 import numpy as np
 
-from ...fitting import Problem, fit
+from ...fitting import FitResult, Problem
 from ...indirection import DifferentiableArray
+from ...interrupt import interruptible
 from ...settings import FitSettings
+from ...task import FitRequest
 from .model import BLACK, DIFFUSE, LOBE, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, ResidualSizes, fourth_roots
 from .pool import Samples, incident, outgoing
 from .starts import starts
@@ -121,24 +125,46 @@ def view_psnr(view: SphereView) -> Callable:
     return lambda bsdf: {"psnr_db": view.psnr(lambda wi, wo: [v * wo.z for v in bsdf.value(wi, wo)])}
 
 
-def fit_proxy(
-    samples: Samples, validation: Samples, types, isotropic: bool, progress: bool, smooth: Samples | None = None
-) -> tuple[np.ndarray, float]:
-    """Return the logarithms of the best proxy of :data:`STARTS` trainings, and its error in dB.
+def train_stage(problem: Problem, settings: FitSettings, request: FitRequest, name: str, title: str) -> FitResult:
+    """Train a stage before the last one, with its checkpoint beside that of the request: ``FILE.name``."""
+    checkpoint = f"{request.checkpoint}.{name}" if request.checkpoint else None
+    settings = dataclasses.replace(settings, deterministic=request.settings.deterministic)
+    resume = request.resume and os.path.exists(checkpoint or "")
+    stage = dataclasses.replace(request, settings=settings, checkpoint=checkpoint, resume=resume)
+    return stage.train(problem, title)
 
-    The starts are found from ``smooth`` samples (default: those of the ``validation``).
+
+def train_last(problem: Problem, request: FitRequest, finish: Callable, stop: Event) -> FitResult:
+    """Train the last stage, or return a record without steps if an earlier one was interrupted (``stop``)."""
+    if stop.is_set():
+        figures = {name: float(value) for name, value in problem.measure(problem.net).items()}
+        return FitResult(figures, 0, 0, 0.0, True, 0, asked_to_stop=True)
+    begun = os.path.exists(request.checkpoint or "") or not os.path.exists(f"{request.checkpoint}.start1")
+    return dataclasses.replace(request, resume=request.resume and begun).train(problem, finish=finish)
+
+
+def fit_proxy(
+    samples: Samples, validation: Samples, types, isotropic: bool, request: FitRequest, identity: dict,
+    smooth: Samples | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Return the logarithms of the best proxy of :data:`STARTS` trainings.
+
+    The starts are found from ``smooth`` samples (default: those of the ``validation``). With a checkpoint, each
+    training has one of its own beside it; a limited time is shared; after Ctrl-C, no further start is trained.
     """
-    best = None
-    form = Form(isotropic=isotropic)
-    for k, start in enumerate(starts(smooth or validation, types, STARTS)):
-        net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
-        problem = BSDFProblem(net, form, samples, proxy_loss(validation))
-        title = f"proxy, start {k + 1} of {STARTS}"
-        result = fit(problem, dataclasses.replace(PROXY, seed=k), progress=progress, title=title)
-        error = result.measured["error_db"]
-        if best is None or error > best[1]:
-            best = net.proxy.numpy().ravel().copy(), error
-    return best
+    best, form = None, Form(isotropic=isotropic)
+    with interruptible() as stop:
+        for k, start in enumerate(starts(smooth or validation, types, STARTS)):
+            net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
+            problem = BSDFProblem(net, form, samples, proxy_loss(validation), {**identity, "start": k})
+            settings, limited = dataclasses.replace(PROXY, seed=k), request.part(1 / (STARTS - k))
+            result = train_stage(problem, settings, limited, f"start{k + 1}", f"proxy, start {k + 1} of {STARTS}")
+            error = result.measured["error_db"]
+            if best is None or error > best[0]:
+                best = error, net.proxy.numpy().ravel().copy()
+            if stop.is_set():
+                break
+    return best[1]
 
 
 def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: str) -> Form:
