@@ -17,6 +17,9 @@ TOLERANCE = 0.01
 #: Azimuth of the axes of a source below which they count as those of the surface, radians.
 TURN = math.radians(0.5)
 
+#: Quantile above which contributions of measured rows count the same in the azimuth of the axes.
+BRIGHT = 0.999
+
 #: Difference of the azimuths from two halves of the samples beyond which neither counts, and samples that are used.
 APART, TURNED = math.radians(4), 2**18
 
@@ -36,6 +39,8 @@ def axes_angle(samples: Samples, truth: Truth) -> float:
         angle = k * math.pi / 4
         value = truth.value(turned(samples.wi, angle), turned(samples.wo, angle)) if k else samples.value
         light, h = samples.weight * dr.square(value[0] + value[1] + value[2]), turned(half, angle)
+        if not truth.function:  # rows may be outliers
+            light = dr.minimum(light, float(np.quantile(light.numpy(), BRIGHT)))
         columns = [light * (dr.square(h.x) - dr.square(h.y)), 2 * light * h.x * h.y]
         moments = moments + np.stack([dr.detach(c).numpy() for c in columns]).astype(np.float64)
     angles = [0.5 * math.atan2(*part.sum(axis=1)[::-1]) for part in (moments, moments[:, ::2], moments[:, 1::2])]
