@@ -21,7 +21,7 @@ SCENES = TESTS.parent / "scenes"
 STORED = [
     *(
         SCENES / f"{name}.xml"
-        for name in ("field", "horizon", "materials", "metals", "rust", "solids", "still_life", "tiles")
+        for name in ("field", "horizon", "library", "materials", "metals", "rust", "solids", "still_life", "tiles")
     ),
     TESTS / "lamp.xml",
 ]
@@ -98,6 +98,8 @@ SLOW = {
     ("field", "llvm_ad_mono"),
     ("field", "llvm_ad_spectral"),
     ("horizon", "llvm_ad_mono"),
+    ("library", "llvm_ad_mono"),
+    ("library", "llvm_ad_spectral"),
     ("materials", "llvm_ad_mono"),
     ("rust", "llvm_ad_mono"),
     ("rust", "llvm_ad_spectral"),

@@ -59,7 +59,7 @@ def write_sheet(path: Path, folder: Path, materials: dict[str, dict]) -> None:
         if material["file"] and picture.is_file():
             with Image.open(picture) as pair:
                 sheet.paste(pair.convert("RGB").resize((2 * SIDE, SIDE), Image.Resampling.BICUBIC), (x, y))
-            text = f"{material['psnr_db']:.1f} dB"
+            text = accuracy(material)
         else:
             draw.rectangle((x, y, x + 2 * SIDE - MARGIN, y + SIDE), outline="lightgray")
             text = material["status"]
@@ -67,6 +67,13 @@ def write_sheet(path: Path, folder: Path, materials: dict[str, dict]) -> None:
         draw.text((x, y + SIDE + LINE), text, "firebrick" if material["failure"] else "dimgray")
     with replacing(path) as temporary:
         sheet.save(temporary)
+
+
+def accuracy(material: dict) -> str:
+    """Return the PSNR of a material's record as text, of a table of measurements the relative error."""
+    if "psnr_db" in material:
+        return f"{material['psnr_db']:.1f} dB"
+    return f"error {100 * material['relative_error']:.2g}%"
 
 
 def shortened(draw, text: str, width: float) -> str:

@@ -18,7 +18,7 @@ from ...jobs import run_jobs
 from ...runtime import use_variant
 from ...tables import load_table
 from ...task import FitRequest, Fitted, Model, fit, load_model
-from .contact_sheet import PICTURES, save_pair, write_sheet
+from .contact_sheet import PICTURES, accuracy, save_pair, write_sheet
 from .files import load
 from .fit import use_rgb_variant
 from .truth import SUFFIXES, material_ids
@@ -278,8 +278,8 @@ def _record(material: LibraryMaterial | None, folder: Path, status: str, failure
 #: Columns of the table: heading → text of a material's record.
 COLUMNS = {
     "bytes": lambda m: f"{m['bytes']:,}",
-    "PSNR, dB": lambda m: f"{m['psnr_db']:.1f}",
-    "albedo": lambda m: f"{100 * m['albedo_excess']:+.2f}%",
+    "accuracy": accuracy,
+    "albedo": lambda m: f"{100 * m['albedo_excess']:+.2f}%" if "albedo_excess" in m else "–",
     "moment": lambda m: f"{m['sample_weight_moment']:.2f}",
     "seconds": lambda m: "" if m["seconds"] is None else f"{m['seconds']:.0f}",
 }

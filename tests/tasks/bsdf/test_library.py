@@ -107,6 +107,21 @@ def test_names_and_identities(mi_rgb, tmp_path, monkeypatch):
     assert identities[0] == identities[1] and len(set(identities)) == 4 and "" not in identities
 
 
+def test_reports_of_measurements(tmp_path):
+    """Materials that are known by samples alone have no PSNR, and materials that failed no figures."""
+    figures = {"relative_error": 0.0123, "albedo_largest": 0.7, "sample_weight_moment": 1.1, "seconds": None}
+    records = {
+        "cloth": {"status": "kept", "failure": "", "file": "cloth.npz", "bytes": 2148, **figures},
+        "glass": {"status": "failed", "failure": "glass: transmits light", "file": "", "bytes": 0},
+    }
+    lines = [line.split() for line in library.table_lines(records)]
+    assert lines[1:] == [["cloth", "kept", "2,148", "error", "1.2%", "–", "1.10"], ["glass", "failed", *"–––––"]]
+    library.write_report(library.FittedLibrary(None, None, folder=tmp_path, materials=records))
+    assert "- glass: glass: transmits light" in (tmp_path / "report.md").read_text()
+    with Image.open(tmp_path / "contact_sheet.png") as sheet:
+        assert sheet.width > 400
+
+
 def test_what_does_not_suit_is_refused(mi_rgb, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "full").mkdir()
