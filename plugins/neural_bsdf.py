@@ -173,7 +173,7 @@ class NeuralBSDF(mi.BSDF):
             self.textures[parameter.name] = props.get_unbounded_texture(parameter.name, parameter.middle)
         self.proxy = _parameters(self.model) if self.model.form.terms and not self.textures else {}
         self._tracked = [TrackedParameter(texture) for texture in self.textures.values()]
-        self.member = None
+        self.known, self.member = [], None
         self._compute_constants()
         if self.textures:
             when_outermost(self._compute_member)
@@ -212,31 +212,38 @@ class NeuralBSDF(mi.BSDF):
 
     def _at(self, si, active):
         """Return the BSDF with its present parameters, and the mixture that samples it."""
-        if self.member is not None and self._is_constant():
-            return self.member
         if self.textures:
-            return self.model.at([texture.eval_1(si, active) for texture in self.textures.values()], active)
+            model, is_constant = self.model, self._constants()
+            if any(is_constant) and is_constant == self.known:
+                model = self.member
+            else:
+                is_constant = [False] * len(is_constant)
+            textures = zip(self.textures.values(), is_constant, strict=True)
+            values = [texture.eval_1(si, active) for texture, known in textures if not known]
+            return model.at(values, active) if values else model
         bsdf = self.model.bsdf
         if self.proxy:
             attached = dr.grad_enabled(list(self.proxy.values()))
             bsdf.proxy = _proxy(self.proxy, self.model.form) if attached else self.constants
         return bsdf, self.model.mixture
 
-    def _is_constant(self) -> bool:
-        """Return whether a family's parameters are constant, and neither changed nor, like the tables, optimised."""
-        is_fixed = all(p.constant and not (p.optimised() or p.changed()) for p in self._tracked)
-        return is_fixed and not tables.optimised(tables.exposed(self._arrays()))
+    def _constants(self) -> list[bool]:
+        """Return which parameters of a family are constant, and neither changed nor, like the tables, optimised."""
+        if tables.optimised(tables.exposed(self._arrays())):
+            return [False] * len(self._tracked)
+        return [p.constant and not (p.optimised() or p.changed()) for p in self._tracked]
 
     def _compute_member(self):
-        """Compute the member of a family whose parameters are constant."""
+        """Compute the family of the parameters that are not constant, or its member if all are."""
         for parameter in self._tracked:
             parameter.update()
-        self.member = None
-        if self._is_constant():
-            si = dr.zeros(mi.SurfaceInteraction3f)
-            with dr.suspend_grad():
-                values = [mi.Float(texture.eval_1(si)) for texture in self.textures.values()]
-            self.member = self.model.fixed([float(v[0]) for v in values])
+        self.known, self.member, values = self._constants(), None, []
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        with dr.suspend_grad():
+            for texture, known in zip(self.textures.values(), self.known, strict=True):
+                values.append(float(mi.Float(texture.eval_1(si))[0]) if known else None)
+            if any(self.known):
+                self.member = self.model.fixed(values) if all(self.known) else self.model.reduced(values)
 
     def _compute_constants(self):
         """Compute what depends on the parameters of the proxy alone, once for all lanes."""

@@ -171,19 +171,22 @@ def test_an_interrupted_capture_is_gone_on_with(mi_rgb, scene, tmp_path, monkeyp
         assert path.read_bytes() == (tmp_path / "views" / path.relative_to(tmp_path / "whole")).read_bytes()
 
 
-def test_views_of_other_processes(mi_rgb, scene, tmp_path, capsys):
+def test_views_of_other_processes(mi_rgb, scene, tmp_path, monkeypatch, capsys):
     """The same bytes, also of the lists; a view that fails ends the capture."""
+    from mi_diffind import view_capture
+    from mi_diffind.jobs import Outcome
+
     assert run(scene, tmp_path / "one", "-D", "red=0.5") == run(
-        scene, tmp_path / "two", "-D", "red=0.5", "--workers", "2"
+        scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1"
     )
     files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*.*"))
     assert len(files) == 6 + 3 and "two: 6 of 6 views, 6 rendered now" in capsys.readouterr().out
     for file in files:
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes(), file
     (tmp_path / "two" / "train" / "r_000.png").unlink()
-    (tmp_path / "two" / "train" / "r_000.png").mkdir()
-    assert run(scene, tmp_path / "two", "-D", "red=0.5", "--workers", "2") == 2
-    assert "train/r_000.png: output file" in capsys.readouterr().err
+    monkeypatch.setattr(view_capture, "run_jobs", lambda *_: [Outcome("train/r_000.png", failure="disk full")])
+    assert run(scene, tmp_path / "two", "-D", "red=0.5", "--workers", "1") == 2
+    assert "train/r_000.png: disk full" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("integrator", ["direct", "prb"])

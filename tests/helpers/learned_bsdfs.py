@@ -56,9 +56,16 @@ def interpolated(array: StoredArray, coordinates) -> np.ndarray:
     return result
 
 
+def about_normal(w, angle: float) -> np.ndarray:
+    """Return directions ``(n, 3)`` after a rotation about the normal."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return w @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+
+
 def formula(table: Table, wi, wo) -> np.ndarray:
     """Return f without the cosine, ``(n, 3)``, of directions ``(n, 3)``, by angles and rotations."""
     form, arrays = table.settings["form"], table.arrays
+    wi, wo = (about_normal(w, -form["angle"]) for w in (wi, wo))
     h = wi + wo
     h /= np.linalg.norm(h, axis=1, keepdims=True)
     cos_d = np.einsum("ni,ni->n", wi, h)

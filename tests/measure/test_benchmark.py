@@ -336,12 +336,12 @@ def test_jobs_in_other_processes(tmp_path, capsys):
     make = functools.partial(separable_plan, os.getpid())
     (tmp_path / "one").mkdir()
     alone = measure(make(), SETTINGS, tmp_path / "one", progress=False)
-    result = measure(make(), SETTINGS, tmp_path, workers=benchmark.Workers(make, 2))
+    result = measure(make(), SETTINGS, tmp_path, workers=benchmark.Workers(make, 1))
     assert list(result["jobs"]) == ["first", "here", "second"] and result["jobs"] == alone["jobs"]
     models = tmp_path / "tradeoff_small_models"
     here = {name: (models / name).read_text() == str(os.getpid()) for name in result["jobs"]}
     assert here == {"first": False, "here": True, "second": False}
     assert "here: ValueError: not in this process" in capsys.readouterr().err
     before = (models / "first").stat().st_mtime_ns
-    measure(make(), SETTINGS, tmp_path, workers=benchmark.Workers(make, 2))
+    measure(make(), SETTINGS, tmp_path, workers=benchmark.Workers(make, 1))
     assert (models / "first").stat().st_mtime_ns == before

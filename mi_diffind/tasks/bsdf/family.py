@@ -88,7 +88,6 @@ class Parameter:
 
     def coordinate(self, value):
         """Return the coordinate of an array of values; values outside the range count as its ends, NaN as the lower."""
-        value = clamp(value, self.low, self.high)
         if self.is_logarithmic:
             position = dr.log2(value * (1 / self.low)) * (1 / math.log2(self.high / self.low))
         else:

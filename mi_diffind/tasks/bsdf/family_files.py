@@ -13,7 +13,7 @@ from ...errors import UsageError, reason
 from ...indirection import DifferentiableArray, Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
 from . import family_measurement
-from .family import CHANNELS, MOST, FamilyArrays, Parameter, interpolation, member, proxy_of, widths
+from .family import CHANNELS, MOST, FamilyArrays, Parameter, member, proxy_of, widths
 from .family_truth import FamilyTruth
 from .files import RESIDUAL, BSDFModel, form_of
 from .mixture import Mixture, SampledLobe
@@ -21,6 +21,9 @@ from .model import Form, LearnedBSDF, fourth_roots
 
 #: Arrays of a residual: those of one material, and the factors of its terms.
 ARRAYS = (*RESIDUAL, "mixing")
+
+#: Tables over the parameters.
+TABLES = ("proxy", "mixing", "weights", "energy")
 
 
 def to_table(
@@ -137,36 +140,48 @@ class FamilyModel(BSDFModel):
 
         What the parameters determine is computed once, so that it takes no more time than any learned BSDF.
         """
-        x = [float(p.coordinate(float(v))) for p, v in zip(self.parameters, values, strict=True)]
-        at_nodes = {name: self.arrays[name].numpy().astype(np.float64) for name in self.arrays}
-
-        def at(name: str, axis: int = 0) -> np.ndarray:
-            """Return a table at the member, of the axes before the first of the parameters."""
-            array = at_nodes[name]
-            index, weight = interpolation(x, array.shape[axis:-1])
-            flat = array.reshape(*array.shape[:axis], -1, array.shape[-1])
-            return np.einsum("n,...nc->...c", weight, flat[..., index, :])
-
-        def stored(values: np.ndarray, border="clamp") -> DifferentiableArray:
-            return DifferentiableArray.from_numpy(values.astype(np.float32), self.dtype, border)
-
+        at = {name: self._interpolated(name, values) for name in TABLES if name in self.arrays}
         Float = self.types.Float
         with dr.suspend_grad():
-            numbers = [dr.opaque(Float, float(v)) for v in at("proxy")]
+            numbers = [dr.opaque(Float, float(v)) for v in at["proxy"]]
             proxy, scale = proxy_of(numbers, self.form)
             factors = self.table.settings["factors"]
             lobes = tuple(f * w for f, w in zip(factors, widths(proxy, scale), strict=True))
             dr.make_opaque(proxy, lobes)
         form = dataclasses.replace(self.form, scale=tuple(float(scale[k][0]) for k in (0, -1)))
         low, step = fourth_roots(form.range)
-        start, cascaded = (1 - low) / step, at_nodes["cascaded"]
+        start, cascaded = (1 - low) / step, self.arrays["cascaded"].numpy().astype(np.float64)
         terms = cascaded.reshape(*cascaded.shape[:3], -1, 3) - start
-        combined = np.clip(start + np.einsum("r,uvwrc->uvwc", 2 * at("mixing") - 1, terms), 0, 1)
+        combined = np.clip(start + np.einsum("r,uvwrc->uvwc", 2 * at["mixing"] - 1, terms), 0, 1)
         parts = [self.arrays[n] for n in RESIDUAL[:2]]
-        residual = Indirection(parts, stored(combined, self.arrays["cascaded"].border), [(0, 1), (1, 2)])
-        energy = stored(at("energy", 1)) if "energy" in self.arrays else None
-        mixture = Mixture(stored(at("weights", 1)), tuple(SampledLobe(a, a) for a in lobes))
+        residual = Indirection(parts, self._array(combined, self.arrays["cascaded"].border), [(0, 1), (1, 2)])
+        energy = self._array(at["energy"]) if "energy" in at else None
+        mixture = Mixture(self._array(at["weights"]), tuple(SampledLobe(a, a) for a in lobes))
         return LearnedBSDF(form, residual, proxy, energy), mixture
+
+    def reduced(self, values: list[float | None]) -> FamilyModel:
+        """Return the family of the parameters whose value is ``None``, for ``values`` of the others."""
+        result = self.copy()
+        for name in TABLES:
+            if name in self.arrays:
+                result.arrays[name] = self._array(self._interpolated(name, values))
+        result.parameters = [p for p, v in zip(self.parameters, values, strict=True) if v is None]
+        return result
+
+    def _array(self, values: np.ndarray, border="clamp") -> DifferentiableArray:
+        return DifferentiableArray.from_numpy(values.astype(np.float32), self.dtype, border)
+
+    def _interpolated(self, name: str, values: list[float | None]) -> np.ndarray:
+        """Return a table without the axes of parameters that have a value."""
+        array, first = self.arrays[name].numpy().astype(np.float64), name in ("weights", "energy")
+        for k, value in reversed(list(enumerate(values))):
+            if value is not None:
+                axis = first + k
+                position = float(self.parameters[k].coordinate(float(value))) * (array.shape[axis] - 1)
+                lower = min(int(position), array.shape[axis] - 2)
+                ends = [np.take(array, lower + end, axis) for end in (0, 1)]
+                array = ends[0] + (position - lower) * (ends[1] - ends[0])
+        return array
 
     def entries(self) -> dict:
         """Return what can be optimised: the residual's arrays and the proxy's, in single precision."""

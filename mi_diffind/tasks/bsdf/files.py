@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import astuple
 from pathlib import Path
@@ -12,7 +13,7 @@ from ...indirection import DifferentiableArray, Indirection
 from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, load_table
 from ...task import Model
 from . import measurement, outputs, scattered, tensor_file
-from .mixture import Mixture, SampledLobe
+from .mixture import Mixture, SampledLobe, TurnedMixture
 from .model import AZIMUTHS, PARAMETERS, TERMS, BSDFArrays, Form, LearnedBSDF, Proxy
 from .source import Truth
 from .training import LIMIT
@@ -56,7 +57,7 @@ def form_of(table: Table) -> Form:
     try:
         form = Form(
             tuple(given["terms"]), given["isotropic"], given["azimuth"],
-            tuple(map(float, given["scale"])), tuple(map(float, given["range"])),
+            tuple(map(float, given["scale"])), tuple(map(float, given["range"])), float(given.get("angle", 0)),
         )  # fmt: skip
         low, high = form.range
         valid = (
@@ -66,6 +67,7 @@ def form_of(table: Table) -> Form:
             and len(form.scale) == 2
             and all(1e-3 <= a <= 1 for a in form.scale)
             and -WIDEST <= low < high <= WIDEST
+            and abs(form.angle) <= math.pi
         )
     except (KeyError, TypeError, ValueError):
         valid = False
@@ -143,6 +145,8 @@ class BSDFModel(Model):
     def build(self):
         self.form = form_of(self.table)
         self.mixture = Mixture(self.arrays["weights"], lobes_of(self.table))
+        if self.form.angle:
+            self.mixture = TurnedMixture(self.mixture, self.form.angle)
         self.refresh()
 
     def refresh(self) -> None:

@@ -17,7 +17,7 @@ from . import energy, mixture, scattered, symmetry, training
 from .files import BSDFModel, allocate, to_table
 from .measurement import cosine, measure, measure_samples
 from .model import LearnedBSDF, structure_of
-from .source import WHITE, FunctionTruth, Truth
+from .source import WHITE, FunctionTruth, Truth, TurnedTruth
 from .truth import recorded_source, truth_of
 from .view import SphereView
 
@@ -94,9 +94,12 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
     else:
         samples, validation, smooth = scattered.split(truth, types, isotropic, training.LIMIT, settings.seed)
         view = None
+    angle = 0.0 if isotropic else symmetry.axes_angle(samples, truth)
+    if angle:
+        lines.append(f"axes at {math.degrees(angle):.1f} degrees")
     first, identity = request.part(PRETRAINING), {"source": truth.digest}
-    logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth)
-    form = training.form_of(logarithms, validation, isotropic, azimuth)
+    logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth, angle)
+    form = training.form_of(logarithms, validation, isotropic, azimuth, angle)
     if request.preset in ("paper", "plain"):  # the proxy gives the scale of u alone
         form = dataclasses.replace(form, terms=())
         form = dataclasses.replace(form, range=training.residual_range(form, logarithms, validation))
@@ -112,6 +115,7 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
         """Return the table of the arrays as they are, its limit of the albedo, and the PSNR without."""
         bsdf = LearnedBSDF.of(form, problem.net.rounded())
         sampled = truth if truth.function else FunctionTruth(truth.name, cosine(bsdf))
+        sampled = TurnedTruth(sampled, -angle) if angle else sampled
         lobes, weights = mixture.fitted_mixture(sampled, types, isotropic, form.scale[1] / form.scale[0])
         scale, raw = None, None if view is None else view.psnr(cosine(bsdf))
         if options["energy"] == "source":

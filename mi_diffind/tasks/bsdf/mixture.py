@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from .model import turned
 from .pool import density_ggx, incident, outgoing, sample_ggx, shortened
 
 #: Directions of incidence for which weights are stored, and samples of each that determine them.
@@ -158,6 +159,21 @@ class Mixture:
         for share, lobe in zip(lobes, self.lobes, strict=True):
             density = dr.fma(share, lobe.density(wi, wo), density)
         return density
+
+
+class TurnedMixture:
+    """Mixture that is turned about the normal by ``angle``, radians."""
+
+    def __init__(self, mixture: Mixture, angle: float):
+        self.mixture, self.angle = mixture, angle
+
+    def sample(self, wi, w, u, v, active=True):
+        """Return directions ``wo`` from three uniform numbers each; some lie below the surface."""
+        return turned(self.mixture.sample(turned(wi, -self.angle), w, u, v, active), self.angle)
+
+    def density(self, wi, wo, active=True):
+        """Return the density of :meth:`sample` per solid angle, for directions above the surface."""
+        return self.mixture.density(turned(wi, -self.angle), turned(wo, -self.angle), active)
 
 
 def second_moment(truth_value, mixture: Mixture, truth, types, cos: float, size: int = 2**16, seed: int = 11) -> float:

@@ -64,6 +64,7 @@ class Form:
 
     ``terms`` are those of the proxy (:data:`TERMS`; none: the residual alone). ``scale`` = (a_x, a_y) of the coordinate
     u, ``range`` the residuals that 0 and 1 in the cascaded array stand for. ``isotropic``: α_v of the lobes is α_u.
+    ``angle``: azimuth of the axes of an anisotropic material, radians.
     """
 
     terms: tuple[str, ...] = TERMS
@@ -71,6 +72,7 @@ class Form:
     azimuth: str = "mirror"
     scale: tuple[float, float] = (0.1, 0.1)
     range: tuple[float, float] = (-1.0, 1.0)
+    angle: float = 0.0
 
     def to_json(self) -> dict:
         """Return the form as JSON."""
@@ -263,7 +265,7 @@ class LearnedBSDF:
 
     def value(self, wi, wo, active=True) -> list:
         """Return f without the cosine, three arrays, for unit directions above the surface."""
-        g = DirectionPair.of(wi, wo)
+        g = DirectionPair.of(turned(wi, -self.form.angle), turned(wo, -self.form.angle))
         result = [1, 1, 1] if self.proxy is None else self.proxy.value(g)
         if self.energy is not None:
             scale = self.energy([dr.sqrt(wi.z)], active)[0] * self.energy([dr.sqrt(wo.z)], active)[0]
@@ -274,6 +276,14 @@ class LearnedBSDF:
         numbers = self.residual(self.coordinates(g), active)
         factors = [dr.square(dr.square(dr.fma(x, step, low))) for x in numbers]
         return [a * b for a, b in zip(result, factors, strict=True)]
+
+
+def turned(w, angle: float):
+    """Return directions after a rotation about the normal."""
+    if not angle:
+        return w
+    cos, sin = math.cos(angle), math.sin(angle)
+    return type(w)(dr.fma(cos, w.x, -sin * w.y), dr.fma(sin, w.x, cos * w.y), w.z)
 
 
 def fourth_roots(limits: tuple[float, float]) -> tuple[float, float]:

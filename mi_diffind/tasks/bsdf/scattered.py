@@ -21,7 +21,7 @@ import drjit as dr
 import numpy as np
 
 from ...errors import UsageError, reason
-from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF
+from .model import BSDFArrays, DirectionPair, Form, LearnedBSDF, turned
 from .pool import Samples
 from .source import Truth
 from .symmetry import TOLERANCE
@@ -171,7 +171,7 @@ def _direction(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
     return np.stack([sin * np.cos(phi), sin * np.sin(phi), np.cos(theta)], axis=1)
 
 
-def turned(truth: ScatteredTruth) -> np.ndarray:
+def along_x(truth: ScatteredTruth) -> np.ndarray:
     """Return ``wo`` after a rotation about the normal that brings ``wi`` to the azimuth 0."""
     x, y = truth.wi[:, 0], truth.wi[:, 1]
     r = np.hypot(x, y)
@@ -185,7 +185,7 @@ def places(truth: ScatteredTruth, isotropic: bool) -> np.ndarray:
     """Return points whose distances are those of rows, ``(n, 4)`` of isotropic and ``(n, 6)`` of other materials."""
     if not isotropic:
         return np.concatenate([truth.wi, truth.wo], axis=1)
-    return np.concatenate([np.arccos(np.clip(truth.wi[:, 2:], -1, 1)), turned(truth)], axis=1)
+    return np.concatenate([np.arccos(np.clip(truth.wi[:, 2:], -1, 1)), along_x(truth)], axis=1)
 
 
 # -- symmetries --------------------------------------------------------------------------------------------------------
@@ -285,7 +285,7 @@ def split(truth: ScatteredTruth, types, isotropic: bool, limit: float, seed: int
     wi, wo = truth.wi, truth.wo
     if isotropic:
         wi = np.stack([np.sqrt(np.maximum(1 - wi[:, 2] ** 2, 0)), 0 * wi[:, 2], wi[:, 2]], axis=1)
-        wo = turned(truth)
+        wo = along_x(truth)
     order = np.random.default_rng(seed).permutation(len(value))
     measured = max(1, round(VALIDATION * len(value)))
 
@@ -308,7 +308,7 @@ def without_outliers(samples: Samples, form: Form, proxy: LearnedBSDF) -> tuple[
     from scipy.spatial import cKDTree
 
     with dr.suspend_grad():
-        g = DirectionPair.of(samples.wi, samples.wo)
+        g = DirectionPair.of(*(turned(w, -form.angle) for w in (samples.wi, samples.wo)))
         columns = [*proxy.coordinates(g), *(v * samples.wo.z for v in proxy.value(samples.wi, samples.wo))]
         dr.eval(columns)
     u, v, w, *expected = (np.asarray(c.numpy(), np.float64) for c in columns)

@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import drjit as dr
 
+from .model import turned
+
 
 class Truth:
     """Base class of sources.
@@ -38,6 +40,23 @@ class FunctionTruth(Truth):
 
     def __init__(self, name: str, value: Callable):
         self.name, self.digest, self.value = name, "", value
+
+
+class TurnedTruth(Truth):
+    """Source that is turned about the normal by ``angle``, radians."""
+
+    def __init__(self, truth: Truth, angle: float):
+        self.truth, self.angle, self.name, self.digest = truth, angle, truth.name, truth.digest
+        self.samples, self.remark = truth.samples, truth.remark
+
+    def value(self, wi, wo) -> list:
+        return self.truth.value(turned(wi, -self.angle), turned(wo, -self.angle))
+
+    def sample(self, wi, w, u, v):
+        return turned(self.truth.sample(turned(wi, -self.angle), w, u, v), self.angle)
+
+    def density(self, wi, wo):
+        return self.truth.density(turned(wi, -self.angle), turned(wo, -self.angle))
 
 
 #: Diffuse source of albedo 1.

@@ -75,7 +75,7 @@ def fields(bsdf: LearnedBSDF, types, description: str) -> dict:
     phi = np.zeros(1)
     if not isotropic:
         # The plugin mirrors wi into the range: of a quarter turn if f is symmetric about both axes, else of half a turn
-        quarters = 1 if bsdf.form.azimuth == "mirror" else 2
+        quarters = 1 if bsdf.form.azimuth == "mirror" and not bsdf.form.angle else 2
         phi = np.linspace(-np.pi, (quarters / 2 - 1) * np.pi, quarters * (PHIS - 1) + 1)
     normals = direction(np.linspace(0, 1, NORMALS[1]), np.linspace(0, 1, NORMALS[0])[:, None])
     ndf = distribution_of_normals(bsdf, types, normals)

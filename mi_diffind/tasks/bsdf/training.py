@@ -145,14 +145,15 @@ def train_last(problem: Problem, request: FitRequest, finish: Callable, stop: Ev
 
 def fit_proxy(
     samples: Samples, validation: Samples, types, isotropic: bool, request: FitRequest, identity: dict,
-    smooth: Samples | None = None,
+    smooth: Samples | None = None, angle: float = 0.0,
 ) -> np.ndarray:  # fmt: skip
     """Return the logarithms of the best proxy of :data:`STARTS` trainings.
 
-    The starts are found from ``smooth`` samples (default: those of the ``validation``). With a checkpoint, each
-    training has one of its own beside it; a limited time is shared; after Ctrl-C, no further start is trained.
+    ``angle`` is that of the material's axes. The starts are found from ``smooth`` samples (default: ``validation``).
+    With a checkpoint, each training has one of its own beside it; a limited time is shared; after Ctrl-C, no further
+    start is trained.
     """
-    best, form = None, Form(isotropic=isotropic)
+    best, form = None, Form(isotropic=isotropic, angle=angle)
     with interruptible() as stop:
         for k, start in enumerate(starts(smooth or validation, types, STARTS)):
             net = BSDFArrays(None, proxy_array(start, 1.0)).alloc(types.TensorXf)
@@ -167,7 +168,7 @@ def fit_proxy(
     return best[1]
 
 
-def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: str) -> Form:
+def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: str, angle: float = 0.0) -> Form:
     """Return the form of a fitted proxy: its terms, the scale of u, and the range of the residuals of ``samples``."""
     values = np.exp(logarithms)
     terms = ["diffuse"] if logarithms[DIFFUSE].max() > BLACK else []
@@ -178,7 +179,7 @@ def form_of(logarithms: np.ndarray, samples: Samples, isotropic: bool, azimuth: 
             terms.append(name)
             scales.append([float(np.clip(values[a + i], 1e-3, 1)) for i in (0, 0 if isotropic else 1)])
     scale = min(scales, key=min) if scales else [1.0, 1.0]
-    form = Form(tuple(terms), isotropic, azimuth, tuple(scale))
+    form = Form(tuple(terms), isotropic, azimuth, tuple(scale), angle=angle)
     return dataclasses.replace(form, range=residual_range(form, logarithms, samples))
 
 

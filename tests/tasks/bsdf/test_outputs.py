@@ -33,7 +33,7 @@ def model(types, tmp_path):
     return opened
 
 
-@pytest.mark.parametrize("form", [{}, {"isotropic": False, "scale": (0.08, 0.3)}, {"azimuth": "half"}])
+@pytest.mark.parametrize("form", [{}, {"isotropic": False, "scale": (0.08, 0.3), "angle": 0.4}, {"azimuth": "half"}])
 def test_measured_files(mi_rgb, types, model, tmp_path, form):
     """Mitsuba's ``measured`` shows nearly the learned BSDF, and samples it."""
     opened = model(**form)

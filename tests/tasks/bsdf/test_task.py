@@ -7,20 +7,23 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned, numpy_of
-from learned_bsdfs import formula, handmade
+from learned_bsdfs import about_normal, formula, handmade
 
 import mi_diffind
 from mi_diffind.errors import UsageError
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.tasks.bsdf import TASK, energy, mixture, pool, symmetry, training, view
+from mi_diffind.tasks.bsdf.files import BSDFModel, allocate
 from mi_diffind.tasks.bsdf.model import TERMS, Form, structure_of
-from mi_diffind.tasks.bsdf.truth import MERLTruth, Truth, truth_of
+from mi_diffind.tasks.bsdf.source import Truth, TurnedTruth
+from mi_diffind.tasks.bsdf.truth import MERLTruth, truth_of
 
 FORMS = {
     "isotropic": {},
     "anisotropic": {"isotropic": False, "scale": (0.05, 0.3)},
     "half": {"azimuth": "half"},
+    "turned": {"isotropic": False, "scale": (0.05, 0.3), "azimuth": "half", "angle": 0.6},
     "one lobe": {"terms": ("second",)},
     "residual alone": {"terms": ()},
 }
@@ -127,6 +130,32 @@ def test_symmetries_are_measured(types, changes, broken):
         measured = symmetry.measured_symmetry(FormulaTruth(**changes), types, 2**14)
     for name, value in measured.items():
         assert (value > 0.02) if name in broken else (value < 1e-3), (name, value)
+
+
+@pytest.mark.parametrize("degrees", [0, 0.3, 20, -40, 80])
+def test_axes_are_measured(types, degrees):
+    """The axes of an anisotropic source, up to a quarter turn; small angles count as none."""
+    truth = TurnedTruth(FormulaTruth(anisotropy=8), math.radians(degrees))
+    samples = training.draw(truth, types, 2**16, 1, False)
+    expected = (degrees + 45) % 90 - 45 if abs(degrees) > 0.5 else 0
+    assert math.degrees(symmetry.axes_angle(samples, truth)) == pytest.approx(expected, abs=0.5 if expected else 0)
+
+
+def test_mixtures_are_turned(types, rng):
+    """Samples and densities of a file with an angle are those of one without, in turned directions."""
+    table, angle = handmade(isotropic=False), 0.6
+    plain, turned = (
+        BSDFModel(t, allocate(t, types.TensorXf), types.TensorXf)
+        for t in (table, handmade(isotropic=False, angle=angle))
+    )
+    wi, wo = directions(rng, 500)
+    there = [arrays3(types, about_normal(w, angle)) for w in (wi, wo)]
+    here = [arrays3(types, w) for w in (wi, wo)]
+    u = [types.Float(aligned(rng.random(500))) for _ in range(3)]
+    densities = numpy_of([plain.mixture.density(*here), turned.mixture.density(*there)])
+    np.testing.assert_allclose(densities[:, 0], densities[:, 1], rtol=1e-3)
+    samples = numpy_of(plain.mixture.sample(here[0], *u)), numpy_of(turned.mixture.sample(there[0], *u))
+    np.testing.assert_allclose(about_normal(samples[0], angle), samples[1], atol=1e-4)
 
 
 def test_merl(types, tmp_path, rng):
