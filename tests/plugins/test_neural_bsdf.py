@@ -93,7 +93,7 @@ def test_chi2_of_the_library(mi_rgb, path, tmp_path, monkeypatch):
         theta = np.radians(angle)
         wi = dr.opaque(mi_rgb.Vector3f, [np.sin(theta), 0, np.cos(theta)])
         sample, pdf = BSDFAdapter("neural_bsdf", xml, wi=wi)
-        test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=61, ires=32)
+        test = ChiSquareTest(SphericalDomain(), sample, pdf, sample_dim=3, sample_count=500_000, res=201, ires=32)
         assert test.run(test_count=72, quiet=True), f"{angle} degrees: {test.messages}"
 
 

@@ -98,7 +98,8 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
     if angle:
         lines.append(f"axes at {math.degrees(angle):.1f} degrees")
     first, identity = request.part(PRETRAINING), {"source": truth.digest}
-    logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth, angle)
+    judge = None if view is None else training.view_psnr(view)
+    logarithms = training.fit_proxy(samples, validation, types, isotropic, first, identity, smooth, angle, judge)
     form = training.form_of(logarithms, validation, isotropic, azimuth, angle)
     if request.preset in ("paper", "plain"):  # the proxy gives the scale of u alone
         form = dataclasses.replace(form, terms=())
@@ -107,8 +108,8 @@ def _fitted(truth: Truth, request: FitRequest, stop: Event) -> FittedBSDF:
         (samples, validation), form, line = scattered.cleaned(truth, [samples, validation], form, logarithms)
         lines.append(line)
     identity = {"source": truth.digest, "structure": dataclasses.asdict(structure), "form": form.to_json()}
-    measured = training.proxy_loss(validation) if view is None else training.view_psnr(view)
-    problem = training.residual_problem(logarithms, form, structure, samples, measured, identity)
+    judge = judge or training.proxy_loss(validation)
+    problem = training.residual_problem(logarithms, form, structure, samples, judge, identity)
     azimuths = (0.0,) if isotropic else tuple(math.pi * k / 8 for k in range(8))
 
     def stored(result: FitResult | None = None) -> tuple:

@@ -11,14 +11,21 @@ from .model import EDGE, LOBE, PARAMETERS, DirectionPair, ProxyLobe
 from .pool import Samples
 
 #: Shapes that are tried: roughness, and exponents of GGX, of a lobe with a shorter tail, and nearly Beckmann's.
-ALPHAS, EXPONENTS = tuple(float(a) for a in np.geomspace(0.005, 0.9, 12)), (2.0, 6.0, 30.0)
+ALPHAS, EXPONENTS = tuple(float(a) for a in np.geomspace(0.003, 0.9, 13)), (2.0, 6.0, 30.0)
+
+#: Roughness below which a lobe is much narrower than those of a start, relative to the narrowest.
+NARROW = 0.4
 
 #: Samples, sweeps of the least squares, and the least colour of a term.
 SAMPLES, SWEEPS, LEAST = 2**13, 60, 1e-5
 
 
 def starts(samples: Samples, types, count: int) -> list[np.ndarray]:
-    """Return the logarithms of the ``count`` best proxies, ``(22,)`` each, by their mean absolute error."""
+    """Return the logarithms of the ``count`` best proxies, ``(22,)`` each, by their mean absolute error.
+
+    The second is the best one with a lobe that is much narrower than those of the first, if there is room for one: a
+    sharp coat of little light counts little in the error, but is seen.
+    """
     index = dr.arange(types.UInt32, min(SAMPLES, dr.width(samples.weight)))
     s = samples.at(index)
     g = DirectionPair.of(s.wi, s.wo)
@@ -43,6 +50,9 @@ def starts(samples: Samples, types, count: int) -> list[np.ndarray]:
         error = np.abs(basis[:, chosen] @ colours - target).mean()
         ranked.append((error, i, j, colours))
     ranked.sort(key=lambda entry: entry[0])
+    narrowest = [min(shapes[i][0], shapes[j][0]) for _, i, j, _ in ranked]
+    narrow = next((k for k, alpha in enumerate(narrowest) if alpha < NARROW * narrowest[0]), 1)
+    ranked.insert(1, ranked.pop(narrow))
     return [_logarithms(shapes[i], shapes[j], colours) for _, i, j, colours in ranked[:count]]
 
 

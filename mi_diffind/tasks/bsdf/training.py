@@ -145,9 +145,9 @@ def train_last(problem: Problem, request: FitRequest, finish: Callable, stop: Ev
 
 def fit_proxy(
     samples: Samples, validation: Samples, types, isotropic: bool, request: FitRequest, identity: dict,
-    smooth: Samples | None = None, angle: float = 0.0,
+    smooth: Samples | None = None, angle: float = 0.0, judge: Callable | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Return the logarithms of the best proxy of :data:`STARTS` trainings.
+    """Return the logarithms of the best proxy of :data:`STARTS` trainings, by ``judge`` (default: by their error).
 
     ``angle`` is that of the material's axes. The starts are found from ``smooth`` samples (default: ``validation``).
     With a checkpoint, each training has one of its own beside it; a limited time is shared; after Ctrl-C, no further
@@ -161,6 +161,9 @@ def fit_proxy(
             settings, limited = dataclasses.replace(PROXY, seed=k), request.part(1 / (STARTS - k))
             result = train_stage(problem, settings, limited, f"start{k + 1}", f"proxy, start {k + 1} of {STARTS}")
             error = result.measured["error_db"]
+            if judge is not None:
+                with dr.suspend_grad():
+                    error = next(iter(judge(LearnedBSDF.of(form, net)).values()))
             if best is None or error > best[0]:
                 best = error, net.proxy.numpy().ravel().copy()
             if stop.is_set():
