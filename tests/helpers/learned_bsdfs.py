@@ -96,8 +96,12 @@ def formula(table: Table, wi, wo) -> np.ndarray:
     v = np.sqrt(1 - cos_d)
     first = interpolated(arrays["primary_uv"], np.stack([u, v], axis=1))
     second = interpolated(arrays["primary_vw"], np.stack([v, w], axis=1))
-    low, high = np.exp(np.array(form["range"]) / 4)
-    value *= (low + (high - low) * interpolated(arrays["cascaded"], np.concatenate([first, second], axis=1))) ** 4
+    numbers = interpolated(arrays["cascaded"], np.concatenate([first, second], axis=1))
+    low, high = np.array(form["range"])
+    roots = np.exp(low / 4), np.exp(high / 4)
+    value *= (
+        (roots[0] + (roots[1] - roots[0]) * numbers) ** 4 if form["terms"] else np.exp(low + (high - low) * numbers)
+    )
     for direction in (wi, wo):
         value *= interpolated(arrays["energy"], np.sqrt(direction[:, 2:]))
     return value

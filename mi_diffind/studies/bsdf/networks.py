@@ -1,12 +1,11 @@
 """Networks that learned BSDFs are compared with: 675 weights, for raw and for warped inputs.
 
 The size is that of Sztrajman et al., *Neural BRDF Representation and Importance Sampling* (2021): two hidden layers of
-21 units. The output is the logarithm of f, and starts at that of its mean.
+21 units. The output is the logarithm of f, and starts at its mean.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -115,9 +114,9 @@ class NetworkProblem(BSDFProblem):
 
 
 def mean_logarithm(samples) -> float:
-    """Return the logarithm of the mean of f over samples by their weight."""
-    total = sum(float(dr.mean(samples.weight * v)[0]) for v in samples.value) / 3
-    return math.log(max(total / math.pi, 1e-6))
+    """Return the mean of the logarithms of f over samples."""
+    cos = dr.maximum(samples.wo.z, 1e-3)
+    return sum(float(dr.mean(dr.log(dr.maximum(v, DARK) / cos))[0]) for v in samples.value) / 3
 
 
 class NetworkTraining(ConvergenceTraining):

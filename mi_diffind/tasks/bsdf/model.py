@@ -6,7 +6,7 @@ the angle θ_d between h and either direction,
     f(wi, wo) = proxy(wi, wo) · (a + b C[P₁(u, v), P₂(v, w)])⁴,
 
 where a and b map the range [0, 1] of the residual to the fourth roots of its factors. (A fourth power is nearly an
-exponential over one step of a byte, and takes two products.)
+exponential over one step of a byte, and takes two products. Without a proxy, the factor is an exponential.)
 
 The *proxy* is the sum of a Lambertian lobe with an edge term, ρ/π (1 + (e − 1)(1 − cos θ_i)⁵)(1 + (e − 1)(1 − cos
 θ_o)⁵), and of two microfacet lobes D V F. D ∝ cos⁻⁴θ_h (1 + 2 tan²θ_h/(γα²))^−γ is Student's distribution of slopes
@@ -272,9 +272,13 @@ class LearnedBSDF:
             result = [scale * v for v in result]
         if self.residual is None:
             return result
-        low, step = fourth_roots(self.form.range)
         numbers = self.residual(self.coordinates(g), active)
-        factors = [dr.square(dr.square(dr.fma(x, step, low))) for x in numbers]
+        if self.proxy is None:  # a wide range, of which a fourth power would leave few steps to small values
+            low, high = self.form.range
+            factors = [dr.exp(dr.fma(x, high - low, low)) for x in numbers]
+        else:
+            low, step = fourth_roots(self.form.range)
+            factors = [dr.square(dr.square(dr.fma(x, step, low))) for x in numbers]
         return [a * b for a, b in zip(result, factors, strict=True)]
 
 

@@ -230,8 +230,11 @@ def residual_problem(
     The first number of ``measure(bsdf)`` decides which state is the best.
     """
     types = module_types(samples)
-    low, step = fourth_roots(form.range)
-    start = float(np.clip((1 - low) / step, 0, 1))
+    low, high = form.range
+    start = float(np.clip(-low / (high - low), 0, 1))
+    if form.terms:
+        low, step = fourth_roots(form.range)
+        start = float(np.clip((1 - low) / step, 0, 1))
     proxy = proxy_array(logarithms, RATE) if form.terms else None
     net = BSDFArrays(structure.residual(start, form.azimuth), proxy, RATE).alloc(types.TensorXf)
     return BSDFProblem(net, form, samples, measure, identity)
