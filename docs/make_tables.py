@@ -331,24 +331,41 @@ def material_times() -> str:
     return table(["material", "instructions", "flops", "reads", "8 × 8 pixels", "960 × 640", "training step"], rows)
 
 
+#: Contenders of the study of learned BSDFs, in columns.
+BSDF_CONTENDERS = ("ours", "table", "plain", "paper", "network, warped", "network, raw", "measured")
+
+
 def bsdf() -> str:
-    """Return figures of learned BSDFs: errors, albedo, noise of sampling, times."""
+    """Return the PSNR of learned BSDFs and of what they are compared with."""
+    candidates, rows = measured("tradeoff_bsdf")["candidates"], []
+    for material in measured("tradeoff_bsdf")["cases"]:
+        by_name = {name: candidates.get(f"{material}: {name}") for name in BSDF_CONTENDERS}
+        psnr = [f"{c['errors']['psnr_db']:.1f}" if c else "–" for c in by_name.values()]
+        proxy = f"{by_name['ours']['errors']['psnr_proxy_db']:.1f}"
+        rows.append([material, f"{by_name['ours']['bytes']:,}", proxy, *psnr])
+    return table(["material", "bytes", "proxy alone", *BSDF_CONTENDERS], rows)
+
+
+def bsdf_times() -> str:
+    """Return albedo, noise of sampling and times of learned BSDFs."""
     result, rows = measured("tradeoff_bsdf"), []
-    for name, candidate in result["candidates"].items():
-        errors = candidate["errors"]
-        if "albedo_excess" not in errors:
-            continue
-        material, preset = name.rsplit(": ", 1)
-        ratios = result["cases"][material]["ratios"]
-        pair = f"{name} / {material}: principled"
-        times = (f"{ratios[query][pair]['median']:.2f}" for query in ("eval", "sample"))
-        proxy = f"{errors['psnr_proxy_db']:.1f}" if "psnr_proxy_db" in errors else "–"
-        moments = f"{errors['moment_learned']:.2f} / {errors['moment_native']:.2f}"
-        albedo = f"{100 * errors['albedo_excess']:.2f}%"
-        rows.append(
-            [material, preset, f"{candidate['bytes']:,}", f"{errors['psnr_db']:.1f}", proxy, albedo, moments, *times]
-        )
-    head = ["material", "preset", "bytes", "PSNR, dB", "proxy, dB", "albedo", "moment", "eval", "sample"]
+    for material, case in result["cases"].items():
+        name = f"{material}: ours"
+        errors = result["candidates"][name]["errors"]
+
+        def ratio(query, other, case=case, name=name, material=material):
+            found = case["ratios"][query].get(f"{name} / {material}: {other}")
+            return f"{found['median']:.2f}" if found else "–"
+
+        queries = ("eval", "eval_pdf", "sample")
+        rows.append([
+            material, f"{100 * errors['albedo_excess']:.2f}%",
+            f"{errors['moment_learned']:.2f} / {errors['moment_native']:.2f}",
+            " / ".join(ratio(query, "principled") for query in queries),
+            " / ".join(ratio(query, "source") for query in queries),
+            " / ".join(ratio(query, "measured") for query in queries),
+        ])  # fmt: skip
+    head = ["material", "albedo", "moment", "of `principled`'s time", "of the source's", "of `measured`'s"]
     return table(head, rows)
 
 
@@ -529,6 +546,7 @@ TABLES = {
         image_seen,
         material_times,
         bsdf,
+        bsdf_times,
         shading_distances,
         scene_training,
         texture_memory,
