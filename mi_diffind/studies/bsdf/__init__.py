@@ -1,8 +1,9 @@
 """Study ``tradeoff bsdf``: learned BSDFs against their sources, in accuracy, time, bytes and noise.
 
-Each material is fitted with a proxy times an indirection (``ours``), a proxy times a plain array (``table``), and an
-indirection alone (``paper``). Timed beside them are the material itself and ``principled``. :mod:`.plan` describes
-them, :mod:`.materials` lists the materials.
+Each material is fitted with a proxy times an indirection (``ours``), a proxy times one array (``table``), an
+indirection alone (``paper``), one array alone (``plain``), and networks (:mod:`.networks`). Timed beside them are the
+material itself, ``principled``, and ``measured`` with a file of the first. :mod:`.plan` describes them,
+:mod:`.materials` lists the materials.
 """
 
 from __future__ import annotations
