@@ -880,7 +880,7 @@ def test_arrays_of_the_same_size(folder, preset, tmp_path):
 
 def test_a_training_that_gains_nothing_keeps_its_start(folder, path):
     """With a rate that ruins the arrays; and a start of another source is refused."""
-    settings = FitSettings(steps=2, batch=64, lr=5.0, measure_every=1, deterministic=True)
+    settings = FitSettings(steps=4, batch=64, lr=5.0, measure_every=4, deterministic=True)
     recipe, before = SceneRecipe(reference_spp=4, settings=settings), load(folder / "material.npz")
     request = FitRequest("ours", settings, array_module("llvm"), progress=False)
     parsed, views = scenes.ParsedScene(path, {"film": 4}), ViewDistribution(1, 1)

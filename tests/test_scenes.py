@@ -107,8 +107,8 @@ def test_compare_against_principled(mi_rgb, tmp_path, name):
             "disney",
             "",
             "exact",
-            "names no learned plugin (neural_disney, neural_field, neural_ggx, neural_image, neural_material, "
-            "neural_sdf, neural_texture)",
+            "names no learned plugin (neural_bsdf, neural_disney, neural_field, neural_ggx, neural_image, "
+            "neural_material, neural_sdf, neural_texture)",
         ),
         (
             "neural_ggx",

@@ -244,7 +244,7 @@ def test_bad_input(scene, tmp_path):
         study.measure(tmp_path / "no-such.xml", QUICK, progress=False)
     plain = tmp_path / "plain.xml"
     plain.write_text(SCENE.replace("MATERIAL", '<bsdf type="diffuse"/>'), encoding="utf-8")
-    with pytest.raises(SceneError, match=r"plain\.xml: names no learned plugin \(neural_disney"):
+    with pytest.raises(SceneError, match=r"plain\.xml: names no learned plugin \(neural_bsdf, neural_disney"):
         study.measure(plain, QUICK, progress=False)
 
 
