@@ -354,8 +354,8 @@ def bsdf_times() -> str:
         errors = result["candidates"][name]["errors"]
 
         def ratio(query, other, case=case, name=name, material=material):
-            found = case["ratios"][query].get(f"{name} / {material}: {other}")
-            return f"{found['median']:.2f}" if found else "–"
+            times = case["ratios"][query].get(f"{name} / {material}: {other}")
+            return f"{times['median']:.2f}" if times else "–"
 
         queries = ("eval", "eval_pdf", "sample")
         rows.append([

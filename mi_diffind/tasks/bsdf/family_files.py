@@ -15,7 +15,7 @@ from ...tables import StoredArray, Table, TableError, byte_array, check_ranges, 
 from . import family_measurement
 from .family import CHANNELS, MOST, FamilyArrays, Parameter, member, proxy_of, widths
 from .family_truth import FamilyTruth
-from .files import RESIDUAL, BSDFModel, form_of
+from .files import RESIDUAL, BSDFModel, check_arrays, form_of
 from .mixture import Mixture, SampledLobe
 from .model import Form, LearnedBSDF, fourth_roots
 
@@ -67,18 +67,7 @@ def load(path: str | os.PathLike) -> Table:
     dims |= {"proxy": (count, CHANNELS), "weights": (count + 1, 3)}
     if "energy" in table.arrays:
         dims["energy"] = (count + 1, 1)
-    for name in dims:
-        if name not in table.arrays:
-            raise TableError(f'{path}: the array "{name}" is missing')
-    for name, array in table.arrays.items():
-        if name not in dims:
-            raise TableError(f'{path}: has an unexpected array "{name}"')
-        expected, channels = dims[name]
-        if len(array.shape) - 1 != expected or channels not in (None, array.shape[-1]):
-            raise TableError(
-                f'{path}: the array "{name}" has the shape {array.shape}, expected {expected} dimension(s)'
-                + (f" and {channels} channel(s)" if channels else "")
-            )
+    check_arrays(table, dims)
     rank = table.arrays["mixing"].shape[-1]
     if table.arrays["cascaded"].shape[-1] != 3 * rank:
         raise TableError(

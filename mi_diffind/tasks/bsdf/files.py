@@ -87,23 +87,32 @@ def load(path: str | os.PathLike) -> Table:
         dims["proxy"] = (1, 1)
     if "energy" in table.arrays:
         dims["energy"] = (1, 1)
-    for name in dims:
-        if name not in table.arrays:
-            raise TableError(f'{path}: the array "{name}" is missing')
-    for name, array in table.arrays.items():
-        if name not in dims:
-            raise TableError(f'{path}: has an unexpected array "{name}"')
-        if (len(array.shape) - 1, array.shape[-1]) != dims[name]:
-            raise TableError(
-                f'{path}: the array "{name}" has the shape {array.shape}, expected {dims[name][0]} dimension(s) and '
-                f"{dims[name][1]} channel(s)"
-            )
+    check_arrays(table, dims)
     if form.terms and table.arrays["proxy"].shape != (PARAMETERS, 1):
         raise TableError(f'{path}: the array "proxy" has the shape {table.arrays["proxy"].shape}, expected (22, 1)')
     unit = (0.0, 1.0)
     check_ranges(table, {n: unit for n in table.arrays if n != "proxy"})
     lobes_of(table)
     return table
+
+
+def check_arrays(table: Table, dims: dict[str, tuple[int, int | None]]) -> None:
+    """Raise :class:`TableError` unless a table has the arrays ``dims`` and no others.
+
+    ``dims`` maps names to numbers of dimensions and of channels (``None``: any).
+    """
+    for name in dims:
+        if name not in table.arrays:
+            raise TableError(f'{table.path}: the array "{name}" is missing')
+    for name, array in table.arrays.items():
+        if name not in dims:
+            raise TableError(f'{table.path}: has an unexpected array "{name}"')
+        expected, channels = dims[name]
+        if len(array.shape) - 1 != expected or channels not in (None, array.shape[-1]):
+            raise TableError(
+                f'{table.path}: the array "{name}" has the shape {array.shape}, expected {expected} dimension(s)'
+                + (f" and {channels} channel(s)" if channels else "")
+            )
 
 
 def lobes_of(table: Table) -> tuple[SampledLobe, SampledLobe]:

@@ -30,9 +30,6 @@ from .training import module_types, proxy_array, residual_range
 #: Columns of angles and values that a file needs, and columns that it may have.
 ANGLES, VALUES, OPTIONAL = ("theta_i", "phi_i", "theta_o", "phi_o"), ("r", "g", "b"), ("solid_angle", "weight")
 
-#: Units of the angles.
-UNITS = ("degrees", "radians")
-
 #: Smallest number of rows, and the share of rows that measure the result.
 LEAST, VALIDATION = 200, 0.1
 
