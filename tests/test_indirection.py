@@ -300,8 +300,8 @@ def test_unfolded(ad, storage):
         found.append([np.array(v) for v in values] + [a.data.grad.numpy() for a in arrays])
     for a, b in zip(*found, strict=True):
         assert np.abs(a).max() > 0.1
-        # Several cores add gradients in any order, which rounds halves differently
-        np.testing.assert_allclose(a, b, rtol=4e-3 if storage == "float16" else 0, atol=0)
+        # Several cores add gradients in any order: sums differ by the rounding of their storage
+        np.testing.assert_allclose(a, b, rtol=0, atol=(4e-3 if storage == "float16" else 1e-6) * np.abs(a).max())
     changed = unfolded(net)
     assert list(changed) == list(net) and not changed.layers[0].cascaded.folded
     for made, array in zip((*changed.layers[0].primary, changed.layers[0].cascaded), arrays, strict=False):
