@@ -17,7 +17,7 @@ from mi_diffind.studies.radiance import conclusions
 from mi_diffind.studies.radiance import plan as plans
 from mi_diffind.tasks.radiance import visual_hull
 from mi_diffind.tasks.radiance.nodes import Nodes, cells_of, corners_of
-from mi_diffind.tasks.radiance.training import FieldSession
+from mi_diffind.tasks.radiance.session import FieldSession
 from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField
 
 LOWER, SPACING, SHAPE = (-0.5, -0.3, 0.1), 0.05, (11, 9, 14)

@@ -7,7 +7,7 @@ import numpy as np
 from ...measure import plot
 from ...measure.curves import against_time, curves, finish
 from ...measure.formatting import figure_caption
-from ...tasks.radiance.training import displayed
+from ...tasks.radiance.session import displayed
 from ..equal_memory import candidates_by_budget
 from .conclusions import FOREGROUND, WHITE, ratio_text, references
 

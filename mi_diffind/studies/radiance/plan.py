@@ -35,7 +35,8 @@ from ...tasks.radiance.files import load
 from ...tasks.radiance.fit import grid_of
 from ...tasks.radiance.march import march
 from ...tasks.radiance.presets import dense_bytes
-from ...tasks.radiance.training import FieldSession, ImagesProblem
+from ...tasks.radiance.session import FieldSession
+from ...tasks.radiance.training import ImagesProblem
 from ...tasks.radiance.volume_field import NodeField, VolumeField
 from .. import equal_memory
 from ..baselines import radiance_factors as factors

@@ -22,7 +22,8 @@ from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
 from .presets import COMPRESSION, PRESETS, RESOLUTION, STAGES, dense_bytes, ratio_for
-from .training import FieldSession, ImagesProblem
+from .session import FieldSession
+from .training import ImagesProblem
 from .volume_field import VolumeField
 
 #: Sizes that ``--psnr`` tries in turn: share of the resolution, and bits of an index.

@@ -15,7 +15,8 @@ from scipy.ndimage import binary_dilation, map_coordinates
 from ...indirection import device_array, device_tensor
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
-from .training import FieldSession, ImagesProblem, ViewImages
+from .session import FieldSession, ViewImages
+from .training import ImagesProblem
 from .views import CapturedViews
 from .visual_hull import box_of, hull
 from .volume_field import NodeField, NodeVolume

@@ -22,7 +22,7 @@ from mi_diffind.task import fit, tasks
 from mi_diffind.tasks.radiance import compression, files, nodes, visual_hull
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
-from mi_diffind.tasks.radiance.training import FieldSession, ViewImages, displayed, scores
+from mi_diffind.tasks.radiance.session import FieldSession, ViewImages, displayed, scores
 from mi_diffind.tasks.radiance.views import load_views
 
 SIZE, FOV = 40, 0.9

@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from mi_diffind.tasks.radiance.training import FieldSession, ViewImages
+from mi_diffind.tasks.radiance.session import FieldSession, ViewImages
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
 
 SIZE = (6, 8)  # height, width
