@@ -79,7 +79,8 @@ def fit(request: FitRequest) -> Fitted:
     :class:`~mi_diffind.fitting.FittingError`.
     """
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
-    return FieldFit(request, FieldSession.load(request.types, request.options["source"], pixels)).run()
+    session = FieldSession.load(request.types, request.options["source"], pixels, request.progress)
+    return FieldFit(request, session).run()
 
 
 @dataclasses.dataclass
