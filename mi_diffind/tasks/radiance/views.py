@@ -93,8 +93,9 @@ class CapturedViews:
         same = (self.sizes == self.sizes[0]).all()
         shape = [len(self), *self.sizes[0].tolist(), 4] if same else self.sizes.tolist()
         digest = hashlib.sha256(json.dumps([self.split, shape, self.names, self.has_alpha]).encode())
-        arrays = [self.poses, self.focal, self.centre, *([] if self.box is None else [self.box])]
-        for array in (*map(self.image, range(len(self))), *arrays):
+        for view in range(len(self)):
+            digest.update(self.image(view))
+        for array in (self.poses, self.focal, self.centre, *([] if self.box is None else [self.box])):
             digest.update(np.ascontiguousarray(array))
         return digest.hexdigest()
 
@@ -154,7 +155,7 @@ def _read_all(
     """Return ``pixels`` and ``sizes`` of :class:`CapturedViews`, and whether all images have alpha."""
     words = 2 if any(map(is_linear, paths)) else 1
     pixels, count, sizes, all_alpha = np.empty((0, words), np.uint32), 0, [], True
-    with progress_bar("views", len(paths), "image", progress) as bar:
+    with progress_bar("views", len(paths), "images", progress) as bar:
         for i, (path, numbers) in enumerate(zip(paths, cameras, strict=True)):
             image, has_alpha = read_image(path)
             height, width = image.shape[:2]
