@@ -18,6 +18,7 @@ from .path_footprint import relative
 from .support import distance_shapes as sdf
 from .support import omissions, properties
 from .support.differentials import Differentials
+from .support.field_light import FieldLight, in_order
 from .support.manual import shared_parts
 from .support.placed_fields import PlacedField, VariantLight, to_grid
 
@@ -58,6 +59,12 @@ Radiance field among surfaces (:monosp:`neural_field`)
      ``max_depth``, ``rr_depth``, ``hide_emitters`` and ``jitter`` given here)
    - --
 
+ * - lit
+   - |bool|
+   - Let the field light and shadow the surfaces. The nested integrator is then :monosp:`path_footprint`. (Default:
+     false)
+   - --
+
  * - smooth_depth
    - |int|
    - Number of smooth mirrors and panes that a ray is followed across to meet the field, 0 to 64. (Default: 8)
@@ -90,20 +97,28 @@ the film is one minus the transmittance.
 **Mirrors and glass.** Rays are followed across surfaces that are smooth throughout (:monosp:`conductor`,
 :monosp:`dielectric`, :monosp:`thindielectric`, :monosp:`null`, no medium inside), and marched through the field between
 them. All other surfaces, including those with a smooth lobe and another lobe (:monosp:`plastic`, :monosp:`mask`), are
-rendered by the inner integrator, which does not see the field: the field is not visible in or through them, casts no
-light and no shadow, and is not visible in rough mirrors. Paths of a limited ``max_depth`` may be longer by the smooth
-surfaces before. Participating media count as being behind the field. Rays keep their footprints across mirrors.
+rendered by the inner integrator. Paths of a limited ``max_depth`` may be longer by the smooth surfaces before.
+Participating media count as being behind the field. Rays keep their footprints across mirrors.
+
+**Light and shadow.** With ``lit``, every segment of a path is marched through the field: surfaces are lit and shadowed
+by the field, and it is visible in rough mirrors, in the coat of :monosp:`plastic` and through the holes of a
+:monosp:`mask`. The estimator is unbiased for light that surfaces scatter any number of times. Directions towards the
+field are sampled from cones around its bright parts; they and the samples of BSDFs are weighted by the power heuristic.
+The field itself is not lit: it keeps the light of its capture. Participating media are not rendered, which a warning
+says. Without ``lit``, the inner integrator does not see the field: the field casts no light and no shadow, and is not
+visible in rough mirrors, in :monosp:`plastic` or through a :monosp:`mask`.
 
 **Spectral variants** treat the radiance as that of an emitter of this colour: upsampled, times D65. ``mono`` variants
 take the luminance. Polarised variants are not supported.
 
 **Several fields**, up to four, are nested in one another, with the integrator of surfaces in the innermost;
-``smooth_depth`` and ``aovs`` are those of the outermost. Their boxes may not overlap.
+``lit``, ``smooth_depth`` and ``aovs`` are those of the outermost. Their boxes may not overlap.
 
 **Derivatives** with respect to the field's arrays and its ``to_world`` replay the rays (Vicini et al., *Path Replay
 Backpropagation*, SIGGRAPH 2021). They cover the radiance, alpha and the channels of ``aovs``. If the inner integrator
 replays paths, too (:monosp:`path_footprint`, :monosp:`path_sdf`, :monosp:`prb`, …), it adds the derivatives of
-materials, textures and emitters; any other inner integrator is constant, and so is the geometry.
+materials, textures and emitters; any other inner integrator is constant, and so is the geometry. With ``lit``, light
+and shadow of the field on surfaces are constants to the derivatives with respect to the field.
 
 ``to_world`` may change between renders; the field is then that of a new scene. Its derivatives, with any ``storage``,
 include the sides of the box and the surfaces that cut the field. Where occupied cells end before the density is zero,
@@ -187,26 +202,6 @@ def has_smooth(scene: mi.Scene) -> bool:
     return False
 
 
-def in_order(fields: list, entered: list) -> list:
-    """Return pairs of a field and the rays that enter it at this place of the order along a ray.
-
-    ``entered`` holds, for each of ``fields``, the distance at which rays enter it and whether they do.
-    """
-    if len(fields) == 1:
-        return [(fields[0], entered[0][1])]
-    ranks = []
-    for i, (near, _) in enumerate(entered):
-        rank = mi.UInt32(0)
-        for j, (other, crossed) in enumerate(entered):
-            if j != i:
-                rank += dr.select(crossed & ((other < near) | ((other == near) & (j < i))), mi.UInt32(1), 0)
-        ranks.append(rank)
-    pairs = []
-    for place in range(len(fields)):
-        pairs += [(field, entered[i][1] & (ranks[i] == place)) for i, field in enumerate(fields)]
-    return pairs
-
-
 def with_holes(scene: mi.Scene) -> list[str]:
     """Return the names of shapes whose material has holes, such as a ``mask``."""
     names = []
@@ -245,7 +240,6 @@ def integrator() -> type:
                 field = self.model.field
             self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
             self.light = VariantLight()
-            self.held = self.placed.held()
             self.fields = [self.placed]
             if isinstance(self.nested, NeuralField):
                 self.fields += self.nested.fields
@@ -253,6 +247,11 @@ def integrator() -> type:
             if len(self.fields) > MOST:
                 raise RuntimeError(f"found {len(self.fields)} nested fields, allowed are {MOST}")
             self._check_overlaps()
+            self.lit = props.get("lit", False)
+            if not isinstance(self.lit, bool):
+                raise RuntimeError(f'parameter "lit": found {self.lit}, allowed are true and false')
+            self._connect()
+            self._hold()
             self._warned = False
             omissions.watch(self)
             self._shapes = {name: tuple(values.shape) for name, values in self.placed.exposed.items()}
@@ -260,6 +259,21 @@ def integrator() -> type:
         def _check_overlaps(self) -> None:
             if any(self.placed.overlaps(other) for other in self.fields[1:]):
                 raise RuntimeError("the boxes of two nested fields overlap, allowed are boxes without a common volume")
+
+        def _connect(self) -> None:
+            """Show the fields to the integrator of surfaces, or hide those that a nested integrator has shown to it."""
+            if self.lit and type(self.surfaces) is not path_footprint():
+                raise RuntimeError(
+                    f'parameter "lit": the nested integrator {compat.integrator_name(self.surfaces)} does not see '
+                    f"fields, allowed are path_footprint and none"
+                )
+            if isinstance(self.surfaces, path_footprint()):
+                self.surfaces.between = FieldLight(self.fields, self.light) if self.lit else None
+
+        def _hold(self) -> None:
+            """Keep all arrays that rays read as an attribute, for frozen functions."""
+            between = self.surfaces.between if self.lit else None
+            self.held = self.placed.held() + ([between.spheres, between.radiances] if between is not None else [])
 
         @staticmethod
         def _inner(props: mi.Properties):
@@ -311,9 +325,11 @@ def integrator() -> type:
                     raise RuntimeError(f'parameter "tables.{name}": has the shape {shape}, expected {expected}')
             if not keys or "to_world" in keys:
                 self.placed.update()
-                self.held = self.placed.held()
             if not all(key.startswith("tables.") for key in keys or ("",)):
                 self._check_overlaps()
+            if self.lit and self.surfaces.between is not None:
+                self.surfaces.between.update(arrays=any(key != "to_world" for key in keys or ("",)))
+            self._hold()
 
         def aov_names(self) -> list[str]:
             return list(self.aovs)
@@ -357,13 +373,21 @@ def integrator() -> type:
         def _begin(self, scene, sensor, seed, spp) -> tuple:
             if not self._warned:
                 self._warned = True
-                holes = with_holes(scene)
-                if holes:
-                    warn(f'neural_field: the field is not visible through the holes of "{holes[0]}"')
+                omitted = self._unseen(scene)
+                if omitted:
+                    warn(f"neural_field: {omitted}")
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             sampler, spp = self.prepare(sensor, seed, spp, self.aov_names())
             ray, weight, place = self.sample_rays(scene, sensor, sampler)
             return sensor.film(), sampler, spp, ray, weight, place
+
+        def _unseen(self, scene) -> str:
+            """Return a sentence on where the field is not seen in a scene, or ``""``."""
+            if not self.lit:
+                holes = with_holes(scene)
+                return f'the field is not visible through the holes of "{holes[0]}", "lit" shows it' if holes else ""
+            media = [shape.id() for shape in scene.shapes() if shape.is_medium_transition()]
+            return f'with "lit", the participating medium of "{media[0]}" is not rendered' if media else ""
 
         @staticmethod
         def _developed(film, spp, place, light, alpha, aovs, wavelengths):
@@ -448,9 +472,9 @@ def integrator() -> type:
             """
             path = self._start(ray, active)
             sampler, path = self._follow(None, scene, sampler, path, None, carries(ray))
-            inner, valid, state = self._surfaces(dr.ADMode.Primal, scene, sampler, ray, path)
+            inner, valid, passed, state = self._surfaces(dr.ADMode.Primal, scene, sampler, ray, path)
             light = path.light + dr.select(path.handed, path.throughput * inner, 0)
-            clear = dr.select(path.handed & valid, 0, path.clear)
+            clear = dr.select(path.handed & valid, 0, path.clear * passed)
             aovs = {"depth": path.depth, "opacity": path.opacity}
             state = light, clear, path.depth, path.opacity, state
             return light, 1 - clear, [aovs[name] for name in self.aovs], state
@@ -478,7 +502,7 @@ def integrator() -> type:
                 δ = None
                 if mode == dr.ADMode.Backward:
                     δ = dr.select(path.handed, path.change * path.throughput, 0)
-                inner, _, _ = self._surfaces(mode, scene, sampler, ray, path, δ, inner_state)
+                inner, *_ = self._surfaces(mode, scene, sampler, ray, path, δ, inner_state)
                 if mode == dr.ADMode.Forward:
                     change = change + dr.select(path.handed, path.throughput * inner, 0)
             aovs = {"depth": path.change_depth, "opacity": path.change_opacity}
@@ -493,7 +517,10 @@ def integrator() -> type:
             return path
 
         def _surfaces(self, mode, scene, sampler, ray, path, δL=None, state=None) -> tuple:
-            """Return light, validity and state of the inner integrator for the rays that are handed to it."""
+            """Return what the inner integrator does for the rays that are handed to it.
+
+            Returned are light, validity, the transmittance of fields beyond holes in the first surface, and the state.
+            """
             onward = mi.RayDifferential3f(path.ray)
             onward.has_differentials = carries(ray)
             if onward.has_differentials:
@@ -502,12 +529,12 @@ def integrator() -> type:
                 onward.d_x, onward.d_y = onward.d + offsets.dx, onward.d + offsets.dy
             if not compat.written_in_python(self.surfaces):
                 light, valid, _ = self.surfaces.sample(scene, sampler, onward, None, path.handed)
-                return light, valid, None
-            light, valid, _, state = self.surfaces.sample(
+                return light, valid, mi.Float(1), None
+            light, valid, passed, state = self.surfaces.sample(
                 mode=mode, scene=scene, sampler=sampler, ray=onward, depth=mi.UInt32(0), δL=δL, δaovs=None,
                 state_in=state, active=mi.Bool(path.handed),
             )  # fmt: skip
-            return light, valid, state
+            return light, valid, dr.select(path.handed, passed[0], 1) if passed else mi.Float(1), state
 
         def _follow(self, mode, scene, sampler, path, surfaces, carried: bool) -> tuple:
             """Follow rays up to the surfaces at which the inner integrator takes over.

@@ -123,6 +123,9 @@ def integrator() -> type:
         #: Rays carry differentials, from which textures get footprints (:mod:`.filtered_texture`).
         gives_footprints = True
 
+        #: Radiance fields between the surfaces (:class:`.field_light.FieldLight`), or ``None``.
+        between = None
+
         def __init__(self, props: mi.Properties):
             for name, low in (("max_depth", -1), ("rr_depth", 1)):
                 if name in props and (props.type(name) != mi.Properties.Type.Integer or props[name] < low):
@@ -173,7 +176,7 @@ def integrator() -> type:
             In the differential phases, ``L`` is the radiance that is still to come at the current vertex; it starts as
             the radiance of the whole path (``state_in``).
             """
-            primal = mode == dr.ADMode.Primal
+            primal, between = mode == dr.ADMode.Primal, self.between
             carried = bool(getattr(ray, "has_differentials", False))
             environment = scene.environment() is not None and not self.hide_emitters
             flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if carried else mi.RayFlags.All
@@ -192,6 +195,7 @@ def integrator() -> type:
             before = dr.zeros(mi.SurfaceInteraction3f)
             density = mi.Float(1)
             delta = mi.Bool(True)
+            clear = mi.Float(1)  # transmittance of fields before the first surface that changes a ray
 
             pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
             if dr.hint(self.hide_emitters, mode="scalar"):
@@ -209,7 +213,8 @@ def integrator() -> type:
                 # Emission, weighted against having sampled the emitter at the vertex before
                 shown = active
                 if dr.hint(self.hide_emitters, mode="scalar"):
-                    shown &= (depth > 0) | si.is_valid()
+                    # Fields are visible where the environment is not
+                    shown &= (valid if between is not None else depth > 0) | si.is_valid()
                 ds = mi.DirectionSample3f(scene, si, before)
                 weight = power_heuristic(density, scene.pdf_emitter_direction(before, ds, shown & ~delta))
                 with dr.resume_grad(when=not primal):
@@ -217,10 +222,15 @@ def integrator() -> type:
 
                 # Light from an emitter, and the next direction
                 going = active & si.is_valid() & (depth + 1 < self.max_depth)
-                lit = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                smooth = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                lit = mi.Bool(smooth)
                 ds, emitter_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
                 lit &= ds.pdf != 0
                 wo = si.to_local(ds.d)
+                shadow = mi.Float(1)
+                if dr.hint(between is not None, mode="scalar"):
+                    beam = si.spawn_ray_to(ds.p)
+                    shadow = between.transmittance(beam, beam.maxt, lit)
                 with dr.resume_grad(when=not primal):
                     if dr.hint(not primal, mode="scalar"):
                         value = scene.eval_emitter_direction(si, ds, lit) * dr.select(lit, dr.rcp(ds.pdf), 0)
@@ -230,7 +240,20 @@ def integrator() -> type:
                         context, si, wo, sampler.next_1d(), sampler.next_2d(), going
                     )
                     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
-                    direct = dr.select(lit, throughput * weight * bsdf_value * emitter_weight, 0)
+                    direct = dr.select(lit, throughput * weight * shadow * bsdf_value * emitter_weight, 0)
+                if dr.hint(between is not None, mode="scalar"):
+                    # Light from a field
+                    toward, chance = between.sample(si.p, sampler.next_1d(), sampler.next_2d(), smooth)
+                    smooth &= chance > 0
+                    with dr.resume_grad(when=not primal):
+                        bsdf_value, bsdf_pdf = bsdf.eval_pdf(context, si, si.to_local(toward), smooth)
+                    smooth &= dr.max(dr.detach(bsdf_value)) > 0
+                    beam = si.spawn_ray(toward)
+                    far = scene.ray_intersect_preliminary(beam, coherent=False, active=smooth).t
+                    shine, _ = between.cross(beam, far, smooth)
+                    weight = power_heuristic(chance, dr.detach(bsdf_pdf)) * dr.rcp(chance)
+                    with dr.resume_grad(when=not primal):
+                        direct += dr.select(smooth, throughput * weight * bsdf_value * shine, 0)
                 bs = dr.detach(bs)
                 delta_next = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
                 L = L + emitted + direct if primal else L - dr.detach(emitted + direct)
@@ -238,8 +261,8 @@ def integrator() -> type:
                 if dr.hint(not primal, mode="scalar"):
                     with dr.resume_grad():
                         # A smooth mirror cannot be evaluated: there, the weight itself is differentiated
-                        smooth = bsdf.eval(context, si, bs.wo, going & ~delta_next)
-                        reflected = L * dr.select(delta_next, relative(bsdf_weight), relative(smooth))
+                        rough = bsdf.eval(context, si, bs.wo, going & ~delta_next)
+                        reflected = L * dr.select(delta_next, relative(bsdf_weight), relative(rough))
                         contribution = emitted + direct + dr.select(going, reflected, 0)
                         if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
                             dr.backward_from(δL * contribution)
@@ -268,8 +291,19 @@ def integrator() -> type:
                 depth[going] += 1
                 pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
-            result = dr.select(valid, L, 0) if primal else δL
-            return result, valid, [], L
+                if dr.hint(between is not None, mode="scalar"):
+                    # Fields up to the next surface, weighted against having sampled this direction towards them
+                    shine, passed = between.cross(ray, pi.t, active)
+                    weight = power_heuristic(density, between.density(before.p, ray.d, active & ~delta))
+                    shine = dr.select(active, throughput * weight * shine, 0)
+                    L = L + shine if primal else L - shine
+                    clear = dr.select(active & ~valid, clear * passed, clear)
+                    throughput *= dr.select(active, passed, 1)
+                    active &= passed > 0
+
+            visible = L if between is not None else dr.select(valid, L, 0)
+            result = visible if primal else δL
+            return result, valid, [clear] if between is not None else [], L
 
     return PathFootprint
 

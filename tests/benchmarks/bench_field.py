@@ -17,7 +17,7 @@ from mi_diffind.runtime import array_module
 from mi_diffind.task import FitRequest, tasks
 from mi_diffind.tasks.radiance import compression, files, fit
 from mi_diffind.tasks.radiance.presets import PRESETS, dense_bytes
-from mi_diffind.tasks.radiance.training import FieldSession
+from mi_diffind.tasks.radiance.session import FieldSession
 
 #: Name of a row → what is changed.
 ROWS = {

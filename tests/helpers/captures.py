@@ -32,6 +32,11 @@ def rays_of(views, view, x, y):
     return np.broadcast_to(pose[..., :3, 3], directions.shape), directions
 
 
+def images_of(views):
+    """Images of views of one size, ``(V, height, width, 4)``, float32."""
+    return np.stack([views.image(v) for v in range(len(views))])
+
+
 def picture(pose, side):
     """sRGB and alpha, uint8: a red ball with stripes, and a blue one."""
     focal = side / 2 / math.tan(ANGLE / 2)

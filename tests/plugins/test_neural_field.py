@@ -549,6 +549,11 @@ def test_derivatives_of_surfaces(mi_rgb, fields, ending):
     check(mi_rgb, made, ending)
 
 
+def test_derivatives_of_lit_surfaces(mi_rgb, fields):
+    """Of a material that a field lights and shadows."""
+    check(mi_rgb, lit(mi_rgb, integrator={"max_depth": 3, "lit": True}), "bsdf.reflectance.value")
+
+
 def test_derivatives_of_spectra():
     import mitsuba as mi
 
@@ -576,10 +581,12 @@ def test_parameters(mi_rgb, fields):
     assert "NeuralField[" in str(made.integrator()) and "PathFootprint" in str(made.integrator())
 
 
-def test_frozen(mi_rgb, fields, no_garbage_collection):
+@pytest.mark.parametrize("surfaces_lit", [False, True])
+def test_frozen(mi_rgb, fields, no_garbage_collection, surfaces_lit):
     """A recorded render sees other arrays, other seeds."""
     mi = mi_rgb
-    made = scene(mi, "bumps", glass=mirror(mi, {"type": "conductor"}))
+    things = {"glass": mirror(mi, {"type": "conductor"}), "wall": mirror(mi, {"type": "diffuse"}, place=(-1.2, 1.2, 0))}
+    made = scene(mi, "bumps", integrator={"lit": surfaces_lit}, **things)
     params = mi.traverse(made)
     frozen = dr.freeze(lambda loaded, seed: mi.render(loaded, spp=1, seed=seed))
     for seed in range(5):

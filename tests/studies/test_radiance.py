@@ -17,7 +17,7 @@ from mi_diffind.studies.radiance import conclusions
 from mi_diffind.studies.radiance import plan as plans
 from mi_diffind.tasks.radiance import visual_hull
 from mi_diffind.tasks.radiance.nodes import Nodes, cells_of, corners_of
-from mi_diffind.tasks.radiance.training import FieldSession
+from mi_diffind.tasks.radiance.session import FieldSession
 from mi_diffind.tasks.radiance.volume_field import FAINT, NodeField
 
 LOWER, SPACING, SHAPE = (-0.5, -0.3, 0.1), 0.05, (11, 9, 14)
@@ -237,7 +237,7 @@ def test_what_is_seen_is_where_rays_end(grid):
 
     class ParallelRays:
         def __init__(self):
-            self.views = type("Views", (), {"width": 4, "height": 4, "__len__": lambda self: 1})()
+            self.views = type("Views", (), {"sizes": np.array([[4, 4]])})()
 
         def rays(self, view, x, y):
             o = T.Array3f(0.5 + 0.5 * T.Float(x), 0.5 + 0.5 * T.Float(y), 9.0)

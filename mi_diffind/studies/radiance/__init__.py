@@ -66,7 +66,7 @@ class RadianceStudy(Study):
         import mitsuba as mi
 
         from ...runtime import array_module
-        from ...tasks.radiance.training import FieldSession
+        from ...tasks.radiance.session import FieldSession
         from .plan import RadianceStudySettings, plan
 
         quick = arguments.quick

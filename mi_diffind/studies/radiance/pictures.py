@@ -7,7 +7,7 @@ import numpy as np
 from ...measure import plot
 from ...measure.curves import against_time, curves, finish
 from ...measure.formatting import figure_caption
-from ...tasks.radiance.training import displayed
+from ...tasks.radiance.session import displayed
 from ..equal_memory import candidates_by_budget
 from .conclusions import FOREGROUND, WHITE, ratio_text, references
 
@@ -32,7 +32,7 @@ def views(context, result: dict):
     first = result["details"]["first"]
     jobs = [job for job in context.jobs.values() if job.budget == first and job.method in STYLES]
     columns = max(4, len(jobs) + 1)
-    truth = context.session.held_out.images[0]
+    truth = context.session.held_out.image(0)
     crop, reference = plot.crop_to(truth[..., 3] > 0), displayed(truth)
     tall = 1.6 * reference[crop].shape[0] / reference[crop].shape[1]
     title = f"{result['title']}, {ratio_text(first)} above"

@@ -2,7 +2,7 @@
 
 - :mod:`.views`, :mod:`.visual_hull`: captured images with cameras, and the space that they may occupy;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
-- :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
+- :mod:`.session`, :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
 - :mod:`.compression`, :mod:`.paper`: our compressed layout, and that of the supplement;
 - :mod:`.presets`, :mod:`.fit`, :mod:`.files`, :mod:`.model`, :mod:`.decode`: the steps of ``fit field`` and its result.
 """

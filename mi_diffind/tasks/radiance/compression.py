@@ -17,7 +17,8 @@ from ...indirection import device_array, device_tensor, fold
 from . import grid as grids
 from .grid import NodeGrid
 from .nodes import Nodes
-from .training import FieldSession, ImagesProblem, ViewImages
+from .session import FieldSession, ViewImages
+from .training import ImagesProblem
 from .volume_field import NodeField
 
 #: Raw densities of the first and the last density level: empty, and opaque.

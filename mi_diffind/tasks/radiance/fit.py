@@ -22,7 +22,8 @@ from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
 from .presets import COMPRESSION, PRESETS, RESOLUTION, STAGES, dense_bytes, ratio_for
-from .training import FieldSession, ImagesProblem
+from .session import FieldSession
+from .training import ImagesProblem
 from .volume_field import VolumeField
 
 #: Sizes that ``--psnr`` tries in turn: share of the resolution, and bits of an index.
@@ -78,7 +79,8 @@ def fit(request: FitRequest) -> Fitted:
     :class:`~mi_diffind.fitting.FittingError`.
     """
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
-    return FieldFit(request, FieldSession.load(request.types, request.options["source"], pixels)).run()
+    session = FieldSession.load(request.types, request.options["source"], pixels, request.progress)
+    return FieldFit(request, session).run()
 
 
 @dataclasses.dataclass

@@ -15,7 +15,8 @@ from scipy.ndimage import binary_dilation, map_coordinates
 from ...indirection import device_array, device_tensor
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
-from .training import FieldSession, ImagesProblem, ViewImages
+from .session import FieldSession, ViewImages
+from .training import ImagesProblem
 from .views import CapturedViews
 from .visual_hull import box_of, hull
 from .volume_field import NodeField, NodeVolume
@@ -111,9 +112,9 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
     """Return the largest weight (transmittance × opacity) of each cell in a ray: ``(X − 1, Y − 1, Z − 1)``."""
     nodes, types, views = field.nodes, field.types, images.views
     largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
-    lane = dr.arange(types.UInt32, views.height * views.width)
-    for view in range(len(views)):
-        o, d = images.rays(dr.opaque(types.UInt32, view), lane % views.width, lane // views.width)
+    for view, (height, width) in enumerate(views.sizes.tolist()):
+        lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
+        o, d = images.rays(dr.opaque(types.UInt32, view), lane % width, lane // width)
         visibility(field, o, d, 0, dr.inf, True, largest)
         dr.eval(largest)
     return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]

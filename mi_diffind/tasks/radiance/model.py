@@ -112,7 +112,7 @@ class RadianceFieldModel(Model):
 
     def _test_views(self, capture):
         """Return the test views of a capture. Raises :class:`~mi_diffind.tables.TableError` if it is not there."""
-        from .training import ViewImages, load_held_out
+        from .session import ViewImages, load_held_out
 
         folder = (self.table.path or Path("x")).resolve().parent
         path = Path(capture) if capture is not None else folder / self.table.settings.get("capture_path", "")

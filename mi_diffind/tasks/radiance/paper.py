@@ -15,7 +15,8 @@ from ...fitting import Problem
 from ...indirection import DifferentiableArray, Indirection, ramp, rounded
 from .grid import NodeGrid
 from .nodes import Nodes
-from .training import FieldSession, ImagesProblem
+from .session import FieldSession
+from .training import ImagesProblem
 from .volume_field import NodeVolume, blended, colour_of, density_of
 
 #: Range of raw densities: empty space has the smallest, the largest is opaque.

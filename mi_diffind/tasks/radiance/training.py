@@ -1,156 +1,16 @@
-"""Training of a radiance field through images: rays of random patches of the views, in front of random greys.
-
-A patch of 4 × 4 neighbouring pixels shares most of what its rays read, which is 2.5 times as fast as single pixels.
-"""
+"""Training of a radiance field through images: rays of random patches of the views, in front of random greys."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from dataclasses import dataclass
-from types import ModuleType
 
 import drjit as dr
-import numpy as np
 
 from ... import srgb
 from ...fitting import Problem
-from ...indirection import device_array
-from .march import differentiable, march
-from .views import CapturedViews, ViewsError, load_views
+from .march import differentiable
+from .session import FieldSession
 from .volume_field import VolumeField
-
-#: Pixels along a side of a patch.
-PATCH = 4
-
-#: Most held-out views of measurements during a training whose time is limited, their share of the held-out views that
-#: are read, and the least views for visible cells.
-WATCHED, WATCHED_SHARE, SEEING = 8, 0.2, 8
-
-
-class ViewImages:
-    """Captured ``views`` as Dr.Jit arrays, and the rays of their pixels."""
-
-    def __init__(self, types, views: CapturedViews):
-        self.types, self.views = types, views
-        self.pixels = device_array(types.Float, views.images)
-        cameras = np.concatenate([views.poses[:, :3, :].reshape(-1, 12), views.focal, views.centre], axis=1)
-        self.cameras = device_array(types.Float, cameras)
-
-    def rays(self, view, x, y) -> tuple:
-        """Return origins and unit directions of the rays through the centres of pixels."""
-        c = [value for j in range(4) for value in dr.gather(self.types.Array4f, self.cameras, view * 4 + j)]
-        fx, fy, cx, cy = c[12:]
-        u = (self.types.Float(x) + 0.5 - cx) / fx
-        v = (cy - self.types.Float(y) - 0.5) / fy
-        d = self.types.Array3f(*(c[4 * i] * u + c[4 * i + 1] * v - c[4 * i + 2] for i in range(3)))
-        return self.types.Array3f(c[3], c[7], c[11]), dr.normalize(d)
-
-    def colours(self, view, x, y):
-        """Return linear red, green and blue, multiplied by alpha, and alpha."""
-        height, width = self.views.height, self.views.width
-        return dr.gather(self.types.Array4f, self.pixels, dr.fma(dr.fma(view, height, y), width, x))
-
-    def random_pixels(self, rng, size: int) -> tuple:
-        """Return view, column and row of ``size`` random pixels, in patches."""
-        types, views = self.types, self.views
-        patches = max(1, size // PATCH**2)
-
-        def whole(limit: int):
-            number = types.UInt32(types.Float(rng.random(types.TensorXf, (patches,)).array) * limit)
-            return dr.minimum(number, limit - 1)
-
-        lane = dr.arange(types.UInt32, patches * PATCH**2)
-        patch, pixel = lane // PATCH**2, lane % PATCH**2
-        view = whole(len(views))
-        x, y = whole(max(1, views.width - PATCH + 1)), whole(max(1, views.height - PATCH + 1))
-        view, x, y = (dr.gather(types.UInt32, value, patch) for value in (view, x, y))
-        x, y = x + pixel % PATCH, y + pixel // PATCH
-        return view, dr.minimum(x, views.width - 1), dr.minimum(y, views.height - 1)
-
-    def render(self, field: VolumeField, view: int) -> np.ndarray:
-        """Return the picture of a view, ``(height, width, 4)``: linear colours multiplied by alpha, and alpha."""
-        types, views, side = self.types, self.views, PATCH
-        rows, columns = -(-views.height // side), -(-views.width // side)
-        # Neighbouring pixels, which read the same nodes, lie in tiles
-        lane = dr.arange(types.UInt32, rows * columns * side * side)
-        tile, pixel = lane // (side * side), lane % (side * side)
-        x, y = (tile % columns) * side + pixel % side, (tile // columns) * side + pixel // side
-        o, d = self.rays(dr.opaque(types.UInt32, view), x, y)
-        seen = march(field, o, d, 0, dr.inf)
-        values = np.stack([*seen.colour.numpy(), 1 - seen.transmittance.numpy()], axis=-1)
-        values = values.reshape(rows, columns, side, side, 4).swapaxes(1, 2).reshape(rows * side, columns * side, 4)
-        return values[: views.height, : views.width]
-
-    def evaluate(self, field: VolumeField) -> dict[str, float]:
-        """Return the PSNR of sRGB values before white in decibels, as means over the views.
-
-        ``psnr_white_db`` is that of all pixels. ``psnr_foreground_db``, of the pixels with an alpha above 0, is the
-        first figure, since white flatters.
-        """
-        return scores([self.render(field, v) for v in range(len(self.views))], self.views)
-
-
-@dataclass
-class FieldSession:
-    """Views of one capture: those that fields are trained by, and the ``held_out`` ones that they are measured by."""
-
-    types: ModuleType
-    views: CapturedViews
-    held_out: CapturedViews
-    #: False if the capture has no test views, so that ``held_out`` are the training views.
-    has_test_views: bool = True
-    #: Most pixels of the views in which the visible cells of a field are sought (``None``: all).
-    pixels: float | None = None
-
-    @staticmethod
-    def load(types: ModuleType, folder, pixels: float | None = None) -> FieldSession:
-        """Read the capture in a folder, of the held-out views so many that they have at most ``pixels``.
-
-        Raises :class:`.views.ViewsError`.
-        """
-        views = load_views(folder, "train")
-        most = None if pixels is None else max(2, round(pixels / (views.height * views.width)))
-        return FieldSession(types, views, *load_held_out(folder, most), pixels)
-
-    @functools.cached_property
-    def images(self) -> ViewImages:
-        """Training views as Dr.Jit arrays."""
-        return ViewImages(self.types, self.views)
-
-    @functools.cached_property
-    def seeing_images(self) -> ViewImages:
-        """Training views in which visible cells are sought, evenly spread in the list."""
-        views = self.views
-        most = len(views) if self.pixels is None else max(SEEING, round(self.pixels / (views.height * views.width)))
-        if most >= len(views):
-            return self.images
-        return ViewImages(self.types, views.chosen(np.arange(most) * len(views) // most))
-
-    @functools.cached_property
-    def held_out_images(self) -> ViewImages:
-        """Held-out views as Dr.Jit arrays."""
-        return ViewImages(self.types, self.held_out)
-
-    @functools.cached_property
-    def watched_images(self) -> ViewImages:
-        """Held-out views for measurements during a training, evenly spread in the list; few if time is limited."""
-        count = len(self.held_out)
-        if self.pixels is None:
-            return self.held_out_images
-        watched = min(count, max(1, min(WATCHED, round(WATCHED_SHARE * count))))
-        return ViewImages(self.types, self.held_out.chosen(np.arange(watched) * count // watched))
-
-
-def load_held_out(folder, most: int | None = None) -> tuple[CapturedViews, bool]:
-    """Return ``most`` test views of a capture and True or, if there are none, of its training views and False."""
-    try:
-        return load_views(folder, "test", most), True
-    except ViewsError as e:
-        try:
-            return load_views(folder, "train", most), False
-        except ViewsError:
-            raise e from None
 
 
 class ImagesProblem(Problem):
@@ -184,20 +44,3 @@ class ImagesProblem(Problem):
 
     def measure(self, net):
         return self.session.watched_images.evaluate(self.field_of(net))
-
-
-def displayed(image: np.ndarray) -> np.ndarray:
-    """Return an image ``(…, 4)`` in front of white as sRGB ``(…, 3)`` in [0, 1]."""
-    return srgb.for_display(image[..., :3] + (1 - image[..., 3:]))
-
-
-def scores(pictures: list[np.ndarray], views: CapturedViews) -> dict[str, float]:
-    """Return the figures of :meth:`ViewImages.evaluate` for pictures ``(height, width, 4)`` of the views."""
-    white, foreground = [], []
-    for picture, truth in zip(pictures, views.images, strict=True):
-        squared = np.square(displayed(picture) - displayed(truth))
-        covered = truth[..., 3] > 0
-        white.append(squared.mean())
-        foreground.append(squared[covered].mean() if covered.any() else squared.mean())
-    psnr = [float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12)))) for errors in (foreground, white)]
-    return {"psnr_foreground_db": psnr[0], "psnr_white_db": psnr[1]}

@@ -5,13 +5,14 @@
 ``transforms.json`` of nerfstudio. Poses map camera to world; a camera looks along −z with y up. Transforms that
 nerfstudio has already applied to the poses (``applied_transform``, ``applied_scale``) are not undone.
 
-PNG and JPEG hold sRGB, not multiplied by alpha; EXR holds linear values multiplied by alpha. An image without alpha is
-opaque everywhere, so that its background becomes part of the field.
+Pixels stay as their files have them (:mod:`.image_files`), 4 bytes each, or 8 bytes if there is an EXR among the files.
+An image without alpha is opaque everywhere, so that its background becomes part of the field.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -20,13 +21,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DiffindError, reason
-from ...srgb import to_linear
+from ...errors import reason
+from ...indirection import aligned
+from ...progress import progress_bar
+from .image_files import ViewsError, decoded, half_floats, image_file, is_linear, read_image
 
 SPLITS = ("train", "test", "val")
-
-#: Extensions tried in turn for an image name without one.
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
 
 #: Tolerance of the columns of a rotation: lengths against 1, and dot products against 0.
 RIGID = 1e-3
@@ -40,24 +40,24 @@ PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "F
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-class ViewsError(DiffindError, ValueError):
-    """Error for unusable images or poses; the message is one sentence that names the file and the fault."""
-
-
 @dataclass(frozen=True, eq=False)
 class CapturedViews:
-    """Images of one split of a capture, with their cameras.
+    """Images of one ``split`` of a capture, with their cameras.
 
-    ``images`` ``(V, height, width, 4)``, float32, holds linear colours multiplied by alpha, and alpha in [0, 1].
+    ``pixels``, uint32, holds all images one after the other, row by row: ``(n, 1)`` with four bytes a pixel (sRGB and
+    alpha), or ``(n, 2)`` with four numbers in half precision (linear, multiplied by alpha). The pixels of view i begin
+    at ``offsets[i]``; ``sizes[i]`` holds its height and width. :meth:`image` decodes a view.
+
     ``poses`` ``(V, 4, 4)``, float64, map camera to world. ``focal`` and ``centre``, ``(V, 2)``, are in pixels, the
     centre from the upper left corner. ``names`` are those of the image files.
 
     ``has_alpha`` is false if an image without alpha counts as opaque. ``box`` ``(2, 3)`` holds the lower and the upper
-    corner of the captured objects if the file has an ``aabb`` (as of instant-ngp), else it is ``None``. ``digest`` is a
-    SHA-256 of everything.
+    corner of the captured objects if the file has an ``aabb`` (as of instant-ngp), else it is ``None``.
     """
 
-    images: np.ndarray
+    pixels: np.ndarray
+    offsets: np.ndarray
+    sizes: np.ndarray
     poses: np.ndarray
     focal: np.ndarray
     centre: np.ndarray
@@ -65,25 +65,44 @@ class CapturedViews:
     path: Path
     has_alpha: bool
     box: np.ndarray | None = None
-    digest: str = ""
+    split: str = "train"
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self.sizes)
 
     def chosen(self, numbers: np.ndarray) -> CapturedViews:
-        """Return the views with these ``numbers`` alone."""
+        """Return the views with these ``numbers`` alone; the pixels are shared."""
         return dataclasses.replace(
-            self, images=self.images[numbers], poses=self.poses[numbers], focal=self.focal[numbers],
-            centre=self.centre[numbers], names=tuple(self.names[i] for i in numbers),
+            self, offsets=self.offsets[numbers], sizes=self.sizes[numbers], poses=self.poses[numbers],
+            focal=self.focal[numbers], centre=self.centre[numbers], names=tuple(self.names[i] for i in numbers),
         )  # fmt: skip
 
-    @property
-    def height(self) -> int:
-        return self.images.shape[1]
+    def stored(self, view: int) -> np.ndarray:
+        """Return the image of a view ``(height, width, 4)`` as it is kept: uint8 or float16, not a copy."""
+        height, width = self.sizes[view]
+        words = self.pixels[self.offsets[view] : self.offsets[view] + height * width]
+        return words.view(np.uint8 if words.shape[1] == 1 else np.float16).reshape(height, width, 4)
+
+    def image(self, view: int) -> np.ndarray:
+        """Return the image of a view ``(height, width, 4)``, float32: linear, multiplied by alpha, and alpha."""
+        return decoded(self.stored(view))
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of everything: images as float32, names, cameras and box."""
+        same = (self.sizes == self.sizes[0]).all()
+        shape = [len(self), *self.sizes[0].tolist(), 4] if same else self.sizes.tolist()
+        digest = hashlib.sha256(json.dumps([self.split, shape, self.names, self.has_alpha]).encode())
+        for view in range(len(self)):
+            digest.update(self.image(view))
+        for array in (self.poses, self.focal, self.centre, *([] if self.box is None else [self.box])):
+            digest.update(np.ascontiguousarray(array))
+        return digest.hexdigest()
 
     @property
-    def width(self) -> int:
-        return self.images.shape[2]
+    def mean_pixels(self) -> float:
+        """Mean number of pixels of a view."""
+        return float(self.sizes.prod(axis=1).mean())
 
     @property
     def origins(self) -> np.ndarray:
@@ -91,12 +110,14 @@ class CapturedViews:
         return self.poses[:, :3, 3]
 
 
-def load_views(folder: str | os.PathLike, split: str = "train", most: int | None = None) -> CapturedViews:
+def load_views(
+    folder: str | os.PathLike, split: str = "train", most: int | None = None, progress: bool = False
+) -> CapturedViews:
     """Read the views of a ``split``: "train", "test" or "val".
 
     The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``,
     ``test_filenames`` and ``val_filenames``. If no file or list names the test views, every eighth view is one. Of more
-    than ``most`` views, so many are read, evenly spread in the list.
+    than ``most`` views, so many are read, evenly spread in the list. ``progress`` shows a bar on stderr.
     Raises :class:`ViewsError`, also for fewer than two training views, since one view does not show depth.
     """
     folder = Path(folder)
@@ -110,32 +131,51 @@ def load_views(folder: str | os.PathLike, split: str = "train", most: int | None
     if most is not None and most < len(frames):
         frames = [frames[i * len(frames) // most] for i in range(most)]
     cameras = [_camera(file, content, frame) for frame in frames]
-    names, images, has_alpha = [], None, True
-    for i, ((_, numbers), frame) in enumerate(zip(cameras, frames, strict=True)):
-        path = _image_file(file, frame["file_path"])
-        image, alpha = _read(path)
-        height, width = image.shape[:2]
-        expected = numbers.get("w", width), numbers.get("h", height)
-        if expected != (width, height):
-            raise ViewsError(
-                f"{path}: has {width} × {height} pixels, {file} says {expected[0]:g} × {expected[1]:g}, to which its "
-                f"focal lengths refer"
-            )
-        if images is None:
-            images = np.empty((len(frames), *image.shape), np.float32)
-        elif image.shape != images.shape[1:]:
-            sizes = " and ".join(f"{a.shape[1]} × {a.shape[0]}" for a in (images[0], image))
-            raise ViewsError(f"{path}: has another size than {names[0]} ({sizes} pixels), all need the same")
-        images[i] = image
-        names.append(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
-        has_alpha &= alpha
-    focal = np.array([_focal(numbers, width, height) for _, numbers in cameras])
-    centre = np.array([(numbers.get("cx", width / 2), numbers.get("cy", height / 2)) for _, numbers in cameras])
-    poses, box = np.stack([pose for pose, _ in cameras]), _box(file, content)
-    digest = hashlib.sha256(json.dumps([split, images.shape, names, has_alpha]).encode())
-    for array in (images, poses, focal, centre, *([] if box is None else [box])):
-        digest.update(np.ascontiguousarray(array))
-    return CapturedViews(images, poses, focal, centre, tuple(names), folder, has_alpha, box, digest.hexdigest())
+    paths = [image_file(file, frame["file_path"]) for frame in frames]
+    pixels, sizes, has_alpha = _read_all(file, paths, [numbers for _, numbers in cameras], progress)
+    numbers = [(numbers, *size) for (_, numbers), size in zip(cameras, sizes, strict=True)]
+    return CapturedViews(
+        pixels=pixels,
+        offsets=np.cumsum([0, *sizes.prod(axis=1)])[:-1],
+        sizes=sizes,
+        poses=np.stack([pose for pose, _ in cameras]),
+        focal=np.array([_focal(n, width, height) for n, height, width in numbers]),
+        centre=np.array([(n.get("cx", width / 2), n.get("cy", height / 2)) for n, height, width in numbers]),
+        names=tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in paths),
+        path=folder,
+        has_alpha=has_alpha,
+        box=_box(file, content),
+        split=split,
+    )
+
+
+def _read_all(
+    file: Path, paths: list[Path], cameras: list[dict], progress: bool
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return ``pixels`` and ``sizes`` of :class:`CapturedViews`, and whether all images have alpha."""
+    words = 2 if any(map(is_linear, paths)) else 1
+    pixels, count, sizes, all_alpha = np.empty((0, words), np.uint32), 0, [], True
+    with progress_bar("views", len(paths), "images", progress) as bar:
+        for i, (path, numbers) in enumerate(zip(paths, cameras, strict=True)):
+            image, has_alpha = read_image(path)
+            height, width = image.shape[:2]
+            expected = numbers.get("w", width), numbers.get("h", height)
+            if expected != (width, height):
+                raise ViewsError(
+                    f"{path}: has {width} × {height} pixels, {file} says {expected[0]:g} × {expected[1]:g}, to which "
+                    f"its focal lengths refer"
+                )
+            end = count + height * width
+            if end > len(pixels):  # the first time, or if a larger image follows: memory that nobody writes is free
+                grown = aligned((count + (len(paths) - i) * height * width, words), np.uint32)
+                grown[:count] = pixels[:count]
+                pixels = grown
+            stored = image if words == 1 else half_floats(image)
+            pixels[count:end] = stored.reshape(-1).view(np.uint32).reshape(-1, words)
+            count, all_alpha = end, all_alpha and has_alpha
+            sizes.append((height, width))
+            bar.update()
+    return pixels[:count], np.array(sizes), all_alpha
 
 
 def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
@@ -274,71 +314,3 @@ def _pose(where: str, matrix) -> np.ndarray:
     if np.linalg.det(rotation) < 0:
         raise ViewsError(f"{where} has a transform_matrix that mirrors, a rotation is needed")
     return pose
-
-
-def _image_file(file: Path, name: str) -> Path:
-    """Return the path of the image ``name`` in a list of views."""
-    path = file.parent / name
-    for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
-        if candidate.is_file():
-            return candidate
-    more = "" if path.suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
-    raise ViewsError(f"{path}: no such image{more}, {file.name} names it")
-
-
-def _read(path: Path) -> tuple[np.ndarray, bool]:
-    """Return an image ``(height, width, 4)``, linear and multiplied by alpha, and whether the file has alpha."""
-    encoded = path.suffix.lower() != ".exr"
-    try:
-        values = _read_bytes(path) if encoded else _read_exr(path)
-    except (ViewsError, ImportError):
-        raise
-    except Exception as e:  # each decoder raises errors of its own for a damaged file
-        raise ViewsError(
-            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
-        ) from None
-    has_alpha = values.shape[2] in (2, 4)
-    colour, alpha = (values[..., :-1], values[..., -1:]) if has_alpha else (values, None)
-    if encoded:
-        colour = _LINEAR[colour]
-        alpha = None if alpha is None else alpha / np.float32(255)
-    elif not np.isfinite(values).all():
-        raise ViewsError(f"{path}: has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
-    image = np.ones((*values.shape[:2], 4), np.float32)
-    image[..., :3] = colour
-    if has_alpha:
-        image[..., 3:] = np.clip(alpha, 0, 1)
-        if encoded:
-            image[..., :3] *= image[..., 3:]
-    return image, has_alpha
-
-
-#: Byte → linear value.
-_LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
-
-
-def _read_bytes(path: Path) -> np.ndarray:
-    """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        if image.mode not in ("RGB", "RGBA", "L", "LA"):
-            if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
-                raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
-            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        elif image.mode in ("RGB", "L") and image.has_transparency_data:
-            image = image.convert("RGBA")
-        values = np.array(image)
-    return values.reshape(*values.shape[:2], -1)
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    """Return an EXR image, ``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
-    import OpenEXR
-
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(planes)), None)
-    if colours is None:
-        raise ViewsError(f"{path}: has the channels {', '.join(sorted(planes))}, expected R, G, B or Y, and A")
-    return np.stack([planes[name] for name in (*colours, *(("A",) if "A" in planes else ()))], axis=-1)

@@ -79,7 +79,7 @@ def hull(views: CapturedViews, lower, spacing: float, shape) -> np.ndarray:
         near = 0.5 * np.median(ahead[front]) if front.any() else np.inf
         front &= ahead >= near
         reach = int(np.ceil(0.87 * spacing * views.focal[v].max() / near))
-        covered = maximum_filter(views.images[v, :, :, 3] > 0, size=2 * reach + 1)
+        covered = maximum_filter(views.stored(v)[..., 3] > 0, size=2 * reach + 1)
         height, width = covered.shape
         i, j = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
         sighted = front & (i >= 0) & (i < width) & (j >= 0) & (j < height)
