@@ -18,6 +18,7 @@ PATHS = ("sphere", "orbit")
 #: Formats of the images.
 FORMATS = ("png", "exr")
 
+
 @dataclass(frozen=True)
 class CaptureSettings:
     """Settings of a capture: number and size of the views, samples, camera path.
@@ -28,8 +29,8 @@ class CaptureSettings:
     (default: the centre of the objects' box) from the distance ``radius`` (default: a sphere around the objects fills
     the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and
     the highest, degrees above the plane normal to ``up``; an orbit swings between them (default: −90, 90 for a sphere,
-    20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats. ``box``: of 3D Gaussians,
-    the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`).
+    20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats. ``box``: of 3D
+    Gaussians, the lower and the upper corner of what is captured (default: :meth:`.splats.Splats.cropped`).
     """
 
     views: int = 60

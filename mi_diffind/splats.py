@@ -43,7 +43,7 @@ EDGE = 0.05
 #: it is widened. Gaussians outside count as strays.
 STRAY, WIDER = 0.01, 0.25
 
-#: Half diagonal of the box of all Gaussians while they are traced, and the distance behind a hit at which a ray goes on.
+#: Half diagonal of the box of all Gaussians while they are traced, and the step behind a hit.
 SIZE, STEP = 100.0, 1e-4
 
 #: Transmittance at which a ray ends, and counts as stopped.
@@ -69,9 +69,10 @@ def is_splats(source) -> bool:
 class Splats:
     """Gaussians of a file, as arrays of float32.
 
-    ``centres`` ``(N, 3)``; ``scales`` ``(N, 3)``, standard deviations along the axes that the ``quaternions`` ``(N, 4)``
-    (x, y, z, w, of length 1) turn; ``opacities`` ``(N,)`` in (0, 1]; ``colours`` ``(N, K, 3)``, coefficients of spherical
-    harmonics, whose sum plus 0.5 is the colour as displayed (sRGB). ``digest`` is the SHA-256 of the file.
+    ``centres`` ``(N, 3)``; ``scales`` ``(N, 3)``, standard deviations along the axes that the ``quaternions``
+    ``(N, 4)`` (x, y, z, w, of length 1) turn; ``opacities`` ``(N,)`` in [0, 1]; ``colours`` ``(N, K, 3)``, coefficients
+    of spherical harmonics, whose sum plus 0.5 is the colour as displayed (sRGB). ``digest`` is the SHA-256 of the
+    file.
     """
 
     path: Path
@@ -132,9 +133,9 @@ class Splats:
             opacities = 1 / (1 + np.exp(-columns("opacity")[:, 0]))
             scales = np.exp(columns("scale_0", "scale_1", "scale_2"))
         arrays = (columns("x", "y", "z"), scales, rotations / lengths, opacities, colours)
+        if scales.max() > 1e18 or np.abs(arrays[0]).max() > 1e18:
+            raise SplatsError(f"{path}: has places or scales above 1e18, are the scales logarithms?")
         arrays = [array.astype(np.float32) for array in arrays]
-        if not np.isfinite(arrays[1]).all():
-            raise SplatsError(f"{path}: has scales that are too large, are they logarithms?")
         return Splats(path, *arrays, hashlib.sha256(content).hexdigest())
 
     def chosen(self, which: np.ndarray) -> Splats:

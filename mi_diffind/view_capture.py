@@ -16,6 +16,7 @@ import json
 import math
 import os
 import pickle
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ from .plugins.support import footprint
 from .poses import frame_of, pose
 from .progress import progress_bar
 from .runtime import use_variant
+from .task import FitRequest
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
@@ -50,6 +52,9 @@ LARGEST = 65504.0
 
 #: Number of views of a contact sheet.
 SHOWN = 24
+
+#: Settings of the views that ``fit field`` renders of 3D Gaussians.
+SPLAT_VIEWS = {"views": 80, "test": 20, "resolution": 200}
 
 #: File that records the settings of a folder.
 RECORD = "capture.json"
@@ -200,6 +205,21 @@ def capture(
     return Captured(folder, files, total, rendered, seconds, radius, centre, box, opaque)
 
 
+def views_of_splats(request: FitRequest) -> Path:
+    """Capture the PLY file of 3D Gaussians that a field is to be fitted to, and return the folder of its views.
+
+    The folder ``NAME_views`` stands beside the output ``NAME.npz``; views that it holds already are kept. Raises as
+    :func:`capture` does.
+    """
+    path = Path(request.options["source"])
+    folder = request.folder / f"{(request.output or path).stem}_views"
+    captured = capture(path, folder, box=request.options["box"], progress=request.progress, **SPLAT_VIEWS)
+    print(captured, file=sys.stderr)
+    if captured.interrupted:
+        raise CaptureError(f"{folder}: has {len(captured.files)} of {captured.total} views, the same call continues")
+    return folder
+
+
 def _render(camera: CaptureCamera, splits: dict, folder: Path, split: str, i: int) -> bool:
     """Render a view, write it, and return whether it is opaque everywhere."""
     settings = camera.settings
@@ -261,7 +281,11 @@ class SceneSubject:
         parsed, digest = self.parsed, hashlib.sha256(self.parsed.description.encode())
         for file in parsed.files():
             digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
-        return {"scene": parsed.path.name, "defines": dict(sorted(parsed.defines.items())), "digest": digest.hexdigest()}
+        return {
+            "scene": parsed.path.name,
+            "defines": dict(sorted(parsed.defines.items())),
+            "digest": digest.hexdigest(),
+        }
 
     def bounds(self) -> np.ndarray:
         """Return the corners ``(2, 3)`` of the captured objects' box."""

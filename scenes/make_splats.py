@@ -62,6 +62,7 @@ def strays(count: int, like: dict[str, np.ndarray], rng) -> dict[str, np.ndarray
 
 
 def main() -> None:
+    """Write the file that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", metavar="FILE.ply")
     parser.add_argument("--count", type=int, default=60000, help="number of Gaussians (default: 60000)")
