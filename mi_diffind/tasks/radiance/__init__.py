@@ -1,6 +1,7 @@
 """Task 7: radiance fields from images of a scene.
 
-- :mod:`.views`, :mod:`.visual_hull`: captured images with cameras, and the space that they may occupy;
+- :mod:`.transforms`, :mod:`.image_files`, :mod:`.lenses`, :mod:`.views`: captured images with cameras;
+- :mod:`.visual_hull`: the space that captured objects may occupy;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
 - :mod:`.session`, :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
 - :mod:`.compression`, :mod:`.paper`: our compressed layout, and that of the supplement;
