@@ -1,6 +1,6 @@
 """Task 7: radiance fields from images of a scene.
 
-- :mod:`.transforms`, :mod:`.image_files`, :mod:`.lenses`, :mod:`.views`: captured images with cameras;
+- :mod:`.transforms`, :mod:`.colmap`, :mod:`.image_files`, :mod:`.lenses`, :mod:`.views`: captured images with cameras;
 - :mod:`.visual_hull`: the space that captured objects may occupy;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
 - :mod:`.session`, :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
@@ -30,7 +30,7 @@ class RadianceField(Task):
     arguments = (
         Argument(
             "source", metavar="FOLDER",
-            help="folder of views (transforms_*.json) of mi-diffind capture, Blender or nerfstudio"
+            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json) or COLMAP"
         ),
         Argument(
             "--bytes", group="size", type=checked(units.parse_bytes), metavar="N",

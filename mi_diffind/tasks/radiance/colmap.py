@@ -68,14 +68,11 @@ def colmap_frames(folder: Path, model: Path, split: str) -> FrameList:
                 f"{', '.join(PARAMETERS)}: undistort the images first"
             )
         numbers = dict(zip(PARAMETERS[camera.model.name].split(), map(float, camera.params), strict=True))
+        numbers |= {"w": float(camera.width), "h": float(camera.height)}
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
         pose[:3, 1:3] *= -1  # COLMAP's cameras look along z, with y downwards
-        frames.append(
-            Frame(
-                f"{IMAGES}/{image.name}", pose, numbers | {"w": float(camera.width), "h": float(camera.height)},
-                str(mask.relative_to(folder)) if mask.is_file() else None,
-            )  # fmt: skip
-        )
+        mask_name = str(mask.relative_to(folder)) if mask.is_file() else None
+        frames.append(Frame(f"{IMAGES}/{image.name}", pose, numbers, mask_name))
     points = [p.xyz for p in reconstruction.points3D.values() if p.track.length() >= TRACK]
     return FrameList(model, folder, frames, points=np.array(points).reshape(-1, 3))

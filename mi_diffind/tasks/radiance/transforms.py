@@ -86,7 +86,10 @@ def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
             return train, content, frames[::EVERY]
         raise ViewsError(f"{listed_split}: no such file")
     if not single.is_file():
-        raise ViewsError(f"{folder}: holds no views: neither transforms_train.json nor transforms.json is there")
+        raise ViewsError(
+            f"{folder}: holds no views: neither transforms_train.json nor transforms.json, nor a COLMAP model in "
+            f"sparse/0"
+        )
     content, frames = _parse(single)
     lists = {s: content[f"{s}_filenames"] for s in SPLITS if f"{s}_filenames" in content}
     if not lists:

@@ -1,9 +1,9 @@
 """Captured views: images of a scene with the poses of their cameras, read from a folder.
 
-``mi-diffind capture``, Blender, nerfstudio and instant-ngp list views in JSON (:mod:`.transforms`). Pixels stay as
-their files have them (:mod:`.image_files`), 4 bytes each, or 8 bytes if there is an EXR among the files; photographs
-with a distortion become images of pinholes (:mod:`.lenses`). An image without alpha is opaque everywhere, so that its
-background becomes part of the field.
+``mi-diffind capture``, Blender, nerfstudio and instant-ngp list views in JSON (:mod:`.transforms`); models of COLMAP
+are read, too (:mod:`.colmap`). Pixels stay as their files have them (:mod:`.image_files`), 4 bytes each, or 8 bytes if
+there is an EXR among the files; photographs with a distortion become images of pinholes (:mod:`.lenses`). An image
+without alpha is opaque everywhere, so that its background becomes part of the field.
 """
 
 from __future__ import annotations
@@ -20,9 +20,14 @@ import numpy as np
 
 from ...indirection import aligned
 from ...progress import progress_bar
+from .colmap import colmap_frames, model_folder
 from .image_files import ViewsError, decoded, half_floats, image_file, is_linear, read_image, read_mask
 from .lenses import DISTORTION, undistorted
 from .transforms import SPLITS, Frame, FrameList, listed_frames
+
+#: Percentiles of points along each axis between which the captured objects lie, and the margin around these, as a share
+#: of the longest side.
+OUTLIERS, POINTS_MARGIN = (1, 99), 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +42,8 @@ class CapturedViews:
     centre from the upper left corner. ``names`` are those of the image files.
 
     ``has_alpha`` is false if an image without alpha counts as opaque. ``box`` ``(2, 3)`` holds the lower and the upper
-    corner of the captured objects if the file has an ``aabb`` (as of instant-ngp), else it is ``None``.
+    corner of the captured objects if the file has an ``aabb``, or those of most points of a model of COLMAP whose
+    images have no alpha; else it is ``None``.
 
     ``mask``, bool ``(n,)``, is false for pixels that do not count: those that a mask excludes, and those that an
     undistorted photograph does not show. ``None``: all count. ``notes`` are sentences for the user; ``settings`` are
@@ -115,8 +121,9 @@ def load_views(
     """Read the views of a ``split``: "train", "test" or "val".
 
     The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``,
-    ``test_filenames`` and ``val_filenames``. If no file or list names the test views, every eighth view is one. Of more
-    than ``most`` views, so many are read, evenly spread in the list. ``progress`` shows a bar on stderr.
+    ``test_filenames`` and ``val_filenames``, or, without these, a model of COLMAP. If no file or list names the test
+    views, every eighth view is one. Of more than ``most`` views, so many are read, evenly spread in the list.
+    ``progress`` shows a bar on stderr.
     Raises :class:`ViewsError`, also for fewer than two training views, since one view does not show depth.
     """
     folder = Path(folder)
@@ -150,7 +157,7 @@ def load_views(
         names=tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in paths),
         path=folder,
         has_alpha=images.has_alpha,
-        box=listed.box,
+        box=_box(listed, images.has_alpha),
         split=split,
         mask=images.mask(),
         notes=tuple(notes),
@@ -159,8 +166,21 @@ def load_views(
 
 
 def _listed(folder: Path, split: str) -> FrameList:
-    """Return the list of the views of a split."""
+    """Return the list of the views of a split: in JSON if there is such a file, else in a COLMAP model."""
+    if not any(folder.glob("transforms*.json")):
+        model = model_folder(folder)
+        if model is not None:
+            return colmap_frames(folder, model, split)
     return listed_frames(folder, split)
+
+
+def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:
+    """Return the box of a list of views or, if no alpha shows where the objects are, that of most of its points."""
+    if listed.box is not None or has_alpha or listed.points is None or not len(listed.points):
+        return listed.box
+    lower, upper = np.percentile(listed.points, OUTLIERS, axis=0)
+    margin = POINTS_MARGIN * (upper - lower).max()
+    return np.stack([lower - margin, upper + margin])
 
 
 class _Images:

@@ -8,6 +8,7 @@ import drjit.llvm.ad as llvm
 import numpy as np
 import OpenEXR
 import pytest
+from captures import SIZE, change, pose, write_image, write_json
 from PIL import Image
 
 from mi_diffind.tasks.radiance.session import FieldSession, ViewImages
@@ -15,27 +16,6 @@ from mi_diffind.tasks.radiance.training import ImagesProblem
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
 from mi_diffind.tasks.radiance.visual_hull import hull
 from mi_diffind.tasks.radiance.volume_field import VolumeField
-
-SIZE = (6, 8)  # height, width
-
-
-def pose(x=0.0, scale=1.0):
-    """A camera at (x, 1, 4) that looks along −z."""
-    matrix = scale * np.eye(4)
-    matrix[3, 3] = 1
-    matrix[:3, 3] = x, 1, 4
-    return matrix.tolist()
-
-
-def write_image(path, seed=0, channels=4, size=SIZE):
-    """Random bytes as PNG; returns them."""
-    values = np.random.default_rng(seed).integers(0, 256, (*size, channels), dtype=np.uint8)
-    Image.fromarray(values[..., 0] if channels == 1 else values).save(path)
-    return values
-
-
-def write_json(path, **content):
-    path.write_text(json.dumps(content))
 
 
 def test_few_views_of_many_are_evenly_spread(blender):
@@ -68,17 +48,6 @@ def blender(tmp_path):
             write_image(tmp_path / split / f"r_{i}.png", i)
         write_json(tmp_path / f"transforms_{split}.json", camera_angle_x=0.7, frames=frames)
     return tmp_path
-
-
-def change(folder, name="transforms_train.json", frame=None, **changes):
-    """Change a list of views, or its second frame; ``None`` removes a key."""
-    path = folder / name
-    content = json.loads(path.read_text())
-    target = content if frame is None else content["frames"][frame]
-    target.update(changes)
-    for key in [key for key, value in changes.items() if value is None]:
-        del target[key]
-    path.write_text(json.dumps(content))
 
 
 def linear(byte):
@@ -366,95 +335,7 @@ def test_folders_that_are_refused(blender, tmp_path):
         load_views(blender, "all")
 
 
-# -- lenses and masks -------------------------------------------------------------------------------------------------
-
-LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.003}
-SIDE = 64
-
-
-def shown_at(u, v, k1=0, k2=0, p1=0, p2=0, k3=0, k4=0, k5=0, k6=0):
-    """Where OpenCV says that a lens shows a point: ``cv2.projectPoints``, written out."""
-    r2 = u**2 + v**2
-    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-    return (
-        u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u**2),
-        v * radial + p1 * (r2 + 2 * v**2) + 2 * p2 * u * v,
-    )
-
-
-def pattern(u, v):
-    """Linear colours of the directions (u, v, 1), ``(…, 3)``."""
-    return np.stack([0.5 + 0.4 * np.sin(4 * u), 0.5 + 0.4 * np.cos(5 * v), 0.5 + 0.4 * np.sin(3 * (u + v))], axis=-1)
-
-
-def photographs(folder, alpha=None, **lens):
-    """Two views of :func:`pattern` through a lens, written as nerfstudio writes them."""
-    (folder / "images").mkdir(exist_ok=True)
-    focal, centre = np.array([50.0, 55.0]), np.array([33.0, 30.5])
-    pixel = np.stack(np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5), axis=-1)
-    point = seen = (pixel - centre) / focal
-    for _ in range(200):  # the inverse, by fixed-point iterations
-        point = point + 0.5 * (seen - np.stack(shown_at(point[..., 0], point[..., 1], **lens), axis=-1))
-    colour = pattern(point[..., 0], point[..., 1])
-    srgb = np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
-    image = np.uint8(np.rint(255 * srgb))
-    if alpha is not None:
-        image = np.dstack([image, alpha])
-    for i in range(2):
-        Image.fromarray(image).save(folder / "images" / f"{i}.png")
-    frames = [{"file_path": f"images/{i}.png", "transform_matrix": pose(i)} for i in range(2)]
-    names = [frame["file_path"] for frame in frames]
-    write_json(
-        folder / "transforms.json", w=SIDE, h=SIDE, fl_x=focal[0], fl_y=focal[1], cx=centre[0], cy=centre[1],
-        camera_model="OPENCV", frames=frames, train_filenames=names, **lens,
-    )  # fmt: skip
-    u, v = np.moveaxis((pixel - centre) / focal, -1, 0)
-    return u, v
-
-
-@pytest.mark.parametrize("lens", [LENS, {"k1": 0.1, "k2": 0.02, "k3": 0.01, "k4": 0.05, "k5": 0.01, "k6": 0.002}])
-def test_photographs_of_a_lens_become_those_of_a_pinhole(tmp_path, lens):
-    u, v = photographs(tmp_path, **lens)
-    views = load_views(tmp_path)
-    assert views.notes == ("all images have a lens distortion and were undistorted",)
-    counted = views.counted(1)
-    x, y = shown_at(u, v, **lens)
-    x, y = 33 + 50 * x, 30.5 + 55 * y  # pixels of the photograph
-    np.testing.assert_array_equal(counted, (x >= 0) & (x <= SIDE) & (y >= 0) & (y <= SIDE))
-    assert counted.mean() > 0.85
-    error = np.abs(views.image(1)[..., :3] - pattern(u, v))
-    inside = (x > 1) & (x < SIDE - 1) & (y > 1) & (y < SIDE - 1)
-    assert error[inside].max() < 0.01 and not views.image(1)[~counted].any()
-    change(tmp_path, "transforms.json", **dict.fromkeys(lens, 0))
-    plain = load_views(tmp_path)
-    assert not plain.notes and plain.mask is None
-    assert np.abs(plain.image(1)[..., :3] - pattern(u, v))[inside].max() > 0.03
-
-
-def test_a_lens_that_turns_back_is_cut_there(tmp_path):
-    """r (1 − r²) has its maximum at the radius √⅓; farther out, the photograph would be seen mirrored."""
-    u, v = photographs(tmp_path)
-    change(tmp_path, "transforms.json", k1=-1.0)
-    counted = load_views(tmp_path).counted(0)
-    radius = np.hypot(u, v)
-    assert counted[radius < 0.57].all() and not counted[radius > 0.58].any()
-
-
-def test_alpha_and_masks_are_undistorted_too(tmp_path):
-    alpha = np.full((SIDE, SIDE), 255, np.uint8)
-    alpha[:, :20] = 0
-    u, v = photographs(tmp_path, alpha, **LENS)
-    mask = np.zeros((SIDE, SIDE), np.uint8)
-    mask[:40] = 1
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    change(tmp_path, "transforms.json", frame=1, mask_path="mask.png")
-    views = load_views(tmp_path)
-    x, y = shown_at(u, v, **LENS)
-    x, y = 33 + 50 * x, 30.5 + 55 * y
-    assert (views.image(0)[..., 3][x < 19] == 0).all() and (views.image(0)[..., 3][x > 21] == 1).all()
-    assert np.abs(views.image(0)[..., :3] - pattern(u, v))[x > 21].max() < 0.01
-    assert views.counted(0).all()
-    np.testing.assert_array_equal(views.counted(1), y < 40)
+# -- masks -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
