@@ -1,6 +1,7 @@
 """Task 7: radiance fields from images of a scene.
 
-- :mod:`.views`, :mod:`.visual_hull`: captured images with cameras, and the space that they may occupy;
+- :mod:`.transforms`, :mod:`.colmap`, :mod:`.image_files`, :mod:`.lenses`, :mod:`.views`: captured images with cameras;
+- :mod:`.visual_hull`: the space that captured objects may occupy;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
 - :mod:`.session`, :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
 - :mod:`.compression`, :mod:`.paper`: our compressed layout, and that of the supplement;
@@ -33,8 +34,8 @@ class RadianceField(Task):
     arguments = (
         Argument(
             "source", metavar="FOLDER",
-            help="folder of views (transforms_*.json) of mi-diffind capture, Blender or nerfstudio; or SPLATS.ply, 3D "
-            "Gaussians, of which views are rendered first"
+            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json) or COLMAP; or "
+            "SPLATS.ply, 3D Gaussians, of which views are rendered first"
         ),
         Argument(
             "--bytes", group="size", type=checked(units.parse_bytes), metavar="N",

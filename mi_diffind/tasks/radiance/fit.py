@@ -100,8 +100,8 @@ class FieldFit:
             warnings.append("there are no test views: the measured error is that of the training views")
         if not session.views.has_alpha:
             warnings.append("the images have no alpha: their background becomes part of the field")
-        for warning in warnings:
-            print(f"warning: {warning}", file=sys.stderr)
+        for line in (*session.views.notes, *(f"warning: {warning}" for warning in warnings)):
+            print(line, file=sys.stderr)
         start = time.perf_counter()
         grid, grid_result = self.grid()
         grid_seconds = time.perf_counter() - start
@@ -117,6 +117,7 @@ class FieldFit:
         table.settings = {
             **request.recorded(result),
             "source": session.views.digest,
+            **session.views.settings,
             **request.paths(capture_path=options["source"], grid_path=options["grid"] or None),
             "warnings": warnings,
             **table.settings,

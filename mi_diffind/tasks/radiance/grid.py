@@ -114,8 +114,8 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
     largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
     for view, (height, width) in enumerate(views.sizes.tolist()):
         lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
-        o, d = images.rays(dr.opaque(types.UInt32, view), lane % width, lane // width)
-        visibility(field, o, d, 0, dr.inf, True, largest)
+        place = dr.opaque(types.UInt32, view), lane % width, lane // width
+        visibility(field, *images.rays(*place), 0, dr.inf, images.counted(*place), largest)
         dr.eval(largest)
     return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DiffindError, reason
-from ...srgb import to_linear
+from ...srgb import from_linear, to_linear
 
 #: Extensions tried in turn for an image name without one.
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
@@ -27,9 +27,9 @@ class ViewsError(DiffindError, ValueError):
     """Error for unusable images or poses; the message is one sentence that names the file and the fault."""
 
 
-def image_file(file: Path, name: str) -> Path:
-    """Return the path of the image ``name`` in a list of views."""
-    path = file.parent / name
+def image_file(root: Path, name: str, file: Path) -> Path:
+    """Return the path of an image in the folder ``root``, which the ``file`` with a list of views names."""
+    path = root / name
     for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
         if candidate.is_file():
             return candidate
@@ -78,6 +78,32 @@ def decoded(image: np.ndarray) -> np.ndarray:
         return image.astype(np.float32)
     alpha = SHARE[image[..., 3:]]
     return np.concatenate([LINEAR[image[..., :3]] * alpha, alpha], axis=-1)
+
+
+def encoded(image: np.ndarray) -> np.ndarray:
+    """Return an image ``(…, 4)`` of linear colours multiplied by alpha, and alpha, as bytes, see :func:`decoded`."""
+    alpha = image[..., 3:]
+    straight = image[..., :3] / np.where(alpha > 0, alpha, 1)
+    shown = from_linear(np.clip(straight, 0, 1))
+    return np.rint(255 * np.concatenate([shown, np.clip(alpha, 0, 1)], axis=-1)).astype(np.uint8)
+
+
+def read_mask(path: Path, image: np.ndarray, image_path: Path) -> np.ndarray:
+    """Return the mask of an image, bool ``(height, width)``: true where the file is not 0.
+
+    Raises :class:`ViewsError`, also if the sizes differ.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            mask = np.array(opened.convert("L")) > 0
+    except Exception as e:
+        raise ViewsError(f"{path}: cannot be read as a mask ({reason(e)})") from None
+    if mask.shape != image.shape[:2]:
+        sizes = " × ".join(map(str, mask.shape[::-1])), " × ".join(map(str, image.shape[1::-1]))
+        raise ViewsError(f"{path}: has {sizes[0]} pixels, its image {image_path.name} has {sizes[1]}")
+    return mask
 
 
 def _read_bytes(path: Path) -> np.ndarray:

@@ -79,6 +79,18 @@ class ViewImages:
         colour = [dr.gather(types.Float, self.linear, (word >> shift) & 255) * alpha for shift in (0, 8, 16)]
         return types.Array4f(*colour, alpha)
 
+    @functools.cached_property
+    def mask(self):
+        """Mask of :class:`.CapturedViews`, or ``None`` if all pixels count."""
+        return None if self.views.mask is None else self.types.Bool(self.views.mask)
+
+    def counted(self, view, x, y):
+        """Return whether pixels count."""
+        if self.mask is None:
+            return self.types.Bool(True)
+        offset, _, width = self._place(view)
+        return dr.gather(self.types.Bool, self.mask, offset + dr.fma(y, width, x))
+
     def random_pixels(self, rng, size: int) -> tuple:
         """Return view, column and row of ``size`` random pixels, in patches; each view is as likely as the others."""
         types, views = self.types, self.views
@@ -115,8 +127,8 @@ class ViewImages:
     def evaluate(self, field: VolumeField) -> dict[str, float]:
         """Return the PSNR of sRGB values before white in decibels, as means over the views.
 
-        ``psnr_white_db`` is that of all pixels. ``psnr_foreground_db``, of the pixels with an alpha above 0, is the
-        first figure, since white flatters.
+        ``psnr_white_db`` is that of all pixels that count. ``psnr_foreground_db``, of those with an alpha above 0, is
+        the first figure, since white flatters.
         """
         return scores((self.render(field, v) for v in range(len(self.views))), self.views)
 
@@ -192,9 +204,11 @@ def scores(pictures: Iterable[np.ndarray], views: CapturedViews) -> dict[str, fl
     """Return the figures of :meth:`ViewImages.evaluate` for pictures ``(height, width, 4)`` of the views."""
     white, foreground = [], []
     for view, picture in zip(range(len(views)), pictures, strict=True):
-        truth = views.image(view)
-        squared = np.square(displayed(picture) - displayed(truth))
-        covered = truth[..., 3] > 0
+        truth, counted = views.image(view), views.counted(view)
+        if not counted.any():
+            continue
+        squared = np.square(displayed(picture) - displayed(truth))[counted]
+        covered = truth[counted][:, 3] > 0
         white.append(squared.mean())
         foreground.append(squared[covered].mean() if covered.any() else squared.mean())
     psnr = [float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12)))) for errors in (foreground, white)]
