@@ -34,8 +34,8 @@ class RadianceField(Task):
     arguments = (
         Argument(
             "source", metavar="FOLDER",
-            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json) or COLMAP; or "
-            "SPLATS.ply, 3D Gaussians, of which views are rendered first"
+            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json), COLMAP, "
+            "or SPLATS.ply: 3D Gaussians, of which views are rendered first"
         ),
         Argument(
             "--bytes", group="size", type=checked(units.parse_bytes), metavar="N",
