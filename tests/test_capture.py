@@ -77,17 +77,18 @@ def test_images_show_what_rays_of_their_poses_meet(mi_rgb, scene, tmp_path, caps
     assert "views: 6 of 6 views, 6 rendered now" in capsys.readouterr().out
     for split, count in (("train", 4), ("test", 2)):
         views = load_views(folder, split)
-        assert len(views) == count and views.has_alpha and (views.height, views.width) == (24, 24)
+        assert len(views) == count and views.has_alpha and (views.sizes == 24).all()
+        images = captures.images_of(views)
         edges = np.arange(25) - 0.5
         numbers = np.stack([nearest(*captures.rays_of(views, v, *np.meshgrid(edges, edges))) for v in range(count)])
         corners = np.stack([numbers[:, :-1, :-1], numbers[:, 1:, :-1], numbers[:, :-1, 1:], numbers[:, 1:, 1:]])
         same = (corners == corners[0]).all(axis=0)
         for i in range(3):  # the colour that a sphere is of is the largest, nowhere else
-            seen = views.images[same & (corners[0] == i)]
+            seen = images[same & (corners[0] == i)]
             assert len(seen) > 20 and (seen[:, :3].argmax(axis=1) == i).all() and seen[:, 3].min() == 1
-        nothing = views.images[same & (corners[0] == -1)]
+        nothing = images[same & (corners[0] == -1)]
         assert len(nothing) > 200 and nothing.max() < 0.3 and np.mean(nothing == 0) > 0.97
-        assert not views.images[:, 0, 0].any()
+        assert not images[:, 0, 0].any()
         assert views.box[0] == pytest.approx([-0.5 - 0.018, -0.5 - 0.019, -0.5 - 0.018], abs=0.003)
         assert views.box[1] == pytest.approx([1.3 + 0.018, 1.4 + 0.019, 0.8 + 0.018], abs=0.003)
 
@@ -98,8 +99,9 @@ def test_formats_agree(mi_rgb, scene, tmp_path):
     assert run(scene, tmp_path / "png") == run(scene, tmp_path / "exr", "--format", "exr") == 0
     png, exr = (load_views(tmp_path / name) for name in ("png", "exr"))
     assert exr.names[0] == "train/r_000.exr" and np.array_equal(png.poses, exr.poses)
-    assert np.abs(png.images - np.minimum(exr.images, exr.images[..., 3:])).max() < 0.006
-    assert len(np.unique(exr.images)) > len(np.unique(png.images))
+    png, exr = (captures.images_of(views) for views in (png, exr))
+    assert np.abs(png - np.minimum(exr, exr[..., 3:])).max() < 0.006
+    assert len(np.unique(exr)) > len(np.unique(png))
 
 
 def test_what_is_there_is_kept(mi_rgb, scene, tmp_path, capsys):
@@ -209,9 +211,10 @@ def test_objects_alone_are_seen(mi_rgb, scene, tmp_path, capsys, integrator):
         assert -50 < np.degrees(np.arcsin(-away[1] / np.linalg.norm(away))) < 60
         origin, direction = captures.rays_of(views, i, *np.meshgrid(np.arange(32), np.arange(32)))
         beside = np.linalg.norm(np.cross(direction, centre - origin), axis=-1)
-        assert (views.images[i, ..., 3][beside < 0.27] > 0.99).all()  # half a pixel within
-        assert not views.images[i][beside > 0.33].any()
-        inside.append(views.images[i][beside < 0.2])
+        image = views.image(i)
+        assert (image[..., 3][beside < 0.27] > 0.99).all()  # half a pixel within
+        assert not image[beside > 0.33].any()
+        inside.append(image[beside < 0.2])
         assert (inside[-1][:, :3].argmax(axis=1) == 1).mean() > 0.97  # but where nothing arrived
     # Beside a wall, and below another sphere, it is not as bright everywhere as alone in this light
     assert np.concatenate(inside)[:, 1].min() < 0.6 < np.concatenate(inside)[:, 1].max()
@@ -243,7 +246,7 @@ def test_integrators_that_nest_another_leave_lights_to_it(mi_rgb, scene, tmp_pat
     other = tmp_path / "other.xml"
     other.write_text(scene.read_text().replace('<integrator type="direct"/>', nested))
     assert run(scene, tmp_path / "plain") == run(other, tmp_path / "nested") == 0
-    plain, found = (load_views(tmp_path / name).images for name in ("plain", "nested"))
+    plain, found = (captures.images_of(load_views(tmp_path / name)) for name in ("plain", "nested"))
     assert not found[:, 0, 0].any() and np.abs(found - plain).mean() < 0.01
 
 
@@ -260,7 +263,7 @@ def test_a_field_of_distances_is_captured_whole_only(mi_rgb, scene, tmp_path, ca
     assert run(scene, tmp_path / "views", "--objects", "knot") == 2
     assert 'objects: found "knot", ' in capsys.readouterr().err
     assert run(scene, tmp_path / "views", "--spp", "1") == 0
-    assert 0.05 < load_views(tmp_path / "views").images[..., 3].mean() < 0.4
+    assert 0.05 < captures.images_of(load_views(tmp_path / "views"))[..., 3].mean() < 0.4
 
 
 def test_what_hides_nothing_is_said(mi_rgb, scene, tmp_path, capsys):
@@ -310,7 +313,7 @@ def test_scenes_that_ship_are_wholly_in_sight(mi_rgb, tmp_path, name):
     content = json.loads((tmp_path / "views" / "transforms_train.json").read_text())
     write = {**content, "frames": content["frames"] + content["frames"][:1]}
     (tmp_path / "views" / "transforms_train.json").write_text(json.dumps(write))
-    images = load_views(tmp_path / "views").images
+    images = captures.images_of(load_views(tmp_path / "views"))
     alpha = images[..., 3]
     border = np.concatenate([alpha[:, [0, -1]].ravel(), alpha[:, :, [0, -1]].ravel()])
     assert border.max() < 1 and border.mean() < 0.03  # touched, not crossed

@@ -32,6 +32,11 @@ def rays_of(views, view, x, y):
     return np.broadcast_to(pose[..., :3, 3], directions.shape), directions
 
 
+def images_of(views):
+    """Images of views of one size, ``(V, height, width, 4)``, float32."""
+    return np.stack([views.image(v) for v in range(len(views))])
+
+
 def picture(pose, side):
     """sRGB and alpha, uint8: a red ball with stripes, and a blue one."""
     focal = side / 2 / math.tan(ANGLE / 2)
@@ -70,3 +75,38 @@ def write(folder, views=12, test=3, side=24):
         content = {"camera_angle_x": ANGLE, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content), encoding="utf-8")
     return folder
+
+
+# -- few random pixels -------------------------------------------------------------------------------------------------
+
+SIZE = (6, 8)  # height, width
+
+
+def pose(x=0.0, scale=1.0):
+    """A camera at (x, 1, 4) that looks along −z."""
+    matrix = scale * np.eye(4)
+    matrix[3, 3] = 1
+    matrix[:3, 3] = x, 1, 4
+    return matrix.tolist()
+
+
+def write_image(path, seed=0, channels=4, size=SIZE):
+    """Random bytes as PNG; returns them."""
+    values = np.random.default_rng(seed).integers(0, 256, (*size, channels), dtype=np.uint8)
+    Image.fromarray(values[..., 0] if channels == 1 else values).save(path)
+    return values
+
+
+def write_json(path, **content):
+    path.write_text(json.dumps(content))
+
+
+def change(folder, name="transforms_train.json", frame=None, **changes):
+    """Change a list of views, or its second frame; ``None`` removes a key."""
+    path = folder / name
+    content = json.loads(path.read_text())
+    target = content if frame is None else content["frames"][frame]
+    target.update(changes)
+    for key in [key for key, value in changes.items() if value is None]:
+        del target[key]
+    path.write_text(json.dumps(content))

@@ -237,7 +237,7 @@ def test_what_is_seen_is_where_rays_end(grid):
 
     class ParallelRays:
         def __init__(self):
-            self.views = type("Views", (), {"width": 4, "height": 4, "__len__": lambda self: 1})()
+            self.views = type("Views", (), {"sizes": np.array([[4, 4]])})()
 
         def rays(self, view, x, y):
             o = T.Array3f(0.5 + 0.5 * T.Float(x), 0.5 + 0.5 * T.Float(y), 9.0)

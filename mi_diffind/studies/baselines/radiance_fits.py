@@ -108,9 +108,9 @@ def visibility(field: NodeField, images, every: int = 2) -> np.ndarray:
     arrays["colour"] = dr.zeros(types.TensorXf, field.arrays["colour"].shape)
     dr.enable_grad(arrays)
     white = field.with_arrays(arrays)
-    columns, rows = views.width // every, views.height // every
-    lane = dr.arange(types.UInt32, columns * rows)
-    for view in range(len(views)):
+    for view, (height, width) in enumerate(views.sizes.tolist()):
+        columns, rows = width // every, height // every
+        lane = dr.arange(types.UInt32, columns * rows)
         o, d = images.rays(dr.opaque(types.UInt32, view), every * (lane % columns), every * (lane // columns))
         dr.eval(o, d)
         seen = march(white, o, d, 0, dr.inf)

@@ -32,7 +32,7 @@ def views(context, result: dict):
     first = result["details"]["first"]
     jobs = [job for job in context.jobs.values() if job.budget == first and job.method in STYLES]
     columns = max(4, len(jobs) + 1)
-    truth = context.session.held_out.images[0]
+    truth = context.session.held_out.image(0)
     crop, reference = plot.crop_to(truth[..., 3] > 0), displayed(truth)
     tall = 1.6 * reference[crop].shape[0] / reference[crop].shape[1]
     title = f"{result['title']}, {ratio_text(first)} above"

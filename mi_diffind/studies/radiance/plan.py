@@ -172,6 +172,7 @@ def plan(session: FieldSession, source: str, settings: RadianceStudySettings) ->
     """Return the plan of the study for a session of the capture in the folder ``source``."""
     context = RadianceStudyContext(session, source, settings)
     views, held_out, first, jobs = session.views, session.held_out, settings.ratios[0], context.jobs
+    height, width = views.sizes[0].tolist()
     jobs[GRID] = GridReference("grid", 1.0, context, GRID)
     jobs[LONGER] = TrainedOnReference("longer", 1.0, context, LONGER)
     for method, ratio in equal_memory.combinations(KINDS, settings.ratios, ONCE, settings.without):
@@ -200,10 +201,10 @@ def plan(session: FieldSession, source: str, settings: RadianceStudySettings) ->
         ratios=[(ours, n) for n in shown if jobs[n].method in AGAINST] if ours else [],
         details={
             "source": source, "source_digest": views.digest + held_out.digest, "views": [len(views), len(held_out)],
-            "pixels": [views.width, views.height], "request": asdict(settings), "first": first,
+            "pixels": [width, height], "request": asdict(settings), "first": first,
         },
         notes=[
-            f"{Path(source).name}, {len(views)} views of {views.width} × {views.height} and {len(held_out)} to test. "
+            f"{Path(source).name}, {len(views)} views of {width} × {height} and {len(held_out)} to test. "
             "Equal bytes: ours and dense grids in memory, the others on disk, deflated.",
         ],
         jobs=list(jobs.values()),
@@ -454,7 +455,8 @@ def _renders(context: RadianceStudyContext, names) -> dict:
     tile, pixel = lane // 16, lane % 16
     across = side // 4
     x, y = (tile % across) * 4 + pixel % 4, (tile // across) * 4 + pixel // 4
-    scale = [images.views.width / side, images.views.height / side]
+    height, width = images.views.sizes[0].tolist()
+    scale = [width / side, height / side]
     o, d = images.rays(
         types.UInt32(0), (types.Float(x) + 0.5) * scale[0] - 0.5, (types.Float(y) + 0.5) * scale[1] - 0.5
     )

@@ -1,6 +1,7 @@
 """Task 7: radiance fields from images of a scene.
 
-- :mod:`.views`, :mod:`.visual_hull`: captured images with cameras, and the space that they may occupy;
+- :mod:`.transforms`, :mod:`.colmap`, :mod:`.image_files`, :mod:`.lenses`, :mod:`.views`: captured images with cameras;
+- :mod:`.visual_hull`: the space that captured objects may occupy;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
 - :mod:`.session`, :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
 - :mod:`.compression`, :mod:`.paper`: our compressed layout, and that of the supplement;
@@ -8,6 +9,10 @@
 """
 
 from __future__ import annotations
+
+import dataclasses
+import importlib
+from pathlib import Path
 
 from ... import units
 from ...arguments import Argument, checked, decibels, positive
@@ -29,7 +34,8 @@ class RadianceField(Task):
     arguments = (
         Argument(
             "source", metavar="FOLDER",
-            help="folder of views (transforms_*.json) of mi-diffind capture, Blender or nerfstudio"
+            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json), COLMAP, "
+            "or SPLATS.ply: 3D Gaussians, of which views are rendered first"
         ),
         Argument(
             "--bytes", group="size", type=checked(units.parse_bytes), metavar="N",
@@ -48,12 +54,24 @@ class RadianceField(Task):
             help="resolution of the grid: nodes along the side of a cube of the same volume (default: 128)",
         ),
         Argument("--grid", metavar="FILE", help="grid to compress; if the file does not exist, it is made"),
+        Argument(
+            "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+            help="of 3D Gaussians, those inside, lower corner first (default: all but strays)",
+        ),
     )  # fmt: skip
     decode_arguments = (
         Argument(
             "--resolution", type=positive, metavar="N", help="nodes along the longest side (default: the field's)"
         ),
     )
+
+    def fit(self, request):
+        source = request.options["source"]
+        if Path(source).suffix.lower() == ".ply":
+            # Captures stand above tasks: asked for by name, as plugins are
+            views = importlib.import_module("mi_diffind.view_capture").views_of_splats(request)
+            request = dataclasses.replace(request, options={**request.options, "source": views})
+        return super().fit(request)
 
     def allocate(self, table, dtype, storage=""):
         return {}

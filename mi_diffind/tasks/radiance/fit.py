@@ -55,6 +55,8 @@ def check(request: FitRequest) -> None:
     options = request.options
     if options["source"] is None:
         raise UsageError("source: not given, a folder of views is needed")
+    if options["box"] is not None and Path(options["source"]).suffix.lower() != ".ply":
+        raise UsageError(f"--box: given with {options['source']}, allowed are PLY files of 3D Gaussians")
     sized = [name for name in ("bytes", "compression", "psnr") if options[name] is not None]
     if request.preset == "grid" and sized:
         raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
@@ -79,7 +81,8 @@ def fit(request: FitRequest) -> Fitted:
     :class:`~mi_diffind.fitting.FittingError`.
     """
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
-    return FieldFit(request, FieldSession.load(request.types, request.options["source"], pixels)).run()
+    session = FieldSession.load(request.types, request.options["source"], pixels, request.progress)
+    return FieldFit(request, session).run()
 
 
 @dataclasses.dataclass
@@ -97,8 +100,8 @@ class FieldFit:
             warnings.append("there are no test views: the measured error is that of the training views")
         if not session.views.has_alpha:
             warnings.append("the images have no alpha: their background becomes part of the field")
-        for warning in warnings:
-            print(f"warning: {warning}", file=sys.stderr)
+        for line in (*session.views.notes, *(f"warning: {warning}" for warning in warnings)):
+            print(line, file=sys.stderr)
         start = time.perf_counter()
         grid, grid_result = self.grid()
         grid_seconds = time.perf_counter() - start
@@ -114,6 +117,7 @@ class FieldFit:
         table.settings = {
             **request.recorded(result),
             "source": session.views.digest,
+            **session.views.settings,
             **request.paths(capture_path=options["source"], grid_path=options["grid"] or None),
             "warnings": warnings,
             **table.settings,

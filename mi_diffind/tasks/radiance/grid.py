@@ -112,10 +112,10 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
     """Return the largest weight (transmittance × opacity) of each cell in a ray: ``(X − 1, Y − 1, Z − 1)``."""
     nodes, types, views = field.nodes, field.types, images.views
     largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
-    lane = dr.arange(types.UInt32, views.height * views.width)
-    for view in range(len(views)):
-        o, d = images.rays(dr.opaque(types.UInt32, view), lane % views.width, lane // views.width)
-        visibility(field, o, d, 0, dr.inf, True, largest)
+    for view, (height, width) in enumerate(views.sizes.tolist()):
+        lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
+        place = dr.opaque(types.UInt32, view), lane % width, lane // width
+        visibility(field, *images.rays(*place), 0, dr.inf, images.counted(*place), largest)
         dr.eval(largest)
     return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]
 

@@ -7,6 +7,7 @@ is 2.5 times as fast as single pixels.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from ... import srgb
 from ...indirection import device_array
+from .image_files import LINEAR
 from .march import march
 from .views import CapturedViews, ViewsError, load_views
 from .volume_field import VolumeField
@@ -32,9 +34,29 @@ class ViewImages:
 
     def __init__(self, types, views: CapturedViews):
         self.types, self.views = types, views
-        self.pixels = device_array(types.Float, views.images)
         cameras = np.concatenate([views.poses[:, :3, :].reshape(-1, 12), views.focal, views.centre], axis=1)
         self.cameras = device_array(types.Float, cameras)
+        self.places = device_array(types.UInt32, np.column_stack([views.offsets, views.sizes, views.sizes[:, 0]]))
+
+    @functools.cached_property
+    def pixels(self):
+        """Pixels as :class:`.CapturedViews` keeps them: four bytes in a UInt32, or four numbers of type Float16.
+
+        They share the memory of the views on the CPU.
+        """
+        pixels, types = self.views.pixels, self.types
+        if pixels.shape[1] == 1:
+            return types.UInt32(pixels.reshape(-1))
+        return types.Float16(pixels.view(np.float16).reshape(-1))
+
+    @functools.cached_property
+    def linear(self):
+        """Linear value of each byte of sRGB."""
+        return device_array(self.types.Float, LINEAR)
+
+    def _place(self, view):
+        """Return the number of the first pixel of a view, its height and its width."""
+        return list(dr.gather(self.types.Array4u, self.places, view))[:3]
 
     def rays(self, view, x, y) -> tuple:
         """Return origins and unit directions of the rays through the centres of pixels."""
@@ -47,30 +69,51 @@ class ViewImages:
 
     def colours(self, view, x, y):
         """Return linear red, green and blue, multiplied by alpha, and alpha."""
-        height, width = self.views.height, self.views.width
-        return dr.gather(self.types.Array4f, self.pixels, dr.fma(dr.fma(view, height, y), width, x))
+        types = self.types
+        offset, _, width = self._place(view)
+        index = offset + dr.fma(y, width, x)
+        if self.views.pixels.shape[1] == 2:
+            return types.Array4f(dr.gather(types.Array4f16, self.pixels, index))
+        word = dr.gather(types.UInt32, self.pixels, index)
+        alpha = types.Float(word >> 24) / 255
+        colour = [dr.gather(types.Float, self.linear, (word >> shift) & 255) * alpha for shift in (0, 8, 16)]
+        return types.Array4f(*colour, alpha)
+
+    @functools.cached_property
+    def mask(self):
+        """Mask of :class:`.CapturedViews`, or ``None`` if all pixels count."""
+        return None if self.views.mask is None else self.types.Bool(self.views.mask)
+
+    def counted(self, view, x, y):
+        """Return whether pixels count."""
+        if self.mask is None:
+            return self.types.Bool(True)
+        offset, _, width = self._place(view)
+        return dr.gather(self.types.Bool, self.mask, offset + dr.fma(y, width, x))
 
     def random_pixels(self, rng, size: int) -> tuple:
-        """Return view, column and row of ``size`` random pixels, in patches."""
+        """Return view, column and row of ``size`` random pixels, in patches; each view is as likely as the others."""
         types, views = self.types, self.views
         patches = max(1, size // PATCH**2)
 
-        def whole(limit: int):
-            number = types.UInt32(types.Float(rng.random(types.TensorXf, (patches,)).array) * limit)
+        def whole(limit):
+            number = types.UInt32(types.Float(rng.random(types.TensorXf, (patches,)).array) * types.Float(limit))
             return dr.minimum(number, limit - 1)
 
+        view = whole(types.UInt32(len(views)))
+        _, height, width = self._place(view)
+        x, y = (whole(dr.maximum(limit, PATCH) - (PATCH - 1)) for limit in (width, height))
         lane = dr.arange(types.UInt32, patches * PATCH**2)
         patch, pixel = lane // PATCH**2, lane % PATCH**2
-        view = whole(len(views))
-        x, y = whole(max(1, views.width - PATCH + 1)), whole(max(1, views.height - PATCH + 1))
-        view, x, y = (dr.gather(types.UInt32, value, patch) for value in (view, x, y))
+        view, x, y, width, height = (dr.gather(types.UInt32, value, patch) for value in (view, x, y, width, height))
         x, y = x + pixel % PATCH, y + pixel // PATCH
-        return view, dr.minimum(x, views.width - 1), dr.minimum(y, views.height - 1)
+        return view, dr.minimum(x, width - 1), dr.minimum(y, height - 1)
 
     def render(self, field: VolumeField, view: int) -> np.ndarray:
         """Return the picture of a view, ``(height, width, 4)``: linear colours multiplied by alpha, and alpha."""
-        types, views, side = self.types, self.views, PATCH
-        rows, columns = -(-views.height // side), -(-views.width // side)
+        types, side = self.types, PATCH
+        height, width = self.views.sizes[view].tolist()
+        rows, columns = -(-height // side), -(-width // side)
         # Neighbouring pixels, which read the same nodes, lie in tiles
         lane = dr.arange(types.UInt32, rows * columns * side * side)
         tile, pixel = lane // (side * side), lane % (side * side)
@@ -79,15 +122,15 @@ class ViewImages:
         seen = march(field, o, d, 0, dr.inf)
         values = np.stack([*seen.colour.numpy(), 1 - seen.transmittance.numpy()], axis=-1)
         values = values.reshape(rows, columns, side, side, 4).swapaxes(1, 2).reshape(rows * side, columns * side, 4)
-        return values[: views.height, : views.width]
+        return values[:height, :width]
 
     def evaluate(self, field: VolumeField) -> dict[str, float]:
         """Return the PSNR of sRGB values before white in decibels, as means over the views.
 
-        ``psnr_white_db`` is that of all pixels. ``psnr_foreground_db``, of the pixels with an alpha above 0, is the
-        first figure, since white flatters.
+        ``psnr_white_db`` is that of all pixels that count. ``psnr_foreground_db``, of those with an alpha above 0, is
+        the first figure, since white flatters.
         """
-        return scores([self.render(field, v) for v in range(len(self.views))], self.views)
+        return scores((self.render(field, v) for v in range(len(self.views))), self.views)
 
 
 @dataclass
@@ -103,14 +146,14 @@ class FieldSession:
     pixels: float | None = None
 
     @staticmethod
-    def load(types: ModuleType, folder, pixels: float | None = None) -> FieldSession:
+    def load(types: ModuleType, folder, pixels: float | None = None, progress: bool = False) -> FieldSession:
         """Read the capture in a folder, of the held-out views so many that they have at most ``pixels``.
 
-        Raises :class:`.views.ViewsError`.
+        ``progress`` shows bars on stderr. Raises :class:`.views.ViewsError`.
         """
-        views = load_views(folder, "train")
-        most = None if pixels is None else max(2, round(pixels / (views.height * views.width)))
-        return FieldSession(types, views, *load_held_out(folder, most), pixels)
+        views = load_views(folder, "train", progress=progress)
+        most = None if pixels is None else max(2, round(pixels / views.mean_pixels))
+        return FieldSession(types, views, *load_held_out(folder, most, progress), pixels)
 
     @functools.cached_property
     def images(self) -> ViewImages:
@@ -121,7 +164,7 @@ class FieldSession:
     def seeing_images(self) -> ViewImages:
         """Training views in which visible cells are sought, evenly spread in the list."""
         views = self.views
-        most = len(views) if self.pixels is None else max(SEEING, round(self.pixels / (views.height * views.width)))
+        most = len(views) if self.pixels is None else max(SEEING, round(self.pixels / views.mean_pixels))
         if most >= len(views):
             return self.images
         return ViewImages(self.types, views.chosen(np.arange(most) * len(views) // most))
@@ -141,13 +184,13 @@ class FieldSession:
         return ViewImages(self.types, self.held_out.chosen(np.arange(watched) * count // watched))
 
 
-def load_held_out(folder, most: int | None = None) -> tuple[CapturedViews, bool]:
+def load_held_out(folder, most: int | None = None, progress: bool = False) -> tuple[CapturedViews, bool]:
     """Return ``most`` test views of a capture and True or, if there are none, of its training views and False."""
     try:
-        return load_views(folder, "test", most), True
+        return load_views(folder, "test", most, progress), True
     except ViewsError as e:
         try:
-            return load_views(folder, "train", most), False
+            return load_views(folder, "train", most, progress), False
         except ViewsError:
             raise e from None
 
@@ -157,12 +200,15 @@ def displayed(image: np.ndarray) -> np.ndarray:
     return srgb.for_display(image[..., :3] + (1 - image[..., 3:]))
 
 
-def scores(pictures: list[np.ndarray], views: CapturedViews) -> dict[str, float]:
+def scores(pictures: Iterable[np.ndarray], views: CapturedViews) -> dict[str, float]:
     """Return the figures of :meth:`ViewImages.evaluate` for pictures ``(height, width, 4)`` of the views."""
     white, foreground = [], []
-    for picture, truth in zip(pictures, views.images, strict=True):
-        squared = np.square(displayed(picture) - displayed(truth))
-        covered = truth[..., 3] > 0
+    for view, picture in zip(range(len(views)), pictures, strict=True):
+        truth, counted = views.image(view), views.counted(view)
+        if not counted.any():
+            continue
+        squared = np.square(displayed(picture) - displayed(truth))[counted]
+        covered = truth[counted][:, 3] > 0
         white.append(squared.mean())
         foreground.append(squared[covered].mean() if covered.any() else squared.mean())
     psnr = [float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12)))) for errors in (foreground, white)]

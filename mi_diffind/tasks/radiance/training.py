@@ -40,7 +40,7 @@ class ImagesProblem(Problem):
             # The prediction is not clamped at white: its slope leads back into the range
             shown = srgb.from_linear(seen.colour[c] + seen.transmittance * grey, fused=False)
             total += dr.square(shown - reference)
-        return total * (1 / (3 * count))
+        return dr.select(images.counted(view, x, y), total, 0) * (1 / (3 * count))
 
     def measure(self, net):
         return self.session.watched_images.evaluate(self.field_of(net))

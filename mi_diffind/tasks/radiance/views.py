@@ -1,17 +1,15 @@
 """Captured views: images of a scene with the poses of their cameras, read from a folder.
 
-``mi-diffind capture``, Blender and nerfstudio write such folders. Two layouts are read: ``transforms_train.json``,
-``transforms_test.json`` and ``transforms_val.json`` of NeRF's Blender data (Mildenhall et al. 2020), and the
-``transforms.json`` of nerfstudio. Poses map camera to world; a camera looks along −z with y up. Transforms that
-nerfstudio has already applied to the poses (``applied_transform``, ``applied_scale``) are not undone.
-
-PNG and JPEG hold sRGB, not multiplied by alpha; EXR holds linear values multiplied by alpha. An image without alpha is
-opaque everywhere, so that its background becomes part of the field.
+``mi-diffind capture``, Blender, nerfstudio and instant-ngp list views in JSON (:mod:`.transforms`); models of COLMAP
+are read, too (:mod:`.colmap`). Pixels stay as their files have them (:mod:`.image_files`), 4 bytes each, or 8 bytes if
+there is an EXR among the files; photographs with a distortion become images of pinholes (:mod:`.lenses`). An image
+without alpha is opaque everywhere, so that its background becomes part of the field.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -20,44 +18,41 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DiffindError, reason
-from ...srgb import to_linear
+from ...indirection import aligned
+from ...progress import progress_bar
+from .colmap import colmap_frames, model_folder
+from .image_files import ViewsError, decoded, half_floats, image_file, is_linear, read_image, read_mask
+from .lenses import DISTORTION, undistorted
+from .transforms import SPLITS, Frame, FrameList, listed_frames
 
-SPLITS = ("train", "test", "val")
-
-#: Extensions tried in turn for an image name without one.
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
-
-#: Tolerance of the columns of a rotation: lengths against 1, and dot products against 0.
-RIGID = 1e-3
-
-#: Interval of the test views in a list without splits, beginning with the first view (as in LLFF's data).
-EVERY = 8
-
-#: Camera models that are pinholes if their distortion is zero.
-PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
-
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-
-
-class ViewsError(DiffindError, ValueError):
-    """Error for unusable images or poses; the message is one sentence that names the file and the fault."""
+#: Percentiles of points along each axis between which the captured objects lie, and the margin around these, as a share
+#: of the longest side.
+OUTLIERS, POINTS_MARGIN = (1, 99), 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class CapturedViews:
-    """Images of one split of a capture, with their cameras.
+    """Images of one ``split`` of a capture, with their cameras.
 
-    ``images`` ``(V, height, width, 4)``, float32, holds linear colours multiplied by alpha, and alpha in [0, 1].
+    ``pixels``, uint32, holds all images one after the other, row by row: ``(n, 1)`` with four bytes a pixel (sRGB and
+    alpha), or ``(n, 2)`` with four numbers in half precision (linear, multiplied by alpha). The pixels of view i begin
+    at ``offsets[i]``; ``sizes[i]`` holds its height and width. :meth:`image` decodes a view.
+
     ``poses`` ``(V, 4, 4)``, float64, map camera to world. ``focal`` and ``centre``, ``(V, 2)``, are in pixels, the
     centre from the upper left corner. ``names`` are those of the image files.
 
     ``has_alpha`` is false if an image without alpha counts as opaque. ``box`` ``(2, 3)`` holds the lower and the upper
-    corner of the captured objects if the file has an ``aabb`` (as of instant-ngp), else it is ``None``. ``digest`` is a
-    SHA-256 of everything.
+    corner of the captured objects if the file has an ``aabb``, or those of most points of a model of COLMAP whose
+    images have no alpha; else it is ``None``.
+
+    ``mask``, bool ``(n,)``, is false for pixels that do not count: those that a mask excludes, and those that an
+    undistorted photograph does not show. ``None``: all count. ``notes`` are sentences for the user; ``settings`` are
+    recorded in the file of a fitted field.
     """
 
-    images: np.ndarray
+    pixels: np.ndarray
+    offsets: np.ndarray
+    sizes: np.ndarray
     poses: np.ndarray
     focal: np.ndarray
     centre: np.ndarray
@@ -65,25 +60,54 @@ class CapturedViews:
     path: Path
     has_alpha: bool
     box: np.ndarray | None = None
-    digest: str = ""
+    split: str = "train"
+    mask: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+    settings: dict = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self.sizes)
 
     def chosen(self, numbers: np.ndarray) -> CapturedViews:
-        """Return the views with these ``numbers`` alone."""
+        """Return the views with these ``numbers`` alone; the pixels are shared."""
         return dataclasses.replace(
-            self, images=self.images[numbers], poses=self.poses[numbers], focal=self.focal[numbers],
-            centre=self.centre[numbers], names=tuple(self.names[i] for i in numbers),
+            self, offsets=self.offsets[numbers], sizes=self.sizes[numbers], poses=self.poses[numbers],
+            focal=self.focal[numbers], centre=self.centre[numbers], names=tuple(self.names[i] for i in numbers),
         )  # fmt: skip
 
-    @property
-    def height(self) -> int:
-        return self.images.shape[1]
+    def stored(self, view: int) -> np.ndarray:
+        """Return the image of a view ``(height, width, 4)`` as it is kept: uint8 or float16, not a copy."""
+        height, width = self.sizes[view]
+        words = self.pixels[self.offsets[view] : self.offsets[view] + height * width]
+        return words.view(np.uint8 if words.shape[1] == 1 else np.float16).reshape(height, width, 4)
+
+    def image(self, view: int) -> np.ndarray:
+        """Return the image of a view ``(height, width, 4)``, float32: linear, multiplied by alpha, and alpha."""
+        return decoded(self.stored(view))
+
+    def counted(self, view: int) -> np.ndarray:
+        """Return which pixels of a view count, bool ``(height, width)``."""
+        height, width = self.sizes[view]
+        if self.mask is None:
+            return np.ones((height, width), bool)
+        return self.mask[self.offsets[view] : self.offsets[view] + height * width].reshape(height, width)
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """SHA-256 of everything: images as float32, names, cameras, box and mask."""
+        same = (self.sizes == self.sizes[0]).all()
+        shape = [len(self), *self.sizes[0].tolist(), 4] if same else self.sizes.tolist()
+        digest = hashlib.sha256(json.dumps([self.split, shape, self.names, self.has_alpha]).encode())
+        for view in range(len(self)):
+            digest.update(self.image(view))
+        for array in (self.poses, self.focal, self.centre, self.box, self.mask):
+            digest.update(b"" if array is None else np.ascontiguousarray(array))
+        return digest.hexdigest()
 
     @property
-    def width(self) -> int:
-        return self.images.shape[2]
+    def mean_pixels(self) -> float:
+        """Mean number of pixels of a view."""
+        return float(self.sizes.prod(axis=1).mean())
 
     @property
     def origins(self) -> np.ndarray:
@@ -91,119 +115,127 @@ class CapturedViews:
         return self.poses[:, :3, 3]
 
 
-def load_views(folder: str | os.PathLike, split: str = "train", most: int | None = None) -> CapturedViews:
+def load_views(
+    folder: str | os.PathLike, split: str = "train", most: int | None = None, progress: bool = False
+) -> CapturedViews:
     """Read the views of a ``split``: "train", "test" or "val".
 
     The file is ``transforms_SPLIT.json``, or ``transforms.json`` with the lists ``train_filenames``,
-    ``test_filenames`` and ``val_filenames``. If no file or list names the test views, every eighth view is one. Of more
-    than ``most`` views, so many are read, evenly spread in the list.
+    ``test_filenames`` and ``val_filenames``, or, without these, a model of COLMAP. If no file or list names the test
+    views, every eighth view is one. Of more than ``most`` views, so many are read, evenly spread in the list.
+    ``progress`` shows a bar on stderr.
     Raises :class:`ViewsError`, also for fewer than two training views, since one view does not show depth.
     """
     folder = Path(folder)
     if split not in SPLITS:
         raise ValueError(f'split: found "{split}", allowed are {", ".join(SPLITS)}')
-    file, content, frames = _frames(folder, split)
+    listed = _listed(folder, split)
+    file, frames = listed.file, listed.frames
     if split == "train" and len(frames) < 2:
         raise ViewsError(f"{file}: has {len(frames)} view for training, at least 2 are needed: one shows no depth")
     if not frames:
         raise ViewsError(f'{file}: has no views for the split "{split}"')
     if most is not None and most < len(frames):
         frames = [frames[i * len(frames) // most] for i in range(most)]
-    cameras = [_camera(file, content, frame) for frame in frames]
-    names, images, has_alpha = [], None, True
-    for i, ((_, numbers), frame) in enumerate(zip(cameras, frames, strict=True)):
-        path = _image_file(file, frame["file_path"])
-        image, alpha = _read(path)
+    paths = [image_file(listed.root, frame.image, file) for frame in frames]
+    images = _Images(len(paths), 2 if any(map(is_linear, paths)) else 1)
+    with progress_bar("views", len(paths), "images", progress) as bar:
+        for path, frame in zip(paths, frames, strict=True):
+            images.add(path, frame, listed)
+            bar.update()
+    notes = []
+    if images.undistorted:
+        count = "all" if images.undistorted == len(paths) else f"{images.undistorted} of {len(paths)}"
+        notes.append(f"{count} images have a lens distortion and were undistorted")
+    return CapturedViews(
+        pixels=images.pixels[: images.count],
+        offsets=np.cumsum([0, *(height * width for height, width in images.sizes)])[:-1],
+        sizes=np.array(images.sizes),
+        poses=np.stack([frame.pose for frame in frames]),
+        focal=np.array(images.focal),
+        centre=np.array(images.centre),
+        names=tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in paths),
+        path=folder,
+        has_alpha=images.has_alpha,
+        box=_box(listed, images.has_alpha),
+        split=split,
+        mask=images.mask(),
+        notes=tuple(notes),
+        settings=listed.settings,
+    )
+
+
+def _listed(folder: Path, split: str) -> FrameList:
+    """Return the list of the views of a split: in JSON if there is such a file, else in a COLMAP model."""
+    if not any(folder.glob("transforms*.json")):
+        model = model_folder(folder)
+        if model is not None:
+            return colmap_frames(folder, model, split)
+    return listed_frames(folder, split)
+
+
+def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:
+    """Return the box of a list of views or, if no alpha shows where the objects are, that of most of its points."""
+    if listed.box is not None or has_alpha or listed.points is None or not len(listed.points):
+        return listed.box
+    lower, upper = np.percentile(listed.points, OUTLIERS, axis=0)
+    margin = POINTS_MARGIN * (upper - lower).max()
+    return np.stack([lower - margin, upper + margin])
+
+
+class _Images:
+    """Images of a capture while they are read: arrays and lists of :class:`CapturedViews`."""
+
+    def __init__(self, views: int, words: int):
+        self.views, self.pixels, self.count = views, np.empty((0, words), np.uint32), 0
+        self.sizes, self.focal, self.centre, self.masks = [], [], [], []
+        self.has_alpha, self.undistorted = True, 0
+
+    def add(self, path: Path, frame: Frame, listed: FrameList) -> None:
+        """Read an image and its mask, and undistort them."""
+        numbers, (image, has_alpha) = frame.numbers, read_image(path)
         height, width = image.shape[:2]
         expected = numbers.get("w", width), numbers.get("h", height)
         if expected != (width, height):
             raise ViewsError(
-                f"{path}: has {width} × {height} pixels, {file} says {expected[0]:g} × {expected[1]:g}, to which its "
-                f"focal lengths refer"
+                f"{path}: has {width} × {height} pixels, {listed.file} says {expected[0]:g} × {expected[1]:g}, to "
+                f"which its focal lengths refer"
             )
-        if images is None:
-            images = np.empty((len(frames), *image.shape), np.float32)
-        elif image.shape != images.shape[1:]:
-            sizes = " and ".join(f"{a.shape[1]} × {a.shape[0]}" for a in (images[0], image))
-            raise ViewsError(f"{path}: has another size than {names[0]} ({sizes} pixels), all need the same")
-        images[i] = image
-        names.append(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
-        has_alpha &= alpha
-    focal = np.array([_focal(numbers, width, height) for _, numbers in cameras])
-    centre = np.array([(numbers.get("cx", width / 2), numbers.get("cy", height / 2)) for _, numbers in cameras])
-    poses, box = np.stack([pose for pose, _ in cameras]), _box(file, content)
-    digest = hashlib.sha256(json.dumps([split, images.shape, names, has_alpha]).encode())
-    for array in (images, poses, focal, centre, *([] if box is None else [box])):
-        digest.update(np.ascontiguousarray(array))
-    return CapturedViews(images, poses, focal, centre, tuple(names), folder, has_alpha, box, digest.hexdigest())
+        focal = _focal(numbers, width, height)
+        centre = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
+        mask = None
+        if frame.mask is not None:
+            mask = read_mask(image_file(listed.root, frame.mask, listed.file), image, path)
+        lens = tuple(numbers.get(name, 0.0) for name in DISTORTION)
+        if any(lens):
+            image, mask = undistorted(image, mask, focal, centre, lens)
+            self.undistorted += 1
+        self.sizes.append((height, width))
+        self.focal.append(focal)
+        self.centre.append(centre)
+        self.masks.append(None if mask is None or mask.all() else mask)
+        self.has_alpha &= has_alpha
+        self._store(image)
 
+    def _store(self, image: np.ndarray) -> None:
+        words, size = self.pixels.shape[1], image.shape[0] * image.shape[1]
+        end = self.count + size
+        if end > len(self.pixels):  # the first time, or if a larger image follows: memory that nobody writes is free
+            grown = aligned((self.count + (self.views - len(self.sizes) + 1) * size, words), np.uint32)
+            grown[: self.count] = self.pixels[: self.count]
+            self.pixels = grown
+        stored = image if words == 1 else half_floats(image)
+        self.pixels[self.count : end] = stored.reshape(-1).view(np.uint32).reshape(-1, words)
+        self.count = end
 
-def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
-    """Return the file that lists the views of a split, its content, and the entries of these views."""
-    if not folder.is_dir():
-        raise ViewsError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
-    listed_split, train, single = (folder / f"transforms{s}.json" for s in (f"_{split}", "_train", ""))
-    if listed_split.is_file():
-        content, frames = _parse(listed_split)
-        if split == "train" and not (folder / "transforms_test.json").is_file():
-            frames = [f for i, f in enumerate(frames) if i % EVERY or len(frames) == 1]
-        return listed_split, content, frames
-    if train.is_file():
-        if split == "test":
-            content, frames = _parse(train)
-            return train, content, frames[::EVERY]
-        raise ViewsError(f"{listed_split}: no such file")
-    if not single.is_file():
-        raise ViewsError(f"{folder}: holds no views: neither transforms_train.json nor transforms.json is there")
-    content, frames = _parse(single)
-    lists = {s: content[f"{s}_filenames"] for s in SPLITS if f"{s}_filenames" in content}
-    if not lists:
-        if split == "val":
-            raise ViewsError(f'{single}: has no list "val_filenames"')
-        wanted = [f for i, f in enumerate(frames) if (i % EVERY == 0) == (split == "test")]
-        return single, content, frames if len(frames) == 1 else wanted
-    if split not in lists:
-        raise ViewsError(f'{single}: has no list "{split}_filenames", only those of {", ".join(lists)}')
-    listed = {frame["file_path"]: frame for frame in frames}
-    if not isinstance(lists[split], list):
-        raise ViewsError(f'{single}: "{split}_filenames" is {lists[split]!r:.40}, expected a list')
-    for name in lists[split]:
-        if name not in listed:
-            raise ViewsError(f'{single}: "{split}_filenames" names {name!r:.60}, which is not among the frames')
-    return single, content, [listed[name] for name in lists[split]]
-
-
-def _parse(file: Path) -> tuple[dict, list[dict]]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as e:
-        raise ViewsError(f"{file}: is not valid JSON ({reason(e)})") from None
-    except OSError as e:
-        raise ViewsError(f"{file}: cannot be read ({reason(e)})") from None
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames:
-        raise ViewsError(f'{file}: has no "frames", expected a list of views')
-    for i, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
-            raise ViewsError(f'{file}: frame {i} has no "file_path", expected the name of an image')
-        if "mask_path" in frame:
-            raise ViewsError(f'{file}: frame {i} has a "mask_path", masks are not supported: make them alpha')
-    return content, frames
-
-
-def _box(file: Path, content: dict) -> np.ndarray | None:
-    if "aabb" not in content:
-        return None
-    try:
-        box = np.array(content["aabb"], np.float64)
-    except (TypeError, ValueError):
-        box = np.zeros(0)
-    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
-        raise ViewsError(
-            f'{file}: has the "aabb" {content["aabb"]!r:.60}, expected two corners, the lower one first: '
-            f"[[x, y, z], [x, y, z]]"
+    def mask(self) -> np.ndarray | None:
+        """Return the masks of all images one after the other, or ``None`` if all pixels count."""
+        if all(mask is None for mask in self.masks):
+            return None
+        whole = (
+            np.ones(h * w, bool) if m is None else m.ravel() for m, (h, w) in zip(self.masks, self.sizes, strict=True)
         )
-    return box
+        return np.concatenate(list(whole))
 
 
 def _focal(numbers: dict[str, float], width: int, height: int) -> tuple[float, float]:
@@ -212,133 +244,3 @@ def _focal(numbers: dict[str, float], width: int, height: int) -> tuple[float, f
     if "fl_y" in numbers or "fl_x" in numbers or "camera_angle_y" not in numbers:
         return fx, numbers.get("fl_y", fx)
     return fx, height / 2 / np.tan(numbers["camera_angle_y"] / 2)
-
-
-def _camera(file: Path, content: dict, frame: dict) -> tuple[np.ndarray, dict[str, float]]:
-    """Return the pose of a frame, ``(4, 4)``, camera to world, and the numbers of its pinhole that the file gives."""
-    where = f'{file}: frame "{frame["file_path"]}"'
-    entries = {**{k: v for k, v in content.items() if k != "frames"}, **frame}
-    model = entries.get("camera_model", "PINHOLE")
-    if model not in PINHOLES or entries.get("is_fisheye"):
-        model = model if model not in PINHOLES else "fisheye"
-        raise ViewsError(
-            f"{where} has the camera model {model!r:.40}, allowed are pinholes without distortion "
-            f"({', '.join(PINHOLES)}): undistort the images first"
-        )
-    numbers = {}
-    for name in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", *DISTORTION):
-        value = entries.get(name)
-        if value is None:
-            continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-            raise ViewsError(f'{where} has the "{name}" {value!r:.40}, expected a number')
-        numbers[name] = float(value)
-    for name in DISTORTION:
-        if numbers.get(name, 0.0) != 0.0:
-            raise ViewsError(f'{where} has a distortion ("{name}" is {numbers[name]:g}): undistort the images first')
-    if not {"fl_x", "camera_angle_x"} & set(numbers):
-        raise ViewsError(f'{where} has no focal length: neither "camera_angle_x" nor "fl_x" is given')
-    for names, limit, allowed in (
-        (("fl_x", "fl_y", "w", "h"), np.inf, "a number > 0"),
-        (("camera_angle_x", "camera_angle_y"), np.pi, "radians between 0 and π"),
-    ):
-        for name in names:
-            if name in numbers and not 0 < numbers[name] < limit:
-                raise ViewsError(f'{where} has the "{name}" {numbers[name]:g}, expected {allowed}')
-    return _pose(where, frame.get("transform_matrix")), numbers
-
-
-def _pose(where: str, matrix) -> np.ndarray:
-    """Return a ``transform_matrix`` as a rigid motion, ``(4, 4)``."""
-    if matrix is None:
-        raise ViewsError(f'{where} has no "transform_matrix"')
-    try:
-        pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
-        raise ViewsError(f"{where} has a transform_matrix that is not a matrix of numbers") from None
-    if pose.shape == (3, 4):
-        pose = np.vstack([pose, [0, 0, 0, 1]])
-    if pose.shape != (4, 4):
-        raise ViewsError(f"{where} has a transform_matrix of the shape {pose.shape}, expected (4, 4)")
-    if not np.isfinite(pose).all():
-        raise ViewsError(f"{where} has a transform_matrix with NaN or infinite numbers")
-    if np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID:
-        raise ViewsError(f"{where} has a transform_matrix whose last row is not 0, 0, 0, 1")
-    rotation = pose[:3, :3]
-    lengths = np.linalg.norm(rotation, axis=0)
-    if np.abs(lengths - 1).max() > RIGID:
-        text = ", ".join(f"{x:.4g}" for x in lengths)
-        raise ViewsError(f"{where} has a transform_matrix that scales (columns of length {text}), a rotation is needed")
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID:
-        raise ViewsError(f"{where} has a transform_matrix that shears, a rotation is needed")
-    if np.linalg.det(rotation) < 0:
-        raise ViewsError(f"{where} has a transform_matrix that mirrors, a rotation is needed")
-    return pose
-
-
-def _image_file(file: Path, name: str) -> Path:
-    """Return the path of the image ``name`` in a list of views."""
-    path = file.parent / name
-    for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
-        if candidate.is_file():
-            return candidate
-    more = "" if path.suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
-    raise ViewsError(f"{path}: no such image{more}, {file.name} names it")
-
-
-def _read(path: Path) -> tuple[np.ndarray, bool]:
-    """Return an image ``(height, width, 4)``, linear and multiplied by alpha, and whether the file has alpha."""
-    encoded = path.suffix.lower() != ".exr"
-    try:
-        values = _read_bytes(path) if encoded else _read_exr(path)
-    except (ViewsError, ImportError):
-        raise
-    except Exception as e:  # each decoder raises errors of its own for a damaged file
-        raise ViewsError(
-            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
-        ) from None
-    has_alpha = values.shape[2] in (2, 4)
-    colour, alpha = (values[..., :-1], values[..., -1:]) if has_alpha else (values, None)
-    if encoded:
-        colour = _LINEAR[colour]
-        alpha = None if alpha is None else alpha / np.float32(255)
-    elif not np.isfinite(values).all():
-        raise ViewsError(f"{path}: has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
-    image = np.ones((*values.shape[:2], 4), np.float32)
-    image[..., :3] = colour
-    if has_alpha:
-        image[..., 3:] = np.clip(alpha, 0, 1)
-        if encoded:
-            image[..., :3] *= image[..., 3:]
-    return image, has_alpha
-
-
-#: Byte → linear value.
-_LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
-
-
-def _read_bytes(path: Path) -> np.ndarray:
-    """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        if image.mode not in ("RGB", "RGBA", "L", "LA"):
-            if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
-                raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
-            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        elif image.mode in ("RGB", "L") and image.has_transparency_data:
-            image = image.convert("RGBA")
-        values = np.array(image)
-    return values.reshape(*values.shape[:2], -1)
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    """Return an EXR image, ``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
-    import OpenEXR
-
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(planes)), None)
-    if colours is None:
-        raise ViewsError(f"{path}: has the channels {', '.join(sorted(planes))}, expected R, G, B or Y, and A")
-    return np.stack([planes[name] for name in (*colours, *(("A",) if "A" in planes else ()))], axis=-1)

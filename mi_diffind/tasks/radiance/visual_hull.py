@@ -61,7 +61,7 @@ def hull(views: CapturedViews, lower, spacing: float, shape) -> np.ndarray:
     """Return the nodes ``lower + spacing · (i, j, k)`` of the visual hull: bool of this ``shape``.
 
     A node belongs to it if a share :data:`SIGHTED` of the views have it in sight and none of these shows it empty: a
-    pixel within a voxel of its projection has an alpha above 0.
+    pixel within a voxel of its projection has an alpha above 0, or does not count.
     """
     lower = np.asarray(lower, np.float64)
     axes = [a + spacing * np.arange(n) for a, n in zip(lower, shape, strict=True)]
@@ -79,7 +79,7 @@ def hull(views: CapturedViews, lower, spacing: float, shape) -> np.ndarray:
         near = 0.5 * np.median(ahead[front]) if front.any() else np.inf
         front &= ahead >= near
         reach = int(np.ceil(0.87 * spacing * views.focal[v].max() / near))
-        covered = maximum_filter(views.images[v, :, :, 3] > 0, size=2 * reach + 1)
+        covered = maximum_filter((views.stored(v)[..., 3] > 0) | ~views.counted(v), size=2 * reach + 1)
         height, width = covered.shape
         i, j = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
         sighted = front & (i >= 0) & (i < width) & (j >= 0) & (j < height)

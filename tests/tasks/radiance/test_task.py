@@ -6,6 +6,7 @@ import json
 import resource
 from pathlib import Path
 
+import captures
 import drjit as dr
 import numpy as np
 import pytest
@@ -331,14 +332,15 @@ def test_clusters(rng):
 
 def test_scores_of_a_known_error(folder):
     views = load_views(folder, "test")
-    pictures = [image.copy() for image in views.images]
+    truth = captures.images_of(views)
+    pictures = truth.copy()
     assert scores(pictures, views)["psnr_white_db"] > 100
-    covered = views.images[..., 3] > 0
+    covered = truth[..., 3] > 0
     share = covered.mean(axis=(1, 2))
     for image, where in zip(pictures, covered, strict=True):
         image[where] = [0, 0, 0, 1]
     found = scores(pictures, views)
-    black = [np.square(displayed(v))[c].mean() for v, c in zip(views.images, covered, strict=True)]
+    black = [np.square(displayed(v))[c].mean() for v, c in zip(truth, covered, strict=True)]
     assert found["psnr_foreground_db"] == pytest.approx(np.mean(-10 * np.log10(black)), abs=1e-3)
     assert found["psnr_white_db"] == pytest.approx(np.mean(-10 * np.log10(black * share)), abs=1e-3)
 
@@ -412,7 +414,8 @@ def test_a_view_that_sees_nothing(folder):
     away = look_at([0, 2.0, 0.1])
     away[:3, :3] = away[:3, :3] @ np.diag([-1, 1, -1])
     more = dataclasses.replace(
-        views, images=np.concatenate([views.images, np.zeros_like(views.images[:1])]),
+        views, pixels=np.concatenate([views.pixels, np.zeros((SIZE**2, 1), np.uint32)]),
+        offsets=np.append(views.offsets, len(views.pixels)), sizes=np.append(views.sizes, views.sizes[:1], axis=0),
         poses=np.concatenate([views.poses, away[None]]), focal=np.concatenate([views.focal, views.focal[:1]]),
         centre=np.concatenate([views.centre, views.centre[:1]]), names=(*views.names, "away.png"),
     )  # fmt: skip

@@ -1,0 +1,133 @@
+"""Image files of captures: PNG and JPEG as bytes, EXR in half precision.
+
+PNG and JPEG hold sRGB, not multiplied by alpha; EXR holds linear values multiplied by alpha. An image without alpha is
+opaque everywhere.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DiffindError, reason
+from ...srgb import from_linear, to_linear
+
+#: Extensions tried in turn for an image name without one.
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
+
+#: Byte of sRGB → linear value, and byte of alpha → share.
+LINEAR, SHARE = to_linear(np.arange(256) / 255).astype(np.float32), np.arange(256, dtype=np.float32) / np.float32(255)
+
+#: Largest number in half precision.
+LARGEST = 65504.0
+
+
+class ViewsError(DiffindError, ValueError):
+    """Error for unusable images or poses; the message is one sentence that names the file and the fault."""
+
+
+def image_file(root: Path, name: str, file: Path) -> Path:
+    """Return the path of an image in the folder ``root``, which the ``file`` with a list of views names."""
+    path = root / name
+    for candidate in (path, *(path.with_name(path.name + e) for e in EXTENSIONS)):
+        if candidate.is_file():
+            return candidate
+    more = "" if path.suffix.lower() in EXTENSIONS else f", nor with {', '.join(EXTENSIONS)}"
+    raise ViewsError(f"{path}: no such image{more}, {file.name} names it")
+
+
+def is_linear(path: Path) -> bool:
+    """Return whether an image file holds linear values."""
+    return path.suffix.lower() == ".exr"
+
+
+def read_image(path: Path) -> tuple[np.ndarray, bool]:
+    """Return an image ``(height, width, 4)`` as the file has it, and whether the file has alpha.
+
+    That is uint8, or float32 for EXR. Raises :class:`ViewsError`.
+    """
+    encoded = not is_linear(path)
+    try:
+        values = _read_bytes(path) if encoded else _read_exr(path)
+    except (ViewsError, ImportError):
+        raise
+    except Exception as e:  # each decoder raises errors of its own for a damaged file
+        raise ViewsError(
+            f"{path}: cannot be read as an image, it is damaged or of an unknown format ({reason(e)})"
+        ) from None
+    if not encoded and not np.isfinite(values).all():
+        raise ViewsError(f"{path}: has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
+    has_alpha = values.shape[2] in (2, 4)
+    image = np.full((*values.shape[:2], 4), 255 if encoded else 1, values.dtype)
+    image[..., :3] = values[..., :-1] if has_alpha else values
+    if has_alpha:
+        image[..., 3] = values[..., -1] if encoded else np.clip(values[..., -1], 0, 1)
+    return image, has_alpha
+
+
+def half_floats(image: np.ndarray) -> np.ndarray:
+    """Return an image of :func:`read_image` in half precision: linear and multiplied by alpha."""
+    values = decoded(image) if image.dtype == np.uint8 else image
+    return np.clip(values, -LARGEST, LARGEST).astype(np.float16)
+
+
+def decoded(image: np.ndarray) -> np.ndarray:
+    """Return an image ``(…, 4)`` of bytes or halves as float32: linear colours multiplied by alpha, and alpha."""
+    if image.dtype != np.uint8:
+        return image.astype(np.float32)
+    alpha = SHARE[image[..., 3:]]
+    return np.concatenate([LINEAR[image[..., :3]] * alpha, alpha], axis=-1)
+
+
+def encoded(image: np.ndarray) -> np.ndarray:
+    """Return an image ``(…, 4)`` of linear colours multiplied by alpha, and alpha, as bytes, see :func:`decoded`."""
+    alpha = image[..., 3:]
+    straight = image[..., :3] / np.where(alpha > 0, alpha, 1)
+    shown = from_linear(np.clip(straight, 0, 1))
+    return np.rint(255 * np.concatenate([shown, np.clip(alpha, 0, 1)], axis=-1)).astype(np.uint8)
+
+
+def read_mask(path: Path, image: np.ndarray, image_path: Path) -> np.ndarray:
+    """Return the mask of an image, bool ``(height, width)``: true where the file is not 0.
+
+    Raises :class:`ViewsError`, also if the sizes differ.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            mask = np.array(opened.convert("L")) > 0
+    except Exception as e:
+        raise ViewsError(f"{path}: cannot be read as a mask ({reason(e)})") from None
+    if mask.shape != image.shape[:2]:
+        sizes = " × ".join(map(str, mask.shape[::-1])), " × ".join(map(str, image.shape[1::-1]))
+        raise ViewsError(f"{path}: has {sizes[0]} pixels, its image {image_path.name} has {sizes[1]}")
+    return mask
+
+
+def _read_bytes(path: Path) -> np.ndarray:
+    """Return an image of 8 bits, ``(height, width, 1 to 4)``, uint8."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        if image.mode not in ("RGB", "RGBA", "L", "LA"):
+            if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "1", "F", "I") or image.mode.startswith("I;"):
+                raise ViewsError(f"{path}: has pixels of the mode {image.mode}, allowed are 8 bits of grey or RGB")
+            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+        elif image.mode in ("RGB", "L") and image.has_transparency_data:
+            image = image.convert("RGBA")
+        values = np.array(image)
+    return values.reshape(*values.shape[:2], -1)
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    """Return an EXR image, ``(height, width, 1 to 4)``, float32: R, G, B or Y, and A."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    colours = next((c for c in (("R", "G", "B"), ("Y",)) if set(c) <= set(planes)), None)
+    if colours is None:
+        raise ViewsError(f"{path}: has the channels {', '.join(sorted(planes))}, expected R, G, B or Y, and A")
+    return np.stack([planes[name] for name in (*colours, *(("A",) if "A" in planes else ()))], axis=-1)

@@ -1,0 +1,200 @@
+"""Lists of views in JSON: those of NeRF's Blender data, of nerfstudio and of instant-ngp.
+
+Two layouts are read: ``transforms_train.json``, ``transforms_test.json`` and ``transforms_val.json`` of NeRF's Blender
+data (Mildenhall et al. 2020), and the ``transforms.json`` of nerfstudio and instant-ngp. Poses map camera to world; a
+camera looks along −z with y up. Transforms that nerfstudio has already applied to the poses (``applied_transform``,
+``applied_scale``) are not undone.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import reason
+from .image_files import ViewsError
+from .lenses import DISTORTION
+
+SPLITS = ("train", "test", "val")
+
+#: Tolerance of the columns of a rotation: lengths against 1, and dot products against 0.
+RIGID = 1e-3
+
+#: Interval of the test views in a list without splits, beginning with the first view (as in LLFF's data).
+EVERY = 8
+
+#: Camera models that are read; a distortion may be 0.
+CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view in a list: the name of its image, pose ``(4, 4)``, camera to world, and the ``numbers`` of its camera.
+
+    The numbers have the names of nerfstudio: w, h, fl_x, fl_y, cx, cy, camera_angle_x, camera_angle_y, k1 to k6, p1 and
+    p2. ``mask`` names a mask.
+    """
+
+    image: str
+    pose: np.ndarray
+    numbers: dict[str, float]
+    mask: str | None = None
+
+
+@dataclass(frozen=True)
+class FrameList:
+    """Views of a split: the ``file`` that lists them, the folder of their images, and what else the file says.
+
+    ``box`` ``(2, 3)`` holds two corners; ``points`` ``(n, 3)`` lie on surfaces. ``settings`` are those that a fitted
+    field records.
+    """
+
+    file: Path
+    root: Path
+    frames: list[Frame]
+    box: np.ndarray | None = None
+    points: np.ndarray | None = None
+    settings: dict = field(default_factory=dict)
+
+
+def listed_frames(folder: Path, split: str) -> FrameList:
+    """Return the views of a ``split`` that the JSON files in a folder list. Raises :class:`ViewsError`."""
+    file, content, frames = _frames(folder, split)
+    names = ("applied_transform", "applied_scale")
+    return FrameList(
+        file, file.parent, [_camera(file, content, frame) for frame in frames], _box(file, content),
+        settings={name: content[name] for name in names if name in content},
+    )  # fmt: skip
+
+
+def _frames(folder: Path, split: str) -> tuple[Path, dict, list[dict]]:
+    """Return the file that lists the views of a split, its content, and the entries of these views."""
+    if not folder.is_dir():
+        raise ViewsError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
+    listed_split, train, single = (folder / f"transforms{s}.json" for s in (f"_{split}", "_train", ""))
+    if listed_split.is_file():
+        content, frames = _parse(listed_split)
+        if split == "train" and not (folder / "transforms_test.json").is_file():
+            frames = [f for i, f in enumerate(frames) if i % EVERY or len(frames) == 1]
+        return listed_split, content, frames
+    if train.is_file():
+        if split == "test":
+            content, frames = _parse(train)
+            return train, content, frames[::EVERY]
+        raise ViewsError(f"{listed_split}: no such file")
+    if not single.is_file():
+        raise ViewsError(
+            f"{folder}: holds no views: neither transforms_train.json nor transforms.json, nor a COLMAP model in "
+            f"sparse/0"
+        )
+    content, frames = _parse(single)
+    lists = {s: content[f"{s}_filenames"] for s in SPLITS if f"{s}_filenames" in content}
+    if not lists:
+        if split == "val":
+            raise ViewsError(f'{single}: has no list "val_filenames"')
+        wanted = [f for i, f in enumerate(frames) if (i % EVERY == 0) == (split == "test")]
+        return single, content, frames if len(frames) == 1 else wanted
+    if split not in lists:
+        raise ViewsError(f'{single}: has no list "{split}_filenames", only those of {", ".join(lists)}')
+    listed = {frame["file_path"]: frame for frame in frames}
+    if not isinstance(lists[split], list):
+        raise ViewsError(f'{single}: "{split}_filenames" is {lists[split]!r:.40}, expected a list')
+    for name in lists[split]:
+        if name not in listed:
+            raise ViewsError(f'{single}: "{split}_filenames" names {name!r:.60}, which is not among the frames')
+    return single, content, [listed[name] for name in lists[split]]
+
+
+def _parse(file: Path) -> tuple[dict, list[dict]]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as e:
+        raise ViewsError(f"{file}: is not valid JSON ({reason(e)})") from None
+    except OSError as e:
+        raise ViewsError(f"{file}: cannot be read ({reason(e)})") from None
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise ViewsError(f'{file}: has no "frames", expected a list of views')
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise ViewsError(f'{file}: frame {i} has no "file_path", expected the name of an image')
+        if not isinstance(frame.get("mask_path", ""), str):
+            raise ViewsError(f'{file}: frame {i} has a "mask_path" that is no name of a file')
+    return content, frames
+
+
+def _box(file: Path, content: dict) -> np.ndarray | None:
+    if "aabb" not in content:
+        return None
+    try:
+        box = np.array(content["aabb"], np.float64)
+    except (TypeError, ValueError):
+        box = np.zeros(0)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        raise ViewsError(
+            f'{file}: has the "aabb" {content["aabb"]!r:.60}, expected two corners, the lower one first: '
+            f"[[x, y, z], [x, y, z]]"
+        )
+    return box
+
+
+def _camera(file: Path, content: dict, frame: dict) -> Frame:
+    where = f'{file}: frame "{frame["file_path"]}"'
+    entries = {**{k: v for k, v in content.items() if k != "frames"}, **frame}
+    model = entries.get("camera_model", "PINHOLE")
+    if model not in CAMERA_MODELS or entries.get("is_fisheye"):
+        model = model if model not in CAMERA_MODELS else "fisheye"
+        raise ViewsError(
+            f"{where} has the camera model {model!r:.40}, allowed are {', '.join(CAMERA_MODELS)}: undistort the images "
+            f"first"
+        )
+    numbers = {}
+    for name in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", *DISTORTION):
+        value = entries.get(name)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+            raise ViewsError(f'{where} has the "{name}" {value!r:.40}, expected a number')
+        numbers[name] = float(value)
+    if not {"fl_x", "camera_angle_x"} & set(numbers):
+        raise ViewsError(f'{where} has no focal length: neither "camera_angle_x" nor "fl_x" is given')
+    for names, limit, allowed in (
+        (("fl_x", "fl_y", "w", "h"), np.inf, "a number > 0"),
+        (("camera_angle_x", "camera_angle_y"), np.pi, "radians between 0 and π"),
+    ):
+        for name in names:
+            if name in numbers and not 0 < numbers[name] < limit:
+                raise ViewsError(f'{where} has the "{name}" {numbers[name]:g}, expected {allowed}')
+    pose = _pose(where, frame.get("transform_matrix"))
+    return Frame(frame["file_path"], pose, numbers, frame.get("mask_path") or None)
+
+
+def _pose(where: str, matrix) -> np.ndarray:
+    """Return a ``transform_matrix`` as a rigid motion, ``(4, 4)``."""
+    if matrix is None:
+        raise ViewsError(f'{where} has no "transform_matrix"')
+    try:
+        pose = np.array(matrix, np.float64)
+    except (TypeError, ValueError):
+        raise ViewsError(f"{where} has a transform_matrix that is not a matrix of numbers") from None
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0, 0, 0, 1]])
+    if pose.shape != (4, 4):
+        raise ViewsError(f"{where} has a transform_matrix of the shape {pose.shape}, expected (4, 4)")
+    if not np.isfinite(pose).all():
+        raise ViewsError(f"{where} has a transform_matrix with NaN or infinite numbers")
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID:
+        raise ViewsError(f"{where} has a transform_matrix whose last row is not 0, 0, 0, 1")
+    rotation = pose[:3, :3]
+    lengths = np.linalg.norm(rotation, axis=0)
+    if np.abs(lengths - 1).max() > RIGID:
+        text = ", ".join(f"{x:.4g}" for x in lengths)
+        raise ViewsError(f"{where} has a transform_matrix that scales (columns of length {text}), a rotation is needed")
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID:
+        raise ViewsError(f"{where} has a transform_matrix that shears, a rotation is needed")
+    if np.linalg.det(rotation) < 0:
+        raise ViewsError(f"{where} has a transform_matrix that mirrors, a rotation is needed")
+    return pose

@@ -1,0 +1,195 @@
+"""Photographs: lenses with a distortion, and models of COLMAP."""
+
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from captures import SIZE, change, pose, write_image, write_json
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from mi_diffind.tasks.radiance.views import ViewsError, load_views
+
+LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.003}
+SIDE = 64
+
+
+def shown_at(u, v, k1=0, k2=0, p1=0, p2=0, k3=0, k4=0, k5=0, k6=0):
+    """Where OpenCV says that a lens shows a point: ``cv2.projectPoints``, written out."""
+    r2 = u**2 + v**2
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    return (
+        u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u**2),
+        v * radial + p1 * (r2 + 2 * v**2) + 2 * p2 * u * v,
+    )
+
+
+def pattern(u, v):
+    """Linear colours of the directions (u, v, 1), ``(…, 3)``."""
+    return np.stack([0.5 + 0.4 * np.sin(4 * u), 0.5 + 0.4 * np.cos(5 * v), 0.5 + 0.4 * np.sin(3 * (u + v))], axis=-1)
+
+
+def photographs(folder, alpha=None, **lens):
+    """Two views of :func:`pattern` through a lens, written as nerfstudio writes them."""
+    (folder / "images").mkdir(exist_ok=True)
+    focal, centre = np.array([50.0, 55.0]), np.array([33.0, 30.5])
+    pixel = np.stack(np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5), axis=-1)
+    point = seen = (pixel - centre) / focal
+    for _ in range(200):  # the inverse, by fixed-point iterations
+        point = point + 0.5 * (seen - np.stack(shown_at(point[..., 0], point[..., 1], **lens), axis=-1))
+    colour = pattern(point[..., 0], point[..., 1])
+    srgb = np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
+    image = np.uint8(np.rint(255 * srgb))
+    if alpha is not None:
+        image = np.dstack([image, alpha])
+    for i in range(2):
+        Image.fromarray(image).save(folder / "images" / f"{i}.png")
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": pose(i)} for i in range(2)]
+    names = [frame["file_path"] for frame in frames]
+    write_json(
+        folder / "transforms.json", w=SIDE, h=SIDE, fl_x=focal[0], fl_y=focal[1], cx=centre[0], cy=centre[1],
+        camera_model="OPENCV", frames=frames, train_filenames=names, **lens,
+    )  # fmt: skip
+    u, v = np.moveaxis((pixel - centre) / focal, -1, 0)
+    return u, v
+
+
+@pytest.mark.parametrize("lens", [LENS, {"k1": 0.1, "k2": 0.02, "k3": 0.01, "k4": 0.05, "k5": 0.01, "k6": 0.002}])
+def test_photographs_of_a_lens_become_those_of_a_pinhole(tmp_path, lens):
+    u, v = photographs(tmp_path, **lens)
+    views = load_views(tmp_path)
+    assert views.notes == ("all images have a lens distortion and were undistorted",)
+    counted = views.counted(1)
+    x, y = shown_at(u, v, **lens)
+    x, y = 33 + 50 * x, 30.5 + 55 * y  # pixels of the photograph
+    np.testing.assert_array_equal(counted, (x >= 0) & (x <= SIDE) & (y >= 0) & (y <= SIDE))
+    assert counted.mean() > 0.85
+    error = np.abs(views.image(1)[..., :3] - pattern(u, v))
+    inside = (x > 1) & (x < SIDE - 1) & (y > 1) & (y < SIDE - 1)
+    assert error[inside].max() < 0.01 and not views.image(1)[~counted].any()
+    change(tmp_path, "transforms.json", **dict.fromkeys(lens, 0))
+    plain = load_views(tmp_path)
+    assert not plain.notes and plain.mask is None
+    assert np.abs(plain.image(1)[..., :3] - pattern(u, v))[inside].max() > 0.03
+
+
+def test_a_lens_that_turns_back_is_cut_there(tmp_path):
+    """r (1 − r²) has its maximum at the radius √⅓; farther out, the photograph would be seen mirrored."""
+    u, v = photographs(tmp_path)
+    change(tmp_path, "transforms.json", k1=-1.0)
+    counted = load_views(tmp_path).counted(0)
+    radius = np.hypot(u, v)
+    assert counted[radius < 0.57].all() and not counted[radius > 0.58].any()
+
+
+def test_alpha_and_masks_are_undistorted_too(tmp_path):
+    alpha = np.full((SIDE, SIDE), 255, np.uint8)
+    alpha[:, :20] = 0
+    u, v = photographs(tmp_path, alpha, **LENS)
+    mask = np.zeros((SIDE, SIDE), np.uint8)
+    mask[:40] = 1
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    change(tmp_path, "transforms.json", frame=1, mask_path="mask.png")
+    views = load_views(tmp_path)
+    x, y = shown_at(u, v, **LENS)
+    x, y = 33 + 50 * x, 30.5 + 55 * y
+    assert (views.image(0)[..., 3][x < 19] == 0).all() and (views.image(0)[..., 3][x > 21] == 1).all()
+    assert np.abs(views.image(0)[..., :3] - pattern(u, v))[x > 21].max() < 0.01
+    assert views.counted(0).all()
+    np.testing.assert_array_equal(views.counted(1), y < 40)
+
+
+# -- COLMAP -----------------------------------------------------------------------------------------------------------
+
+
+def quaternion(rotation):
+    """(w, x, y, z) of a rotation matrix."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return w, x, y, z
+
+
+@pytest.fixture
+def colmap(tmp_path):
+    """Ten views of a model as text, written line by line, and the poses that they should have."""
+    pytest.importorskip("pycolmap", reason="pycolmap reads COLMAP's models")
+    (tmp_path / "images" / "left").mkdir(parents=True)
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    poses, lines = [], []
+    for i in range(10):
+        write_image(tmp_path / "images" / "left" / f"{i}.png", i, channels=3)
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec([0.1 * i, 0.5, -0.2 * i]).as_matrix()
+        matrix[:3, 3] = 2 - i, 1, 4
+        poses.append(matrix)
+        world_to_camera = np.linalg.inv(matrix @ np.diag([1, -1, -1, 1]))  # y downwards, along z
+        numbers = *quaternion(world_to_camera[:3, :3]), *world_to_camera[:3, 3]
+        # Numbers of images are not in the order of names; each sees the points 1 and 2, two see 7
+        camera = " ".join(map(repr, map(float, numbers)))
+        seventh = 7 if i in (1, 2) else -1
+        lines.append(f"{100 - i} {camera} {1 + i % 2} left/{i}.png\n1 1 1 2 2 2 3 3 {seventh}\n")
+    model = tmp_path / "sparse" / "0"
+    (model / "cameras.txt").write_text("1 OPENCV 8 6 10 11 4.5 3.25 0 0 0 0\n2 SIMPLE_PINHOLE 8 6 9 4 3\n")
+    (model / "images.txt").write_text("# Image list\n" + "".join(lines))
+    tracks = " ".join(f"{100 - i} {{0}}" for i in range(10))
+    (model / "points3D.txt").write_text(
+        "".join(f"{n + 1} {x} {2 * x} {-x} 1 2 3 0.5 {tracks.format(n)}\n" for n, x in enumerate((-1, 3)))
+        + "7 100 100 100 1 2 3 0.5 98 2 99 2\n"  # two images only
+    )
+    return tmp_path, np.array(poses)
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_colmap_models(colmap, place):
+    folder, poses = colmap
+    binary = folder / "other"
+    binary.mkdir()
+    import pycolmap
+
+    pycolmap.Reconstruction(str(folder / "sparse" / "0")).write_binary(str(binary))
+    shutil.rmtree(folder / "sparse")
+    (folder / place).parent.mkdir(parents=True, exist_ok=True)
+    binary.rename(folder / place)
+    train, test = load_views(folder), load_views(folder, "test")
+    assert test.names == ("images/left/0.png", "images/left/8.png") and len(train) == 8
+    np.testing.assert_allclose(test.poses, poses[[0, 8]], atol=1e-9)
+    np.testing.assert_allclose(train.poses[:3], poses[1:4], atol=1e-9)
+    assert train.focal[:2].tolist() == [[9, 9], [10, 11]] and train.centre[:2].tolist() == [[4, 3], [4.5, 3.25]]
+    # 98% of the extents of two points, and a margin of 5% of the longest
+    np.testing.assert_allclose(train.box, [[-1.352, -2.312, -3.352], [3.352, 6.312, 1.352]], atol=1e-9)
+    with pytest.raises(ViewsError, match=r'has no views for the split "val"$'):
+        load_views(folder, "val")
+    for i in range(10):
+        write_image(folder / "images" / "left" / f"{i}.png", i)
+    assert load_views(folder).box is None
+
+
+def test_colmap_text_distortion_and_masks(colmap):
+    folder, poses = colmap
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    cameras.write_text("1 RADIAL 8 6 10 4.5 3.25 -0.1 0.02\n2 SIMPLE_RADIAL 8 6 9 4 3 0\n")
+    (folder / "masks" / "left").mkdir(parents=True)
+    Image.fromarray(np.zeros(SIZE, np.uint8)).save(folder / "masks" / "left" / "3.png.png")
+    views = load_views(folder)
+    assert views.notes == ("3 of 8 images have a lens distortion and were undistorted",)
+    np.testing.assert_allclose(views.poses[0], poses[1], atol=1e-9)
+    assert not views.counted(2).any() and views.counted(0).all()
+    write_json(folder / "transforms.json", frames=[])
+    with pytest.raises(ViewsError, match=r'transforms\.json: has no "frames"'):
+        load_views(folder)
+
+
+def test_colmap_models_that_are_refused(colmap, monkeypatch):
+    folder, _ = colmap
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    cameras.write_text("1 OPENCV_FISHEYE 8 6 10 11 4.5 3.25 0 0 0 0\n2 PINHOLE 8 6 9 9 4 3\n")
+    with pytest.raises(
+        ViewsError, match=r'image "left/2.png" has the camera model OPENCV_FISHEYE, allowed are SIMPLE_'
+    ):
+        load_views(folder)
+    cameras.write_text("1 OPENCV x\n")
+    with pytest.raises(ViewsError, match=r"sparse/0: cannot be read as a COLMAP model \("):
+        load_views(folder)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(ViewsError, match=r'sparse/0: is a COLMAP model, .* pip install "mi-diffind\[colmap\]"$'):
+        load_views(folder)
