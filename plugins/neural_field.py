@@ -274,7 +274,7 @@ def integrator() -> type:
 
         def _hold(self) -> None:
             """Keep all arrays that rays read as an attribute, for frozen functions."""
-            self.held = [array for placed in {self.placed, *self.groups} for array in placed.held()]
+            self.held = [array for placed in dict.fromkeys([self.placed, *self.groups]) for array in placed.held()]
             if self.lit:
                 self.held += [self.field_light.spheres, self.field_light.radiances]
 

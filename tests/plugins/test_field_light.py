@@ -189,6 +189,7 @@ def test_a_field_that_moves_or_changes_is_followed(mi_rgb, fields):
     params["it.to_world"] = mi.AffineTransform4f().translate([1, 0, 0])
     params["it.tables.colour"] = mi.TensorXf(np.float32(2 * np.array(RADIANCE)))
     params.update()
+    between = made.integrator().surfaces.between
     assert np.abs(np.array(between.spheres).reshape(-1, 4) - spheres - [1, 0, 0, 0]).max() < 1e-4
     assert np.abs(np.array(between.radiances) / radiances - 2).max() < 1e-3
 
