@@ -186,7 +186,7 @@ def _in_front_of(views: CapturedViews, opaque: list[int], background) -> Capture
             [] if opaque or background in (None, "scene") else ["all images have alpha: the background is not used"]
         )
         return dataclasses.replace(views, notes=(*views.notes, *unused))
-    chosen = backgrounds.NAMED.get(background, background)
+    chosen = backgrounds.NAMED[background] if isinstance(background, str) else background
     colour = chosen or backgrounds.border_colour(opaque, views.stored, views.counted)
     if colour is None:
         return views
