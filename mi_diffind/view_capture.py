@@ -16,6 +16,7 @@ import json
 import math
 import os
 import pickle
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,24 +26,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import __version__, compat, scenes, srgb
+from . import __version__, compat, scenes, splats, srgb
+from .capture_settings import CaptureSettings
 from .errors import DiffindError, UsageError, reason
 from .files import replacing, writable_folder, write_json
 from .interrupt import interruptible
 from .jobs import run_jobs
 from .plugins.support import footprint
-from .poses import frame_of, orbit_directions, pose, sphere_directions
+from .poses import frame_of, pose
 from .progress import progress_bar
 from .runtime import use_variant
-from .units import check_memory
-
-#: Bytes of memory for a sample of a pass and for the camera of a view, roughly.
-SAMPLE, VIEW = 512, 1024
-
-#: Shapes of the camera path.
-PATHS = ("sphere", "orbit")
-#: Formats of the images.
-FORMATS = ("png", "exr")
+from .task import FitRequest
 
 #: Samples of the whole image in one pass.
 PASS = 1 << 23
@@ -59,77 +53,15 @@ LARGEST = 65504.0
 #: Number of views of a contact sheet.
 SHOWN = 24
 
+#: Settings of the views that ``fit field`` renders of 3D Gaussians.
+SPLAT_VIEWS = {"views": 80, "test": 20, "resolution": 200}
+
 #: File that records the settings of a folder.
 RECORD = "capture.json"
 
 
 class CaptureError(DiffindError, RuntimeError):
     """A scene cannot be captured with these settings, or not in this folder; the message is one sentence."""
-
-
-@dataclass(frozen=True)
-class CaptureSettings:
-    """Settings of a capture: number and size of the views, samples, camera path.
-
-    ``views`` are for training, ``test`` further ones for tests: square images of ``resolution`` pixels with a field of
-    view ``fov`` (degrees) and ``spp`` samples a pixel. ``objects`` are the ids of the captured shapes (none: all
-    surfaces that do not shine); all other shapes only cast light and shadow on them. Cameras look at ``centre``
-    (default: the centre of the objects' box) from the distance ``radius`` (default: a sphere around the objects fills
-    the image). ``path``: "sphere", all over it, or "orbit", once around the axis ``up``. ``elevation``: the lowest and
-    the highest, degrees above the plane normal to ``up``; an orbit swings between them (default: −90, 90 for a sphere,
-    20, 20 for an orbit). ``format``: "png", as displayed, 8 bits, or "exr", linear half floats.
-    """
-
-    views: int = 60
-    test: int = 20
-    resolution: int = 160
-    spp: int = 256
-    fov: float = 40.0
-    centre: tuple[float, float, float] | None = None
-    radius: float | None = None
-    path: str = "sphere"
-    elevation: tuple[float, float] | None = None
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    objects: tuple[str, ...] = ()
-    seed: int = 0
-    format: str = "png"
-
-    def check(self) -> None:
-        """Raise ``ValueError`` for values that are not allowed."""
-        if self.path not in PATHS:
-            raise ValueError(f'path: found "{self.path}", allowed are {", ".join(PATHS)}')
-        if self.format not in FORMATS:
-            raise ValueError(f'format: found "{self.format}", allowed are {", ".join(FORMATS)}')
-        for name, least in (("views", 1), ("test", 0), ("resolution", 1), ("spp", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: found {getattr(self, name)}, allowed are whole numbers ≥ {least}")
-        check_memory("resolution", self.resolution, SAMPLE * self.resolution**2)
-        check_memory("views", self.views + self.test, VIEW * (self.views + self.test))
-        if not 0 < self.fov < 170:
-            raise ValueError(f"fov: found {self.fov:g}, allowed are degrees between 0 and 170")
-        if self.radius is not None and not 0 < self.radius < math.inf:
-            raise ValueError(f"radius: found {self.radius:g}, allowed are numbers > 0")
-        if self.centre is not None and not np.isfinite(self.centre).all():
-            raise ValueError("centre: found NaN or infinity, allowed are numbers")
-        if not np.isfinite(self.up).all() or not np.any(self.up):
-            raise ValueError("up: found no direction, allowed are three numbers that are not all 0")
-        low, high = self.elevations
-        if not -90 <= low <= high <= 90:
-            raise ValueError(
-                f"elevation: found {low:g} to {high:g}, allowed are degrees from −90 to 90, the lower first"
-            )
-
-    @property
-    def elevations(self) -> tuple[float, float]:
-        """Lowest and highest elevation, degrees: ``elevation`` or its default."""
-        return self.elevation or ((20.0, 20.0) if self.path == "orbit" else (-90.0, 90.0))
-
-    def directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return unit vectors from the centre to the cameras, ``(views, 3)`` and ``(test, 3)``; z is up."""
-        low, high = np.radians(self.elevations)
-        if self.path == "orbit":
-            return orbit_directions(self.views, self.test, low, high)
-        return sphere_directions(self.views, self.test, low, high, self.seed)
 
 
 @dataclass
@@ -220,28 +152,28 @@ def capture(
 ) -> Captured:
     """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
-    The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden.
+    The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden. It may
+    also be a PLY file of 3D Gaussians (:mod:`.splats`), of which ``box`` crops a part.
     ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
     ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers``
     processes share the views, or those of the Dask cluster ``scheduler``. The folder is created if its parent exists.
     Views of an earlier capture with the same settings of the same scene are kept, unless a dictionary holds objects
     that exist already; after Ctrl-C the current view is the last. Raises :class:`~mi_diffind.errors.UsageError` for bad
-    settings, :class:`CaptureError`, also for a folder with other settings, :class:`~mi_diffind.scenes.SceneError` and
-    :class:`~mi_diffind.files.OutputError`.
+    settings, :class:`CaptureError`, also for a folder with other settings, :class:`~mi_diffind.scenes.SceneError`,
+    :class:`~mi_diffind.splats.SplatsError` and :class:`~mi_diffind.files.OutputError`.
     """
     use_variant()
-    settings = _settings(given)
-    parsed = scenes.ParsedScene(scene, defines)
+    settings = _settings(scene, given)
+    subject = _subject(scene, defines, settings)
     folder = writable_folder(folder, create=True)
-    record = _record(parsed, settings)
+    record = _record(subject, settings)
     _check_record(folder, record)
-    loaded = _load(parsed)
-    box = bounds(loaded, settings.objects)
+    box = subject.bounds()
     centre = box.mean(axis=0) if settings.centre is None else np.array(settings.centre, np.float64)
-    radius = settings.radius or _reach(loaded, settings.objects, centre) / math.sin(math.radians(settings.fov) / 2)
+    radius = settings.radius or subject.reach(centre) / math.sin(math.radians(settings.fov) / 2)
     if not radius > 0:
-        raise CaptureError(f"{parsed.path}: the captured objects have no extent, --radius has to be given")
-    camera = CaptureCamera(loaded, settings)
+        raise CaptureError(f"{subject.path}: the captured objects have no extent, --radius has to be given")
+    camera = subject.camera(settings)
     write_json(folder / RECORD, record)
     splits, left = _plan(settings, centre, radius), []
     for split, views in splits.items():
@@ -250,7 +182,7 @@ def capture(
     total, start, rendered, opaque = sum(map(len, splits.values())), time.perf_counter(), 0, bool(left)
     _write_lists(folder, settings, splits, box)
     if left and (workers or scheduler):
-        views = _shared(scene, parsed, (settings, centre, radius), folder, left)
+        views = _shared(scene, subject, (settings, centre, radius), folder, left)
         outcomes = run_jobs(
             render_separately, views, workers, scheduler, progress, "capture", "view", total - len(left)
         )
@@ -273,6 +205,21 @@ def capture(
     return Captured(folder, files, total, rendered, seconds, radius, centre, box, opaque)
 
 
+def views_of_splats(request: FitRequest) -> Path:
+    """Capture the PLY file of 3D Gaussians that a field is to be fitted to, and return the folder of its views.
+
+    The folder ``NAME_views`` stands beside the output ``NAME.npz``; views that it holds already are kept. Raises as
+    :func:`capture` does.
+    """
+    path = Path(request.options["source"])
+    folder = request.folder / f"{(request.output or path).stem}_views"
+    captured = capture(path, folder, box=request.options["box"], progress=request.progress, **SPLAT_VIEWS)
+    print(captured, file=sys.stderr)
+    if captured.interrupted:
+        raise CaptureError(f"{folder}: has {len(captured.files)} of {captured.total} views, the same call continues")
+    return folder
+
+
 def _render(camera: CaptureCamera, splits: dict, folder: Path, split: str, i: int) -> bool:
     """Render a view, write it, and return whether it is opaque everywhere."""
     settings = camera.settings
@@ -281,11 +228,11 @@ def _render(camera: CaptureCamera, splits: dict, folder: Path, split: str, i: in
     return bool((image[..., 3] > 0.999).all())
 
 
-def _shared(scene, parsed: scenes.ParsedScene, given: tuple, folder: Path, left: list) -> dict[str, tuple]:
+def _shared(scene, subject: SceneSubject, given: tuple, folder: Path, left: list) -> dict[str, tuple]:
     """Return the jobs of :func:`render_separately`. Raises :class:`~mi_diffind.errors.UsageError`."""
-    source = scene if parsed.description else str(parsed.path.resolve())
+    source = scene if isinstance(scene, dict) else str(subject.path.resolve())
     try:
-        content = pickle.dumps((source, parsed.defines, *given, mi.variant()))
+        content = pickle.dumps((source, subject.record()["defines"], *given, mi.variant()))
     except Exception:  # of the objects in a dictionary, each has its own
         raise UsageError("workers: the scene holds objects of this process, a scene file is needed") from None
     return {_name(split, i, given[0]): (content, str(folder.resolve()), split, i) for split, i in left}
@@ -302,18 +249,67 @@ def render_separately(view: tuple[bytes, str, str, int]) -> bool:
 def _camera_of(content: bytes) -> tuple[CaptureCamera, dict]:
     scene, defines, settings, centre, radius, variant = pickle.loads(content)
     use_variant(variant)
-    camera = CaptureCamera(_load(scenes.ParsedScene(scene, defines)), settings)
-    return camera, _plan(settings, centre, radius)
+    return _subject(scene, defines, settings).camera(settings), _plan(settings, centre, radius)
 
 
-def _settings(given: dict) -> CaptureSettings:
+def _subject(scene, defines: Mapping | None, settings: CaptureSettings) -> SceneSubject | splats.SplatSubject:
+    """Return the subject of a capture. Raises :class:`~mi_diffind.errors.UsageError`."""
+    if not splats.is_splats(scene):
+        if settings.box is not None:
+            raise UsageError("box: given with a scene, allowed are PLY files of 3D Gaussians; objects names shapes")
+        return SceneSubject(scene, defines, settings.objects)
+    for name, value in (("defines", defines), ("objects", settings.objects)):
+        if value:
+            raise UsageError(f"{name}: given with the 3D Gaussians {scene}, allowed are scenes")
+    return splats.SplatSubject(scene, settings.box)
+
+
+class SceneSubject:
+    """Scene as the subject of a capture, of which ``objects`` are captured."""
+
+    def __init__(self, scene, defines: Mapping | None, objects: tuple[str, ...]):
+        self.parsed, self.objects = scenes.ParsedScene(scene, defines), objects
+        self.path = self.parsed.path
+
+    @functools.cached_property
+    def scene(self):
+        """Scene whose integrators hide its lights."""
+        return _load(self.parsed)
+
+    def record(self) -> dict:
+        """Return what the images depend on beside the settings."""
+        parsed, digest = self.parsed, hashlib.sha256(self.parsed.description.encode())
+        for file in parsed.files():
+            digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
+        return {
+            "scene": parsed.path.name,
+            "defines": dict(sorted(parsed.defines.items())),
+            "digest": digest.hexdigest(),
+        }
+
+    def bounds(self) -> np.ndarray:
+        """Return the corners ``(2, 3)`` of the captured objects' box."""
+        return bounds(self.scene, self.objects)
+
+    def reach(self, centre: np.ndarray) -> float:
+        """Return the radius of a sphere around a point that holds the captured objects."""
+        return _reach(self.scene, self.objects, centre)
+
+    def camera(self, settings: CaptureSettings) -> CaptureCamera:
+        """Return the camera of a capture with these settings."""
+        return CaptureCamera(self.scene, settings)
+
+
+def _settings(scene, given: dict) -> CaptureSettings:
     """Return the settings with the ``given`` fields. Raises :class:`~mi_diffind.errors.UsageError`."""
     allowed = [f.name for f in dataclasses.fields(CaptureSettings)]
     for name in given:
         if name not in allowed:
             raise UsageError(f'capture: found the argument "{name}", allowed are {", ".join(allowed)}')
-    names = ("centre", "elevation", "up", "objects")
+    names = ("centre", "elevation", "up", "objects", "box")
     tuples = {name: tuple(given[name]) for name in names if given.get(name) is not None}
+    if given.get("spp") is None:
+        tuples["spp"] = splats.SPP if splats.is_splats(scene) else CaptureSettings.spp
     settings = CaptureSettings(**{**given, **tuples})
     try:
         settings.check()
@@ -475,18 +471,13 @@ def _only(inner, shapes: list):
     return ObjectsOnly(mi.Properties("only"))
 
 
-def _record(parsed: scenes.ParsedScene, settings: CaptureSettings) -> dict:
+def _record(subject: SceneSubject | splats.SplatSubject, settings: CaptureSettings) -> dict:
     """Return the record of a folder: the settings, and everything else that its images depend on."""
-    digest = hashlib.sha256(parsed.description.encode())
-    for file in parsed.files():
-        digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
     return {
-        "scene": parsed.path.name,
         "settings": json.loads(json.dumps(dataclasses.asdict(settings))),
-        "defines": dict(sorted(parsed.defines.items())),
         "variant": mi.variant(),
         "versions": {"mitsuba": mi.__version__, "mi_diffind": __version__},
-        "digest": digest.hexdigest(),
+        **subject.record(),
     }
 
 

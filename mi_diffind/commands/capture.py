@@ -1,4 +1,4 @@
-"""``mi-diffind capture``: views of a scene from all sides with their poses, the input of a radiance field."""
+"""``mi-diffind capture``: views of a scene or of 3D Gaussians from all sides with their poses, for a radiance field."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ..arguments import WORKER_ARGUMENTS, add_arguments
 from ..files import writable_folder
 from .common import natural, positive, require_scene, scene_options, set_variant, verb
 
-HELP = "render views of a scene from all sides, with their poses"
+HELP = "render views of a scene, or of 3D Gaussians, from all sides, with their poses"
 
 EXAMPLE = "mi-diffind capture scene.xml -o views --objects statue --views 60"
 
@@ -16,7 +16,7 @@ EXAMPLE = "mi-diffind capture scene.xml -o views --objects statue --views 60"
 def add(commands) -> None:
     """Add the verb and its options to ``commands``, the subparsers of the command line."""
     sub = verb(commands, "capture", run, HELP, EXAMPLE)
-    sub.add_argument("scene", metavar="SCENE.xml")
+    sub.add_argument("scene", metavar="SCENE.xml", help="scene file, or SPLATS.ply, 3D Gaussians")
     sub.add_argument(
         "-o", "--output", required=True, metavar="FOLDER", help="folder of the views; an unfinished one is completed"
     )
@@ -50,10 +50,14 @@ def add(commands) -> None:
         "--objects", nargs="+", metavar="ID", default=(),
         help="shapes to capture (default: all but lights); the others only cast light and shadow",
     )  # fmt: skip
+    sub.add_argument(
+        "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="of 3D Gaussians, those inside, lower corner first (default: all but strays)",
+    )  # fmt: skip
     sub.add_argument("--format", choices=["png", "exr"], default="png", help="8 bits, or linear (default: png)")
     add_arguments(sub, WORKER_ARGUMENTS)
     scene_options(sub, rendering=False)
-    sub.add_argument("--spp", type=positive, default=256, help="samples per pixel (default: 256)")
+    sub.add_argument("--spp", type=positive, help="samples per pixel (default: 256; of 3D Gaussians: 4)")
     sub.add_argument("--seed", type=natural, default=0, help="seed of the random numbers (default: 0)")
 
 
@@ -69,7 +73,7 @@ def run(arguments) -> dict:
     from ..view_capture import capture
 
     names = ("views", "test", "resolution", "spp", "fov", "radius", "path", "seed", "format", "workers", "scheduler")
-    given = {name: getattr(arguments, name) for name in (*names, "centre", "elevation", "up", "objects")}
+    given = {name: getattr(arguments, name) for name in (*names, "centre", "elevation", "up", "objects", "box")}
     captured = capture(arguments.scene, arguments.output, defines=dict(arguments.defines), **given)
     print(captured)
     return {"scene": arguments.scene, **captured.figures}

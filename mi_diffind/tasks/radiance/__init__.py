@@ -11,6 +11,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
+from pathlib import Path
+
 from ... import units
 from ...arguments import Argument, checked, decibels, positive
 from ...task import Task
@@ -31,7 +35,8 @@ class RadianceField(Task):
     arguments = (
         Argument(
             "source", metavar="FOLDER",
-            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json) or COLMAP"
+            help="folder of views of mi-diffind capture, Blender, nerfstudio, instant-ngp (transforms*.json), COLMAP, "
+            "or SPLATS.ply: 3D Gaussians, of which views are rendered first"
         ),
         Argument(
             "--bytes", group="size", type=checked(units.parse_bytes), metavar="N",
@@ -55,12 +60,24 @@ class RadianceField(Task):
             "borders if it is one, else scene)"
         ),
         Argument("--grid", metavar="FILE", help="grid to compress; if the file does not exist, it is made"),
+        Argument(
+            "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+            help="of 3D Gaussians, those inside, lower corner first (default: all but strays)",
+        ),
     )  # fmt: skip
     decode_arguments = (
         Argument(
             "--resolution", type=positive, metavar="N", help="nodes along the longest side (default: the field's)"
         ),
     )
+
+    def fit(self, request):
+        source = request.options["source"]
+        if Path(source).suffix.lower() == ".ply":
+            # Captures stand above tasks: asked for by name, as plugins are
+            views = importlib.import_module("mi_diffind.view_capture").views_of_splats(request)
+            request = dataclasses.replace(request, options={**request.options, "source": views})
+        return super().fit(request)
 
     def allocate(self, table, dtype, storage=""):
         return {}

@@ -55,6 +55,8 @@ def check(request: FitRequest) -> None:
     options = request.options
     if options["source"] is None:
         raise UsageError("source: not given, a folder of views is needed")
+    if options["box"] is not None and Path(options["source"]).suffix.lower() != ".ply":
+        raise UsageError(f"--box: given with {options['source']}, allowed are PLY files of 3D Gaussians")
     sized = [name for name in ("bytes", "compression", "psnr") if options[name] is not None]
     if request.preset == "grid" and sized:
         raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
