@@ -81,8 +81,9 @@ def fit(request: FitRequest) -> Fitted:
     :class:`~mi_diffind.fitting.FittingError`.
     """
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
-    background = request.options.get("background")
-    session = FieldSession.load(request.types, request.options["source"], pixels, request.progress, background)
+    options = request.options
+    reading = {name: options.get(name) for name in ("background", "downscale")}
+    session = FieldSession.load(request.types, options["source"], pixels, progress=request.progress, **reading)
     return FieldFit(request, session).run()
 
 
@@ -119,6 +120,7 @@ class FieldFit:
             **request.recorded(result),
             "source": session.views.digest,
             **session.views.settings,
+            **({"downscale": options["downscale"]} if options.get("downscale") else {}),
             **request.paths(capture_path=options["source"], grid_path=options["grid"] or None),
             "warnings": warnings,
             **table.settings,

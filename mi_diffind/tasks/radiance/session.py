@@ -154,15 +154,15 @@ class FieldSession:
     pixels: float | None = None
 
     @staticmethod
-    def load(types, folder, pixels: float | None = None, progress: bool = False, background=None) -> FieldSession:
+    def load(types: ModuleType, folder, pixels: float | None = None, **reading) -> FieldSession:
         """Read the capture in a folder, of the held-out views so many that they have at most ``pixels``.
 
-        ``progress`` shows bars on stderr; ``background`` is that of :func:`.views.load_views`. Raises
-        :class:`.views.ViewsError`.
+        ``reading`` are further arguments of :func:`.views.load_views`. Raises :class:`.views.ViewsError`.
         """
-        views = load_views(folder, "train", progress=progress, background=background)
+        views = load_views(folder, "train", **reading)
         most = None if pixels is None else max(2, round(pixels / views.mean_pixels))
-        return FieldSession(types, views, *load_held_out(folder, most, progress, views.background), pixels)
+        reading["background"] = views.background or "scene"
+        return FieldSession(types, views, *load_held_out(folder, most, **reading), pixels)
 
     @functools.cached_property
     def images(self) -> ViewImages:
@@ -193,17 +193,16 @@ class FieldSession:
         return ViewImages(self.types, self.held_out.chosen(np.arange(watched) * count // watched))
 
 
-def load_held_out(folder, most: int | None = None, progress: bool = False, background=None) -> tuple:
+def load_held_out(folder, most: int | None = None, **reading) -> tuple[CapturedViews, bool]:
     """Return ``most`` test views of a capture and True or, if there are none, of its training views and False.
 
-    ``background`` is that of the training views (:class:`.CapturedViews`).
+    ``reading`` are further arguments of :func:`.views.load_views`.
     """
-    options = {"most": most, "progress": progress, "background": background or "scene"}
     try:
-        return load_views(folder, "test", **options), True
+        return load_views(folder, "test", most, **reading), True
     except ViewsError as e:
         try:
-            return load_views(folder, "train", **options), False
+            return load_views(folder, "train", most, **reading), False
         except ViewsError:
             raise e from None
 
