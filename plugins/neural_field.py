@@ -19,6 +19,7 @@ from .support import distance_shapes as sdf
 from .support import omissions, properties
 from .support.differentials import Differentials
 from .support.field_light import FieldLight, in_order
+from .support.joined_fields import grouped
 from .support.manual import shared_parts
 from .support.placed_fields import PlacedField, VariantLight, to_grid
 
@@ -111,8 +112,9 @@ visible in rough mirrors, in :monosp:`plastic` or through a :monosp:`mask`.
 **Spectral variants** treat the radiance as that of an emitter of this colour: upsampled, times D65. ``mono`` variants
 take the luminance. Polarised variants are not supported.
 
-**Several fields**, up to four, are nested in one another, with the integrator of surfaces in the innermost;
-``lit``, ``smooth_depth`` and ``aovs`` are those of the outermost. Their boxes may not overlap.
+**Several fields**, up to four, are nested in one another, with the integrator of surfaces in the innermost; ``lit``,
+``smooth_depth`` and ``aovs`` are those of the outermost. Where boxes overlap, densities and emissions add up. Rays take
+steps of half the smallest voxel there, and ``to_world`` of such fields has no derivatives.
 
 **Derivatives** with respect to the field's arrays and its ``to_world`` replay the rays (Vicini et al., *Path Replay
 Backpropagation*, SIGGRAPH 2021). They cover the radiance, alpha and the channels of ``aovs``. If the inner integrator
@@ -246,34 +248,35 @@ def integrator() -> type:
                 self.surfaces = self.nested.surfaces
             if len(self.fields) > MOST:
                 raise RuntimeError(f"found {len(self.fields)} nested fields, allowed are {MOST}")
-            self._check_overlaps()
             self.lit = props.get("lit", False)
             if not isinstance(self.lit, bool):
                 raise RuntimeError(f'parameter "lit": found {self.lit}, allowed are true and false')
-            self._connect()
-            self._hold()
+            self._group()
             self._warned = False
             omissions.watch(self)
             self._shapes = {name: tuple(values.shape) for name, values in self.placed.exposed.items()}
 
-        def _check_overlaps(self) -> None:
-            if any(self.placed.overlaps(other) for other in self.fields[1:]):
-                raise RuntimeError("the boxes of two nested fields overlap, allowed are boxes without a common volume")
+        def _group(self) -> None:
+            """Join fields whose boxes overlap, and show them to the integrator of surfaces if they light it.
 
-        def _connect(self) -> None:
-            """Show the fields to the integrator of surfaces, or hide those that a nested integrator has shown to it."""
+            Fields that a nested integrator has shown to it are hidden.
+            """
+            self.groups = grouped(self.fields)
             if self.lit and type(self.surfaces) is not path_footprint():
                 raise RuntimeError(
                     f'parameter "lit": the nested integrator {compat.integrator_name(self.surfaces)} does not see '
                     f"fields, allowed are path_footprint and none"
                 )
+            self.field_light = FieldLight(self.groups, self.light) if self.lit else None
             if isinstance(self.surfaces, path_footprint()):
-                self.surfaces.between = FieldLight(self.fields, self.light) if self.lit else None
+                self.surfaces.between = self.field_light
+            self._hold()
 
         def _hold(self) -> None:
             """Keep all arrays that rays read as an attribute, for frozen functions."""
-            between = self.surfaces.between if self.lit else None
-            self.held = self.placed.held() + ([between.spheres, between.radiances] if between is not None else [])
+            self.held = [array for placed in dict.fromkeys([self.placed, *self.groups]) for array in placed.held()]
+            if self.lit:
+                self.held += [self.field_light.spheres, self.field_light.radiances]
 
         @staticmethod
         def _inner(props: mi.Properties):
@@ -325,11 +328,12 @@ def integrator() -> type:
                     raise RuntimeError(f'parameter "tables.{name}": has the shape {shape}, expected {expected}')
             if not keys or "to_world" in keys:
                 self.placed.update()
-            if not all(key.startswith("tables.") for key in keys or ("",)):
-                self._check_overlaps()
-            if self.lit and self.surfaces.between is not None:
-                self.surfaces.between.update(arrays=any(key != "to_world" for key in keys or ("",)))
-            self._hold()
+            if all(key.startswith("tables.") for key in keys or ("",)):
+                if self.lit:
+                    self.field_light.update()
+                self._hold()
+            else:
+                self._group()
 
         def aov_names(self) -> list[str]:
             return list(self.aovs)
@@ -421,8 +425,9 @@ def integrator() -> type:
             with dr.suspend_grad():
                 film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
                 surfaces = self._surfaces_optimised(scene)
+                self._check_moving()
                 _, _, _, state = self.primal(scene, sampler.clone(), ray)
-                for placed in self.fields:
+                for placed in self.groups:
                     placed.start_forward()
                 light, alpha, aovs = self.replayed(dr.ADMode.Forward, scene, sampler, ray, state, surfaces)
                 return self._developed(film, spp, place, light * weight, alpha, aovs, ray.wavelengths)
@@ -431,6 +436,7 @@ def integrator() -> type:
             with dr.suspend_grad():
                 film, sampler, spp, ray, weight, place = self._begin(scene, sensor, seed, spp)
                 surfaces = self._surfaces_optimised(scene)
+                self._check_moving()
                 # The film is linear in light, alpha and channels, so that their values do not matter
                 with dr.resume_grad():
                     count = dr.width(ray)
@@ -455,6 +461,10 @@ def integrator() -> type:
             values = [params[key] for key in params.keys()]
             attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
             return any(compat.identity(v) not in field_arrays for v in attached)
+
+        def _check_moving(self) -> None:
+            if any(placed.position.moving() and placed not in self.groups for placed in self.fields):
+                raise RuntimeError('parameter "to_world": has no derivatives for a field that overlaps another one')
 
         def sample(self, mode, scene, sampler, ray, δL=None, δaovs=None, state_in=None, active=True, **kwargs):
             """Sample as ``ADIntegrator.sample`` does, for an integrator around this one, in the primal mode only."""
@@ -560,7 +570,7 @@ def integrator() -> type:
             """
             ray, active = path.ray, path.active
             first = path.count == 0
-            entered = [placed.enters(ray, ray.maxt, active) for placed in self.fields]
+            entered = [placed.enters(ray, ray.maxt, active) for placed in self.groups]
             met = active
             if not onward and "depth" not in self.aovs:
                 met = mi.Bool(False)
@@ -568,7 +578,7 @@ def integrator() -> type:
                     met |= crossed
             pi, far, solid = self._meet(scene, solids, ray, met, path.turned)
             through = mi.Float(1)
-            for placed, crossed in in_order(self.fields, entered):
+            for placed, crossed in in_order(self.groups, entered):
                 through = self._see(mode, path, placed, ray, far, crossed, first, through)
             if mode is None:
                 distance = dr.select(met & (pi.is_valid() | solid), far, 0)

@@ -20,7 +20,7 @@ LINES = 1 << 14
 class FieldLight:
     """Radiance fields between surfaces: emitters and occluders on straight segments, and emitters to be sampled.
 
-    ``fields`` are the :class:`.PlacedField` of a scene, from the outermost to the innermost. Directions are sampled
+    ``fields`` are the :class:`.PlacedField` of a scene, without common volumes. Directions are sampled
     towards :data:`SPHERES` spheres around places that send light: a sphere by its mean radiance times its solid angle,
     and uniform directions to it. The spheres only guide samples. Light outside of them is left to samples of BSDFs.
     """
@@ -29,15 +29,12 @@ class FieldLight:
         self.fields, self.light = fields, light
         self.update()
 
-    def update(self, arrays: bool = True) -> None:
-        """Follow a change of the fields' placements and, if ``arrays``, of their arrays."""
-        if arrays:
-            count = SPHERES // len(self.fields)
-            self._bounds = [bright_spheres(placed.field, count) for placed in self.fields]
-        rows = [
-            np.column_stack([placed.placement.world(b[:, :3]), b[:, 3:4] * placed.placement.size, b[:, 4:]])
-            for placed, b in zip(self.fields, self._bounds, strict=True)
-        ]
+    def update(self) -> None:
+        """Follow a change of the fields."""
+        rows = []
+        for placed in self.fields:
+            bright, placement = bright_spheres(placed.field, SPHERES // len(self.fields)), placed.placement
+            rows.append(np.column_stack([placement.world(bright[:, :3]), bright[:, 3] * placement.size, bright[:, 4]]))
         rows = np.concatenate([*rows, np.zeros((SPHERES, 5))])[:SPHERES].astype(np.float32)
         # Always as many, so that a frozen function takes other ones
         self.spheres = mi.Float(np.ascontiguousarray(rows[:, :4]).reshape(-1))

@@ -86,8 +86,7 @@ class PlacedField:
 
     def overlaps(self, other: PlacedField) -> bool:
         """Return whether the boxes of two fields have a volume in common, by the separating axis theorem."""
-        corners = [np.array(list(product(*zip(f.field.lower, f.field.upper, strict=True)))) for f in (self, other)]
-        points = [f.placement.world(c) for f, c in zip((self, other), corners, strict=True)]
+        points = corners(self), corners(other)
         axes = [self.placement.rotation.T, other.placement.rotation.T]
         crossed = np.cross(axes[0][:, None], axes[1][None]).reshape(-1, 3)
         for axis in (*axes[0], *axes[1], *crossed[np.linalg.norm(crossed, axis=1) > 1e-6]):
@@ -150,6 +149,12 @@ class PlacedField:
         if moving:
             depth += dr.select(active, dr.detach(marched.depth) * self._turn[12], 0)
         return colour, transmittance, depth
+
+
+def corners(placed: PlacedField) -> np.ndarray:
+    """Return the corners ``(8, 3)`` of a field's box in the world."""
+    field = placed.field
+    return placed.placement.world(np.array(list(product(*zip(field.lower, field.upper, strict=True)))))
 
 
 def _arrays_of(value, visited: set) -> list:

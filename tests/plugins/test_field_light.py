@@ -82,13 +82,13 @@ def compare(mi, made, expected, spp=64, tolerance=0.02):
     assert (np.abs(a.mean(0) - b.mean(0)) < 6 * error + 0.02 * b.mean(0) + 1e-3).all()
 
 
-@pytest.mark.parametrize("lights", ["one", "two"])
+@pytest.mark.parametrize("lights", ["one", "two", "joined"])
 def test_a_lamp_lights_a_room_as_its_mesh_does(mi_rgb, fields, lights):
     """Plastic, a rough mirror, and through holes; one of two fields shadows the light of the other."""
     mi = mi_rgb
     lamp, more = field("lamp", to_world=turned(mi), max_depth=4), {}
-    if lights == "two":
-        other = mi.ScalarTransform4f().translate([-0.9, -0.3, 0.2])
+    if lights != "one":
+        other = mi.ScalarTransform4f().translate([-0.9, -0.3, 0.2] if lights == "two" else [-0.1, -0.2, 0.1])
         del lamp["max_depth"]
         lamp["c"] = {"type": "test_field", "field": "black", "to_world": other, "max_depth": 4}
         more["other"] = box(mi, other)
@@ -189,6 +189,7 @@ def test_a_field_that_moves_or_changes_is_followed(mi_rgb, fields):
     params["it.to_world"] = mi.AffineTransform4f().translate([1, 0, 0])
     params["it.tables.colour"] = mi.TensorXf(np.float32(2 * np.array(RADIANCE)))
     params.update()
+    between = made.integrator().surfaces.between
     assert np.abs(np.array(between.spheres).reshape(-1, 4) - spheres - [1, 0, 0, 0]).max() < 1e-4
     assert np.abs(np.array(between.radiances) / radiances - 2).max() < 1e-3
 
