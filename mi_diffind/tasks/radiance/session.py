@@ -135,14 +135,9 @@ class ViewImages:
     def evaluate(self, field: VolumeField, ssim: bool = False) -> dict[str, float]:
         """Return the PSNR of sRGB values before white in decibels, as means over the views.
 
-<<<<<<< HEAD
-        ``psnr_white_db`` is that of all pixels that count. ``psnr_foreground_db``, of those with an alpha above 0, is
-        the first figure, since white flatters. With ``ssim``, ``ssim_white`` is the structural similarity before white,
-        unless the views are smaller than its window.
-=======
         Views with a background of their own are compared in front of that. ``psnr_white_db`` is that of all pixels that
-        count. ``psnr_foreground_db``, of those with an alpha above 0, is the first figure, since white flatters.
->>>>>>> main
+        count. ``psnr_foreground_db``, of those with an alpha above 0, is the first figure, since white flatters. With
+        ``ssim``, ``ssim_white`` is the structural similarity, unless the views are smaller than its window.
         """
         return scores((self.render(field, v) for v in range(len(self.views))), self.views, ssim)
 
