@@ -114,7 +114,7 @@ class FieldFit:
         else:
             stopped = grid_result is not None and grid_result.interrupted
             table, result, field = (self.sparse if layout == "sparse" else self.pairs)(grid, stopped)
-        measured = session.held_out_images.evaluate(field)
+        measured = session.held_out_images.evaluate(field, ssim=True)
         table.preset, table.seed = request.preset, request.settings.seed
         table.settings = {
             **request.recorded(result),
@@ -155,7 +155,7 @@ class FieldFit:
             table = self.grid_table(grid)
             table.preset, table.settings["source"] = "grid", views.digest
             stored = files.field_of(table, request.types)  # without invisible cells, in half precision
-            table.measured = rounded_figures(self.session.held_out_images.evaluate(stored))
+            table.measured = rounded_figures(self.session.held_out_images.evaluate(stored, ssim=True))
             save_table(path, table)
             grid = grid_of(files.load(path), request.types)
         return grid, result

@@ -95,11 +95,11 @@ class RadianceFieldModel(Model):
         return count(self.field, o, d, 0, np.inf).asdict()
 
     def measure(self, capture=None):
-        """Return the PSNR of the test views of a capture.
+        """Return PSNR and SSIM of the test views of a capture.
 
         ``capture`` is its folder; by default, that of the capture that was fitted, if it still exists.
         """
-        return self._test_views(capture).evaluate(self.field)
+        return self._test_views(capture).evaluate(self.field, ssim=True)
 
     def render_views(self, capture=None, count: int | None = None) -> list[np.ndarray]:
         """Return pictures of the field from the test views of a capture (default: that which was fitted).

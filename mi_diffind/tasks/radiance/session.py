@@ -14,7 +14,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from ... import srgb
+from ... import metrics, srgb
 from ...indirection import device_array
 from .image_files import LINEAR
 from .march import march
@@ -132,13 +132,14 @@ class ViewImages:
         values = values.reshape(rows, columns, side, side, 4).swapaxes(1, 2).reshape(rows * side, columns * side, 4)
         return values[:height, :width]
 
-    def evaluate(self, field: VolumeField) -> dict[str, float]:
+    def evaluate(self, field: VolumeField, ssim: bool = False) -> dict[str, float]:
         """Return the PSNR of sRGB values before white in decibels, as means over the views.
 
         Views with a background of their own are compared in front of that. ``psnr_white_db`` is that of all pixels that
-        count. ``psnr_foreground_db``, of those with an alpha above 0, is the first figure, since white flatters.
+        count. ``psnr_foreground_db``, of those with an alpha above 0, is the first figure, since white flatters. With
+        ``ssim``, ``ssim_white`` is the structural similarity, unless the views are smaller than its window.
         """
-        return scores((self.render(field, v) for v in range(len(self.views))), self.views)
+        return scores((self.render(field, v) for v in range(len(self.views))), self.views, ssim)
 
 
 @dataclass
@@ -212,16 +213,24 @@ def displayed(image: np.ndarray, background=(255, 255, 255)) -> np.ndarray:
     return srgb.for_display(image[..., :3] + (1 - image[..., 3:]) * LINEAR[list(background)])
 
 
-def scores(pictures: Iterable[np.ndarray], views: CapturedViews) -> dict[str, float]:
+def scores(pictures: Iterable[np.ndarray], views: CapturedViews, ssim: bool = False) -> dict[str, float]:
     """Return the figures of :meth:`ViewImages.evaluate` for pictures ``(height, width, 4)`` of the views."""
-    white, foreground, behind = [], [], views.background or (255, 255, 255)
+    white, foreground, similarities, behind = [], [], [], views.background or (255, 255, 255)
     for view, picture in zip(range(len(views)), pictures, strict=True):
         truth, counted = views.image(view), views.counted(view)
         if not counted.any():
             continue
-        squared = np.square(displayed(picture, behind) - displayed(truth, behind))[counted]
+        shown, expected = displayed(picture, behind), displayed(truth, behind)
+        squared = np.square(shown - expected)[counted]
         covered = truth[counted][:, 3] > 0
         white.append(squared.mean())
         foreground.append(squared[covered].mean() if covered.any() else squared.mean())
+        if ssim:
+            similarities.append(metrics.ssim_published(expected, shown, counted))
     psnr = [float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12)))) for errors in (foreground, white)]
-    return {"psnr_foreground_db": psnr[0], "psnr_white_db": psnr[1]}
+    similar = [s for s in similarities if s is not None]
+    return {
+        "psnr_foreground_db": psnr[0],
+        "psnr_white_db": psnr[1],
+        **({"ssim_white": float(np.mean(similar))} if similar else {}),
+    }
