@@ -76,8 +76,11 @@ def decoded(image: np.ndarray) -> np.ndarray:
     """Return an image ``(…, 4)`` of bytes or halves as float32: linear colours multiplied by alpha, and alpha."""
     if image.dtype != np.uint8:
         return image.astype(np.float32)
-    alpha = SHARE[image[..., 3:]]
-    return np.concatenate([LINEAR[image[..., :3]] * alpha, alpha], axis=-1)
+    values = np.empty(image.shape, np.float32)
+    values[..., 3] = alpha = SHARE[image[..., 3]]
+    for channel in range(3):  # three times as fast as all at once
+        np.multiply(LINEAR[image[..., channel]], alpha, out=values[..., channel])
+    return values
 
 
 def encoded(image: np.ndarray) -> np.ndarray:
