@@ -6,6 +6,8 @@ import math
 import numpy as np
 from PIL import Image
 
+from mi_diffind.tasks.radiance.volume_field import VolumeField
+
 ANGLE = 0.7
 
 
@@ -110,3 +112,13 @@ def change(folder, name="transforms_train.json", frame=None, **changes):
     for key in [key for key, value in changes.items() if value is None]:
         del target[key]
     path.write_text(json.dumps(content))
+
+
+class Fog(VolumeField):
+    """White, of the density 1."""
+
+    def density_at(self, p, active=True):
+        return self.types.Float(1), []
+
+    def radiance_at(self, point_data, p, d, active=True):
+        return [self.types.Float(1)] * 3

@@ -1,6 +1,7 @@
 """Task 7: radiance fields from images of a scene.
 
-- :mod:`.transforms`, :mod:`.colmap`, :mod:`.image_files`, :mod:`.lenses`, :mod:`.views`: captured images with cameras;
+- :mod:`.transforms`, :mod:`.colmap`, :mod:`.image_files`, :mod:`.lenses`, :mod:`.background`, :mod:`.views`: captured
+  images with cameras;
 - :mod:`.visual_hull`: the space that captured objects may occupy;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
 - :mod:`.session`, :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
@@ -17,7 +18,7 @@ from pathlib import Path
 from ... import units
 from ...arguments import Argument, checked, decibels, positive
 from ...task import Task
-from .presets import PRESETS
+from .presets import BACKGROUNDS, PRESETS
 
 
 class RadianceField(Task):
@@ -52,6 +53,11 @@ class RadianceField(Task):
         Argument(
             "--resolution", type=positive, metavar="N",
             help="resolution of the grid: nodes along the side of a cube of the same volume (default: 128)",
+        ),
+        Argument(
+            "--background", choices=BACKGROUNDS,
+            help="background of images without alpha: a colour, or the scene itself (default: the colour of their "
+            "borders if it is one, else scene)"
         ),
         Argument("--grid", metavar="FILE", help="grid to compress; if the file does not exist, it is made"),
         Argument(

@@ -81,7 +81,8 @@ def fit(request: FitRequest) -> Fitted:
     :class:`~mi_diffind.fitting.FittingError`.
     """
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
-    session = FieldSession.load(request.types, request.options["source"], pixels, request.progress)
+    background = request.options.get("background")
+    session = FieldSession.load(request.types, request.options["source"], pixels, request.progress, background)
     return FieldFit(request, session).run()
 
 

@@ -118,7 +118,7 @@ class RadianceFieldModel(Model):
         path = Path(capture) if capture is not None else folder / self.table.settings.get("capture_path", "")
         if (capture is None and not self.table.settings.get("capture_path")) or not path.is_dir():
             self._refuse(f"was fitted to the capture {path}, which is not there")
-        return ViewImages(self.types, load_held_out(path)[0])
+        return ViewImages(self.types, load_held_out(path, background=self.table.settings.get("background"))[0])
 
     def decode(self, output: Path, resolution: int | None = None):
         """Write density and colour on a dense grid (:mod:`.decode`)."""

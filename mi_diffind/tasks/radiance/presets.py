@@ -22,6 +22,9 @@ RATIOS = {
 #: Default compression of the preset ``paper``.
 COMPRESSION = 50.0
 
+#: Backgrounds of images without alpha that a user may choose (:mod:`.background`).
+BACKGROUNDS = ("white", "black", "scene")
+
 #: Bytes of a node of the uncompressed grid: a density and twelve numbers of colour in float32.
 NODE_BYTES = 52
 

@@ -91,6 +91,14 @@ class ViewImages:
         offset, _, width = self._place(view)
         return dr.gather(self.types.Bool, self.mask, offset + dr.fma(y, width, x))
 
+    def behind(self, rng, count: int) -> list:
+        """Return linear red, green and blue behind ``count`` rays: a random grey, or the background of the views."""
+        types = self.types
+        grey = rng.random(types.TensorXf, (count,)).array
+        if self.views.background is None:
+            return [grey] * 3
+        return [types.Float(float(LINEAR[byte])) for byte in self.views.background]
+
     def random_pixels(self, rng, size: int) -> tuple:
         """Return view, column and row of ``size`` random pixels, in patches; each view is as likely as the others."""
         types, views = self.types, self.views
@@ -127,8 +135,8 @@ class ViewImages:
     def evaluate(self, field: VolumeField) -> dict[str, float]:
         """Return the PSNR of sRGB values before white in decibels, as means over the views.
 
-        ``psnr_white_db`` is that of all pixels that count. ``psnr_foreground_db``, of those with an alpha above 0, is
-        the first figure, since white flatters.
+        Views with a background of their own are compared in front of that. ``psnr_white_db`` is that of all pixels that
+        count. ``psnr_foreground_db``, of those with an alpha above 0, is the first figure, since white flatters.
         """
         return scores((self.render(field, v) for v in range(len(self.views))), self.views)
 
@@ -146,14 +154,15 @@ class FieldSession:
     pixels: float | None = None
 
     @staticmethod
-    def load(types: ModuleType, folder, pixels: float | None = None, progress: bool = False) -> FieldSession:
+    def load(types, folder, pixels: float | None = None, progress: bool = False, background=None) -> FieldSession:
         """Read the capture in a folder, of the held-out views so many that they have at most ``pixels``.
 
-        ``progress`` shows bars on stderr. Raises :class:`.views.ViewsError`.
+        ``progress`` shows bars on stderr; ``background`` is that of :func:`.views.load_views`. Raises
+        :class:`.views.ViewsError`.
         """
-        views = load_views(folder, "train", progress=progress)
+        views = load_views(folder, "train", progress=progress, background=background)
         most = None if pixels is None else max(2, round(pixels / views.mean_pixels))
-        return FieldSession(types, views, *load_held_out(folder, most, progress), pixels)
+        return FieldSession(types, views, *load_held_out(folder, most, progress, views.background), pixels)
 
     @functools.cached_property
     def images(self) -> ViewImages:
@@ -184,30 +193,34 @@ class FieldSession:
         return ViewImages(self.types, self.held_out.chosen(np.arange(watched) * count // watched))
 
 
-def load_held_out(folder, most: int | None = None, progress: bool = False) -> tuple[CapturedViews, bool]:
-    """Return ``most`` test views of a capture and True or, if there are none, of its training views and False."""
+def load_held_out(folder, most: int | None = None, progress: bool = False, background=None) -> tuple:
+    """Return ``most`` test views of a capture and True or, if there are none, of its training views and False.
+
+    ``background`` is that of the training views (:class:`.CapturedViews`).
+    """
+    options = {"most": most, "progress": progress, "background": background or "scene"}
     try:
-        return load_views(folder, "test", most, progress), True
+        return load_views(folder, "test", **options), True
     except ViewsError as e:
         try:
-            return load_views(folder, "train", most, progress), False
+            return load_views(folder, "train", **options), False
         except ViewsError:
             raise e from None
 
 
-def displayed(image: np.ndarray) -> np.ndarray:
-    """Return an image ``(…, 4)`` in front of white as sRGB ``(…, 3)`` in [0, 1]."""
-    return srgb.for_display(image[..., :3] + (1 - image[..., 3:]))
+def displayed(image: np.ndarray, background=(255, 255, 255)) -> np.ndarray:
+    """Return an image ``(…, 4)`` in front of a background, by default white, as sRGB ``(…, 3)`` in [0, 1]."""
+    return srgb.for_display(image[..., :3] + (1 - image[..., 3:]) * LINEAR[list(background)])
 
 
 def scores(pictures: Iterable[np.ndarray], views: CapturedViews) -> dict[str, float]:
     """Return the figures of :meth:`ViewImages.evaluate` for pictures ``(height, width, 4)`` of the views."""
-    white, foreground = [], []
+    white, foreground, behind = [], [], views.background or (255, 255, 255)
     for view, picture in zip(range(len(views)), pictures, strict=True):
         truth, counted = views.image(view), views.counted(view)
         if not counted.any():
             continue
-        squared = np.square(displayed(picture) - displayed(truth))[counted]
+        squared = np.square(displayed(picture, behind) - displayed(truth, behind))[counted]
         covered = truth[counted][:, 3] > 0
         white.append(squared.mean())
         foreground.append(squared[covered].mean() if covered.any() else squared.mean())

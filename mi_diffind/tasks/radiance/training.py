@@ -18,7 +18,7 @@ class ImagesProblem(Problem):
 
     ``net`` maps names to tensors (a dictionary or a module); ``field_of`` makes a :class:`.VolumeField` of them,
     differentiably. The loss is the mean squared difference of sRGB values in front of random greys, which trains the
-    opacity, too.
+    opacity, too, or in front of the background of views that have one.
     """
 
     def __init__(self, session: FieldSession, net, field_of: Callable[..., VolumeField]):
@@ -30,15 +30,15 @@ class ImagesProblem(Problem):
         view, x, y = images.random_pixels(rng, size)
         count = dr.width(view)
         offset = rng.random(types.TensorXf, (count,)).array
-        grey = rng.random(types.TensorXf, (count,)).array
+        behind = images.behind(rng, count)
         o, d = images.rays(view, x, y)
         truth = images.colours(view, x, y)
         seen = differentiable(self.field_of(net), o, d, 0, dr.inf, True, offset)
         total = types.Float(0)
         for c in range(3):
-            reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * grey, 0, 1), fused=False)
+            reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * behind[c], 0, 1), fused=False)
             # The prediction is not clamped at white: its slope leads back into the range
-            shown = srgb.from_linear(seen.colour[c] + seen.transmittance * grey, fused=False)
+            shown = srgb.from_linear(seen.colour[c] + seen.transmittance * behind[c], fused=False)
             total += dr.square(shown - reference)
         return dr.select(images.counted(view, x, y), total, 0) * (1 / (3 * count))
 

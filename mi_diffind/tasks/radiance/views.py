@@ -20,6 +20,7 @@ import numpy as np
 
 from ...indirection import aligned
 from ...progress import progress_bar
+from . import background as backgrounds
 from .colmap import colmap_frames, model_folder
 from .image_files import ViewsError, decoded, half_floats, image_file, is_linear, read_image, read_mask
 from .lenses import DISTORTION, undistorted
@@ -48,6 +49,9 @@ class CapturedViews:
     ``mask``, bool ``(n,)``, is false for pixels that do not count: those that a mask excludes, and those that an
     undistorted photograph does not show. ``None``: all count. ``notes`` are sentences for the user; ``settings`` are
     recorded in the file of a fitted field.
+
+    ``background`` holds bytes of sRGB if images without alpha show one colour around the objects
+    (:mod:`.background`); its pixels have alpha 0 then. ``None``: images with alpha, or surroundings that are captured.
     """
 
     pixels: np.ndarray
@@ -63,6 +67,7 @@ class CapturedViews:
     split: str = "train"
     mask: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    background: tuple[int, int, int] | None = None
     settings: dict = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -94,13 +99,14 @@ class CapturedViews:
 
     @functools.cached_property
     def digest(self) -> str:
-        """SHA-256 of everything: images as float32, names, cameras, box and mask."""
+        """SHA-256 of everything: images as float32, names, cameras, box, mask and background."""
         same = (self.sizes == self.sizes[0]).all()
         shape = [len(self), *self.sizes[0].tolist(), 4] if same else self.sizes.tolist()
         digest = hashlib.sha256(json.dumps([self.split, shape, self.names, self.has_alpha]).encode())
         for view in range(len(self)):
             digest.update(self.image(view))
-        for array in (self.poses, self.focal, self.centre, self.box, self.mask):
+        background = None if self.background is None else np.uint8(self.background)
+        for array in (self.poses, self.focal, self.centre, self.box, self.mask, background):
             digest.update(b"" if array is None else np.ascontiguousarray(array))
         return digest.hexdigest()
 
@@ -116,7 +122,11 @@ class CapturedViews:
 
 
 def load_views(
-    folder: str | os.PathLike, split: str = "train", most: int | None = None, progress: bool = False
+    folder: str | os.PathLike,
+    split: str = "train",
+    most: int | None = None,
+    progress: bool = False,
+    background: str | tuple[int, int, int] | None = None,
 ) -> CapturedViews:
     """Read the views of a ``split``: "train", "test" or "val".
 
@@ -124,6 +134,9 @@ def load_views(
     ``test_filenames`` and ``val_filenames``, or, without these, a model of COLMAP. If no file or list names the test
     views, every eighth view is one. Of more than ``most`` views, so many are read, evenly spread in the list.
     ``progress`` shows a bar on stderr.
+
+    ``background`` is that of images without alpha: "white", "black", bytes of sRGB, or "scene" if their surroundings
+    are part of the capture. ``None``: the colour of their borders if it is one, else "scene".
     Raises :class:`ViewsError`, also for fewer than two training views, since one view does not show depth.
     """
     folder = Path(folder)
@@ -147,7 +160,7 @@ def load_views(
     if images.undistorted:
         count = "all" if images.undistorted == len(paths) else f"{images.undistorted} of {len(paths)}"
         notes.append(f"{count} images have a lens distortion and were undistorted")
-    return CapturedViews(
+    views = CapturedViews(
         pixels=images.pixels[: images.count],
         offsets=np.cumsum([0, *(height * width for height, width in images.sizes)])[:-1],
         sizes=np.array(images.sizes),
@@ -156,13 +169,35 @@ def load_views(
         centre=np.array(images.centre),
         names=tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in paths),
         path=folder,
-        has_alpha=images.has_alpha,
-        box=_box(listed, images.has_alpha),
+        has_alpha=not images.opaque,
         split=split,
         mask=images.mask(),
         notes=tuple(notes),
         settings=listed.settings,
     )
+    views = _in_front_of(views, images.opaque, background)
+    return dataclasses.replace(views, box=_box(listed, views.has_alpha))
+
+
+def _in_front_of(views: CapturedViews, opaque: list[int], background) -> CapturedViews:
+    """Return views whose ``opaque`` images are in front of a background."""
+    if not opaque or background == "scene":
+        unused = (
+            [] if opaque or background in (None, "scene") else ["all images have alpha: the background is not used"]
+        )
+        return dataclasses.replace(views, notes=(*views.notes, *unused))
+    chosen = backgrounds.NAMED[background] if isinstance(background, str) else background
+    colour = chosen or backgrounds.border_colour(opaque, views.stored, views.counted)
+    if colour is None:
+        return views
+    for view in opaque:
+        backgrounds.clear(views.stored(view), views.counted(view), colour)
+    notes = views.notes
+    if not chosen:
+        text = ", ".join(map(str, colour))
+        notes += (f"images without alpha: the colour of their borders (sRGB {text}) is taken for the background",)
+    settings = views.settings | {"background": list(colour)}
+    return dataclasses.replace(views, has_alpha=True, background=tuple(colour), notes=notes, settings=settings)
 
 
 def _listed(folder: Path, split: str) -> FrameList:
@@ -189,7 +224,7 @@ class _Images:
     def __init__(self, views: int, words: int):
         self.views, self.pixels, self.count = views, np.empty((0, words), np.uint32), 0
         self.sizes, self.focal, self.centre, self.masks = [], [], [], []
-        self.has_alpha, self.undistorted = True, 0
+        self.opaque, self.undistorted = [], 0
 
     def add(self, path: Path, frame: Frame, listed: FrameList) -> None:
         """Read an image and its mask, and undistort them."""
@@ -214,7 +249,8 @@ class _Images:
         self.focal.append(focal)
         self.centre.append(centre)
         self.masks.append(None if mask is None or mask.all() else mask)
-        self.has_alpha &= has_alpha
+        if not has_alpha:
+            self.opaque.append(len(self.sizes) - 1)
         self._store(image)
 
     def _store(self, image: np.ndarray) -> None:

@@ -1,15 +1,29 @@
-"""Photographs: lenses with a distortion, and models of COLMAP."""
+"""Photographs: lenses with a distortion, backgrounds of one colour, and models of COLMAP."""
 
+import json
 import shutil
 import sys
 
+import captures
+import drjit as dr
+import drjit.llvm.ad as llvm
 import numpy as np
+import OpenEXR
 import pytest
-from captures import SIZE, change, pose, write_image, write_json
+from captures import SIZE, Fog, change, pose, write_image, write_json
 from PIL import Image
+from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
+from mi_diffind.cli import main
+from mi_diffind.task import tasks
+from mi_diffind.tasks.radiance import grid as grids
+from mi_diffind.tasks.radiance import visual_hull
+from mi_diffind.tasks.radiance.image_files import LINEAR
+from mi_diffind.tasks.radiance.session import FieldSession
+from mi_diffind.tasks.radiance.training import ImagesProblem
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
+from mi_diffind.tasks.radiance.visual_hull import box_of
 
 LENS = {"k1": -0.12, "k2": 0.03, "p1": 0.004, "p2": -0.003}
 SIDE = 64
@@ -98,6 +112,120 @@ def test_alpha_and_masks_are_undistorted_too(tmp_path):
     assert np.abs(views.image(0)[..., :3] - pattern(u, v))[x > 21].max() < 0.01
     assert views.counted(0).all()
     np.testing.assert_array_equal(views.counted(1), y < 40)
+
+
+# -- backgrounds of one colour ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def studio_shots(tmp_path):
+    """Two balls in front of a bright grey, without alpha; returns the folder and the bytes of all images by name."""
+    captures.write(tmp_path, 6, 2)
+    images = {}
+    for path in sorted(tmp_path.glob("*.png")):
+        with Image.open(path) as opened:
+            values = np.array(opened)
+        values[values[..., 3] == 0] = [240, 240, 235, 0]
+        images[path.name] = values
+        Image.fromarray(values[..., :3]).save(path)
+    return tmp_path, images
+
+
+def test_a_border_of_one_colour_is_the_background(studio_shots):
+    folder, images = studio_shots
+    values = images["train_2.png"]
+    inside = np.argwhere(binary_erosion(values[..., 3] > 0))[0]
+    values[tuple(inside)] = [240, 240, 235, 255]  # not connected with the border
+    values[0, 0] = [237, 243, 235, 0]
+    Image.fromarray(values[..., :3]).save(folder / "train_2.png")
+    views = load_views(folder)
+    assert views.background == (240, 240, 235) and views.settings == {"background": [240, 240, 235]}
+    assert "(sRGB 240, 240, 235)" in views.notes[0] and views.has_alpha
+    for view, name in enumerate(views.names):
+        np.testing.assert_array_equal(views.stored(view), images[name] * (images[name][..., 3:] > 0))
+    with_alpha = load_views(captures.write(folder / "alpha", 6, 2))
+    np.testing.assert_allclose(box_of(views), box_of(with_alpha))
+    session = FieldSession.load(llvm, folder)
+    assert session.held_out.background == views.background and len(session.held_out) == 2
+    # An empty field shows the background: no loss, and PSNR from the bytes of the files
+    empty = Fog(llvm, (5, 5, 5), (6, 6, 6), 0.5, {})
+    errors = [np.square((images[n][..., :3] - np.float64([240, 240, 235])) / 255) for n in session.held_out.names]
+    expected = np.mean([-10 * np.log10(e.mean()) for e in errors])
+    assert session.held_out_images.evaluate(empty)["psnr_white_db"] == pytest.approx(expected, abs=1e-3)
+    loss = ImagesProblem(session, {}, lambda net: empty).loss({}, dr.rng(seed=0), 256)
+    view, x, y = (a.numpy() for a in session.images.random_pixels(dr.rng(seed=0), 256))
+    files = np.stack([images[name][..., :3] for name in views.names])[view, y, x]
+    assert dr.sum(loss)[0] == pytest.approx(np.square((files - np.float64([240, 240, 235])) / 255).mean(), rel=1e-4)
+
+
+def test_backgrounds_that_are_chosen(studio_shots):
+    folder, images = studio_shots
+    scene, black = (load_views(folder, background=name) for name in ("scene", "black"))
+    assert scene.background is None and not scene.has_alpha and not scene.settings and not scene.notes
+    assert black.background == (0, 0, 0) and black.has_alpha and not black.notes
+    for views in (scene, black):
+        opaque = np.dstack([images["train_1.png"][..., :3], np.full((24, 24), 255, np.uint8)])
+        np.testing.assert_array_equal(views.stored(1), opaque)
+    assert scene.digest != black.digest
+    rng = np.random.default_rng(0)
+    for name, values in images.items():  # surroundings
+        Image.fromarray(np.uint8(values[..., :3] - rng.integers(0, 40, (24, 24, 1)))).save(folder / name)
+    assert load_views(folder).background is None
+    for name, values in images.items():
+        Image.fromarray(values).save(folder / name)
+    assert load_views(folder, background="white").notes == ("all images have alpha: the background is not used",)
+    assert load_views(folder).background is None and not load_views(folder).notes
+
+
+def test_backgrounds_of_linear_images(studio_shots):
+    folder, images = studio_shots
+    views = load_views(folder)
+    exr = views.image(0)
+    exr[exr[..., 3] == 0] = [*np.float32(LINEAR[[240, 240, 235]]), 1]
+    (folder / "train_0.png").unlink()
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": np.ascontiguousarray(exr[..., :3])}) as file:
+        file.write(str(folder / "train_0.exr"))
+    content = (folder / "transforms_train.json").read_text()
+    (folder / "transforms_train.json").write_text(content.replace("train_0.png", "train_0.exr"))
+    again = load_views(folder)
+    assert again.background == views.background and again.pixels.shape[1] == 2
+    np.testing.assert_array_equal(again.image(0)[..., 3] > 0, images["train_0.png"][..., 3] > 0)
+    np.testing.assert_allclose(again.image(0), views.image(0), atol=1e-3)
+
+
+def test_masked_borders_are_no_background(studio_shots):
+    """What a mask excludes at the border counts neither for nor against, and lets the background through."""
+    folder, images = studio_shots
+    mask = np.full((24, 24), 255, np.uint8)
+    mask[:, :3] = mask[:3] = mask[-3:] = mask[:, -3:] = 0
+    Image.fromarray(mask).save(folder / "mask.png")
+    content = json.loads((folder / "transforms_train.json").read_text())
+    for frame in content["frames"]:
+        frame["mask_path"] = "mask.png"
+        values = images[frame["file_path"]].copy()
+        values[mask == 0] = 17
+        Image.fromarray(values[..., :3]).save(folder / frame["file_path"])
+    write_json(folder / "transforms_train.json", **content)
+    assert load_views(folder).background is None  # no border is left
+    views = load_views(folder, background=(240, 240, 235))
+    counted = mask > 0
+    for view, name in enumerate(views.names):
+        np.testing.assert_array_equal(views.stored(view)[counted][:, 3], images[name][counted][:, 3])
+
+
+def test_a_field_records_its_background(studio_shots, monkeypatch):
+    folder, _ = studio_shots
+    options = ["--preset", "grid", "--steps", "12", "--resolution", "12", "--batch", "256"]
+    monkeypatch.setattr(visual_hull, "SEARCH", 24)
+    monkeypatch.setattr(grids, "VISIBLE", 0.0)
+    assert main(["fit", "field", str(folder), "-o", str(folder / "x.npz"), *options, "--variant", "llvm_ad_rgb"]) == 0
+    model = tasks()["field"].open(llvm.TensorXf, folder / "x.npz")
+    assert model.table.settings["background"] == [240, 240, 235]
+    measured = model.table.measured["psnr_white_db"]
+    assert model.measure()["psnr_white_db"] == pytest.approx(measured, abs=1e-3)
+    model.table.settings.pop("background")
+    assert model.measure()["psnr_white_db"] != pytest.approx(measured, abs=1e-2)
 
 
 # -- COLMAP -----------------------------------------------------------------------------------------------------------

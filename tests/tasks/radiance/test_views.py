@@ -8,14 +8,13 @@ import drjit.llvm.ad as llvm
 import numpy as np
 import OpenEXR
 import pytest
-from captures import SIZE, change, pose, write_image, write_json
+from captures import SIZE, Fog, change, pose, write_image, write_json
 from PIL import Image
 
 from mi_diffind.tasks.radiance.session import FieldSession, ViewImages
 from mi_diffind.tasks.radiance.training import ImagesProblem
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
 from mi_diffind.tasks.radiance.visual_hull import hull
-from mi_diffind.tasks.radiance.volume_field import VolumeField
 
 
 def test_few_views_of_many_are_evenly_spread(blender):
@@ -75,16 +74,6 @@ def test_pixels_are_linear_and_multiplied_by_alpha(blender):
         *colour, alpha = (int(v) for v in stored[y, x])
         expected = [linear(c) * alpha / 255 for c in colour]
         assert image[y, x] == pytest.approx([*expected, alpha / 255], abs=1e-6)
-
-
-class Fog(VolumeField):
-    """White, of the density 1."""
-
-    def density_at(self, p, active=True):
-        return self.types.Float(1), []
-
-    def radiance_at(self, point_data, p, d, active=True):
-        return [self.types.Float(1)] * 3
 
 
 def assert_colours_are_images(views):
