@@ -530,6 +530,31 @@ def field_captures() -> str:
     return table(["", "grid, dB", "compressed, dB", "MB in memory", "MB on disk"], rows)
 
 
+#: Figures for NeRF's synthetic scene lego at 800²: method, paper, dB before white, MB on disk as far as it is stated.
+PUBLISHED_LEGO = (
+    ("DVGO", "Sun et al. 2022", "34.6", ""),
+    ("Plenoxels", "Fridovich-Keil et al. 2022", "34.1", ""),
+    ("TensoRF-VM", "Chen et al. 2022", "36.5", ""),
+    ("Instant-NGP", "Müller et al. 2022", "36.4", ""),
+    ("VQRF", "Li et al. 2023", "about 34", ""),
+    ("CNC, HAC++", "Chen et al. 2024, 2025", "33 to 36", "0.4 to 2"),
+)
+
+
+def field_nerf() -> str:
+    """Return figures of NeRF's synthetic scenes: as measured here, and as published for lego."""
+    rows, path = [], DOCS / "measured" / "nerf_scenes.json"
+    for row in measured(path.stem)["rows"] if path.is_file() else ():
+        rows.append([
+            f"{row['scene']}, {row['side']}²", f"{row['method']}, measured", f"{row['psnr_white_db']:.2f}",
+            f"{row['ssim_white']:.3f}", f"{row['file_bytes'] / 1e6:.2f}", f"{row['minutes']:.0f}",
+            f"{row['peak_bytes'] / 1e9:.1f}", f"{row['machine']['cores']} cores, {row['machine']['cpu']}",
+        ])  # fmt: skip
+    for method, paper, decibels, megabytes in PUBLISHED_LEGO:
+        rows.append(["lego, 800²", f"{method} ({paper}), claimed", decibels, "", megabytes, "", "", ""])
+    return table(["scene", "method", "dB, white", "SSIM", "MB on disk", "minutes", "peak memory, GB", "machine"], rows)
+
+
 def mean(values) -> float:
     """Return the mean of an iterable."""
     values = list(values)
@@ -572,7 +597,7 @@ TABLES |= {"sdf_parts": lambda: sdf_parts("tradeoff_sdf_parts_armadillo"), "sdf_
 TABLES |= {
     "field_errors": lambda: field_errors("tradeoff_field"),
     "field_errors_50": lambda: field_errors("tradeoff_field_50"), "field_times": lambda: field_times("tradeoff_field"),
-    "field_parts": field_parts, "field_captures": field_captures,
+    "field_parts": field_parts, "field_captures": field_captures, "field_nerf": field_nerf,
 }  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))

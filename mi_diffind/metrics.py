@@ -8,6 +8,9 @@ import numpy as np
 
 from .srgb import for_display
 
+#: Side of the window of :func:`ssim_published`, pixels.
+WINDOW = 11
+
 
 def psnr(reference: np.ndarray, image: np.ndarray) -> float:
     """Return the peak signal-to-noise ratio in dB of linear values clipped to [0, 1]; infinite for equal images."""
@@ -49,6 +52,26 @@ def ssim(reference: np.ndarray, image: np.ndarray) -> float | None:
     if min(reference.shape[:2]) < 7:
         return None
     return float(structural_similarity(reference, image, data_range=1.0, channel_axis=-1))
+
+
+def ssim_published(reference: np.ndarray, image: np.ndarray, counted: np.ndarray | None = None) -> float | None:
+    """Return the structural similarity of values in [0, 1] as tables of radiance fields state it.
+
+    The window is a Gaussian of 11 × 11 pixels, σ = 1.5, with population covariances (Wang et al. 2004); the mean is
+    that of all channels of the pixels whose window lies inside, or of those among them that are ``counted``
+    ``(height, width)``. ``None`` if there are no such pixels.
+    """
+    from skimage.metrics import structural_similarity
+
+    inside = (slice(WINDOW // 2, -(WINDOW // 2)),) * 2
+    if min(reference.shape[:2]) < WINDOW or (counted is not None and not counted[inside].any()):
+        return None
+    _, similarity = structural_similarity(
+        reference, image, data_range=1.0, channel_axis=-1, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, full=True,
+    )  # fmt: skip
+    similarity = similarity[inside]
+    return float(np.mean(similarity if counted is None else similarity[counted[inside]], dtype=np.float64))
 
 
 def angle(reference: np.ndarray, image: np.ndarray) -> float:

@@ -14,8 +14,9 @@ _NUMBER = r"(\d+\.?\d*|\.\d+)(e[+-]?\d+)?"
 _FIGURE_UNITS = {"_db": (" dB", 2), "_deg": ("°", 2)}
 #: Word in the name of a figure → text.
 _WORDS = {
-    "psnr": "PSNR", "mae": "MAE", "brdf": "BRDF", "iou": "IoU", "flip": "FLIP", "between": "between texels",
-    "worst": "worst level", "seen": "as seen,", "shaded": "PSNR shaded,", "converged": "converged truth",
+    "psnr": "PSNR", "ssim": "SSIM", "mae": "MAE", "brdf": "BRDF", "iou": "IoU", "flip": "FLIP",
+    "between": "between texels", "worst": "worst level", "seen": "as seen,", "shaded": "PSNR shaded,",
+    "converged": "converged truth",
     "prefiltered": "prefiltered truth",
 }  # fmt: skip
 _UNITS = {"": 1, "k": 1024, "m": 1024**2, "g": 1024**3}

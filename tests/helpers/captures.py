@@ -103,6 +103,17 @@ def write_json(path, **content):
     path.write_text(json.dumps(content))
 
 
+def write_blender(folder):
+    """Four views for training, two test views; extensions are left out, as Blender's data has it."""
+    for split, count in (("train", 4), ("test", 2)):
+        (folder / split).mkdir()
+        frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": pose(i)} for i in range(count)]
+        for i in range(count):
+            write_image(folder / split / f"r_{i}.png", i)
+        write_json(folder / f"transforms_{split}.json", camera_angle_x=0.7, frames=frames)
+    return folder
+
+
 def change(folder, name="transforms_train.json", frame=None, **changes):
     """Change a list of views, or its second frame; ``None`` removes a key."""
     path = folder / name

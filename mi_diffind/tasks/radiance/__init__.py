@@ -59,6 +59,10 @@ class RadianceField(Task):
             help="background of images without alpha: a colour, or the scene itself (default: the colour of their "
             "borders if it is one, else scene)"
         ),
+        Argument(
+            "--downscale", type=positive, metavar="N",
+            help="factor by which the sides of images are reduced (default: the least at which they have 1600 pixels)"
+        ),
         Argument("--grid", metavar="FILE", help="grid to compress; if the file does not exist, it is made"),
         Argument(
             "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),

@@ -81,8 +81,9 @@ def fit(request: FitRequest) -> Fitted:
     :class:`~mi_diffind.fitting.FittingError`.
     """
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
-    background = request.options.get("background")
-    session = FieldSession.load(request.types, request.options["source"], pixels, request.progress, background)
+    options = request.options
+    reading = {name: options.get(name) for name in ("background", "downscale")}
+    session = FieldSession.load(request.types, options["source"], pixels, progress=request.progress, **reading)
     return FieldFit(request, session).run()
 
 
@@ -113,12 +114,13 @@ class FieldFit:
         else:
             stopped = grid_result is not None and grid_result.interrupted
             table, result, field = (self.sparse if layout == "sparse" else self.pairs)(grid, stopped)
-        measured = session.held_out_images.evaluate(field)
+        measured = session.held_out_images.evaluate(field, ssim=True)
         table.preset, table.seed = request.preset, request.settings.seed
         table.settings = {
             **request.recorded(result),
             "source": session.views.digest,
             **session.views.settings,
+            **({"downscale": options["downscale"]} if options.get("downscale") else {}),
             **request.paths(capture_path=options["source"], grid_path=options["grid"] or None),
             "warnings": warnings,
             **table.settings,
@@ -153,7 +155,7 @@ class FieldFit:
             table = self.grid_table(grid)
             table.preset, table.settings["source"] = "grid", views.digest
             stored = files.field_of(table, request.types)  # without invisible cells, in half precision
-            table.measured = rounded_figures(self.session.held_out_images.evaluate(stored))
+            table.measured = rounded_figures(self.session.held_out_images.evaluate(stored, ssim=True))
             save_table(path, table)
             grid = grid_of(files.load(path), request.types)
         return grid, result

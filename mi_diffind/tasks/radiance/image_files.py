@@ -88,6 +88,25 @@ def encoded(image: np.ndarray) -> np.ndarray:
     return np.rint(255 * np.concatenate([shown, np.clip(alpha, 0, 1)], axis=-1)).astype(np.uint8)
 
 
+def reduced(image: np.ndarray, mask: np.ndarray | None, factor: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return an image of :func:`read_image` and its mask at a resolution that is lower by a whole ``factor``.
+
+    Linear colours multiplied by alpha are averaged. A pixel counts if all that it covers count. Rows and columns at the
+    right and the bottom that fill no pixel are left out.
+    """
+    height, width = (side // factor for side in image.shape[:2])
+    rows = []
+    for row in range(height):  # one after the other, since a photograph in single precision is large
+        values = image[row * factor : (row + 1) * factor, : width * factor]
+        values = decoded(values) if image.dtype == np.uint8 else values
+        rows.append(values.reshape(factor, width, factor, 4).mean(axis=(0, 2)))
+    if mask is not None:
+        blocks = mask[: height * factor, : width * factor].reshape(height, factor, width, factor)
+        mask = blocks.all(axis=(1, 3))
+    mean = np.stack(rows)
+    return encoded(mean) if image.dtype == np.uint8 else mean, mask
+
+
 def read_mask(path: Path, image: np.ndarray, image_path: Path) -> np.ndarray:
     """Return the mask of an image, bool ``(height, width)``: true where the file is not 0.
 

@@ -95,11 +95,11 @@ class RadianceFieldModel(Model):
         return count(self.field, o, d, 0, np.inf).asdict()
 
     def measure(self, capture=None):
-        """Return the PSNR of the test views of a capture.
+        """Return PSNR and SSIM of the test views of a capture.
 
         ``capture`` is its folder; by default, that of the capture that was fitted, if it still exists.
         """
-        return self._test_views(capture).evaluate(self.field)
+        return self._test_views(capture).evaluate(self.field, ssim=True)
 
     def render_views(self, capture=None, count: int | None = None) -> list[np.ndarray]:
         """Return pictures of the field from the test views of a capture (default: that which was fitted).
@@ -118,7 +118,9 @@ class RadianceFieldModel(Model):
         path = Path(capture) if capture is not None else folder / self.table.settings.get("capture_path", "")
         if (capture is None and not self.table.settings.get("capture_path")) or not path.is_dir():
             self._refuse(f"was fitted to the capture {path}, which is not there")
-        return ViewImages(self.types, load_held_out(path, background=self.table.settings.get("background"))[0])
+        settings = self.table.settings
+        reading = {"background": settings.get("background", "scene"), "downscale": settings.get("downscale")}
+        return ViewImages(self.types, load_held_out(path, **reading)[0])
 
     def decode(self, output: Path, resolution: int | None = None):
         """Write density and colour on a dense grid (:mod:`.decode`)."""

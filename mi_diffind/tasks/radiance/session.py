@@ -14,7 +14,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from ... import srgb
+from ... import metrics, srgb
 from ...indirection import device_array
 from .image_files import LINEAR
 from .march import march
@@ -132,13 +132,14 @@ class ViewImages:
         values = values.reshape(rows, columns, side, side, 4).swapaxes(1, 2).reshape(rows * side, columns * side, 4)
         return values[:height, :width]
 
-    def evaluate(self, field: VolumeField) -> dict[str, float]:
+    def evaluate(self, field: VolumeField, ssim: bool = False) -> dict[str, float]:
         """Return the PSNR of sRGB values before white in decibels, as means over the views.
 
         Views with a background of their own are compared in front of that. ``psnr_white_db`` is that of all pixels that
-        count. ``psnr_foreground_db``, of those with an alpha above 0, is the first figure, since white flatters.
+        count. ``psnr_foreground_db``, of those with an alpha above 0, is the first figure, since white flatters. With
+        ``ssim``, ``ssim_white`` is the structural similarity, unless the views are smaller than its window.
         """
-        return scores((self.render(field, v) for v in range(len(self.views))), self.views)
+        return scores((self.render(field, v) for v in range(len(self.views))), self.views, ssim)
 
 
 @dataclass
@@ -154,15 +155,15 @@ class FieldSession:
     pixels: float | None = None
 
     @staticmethod
-    def load(types, folder, pixels: float | None = None, progress: bool = False, background=None) -> FieldSession:
+    def load(types: ModuleType, folder, pixels: float | None = None, **reading) -> FieldSession:
         """Read the capture in a folder, of the held-out views so many that they have at most ``pixels``.
 
-        ``progress`` shows bars on stderr; ``background`` is that of :func:`.views.load_views`. Raises
-        :class:`.views.ViewsError`.
+        ``reading`` are further arguments of :func:`.views.load_views`. Raises :class:`.views.ViewsError`.
         """
-        views = load_views(folder, "train", progress=progress, background=background)
+        views = load_views(folder, "train", **reading)
         most = None if pixels is None else max(2, round(pixels / views.mean_pixels))
-        return FieldSession(types, views, *load_held_out(folder, most, progress, views.background), pixels)
+        reading["background"] = views.background or "scene"
+        return FieldSession(types, views, *load_held_out(folder, most, **reading), pixels)
 
     @functools.cached_property
     def images(self) -> ViewImages:
@@ -193,17 +194,16 @@ class FieldSession:
         return ViewImages(self.types, self.held_out.chosen(np.arange(watched) * count // watched))
 
 
-def load_held_out(folder, most: int | None = None, progress: bool = False, background=None) -> tuple:
+def load_held_out(folder, most: int | None = None, **reading) -> tuple[CapturedViews, bool]:
     """Return ``most`` test views of a capture and True or, if there are none, of its training views and False.
 
-    ``background`` is that of the training views (:class:`.CapturedViews`).
+    ``reading`` are further arguments of :func:`.views.load_views`.
     """
-    options = {"most": most, "progress": progress, "background": background or "scene"}
     try:
-        return load_views(folder, "test", **options), True
+        return load_views(folder, "test", most, **reading), True
     except ViewsError as e:
         try:
-            return load_views(folder, "train", **options), False
+            return load_views(folder, "train", most, **reading), False
         except ViewsError:
             raise e from None
 
@@ -213,16 +213,24 @@ def displayed(image: np.ndarray, background=(255, 255, 255)) -> np.ndarray:
     return srgb.for_display(image[..., :3] + (1 - image[..., 3:]) * LINEAR[list(background)])
 
 
-def scores(pictures: Iterable[np.ndarray], views: CapturedViews) -> dict[str, float]:
+def scores(pictures: Iterable[np.ndarray], views: CapturedViews, ssim: bool = False) -> dict[str, float]:
     """Return the figures of :meth:`ViewImages.evaluate` for pictures ``(height, width, 4)`` of the views."""
-    white, foreground, behind = [], [], views.background or (255, 255, 255)
+    white, foreground, similarities, behind = [], [], [], views.background or (255, 255, 255)
     for view, picture in zip(range(len(views)), pictures, strict=True):
         truth, counted = views.image(view), views.counted(view)
         if not counted.any():
             continue
-        squared = np.square(displayed(picture, behind) - displayed(truth, behind))[counted]
+        shown, expected = displayed(picture, behind), displayed(truth, behind)
+        squared = np.square(shown - expected)[counted]
         covered = truth[counted][:, 3] > 0
         white.append(squared.mean())
         foreground.append(squared[covered].mean() if covered.any() else squared.mean())
+        if ssim:
+            similarities.append(metrics.ssim_published(expected, shown, counted))
     psnr = [float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12)))) for errors in (foreground, white)]
-    return {"psnr_foreground_db": psnr[0], "psnr_white_db": psnr[1]}
+    similar = [s for s in similarities if s is not None]
+    return {
+        "psnr_foreground_db": psnr[0],
+        "psnr_white_db": psnr[1],
+        **({"ssim_white": float(np.mean(similar))} if similar else {}),
+    }

@@ -22,9 +22,12 @@ from ...indirection import aligned
 from ...progress import progress_bar
 from . import background as backgrounds
 from .colmap import colmap_frames, model_folder
-from .image_files import ViewsError, decoded, half_floats, image_file, is_linear, read_image, read_mask
+from .image_files import ViewsError, decoded, half_floats, image_file, is_linear, read_image, read_mask, reduced
 from .lenses import DISTORTION, undistorted
 from .transforms import SPLITS, Frame, FrameList, listed_frames
+
+#: Longest side in pixels of images that are not reduced.
+LONGEST = 1600
 
 #: Percentiles of points along each axis between which the captured objects lie, and the margin around these, as a share
 #: of the longest side.
@@ -127,6 +130,7 @@ def load_views(
     most: int | None = None,
     progress: bool = False,
     background: str | tuple[int, int, int] | None = None,
+    downscale: int | None = None,
 ) -> CapturedViews:
     """Read the views of a ``split``: "train", "test" or "val".
 
@@ -137,6 +141,9 @@ def load_views(
 
     ``background`` is that of images without alpha: "white", "black", bytes of sRGB, or "scene" if their surroundings
     are part of the capture. ``None``: the colour of their borders if it is one, else "scene".
+
+    ``downscale`` is a whole factor by which the sides of images are reduced. ``None``: the least one at which no side
+    is longer than :data:`LONGEST` pixels.
     Raises :class:`ViewsError`, also for fewer than two training views, since one view does not show depth.
     """
     folder = Path(folder)
@@ -151,12 +158,15 @@ def load_views(
     if most is not None and most < len(frames):
         frames = [frames[i * len(frames) // most] for i in range(most)]
     paths = [image_file(listed.root, frame.image, file) for frame in frames]
-    images = _Images(len(paths), 2 if any(map(is_linear, paths)) else 1)
+    images = _Images(len(paths), 2 if any(map(is_linear, paths)) else 1, downscale)
     with progress_bar("views", len(paths), "images", progress) as bar:
         for path, frame in zip(paths, frames, strict=True):
             images.add(path, frame, listed)
             bar.update()
     notes = []
+    if images.reduced:
+        factors = " or ".join(map(str, sorted(images.reduced)))
+        notes.append(f"images are reduced by the factor {factors} along each side: option --downscale")
     if images.undistorted:
         count = "all" if images.undistorted == len(paths) else f"{images.undistorted} of {len(paths)}"
         notes.append(f"{count} images have a lens distortion and were undistorted")
@@ -221,13 +231,13 @@ def _box(listed: FrameList, has_alpha: bool) -> np.ndarray | None:
 class _Images:
     """Images of a capture while they are read: arrays and lists of :class:`CapturedViews`."""
 
-    def __init__(self, views: int, words: int):
+    def __init__(self, views: int, words: int, downscale: int | None):
         self.views, self.pixels, self.count = views, np.empty((0, words), np.uint32), 0
         self.sizes, self.focal, self.centre, self.masks = [], [], [], []
-        self.opaque, self.undistorted = [], 0
+        self.opaque, self.undistorted, self.downscale, self.reduced = [], 0, downscale, set()
 
     def add(self, path: Path, frame: Frame, listed: FrameList) -> None:
-        """Read an image and its mask, and undistort them."""
+        """Read an image and its mask, reduce and undistort them."""
         numbers, (image, has_alpha) = frame.numbers, read_image(path)
         height, width = image.shape[:2]
         expected = numbers.get("w", width), numbers.get("h", height)
@@ -241,6 +251,13 @@ class _Images:
         mask = None
         if frame.mask is not None:
             mask = read_mask(image_file(listed.root, frame.mask, listed.file), image, path)
+        factor = self.downscale or -(-max(height, width) // LONGEST)
+        if factor > min(height, width):
+            raise ViewsError(f"{path}: has {width} × {height} pixels, which cannot be reduced by the factor {factor}")
+        if factor > 1:
+            image, mask = reduced(image, mask, factor)
+            (height, width), self.reduced = image.shape[:2], self.reduced | {factor}
+            focal, centre = ((x / factor, y / factor) for x, y in (focal, centre))
         lens = tuple(numbers.get(name, 0.0) for name in DISTORTION)
         if any(lens):
             image, mask = undistorted(image, mask, focal, centre, lens)

@@ -10,7 +10,7 @@ import drjit.llvm.ad as llvm
 import numpy as np
 import OpenEXR
 import pytest
-from captures import SIZE, Fog, change, pose, write_image, write_json
+from captures import SIZE, Fog, change, pose, write_blender, write_image, write_json
 from PIL import Image
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from mi_diffind.cli import main
 from mi_diffind.task import tasks
 from mi_diffind.tasks.radiance import grid as grids
+from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance import visual_hull
 from mi_diffind.tasks.radiance.image_files import LINEAR
 from mi_diffind.tasks.radiance.session import FieldSession
@@ -67,6 +68,45 @@ def photographs(folder, alpha=None, **lens):
     )  # fmt: skip
     u, v = np.moveaxis((pixel - centre) / focal, -1, 0)
     return u, v
+
+
+def test_large_images_are_reduced(tmp_path, monkeypatch):
+    """By averages of linear colours; rays go through the middles of what the pixels cover."""
+    blender = write_blender(tmp_path)
+    large = write_image(blender / "train" / "r_0.png", 1, size=(7, 11))
+    full = load_views(blender, downscale=1)
+    monkeypatch.setattr(view_files, "LONGEST", 10)
+    views = load_views(blender)
+    assert views.sizes.tolist() == [[3, 5], [6, 8], [6, 8], [6, 8]] and not full.notes
+    assert views.notes == ("images are reduced by the factor 2 along each side: option --downscale",)
+    mean = full.image(0)[:6, :10].reshape(3, 2, 5, 2, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(views.image(0)[..., 3], mean[..., 3], atol=0.5 / 255 + 1e-6)
+    known = mean[..., 3] > 0.4  # bytes are coarse where little is seen
+    np.testing.assert_allclose(views.image(0)[known], mean[known], atol=0.01)
+    assert np.array_equal(views.stored(1), full.stored(1)) and large.shape == (7, 11, 4)
+    x, y = np.meshgrid(np.arange(5), np.arange(3))
+    rays = captures.rays_of(views, 0, x, y)[1], captures.rays_of(full, 0, 2 * x + 0.5, 2 * y + 0.5)[1]
+    np.testing.assert_allclose(*rays, atol=1e-12)
+    assert load_views(blender, downscale=3).sizes.tolist() == [[2, 3], [2, 2], [2, 2], [2, 2]]
+    with pytest.raises(ViewsError, match=r"r_1\.png: has 8 × 6 pixels, which cannot be reduced by the factor 7$"):
+        load_views(blender, downscale=7)
+
+
+def test_masks_and_lenses_of_reduced_images(tmp_path):
+    u, v = photographs(tmp_path, **LENS)
+    mask = np.full((SIDE, SIDE), 255, np.uint8)
+    mask[31:] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    change(tmp_path, "transforms.json", frame=1, mask_path="mask.png")
+    views = load_views(tmp_path, downscale=2)
+    focal, centre = views.focal[0], views.centre[0]
+    assert focal.tolist() == [25, 27.5] and centre.tolist() == [16.5, 15.25]
+    x, y = np.meshgrid(np.arange(SIDE // 2) + 0.5, np.arange(SIDE // 2) + 0.5)
+    u, v = (x - centre[0]) / focal[0], (y - centre[1]) / focal[1]
+    counted = views.counted(0) & (np.abs(u) < 0.55) & (np.abs(v) < 0.5)
+    assert counted.sum() > 500 and np.abs(views.image(0)[..., :3] - pattern(u, v))[counted].max() < 0.02
+    rows = 15.25 + 27.5 * shown_at(u, v, **LENS)[1]
+    np.testing.assert_array_equal(views.counted(1), rows < 15)
 
 
 @pytest.mark.parametrize("lens", [LENS, {"k1": 0.1, "k2": 0.02, "k3": 0.01, "k4": 0.05, "k5": 0.01, "k6": 0.002}])

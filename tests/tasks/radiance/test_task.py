@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mi_diffind import fitting
+from mi_diffind import fitting, metrics
 from mi_diffind.cli import main
 from mi_diffind.deadline import Deadline
 from mi_diffind.fitting import FitSettings
@@ -102,6 +102,7 @@ def test_fit_meets_views_it_has_not_seen(folder):
     figures = json.loads((folder / "fit.json").read_text())
     table = load_table(folder / "ball.npz", "field")
     assert table.preset == "sparse" and table.settings["capture_path"] == "."
+    assert 0.5 < table.measured["ssim_white"] < 1
     # A grey ball in its place, the mean of all pixels, has 13 dB
     assert table.measured["psnr_foreground_db"] > 17.5 and table.measured["psnr_white_db"] > 23
     assert figures["memory_bytes"] < figures["dense_bytes"] / 10
@@ -343,6 +344,25 @@ def test_scores_of_a_known_error(folder):
     black = [np.square(displayed(v))[c].mean() for v, c in zip(truth, covered, strict=True)]
     assert found["psnr_foreground_db"] == pytest.approx(np.mean(-10 * np.log10(black)), abs=1e-3)
     assert found["psnr_white_db"] == pytest.approx(np.mean(-10 * np.log10(black * share)), abs=1e-3)
+
+
+def test_structural_similarity(rng):
+    """Against its definition: means, variances and covariance under a Gaussian of 11 × 11 pixels."""
+    truth = rng.random((24, 20, 3))
+    image, counted = np.clip(truth + rng.normal(0, 0.2, truth.shape), 0, 1), rng.random((24, 20)) < 0.5
+    window = np.exp(-np.square(np.arange(-5, 6) / 1.5) / 2)
+    window = np.outer(window, window) / window.sum() ** 2
+    pieces = [np.lib.stride_tricks.sliding_window_view(v, (11, 11), axis=(0, 1)) for v in (truth, image)]
+    a, b = (np.einsum("yxcij,ij->yxc", v, window) for v in pieces)
+    aa, bb, ab = (
+        np.einsum("yxcij,yxcij,ij->yxc", pieces[i], pieces[j], window) - m
+        for i, j, m in ((0, 0, a * a), (1, 1, b * b), (0, 1, a * b))
+    )
+    expected = (2 * a * b + 1e-4) * (2 * ab + 9e-4) / ((a * a + b * b + 1e-4) * (aa + bb + 9e-4))
+    assert metrics.ssim_published(truth, image) == pytest.approx(expected.mean(), abs=1e-6)
+    inside = counted[5:-5, 5:-5]
+    assert metrics.ssim_published(truth, image, counted) == pytest.approx(expected[inside].mean(), abs=1e-6)
+    assert metrics.ssim_published(truth[:10], image[:10]) is None
 
 
 def test_divided_grids_are_what_they_were(folder, ad, rng):

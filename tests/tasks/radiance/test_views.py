@@ -8,7 +8,7 @@ import drjit.llvm.ad as llvm
 import numpy as np
 import OpenEXR
 import pytest
-from captures import SIZE, Fog, change, pose, write_image, write_json
+from captures import SIZE, Fog, change, pose, write_blender, write_image, write_json
 from PIL import Image
 
 from mi_diffind.tasks.radiance.session import FieldSession, ViewImages
@@ -39,14 +39,7 @@ def test_a_limit_of_pixels_leaves_out_held_out_views(blender):
 
 @pytest.fixture
 def blender(tmp_path):
-    """Four views for training, two test views; extensions are left out, as Blender's data has it."""
-    for split, count in (("train", 4), ("test", 2)):
-        (tmp_path / split).mkdir()
-        frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": pose(i)} for i in range(count)]
-        for i in range(count):
-            write_image(tmp_path / split / f"r_{i}.png", i)
-        write_json(tmp_path / f"transforms_{split}.json", camera_angle_x=0.7, frames=frames)
-    return tmp_path
+    return write_blender(tmp_path)
 
 
 def linear(byte):

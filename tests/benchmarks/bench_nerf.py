@@ -1,0 +1,96 @@
+"""
+Measure grid and field on captures in the format of NeRF's synthetic scenes, which the user brings:
+
+    python tests/benchmarks/bench_nerf.py nerf_synthetic/lego nerf_synthetic/chair -o docs/measured/nerf_scenes.json
+
+A scene is called as its folder. Each training is a process of its own: ``mi-diffind fit field FOLDER --preset grid``,
+then ``mi-diffind fit field FOLDER --grid GRID``, with the defaults but for ``--steps`` (of both, for trials) and
+``--bytes`` (one more field for each size). The file grows with each result; rows of the same scene, size of the views
+and method are replaced. Files of fields stay in ``--work``.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from mi_diffind.files import write_json
+from mi_diffind.measure.clock import machine
+from mi_diffind.tasks.radiance.views import load_views
+
+
+def timed(command: list[str]) -> dict:
+    """Run a command; return minutes of the clock and of the processor, and peak memory. Raises ``SystemExit``."""
+    print(" ".join(command), flush=True)
+    start = time.perf_counter()
+    process = subprocess.Popen([sys.executable, "-m", "mi_diffind.cli", *command])
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"exit code {process.returncode} of: {' '.join(command)}")
+    return {
+        "minutes": (time.perf_counter() - start) / 60,
+        "cpu_minutes": (usage.ru_utime + usage.ru_stime) / 60,
+        "peak_bytes": usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024),
+    }
+
+
+def training(folder: str, output: Path, options: list[str]) -> dict:
+    """Fit a field to a folder, and return its figures."""
+    report = output.with_suffix(".json")
+    cost = timed(["fit", "field", folder, "-o", str(output), "--json", str(report), *options])
+    fitted = json.loads(report.read_text(encoding="utf-8"))
+    return {
+        **fitted["measured"], **cost, "file_bytes": output.stat().st_size, "memory_bytes": fitted["memory_bytes"],
+        "options": [o for o in options if not o.endswith(".npz")],
+    }  # fmt: skip
+
+
+def after(grid: dict, row: dict) -> dict:
+    """Return the row of a field with the cost of the grid that it was made of."""
+    costs = {name: grid[name] + row[name] for name in ("minutes", "cpu_minutes")}
+    return row | costs | {"peak_bytes": max(grid["peak_bytes"], row["peak_bytes"])}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", metavar="FOLDER")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE.json")
+    parser.add_argument("--steps", type=int, metavar="N", help="steps of each training, for trials")
+    parser.add_argument("--bytes", nargs="*", default=[], metavar="N", help="one more field of so many bytes in memory")
+    parser.add_argument(
+        "--work", metavar="FOLDER", help="folder for the files of the fields (default: a temporary one)"
+    )
+    arguments = parser.parse_args()
+    output = Path(arguments.output)
+    result = json.loads(output.read_text(encoding="utf-8")) if output.is_file() else {"rows": []}
+    described = machine("llvm_ad_rgb")
+    quoted = {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
+    steps = [] if arguments.steps is None else ["--steps", str(arguments.steps)]
+    work = Path(arguments.work or tempfile.mkdtemp())
+    work.mkdir(parents=True, exist_ok=True)
+    for folder in arguments.folders:
+        scene = Path(folder).resolve().name
+        side = int(load_views(folder, "test", 1).sizes[0].max())
+        grid_file = work / f"{scene}{side}.grid.npz"
+
+        def add(row: dict, scene=scene, side=side) -> None:
+            place = {"scene": scene, "side": side, "method": row["method"]}
+            result["rows"] = [r for r in result["rows"] if any(r[k] != v for k, v in place.items())]
+            result["rows"].append(place | row | {"machine": quoted})
+            write_json(output, result)
+
+        grid = training(folder, grid_file, ["--preset", "grid", *steps])
+        add({"method": "grid", **grid})
+        for size in ("", *arguments.bytes):
+            sized = ["--bytes", size] if size else []
+            field = training(folder, work / f"{scene}{side}{size}.npz", ["--grid", str(grid_file), *sized, *steps])
+            add({"method": f"field, {size} in memory" if size else "field", **after(grid, field)})
+
+
+if __name__ == "__main__":
+    main()
