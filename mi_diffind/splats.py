@@ -98,7 +98,7 @@ class Splats:
                 vertices = load_ply(file)["metadata"]["_ply_raw"]["vertex"]["data"]
             names = vertices.dtype.names if isinstance(vertices, np.ndarray) else tuple(vertices)
         except OSError as e:
-            raise SplatsError(f"{path}: cannot be read ({reason(e)})") from None
+            raise SplatsError(f"{path}: cannot be read ({e.strerror or reason(e)})") from None
         except Exception as e:  # the reader has no errors of its own
             raise SplatsError(f"{path}: is not a PLY file with vertices, or is damaged ({reason(e)})") from None
         if "packed_position" in names:
@@ -189,11 +189,14 @@ class Splats:
 class SplatSubject:
     """Gaussians of a file as the subject of a capture, cropped to a ``box`` (default: :meth:`Splats.cropped`).
 
-    Raises :class:`SplatsError`, and :class:`~mi_diffind.errors.UsageError` if they need more memory than there is.
+    Raises :class:`SplatsError`, also in a variant without RGB, and :class:`~mi_diffind.errors.UsageError` if the
+    Gaussians need more memory than there is.
     """
 
     def __init__(self, path: str | os.PathLike, box=None):
         self.path = Path(path)
+        if not mi.is_rgb:
+            raise SplatsError(f"{path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
         splats = Splats.read(path)
         self.splats, self.total = splats.cropped(box), len(splats)
         check_memory(f"{path}: Gaussians", len(self.splats), GAUSSIAN * len(self.splats))
@@ -220,8 +223,6 @@ class SplatCamera:
     """Camera that sees Gaussians, ``settings`` (:class:`.capture_settings.CaptureSettings`) as for a scene."""
 
     def __init__(self, splats: Splats, settings):
-        if not mi.is_rgb:
-            raise SplatsError(f"{splats.path}: the variant {mi.variant()} shows no Gaussians, one with rgb is needed")
         self.settings = settings
         box = splats.box()
         self.centre, self.scale = box.mean(axis=0), SIZE / max(np.linalg.norm(box[1] - box[0]) / 2, 1e-30)

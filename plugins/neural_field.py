@@ -357,7 +357,8 @@ def integrator() -> type:
             path = self.model.table.path if self.model is not None else ""
             inner = str(self.surfaces).replace("\n", "\n  ")
             return (
-                f'NeuralField[\n  filename = "{path}",\n  smooth_depth = {self.smooth_depth},\n'
+                f'NeuralField[\n  filename = "{path}",\n  lit = {str(self.lit).lower()},\n'
+                f"  smooth_depth = {self.smooth_depth},\n"
                 f'  aovs = "{",".join(self.aovs)}",\n  surfaces = {inner}\n]'
             )
 

@@ -1,4 +1,4 @@
-"""Write field.xml: a radiance field among meshes.
+"""Write field.xml and field_lit.xml: a radiance field among meshes.
 
 The field was captured from capture_group.xml and compressed (``mi-diffind capture``, ``mi-diffind fit field``). See
 README.md.
@@ -11,18 +11,49 @@ from scene_xml import Whole, element, environment, head, lying, plugin, transfor
 
 ABOUT = """A radiance field among meshes: Suzanne, a vase, a knot and a pear, captured in the same light, on a mirror
 that shows them from below. A golden knot before them and a jar behind are meshes; a mirror shows their other side, and
-a ball of glass is there to see them through. The field casts no shadow and is not lit. Written by make_field.py:
-change that file.
+a ball of glass is there to see them through. The field casts no shadow; that of field_lit.xml does. Written by
+make_field.py: change that file.
 
 "-D file=…" takes another field."""
+
+ABOUT_LIT = """A radiance field that lights and shadows the surfaces around it: Suzanne, a vase, a knot and a pear on a
+white table, before a brushed plate, beside a ball of plastic, in the light of their capture. Written by
+make_field.py: change that file.
+
+"-D lit=false" renders the field without its light and its shadow."""
+
+#: Camera of both scenes.
+CAMERA = {"origin": (2.2, 2.4, 6.5), "target": (0.02, 0.68, 0), "up": (0, 1, 0)}
 
 FOLDER = Path(__file__).resolve().parent
 
 
+def write_lit() -> None:
+    """Write field_lit.xml."""
+    content = head(960, 540, {"file": "assets/group.npz", "lit": "true"}, fov=41.0, camera=CAMERA)
+    at = next(i for i, item in enumerate(content) if item.tag == "integrator")
+    lit = element("boolean", name="lit", value="$lit")
+    content[at] = plugin("integrator", "neural_field", lit, filename="$file", max_depth=Whole("$max_depth"))
+    plate = plugin("bsdf", "twosided", plugin("bsdf", "roughconductor", material="Al", alpha=0.1), id="plate")
+    ball = plugin("bsdf", "plastic", diffuse_reflectance=(0.5, 0.03, 0.02))
+    content += [
+        "The light that the field was captured in",
+        environment("forest.exr", 0.8, 40.0),
+        "A table",
+        lying(5, 5, plugin("bsdf", "diffuse", reflectance=(0.7, 0.7, 0.7)), y=-0.01),
+        "A brushed plate behind the field, turned towards the camera, and a ball",
+        plate,
+        plugin("shape", "rectangle", transform(scale={"x": 1.1, "y": 1.0}, rotate=turn("y", 42),
+               translate=place(-2.1, 1.0, -1.5)), element("ref", id="plate")),
+        plugin("shape", "sphere", ball, transform(scale={"value": 0.36}, translate=place(-0.3, 0.35, 1.9))),
+    ]  # fmt: skip
+    write(FOLDER / "field_lit.xml", ABOUT_LIT, content)
+
+
 def main() -> None:
     """Write the files."""
-    camera = {"origin": (2.2, 2.4, 6.5), "target": (0.02, 0.68, 0), "up": (0, 1, 0)}
-    content = head(960, 540, {"file": "assets/group.npz"}, fov=41.0, camera=camera)
+    write_lit()
+    content = head(960, 540, {"file": "assets/group.npz"}, fov=41.0, camera=CAMERA)
     at = next(i for i, item in enumerate(content) if item.tag == "integrator")
     surfaces = plugin("integrator", "path", name="surfaces", max_depth=Whole("$max_depth"))
     content[at] = plugin("integrator", "neural_field", surfaces, filename="$file")

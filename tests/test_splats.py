@@ -187,17 +187,21 @@ def test_damaged_files_are_refused(tmp_path, rng):
 
 def test_options_of_scenes_are_refused(mi_rgb, tmp_path, rng, capsys):
     path = str(write(tmp_path / "s.ply", columns(gaussians(rng))))
-    (tmp_path / "s.xml").write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
+    scene = tmp_path / "s.xml"
+    scene.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     box, out = ["--box", *"000111"], ["-o", str(tmp_path / "v")]
     for command, message in (
         (["capture", path, *out, "--objects", "a"], "objects: given with the 3D Gaussians"),
         (["capture", path, *out, "-D", "a=1"], "defines: given with the 3D Gaussians"),
-        (["capture", str(tmp_path / "s.xml"), *out, *box], "box: given with a scene"),
+        (["capture", str(scene), *out, *box], "box: given with a scene"),
         (["capture", path, *out, "--box", *"000110"], "box: found no box"),
+        (["capture", path, *out, "--variant", "llvm_ad_mono"], "the variant llvm_ad_mono shows no Gaussians"),
+        (["fit", "field", str(tmp_path / "none.ply"), "-o", str(tmp_path / "f.npz")], "none.ply: cannot be read (No"),
         (["fit", "field", str(tmp_path), "-o", str(tmp_path / "f.npz"), *box], "--box: given with"),
     ):
         assert cli.main(command) == 2
         assert message in capsys.readouterr().err
+    assert not (tmp_path / "v").exists()
 
 
 def test_a_field_of_gaussians(mi_rgb, tmp_path, rng, monkeypatch):
