@@ -119,8 +119,8 @@ steps of half the smallest voxel there, and ``to_world`` of such fields has no d
 **Derivatives** with respect to the field's arrays and its ``to_world`` replay the rays (Vicini et al., *Path Replay
 Backpropagation*, SIGGRAPH 2021). They cover the radiance, alpha and the channels of ``aovs``. If the inner integrator
 replays paths, too (:monosp:`path_footprint`, :monosp:`path_sdf`, :monosp:`prb`, …), it adds the derivatives of
-materials, textures and emitters; any other inner integrator is constant, and so is the geometry. With ``lit``, light
-and shadow of the field on surfaces are constants to the derivatives with respect to the field.
+materials, textures and emitters; any other inner integrator is constant, and so is the geometry. With ``lit``, the
+derivatives with respect to the field include its light and its shadow on surfaces; alpha behind holes is constant.
 
 ``to_world`` may change between renders; the field is then that of a new scene. Its derivatives, with any ``storage``,
 include the sides of the box and the surfaces that cut the field. Where occupied cells end before the density is zero,
@@ -328,7 +328,8 @@ def integrator() -> type:
                     raise RuntimeError(f'parameter "tables.{name}": has the shape {shape}, expected {expected}')
             if not keys or "to_world" in keys:
                 self.placed.update()
-            if all(key.startswith("tables.") for key in keys or ("",)):
+            # Mitsuba gives the last part of a name
+            if keys and all(key.rpartition(".")[2] in self.placed.exposed for key in keys):
                 if self.lit:
                     self.field_light.update()
                 self._hold()
@@ -460,6 +461,8 @@ def integrator() -> type:
             field_arrays = {compat.identity(values) for placed in self.fields for values in placed.exposed.values()}
             params = mi.traverse(scene)
             values = [params[key] for key in params.keys()]
+            if self.lit and self.field_light.optimised():
+                return True
             attached = [v for v in values if isinstance(v, dr.ArrayBase) and compat.has_gradient(v)]
             return any(compat.identity(v) not in field_arrays for v in attached)
 

@@ -177,6 +177,8 @@ def integrator() -> type:
             the radiance of the whole path (``state_in``).
             """
             primal, between = mode == dr.ADMode.Primal, self.between
+            moving = not primal and between is not None and between.optimised()
+            unattached = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad  # a field may be all that is optimised
             carried = bool(getattr(ray, "has_differentials", False))
             environment = scene.environment() is not None and not self.hide_emitters
             flags = mi.RayFlags.All | mi.RayFlags.dNSdUV if carried else mi.RayFlags.All
@@ -227,7 +229,7 @@ def integrator() -> type:
                 ds, emitter_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
                 lit &= ds.pdf != 0
                 wo = si.to_local(ds.d)
-                shadow = mi.Float(1)
+                shadow, beam = mi.Float(1), mi.Ray3f(ray)
                 if dr.hint(between is not None, mode="scalar"):
                     beam = si.spawn_ray_to(ds.p)
                     shadow = between.transmittance(beam, beam.maxt, lit)
@@ -241,6 +243,8 @@ def integrator() -> type:
                     )
                     weight = dr.select(ds.delta, 1, power_heuristic(ds.pdf, dr.detach(bsdf_pdf)))
                     direct = dr.select(lit, throughput * weight * shadow * bsdf_value * emitter_weight, 0)
+                if dr.hint(moving, mode="scalar"):
+                    δL += between.derive(mode, beam, beam.maxt, lit, δL, mi.Spectrum(0), dr.detach(direct))
                 if dr.hint(between is not None, mode="scalar"):
                     # Light from a field
                     toward, chance = between.sample(si.p, sampler.next_1d(), sampler.next_2d(), smooth)
@@ -252,8 +256,12 @@ def integrator() -> type:
                     far = scene.ray_intersect_preliminary(beam, coherent=False, active=smooth).t
                     shine, _ = between.cross(beam, far, smooth)
                     weight = power_heuristic(chance, dr.detach(bsdf_pdf)) * dr.rcp(chance)
+                    weight = dr.select(smooth, throughput * weight, 0)
                     with dr.resume_grad(when=not primal):
-                        direct += dr.select(smooth, throughput * weight * bsdf_value * shine, 0)
+                        direct += dr.select(smooth, weight * bsdf_value * shine, 0)
+                    if dr.hint(moving, mode="scalar"):
+                        weight = weight * dr.detach(bsdf_value)
+                        δL += between.derive(mode, beam, far, smooth, δL, weight, weight * shine)
                 bs = dr.detach(bs)
                 delta_next = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
                 L = L + emitted + direct if primal else L - dr.detach(emitted + direct)
@@ -265,9 +273,9 @@ def integrator() -> type:
                         reflected = L * dr.select(delta_next, relative(bsdf_weight), relative(rough))
                         contribution = emitted + direct + dr.select(going, reflected, 0)
                         if dr.hint(mode == dr.ADMode.Backward, mode="scalar"):
-                            dr.backward_from(δL * contribution)
+                            dr.backward_from(δL * contribution, unattached)
                         else:
-                            δL += dr.forward_to(contribution)
+                            δL += dr.forward_to(contribution, flags=unattached)
 
                 out = si.to_world(bs.wo)
                 if dr.hint(carried, mode="scalar"):
@@ -295,7 +303,10 @@ def integrator() -> type:
                     # Fields up to the next surface, weighted against having sampled this direction towards them
                     shine, passed = between.cross(ray, pi.t, active)
                     weight = power_heuristic(density, between.density(before.p, ray.d, active & ~delta))
-                    shine = dr.select(active, throughput * weight * shine, 0)
+                    weight = dr.select(active, throughput * weight, 0)
+                    if dr.hint(moving, mode="scalar"):
+                        δL += between.derive(mode, ray, pi.t, active, δL, weight, L)
+                    shine = dr.select(active, weight * shine, 0)
                     L = L + shine if primal else L - shine
                     clear = dr.select(active & ~valid, clear * passed, clear)
                     throughput *= dr.select(active, passed, 1)

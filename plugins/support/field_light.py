@@ -51,6 +51,35 @@ class FieldLight:
             through *= dr.select(marched.transmittance > marching.OPAQUE, marched.transmittance, 0)
         return light, through
 
+    def optimised(self) -> bool:
+        """Return whether a derivative with respect to a field is requested."""
+        return any(placed.optimised() for placed in self.fields)
+
+    def derive(self, mode, ray, far, active, δL, factor, total):
+        """Propagate the derivatives of the light ``total`` that arrives along rays, up to the distance ``far``.
+
+        ``total`` is ``factor`` times the light of :meth:`cross`, plus the light from beyond. ``Backward`` propagates
+        the adjoint ``δL`` of ``total`` to the fields. ``Forward`` returns the derivative of ``total``.
+        """
+        change, before, beyond = mi.Spectrum(0), mi.Float(1), mi.Spectrum(total)
+        for placed, crossed in in_order(self.fields, [f.enters(ray, far, active) for f in self.fields]):
+            marched = placed.march(ray, far, crossed)
+            through = dr.select(marched.transmittance > marching.OPAQUE, marched.transmittance, 0)
+            share = mi.Spectrum(factor) * before
+            beyond -= dr.select(crossed, share * self.light.of(marched.colour, ray.wavelengths, crossed), 0)
+            if placed.optimised():
+                inverse = dr.select(through > 0, dr.rcp(through), 0)
+                if mode == dr.ADMode.Backward:
+                    d_colour = self.light.adjoint(marched.colour, ray.wavelengths, δL * share, crossed)
+                    d_through = dr.sum(δL * beyond) * inverse
+                    placed.replay(ray, far, crossed, marched, d_colour, d_through, mi.Float(0))
+                else:
+                    colour, transmittance, _ = placed.tangent(ray, far, crossed, marched)
+                    seen = self.light.tangent(marched.colour, colour, ray.wavelengths, crossed)
+                    change += dr.select(crossed, share * seen + beyond * transmittance * inverse, 0)
+            before *= through
+        return change
+
     def transmittance(self, ray, far, active=True):
         """Return the transmittance of the fields on rays up to the distance ``far``."""
         through = mi.Float(1)

@@ -608,6 +608,14 @@ def test_derivatives_of_lit_surfaces(mi_rgb, fields):
     check(mi_rgb, lit(mi_rgb, integrator={"max_depth": 3, "lit": True}), "bsdf.reflectance.value")
 
 
+def test_derivatives_of_light_and_shadow(mi_rgb, fields):
+    """Of a field that lights and shadows; directions towards it are constants, as the derivatives take them."""
+    made = lit(mi_rgb, integrator={"max_depth": 3, "lit": True, "hide_emitters": True})
+    made.integrator()._group = made.integrator().field_light.update = lambda: None
+    check(mi_rgb, made, "tables.density")
+    check_place(mi_rgb, made, "it.to_world")
+
+
 def test_derivatives_of_spectra():
     import mitsuba as mi
 
