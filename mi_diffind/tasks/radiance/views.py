@@ -45,9 +45,9 @@ class CapturedViews:
     ``poses`` ``(V, 4, 4)``, float64, map camera to world. ``focal`` and ``centre``, ``(V, 2)``, are in pixels, the
     centre from the upper left corner. ``names`` are those of the image files.
 
-    ``has_alpha`` is false if an image without alpha counts as opaque. ``box`` ``(2, 3)`` holds the lower and the upper
-    corner of the captured objects if the file has an ``aabb``, or those of most points of a model of COLMAP whose
-    images have no alpha; else it is ``None``.
+    ``has_alpha`` is false if an image without alpha counts as opaque, or if the alpha of all images is 1 everywhere.
+    ``box`` ``(2, 3)`` holds the lower and the upper corner of the captured objects if the file has an ``aabb``, or
+    those of most points of a model of COLMAP whose images have no alpha; else it is ``None``.
 
     ``mask``, bool ``(n,)``, is false for pixels that do not count: those that a mask excludes, and those that an
     undistorted photograph does not show. ``None``: all count. ``notes`` are sentences for the user; ``settings`` are
@@ -163,6 +163,7 @@ def load_views(
         for path, frame in zip(paths, frames, strict=True):
             images.add(path, frame, listed)
             bar.update()
+    opaque = images.opaque if images.transparent else list(range(len(paths)))
     notes = []
     if images.reduced:
         factors = " or ".join(map(str, sorted(images.reduced)))
@@ -179,13 +180,13 @@ def load_views(
         centre=np.array(images.centre),
         names=tuple(str(path.relative_to(folder) if path.is_relative_to(folder) else path) for path in paths),
         path=folder,
-        has_alpha=not images.opaque,
+        has_alpha=not opaque,
         split=split,
         mask=images.mask(),
         notes=tuple(notes),
         settings=listed.settings,
     )
-    views = _in_front_of(views, images.opaque, background)
+    views = _in_front_of(views, opaque, background)
     return dataclasses.replace(views, box=_box(listed, views.has_alpha))
 
 
@@ -234,7 +235,7 @@ class _Images:
     def __init__(self, views: int, words: int, downscale: int | None):
         self.views, self.pixels, self.count = views, np.empty((0, words), np.uint32), 0
         self.sizes, self.focal, self.centre, self.masks = [], [], [], []
-        self.opaque, self.undistorted, self.downscale, self.reduced = [], 0, downscale, set()
+        self.transparent, self.opaque, self.undistorted, self.downscale, self.reduced = False, [], 0, downscale, set()
 
     def add(self, path: Path, frame: Frame, listed: FrameList) -> None:
         """Read an image and its mask, reduce and undistort them."""
@@ -268,6 +269,8 @@ class _Images:
         self.masks.append(None if mask is None or mask.all() else mask)
         if not has_alpha:
             self.opaque.append(len(self.sizes) - 1)
+        elif not self.transparent:
+            self.transparent = bool(image[..., 3].min() < (255 if image.dtype == np.uint8 else 1))
         self._store(image)
 
     def _store(self, image: np.ndarray) -> None:

@@ -217,6 +217,16 @@ def test_backgrounds_that_are_chosen(studio_shots):
     assert load_views(folder).background is None and not load_views(folder).notes
 
 
+def test_an_alpha_of_one_everywhere_is_none(studio_shots):
+    folder, images = studio_shots
+    views = load_views(folder)
+    for name, values in images.items():
+        Image.fromarray(np.dstack([values[..., :3], np.full((24, 24), 255, np.uint8)])).save(folder / name)
+    again = load_views(folder)
+    assert again.background == views.background and again.digest == views.digest
+    assert not load_views(folder, background="scene").has_alpha
+
+
 def test_backgrounds_of_linear_images(studio_shots):
     folder, images = studio_shots
     views = load_views(folder)
