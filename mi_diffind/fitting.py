@@ -27,6 +27,7 @@ from .indirection import aligned_copy, unfolded
 from .interrupt import interruptible
 from .progress import in_terminal, progress_bar
 from .settings import LOSSES, SCHEDULES, FitSettings, FittingError
+from .sparse_adam import SparseAdam
 
 __all__ = ["LOSSES", "SCHEDULES", "FitResult", "FitSettings", "FittingError", "Problem", "fit"]
 
@@ -80,6 +81,10 @@ class Problem:
 
     #: Adam's decay of squared gradients. A rare, large gradient moves an entry by ``1 / √(1 − beta_2)`` learning rates.
     beta_2: float = 0.999
+
+    #: True if a step reads a small part of the tables: only entries with a gradient are updated
+    #: (:class:`.sparse_adam.SparseAdam`). ``net`` is a dictionary then.
+    sparse: bool = False
 
     #: What the settings do not say about the problem, as JSON; a checkpoint of another one is refused.
     identity: Mapping = {}
@@ -240,7 +245,9 @@ def fit(
 
     with interruptible() as stop, cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
-            before, share_before = trainer.snapshot(), trainer.share
+            # A snapshot of tables that are written in place is a copy
+            kept = not problem.sparse or (trainer.step + 1) % settings.check_every == 0
+            before, share_before = trainer.snapshot() if kept else good, trainer.share
             loss = trainer.take_step(plateau.factor)
             if seconds is not None:
                 dr.eval(loss)
@@ -402,7 +409,7 @@ class _Trainer:
         self.problem, self.settings = problem, settings
         self.step, self.lr_scale, self.restarts, self.phase = 0, 1.0, 0, ""
         self.share = 0.0  # of the training that is over
-        self.optimizer = Adam(lr=settings.lr, beta_2=problem.beta_2)
+        self.optimizer = (SparseAdam if problem.sparse else Adam)(lr=settings.lr, beta_2=problem.beta_2)
         self.optimizer.update(problem.net)
         self.module = compat.module_of(next(iter(self.optimizer.values())))
 
@@ -432,6 +439,8 @@ class _Trainer:
         dr.traverse(dr.ADMode.Backward)
         rate = self.learning_rate(plateau)
         self.optimizer.set_learning_rate({name: rate for name in self.optimizer})
+        if self.problem.sparse:
+            net.clear()  # the tables are written in place
         self.optimizer.step()
         net.update(self.optimizer)
         self.step += 1

@@ -26,6 +26,7 @@ FLOORS = (
     ("lookup",),
     ("indirection", "pages"),
     ("tables",),
+    ("sparse_adam",),
     ("fitting",),
     ("task",),
     ("maps",),

@@ -21,6 +21,11 @@ from ...task import Task
 from .presets import BACKGROUNDS, PRESETS
 
 
+def resolution(text: str) -> int | None:
+    """Return a whole number ≥ 1, or ``None`` for ``auto``. Raises ``ArgumentTypeError``."""
+    return None if text == "auto" else positive(text)
+
+
 class RadianceField(Task):
     """Task 7, ``fit field``. The layout fixes the storage: bytes, or half precision for the preset ``grid``."""
 
@@ -51,8 +56,9 @@ class RadianceField(Task):
             help="PSNR over white, in dB: the smallest of several sizes that reaches it is taken (several trainings)",
         ),
         Argument(
-            "--resolution", type=positive, metavar="N",
-            help="resolution of the grid: nodes along the side of a cube of the same volume (default: 128)",
+            "--resolution", type=resolution, metavar="N",
+            help="resolution of the grid: nodes along the side of a cube of the same volume, or auto: a voxel is as "
+            "wide as a pixel (default: auto)",
         ),
         Argument(
             "--background", choices=BACKGROUNDS,

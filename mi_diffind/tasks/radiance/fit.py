@@ -21,7 +21,7 @@ from ...task import FitRequest, Fitted
 from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
-from .presets import COMPRESSION, PRESETS, RESOLUTION, STAGES, dense_bytes, ratio_for
+from .presets import COMPRESSION, PRESETS, RESOLUTIONS, STAGES, dense_bytes, ratio_for, scaled_steps
 from .session import FieldSession
 from .training import ImagesProblem
 from .volume_field import VolumeField
@@ -70,7 +70,7 @@ def check(request: FitRequest) -> None:
                 raise UsageError(f"--{name}: {e}") from None
             if name == "bytes":
                 units.check_size("--bytes", value, MAX_BYTES)
-    nodes = options["resolution"] or RESOLUTION
+    nodes = options["resolution"] or RESOLUTIONS[0]
     units.check_memory("--resolution", nodes, VOXEL * nodes**3)
 
 
@@ -84,7 +84,8 @@ def fit(request: FitRequest) -> Fitted:
     options = request.options
     reading = {name: options.get(name) for name in ("background", "downscale")}
     session = FieldSession.load(request.types, options["source"], pixels, progress=request.progress, **reading)
-    return FieldFit(request, session).run()
+    settings = scaled_steps(request.settings, len(session.views) * session.views.mean_pixels)
+    return FieldFit(dataclasses.replace(request, settings=settings), session).run()
 
 
 @dataclasses.dataclass
@@ -171,7 +172,8 @@ class FieldFit:
         settings = dataclasses.replace(
             settings, seed=request.settings.seed, deterministic=request.settings.deterministic
         )
-        nodes = request.options["resolution"] or RESOLUTION
+        settings = scaled_steps(settings, len(views) * views.mean_pixels)
+        nodes = request.options["resolution"] or grids.resolution_of(views)
         stages_file = Path(f"{request.checkpoint}.grid.npz") if request.checkpoint else None
         limited = request.part(GRID_TIME if request.preset != "grid" else 1.0)
         grid, finished, result = None, 0, None

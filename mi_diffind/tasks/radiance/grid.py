@@ -15,10 +15,11 @@ from scipy.ndimage import binary_dilation, map_coordinates
 from ...indirection import device_array, device_tensor
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
+from .presets import RESOLUTIONS, VOXELS_PER_PIXEL
 from .session import FieldSession, ViewImages
 from .training import ImagesProblem
 from .views import CapturedViews
-from .visual_hull import box_of, hull
+from .visual_hull import box_of, hull, pixel_width
 from .volume_field import NodeField, NodeVolume
 
 #: Raw density per unit of the trained parameter, so that one learning rate suits density and colour.
@@ -28,7 +29,7 @@ DENSITY_SCALE = 10.0
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 
 #: Total variation of raw densities: its weight, the square that rounds its kink at 0, and nodes a step.
-SMOOTH, ROUND, VARIED = 2e-4, 1e-2, 2**15
+SMOOTH, ROUND, VARIED = 4e-5, 1e-2, 2**13
 
 #: Largest weight in a ray below which a cell is removed.
 VISIBLE = 0.02
@@ -53,6 +54,9 @@ class GridProblem(ImagesProblem):
 
     The variation makes neighbours agree that no image distinguishes, which is worth half a decibel in held-out views.
     """
+
+    sparse = True
+    beta_2 = 0.99
 
     def __init__(self, grid: NodeGrid, session: FieldSession):
         self.nodes, types = grid.nodes, grid.nodes.types
@@ -93,6 +97,13 @@ def neighbours(nodes: Nodes) -> np.ndarray:
     return np.stack([numbers[tuple((places + axis).T)] for axis in np.eye(3, dtype=int)], axis=1)
 
 
+def resolution_of(views: CapturedViews) -> int:
+    """Return the resolution at which a voxel is as wide as a pixel is at the middle of the box, for :func:`begin`."""
+    lower, upper = box_of(views)
+    voxel = pixel_width(views, (lower + upper) / 2) / VOXELS_PER_PIXEL
+    return int(np.clip(round(float(np.prod(upper - lower)) ** (1 / 3) / voxel), *RESOLUTIONS))
+
+
 def begin(types, views: CapturedViews, nodes: int) -> NodeGrid:
     """Return an empty grid of the visual hull, as fine as a cube of ``nodes``³ nodes with the volume of its box."""
     lower, upper = box_of(views)
@@ -121,8 +132,12 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
 
 
 def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
-    """Return the cells that some ray of the views sees, bool ``(X − 1, Y − 1, Z − 1)``."""
-    return weights(grid.field(), images) >= VISIBLE
+    """Return the cells that some ray of the views sees, bool ``(X − 1, Y − 1, Z − 1)``.
+
+    In a field that is nearly empty, since its training has just begun, they are those that are seen best.
+    """
+    largest = weights(grid.field(), images)
+    return (largest > 0) & (largest >= min(VISIBLE, 0.5 * float(largest.max())))
 
 
 def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 0) -> NodeGrid:

@@ -22,9 +22,6 @@ from .volume_field import VolumeField
 #: Transmittance at which a ray ends.
 OPAQUE = 1e-4
 
-#: Weight of a step below which its radiance is not read.
-NOTHING = 2e-7
-
 #: Flags of derivatives: not all arrays have to be differentiated.
 ANY = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
@@ -79,7 +76,7 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
             density, point_data = field.density_at(p, here)
             passed = through * dr.exp(-density * (end - t))
             weight = dr.select(here, through - passed, 0)
-            shown = here & (weight > NOTHING)
+            shown = here & (weight > field.least_weight)
             colour = types.Array3f(0)
             if shown:
                 colour = types.Array3f(*field.radiance_at(point_data, p, d, shown))
@@ -168,7 +165,7 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
                 density, point_data = field.density_at(place, here)
             passed = through * dr.exp(-dr.detach(density) * length)
             weight = dr.select(here, through - passed, 0)
-            shown = here & (weight > NOTHING)
+            shown = here & (weight > field.least_weight)
             colour, radiance, change = types.Array3f(0), types.Array3f(0), types.Array4f(0)
             if dr.hint(moving, mode="scalar"):
                 # Not in a branch: derivatives of the place leave it
@@ -193,19 +190,25 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
             step_depth = passed * (near + at) - rest_depth
             if dr.hint(adjoint is not None, mode="scalar"):
                 slope = dr.dot(d_colour, step_colour) + d_depth * step_depth - d_through * total
-                with dr.resume_grad():
-                    light = dr.select(here, density * (length * slope), 0)
-                    if dr.hint(moving, mode="scalar"):
-                        light += dr.select(shown, dr.dot(radiance, d_colour * weight), 0)
-                    dr.backward_from(light, ANY)
-                    moved, turned = dr.grad(place), dr.grad(way)
                 if dr.hint(moving, mode="scalar"):
+                    with dr.resume_grad():
+                        light = dr.select(here, density * (length * slope), 0)
+                        light += dr.select(shown, dr.dot(radiance, d_colour * weight), 0)
+                        dr.backward_from(light, ANY)
+                        moved, turned = dr.grad(place), dr.grad(way)
                     moved = dr.select(here, moved, 0)
                     d_entry += moved
                     d_way += at * moved + dr.select(here, turned, 0)
                     d_near += d_depth * weight
                     along = offset * (dr.dot(moved, d) + d_depth * weight)
                     d_length += last * dr.select(here, dr.detach(density) * slope + along, 0)
+                else:
+                    # A density of 0 has no derivative: most steps are read again to save the sums of the others
+                    dense = here & (dr.detach(density) > 0)
+                    if dense:
+                        with dr.resume_grad():
+                            again, _ = field.density_at(p, dense)
+                            dr.backward_from(again * (length * slope), ANY)
             else:
                 if dr.hint(moving, mode="scalar"):
                     rate = length * change[0] + last * dr.select(here, dr.detach(density), 0) * d_length

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import log, prod
 
 from ...settings import FitSettings
 
-#: Resolution of the grid: nodes along each side of a cube with the volume of the box.
-RESOLUTION = 128
+#: Voxels per pixel of the views at the distance of the box, and the range of the resolution that follows from them:
+#: nodes along each side of a cube with the volume of the box.
+VOXELS_PER_PIXEL, RESOLUTIONS = 1.0, (32, 320)
 
-#: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps.
-STAGES = ((0.25, 0.13), (0.5, 0.22), (1.0, 0.65))
+#: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
+#: that no ray sees are removed.
+STAGES = ((0.25, 0.08), (0.5, 0.12), (1.0, 0.15), (1.0, 0.65))
+
+#: Default steps of the grid and of the compressed field, for views of few pixels.
+GRID_STEPS, STEPS = 2300, 1000
+
+#: Rays for each pixel of the training views, by the default steps of a training, and the most steps that they give.
+RAYS_PER_PIXEL, MOST_STEPS = {GRID_STEPS: 6.0, STEPS: 1.5}, 12_000
 
 #: Ratio ρ of the sides of primary and cascaded array by compression (Table 6 of the supplement).
 RATIOS = {
@@ -47,10 +55,18 @@ class RadianceRecipe:
 
 #: Preset name → recipe; the first is the default.
 PRESETS = {
-    "sparse": RadianceRecipe("sparse", FitSettings(steps=1000, batch=8192, lr=5e-3, loss="mse", check_every=50)),
-    "paper": RadianceRecipe("pairs", FitSettings(steps=1000, batch=8192, lr=5e-3, loss="mse", check_every=50)),
-    "grid": RadianceRecipe("grid", FitSettings(steps=2300, batch=8192, lr=2.5e-2, loss="mse", check_every=50)),
+    "sparse": RadianceRecipe("sparse", FitSettings(steps=STEPS, batch=8192, lr=5e-3, loss="mse", check_every=50)),
+    "paper": RadianceRecipe("pairs", FitSettings(steps=STEPS, batch=8192, lr=5e-3, loss="mse", check_every=50)),
+    "grid": RadianceRecipe("grid", FitSettings(steps=GRID_STEPS, batch=8192, lr=4e-2, loss="mse", check_every=50)),
 }
+
+
+def scaled_steps(settings: FitSettings, pixels: float) -> FitSettings:
+    """Return settings whose default steps, if they are kept, grow with the ``pixels`` of all training views."""
+    rays = RAYS_PER_PIXEL.get(settings.steps)
+    if rays is None:
+        return settings
+    return replace(settings, steps=max(settings.steps, min(MOST_STEPS, round(rays * pixels / settings.batch))))
 
 
 def ratio_for(quantity: str, compression: float) -> float:

@@ -24,8 +24,10 @@ from .volume_field import VolumeField
 #: Pixels along a side of a patch.
 PATCH = 4
 
-#: Most held-out views of measurements during a training whose time is limited, their share of the held-out views that
-#: are read, and the least views for visible cells.
+#: Most held-out views of measurements during a training.
+MOST_WATCHED = 20
+
+#: The same if time is limited, their share of the held-out views that are read, and the least views for visible cells.
 WATCHED, WATCHED_SHARE, SEEING = 8, 0.2, 8
 
 
@@ -186,11 +188,13 @@ class FieldSession:
 
     @functools.cached_property
     def watched_images(self) -> ViewImages:
-        """Held-out views for measurements during a training, evenly spread in the list; few if time is limited."""
+        """Held-out views for measurements during a training, evenly spread in the list; fewer if time is limited."""
         count = len(self.held_out)
-        if self.pixels is None:
+        watched = min(count, MOST_WATCHED)
+        if self.pixels is not None:
+            watched = min(watched, max(1, min(WATCHED, round(WATCHED_SHARE * count))))
+        if watched == count:
             return self.held_out_images
-        watched = min(count, max(1, min(WATCHED, round(WATCHED_SHARE * count))))
         return ViewImages(self.types, self.held_out.chosen(np.arange(watched) * count // watched))
 
 

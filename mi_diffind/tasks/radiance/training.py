@@ -33,7 +33,7 @@ class ImagesProblem(Problem):
         behind = images.behind(rng, count)
         o, d = images.rays(view, x, y)
         truth = images.colours(view, x, y)
-        seen = differentiable(self.field_of(net), o, d, 0, dr.inf, True, offset)
+        seen = differentiable(self.field_of(net).for_training(), o, d, 0, dr.inf, True, offset)
         total = types.Float(0)
         for c in range(3):
             reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * behind[c], 0, 1), fused=False)

@@ -43,6 +43,12 @@ def box_of(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
+def pixel_width(views: CapturedViews, point) -> float:
+    """Return the width of a pixel at the distance of a point: the median over the views."""
+    distances = np.linalg.norm(views.origins - np.asarray(point), axis=1)
+    return float(np.median(distances / views.focal.mean(axis=1)))
+
+
 def _focus(views: CapturedViews) -> tuple[np.ndarray, float]:
     """Return the point nearest to the optical axes of all cameras and its distance to the nearest camera."""
     axes = -views.poses[:, :3, 2]

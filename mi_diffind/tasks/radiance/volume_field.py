@@ -18,6 +18,9 @@ from .nodes import Nodes
 #: Optical depth of a voxel below which its density counts as zero.
 FAINT = 2e-3
 
+#: Weight of a step below which its radiance is not read: in pictures, and in training.
+LEAST_WEIGHT, LEAST_TRAINED_WEIGHT = 2e-7, 1e-3
+
 #: Upper limit of the logarithm of a radiance.
 BRIGHTEST = 12.0
 
@@ -25,14 +28,15 @@ BRIGHTEST = 12.0
 class VolumeField:
     """Radiance field in the box from ``lower`` to ``upper``: the base class.
 
-    ``voxel`` is the side of a voxel. Rays take steps of length ``step``, half a voxel. ``arrays`` maps names to the
-    tensors that can be differentiated.
+    ``voxel`` is the side of a voxel. Rays take steps of length ``step``, half a voxel, and read no radiance where a
+    step weighs less than ``least_weight``. ``arrays`` maps names to the tensors that can be differentiated.
     """
 
     def __init__(self, types, lower, upper, voxel: float, arrays: dict):
         self.types = types
         self.lower, self.upper = tuple(map(float, lower)), tuple(map(float, upper))
         self.voxel, self.step = float(voxel), 0.5 * float(voxel)
+        self.least_weight = LEAST_WEIGHT
         self.arrays = dict(arrays)
         # Opaque: fields of another size use the same kernels
         self.box = tuple(dr.opaque(types.Array3f, corner) for corner in (self.lower, self.upper))
@@ -42,6 +46,12 @@ class VolumeField:
         """Return a copy of the field with other tensors in ``arrays``."""
         result = copy.copy(self)
         result.arrays = dict(arrays)
+        return result
+
+    def for_training(self) -> VolumeField:
+        """Return a copy with steps of a voxel, which reads the radiance of steps with a weight of at least 1e-3."""
+        result = copy.copy(self)
+        result.step, result.least_weight = self.voxel, LEAST_TRAINED_WEIGHT
         return result
 
     def density_at(self, p, active=True) -> tuple:

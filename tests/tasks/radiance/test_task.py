@@ -191,7 +191,7 @@ def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
         fit("field", preset="grid", progress=False, checkpoint=checkpoint, **options)
     stages.clear()
     again = fit("field", preset="grid", progress=False, checkpoint=checkpoint, resume=True, **options).table
-    assert len(stages) == 2
+    assert len(stages) == len(field_fit.STAGES) - 1
     assert again.arrays["density"].shape == whole.arrays["density"].shape
     np.testing.assert_array_equal(again.arrays["density"].values, whole.arrays["density"].values)
 
