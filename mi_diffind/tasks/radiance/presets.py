@@ -57,7 +57,7 @@ class RadianceRecipe:
 PRESETS = {
     "sparse": RadianceRecipe("sparse", FitSettings(steps=STEPS, batch=8192, lr=5e-3, loss="mse", check_every=50)),
     "paper": RadianceRecipe("pairs", FitSettings(steps=STEPS, batch=8192, lr=5e-3, loss="mse", check_every=50)),
-    "grid": RadianceRecipe("grid", FitSettings(steps=GRID_STEPS, batch=8192, lr=4e-2, loss="mse", check_every=50)),
+    "grid": RadianceRecipe("grid", FitSettings(steps=GRID_STEPS, batch=8192, lr=2.5e-2, loss="mse", check_every=50)),
 }
 
 
