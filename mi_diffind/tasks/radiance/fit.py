@@ -21,7 +21,7 @@ from ...task import FitRequest, Fitted
 from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
-from .presets import COMPRESSION, PRESETS, RESOLUTIONS, STAGES, dense_bytes, ratio_for, scaled_steps
+from .presets import COMPRESSION, PRESETS, RESOLUTIONS, STAGES, dense_bytes, ratio_for
 from .session import FieldSession
 from .training import ImagesProblem
 from .volume_field import VolumeField
@@ -84,7 +84,8 @@ def fit(request: FitRequest) -> Fitted:
     options = request.options
     reading = {name: options.get(name) for name in ("background", "downscale")}
     session = FieldSession.load(request.types, options["source"], pixels, progress=request.progress, **reading)
-    settings = scaled_steps(request.settings, len(session.views) * session.views.mean_pixels)
+    pixels = len(session.views) * session.views.mean_pixels
+    settings = PRESETS[request.preset].scaled(request.settings, pixels)
     return FieldFit(dataclasses.replace(request, settings=settings), session).run()
 
 
@@ -172,7 +173,8 @@ class FieldFit:
         settings = dataclasses.replace(
             settings, seed=request.settings.seed, deterministic=request.settings.deterministic
         )
-        settings = scaled_steps(settings, len(views) * views.mean_pixels)
+        if request.preset != "grid":
+            settings = PRESETS["grid"].scaled(settings, len(views) * views.mean_pixels)
         nodes = request.options["resolution"] or grids.resolution_of(views)
         stages_file = Path(f"{request.checkpoint}.grid.npz") if request.checkpoint else None
         limited = request.part(GRID_TIME if request.preset != "grid" else 1.0)

@@ -52,7 +52,7 @@ class NodeGrid:
 class GridProblem(ImagesProblem):
     """Training of a :class:`NodeGrid` through images, with a little total variation of its densities (:data:`SMOOTH`).
 
-    The variation makes neighbours agree that no image distinguishes, which is worth half a decibel in held-out views.
+    The variation makes neighbours agree that no image distinguishes, which is worth 0.3 dB in held-out views.
     """
 
     sparse = True

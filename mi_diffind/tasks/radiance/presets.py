@@ -15,11 +15,8 @@ VOXELS_PER_PIXEL, RESOLUTIONS = 1.0, (32, 320)
 #: that no ray sees are removed.
 STAGES = ((0.25, 0.08), (0.5, 0.12), (1.0, 0.15), (1.0, 0.65))
 
-#: Default steps of the grid and of the compressed field, for views of few pixels.
-GRID_STEPS, STEPS = 2300, 1000
-
-#: Rays for each pixel of the training views, by the default steps of a training, and the most steps that they give.
-RAYS_PER_PIXEL, MOST_STEPS = {GRID_STEPS: 6.0, STEPS: 1.5}, 12_000
+#: Most steps that follow from the pixels of the views.
+MOST_STEPS = 12_000
 
 #: Ratio ρ of the sides of primary and cascaded array by compression (Table 6 of the supplement).
 RATIOS = {
@@ -46,27 +43,29 @@ def dense_bytes(shape) -> int:
 class RadianceRecipe:
     """Layout of the arrays and settings of the training.
 
-    The layout is ``"sparse"`` (:mod:`.compression`), ``"pairs"`` (:mod:`.paper`) or ``"grid"`` (:mod:`.grid`).
+    The layout is ``"sparse"`` (:mod:`.compression`), ``"pairs"`` (:mod:`.paper`) or ``"grid"`` (:mod:`.grid`). By
+    default, a training draws ``rays_per_pixel`` rays for each pixel of the training views, but not fewer than the steps
+    of the settings do.
     """
 
     layout: str
     settings: FitSettings = field(default_factory=FitSettings)
+    rays_per_pixel: float = 0.0
+
+    def scaled(self, settings: FitSettings, pixels: float) -> FitSettings:
+        """Return ``settings`` with steps for the ``pixels`` of all training views, if they have the default steps."""
+        if settings.steps != self.settings.steps:
+            return settings
+        steps = min(MOST_STEPS, round(self.rays_per_pixel * pixels / settings.batch))
+        return replace(settings, steps=max(settings.steps, steps))
 
 
 #: Preset name → recipe; the first is the default.
 PRESETS = {
-    "sparse": RadianceRecipe("sparse", FitSettings(steps=STEPS, batch=8192, lr=5e-3, loss="mse", check_every=50)),
-    "paper": RadianceRecipe("pairs", FitSettings(steps=STEPS, batch=8192, lr=5e-3, loss="mse", check_every=50)),
-    "grid": RadianceRecipe("grid", FitSettings(steps=GRID_STEPS, batch=8192, lr=2.5e-2, loss="mse", check_every=50)),
+    "sparse": RadianceRecipe("sparse", FitSettings(steps=1000, batch=8192, lr=5e-3, loss="mse", check_every=50), 1.5),
+    "paper": RadianceRecipe("pairs", FitSettings(steps=1000, batch=8192, lr=5e-3, loss="mse", check_every=50), 1.5),
+    "grid": RadianceRecipe("grid", FitSettings(steps=2300, batch=8192, lr=2.5e-2, loss="mse", check_every=50), 6.0),
 }
-
-
-def scaled_steps(settings: FitSettings, pixels: float) -> FitSettings:
-    """Return settings whose default steps, if they are kept, grow with the ``pixels`` of all training views."""
-    rays = RAYS_PER_PIXEL.get(settings.steps)
-    if rays is None:
-        return settings
-    return replace(settings, steps=max(settings.steps, min(MOST_STEPS, round(rays * pixels / settings.batch))))
 
 
 def ratio_for(quantity: str, compression: float) -> float:
