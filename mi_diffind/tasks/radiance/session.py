@@ -1,9 +1,8 @@
 """Session of a training: captured views as Dr.Jit arrays, the rays of their pixels, and the figures of held-out views.
 
-A pixel is the mean over its square, as a camera records it: :data:`SIDE` × :data:`SIDE` rays, in training and in
-measurements. One ray through its centre would have to meet the mean at silhouettes, where 29% of the error was.
-Training pixels are those of random patches, which share most of what their rays read. Most patches lie where the views
-show something.
+A pixel is the mean over its square, as a camera records it: the mean of :data:`RAYS` rays, in training and in
+measurements. One ray through its centre cannot be that mean at silhouettes, where 29% of the error was. Training pixels
+are those of random patches, which share most of what their rays read. Most patches lie where the views show something.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from .march import march
 from .views import CapturedViews, ViewsError, load_views
 from .volume_field import VolumeField
 
-#: Rays along a side of a pixel.
-SIDE = 2
+#: Rays along a side of a pixel, and in all, each through the middle of a part of it.
+SIDE, RAYS = 2, 4
 
 #: Pixels along a side of a patch, whose rays are computed together.
 PATCH = 2
@@ -86,10 +85,11 @@ class ViewImages:
         """Return origins and unit directions of the rays of pixels; those of a pixel are next to each other."""
         Float, UInt32 = self.types.Float, self.types.UInt32
         count = max(dr.width(view), dr.width(x), dr.width(y))
-        lane = dr.arange(UInt32, count * SIDE**2)
-        pixel, ray = lane // SIDE**2, lane % SIDE**2
+        lane = dr.arange(UInt32, count * RAYS)
+        pixel, ray = lane // RAYS, lane % RAYS
         view, x, y = (dr.gather(UInt32, value, pixel) if dr.width(value) > 1 else value for value in (view, x, y))
-        return self.rays(view, x, y, ((Float(ray % SIDE) + 0.5) / SIDE, (Float(ray // SIDE) + 0.5) / SIDE))
+        within = ((Float(place) + 0.5) / SIDE for place in (ray % SIDE, ray // SIDE))
+        return self.rays(view, x, y, tuple(within))
 
     def rays(self, view, x, y, within=(0.5, 0.5)) -> tuple:
         """Return origins and unit directions of the rays through pixels, at the positions ``within`` them."""
@@ -174,7 +174,7 @@ class ViewImages:
         o, d = self.pixel_rays(dr.opaque(types.UInt32, view), x, y)
         seen = march(field, o, d, 0, dr.inf)
         values = np.stack([*seen.colour.numpy(), 1 - seen.transmittance.numpy()], axis=-1)
-        values = values.reshape(rows, columns, side, side, SIDE**2, 4).mean(axis=4).swapaxes(1, 2)
+        values = values.reshape(rows, columns, side, side, RAYS, 4).mean(axis=4).swapaxes(1, 2)
         return values.reshape(rows * side, columns * side, 4)[:height, :width]
 
     def evaluate(self, field: VolumeField, ssim: bool = False) -> dict[str, float]:
