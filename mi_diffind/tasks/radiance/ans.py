@@ -14,8 +14,8 @@ PRECISION = 12
 #: Steps of a stored probability in an octave.
 OCTAVE = 8
 
-#: Most symbols of an alphabet, and most lanes.
-MOST_SYMBOLS, MOST_LANES = 256, 1024
+#: Most lanes.
+MOST_LANES = 1024
 
 #: Symbols for each lane, roughly: a lane costs four bytes.
 LANE_SYMBOLS = 4000

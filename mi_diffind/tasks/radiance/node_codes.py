@@ -34,6 +34,9 @@ LOW_BITS, PARTS = 6, 16
 #: Halvings of the grid of cells; the coarsest one begins.
 HALVINGS = 4
 
+#: Most stored nodes of a file: a few bytes may claim any number.
+MOST_STORED = 2**25
+
 _AROUND = np.array([o for o in np.ndindex(3, 3, 3) if o != (1, 1, 1)]) - 1
 _AROUND = _AROUND[np.argsort(np.square(_AROUND).sum(axis=1), kind="stable")]
 
@@ -127,6 +130,8 @@ def decoded(probabilities, data, shape, level_count: int, colours: int) -> tuple
     """Return the mask of stored nodes, their levels and their indices. Raises ``ValueError`` for damaged bytes."""
     coder = ans.SymbolDecoder(probabilities, data)
     stored = corners_of(_cells(coder, tuple(n - 1 for n in shape)))
+    if (count := np.count_nonzero(stored)) > MOST_STORED:
+        raise ValueError(f"found {count:,} nodes, at most {MOST_STORED:,} are accepted")
     return stored, *_numbers(coder, stored, level_count, colours)
 
 
