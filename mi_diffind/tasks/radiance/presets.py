@@ -9,14 +9,14 @@ from ...settings import FitSettings
 
 #: Voxels per pixel of the views at the distance of the box, and the range of the resolution that follows from them:
 #: nodes along each side of a cube with the volume of the box.
-VOXELS_PER_PIXEL, RESOLUTIONS = 1.0, (32, 320)
+VOXELS_PER_PIXEL, RESOLUTIONS = 1.25, (32, 400)
 
 #: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
 #: that no ray sees are removed.
 STAGES = ((0.25, 0.08), (0.5, 0.12), (1.0, 0.15), (1.0, 0.65))
 
 #: Most steps that follow from the pixels of the views.
-MOST_STEPS = 12_000
+MOST_STEPS = 20_000
 
 #: Ratio ρ of the sides of primary and cascaded array by compression (Table 6 of the supplement).
 RATIOS = {
@@ -62,9 +62,9 @@ class RadianceRecipe:
 
 #: Preset name → recipe; the first is the default.
 PRESETS = {
-    "sparse": RadianceRecipe("sparse", FitSettings(steps=1000, batch=8192, lr=5e-3, loss="mse", check_every=50), 1.5),
-    "paper": RadianceRecipe("pairs", FitSettings(steps=1000, batch=8192, lr=5e-3, loss="mse", check_every=50), 1.5),
-    "grid": RadianceRecipe("grid", FitSettings(steps=2300, batch=8192, lr=2.5e-2, loss="mse", check_every=50), 6.0),
+    "sparse": RadianceRecipe("sparse", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 5.0),
+    "paper": RadianceRecipe("pairs", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 5.0),
+    "grid": RadianceRecipe("grid", FitSettings(steps=2000, batch=16384, lr=4e-2, loss="mse", check_every=50), 20.0),
 }
 
 

@@ -11,7 +11,7 @@ from ... import srgb
 from ...fitting import Problem
 from ...indirection import device_tensor
 from .march import differentiable
-from .session import FieldSession
+from .session import RAYS, FieldSession
 from .volume_field import VolumeField
 
 #: Largest difference of the exposure of a view from the mean, in stops.
@@ -36,18 +36,19 @@ class ImagesProblem(Problem):
 
     def loss(self, net, rng, size: int):
         types, images = self.session.types, self.session.images
-        view, x, y = images.random_pixels(rng, size)
+        view, x, y = images.random_pixels(rng, size // RAYS)
         count = dr.width(view)
-        offset = rng.random(types.TensorXf, (count,)).array
+        o, d = images.pixel_rays(view, x, y)
+        offset = rng.random(types.TensorXf, (dr.width(o),)).array
         behind = images.behind(rng, count)
-        o, d = images.rays(view, x, y)
         truth = images.colours(view, x, y)
         seen = differentiable(self.field_of(net).for_training(), o, d, images.near, dr.inf, True, offset)
+        *colour, transmittance = (dr.block_sum(v, RAYS) / RAYS for v in (*seen.colour, seen.transmittance))
         gain, total = self.gain(net, view), types.Float(0)
         for c in range(3):
             reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * behind[c], 0, 1), fused=False)
             # The prediction is not clamped at white: its slope leads back into the range
-            shown = srgb.from_linear(gain * seen.colour[c] + seen.transmittance * behind[c], fused=False)
+            shown = srgb.from_linear(gain * colour[c] + transmittance * behind[c], fused=False)
             total += dr.square(shown - reference)
         return dr.select(images.counted(view, x, y), total, 0) * (1 / (3 * count))
 

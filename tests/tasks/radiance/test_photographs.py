@@ -21,7 +21,7 @@ from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance import views as view_files
 from mi_diffind.tasks.radiance import visual_hull
 from mi_diffind.tasks.radiance.image_files import LINEAR
-from mi_diffind.tasks.radiance.session import FieldSession
+from mi_diffind.tasks.radiance.session import RAYS, FieldSession
 from mi_diffind.tasks.radiance.training import ImagesProblem
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
 from mi_diffind.tasks.radiance.visual_hull import box_of
@@ -193,7 +193,7 @@ def test_a_border_of_one_colour_is_the_background(studio_shots):
     expected = np.mean([-10 * np.log10(e.mean()) for e in errors])
     assert session.held_out_images.evaluate(empty)["psnr_white_db"] == pytest.approx(expected, abs=1e-3)
     loss = ImagesProblem(session, {}, lambda net: empty).loss({}, dr.rng(seed=0), 256)
-    view, x, y = (a.numpy() for a in session.images.random_pixels(dr.rng(seed=0), 256))
+    view, x, y = (a.numpy() for a in session.images.random_pixels(dr.rng(seed=0), 256 // RAYS))
     files = np.stack([images[name][..., :3] for name in views.names])[view, y, x]
     assert dr.sum(loss)[0] == pytest.approx(np.square((files - np.float64([240, 240, 235])) / 255).mean(), rel=1e-4)
 

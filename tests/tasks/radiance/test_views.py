@@ -1,5 +1,7 @@
 """Reading images with poses: Blender's and nerfstudio's layout, what pixels mean, and what is refused in a sentence."""
 
+import dataclasses
+import itertools
 import json
 
 import captures
@@ -11,7 +13,7 @@ import pytest
 from captures import SIZE, Fog, change, pose, write_blender, write_image, write_json
 from PIL import Image
 
-from mi_diffind.tasks.radiance.session import FieldSession, ViewImages
+from mi_diffind.tasks.radiance.session import TILE, FieldSession, ViewImages
 from mi_diffind.tasks.radiance.training import ImagesProblem
 from mi_diffind.tasks.radiance.views import ViewsError, load_views
 from mi_diffind.tasks.radiance.visual_hull import hull
@@ -85,6 +87,25 @@ def assert_colours_are_images(views):
         assert seen.all()
 
 
+def test_patches_lie_where_something_is_seen(blender):
+    """All but a few, in tiles with something in them or beside them; a mask leaves nothing to be seen."""
+    stored = np.zeros((64, 48, 4), np.uint8)
+    stored[30:33, 5:7] = 255  # in the tiles (0, 3) and (0, 4)
+    for i in range(4):
+        write_image(blender / "train" / f"r_{i}.png", i, size=(64, 48))
+        Image.fromarray(stored * (i == 2)).save(blender / "train" / f"r_{i}.png")
+    images = ViewImages(llvm, load_views(blender))
+    tiles = {(x // TILE, y // TILE) for view, x, y in images.tiles.numpy().T.tolist() if view == 2}
+    assert tiles == {(x, y) for x in (0, 1) for y in (2, 3, 4, 5)} and dr.width(images.tiles) == len(tiles)
+    view, x, y = (a.numpy() for a in images.random_pixels(dr.rng(seed=0), 2**14))
+    near = (view == 2) & (x <= 2 * TILE) & (y >= 2 * TILE) & (y <= 6 * TILE)
+    assert 0.94 < near.mean() < 0.965
+    assert np.array_equal(np.unique(view), range(4)) and x.max() == 47 and y.max() == 63 and not (x.min() or y.min())
+    masked = dataclasses.replace(images.views, mask=np.zeros(len(images.views.pixels), bool))
+    view, *_ = (a.numpy() for a in ViewImages(llvm, masked).random_pixels(dr.rng(seed=0), 2**12))
+    assert np.allclose(np.bincount(view) / 2**12, 0.25, atol=0.04)
+
+
 def test_views_of_different_sizes(blender):
     """Each as in a capture of its own, with the focal length that its width gives."""
     stored = {i: write_image(blender / "train" / f"r_{i}.png", i, size=s) for i, s in ((1, (9, 4)), (3, (3, 11)))}
@@ -97,13 +118,18 @@ def test_views_of_different_sizes(blender):
     assert_colours_are_images(views)
     fog, images = Fog(llvm, (-1, 0, -1), (2, 2, 1), 0.5, {}), ViewImages(llvm, views)
     for v, (height, width) in enumerate(views.sizes):
-        o, d = captures.rays_of(views, v, *np.meshgrid(np.arange(width), np.arange(height)))
-        with np.errstate(divide="ignore"):
-            near, far = np.sort([(corner - o) / d for corner in (fog.lower, fog.upper)], axis=0)
-        length = np.maximum(0, far.min(axis=-1) - near.max(axis=-1))
+        # A pixel is the mean of rays through the middles of its quarters
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        opacities = []
+        for across, down in itertools.product((-0.25, 0.25), repeat=2):
+            o, d = captures.rays_of(views, v, x + across, y + down)
+            with np.errstate(divide="ignore"):
+                near, far = np.sort([(corner - o) / d for corner in (fog.lower, fog.upper)], axis=0)
+            length = np.maximum(0, far.min(axis=-1) - near.max(axis=-1))
+            opacities.append(1 - np.exp(-length))
         picture = images.render(fog, v)
         assert picture.shape == (height, width, 4) and (length > 1).any()
-        np.testing.assert_allclose(picture[..., 3], 1 - np.exp(-length), atol=1e-4)
+        np.testing.assert_allclose(picture[..., 3], np.mean(opacities, axis=0), atol=1e-4)
     few = views.chosen(np.array([3, 1]))
     assert np.shares_memory(few.pixels, views.pixels) and np.array_equal(few.image(1), views.image(1))
     assert few.names == ("train/r_3.png", "train/r_1.png")
