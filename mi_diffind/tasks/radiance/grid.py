@@ -83,7 +83,8 @@ class GridProblem(ImagesProblem):
             other = dr.gather(types.UInt32, self.neighbours, node * 3 + axis)
             step = here - dr.gather(types.Float, density, other) * DENSITY_SCALE
             variation += dr.select(other != 0, dr.sqrt(dr.square(step) + ROUND), 0)
-        return [super().loss(net, rng, size), variation * (SMOOTH / VARIED)]
+        smooth = SMOOTH if self.nodes.contraction is None else surroundings.SMOOTH
+        return [super().loss(net, rng, size), variation * (smooth / VARIED)]
 
     def trained(self) -> NodeGrid:
         """Return the grid with the trained numbers."""
@@ -111,7 +112,7 @@ def resolution_of(views: CapturedViews) -> int:
 def begin(types, views: CapturedViews, nodes: int) -> NodeGrid:
     """Return an empty grid of the visual hull, as fine as a cube of ``nodes``³ nodes with the volume of its box."""
     if views.surroundings:
-        return _nearly_empty(surroundings.whole_space(types, views, nodes))
+        return _nearly_empty(surroundings.whole_space(types, views, nodes), surroundings.BEGIN_DENSITY)
     lower, upper = box_of(views)
     spacing = float((np.prod(upper - lower) / nodes**3) ** (1 / 3))
     shape = np.maximum(2, np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1)
@@ -123,10 +124,10 @@ def begin(types, views: CapturedViews, nodes: int) -> NodeGrid:
     return _nearly_empty(Nodes(types, lower, spacing, shape, corners_of(near)))
 
 
-def _nearly_empty(nodes: Nodes) -> NodeGrid:
+def _nearly_empty(nodes: Nodes, density: float = BEGIN_DENSITY) -> NodeGrid:
     """Return a grid of these nodes before its training."""
     colour = np.tile(np.float32([BEGIN_COLOUR, 0, 0, 0] * 3), (nodes.entries, 1))
-    return NodeGrid(nodes, np.full(nodes.entries, BEGIN_DENSITY, np.float32), colour)
+    return NodeGrid(nodes, np.full(nodes.entries, density, np.float32), colour)
 
 
 def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:

@@ -35,7 +35,7 @@ TILE, ANYWHERE = 8, 0.05
 
 #: Distance at which training rays of a field with surroundings begin, as a share of the distance from the point that
 #: the cameras look at to the nearest one.
-NEAR = 0.25
+NEAR = 0.4
 
 #: Most held-out views of measurements during a training.
 MOST_WATCHED = 20
