@@ -1,7 +1,7 @@
 """Ray marching: emission and absorption from front to back, the derivatives of both, and counts of the reads.
 
 A ray is divided into steps of a fixed length from the point where it enters the box; the last step is cut where the ray
-leaves. In surroundings, steps grow (:class:`.surroundings.StretchedDistances`). Distances count from the point of
+leaves. In surroundings, steps grow (:class:`.surroundings.GrowingSteps`). Distances count from the point of
 entry, since a step might be too short to change a distance from afar. Each step has one density and one radiance, so a
 homogeneous medium is Beer–Lambert exactly. Steps that are certainly empty are skipped, which changes nothing. No
 radiance is read where the density is zero. The ray ends when it is opaque (:data:`OPAQUE`).

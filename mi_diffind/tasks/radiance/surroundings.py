@@ -14,7 +14,7 @@ import numpy as np
 from .nodes import Nodes
 from .views import CapturedViews
 from .visual_hull import focus, pixel_width
-from .volume_field import Distances
+from .volume_field import EqualSteps
 
 #: Half side of the inner cube as a share of the distance from the point that the cameras look at to the nearest one.
 INNER = 0.5
@@ -54,13 +54,13 @@ class Contraction:
         """Return the ratio of steps at points to those at the centre."""
         return dr.sqrt(dr.fma(dr.squared_norm(p - self.centre), dr.square(self._inverse) / GROWTH**2, 1))
 
-    def along(self, o, d) -> StretchedDistances:
+    def along(self, o, d) -> GrowingSteps:
         """Return the distances of steps on rays from ``o``."""
-        return StretchedDistances(self.half, (o - self.centre) * self._inverse, d)
+        return GrowingSteps(self.half, (o - self.centre) * self._inverse, d)
 
 
-class StretchedDistances(Distances):
-    """Distances along rays in which steps are of equal length: u = w sinh(s / ρ) from the point next to the centre.
+class GrowingSteps(EqualSteps):
+    """Steps that grow with the distance, u = w sinh(s / ρ) from the point of the ray that is next to the centre.
 
     ``half`` is the half side of the inner cube, ``o`` the origin of a
     ray in units of it, from its centre.

@@ -25,7 +25,7 @@ LEAST_WEIGHT, LEAST_TRAINED_WEIGHT = 2e-7, 1e-3
 BRIGHTEST = 12.0
 
 
-class Distances:
+class EqualSteps:
     """Distances along rays as multiples of steps: here, steps are of equal length."""
 
     @staticmethod
@@ -94,9 +94,9 @@ class VolumeField:
         """Return a length from ``p`` along ``d`` that is certainly empty; 0 where the density has to be read."""
         return self.types.Float(0)
 
-    def along(self, o, d) -> Distances:
+    def along(self, o, d) -> EqualSteps:
         """Return the distances of steps on the rays from ``o`` along ``d``."""
-        return Distances()
+        return EqualSteps()
 
 
 class NodeVolume(VolumeField):
@@ -120,7 +120,7 @@ class NodeVolume(VolumeField):
     def free_distance(self, p, d, active=True):
         return self.nodes.free_distance(p, d, active)
 
-    def along(self, o, d) -> Distances:
+    def along(self, o, d) -> EqualSteps:
         return self.nodes.contraction.along(o, d) if self.unbounded else super().along(o, d)
 
     def interpolated_density(self, node_density, p, active, low=None, step=None) -> tuple:
