@@ -34,6 +34,7 @@ class ImagesProblem(Problem):
         behind = images.behind(rng, count)
         truth = images.colours(view, x, y)
         seen = differentiable(self.field_of(net).for_training(), o, d, 0, dr.inf, True, offset)
+        dr.schedule(seen.colour, seen.transmittance)  # at once: each sum evaluates what it adds up
         *colour, transmittance = (dr.block_sum(v, RAYS) / RAYS for v in (*seen.colour, seen.transmittance))
         total = types.Float(0)
         for c in range(3):
