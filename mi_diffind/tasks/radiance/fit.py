@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 
 from ... import units
@@ -221,7 +222,8 @@ class FieldFit:
             stage = dataclasses.replace(
                 settings, steps=steps, schedule="cosine" if last else "constant", measure_every=max(1, steps // 2)
             )
-            problem = grids.GridProblem(grid, self.session)
+            problem, grid = grids.GridProblem(grid, self.session), None
+            dr.flush_malloc_cache()  # of the coarser grid
             checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
             stage_request = dataclasses.replace(
                 limited.part(part / sum(later for _, later in STAGES[number:])),

@@ -134,9 +134,13 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
     """Return the largest weight (transmittance × opacity) of each cell in a ray: ``(X − 1, Y − 1, Z − 1)``."""
     nodes, types, views = field.nodes, field.types, images.views
     largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
-    for view, (height, width) in enumerate(views.sizes.tolist()):
+    # One ray for each voxel, where that is wider than a pixel
+    middle = (np.array(nodes.lower) + nodes.upper) / 2
+    every = max(1, int(nodes.spacing / pixel_width(views, middle)))
+    for view, (height, width) in enumerate((views.sizes // every).tolist()):
         lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
-        place = dr.opaque(types.UInt32, view), lane % width, lane // width
+        column, row = (n * dr.opaque(types.UInt32, every) for n in (lane % width, lane // width))
+        place = dr.opaque(types.UInt32, view), column, row
         visibility(field, *images.rays(*place), images.near, dr.inf, images.counted(*place), largest)
         dr.eval(largest)
     return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]

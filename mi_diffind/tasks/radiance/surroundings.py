@@ -62,8 +62,7 @@ class Contraction:
 class GrowingSteps(EqualSteps):
     """Steps that grow with the distance, u = w sinh(s / ρ) from the point of the ray that is next to the centre.
 
-    ``half`` is the half side of the inner cube, ``o`` the origin of a
-    ray in units of it, from its centre.
+    ``half`` is the half side of the inner cube, ``o`` the origin of a ray in units of it, from its centre.
     """
 
     def __init__(self, half, o, d):

@@ -43,6 +43,7 @@ class ImagesProblem(Problem):
         behind = images.behind(rng, count)
         truth = images.colours(view, x, y)
         seen = differentiable(self.field_of(net).for_training(), o, d, images.near, dr.inf, True, offset)
+        dr.schedule(seen.colour, seen.transmittance)  # at once: each sum evaluates what it adds up
         *colour, transmittance = (dr.block_sum(v, RAYS) / RAYS for v in (*seen.colour, seen.transmittance))
         gain, total = self.gain(net, view), types.Float(0)
         for c in range(3):
