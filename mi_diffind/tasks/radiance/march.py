@@ -66,17 +66,17 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     with dr.suspend_grad():
         o, near, far, active = box(field, o, d, near, far, active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
-        along = field.along(o, d)
-        far = along.in_steps(far)
+        steps = field.along(o, d)
+        far = steps.in_steps(far)
         seen, depth, through = types.Array3f(0), types.Float(0), types.Float(1)
         offset = types.Float(offset)
         while active:
-            t, here = _next(field, o, d, t, far, step, offset, active, along)
+            t, here = _next(field, o, d, t, far, step, offset, active, steps)
             end = dr.minimum(t + step, far)
-            at = along.of_steps(dr.fma(offset, end - t, t))
+            at = steps.of_steps(dr.fma(offset, end - t, t))
             p = dr.fma(d, at, o)
             density, point_data = field.density_at(p, here)
-            passed = through * dr.exp(-density * (along.of_steps(end) - along.of_steps(t)))
+            passed = through * dr.exp(-density * (steps.of_steps(end) - steps.of_steps(t)))
             weight = dr.select(here, through - passed, 0)
             shown = here & (weight > field.least_weight)
             colour = types.Array3f(0)
@@ -91,7 +91,7 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
 
 
 @dr.syntax
-def _next(field, o, d, t, far, step, offset, active, along):
+def _next(field, o, d, t, far, step, offset, active, steps):
     """Return the start of the next step, from ``t`` on, that may not be empty, and whether there is one."""
     types = field.types
     t = types.Float(t)
@@ -99,11 +99,11 @@ def _next(field, o, d, t, far, step, offset, active, along):
     occupied = types.Bool(False)
     while searching:
         at = dr.fma(offset, dr.minimum(t + step, far) - t, t)
-        distance = along.of_steps(at)
+        distance = steps.of_steps(at)
         free = field.free_distance(dr.fma(d, distance, o), d, searching)
         empty = free > 0
         occupied |= searching & ~empty
-        free = along.skipped(at, distance, free)
+        free = steps.skipped(at, distance, free)
         t = dr.select(searching & empty, dr.fma(dr.floor(free / step) + 1, step, t), t)
         searching &= empty & (t < far)
     return t, occupied
@@ -137,8 +137,8 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
         o, near, far, active = box(field, o, d, near, far, active)
         crossing = types.Bool(active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
-        along = field.along(o, d)
-        far = along.in_steps(far)
+        steps = field.along(o, d)
+        far = steps.in_steps(far)
         through = types.Float(1)
         offset = types.Float(offset)
         total = dr.detach(marched.transmittance)
@@ -153,10 +153,10 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
                 rays = _attached(field, *attached, crossing)
                 d_entry, d_way, d_length, d_near = dr.forward_to(*rays, flags=KEPT)
         while active:
-            t, here = _next(field, o, d, t, far, step, offset, active, along)
+            t, here = _next(field, o, d, t, far, step, offset, active, steps)
             end = dr.minimum(t + step, far)
-            length = along.of_steps(end) - along.of_steps(t)
-            at = along.of_steps(dr.fma(offset, end - t, t))
+            length = steps.of_steps(end) - steps.of_steps(t)
+            at = steps.of_steps(dr.fma(offset, end - t, t))
             p = dr.fma(d, at, o)
             place, way = p, d
             # The last step ends where the ray does
@@ -261,15 +261,15 @@ def visibility(field, o, d, near, far, active, target) -> None:
     with dr.suspend_grad():
         o, near, far, active = box(field, o, d, near, far, active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
-        along = field.along(o, d)
-        far = along.in_steps(far)
+        steps = field.along(o, d)
+        far = steps.in_steps(far)
         through = types.Float(1)
         while active:
-            t, here = _next(field, o, d, t, far, step, types.Float(0.5), active, along)
+            t, here = _next(field, o, d, t, far, step, types.Float(0.5), active, steps)
             end = dr.minimum(t + step, far)
-            p = dr.fma(d, along.of_steps(dr.fma(0.5, end - t, t)), o)
+            p = dr.fma(d, steps.of_steps(dr.fma(0.5, end - t, t)), o)
             density, _ = field.density_at(p, here)
-            passed = through * dr.exp(-density * (along.of_steps(end) - along.of_steps(t)))
+            passed = through * dr.exp(-density * (steps.of_steps(end) - steps.of_steps(t)))
             dr.scatter_reduce(dr.ReduceOp.Max, target, through - passed, field.nodes.cell(p), here)
             through = dr.select(here, passed, through)
             t += step
