@@ -164,7 +164,8 @@ class FitResult:
 class _State:
     """State of a training: parameters and, for each, Adam's step count and moments.
 
-    They are Dr.Jit arrays (never written in place, so a snapshot costs nothing) or, from a checkpoint, NumPy arrays.
+    They are Dr.Jit arrays (not written in place, so a snapshot costs nothing) or, from a checkpoint, NumPy arrays.
+    Without ``moments``, Adam begins anew.
     """
 
     step: int
@@ -225,7 +226,7 @@ def fit(
         return clock.share() if trainer.step >= least else min(clock.share(), 0.999)
 
     trainer.share = share()
-    good = trainer.snapshot()
+    good = trainer.snapshot(all_moments=False)
     bar = _Bar(settings.steps, seconds, title, progress)
     planned = min(MEASUREMENTS, max(1, settings.steps // settings.measure_every))  # with a limit of time
     bar.show(trainer)
@@ -240,14 +241,14 @@ def fit(
         history.append({"step": trainer.step, "loss": loss, **measured})
         top = max((h[name] for h in history if math.isfinite(h[name])), default=value)
         if best is None or value >= top - problem.tolerance:
-            best, best_measured, best_step = trainer.snapshot().parameters, measured, trainer.step
+            best, best_measured, best_step = trainer.snapshot(all_moments=False).parameters, measured, trainer.step
         bar.measured(name, value)
 
     with interruptible() as stop, cores(settings.deterministic), compat.room_for_sums(LARGEST_SUMS), bar.shown:
         while trainer.share < 1 and not stop.is_set():
             # A snapshot of tables that are written in place is a copy
             kept = not problem.sparse or (trainer.step + 1) % settings.check_every == 0
-            before, share_before = trainer.snapshot() if kept else good, trainer.share
+            before, share_before = trainer.snapshot(all_moments=False) if kept else good, trainer.share
             loss = trainer.take_step(plateau.factor)
             if seconds is not None:
                 dr.eval(loss)
@@ -451,16 +452,22 @@ class _Trainer:
     def finite(self) -> bool:
         return all(bool(dr.all(dr.isfinite(v.array), axis=None)) for v in self.optimizer.values())
 
-    def snapshot(self) -> _State:
+    def snapshot(self, all_moments: bool = True) -> _State:
+        """Return the state. Large tables that are written in place are copied: without their moments, if so wished."""
         parameters, moments = {}, {}
         for key, (value, *moment) in compat.adam_state(self.optimizer).items():
-            parameters[key], moments[key] = dr.detach(value), tuple(moment)
+            parameters[key] = dr.detach(value)
+            if all_moments or not self.problem.sparse:
+                moments[key] = tuple(moment)
         return _State(self.step, self.lr_scale, parameters, moments)
 
     def restore(self, state: _State) -> None:
         self.step, self.lr_scale = state.step, state.lr_scale
         for key, value in state.parameters.items():
-            compat.set_adam_state(self.optimizer, key, value, *state.moments[key])
+            if (moments := state.moments.get(key)) is None:
+                none = dr.zeros(type(value.array), dr.width(value))
+                moments = 0, none, none
+            compat.set_adam_state(self.optimizer, key, value, *moments)
         self.problem.net.update(self.optimizer)
 
     def load_parameters(self, parameters: dict) -> None:

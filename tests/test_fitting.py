@@ -54,6 +54,25 @@ class Curve(Problem):
         return {"psnr_db": float(-10 * math.log10(error[0])), "calls": self.calls}
 
 
+class Steps(Curve):
+    """The same curve by a table of 64 numbers that is written in place."""
+
+    sparse = True
+
+    def __init__(self, ad, at=None):
+        super().__init__(ad, at)
+        self.net = {"steps": dr.full(ad.TensorXf, 0.5, (64,))}
+
+    def predict(self, net, inputs):
+        place = self.ad.UInt32(inputs[0] * 64)
+        return {"y": [dr.gather(self.ad.Float, net["steps"].array, dr.minimum(place, 63))]}
+
+    def measure(self, net):
+        x = dr.linspace(self.ad.Float, 0, 1, 500)
+        error = dr.mean(dr.square(self.predict(net, [x])["y"][0] - self.target(x)))
+        return {"psnr_db": float(-10 * math.log10(error[0]))}
+
+
 def settings(**changes):
     return FitSettings(**{"steps": 60, "batch": 512, "lr": 1e-2, "measure_every": 20, "check_every": 5, **changes})
 
@@ -294,6 +313,14 @@ def test_nan_restores_the_last_good_state(ad):
     assert messages == ["step 35: the loss is nan; restored step 29 with half the learning rate (0.005)"]
     assert all(math.isfinite(h["loss"]) for h in result.history)
     assert problem.calls == 300 + 35 - 29
+
+
+def test_large_tables_are_restored_without_moments(ad):
+    """The state before step 30 is a copy of the tables alone, and the training goes on as well."""
+    problem = Steps(ad, dict.fromkeys((33, 34, 35), nan))
+    result, messages = run(problem, settings(steps=300, measure_every=50))
+    assert result.restarts == 1 and result.measured["psnr_db"] > 35
+    assert messages == ["step 35: the loss is nan; restored step 29 with half the learning rate (0.005)"]
 
 
 def test_damage_between_two_looks_is_noticed(ad):

@@ -198,7 +198,7 @@ def byte_range(palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def packed_bytes(grid: NodeGrid, index_bits: int) -> int:
     """Return the bytes in memory of the packed field of a grid."""
     nodes = grid.nodes
-    index = Nodes(nodes.types, nodes.lower, nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
+    index = nodes.like(nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
     return index + nodes.entries * (DENSITY_BITS + index_bits) // 8 + 8 + 16 * min(2**index_bits, nodes.count)
 
 

@@ -15,6 +15,7 @@ from . import node_codes
 from .compression import INDEX_BITS, MOST_BITS, byte_range
 from .nodes import Nodes
 from .paper import PairsField
+from .surroundings import ContractedNodes
 from .volume_field import NodeField, PackedPaletteField, VolumeField
 
 #: Layout → name of an array → number of its dimensions, and channels. "coded" is "sparse" in fewer bytes.
@@ -39,6 +40,8 @@ def stored_nodes(nodes: Nodes) -> tuple[dict[str, StoredArray], dict]:
     """Return the array that marks the stored nodes, one bit each, and the settings of the grid."""
     bits = np.packbits(nodes.stored.reshape(-1))
     settings = {"lower": list(nodes.lower), "spacing": nodes.spacing, "shape": list(nodes.shape)}
+    if nodes.contraction is not None:
+        settings["inner"] = list(nodes.contraction.inner)
     return {"cells": byte_array(bits[:, None])}, settings
 
 
@@ -117,6 +120,11 @@ def load(path) -> Table:
     check_numbers(table, "lower", 3)
     check_numbers(table, "spacing", 1, positive=True)
     check_numbers(table, "shape", 3, positive=True, whole=True)
+    if "inner" in table.settings:
+        check_numbers(table, "inner", 4)
+        half = table.settings["inner"][3]
+        if half <= 0:
+            raise TableError(f"{path}: is damaged: found the half side {half} of the inner cube, allowed are those > 0")
     shape = table.settings["shape"]
     if min(shape) < 2 or math.prod(shape) > MOST_NODES:
         raise TableError(f"{path}: is damaged: found a grid of {shape}, allowed are at most {MOST_NODES:,} nodes")
@@ -192,6 +200,13 @@ def stored_of(table: Table) -> np.ndarray:
     return bits.reshape(shape).astype(bool)
 
 
+def nodes_of(table: Table, types, packed: bool = False) -> Nodes:
+    """Return the nodes of a checked table."""
+    settings = table.settings
+    place = types, settings["lower"], settings["spacing"], settings["shape"], stored_of(table), packed
+    return ContractedNodes(*place, inner=settings["inner"]) if "inner" in settings else Nodes(*place)
+
+
 def index_of(table: Table) -> np.ndarray:
     """Return the palette index of each node, uint32 ``(n,)``."""
     low, high = table.arrays["index"].entries.astype(np.uint32).T
@@ -206,7 +221,7 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
     table = sparse(table)
     settings, layout, arrays = table.settings, table.settings["layout"], table.arrays
     floats = storage == "float32"
-    nodes = Nodes(types, settings["lower"], settings["spacing"], settings["shape"], stored_of(table), packed=not floats)
+    nodes = nodes_of(table, types, packed=not floats)
     tensor = types.TensorXf
     if layout == "grid":
         return NodeField(

@@ -25,12 +25,34 @@ LEAST_WEIGHT, LEAST_TRAINED_WEIGHT = 2e-7, 1e-3
 BRIGHTEST = 12.0
 
 
+class EqualSteps:
+    """Distances along rays as multiples of steps: here, steps are of equal length."""
+
+    @staticmethod
+    def of_steps(s):
+        """Return the distances of a ray at the places ``s`` among its steps."""
+        return s
+
+    @staticmethod
+    def in_steps(t):
+        """Return the places of distances among the steps, the inverse of :meth:`of_steps`."""
+        return t
+
+    @staticmethod
+    def skipped(s, t, free):
+        """Return the length in steps of ``free`` space behind the distance ``t``, which is at ``s``."""
+        return free
+
+
 class VolumeField:
     """Radiance field in the box from ``lower`` to ``upper``: the base class.
 
     ``voxel`` is the side of a voxel. Rays take steps of length ``step``, half a voxel, and read no radiance where a
     step weighs less than ``least_weight``. ``arrays`` maps names to the tensors that can be differentiated.
+    A field that is ``unbounded`` has surroundings (:mod:`.surroundings`): rays are marched in the larger ``box``.
     """
+
+    unbounded = False
 
     def __init__(self, types, lower, upper, voxel: float, arrays: dict):
         self.types = types
@@ -72,16 +94,34 @@ class VolumeField:
         """Return a length from ``p`` along ``d`` that is certainly empty; 0 where the density has to be read."""
         return self.types.Float(0)
 
+    def along(self, o, d) -> EqualSteps:
+        """Return the distances of steps on the rays from ``o`` along ``d``."""
+        return EqualSteps()
+
 
 class NodeVolume(VolumeField):
     """Radiance field whose numbers lie on :class:`.nodes.Nodes`: the base class."""
 
     def __init__(self, nodes: Nodes, arrays: dict):
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
-        self.nodes = nodes
+        self.nodes, contraction = nodes, nodes.contraction
+        lower, upper = (nodes.lower, nodes.upper) if contraction is None else contraction.box(1)
+        super().__init__(nodes.types, lower, upper, nodes.spacing, arrays)
+        self.unbounded = contraction is not None
+        if self.unbounded:
+            self.box = tuple(dr.opaque(self.types.Array3f, corner) for corner in contraction.box(contraction.horizon))
+
+    def without_surroundings(self) -> NodeVolume:
+        """Return a copy of the field in the box from ``lower`` to ``upper`` alone."""
+        result = copy.copy(self)
+        result.unbounded = False
+        result.box = tuple(dr.opaque(self.types.Array3f, corner) for corner in (self.lower, self.upper))
+        return result
 
     def free_distance(self, p, d, active=True):
         return self.nodes.free_distance(p, d, active)
+
+    def along(self, o, d) -> EqualSteps:
+        return self.nodes.contraction.along(o, d) if self.unbounded else super().along(o, d)
 
     def interpolated_density(self, node_density, p, active, low=None, step=None) -> tuple:
         """Return what :meth:`density_at` does, from ``node_density(number, active)``, the raw density of a node.
@@ -94,7 +134,10 @@ class NodeVolume(VolumeField):
         for weight, number in corners:
             raw = dr.fma(weight, node_density(number, active), raw)
         raw = raw if step is None else dr.fma(raw, step, low)
-        density = dr.select(active, density_of(raw, self.per_voxel), 0)
+        contraction, per_voxel = self.nodes.contraction, self.per_voxel
+        if contraction is not None:
+            per_voxel = per_voxel / contraction.growth(p)
+        density = dr.select(active, density_of(raw, per_voxel), 0)
         return density, [w for w, _ in corners] + [n for _, n in corners]
 
 
