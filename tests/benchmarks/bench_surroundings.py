@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("folder", metavar="FOLDER")
     parser.add_argument("--json", required=True, metavar="FILE.json")
     parser.add_argument("--resolution", default="128", help="nodes along a side of all grids (default: 128)")
-    parser.add_argument("--steps", default="1000", help="steps of the grid and of the compressed field (default: 1000)")
+    parser.add_argument("--steps", default="500", help="steps of a grid (default: 500)")
     parser.add_argument("--rows", nargs="*", default=list(ROWS), help="names of the rows (default: all)")
     arguments = parser.parse_args()
     output, folder = Path(arguments.json), Path(arguments.folder)
