@@ -15,7 +15,7 @@ import numpy as np
 
 from ... import units
 from ...errors import UsageError
-from ...fitting import FitResult, FittingError
+from ...fitting import FitResult, FittingError, cores
 from ...interrupt import interruptible
 from ...tables import MAX_BYTES, StoredArray, Table, save_table
 from ...task import FitRequest, Fitted
@@ -23,6 +23,7 @@ from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
 from .presets import COMPRESSION, PRESETS, RESOLUTIONS, STAGES, dense_bytes, ratio_for
+from .rate_distortion import importance
 from .session import FieldSession
 from .training import ImagesProblem
 from .volume_field import VolumeField
@@ -307,13 +308,15 @@ class FieldFit:
         return self.compressed(smaller, bits, stopped)
 
     def compressed(self, grid: NodeGrid, bits: int, stopped: bool, suffix: str = ""):
-        """Train a palette of ``2**bits`` colours on a grid; return the table, the result and the field."""
-        limit = self.request.part(CLUSTER_TIME).deadline
-        coding = compression.palette_coding(grid, bits, self.request.settings.seed, limit)
+        """Train a palette of at most ``2**bits`` colours on a grid; return the table, the result and the field."""
+        limit, settings = self.request.part(CLUSTER_TIME).deadline, self.request.settings
+        with cores(settings.deterministic):
+            weights = importance(grid, self.session, settings.seed, limit)
+        coding = compression.palette_coding(grid, weights, bits, settings.seed, deadline=limit)
         problem = compression.PaletteProblem(coding, self.session)
 
         def stored() -> tuple[Table, VolumeField]:
-            table = files.palette_table(grid.nodes, problem.stored(), bits)
+            table = files.palette_table(grid.nodes, problem.stored())
             return table, files.field_of(table, self.request.types)
 
         result = self.train(problem, stopped, lambda: self.session.watched_images.evaluate(stored()[1]), suffix)

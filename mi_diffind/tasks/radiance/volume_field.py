@@ -228,8 +228,8 @@ class PackedPaletteField(NodeVolume):
 
     ``stored`` is that of :meth:`.compression.PaletteProblem.stored`. The low bits of a node are a density level, which
     stands for the raw density ``density_range[0]`` + level · ``density_range[1]``. The high bits are an index into
-    ``palette`` ``(P, 12)``, uint8, whose bytes stand for ``offset`` + ``scale`` · byte. ``levels`` and ``index`` are
-    NumPy arrays ``(n,)``. Entries of the palette take 16 bytes in memory.
+    ``palette`` ``(P, columns)``, uint8, whose bytes stand for ``offset`` + ``scale`` · byte. ``levels`` and ``index``
+    are NumPy arrays ``(n,)``. Entries of the palette take a multiple of 16 bytes in memory.
     """
 
     def __init__(self, nodes: Nodes, stored: dict, density_bits: int, index_bits: int):
@@ -239,8 +239,8 @@ class PackedPaletteField(NodeVolume):
         # Level and index of each node without gaps, and one more word
         joined = stored["levels"].astype(np.uint32) | (stored["index"].astype(np.uint32) << density_bits)
         self.words = device_array(types.UInt32, as_words(pack_bits(joined, density_bits + index_bits), spare=1))
-        entries = np.zeros((len(stored["palette"]), 16), np.uint8)
-        entries[:, :12] = stored["palette"]
+        entries = np.pad(stored["palette"], ((0, 0), (0, -stored["palette"].shape[1] % 16)))
+        self.packets = entries.shape[1] // 16
         self.palette = device_array(types.UInt32, entries.view("<u4"))
         self.scale, self.offset = ([float(v) for v in stored[name]] for name in ("scale", "offset"))
 
@@ -267,10 +267,12 @@ class PackedPaletteField(NodeVolume):
 
     def radiance_at(self, point_data, p, d, active=True):
         types = self.types
-        sums = [types.Float(0)] * 12
+        sums = [types.Float(0)] * len(self.scale)
         for weight, index in zip(point_data[:8], point_data[8:], strict=True):
-            words = dr.gather(types.Array4u, self.palette, index, active)
-            for k in range(12):
+            words = []
+            for j in range(self.packets):
+                words += list(dr.gather(types.Array4u, self.palette, dr.fma(index, self.packets, j), active))
+            for k in range(len(sums)):
                 # The byte as the mantissa of a number in [1, 2): no conversion, and the weights sum to 1
                 byte = (words[k // 4] << 15 - 8 * (k % 4)) if k % 4 < 2 else (words[k // 4] >> 8 * (k % 4) - 15)
                 number = dr.reinterpret_array(types.Float, (byte & 0x7F8000) | 0x3F800000)
