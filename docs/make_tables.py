@@ -530,6 +530,18 @@ def field_captures() -> str:
     return table(["", "grid, dB", "compressed, dB", "MB in memory", "MB on disk"], rows)
 
 
+def field_surroundings() -> str:
+    """Return figures of a capture without alpha, with and without surroundings."""
+    rows = []
+    for name, row in measured("bench_surroundings")["rows"].items():
+        error = row.get("exposure_error_stops")
+        rows.append([
+            name, f"{row['psnr_white_db']:.2f}", f"{row['ssim_white']:.3f}", f"{row['file_bytes'] / 1e6:.1f}",
+            f"{row['cpu_minutes']:.1f}", "" if error is None else f"{error:.3f}",
+        ])  # fmt: skip
+    return table(["", "dB", "SSIM", "MB on disk", "minutes of a core", "error of exposures, stops"], rows)
+
+
 #: Figures for NeRF's synthetic scene lego at 800²: method, paper, dB before white, MB on disk as far as it is stated.
 PUBLISHED_LEGO = (
     ("DVGO", "Sun et al. 2022", "34.6", ""),
@@ -598,6 +610,7 @@ TABLES |= {
     "field_errors": lambda: field_errors("tradeoff_field"),
     "field_errors_50": lambda: field_errors("tradeoff_field_50"), "field_times": lambda: field_times("tradeoff_field"),
     "field_parts": field_parts, "field_captures": field_captures, "field_nerf": field_nerf,
+    "field_surroundings": field_surroundings,
 }  # fmt: skip
 for source, study in (("", "tradeoff_texture"), ("_boombox", "texture_levels_boombox")):
     TABLES["texture_levels" + source] = lambda study=study: texture_levels(measured(study))

@@ -49,8 +49,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", metavar="FOLDER")
     parser.add_argument("--json", required=True, metavar="FILE.json")
-    parser.add_argument("--resolution", default="128", help="nodes along a side of all grids (default: 128)")
-    parser.add_argument("--steps", default="1000", help="steps of the grid and of the compressed field (default: 1000)")
+    parser.add_argument("--resolution", default="96", help="nodes along a side of all grids (default: 96)")
+    parser.add_argument("--steps", default="400", help="steps of a grid (default: 400)")
+    parser.add_argument("--downscale", default="2", help="factor by which the views are reduced (default: 2)")
     parser.add_argument("--rows", nargs="*", default=list(ROWS), help="names of the rows (default: all)")
     arguments = parser.parse_args()
     output, folder = Path(arguments.json), Path(arguments.folder)
@@ -62,6 +63,7 @@ def main() -> None:
         for name in arguments.rows:
             source = with_box(folder, Path(work) / "boxed") if "box" in name else folder
             options = ["--variant", "llvm_ad_rgb", "--resolution", arguments.resolution, *ROWS[name]]
+            options += ["--downscale", arguments.downscale]
             options += ["--preset", "grid", "--steps", arguments.steps]
             report = Path(work) / "x.npz"
             row = training(str(source), report, options)

@@ -21,7 +21,7 @@ INNER = 0.5
 
 #: Initial raw density, and weight of the total variation of raw densities. A denser begin and more variation keep haze
 #: away, by which a grid shows each camera a picture of its own: 5 dB in a trial at 64³.
-BEGIN_DENSITY, SMOOTH = -3.0, 1e-3
+BEGIN_DENSITY, SMOOTH = -3.0, 4e-3
 
 #: Distance in half sides at which steps begin to grow (ρ), and that at which rays end.
 GROWTH, HORIZON = 2.0, 32.0

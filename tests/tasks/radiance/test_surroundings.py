@@ -238,3 +238,24 @@ def test_surroundings_in_a_scene(field, tmp_path, mi_rgb):
     with pytest.raises(RuntimeError) as raised:
         dr.backward(dr.sum(mi.render(scene, params, spp=1), axis=None))
     assert "has no derivatives for a field with surroundings" in compat.one_sentence(raised.value)
+
+
+def test_surroundings_light_a_ball(ad, tmp_path, mi_rgb):
+    """A white ball in surroundings of radiance 1 is white, and hides none of them."""
+    mi = mi_rgb
+    place = np.abs(np.indices((SIDE,) * 3) - SIDE // 2).max(axis=0) / (SIDE // 4)
+    grid = contracted_nodes(ad, np.ones((SIDE,) * 3, bool))
+    density = np.append(-9, np.where(place > 1.3, 8.0, -9.0).reshape(-1))
+    save_table(tmp_path / "x.npz", files.grid_table(grid, density, np.zeros((grid.entries, 12))))
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    at, white = mi.ScalarTransform4f().look_at([0.2, -0.1, 0.9], list(CENTRE), [0, 1, 0]), {"type": "diffuse"}
+    scene = mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": "neural_field", "filename": str(tmp_path / "x.npz"), "lit": True, "max_depth": 2},
+        "camera": {"type": "perspective", "fov": 60, "to_world": at, "film": film},
+        "ball": {"type": "sphere", "center": list(CENTRE), "radius": 0.2, "bsdf": {**white, "reflectance": 1.0}},
+    })  # fmt: skip
+    image = mi.render(scene, spp=256).numpy()
+    assert np.allclose(image[..., 3], 1, atol=1e-3)
+    assert np.allclose(image[[0, 0, -1, -1], [0, -1, 0, -1], :3], 1, atol=1e-3)  # past the ball
+    assert np.allclose(image[3:5, 3:5, :3].mean(), 1, atol=0.02)
