@@ -345,6 +345,8 @@ class FieldFit:
 
     def in_file(self, grid: NodeGrid, nbytes: int, stopped: bool):
         """Compress a grid to a file of at most ``nbytes``, at the highest resolution that allows it."""
+        if nbytes < 2 * compression.OTHER_BYTES:
+            raise UsageError(f"--disk: {nbytes:,} bytes are fewer than a file needs")
         cells = grids.visible(grid, self.session.seeing_images)
         for share in SHARES:
             smaller = grids.divided(grid, cells, share)
@@ -352,7 +354,7 @@ class FieldFit:
             coding = compression.coding_in(smaller, self.importance(smaller), nbytes, self.request.settings.seed, limit)
             if coding is not None:
                 return self.coded(coding, stopped)
-        raise UsageError(f"--disk: {nbytes:,} bytes are fewer than the smallest file needs")
+        raise UsageError(f"--disk: {nbytes:,} bytes are fewer than the smallest file of this capture needs")
 
     def smallest(self, grid: NodeGrid, psnr: float, stopped: bool):
         """Return the first size of :data:`LADDER` that reaches a PSNR in decibels over white, else the largest tried.
