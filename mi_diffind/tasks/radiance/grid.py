@@ -134,9 +134,9 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
     """Return the largest weight (transmittance × opacity) of each cell in a ray: ``(X − 1, Y − 1, Z − 1)``."""
     nodes, types, views = field.nodes, field.types, images.views
     largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
-    # One ray for each voxel, where that is wider than a pixel
+    # One ray for each voxel, where that is wider than a pixel; voxels of surroundings are narrower from afar
     middle = (np.array(nodes.lower) + nodes.upper) / 2
-    every = max(1, int(nodes.spacing / pixel_width(views, middle)))
+    every = max(1, int(nodes.spacing / pixel_width(views, middle))) if nodes.contraction is None else 1
     for view, (height, width) in enumerate((views.sizes // every).tolist()):
         lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
         column, row = (n * dr.opaque(types.UInt32, every) for n in (lane % width, lane // width))
