@@ -152,7 +152,8 @@ def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
     In a field that is nearly empty, since its training has just begun, they are those that are seen best.
     """
     largest = weights(grid.field(), images)
-    return (largest > 0) & (largest >= min(VISIBLE, 0.5 * float(largest.max())))
+    least = VISIBLE if grid.nodes.contraction is None else surroundings.VISIBLE
+    return (largest > 0) & (largest >= min(least, 0.5 * float(largest.max())))
 
 
 def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 0) -> NodeGrid:
