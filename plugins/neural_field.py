@@ -54,6 +54,11 @@ Radiance field among surfaces (:monosp:`neural_field`)
      (Default: none)
    - |exposed|, |differentiable|, |discontinuous|
 
+ * - surroundings
+   - |bool|
+   - Render the surroundings, too, if the field has them. False: the cube around its objects alone. (Default: true)
+   - --
+
  * - (nested plugin)
    - |integrator|
    - Integrator of the surfaces: any that follows rays from a camera. (Default: :monosp:`path_footprint`, with the
@@ -115,6 +120,11 @@ take the luminance. Polarised variants are not supported.
 **Several fields**, up to four, are nested in one another, with the integrator of surfaces in the innermost; ``lit``,
 ``smooth_depth`` and ``aovs`` are those of the outermost. Where boxes overlap, densities and emissions add up. Rays take
 steps of half the smallest voxel there, and ``to_world`` of such fields has no derivatives.
+
+**Surroundings.** A field of ``fit field --background surroundings`` fills all space: a cube around its objects, and
+what is beyond, coarser with the distance. Rays that meet no surface end in the surroundings, so that alpha is 1 where
+these are opaque. Such a field cannot be nested with others, and its ``to_world`` has no derivatives, unless
+``surroundings`` is false.
 
 **Derivatives** with respect to the field's arrays and its ``to_world`` replay the rays (Vicini et al., *Path Replay
 Backpropagation*, SIGGRAPH 2021). They cover the radiance, alpha and the channels of ``aovs``. If the inner integrator
@@ -240,6 +250,11 @@ def integrator() -> type:
             if field is None:
                 self.model = open_model(props)
                 field = self.model.field
+            shown = props.get("surroundings", True)
+            if not isinstance(shown, bool):
+                raise RuntimeError(f'parameter "surroundings": found {shown}, allowed are true and false')
+            if field.unbounded and not shown:
+                field = field.without_surroundings()
             self.placed = PlacedField(field, props.get("to_world", mi.ScalarTransform4f()))
             self.light = VariantLight()
             self.fields = [self.placed]
@@ -261,6 +276,11 @@ def integrator() -> type:
 
             Fields that a nested integrator has shown to it are hidden.
             """
+            if len(self.fields) > 1 and any(placed.field.unbounded for placed in self.fields):
+                raise RuntimeError(
+                    'parameter "surroundings": true for a field among nested ones, allowed is false, since '
+                    "surroundings fill all space"
+                )
             self.groups = grouped(self.fields)
             if self.lit and type(self.surfaces) is not path_footprint():
                 raise RuntimeError(
@@ -469,6 +489,8 @@ def integrator() -> type:
         def _check_moving(self) -> None:
             if any(placed.position.moving() and placed not in self.groups for placed in self.fields):
                 raise RuntimeError('parameter "to_world": has no derivatives for a field that overlaps another one')
+            if any(placed.position.moving() and placed.field.unbounded for placed in self.fields):
+                raise RuntimeError('parameter "to_world": has no derivatives for a field with surroundings')
 
         def sample(self, mode, scene, sampler, ray, δL=None, δaovs=None, state_in=None, active=True, **kwargs):
             """Sample as ``ADIntegrator.sample`` does, for an integrator around this one, in the primal mode only."""

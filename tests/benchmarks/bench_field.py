@@ -15,7 +15,7 @@ import time
 from mi_diffind.files import write_json
 from mi_diffind.runtime import array_module
 from mi_diffind.task import FitRequest, tasks
-from mi_diffind.tasks.radiance import compression, files, fit
+from mi_diffind.tasks.radiance import compression, files, fit, rate_distortion
 from mi_diffind.tasks.radiance.presets import PRESETS, dense_bytes
 from mi_diffind.tasks.radiance.session import FieldSession
 
@@ -58,7 +58,8 @@ def main() -> None:
         if paper:
             problem = field_fit.pairs_problem(visible, dense / 50, fit.VALUE_STEPS)
         else:
-            problem = compression.PaletteProblem(compression.palette_coding(visible, bits, 0), session)
+            weights = rate_distortion.importance(visible, session, 0)
+            problem = compression.PaletteProblem(compression.palette_coding(visible, weights, bits, 0), session)
         if steps:
             request.train(problem)
         measured = session.held_out_images.evaluate(problem.field_of(problem.net))

@@ -2,7 +2,7 @@
 
 - :mod:`.transforms`, :mod:`.colmap`, :mod:`.image_files`, :mod:`.lenses`, :mod:`.background`, :mod:`.views`: captured
   images with cameras;
-- :mod:`.visual_hull`: the space that captured objects may occupy;
+- :mod:`.visual_hull`, :mod:`.surroundings`: the space that captured objects may occupy, and the space around it;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
 - :mod:`.session`, :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
 - :mod:`.compression`, :mod:`.paper`: our compressed layout, and that of the supplement;
@@ -62,8 +62,13 @@ class RadianceField(Task):
         ),
         Argument(
             "--background", choices=BACKGROUNDS,
-            help="background of images without alpha: a colour, or the scene itself (default: the colour of their "
-            "borders if it is one, else scene)"
+            help="background of images without alpha: a colour, scene (a box around everything), or surroundings "
+            "(coarser with the distance, without an end) (default: the colour of their borders if it is one, else "
+            "scene)"
+        ),
+        Argument(
+            "--exposures", action="store_true",
+            help="train an exposure for each view, in stops with the mean 0: photographs of automatic exposure"
         ),
         Argument(
             "--downscale", type=positive, metavar="N",

@@ -1,4 +1,4 @@
-"""Compression of a grid to density levels and a palette: initial clusters, training through the images, and sizes.
+"""Compression of a grid to density levels and a palette: choice by rate and distortion, training through the images.
 
 Each node stores a density level, a step on a straight line of raw densities, and an index into a palette of colours
 that all nodes share.
@@ -15,8 +15,10 @@ from scipy.spatial import cKDTree
 from ...deadline import Deadline
 from ...indirection import device_array, device_tensor, fold
 from . import grid as grids
+from . import node_codes
 from .grid import NodeGrid
 from .nodes import Nodes
+from .rate_distortion import Importance, chosen_index, chosen_levels
 from .session import FieldSession, ViewImages
 from .training import ImagesProblem
 from .volume_field import NodeField
@@ -25,12 +27,16 @@ from .volume_field import NodeField
 EMPTIEST, DENSEST = -7.0, 8.0
 
 #: Bits of a density level, the number of the last level, and the raw density from one level to the next.
-DENSITY_BITS = 6
+DENSITY_BITS = 4
 LAST_LEVEL = 2**DENSITY_BITS - 1
 LEVEL_STEP = (DENSEST - EMPTIEST) / LAST_LEVEL
 
-#: Allowed bits of a palette index, and the default.
-INDEX_BITS, DEFAULT_BITS = (6, 8, 10, 12, 14), 12
+#: Most bits of a palette index, those of sizes in memory, and the default.
+MOST_BITS, INDEX_BITS, DEFAULT_BITS = 14, (6, 8, 10, 12, 14), 12
+
+#: Weight of a bit for each node against the error of the grid's images: 0.007 is 0.7% of the error a bit. A bit of the
+#: levels counts less, since errors of neighbouring densities add up.
+SLOPE, LEVEL_SLOPE = 0.007, 0.1
 
 #: Training steps between updates of the range of the palette's bytes.
 RANGE_INTERVAL = 50
@@ -38,11 +44,8 @@ RANGE_INTERVAL = 50
 #: Resolution of the smallest grid, as a share of the full resolution.
 SMALLEST = 0.2
 
-#: Weight of the coefficients of direction against those of the mean colour, since |x|, |y|, |z| ≤ 1 in a direction.
-DIRECTION = 0.5
-
 #: Nodes per cluster that clusters are computed from, and rounds of Lloyd's algorithm.
-SAMPLES, ROUNDS = 60, 10
+SAMPLES, ROUNDS = 60, 8
 
 
 @dataclass
@@ -50,60 +53,91 @@ class PaletteCoding:
     """Palette coding of a grid's ``nodes``.
 
     ``levels`` ``(n,)`` are densities in [0, 1] between :data:`EMPTIEST` and :data:`DENSEST`; ``index`` ``(n,)``
-    (uint32) names a row of ``palette`` ``(P, 12)`` in ``index_bits`` bits.
+    (uint32) names a row of ``palette`` ``(P, columns)``. The first entry of both stands for no node. ``weight`` and
+    ``rate`` are those of a squared step of a level and of a bit.
     """
 
     nodes: Nodes
     levels: np.ndarray
     index: np.ndarray
     palette: np.ndarray
-    index_bits: int
+    passes: list[node_codes.Pass]
+    weight: np.ndarray
+    rate: float
+
+    def chosen(self, levels: np.ndarray) -> np.ndarray:
+        """Return whole levels for levels ``(n,)`` in [0, 1]."""
+        exact = levels[1:].astype(np.float64) * LAST_LEVEL
+        return np.concatenate([[0], chosen_levels(self.passes, exact, self.weight, self.rate, LAST_LEVEL + 1)])
 
 
-def palette_coding(grid: NodeGrid, index_bits: int, seed: int, deadline: Deadline | None = None) -> PaletteCoding:
-    """Return the initial coding of a grid of visible nodes, with fewer rounds of :func:`clusters` at the deadline."""
-    palette, index = clusters(grid.colour[1:], 2**index_bits, seed, deadline)
-    # Neighbours in the palette look alike, so that the upper bits of an index vary little and deflate
+def palette_coding(
+    grid: NodeGrid,
+    importance: Importance,
+    index_bits: int,
+    seed: int,
+    slope: float = SLOPE,
+    deadline: Deadline | None = None,
+) -> PaletteCoding:
+    """Return the initial coding of a grid of visible nodes, with fewer rounds of :func:`clusters` at the deadline.
+
+    A bit for each node is worth the share ``slope`` of the error of the grid's images.
+    """
+    metric = np.sqrt(importance.metric)
+    points, rate = grid.colour[1:] * metric, slope * importance.loss / grid.nodes.count
+    palette = clusters(points, importance.colour, 2**index_bits, seed, deadline)
+    # Neighbours in the palette look alike: the part of the palette predicts that of the next node
     centred = palette - palette.mean(axis=0)
-    principal = np.linalg.eigh(centred.T @ centred)[1][:, -1]
-    order = np.argsort(centred @ principal, kind="stable")
-    rank = np.empty(len(order), np.uint32)
-    rank[order] = np.arange(len(order))
+    palette = palette[np.argsort(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1], kind="stable")]
+    passes = node_codes.passes_of(grid.nodes.stored)
+    palette, index = chosen_index(passes, points, importance.colour, palette, rate)
+    used, index = np.unique(index, return_inverse=True)
     levels = np.clip((grid.density - EMPTIEST) / (DENSEST - EMPTIEST), 0, 1).astype(np.float32)
-    index = np.concatenate([[0], rank[index]]).astype(np.uint32)
-    return PaletteCoding(grid.nodes, levels, index, palette[order], index_bits)
+    coding = PaletteCoding(
+        grid.nodes,
+        levels,
+        np.concatenate([[0], index]).astype(np.uint32),
+        (palette[used] / metric).astype(np.float32),
+        passes,
+        importance.density * LEVEL_STEP**2,
+        LEVEL_SLOPE * rate,
+    )
+    coding.levels = (coding.chosen(levels) / LAST_LEVEL).astype(np.float32)
+    return coding
 
 
 def clusters(
-    colour: np.ndarray, count: int, seed: int, deadline: Deadline | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``count`` cluster centres of ``colour`` ``(n, 12)`` and the index of the nearest one for each row.
+    points: np.ndarray, weight: np.ndarray, count: int, seed: int, deadline: Deadline | None = None
+) -> np.ndarray:
+    """Return ``count`` centres of clusters of ``points`` ``(n, c)``, whose squared distances count ``weight`` ``(n,)``.
 
-    The centres, ``(count, 12)``, are found by Lloyd's algorithm on random rows, in :data:`ROUNDS` rounds unless the
-    deadline passes.
+    They are found by Lloyd's algorithm on random points, in :data:`ROUNDS` rounds unless the deadline passes.
     """
     rng = np.random.default_rng(seed)
-    metric = np.tile([1.0, DIRECTION, DIRECTION, DIRECTION], 3)
-    points = colour * metric
     count = min(count, len(points))
-    centres = points[rng.choice(len(points), count, replace=False)]
-    sample = rng.choice(len(points), min(len(points), SAMPLES * count), replace=False)
+    # Likelier by the root of the weight: many points of little weight do not get centres of their own
+    chance = np.sqrt(np.maximum(weight, 1e-6 * weight.max()))
+    chance /= chance.sum()
+    centres = points[rng.choice(len(points), count, replace=False, p=chance)]
+    sample = rng.choice(len(points), min(len(points), SAMPLES * count), replace=False, p=chance)
+    share = weight[sample] / chance[sample]
     for _ in range(ROUNDS):
         if deadline is not None and deadline.passed:
             break
         nearest = cKDTree(centres).query(points[sample])[1]
-        used = np.bincount(nearest, minlength=count)
-        sums = np.stack([np.bincount(nearest, points[sample, c], count) for c in range(12)], axis=1)
+        total = np.bincount(nearest, share, count)
+        sums = np.stack([np.bincount(nearest, share * column, count) for column in points[sample].T], axis=1)
         # A centre without points restarts at a random one
         spare = points[rng.choice(sample, count)]
-        centres = np.where(used[:, None] > 0, sums / np.maximum(used, 1)[:, None], spare)
-    return centres / metric, cKDTree(centres).query(points)[1].astype(np.uint32)
+        centres = np.where(total[:, None] > 0, sums / np.maximum(total, 1e-300)[:, None], spare)
+    return centres
 
 
 class PaletteProblem(ImagesProblem):
     """Training of a :class:`PaletteCoding` through the images of a session.
 
-    Density levels and palette are rounded as they are stored, with straight-through gradients. Indices are constant.
+    Density levels and palette are rounded as they are stored, with straight-through gradients. Indices are constant. At
+    the end, levels are chosen by rate and distortion again.
     """
 
     def __init__(self, coding: PaletteCoding, session: FieldSession):
@@ -120,7 +154,7 @@ class PaletteProblem(ImagesProblem):
         level = fold(net["density"].array) * LAST_LEVEL
         level += dr.detach(dr.round(level) - level)
         palette = net["palette"]
-        lane = dr.arange(types.UInt32, len(self.coding.palette) * 12) % 12
+        lane = dr.arange(types.UInt32, dr.width(palette.array)) % palette.shape[1]
         scale, offset = (dr.gather(types.Float, v, lane) for v in self.range)
         exact = dr.detach(palette.array)
         colour = palette.array + dr.detach(dr.fma(dr.round((exact - offset) / scale), scale, offset) - exact)
@@ -139,13 +173,15 @@ class PaletteProblem(ImagesProblem):
     def stored(self) -> dict[str, np.ndarray]:
         """Return what is stored: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``.
 
-        ``density_range`` holds the raw density of level 0 and the step from one level to the next.
+        ``density_range`` holds the raw density of level 0 and the step from one level to the next, ``density_bits`` the
+        bits of a level.
         """
         palette = self.net["palette"].numpy()
         scale, offset = byte_range(palette)
         return {
-            "levels": np.rint(fold(self.net["density"].array).numpy().astype(np.float64) * LAST_LEVEL).astype(np.uint8),
+            "levels": self.coding.chosen(fold(self.net["density"].array).numpy()).astype(np.uint8),
             "density_range": (EMPTIEST, LEVEL_STEP),
+            "density_bits": DENSITY_BITS,
             "index": self.coding.index,
             "palette": np.clip(np.rint((palette - offset) / scale), 0, 255).astype(np.uint8),
             "scale": scale,
@@ -162,7 +198,7 @@ def byte_range(palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def packed_bytes(grid: NodeGrid, index_bits: int) -> int:
     """Return the bytes in memory of the packed field of a grid."""
     nodes = grid.nodes
-    index = Nodes(nodes.types, nodes.lower, nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
+    index = nodes.like(nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
     return index + nodes.entries * (DENSITY_BITS + index_bits) // 8 + 8 + 16 * min(2**index_bits, nodes.count)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +11,16 @@ import numpy as np
 
 from ...indirection import Indirection, device_array, device_tensor
 from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout, restored
-from .compression import DENSITY_BITS, INDEX_BITS, LAST_LEVEL, byte_range
+from . import node_codes
+from .compression import INDEX_BITS, MOST_BITS, byte_range
 from .nodes import Nodes
 from .paper import PairsField
+from .surroundings import ContractedNodes
 from .volume_field import NodeField, PackedPaletteField, VolumeField
 
-#: Layout → name of an array → number of its dimensions, and channels.
+#: Layout → name of an array → number of its dimensions, and channels. "coded" is "sparse" in fewer bytes.
 LAYOUTS = {
+    "coded": {"probabilities": (1, 1), "nodes": (1, 1), "palette": (1, 12)},
     "sparse": {"cells": (1, 1), "density": (1, 1), "index": (1, 2), "palette": (1, 12)},
     "grid": {"cells": (1, 1), "density": (1, 1), "colour": (1, 12)},
     "pairs": {
@@ -28,23 +32,65 @@ LAYOUTS = {
 #: Most nodes of a grid, counting those that are not stored.
 MOST_NODES = 2**28
 
+#: Bits of a density level of the layout "sparse", and most bits of one.
+SPARSE_BITS, MOST_DENSITY_BITS = 6, 6
+
 
 def stored_nodes(nodes: Nodes) -> tuple[dict[str, StoredArray], dict]:
     """Return the array that marks the stored nodes, one bit each, and the settings of the grid."""
     bits = np.packbits(nodes.stored.reshape(-1))
     settings = {"lower": list(nodes.lower), "spacing": nodes.spacing, "shape": list(nodes.shape)}
+    if nodes.contraction is not None:
+        settings["inner"] = list(nodes.contraction.inner)
     return {"cells": byte_array(bits[:, None])}, settings
 
 
-def palette_table(nodes: Nodes, stored: dict, index_bits: int) -> Table:
+def palette_table(nodes: Nodes, stored: dict) -> Table:
     """Return the table of what :meth:`.compression.PaletteProblem.stored` returned."""
-    arrays, settings = stored_nodes(nodes)
-    index = stored["index"].astype(np.uint32)
+    palette = StoredArray(stored["palette"], (), tuple(stored["scale"]), tuple(stored["offset"]))
     offset, scale = stored["density_range"]
-    arrays["density"] = byte_array(stored["levels"][:, None], scale, offset)
-    arrays["index"] = byte_array(np.stack([index & 255, index >> 8], axis=1))
-    arrays["palette"] = StoredArray(stored["palette"], (), tuple(stored["scale"]), tuple(stored["offset"]))
-    return Table("field", arrays, settings={"layout": "sparse", "index_bits": index_bits, **settings})
+    levels = {"density_bits": stored["density_bits"], "density_offset": offset, "density_scale": scale}
+    settings = {"layout": "coded", **levels, **stored_nodes(nodes)[1]}
+    return Table("field", coded(nodes.stored, stored["levels"], stored["index"], palette, settings), settings=settings)
+
+
+def coded(stored: np.ndarray, levels: np.ndarray, index: np.ndarray, palette: StoredArray, settings: dict) -> dict:
+    """Return the arrays of the layout "coded"; the first entries of ``levels`` and ``index`` stand for no node."""
+    count = 2 ** settings["density_bits"]
+    probabilities, data = node_codes.encoded(stored, levels[1:], index[1:], count, len(palette.entries))
+    return {"probabilities": byte_array(probabilities[:, None]), "nodes": byte_array(data[:, None]), "palette": palette}
+
+
+def sparse(table: Table) -> Table:
+    """Return a table of the layout "coded" in the layout "sparse", any other table as it is.
+
+    Raises :class:`~mi_diffind.tables.TableError` if it is damaged.
+    """
+    if table.settings["layout"] != "coded":
+        return table
+    settings, palette = table.settings, table.arrays["palette"]
+    probabilities, data = (table.arrays[name].entries.tobytes() for name in ("probabilities", "nodes"))
+    try:
+        shape, count = tuple(settings["shape"]), 2 ** settings["density_bits"]
+        stored, levels, index = decoded(probabilities, data, shape, count, len(palette.entries))
+    except ValueError as e:
+        raise TableError(f"{table.path}: is damaged: {e}") from None
+    arrays = {
+        "cells": byte_array(np.packbits(stored.reshape(-1))[:, None]),
+        "density": byte_array(levels[:, None], settings["density_scale"], settings["density_offset"]),
+        "index": byte_array(np.stack([index & 255, index >> 8], axis=1)),
+        "palette": palette,
+    }
+    bits = max(1, (len(palette.entries) - 1).bit_length())
+    return replace(table, arrays=arrays, settings={**settings, "layout": "sparse", "index_bits": bits})
+
+
+@functools.lru_cache(maxsize=1)
+def decoded(probabilities: bytes, data: bytes, *sizes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what :func:`.node_codes.decoded` does for bytes, with first entries for no node; the last call is kept."""
+    stored, *numbers = node_codes.decoded(*(np.frombuffer(b, np.uint8) for b in (probabilities, data)), *sizes)
+    levels, index = (np.concatenate([[0], values]) for values in numbers)
+    return stored, levels.astype(np.uint8), index.astype(np.uint32)
 
 
 def grid_table(nodes: Nodes, density: np.ndarray, colour: np.ndarray, dtype=np.float16) -> Table:
@@ -74,9 +120,22 @@ def load(path) -> Table:
     check_numbers(table, "lower", 3)
     check_numbers(table, "spacing", 1, positive=True)
     check_numbers(table, "shape", 3, positive=True, whole=True)
+    if "inner" in table.settings:
+        check_numbers(table, "inner", 4)
+        half = table.settings["inner"][3]
+        if half <= 0:
+            raise TableError(f"{path}: is damaged: found the half side {half} of the inner cube, allowed are those > 0")
     shape = table.settings["shape"]
     if min(shape) < 2 or math.prod(shape) > MOST_NODES:
         raise TableError(f"{path}: is damaged: found a grid of {shape}, allowed are at most {MOST_NODES:,} nodes")
+    if layout == "coded":
+        check_numbers(table, "density_scale", 1, positive=True)
+        check_numbers(table, "density_offset", 1)
+        bits, colours = table.settings.get("density_bits"), len(table.arrays["palette"].entries)
+        if bits not in range(1, MOST_DENSITY_BITS + 1) or colours > 2**MOST_BITS:
+            raise TableError(f"{path}: is damaged: found {bits!r} bits of a density and {colours:,} colours")
+        sparse(table)
+        return table
     if len(table.arrays["cells"].entries) != -(-math.prod(shape) // 8):
         raise TableError(f'{path}: is damaged: the array "cells" is not that of a grid of {shape}')
     if layout == "pairs":
@@ -97,13 +156,15 @@ def load(path) -> Table:
         if last >= min(palette, 2**bits):
             raise TableError(f"{path}: is damaged: found the index {last} in a palette of {palette} colours")
         density = table.arrays["density"]
-        if density.storage != "uint8" or density.entries.max() > LAST_LEVEL:
-            raise TableError(f"{path}: is damaged: found a density level that is not a number from 0 to {LAST_LEVEL}")
+        last = 2**SPARSE_BITS - 1
+        if density.storage != "uint8" or density.entries.max() > last:
+            raise TableError(f"{path}: is damaged: found a density level that is not a number from 0 to {last}")
     return table
 
 
 def stored(table: Table, entries: dict, storage: str = "") -> Table:
     """Return a table with optimised ``entries``: ``density`` and ``colour`` of its nodes, or of its palette."""
+    given, table = table, sparse(table)
     layout, arrays = table.settings["layout"], dict(table.arrays)
     if layout == "pairs":
         allocated = {name: table.arrays[name].allocate(type(values), "float32") for name, values in entries.items()}
@@ -120,11 +181,15 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
             arrays[name] = StoredArray(values.astype(np.float32)).to(form)
     else:
         levels, palette = table.arrays["density"], colour.reshape(-1, table.arrays["palette"].shape[-1])
-        codes = np.clip(np.rint((density - levels.offset[0]) / levels.scale[0]), 0, LAST_LEVEL)
+        last = 2 ** table.settings.get("density_bits", SPARSE_BITS) - 1
+        codes = np.clip(np.rint((density - levels.offset[0]) / levels.scale[0]), 0, last)
         arrays["density"] = replace(levels, entries=codes.astype(np.uint8)[:, None])
         scale, offset = byte_range(palette)
         codes = np.clip(np.rint((palette - offset) / scale), 0, 255).astype(np.uint8)
         arrays["palette"] = StoredArray(codes, (), tuple(scale.tolist()), tuple(offset.tolist()))
+        if given is not table:
+            codes, palette = arrays["density"].entries[:, 0], arrays["palette"]
+            arrays, table = coded(stored_of(table), codes, index_of(table), palette, given.settings), given
     return replace(table, arrays=arrays, settings={**table.settings, "optimised": True}, measured={}, path=None)
 
 
@@ -133,6 +198,13 @@ def stored_of(table: Table) -> np.ndarray:
     shape = table.settings["shape"]
     bits = np.unpackbits(np.ascontiguousarray(table.arrays["cells"].entries[:, 0]), count=math.prod(shape))
     return bits.reshape(shape).astype(bool)
+
+
+def nodes_of(table: Table, types, packed: bool = False) -> Nodes:
+    """Return the nodes of a checked table."""
+    settings = table.settings
+    place = types, settings["lower"], settings["spacing"], settings["shape"], stored_of(table), packed
+    return ContractedNodes(*place, inner=settings["inner"]) if "inner" in settings else Nodes(*place)
 
 
 def index_of(table: Table) -> np.ndarray:
@@ -146,9 +218,10 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
 
     It is packed for rendering; with the ``storage`` ``"float32"``, its ``arrays`` can be trained instead.
     """
+    table = sparse(table)
     settings, layout, arrays = table.settings, table.settings["layout"], table.arrays
     floats = storage == "float32"
-    nodes = Nodes(types, settings["lower"], settings["spacing"], settings["shape"], stored_of(table), packed=not floats)
+    nodes = nodes_of(table, types, packed=not floats)
     tensor = types.TensorXf
     if layout == "grid":
         return NodeField(
@@ -168,4 +241,4 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
         "levels": density.entries[:, 0], "density_range": (density.offset[0], density.scale[0]), "index": index,
         "palette": palette.entries, "scale": palette.scale, "offset": palette.offset,
     }  # fmt: skip
-    return PackedPaletteField(nodes, stored, DENSITY_BITS, settings["index_bits"])
+    return PackedPaletteField(nodes, stored, settings.get("density_bits", SPARSE_BITS), settings["index_bits"])

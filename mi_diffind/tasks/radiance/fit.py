@@ -15,7 +15,7 @@ import numpy as np
 
 from ... import units
 from ...errors import UsageError
-from ...fitting import FitResult, FittingError
+from ...fitting import FitResult, FittingError, cores
 from ...interrupt import interruptible
 from ...tables import MAX_BYTES, StoredArray, Table, save_table
 from ...task import FitRequest, Fitted
@@ -23,6 +23,7 @@ from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
 from .presets import COMPRESSION, PRESETS, RESOLUTIONS, STAGES, dense_bytes, ratio_for
+from .rate_distortion import importance
 from .session import FieldSession
 from .training import ImagesProblem
 from .volume_field import VolumeField
@@ -61,8 +62,12 @@ def check(request: FitRequest) -> None:
     sized = [name for name in ("bytes", "compression", "psnr") if options[name] is not None]
     if request.preset == "grid" and sized:
         raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
-    if request.preset == "paper" and options["psnr"] is not None:
-        raise UsageError("--psnr is an option of the preset sparse, found the preset paper")
+    if request.preset == "paper":
+        for name in ("psnr", "exposures"):
+            if options.get(name):
+                raise UsageError(f"--{name} is an option of the preset sparse, found the preset paper")
+        if options.get("background") == "surroundings":
+            raise UsageError("--background: found surroundings with the preset paper, whose box is not contracted")
     for name, parse in (("bytes", units.parse_bytes), ("compression", units.parse_compression)):
         if options[name] is not None:
             try:
@@ -83,7 +88,7 @@ def fit(request: FitRequest) -> Fitted:
     """
     pixels = None if request.deadline is None else PIXELS * request.deadline.seconds
     options = request.options
-    reading = {name: options.get(name) for name in ("background", "downscale")}
+    reading = {name: options.get(name) for name in ("background", "downscale", "exposures")}
     session = FieldSession.load(request.types, options["source"], pixels, progress=request.progress, **reading)
     pixels = len(session.views) * session.views.mean_pixels
     settings = PRESETS[request.preset].scaled(request.settings, pixels)
@@ -103,7 +108,7 @@ class FieldFit:
         warnings = []
         if not session.has_test_views:
             warnings.append("there are no test views: the measured error is that of the training views")
-        if not session.views.has_alpha:
+        if not session.views.has_alpha and not session.views.surroundings:
             warnings.append("the images have no alpha: their background becomes part of the field")
         for line in (*session.views.notes, *(f"warning: {warning}" for warning in warnings)):
             print(line, file=sys.stderr)
@@ -124,6 +129,7 @@ class FieldFit:
             "source": session.views.digest,
             **session.views.settings,
             **({"downscale": options["downscale"]} if options.get("downscale") else {}),
+            **self.exposures(),
             **request.paths(capture_path=options["source"], grid_path=options["grid"] or None),
             "warnings": warnings,
             **table.settings,
@@ -143,6 +149,16 @@ class FieldFit:
         figures = {"grid_seconds": grid_seconds, "dense_bytes": dense, "memory_bytes": size, "warnings": warnings}
         return Fitted(table, result, lines, figures)
 
+    def exposures(self) -> dict[str, list[float]]:
+        """Return the setting that records the exposures of the training views in stops, if they were trained."""
+        stops = self.session.exposures
+        return {} if stops is None else {"exposures": [round(float(s), 4) for s in stops]}
+
+    def take_exposures(self, table: Table) -> None:
+        """Begin with the exposures that a table records."""
+        if self.session.exposures is not None and "exposures" in table.settings:
+            self.session.exposures = np.float32(table.settings["exposures"])
+
     def grid(self) -> tuple[NodeGrid, FitResult | None]:
         """Return the grid: that of ``--grid`` if the file exists, else a trained one, which is written there."""
         request, views, path = self.request, self.session.views, self.request.options["grid"]
@@ -152,11 +168,12 @@ class FieldFit:
                 raise UsageError(f'--grid: {path} has the layout "{table.settings["layout"]}", a grid is needed')
             if table.settings.get("source") != views.digest:
                 raise UsageError(f"--grid: {path} was fitted to other views than those in {views.path}")
+            self.take_exposures(table)
             return grid_of(table, request.types), None
         grid, result = self.trained_grid()
         if path and not result.interrupted:  # the next run would take an interrupted grid for a finished one
             table = self.grid_table(grid)
-            table.preset, table.settings["source"] = "grid", views.digest
+            table.preset, table.settings = "grid", {**table.settings, "source": views.digest, **self.exposures()}
             stored = files.field_of(table, request.types)  # without invisible cells, in half precision
             table.measured = rounded_figures(self.session.held_out_images.evaluate(stored, ssim=True))
             save_table(path, table)
@@ -185,6 +202,7 @@ class FieldFit:
             if table.settings.get("source") != views.digest or table.settings.get("nodes") != nodes:
                 raise FittingError(f'the checkpoint "{stages_file}" has other views or another resolution')
             grid, finished = grid_of(table, request.types), table.settings["stages"]
+            self.take_exposures(table)
             if finished == len(STAGES):
                 return grid, FitResult(table.measured, 0, 0, 0.0, False, 0)
         for number, (share, part) in enumerate(STAGES):
@@ -222,11 +240,12 @@ class FieldFit:
                 problem, f"grid, {round(nodes * share)}³", finish, self.times, 1 if number else FIRST_STEPS
             )
             grid = problem.trained()
+            problem.keep_exposures()
             if result.interrupted or (result.asked_to_stop and not last):
                 return grid, dataclasses.replace(result, interrupted=True)
             if stages_file is not None:
                 table = files.grid_table(grid.nodes, grid.density, grid.colour, np.float32)
-                table.settings |= {"source": views.digest, "nodes": nodes, "stages": number + 1}
+                table.settings |= {"source": views.digest, "nodes": nodes, "stages": number + 1} | self.exposures()
                 table.measured = result.measured
                 save_table(stages_file, table)
         return grid, result
@@ -291,16 +310,19 @@ class FieldFit:
         return self.compressed(smaller, bits, stopped)
 
     def compressed(self, grid: NodeGrid, bits: int, stopped: bool, suffix: str = ""):
-        """Train a palette of ``2**bits`` colours on a grid; return the table, the result and the field."""
-        limit = self.request.part(CLUSTER_TIME).deadline
-        coding = compression.palette_coding(grid, bits, self.request.settings.seed, limit)
+        """Train a palette of at most ``2**bits`` colours on a grid; return the table, the result and the field."""
+        limit, settings = self.request.part(CLUSTER_TIME).deadline, self.request.settings
+        with cores(settings.deterministic):
+            weights = importance(grid, self.session, settings.seed, limit)
+        coding = compression.palette_coding(grid, weights, bits, settings.seed, deadline=limit)
         problem = compression.PaletteProblem(coding, self.session)
 
         def stored() -> tuple[Table, VolumeField]:
-            table = files.palette_table(grid.nodes, problem.stored(), bits)
+            table = files.palette_table(grid.nodes, problem.stored())
             return table, files.field_of(table, self.request.types)
 
         result = self.train(problem, stopped, lambda: self.session.watched_images.evaluate(stored()[1]), suffix)
+        problem.keep_exposures()
         table, field = stored()
         return table, result, field
 
@@ -369,8 +391,7 @@ class FieldFit:
 
 def grid_of(table: Table, types) -> NodeGrid:
     """Return the grid of a table of the layout "grid"."""
-    settings = table.settings
-    nodes = grids.Nodes(types, settings["lower"], settings["spacing"], settings["shape"], files.stored_of(table))
+    nodes = files.nodes_of(table, types)
     return NodeGrid(nodes, table.arrays["density"].values[:, 0], table.arrays["colour"].values)
 
 

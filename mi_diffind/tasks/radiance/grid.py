@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, map_coordinates
 
 from ...indirection import device_array, device_tensor
+from . import surroundings
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
 from .presets import RESOLUTIONS, VOXELS_PER_PIXEL
@@ -82,7 +83,8 @@ class GridProblem(ImagesProblem):
             other = dr.gather(types.UInt32, self.neighbours, node * 3 + axis)
             step = here - dr.gather(types.Float, density, other) * DENSITY_SCALE
             variation += dr.select(other != 0, dr.sqrt(dr.square(step) + ROUND), 0)
-        return [super().loss(net, rng, size), variation * (SMOOTH / VARIED)]
+        smooth = SMOOTH if self.nodes.contraction is None else surroundings.SMOOTH
+        return [super().loss(net, rng, size), variation * (smooth / VARIED)]
 
     def trained(self) -> NodeGrid:
         """Return the grid with the trained numbers."""
@@ -99,13 +101,18 @@ def neighbours(nodes: Nodes) -> np.ndarray:
 
 def resolution_of(views: CapturedViews) -> int:
     """Return the resolution at which a voxel is as wide as a pixel is at the middle of the box, for :func:`begin`."""
-    lower, upper = box_of(views)
-    voxel = pixel_width(views, (lower + upper) / 2) / VOXELS_PER_PIXEL
-    return int(np.clip(round(float(np.prod(upper - lower)) ** (1 / 3) / voxel), *RESOLUTIONS))
+    if views.surroundings:
+        nodes = surroundings.resolution_of(views)
+    else:
+        lower, upper = box_of(views)
+        nodes = float(np.prod(upper - lower)) ** (1 / 3) / pixel_width(views, (lower + upper) / 2)
+    return int(np.clip(round(nodes * VOXELS_PER_PIXEL), *RESOLUTIONS))
 
 
 def begin(types, views: CapturedViews, nodes: int) -> NodeGrid:
     """Return an empty grid of the visual hull, as fine as a cube of ``nodes``³ nodes with the volume of its box."""
+    if views.surroundings:
+        return _nearly_empty(surroundings.whole_space(types, views, nodes), surroundings.BEGIN_DENSITY)
     lower, upper = box_of(views)
     spacing = float((np.prod(upper - lower) / nodes**3) ** (1 / 3))
     shape = np.maximum(2, np.ceil((upper - lower) / spacing - 1e-6).astype(int) + 1)
@@ -114,9 +121,13 @@ def begin(types, views: CapturedViews, nodes: int) -> NodeGrid:
     near = np.zeros(tuple(shape - 1), bool)
     for corner in np.ndindex(2, 2, 2):
         near |= inside[tuple(slice(c, n - 1 + c) for c, n in zip(corner, shape, strict=True))]
-    grid = Nodes(types, lower, spacing, shape, corners_of(near))
-    colour = np.tile(np.float32([BEGIN_COLOUR, 0, 0, 0] * 3), (grid.entries, 1))
-    return NodeGrid(grid, np.full(grid.entries, BEGIN_DENSITY, np.float32), colour)
+    return _nearly_empty(Nodes(types, lower, spacing, shape, corners_of(near)))
+
+
+def _nearly_empty(nodes: Nodes, density: float = BEGIN_DENSITY) -> NodeGrid:
+    """Return a grid of these nodes before its training."""
+    colour = np.tile(np.float32([BEGIN_COLOUR, 0, 0, 0] * 3), (nodes.entries, 1))
+    return NodeGrid(nodes, np.full(nodes.entries, density, np.float32), colour)
 
 
 def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
@@ -130,7 +141,7 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
         lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
         column, row = (n * dr.opaque(types.UInt32, every) for n in (lane % width, lane // width))
         place = dr.opaque(types.UInt32, view), column, row
-        visibility(field, *images.rays(*place), 0, dr.inf, images.counted(*place), largest)
+        visibility(field, *images.rays(*place), images.near, dr.inf, images.counted(*place), largest)
         dr.eval(largest)
     return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]
 
@@ -160,7 +171,7 @@ def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 
         np.minimum(((np.arange(n - 1) + 0.5) / factor).astype(int), m - 2)
         for n, m in zip(shape, nodes.shape, strict=True)
     ]
-    fine = Nodes(nodes.types, nodes.lower, spacing, shape, corners_of(cells[np.ix_(*middle)]))
+    fine = nodes.like(spacing, shape, corners_of(cells[np.ix_(*middle)]))
     at = fine.positions().T / factor
 
     def sampled(values, begin: float):

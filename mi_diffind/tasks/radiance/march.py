@@ -1,10 +1,10 @@
 """Ray marching: emission and absorption from front to back, the derivatives of both, and counts of the reads.
 
 A ray is divided into steps of a fixed length from the point where it enters the box; the last step is cut where the ray
-leaves. Distances count from the point of entry, since a step might be too short to change a distance from afar. Each
-step has one density and one radiance, so a homogeneous medium is Beer–Lambert exactly. Steps that are certainly empty
-are skipped, which changes nothing. No radiance is read where the density is zero. The ray ends when it is opaque
-(:data:`OPAQUE`).
+leaves. In surroundings, steps grow (:class:`.surroundings.GrowingSteps`). Distances count from the point of
+entry, since a step might be too short to change a distance from afar. Each step has one density and one radiance, so a
+homogeneous medium is Beer–Lambert exactly. Steps that are certainly empty are skipped, which changes nothing. No
+radiance is read where the density is zero. The ray ends when it is opaque (:data:`OPAQUE`).
 
 Derivatives replay the ray (Vicini et al., *Path Replay Backpropagation*, SIGGRAPH 2021): with the light R that is seen
 from a step on and the transmittance T behind the step, ∂L/∂σ = δ (T c − R). There is no division.
@@ -66,15 +66,17 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
     with dr.suspend_grad():
         o, near, far, active = box(field, o, d, near, far, active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
+        steps = field.along(o, d)
+        far = steps.in_steps(far)
         seen, depth, through = types.Array3f(0), types.Float(0), types.Float(1)
         offset = types.Float(offset)
         while active:
-            t, here = _next(field, o, d, t, far, step, offset, active)
+            t, here = _next(field, o, d, t, far, step, offset, active, steps)
             end = dr.minimum(t + step, far)
-            at = dr.fma(offset, end - t, t)
+            at = steps.of_steps(dr.fma(offset, end - t, t))
             p = dr.fma(d, at, o)
             density, point_data = field.density_at(p, here)
-            passed = through * dr.exp(-density * (end - t))
+            passed = through * dr.exp(-density * (steps.of_steps(end) - steps.of_steps(t)))
             weight = dr.select(here, through - passed, 0)
             shown = here & (weight > field.least_weight)
             colour = types.Array3f(0)
@@ -89,7 +91,7 @@ def march(field, o, d, near, far, active=True, offset=0.5) -> Marched:
 
 
 @dr.syntax
-def _next(field, o, d, t, far, step, offset, active):
+def _next(field, o, d, t, far, step, offset, active, steps):
     """Return the start of the next step, from ``t`` on, that may not be empty, and whether there is one."""
     types = field.types
     t = types.Float(t)
@@ -97,9 +99,11 @@ def _next(field, o, d, t, far, step, offset, active):
     occupied = types.Bool(False)
     while searching:
         at = dr.fma(offset, dr.minimum(t + step, far) - t, t)
-        free = field.free_distance(dr.fma(d, at, o), d, searching)
+        distance = steps.of_steps(at)
+        free = field.free_distance(dr.fma(d, distance, o), d, searching)
         empty = free > 0
         occupied |= searching & ~empty
+        free = steps.skipped(at, distance, free)
         t = dr.select(searching & empty, dr.fma(dr.floor(free / step) + 1, step, t), t)
         searching &= empty & (t < far)
     return t, occupied
@@ -133,6 +137,8 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
         o, near, far, active = box(field, o, d, near, far, active)
         crossing = types.Bool(active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
+        steps = field.along(o, d)
+        far = steps.in_steps(far)
         through = types.Float(1)
         offset = types.Float(offset)
         total = dr.detach(marched.transmittance)
@@ -147,10 +153,10 @@ def _follow(field, o, d, near, far, active, offset, marched, adjoint, moving):
                 rays = _attached(field, *attached, crossing)
                 d_entry, d_way, d_length, d_near = dr.forward_to(*rays, flags=KEPT)
         while active:
-            t, here = _next(field, o, d, t, far, step, offset, active)
+            t, here = _next(field, o, d, t, far, step, offset, active, steps)
             end = dr.minimum(t + step, far)
-            length = end - t
-            at = dr.fma(offset, length, t)
+            length = steps.of_steps(end) - steps.of_steps(t)
+            at = steps.of_steps(dr.fma(offset, end - t, t))
             p = dr.fma(d, at, o)
             place, way = p, d
             # The last step ends where the ray does
@@ -255,13 +261,15 @@ def visibility(field, o, d, near, far, active, target) -> None:
     with dr.suspend_grad():
         o, near, far, active = box(field, o, d, near, far, active)
         t, step = types.Float(0), dr.opaque(types.Float, field.step)
+        steps = field.along(o, d)
+        far = steps.in_steps(far)
         through = types.Float(1)
         while active:
-            t, here = _next(field, o, d, t, far, step, types.Float(0.5), active)
+            t, here = _next(field, o, d, t, far, step, types.Float(0.5), active, steps)
             end = dr.minimum(t + step, far)
-            p = dr.fma(d, dr.fma(0.5, end - t, t), o)
+            p = dr.fma(d, steps.of_steps(dr.fma(0.5, end - t, t)), o)
             density, _ = field.density_at(p, here)
-            passed = through * dr.exp(-density * (end - t))
+            passed = through * dr.exp(-density * (steps.of_steps(end) - steps.of_steps(t)))
             dr.scatter_reduce(dr.ReduceOp.Max, target, through - passed, field.nodes.cell(p), here)
             through = dr.select(here, passed, through)
             t += step
@@ -325,7 +333,7 @@ class CountingField(VolumeField):
 
     def __init__(self, field: VolumeField, reads_all: bool = False):
         super().__init__(field.types, field.lower, field.upper, field.voxel, field.arrays)
-        self.field, self.reads_all = field, reads_all
+        self.field, self.reads_all, self.box = field, reads_all, field.box
         self.counts = dr.zeros(field.types.UInt32, 2)
 
     def _count(self, which: int, active) -> None:
@@ -343,6 +351,9 @@ class CountingField(VolumeField):
     def free_distance(self, p, d, active=True):
         return self.types.Float(0) if self.reads_all else self.field.free_distance(p, d, active)
 
+    def along(self, o, d):
+        return self.field.along(o, d)
+
 
 def count(field: VolumeField, o, d, near, far, active=True) -> RayCounts:
     """Return the counts of :func:`march` for these rays; two marches are needed."""
@@ -350,8 +361,8 @@ def count(field: VolumeField, o, d, near, far, active=True) -> RayCounts:
     with dr.suspend_grad():
         o, active = types.Array3f(o), types.Bool(active)
         rays = dr.max(dr.width(o, d, near, far, active))
-        *_, length, crossing = box(field, o, d, near, far, active)
-        steps = dr.select(crossing, dr.ceil(length / field.step), 0)
+        entry, _, length, crossing = box(field, o, d, near, far, active)
+        steps = dr.select(crossing, dr.ceil(field.along(entry, d).in_steps(length) / field.step), 0)
         skipping, all_steps = CountingField(field), CountingField(field, reads_all=True)
         marched = march(skipping, o, d, near, far, crossing)
         opaque = crossing & (marched.transmittance <= OPAQUE)

@@ -49,6 +49,7 @@ class RadianceFieldModel(Model):
             "file_bytes": file_bytes,
             "dense_bytes": dense,
             "box": [list(field.lower), list(field.upper)],
+            "surroundings": field.unbounded,
             "voxel": field.voxel,
             "shape": list(settings["shape"]),
             "nodes": field.nodes.count,
@@ -61,6 +62,9 @@ class RadianceFieldModel(Model):
             f"dense grid of float32",
             f"{field.nodes.count:,} of {shape} nodes ({share:.0f}%), voxels of {field.voxel:.4g}",
         ]
+        if field.unbounded:
+            side = field.upper[0] - field.lower[0]
+            lines.append(f"with surroundings: voxels grow outside of a cube with the side {side:.4g}")
         if file_bytes:
             lines.append(f"{file_bytes:,} bytes on disk, {dense / file_bytes:.0f} times less")
         steps, looks = max(1, counts["steps"]), max(1, counts["looks"])

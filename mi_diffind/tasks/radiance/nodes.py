@@ -37,6 +37,8 @@ class Nodes:
         self.lower, self.spacing = tuple(map(float, lower)), float(spacing)
         self.shape = tuple(int(n) for n in shape)
         self.stored = stored
+        #: Contraction of space (:class:`.surroundings.Contraction`), if the grid has one.
+        self.contraction = None
         # Opaque: grids of another size use the same kernels
         self._inverse = dr.opaque(types.Float, 1 / self.spacing)
         self._offset = dr.opaque(types.Array3f, [-a / self.spacing for a in self.lower])
@@ -74,6 +76,10 @@ class Nodes:
     def upper(self) -> tuple[float, float, float]:
         """Position of the last node."""
         return tuple(a + self.spacing * (n - 1) for a, n in zip(self.lower, self.shape, strict=True))
+
+    def like(self, spacing: float, shape, stored: np.ndarray | None = None, packed: bool = False) -> Nodes:
+        """Return other nodes in the same space."""
+        return Nodes(self.types, self.lower, spacing, shape, stored, packed)
 
     def positions(self) -> np.ndarray:
         """Return the integer coordinates of each stored node, ``(n, 3)``."""

@@ -28,7 +28,7 @@ RATIOS = {
 COMPRESSION = 50.0
 
 #: Backgrounds of images without alpha that a user may choose (:mod:`.background`).
-BACKGROUNDS = ("white", "black", "scene")
+BACKGROUNDS = ("white", "black", "scene", "surroundings")
 
 #: Bytes of a node of the uncompressed grid: a density and twelve numbers of colour in float32.
 NODE_BYTES = 52

@@ -21,6 +21,7 @@ from ...indirection import device_array
 from .image_files import LINEAR
 from .march import march
 from .views import CapturedViews, ViewsError, load_views
+from .visual_hull import focus
 from .volume_field import VolumeField
 
 #: Rays along a side of a pixel, and in all, each through the middle of a part of it.
@@ -31,6 +32,10 @@ PATCH = 2
 
 #: Pixels along a side of a tile, and the share of patches that are drawn from all tiles, with something in them or not.
 TILE, ANYWHERE = 8, 0.05
+
+#: Distance at which training rays of a field with surroundings begin, as a share of the distance from the point that
+#: the cameras look at to the nearest one.
+NEAR = 0.4
 
 #: Most held-out views of measurements during a training.
 MOST_WATCHED = 20
@@ -63,6 +68,14 @@ class ViewImages:
     def linear(self):
         """Linear value of each byte of sRGB."""
         return device_array(self.types.Float, LINEAR)
+
+    @property
+    def near(self) -> float:
+        """Distance from the camera at which training rays begin.
+
+        Close to a camera, nothing but its own view would say what is there.
+        """
+        return NEAR * focus(self.views)[1] if self.views.surroundings else 0.0
 
     def _place(self, view):
         """Return the number of the first pixel of a view, its height and its width."""
@@ -198,17 +211,21 @@ class FieldSession:
     has_test_views: bool = True
     #: Most pixels of the views in which the visible cells of a field are sought (``None``: all).
     pixels: float | None = None
+    #: Exposure of each training view in stops, float32, if exposures are trained.
+    exposures: np.ndarray | None = None
 
     @staticmethod
-    def load(types: ModuleType, folder, pixels: float | None = None, **reading) -> FieldSession:
+    def load(types: ModuleType, folder, pixels: float | None = None, exposures=False, **reading) -> FieldSession:
         """Read the capture in a folder, of the held-out views so many that they have at most ``pixels``.
 
-        ``reading`` are further arguments of :func:`.views.load_views`. Raises :class:`.views.ViewsError`.
+        ``exposures`` are to be trained. ``reading`` are further arguments of :func:`.views.load_views`. Raises
+        :class:`.views.ViewsError`.
         """
         views = load_views(folder, "train", **reading)
         most = None if pixels is None else max(2, round(pixels / views.mean_pixels))
         reading["background"] = views.background or "scene"
-        return FieldSession(types, views, *load_held_out(folder, most, **reading), pixels)
+        stops = np.zeros(len(views), np.float32) if exposures else None
+        return FieldSession(types, views, *load_held_out(folder, most, **reading), pixels, stops)
 
     @functools.cached_property
     def images(self) -> ViewImages:

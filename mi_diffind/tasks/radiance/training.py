@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import drjit as dr
+import numpy as np
 
 from ... import srgb
 from ...fitting import Problem
+from ...indirection import device_tensor
 from .march import differentiable
 from .session import RAYS, FieldSession
 from .volume_field import VolumeField
+
+#: Largest difference of the exposure of a view from the mean, in stops.
+MOST_STOPS = 3.0
 
 
 class ImagesProblem(Problem):
@@ -19,9 +24,13 @@ class ImagesProblem(Problem):
     ``net`` maps names to tensors (a dictionary or a module); ``field_of`` makes a :class:`.VolumeField` of them,
     differentiably. The loss is the mean squared difference of sRGB values in front of random greys, which trains the
     opacity, too, or in front of the background of views that have one.
+
+    If the session has ``exposures`` (in stops), they are trained, too; their mean stays 0.
     """
 
     def __init__(self, session: FieldSession, net, field_of: Callable[..., VolumeField]):
+        if session.exposures is not None:
+            net = {**net, "exposures": device_tensor(session.types.TensorXf, session.exposures)}
         self.session, self.net, self.field_of = session, net, field_of
         self.identity = {"source": session.views.digest}
 
@@ -33,16 +42,31 @@ class ImagesProblem(Problem):
         offset = rng.random(types.TensorXf, (dr.width(o),)).array
         behind = images.behind(rng, count)
         truth = images.colours(view, x, y)
-        seen = differentiable(self.field_of(net).for_training(), o, d, 0, dr.inf, True, offset)
+        seen = differentiable(self.field_of(net).for_training(), o, d, images.near, dr.inf, True, offset)
         dr.schedule(seen.colour, seen.transmittance)  # at once: each sum evaluates what it adds up
         *colour, transmittance = (dr.block_sum(v, RAYS) / RAYS for v in (*seen.colour, seen.transmittance))
-        total = types.Float(0)
+        gain, total = self.gain(net, view), types.Float(0)
         for c in range(3):
             reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * behind[c], 0, 1), fused=False)
             # The prediction is not clamped at white: its slope leads back into the range
-            shown = srgb.from_linear(colour[c] + transmittance * behind[c], fused=False)
+            shown = srgb.from_linear(gain * colour[c] + transmittance * behind[c], fused=False)
             total += dr.square(shown - reference)
         return dr.select(images.counted(view, x, y), total, 0) * (1 / (3 * count))
+
+    def gain(self, net, view):
+        """Return the factor of the colours of the field in a view."""
+        types = self.session.types
+        if self.session.exposures is None:
+            return types.Float(1)
+        stops = net["exposures"].array
+        stops = dr.gather(types.Float, stops, view) - dr.sum(stops) * (1 / len(self.session.exposures))
+        return dr.exp2(dr.clip(stops, -MOST_STOPS, MOST_STOPS))
+
+    def keep_exposures(self) -> None:
+        """Let the next training of the session begin with the exposures of this one."""
+        if self.session.exposures is not None:
+            stops = self.net["exposures"].numpy()
+            self.session.exposures = np.float32(np.clip(stops - stops.mean(), -MOST_STOPS, MOST_STOPS))
 
     def measure(self, net):
         return self.session.watched_images.evaluate(self.field_of(net))

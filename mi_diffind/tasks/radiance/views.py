@@ -72,6 +72,8 @@ class CapturedViews:
     notes: tuple[str, ...] = ()
     background: tuple[int, int, int] | None = None
     settings: dict = dataclasses.field(default_factory=dict)
+    #: Whether fields have surroundings (:mod:`.surroundings`) instead of a box around everything.
+    surroundings: bool = False
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -109,6 +111,8 @@ class CapturedViews:
         for view in range(len(self)):
             digest.update(self.image(view))
         background = None if self.background is None else np.uint8(self.background)
+        if self.surroundings:
+            digest.update(b"surroundings")
         for array in (self.poses, self.focal, self.centre, self.box, self.mask, background):
             digest.update(b"" if array is None else np.ascontiguousarray(array))
         return digest.hexdigest()
@@ -139,8 +143,8 @@ def load_views(
     views, every eighth view is one. Of more than ``most`` views, so many are read, evenly spread in the list.
     ``progress`` shows a bar on stderr.
 
-    ``background`` is that of images without alpha: "white", "black", bytes of sRGB, or "scene" if their surroundings
-    are part of the capture. ``None``: the colour of their borders if it is one, else "scene".
+    ``background`` is that of images without alpha: "white", "black", bytes of sRGB, or "scene" or "surroundings" if
+    what is around the objects is part of the capture. ``None``: the colour of their borders if it is one, else "scene".
 
     ``downscale`` is a whole factor by which the sides of images are reduced. ``None``: the least one at which no side
     is longer than :data:`LONGEST` pixels.
@@ -187,16 +191,18 @@ def load_views(
         settings=listed.settings,
     )
     views = _in_front_of(views, opaque, background)
-    return dataclasses.replace(views, box=_box(listed, views.has_alpha))
+    # Points of a model lie in the surroundings, too
+    return dataclasses.replace(views, box=_box(listed, views.has_alpha or views.surroundings))
 
 
 def _in_front_of(views: CapturedViews, opaque: list[int], background) -> CapturedViews:
     """Return views whose ``opaque`` images are in front of a background."""
-    if not opaque or background == "scene":
+    if not opaque or background in ("scene", "surroundings"):
         unused = (
             [] if opaque or background in (None, "scene") else ["all images have alpha: the background is not used"]
         )
-        return dataclasses.replace(views, notes=(*views.notes, *unused))
+        surroundings = bool(opaque) and background == "surroundings"
+        return dataclasses.replace(views, notes=(*views.notes, *unused), surroundings=surroundings)
     chosen = backgrounds.NAMED[background] if isinstance(background, str) else background
     colour = chosen or backgrounds.border_colour(opaque, views.stored, views.counted)
     if colour is None:

@@ -27,7 +27,7 @@ def box_of(views: CapturedViews) -> tuple[np.ndarray, np.ndarray]:
     if views.box is not None:
         lower, upper = np.asarray(views.box, np.float64)
     else:
-        middle, reach = _focus(views)
+        middle, reach = focus(views)
         lower, upper = middle - reach, middle + reach
     if not views.has_alpha:
         return lower, upper
@@ -49,7 +49,7 @@ def pixel_width(views: CapturedViews, point) -> float:
     return float(np.median(distances / views.focal.mean(axis=1)))
 
 
-def _focus(views: CapturedViews) -> tuple[np.ndarray, float]:
+def focus(views: CapturedViews) -> tuple[np.ndarray, float]:
     """Return the point nearest to the optical axes of all cameras and its distance to the nearest camera."""
     axes = -views.poses[:, :3, 2]
     # Σ (I − a aᵀ) (x − o) = 0; a little weight on the cameras' mean if all look the same way

@@ -25,12 +25,34 @@ LEAST_WEIGHT, LEAST_TRAINED_WEIGHT = 2e-7, 1e-3
 BRIGHTEST = 12.0
 
 
+class EqualSteps:
+    """Distances along rays as multiples of steps: here, steps are of equal length."""
+
+    @staticmethod
+    def of_steps(s):
+        """Return the distances of a ray at the places ``s`` among its steps."""
+        return s
+
+    @staticmethod
+    def in_steps(t):
+        """Return the places of distances among the steps, the inverse of :meth:`of_steps`."""
+        return t
+
+    @staticmethod
+    def skipped(s, t, free):
+        """Return the length in steps of ``free`` space behind the distance ``t``, which is at ``s``."""
+        return free
+
+
 class VolumeField:
     """Radiance field in the box from ``lower`` to ``upper``: the base class.
 
     ``voxel`` is the side of a voxel. Rays take steps of length ``step``, half a voxel, and read no radiance where a
     step weighs less than ``least_weight``. ``arrays`` maps names to the tensors that can be differentiated.
+    A field that is ``unbounded`` has surroundings (:mod:`.surroundings`): rays are marched in the larger ``box``.
     """
+
+    unbounded = False
 
     def __init__(self, types, lower, upper, voxel: float, arrays: dict):
         self.types = types
@@ -72,16 +94,34 @@ class VolumeField:
         """Return a length from ``p`` along ``d`` that is certainly empty; 0 where the density has to be read."""
         return self.types.Float(0)
 
+    def along(self, o, d) -> EqualSteps:
+        """Return the distances of steps on the rays from ``o`` along ``d``."""
+        return EqualSteps()
+
 
 class NodeVolume(VolumeField):
     """Radiance field whose numbers lie on :class:`.nodes.Nodes`: the base class."""
 
     def __init__(self, nodes: Nodes, arrays: dict):
-        super().__init__(nodes.types, nodes.lower, nodes.upper, nodes.spacing, arrays)
-        self.nodes = nodes
+        self.nodes, contraction = nodes, nodes.contraction
+        lower, upper = (nodes.lower, nodes.upper) if contraction is None else contraction.box(1)
+        super().__init__(nodes.types, lower, upper, nodes.spacing, arrays)
+        self.unbounded = contraction is not None
+        if self.unbounded:
+            self.box = tuple(dr.opaque(self.types.Array3f, corner) for corner in contraction.box(contraction.horizon))
+
+    def without_surroundings(self) -> NodeVolume:
+        """Return a copy of the field in the box from ``lower`` to ``upper`` alone."""
+        result = copy.copy(self)
+        result.unbounded = False
+        result.box = tuple(dr.opaque(self.types.Array3f, corner) for corner in (self.lower, self.upper))
+        return result
 
     def free_distance(self, p, d, active=True):
         return self.nodes.free_distance(p, d, active)
+
+    def along(self, o, d) -> EqualSteps:
+        return self.nodes.contraction.along(o, d) if self.unbounded else super().along(o, d)
 
     def interpolated_density(self, node_density, p, active, low=None, step=None) -> tuple:
         """Return what :meth:`density_at` does, from ``node_density(number, active)``, the raw density of a node.
@@ -94,7 +134,10 @@ class NodeVolume(VolumeField):
         for weight, number in corners:
             raw = dr.fma(weight, node_density(number, active), raw)
         raw = raw if step is None else dr.fma(raw, step, low)
-        density = dr.select(active, density_of(raw, self.per_voxel), 0)
+        contraction, per_voxel = self.nodes.contraction, self.per_voxel
+        if contraction is not None:
+            per_voxel = per_voxel / contraction.growth(p)
+        density = dr.select(active, density_of(raw, per_voxel), 0)
         return density, [w for w, _ in corners] + [n for _, n in corners]
 
 
@@ -185,8 +228,8 @@ class PackedPaletteField(NodeVolume):
 
     ``stored`` is that of :meth:`.compression.PaletteProblem.stored`. The low bits of a node are a density level, which
     stands for the raw density ``density_range[0]`` + level · ``density_range[1]``. The high bits are an index into
-    ``palette`` ``(P, 12)``, uint8, whose bytes stand for ``offset`` + ``scale`` · byte. ``levels`` and ``index`` are
-    NumPy arrays ``(n,)``. Entries of the palette take 16 bytes in memory.
+    ``palette`` ``(P, columns)``, uint8, whose bytes stand for ``offset`` + ``scale`` · byte. ``levels`` and ``index``
+    are NumPy arrays ``(n,)``. Entries of the palette take a multiple of 16 bytes in memory.
     """
 
     def __init__(self, nodes: Nodes, stored: dict, density_bits: int, index_bits: int):
@@ -196,8 +239,8 @@ class PackedPaletteField(NodeVolume):
         # Level and index of each node without gaps, and one more word
         joined = stored["levels"].astype(np.uint32) | (stored["index"].astype(np.uint32) << density_bits)
         self.words = device_array(types.UInt32, as_words(pack_bits(joined, density_bits + index_bits), spare=1))
-        entries = np.zeros((len(stored["palette"]), 16), np.uint8)
-        entries[:, :12] = stored["palette"]
+        entries = np.pad(stored["palette"], ((0, 0), (0, -stored["palette"].shape[1] % 16)))
+        self.packets = entries.shape[1] // 16
         self.palette = device_array(types.UInt32, entries.view("<u4"))
         self.scale, self.offset = ([float(v) for v in stored[name]] for name in ("scale", "offset"))
 
@@ -224,10 +267,12 @@ class PackedPaletteField(NodeVolume):
 
     def radiance_at(self, point_data, p, d, active=True):
         types = self.types
-        sums = [types.Float(0)] * 12
+        sums = [types.Float(0)] * len(self.scale)
         for weight, index in zip(point_data[:8], point_data[8:], strict=True):
-            words = dr.gather(types.Array4u, self.palette, index, active)
-            for k in range(12):
+            words = []
+            for j in range(self.packets):
+                words += list(dr.gather(types.Array4u, self.palette, dr.fma(index, self.packets, j), active))
+            for k in range(len(sums)):
                 # The byte as the mantissa of a number in [1, 2): no conversion, and the weights sum to 1
                 byte = (words[k // 4] << 15 - 8 * (k % 4)) if k % 4 < 2 else (words[k // 4] >> 8 * (k % 4) - 15)
                 number = dr.reinterpret_array(types.Float, (byte & 0x7F8000) | 0x3F800000)

@@ -20,7 +20,7 @@ from mi_diffind.fitting import fit as train
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
 from mi_diffind.task import fit, tasks
-from mi_diffind.tasks.radiance import compression, files, nodes, visual_hull
+from mi_diffind.tasks.radiance import compression, files, nodes, rate_distortion, visual_hull
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
 from mi_diffind.tasks.radiance.session import FieldSession, ViewImages, displayed, scores
@@ -214,7 +214,7 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
         kept = tmp_path / "grid.npz"
         found = fit("field", progress=False, checkpoint=checkpoint, grid=str(kept), **options)
     assert not kept.exists()
-    assert len(stages) == 1 and found.result.interrupted and found.table.settings["layout"] == "sparse"
+    assert len(stages) == 1 and found.result.interrupted and found.table.settings["layout"] == "coded"
     assert not checkpoint.exists()
     assert not fit("field", progress=False, checkpoint=checkpoint, resume=True, **options).result.interrupted
     assert checkpoint.exists()
@@ -250,12 +250,16 @@ def test_a_grid_of_other_views_is_refused(folder, tmp_path, capsys):
     assert "was fitted to other views" in capsys.readouterr().err
     assert main(["fit", "field", str(folder), "-o", str(tmp_path / "x.npz"), "--grid", str(folder / "ball.npz"),
                  *SHORT]) == 2  # fmt: skip
-    assert 'has the layout "sparse", a grid is needed' in capsys.readouterr().err
+    assert 'has the layout "coded", a grid is needed' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("fault", ["layout", "shape", "cells", "index", "bits", "nan", "truncated"])
+@pytest.mark.parametrize(
+    "fault", ["layout", "shape", "cells", "index", "bits", "nan", "truncated", "nodes", "probabilities", "levels"]
+)
 def test_damaged_files_are_refused(folder, tmp_path, fault):
     table, path = load_table(folder / "ball.npz"), tmp_path / "damaged.npz"
+    if fault in ("cells", "index", "bits"):
+        table = files.sparse(table)
     arrays = table.arrays
     if fault == "layout":
         table.settings["layout"] = "cube"
@@ -269,6 +273,10 @@ def test_damaged_files_are_refused(folder, tmp_path, fault):
         table.settings["index_bits"] = 11
     elif fault == "nan":
         table.settings["spacing"] = -1.0
+    elif fault in ("nodes", "probabilities"):
+        arrays[fault] = files.byte_array(arrays[fault].entries[:-20])
+    elif fault == "levels":
+        table.settings["density_bits"] = 7
     save_table(path, table)
     if fault == "truncated":
         path.write_bytes(path.read_bytes()[:-200])
@@ -324,11 +332,30 @@ def test_clusters(rng):
     centres = rng.normal(size=(8, 12))
     which = rng.integers(0, 8, 4000)
     points = centres[which] + 0.01 * rng.normal(size=(4000, 12))
-    entries, codes = compression.clusters(points, 64, 0)
-    assert np.abs(entries[codes] - points).max() < 0.2
-    # Without time for a round, the centres are rows
-    entries, _ = compression.clusters(points, 64, 0, Deadline(0))
+    entries = compression.clusters(points, np.ones(4000), 64, 0)
+    assert np.abs(entries[:, None] - points).max(axis=2).min(axis=0).max() < 0.2
+    # One centre goes where the weight is
+    weight = np.where(which == 3, 1e4, 1.0)
+    assert np.abs(compression.clusters(points, weight, 1, 0)[0] - centres[3]).max() < 0.02
+    # Without time for a round, the centres are points
+    entries = compression.clusters(points, np.ones(4000), 64, 0, Deadline(0))
     assert np.abs(entries[:, None] - points).max(axis=2).min(axis=1).max() < 1e-6
+
+
+def test_importance_is_what_a_change_costs(folder, ad):
+    """Against differences: a changed node changes the images by as much as its importance says."""
+    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    session = FieldSession.load(ad, folder)
+    weights = rate_distortion.importance(grid, session, 0)
+    node = int(np.argsort(weights.colour)[-20])
+    changed = grids.NodeGrid(grid.nodes, grid.density, grid.colour.copy())
+    changed.colour[node + 1, ::4] += 0.05
+    images = session.images
+    pairs = [[displayed(images.render(g.field(), v)) for v in range(len(images.views))] for g in (grid, changed)]
+    error = np.mean(np.square(np.subtract(*pairs)))
+    # The three channels' mean colours, each with its column's weight
+    expected = weights.colour[node] * weights.metric[::4].sum() * 0.05**2
+    assert expected == pytest.approx(error, rel=0.6)
 
 
 def test_scores_of_a_known_error(folder):
@@ -406,10 +433,27 @@ def test_views_without_alpha(tmp_path, capsys):
 def test_sizes(folder, ad):
     grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
-    for bits in (8, 10):
-        problem = compression.PaletteProblem(compression.palette_coding(grid, bits, 0), session)
-        table = files.palette_table(grid.nodes, problem.stored(), bits)
+    weights = rate_distortion.importance(grid, session, 0)
+    for bits in (6, 8):
+        problem = compression.PaletteProblem(compression.palette_coding(grid, weights, bits, 0, 0.0), session)
+        table = files.palette_table(grid.nodes, problem.stored())
         assert files.field_of(table, ad).nbytes == pytest.approx(compression.packed_bytes(grid, bits), rel=0.01)
+
+
+def test_the_layout_of_before(folder, tmp_path, ad):
+    """A file with six bits a level and unpacked indices has the field of the coded one."""
+    coded, path = load_table(folder / "ball.npz"), tmp_path / "sparse.npz"
+    table = files.sparse(coded)
+    levels = table.arrays["density"]
+    assert levels.scale[0] == 1
+    table.arrays["density"] = files.byte_array(levels.entries * 4, 0.25, levels.offset[0])
+    table.settings["index_bits"] = 12
+    del table.settings["density_bits"]
+    save_table(path, table)
+    assert files.load(path).settings["layout"] == "sparse"
+    held_out = ViewImages(ad, load_views(folder, "test"))
+    pictures = [held_out.render(tasks()["field"].open(ad.TensorXf, p).field, 0) for p in (folder / "ball.npz", path)]
+    np.testing.assert_allclose(*pictures, atol=1e-6)
 
 
 @pytest.mark.slow

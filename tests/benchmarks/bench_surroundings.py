@@ -1,0 +1,76 @@
+"""
+Measure fields with and without surroundings on a capture without alpha:
+
+    python scenes/make_phone.py out/phone
+    python tests/benchmarks/bench_surroundings.py out/phone --json docs/measured/bench_surroundings.json
+
+Each row is a process of its own, ``mi-diffind fit field`` with the options that the row names, with the same numbers of
+rays and of nodes along a side. The row "scene, larger box" has an ``aabb`` of five times the side of the other boxes.
+"""
+
+import argparse
+import json
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from bench_nerf import training
+
+from mi_diffind.files import write_json
+from mi_diffind.measure.clock import machine
+from mi_diffind.tasks.radiance.surroundings import inner_cube
+from mi_diffind.tasks.radiance.views import load_views
+
+#: Name of a row → further options of ``fit field``.
+ROWS = {
+    "scene": ["--background", "scene"],
+    "scene, larger box": ["--background", "scene"],
+    "surroundings": ["--background", "surroundings"],
+    "surroundings, exposures": ["--background", "surroundings", "--exposures"],
+}
+
+#: Side of the larger box as a multiple of that of the inner cube.
+LARGER = 5.0
+
+
+def with_box(folder: Path, copy: Path) -> Path:
+    """Copy a capture and give it a larger box."""
+    shutil.copytree(folder, copy)
+    centre, half = inner_cube(load_views(folder, "train", background="surroundings"))
+    for file in copy.glob("transforms_*.json"):
+        content = json.loads(file.read_text(encoding="utf-8"))
+        content["aabb"] = [list(centre - LARGER * half), list(centre + LARGER * half)]
+        file.write_text(json.dumps(content), encoding="utf-8")
+    return copy
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", metavar="FOLDER")
+    parser.add_argument("--json", required=True, metavar="FILE.json")
+    parser.add_argument("--resolution", default="128", help="nodes along a side of all grids (default: 128)")
+    parser.add_argument("--steps", default="1000", help="steps of the grid and of the compressed field (default: 1000)")
+    parser.add_argument("--rows", nargs="*", default=list(ROWS), help="names of the rows (default: all)")
+    arguments = parser.parse_args()
+    output, folder = Path(arguments.json), Path(arguments.folder)
+    result = json.loads(output.read_text(encoding="utf-8")) if output.is_file() else {"rows": {}}
+    described = machine("llvm_ad_rgb")
+    result["machine"] = {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
+    stops = np.array(json.loads((folder / "capture.json").read_text(encoding="utf-8"))["stops"])
+    with tempfile.TemporaryDirectory() as work:
+        for name in arguments.rows:
+            source = with_box(folder, Path(work) / "boxed") if "box" in name else folder
+            options = ["--variant", "llvm_ad_rgb", "--resolution", arguments.resolution, *ROWS[name]]
+            options += ["--preset", "grid", "--steps", arguments.steps]
+            report = Path(work) / "x.npz"
+            row = training(str(source), report, options)
+            settings = json.loads(report.with_suffix(".json").read_text(encoding="utf-8"))["settings"]
+            if "exposures" in settings:
+                row["exposure_error_stops"] = float(np.sqrt(np.mean((settings["exposures"] - stops) ** 2)))
+            result["rows"][name] = row
+            write_json(output, result)
+
+
+if __name__ == "__main__":
+    main()

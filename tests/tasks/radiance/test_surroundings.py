@@ -1,0 +1,240 @@
+"""Fields with surroundings: contraction, steps, derivatives, exposures, files and scenes."""
+
+import dataclasses
+
+import captures
+import drjit as dr
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import map_coordinates
+
+from mi_diffind import compat
+from mi_diffind.cli import main
+from mi_diffind.fitting import FitSettings
+from mi_diffind.runtime import array_module
+from mi_diffind.tables import TableError, load_table, save_table
+from mi_diffind.tasks.radiance import files, march, nodes, surroundings
+from mi_diffind.tasks.radiance import fit as field_fit
+from mi_diffind.tasks.radiance import grid as grids
+from mi_diffind.tasks.radiance.session import FieldSession
+from mi_diffind.tasks.radiance.training import ImagesProblem
+from mi_diffind.tasks.radiance.views import load_views
+from mi_diffind.tasks.radiance.volume_field import NodeField
+
+CENTRE, HALF, SIDE = np.array([0.2, -0.1, 0.3]), 0.7, 13
+SPACING = 4 * HALF / (SIDE - 1)
+
+
+@pytest.fixture(scope="module")
+def ad():
+    return array_module("llvm")
+
+
+def contracted_nodes(types, stored):
+    return surroundings.ContractedNodes(
+        types, CENTRE - 2 * HALF, SPACING, (SIDE,) * 3, stored, inner=(*CENTRE, HALF)
+    )  # fmt: skip
+
+
+def contracted(p):
+    """Places ``(n, 3)`` in the grid, in NumPy."""
+    v = (p - CENTRE) / HALF
+    r = np.maximum(np.abs(v).max(axis=-1, keepdims=True), 1)
+    return (v * (2 - 1 / r) / r + 2) * HALF / SPACING
+
+
+def rays(types, rng, n):
+    """Origins and directions in NumPy, and both as arrays."""
+    o, d = CENTRE + 2 * HALF * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    return o, d, types.Array3f(np.float32(o.T)), types.Array3f(np.float32(d.T))
+
+
+@pytest.fixture
+def field(ad, rng):
+    """A field of random numbers, thin enough that rays see the horizon."""
+    grid = contracted_nodes(ad, np.ones((SIDE,) * 3, bool))
+    density = rng.normal(-4, 2, grid.entries).astype(np.float32)
+    colour = rng.normal(0, 0.3, (grid.entries, 12)).astype(np.float32)
+    return NodeField(grid, ad.TensorXf(density), ad.TensorXf(colour))
+
+
+def test_steps_grow_with_the_distance(ad, rng):
+    o, d, *arrays = rays(ad, rng, 200)
+    along, t = surroundings.Contraction(ad, (*CENTRE, HALF)).along(*arrays), rng.uniform(0, 20, 200)
+    s = along.in_steps(ad.Float(np.float32(t)))
+    assert np.allclose(along.of_steps(s), t, atol=1e-4) and np.allclose(along.of_steps(ad.Float(0)), 0, atol=1e-6)
+    growth = np.sqrt(1 + (np.linalg.norm(o + t[:, None] * d - CENTRE, axis=1) / (2 * HALF)) ** 2)
+    slope = (along.of_steps(s + 0.05).numpy() - along.of_steps(s - 0.05).numpy()) / 0.1
+    assert np.allclose(slope, growth, rtol=2e-3)
+
+
+def test_what_is_skipped_is_empty(ad, rng):
+    stored = nodes.corners_of(rng.random((SIDE - 1,) * 3) < 0.003)
+    grid, cells = contracted_nodes(ad, stored), nodes.cells_of(stored)
+    o, d, *arrays = rays(ad, rng, 4000)
+    free = grid.free_distance(*arrays).numpy()
+    assert 0.5 < (free > 0).mean() < 1 and (free > HALF).any()
+    for share in np.linspace(0, 0.999, 40):
+        place = np.clip(contracted(o + (share * free)[:, None] * d).astype(int), 0, SIDE - 2)
+        assert not cells[tuple(place[free > 0].T)].any()
+
+
+def test_rays_against_numpy(field, ad, rng):
+    """The integral over fine steps of another kind, up to the horizon, with trilinear reads by SciPy."""
+    o, d, *arrays = rays(ad, rng, 24)
+    fine = field.for_training()
+    fine.step, fine.least_weight = 0.02, 0
+    found = march.march(fine, *arrays, 0, np.inf)
+    numbers = [v.numpy()[1:].reshape(SIDE, SIDE, SIDE, -1) for v in field.arrays.values()]
+    grown = np.sinh(np.linspace(0, 6, 4001))
+    grown, middle = 2 * grown, np.add(grown[1:], grown[:-1])
+    for i in range(len(o)):
+        t, steps = middle, np.diff(grown)
+        p = o[i] + t[:, None] * d[i]
+        inside = np.abs(p - CENTRE).max(axis=1) < 32 * HALF
+        raw, *colour = (
+            map_coordinates(a, contracted(p).T, order=1) for n in numbers for a in np.moveaxis(n, -1, 0)
+        )  # fmt: skip
+        growth = np.sqrt(1 + (np.linalg.norm(p - CENTRE, axis=1) / (2 * HALF)) ** 2)
+        density = np.maximum(np.logaddexp(0, raw) - 2e-3, 0) / (SPACING * growth)
+        passed = np.exp(-np.cumsum(np.where(inside, density * steps, 0)))
+        weights = -np.diff(passed, prepend=1)
+        seen = [weights @ np.exp(colour[4 * c] + np.dot(d[i], colour[4 * c + 1 : 4 * c + 4])) for c in range(3)]
+        assert found.transmittance.numpy()[i] == pytest.approx(passed[-1], abs=5e-3)
+        assert np.allclose(np.array(found.colour)[:, i], seen, atol=1e-2)
+
+
+def test_derivatives(field, ad, rng):
+    """Of sums over rays, by replay and by tangents, against finite differences."""
+    *_, o, d = rays(ad, rng, 200)
+    at = o, d, 0, ad.Float(np.inf), ad.Bool(True), ad.Float(0.5)
+    weights = [ad.Float(rng.normal(size=200).astype(np.float32)) for _ in range(5)]
+    direction = {name: rng.normal(size=v.shape).astype(np.float32) for name, v in field.arrays.items()}
+
+    def moved(step):
+        return field.with_arrays({n: ad.TensorXf(v.numpy() + step * direction[n]) for n, v in field.arrays.items()})
+
+    def total(seen):
+        colour, transmittance, depth = seen
+        parts = [*colour, transmittance, depth * 0.1]
+        return float(
+            np.float64(sum((w * p).numpy().astype(np.float64).sum() for w, p in zip(weights, parts, strict=True)))
+        )
+
+    def loss(step):
+        seen = march.march(moved(step), *at)
+        return total((seen.colour, seen.transmittance, seen.depth))
+
+    difference = (loss(0.02) - loss(-0.02)) / 0.04
+    seen, back, ahead = march.march(field, *at), moved(0), moved(0)
+    dr.enable_grad(back.arrays, ahead.arrays)
+    march.replay(back, *at, seen, ad.Array3f(*weights[:3]), weights[3], weights[4] * 0.1)
+    replayed = sum((dr.grad(v).numpy() * direction[n]).sum() for n, v in back.arrays.items())
+    dr.set_grad(ahead.arrays, {n: ad.TensorXf(v) for n, v in direction.items()})
+    assert total(march.tangent(ahead, *at, seen)) == pytest.approx(difference, rel=0.02)
+    assert replayed == pytest.approx(difference, rel=0.02)
+
+
+# -- captures ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Views without alpha, and a short training with surroundings and exposures."""
+    path, patch = tmp_path_factory.mktemp("around"), pytest.MonkeyPatch()
+    captures.write(path, 4, 2)
+    for image in path.glob("*.png"):
+        grey, picture = Image.new("RGBA", (24, 24), (150, 140, 130, 255)), Image.open(image)
+        Image.alpha_composite(grey, picture).convert("RGB").save(image)
+    recipe = field_fit.PRESETS["grid"]
+    short = dataclasses.replace(recipe, settings=FitSettings(**{**vars(recipe.settings), "steps": 80, "batch": 1024}))
+    patch.setitem(field_fit.PRESETS, "grid", short)
+    options = ["--steps", "5", "--batch", "1024", "--resolution", "20", "--variant", "llvm_ad_rgb", "--exposures"]
+    assert main(["fit", "field", str(path), "-o", str(path / "x.npz"), "--background", "surroundings",
+                 "--grid", str(path / "grid.npz"), *options]) == 0  # fmt: skip
+    patch.undo()
+    return path
+
+
+def test_a_file_keeps_its_surroundings(folder, ad, rng):
+    """The cube that is not contracted, in the grid, in its compressed form and in its trainable form."""
+    views = load_views(folder, "train", background="surroundings")
+    centre, half = surroundings.inner_cube(views)
+    assert np.allclose(centre, 0, atol=1e-3) and half == pytest.approx(1.1, rel=1e-3)
+    table = files.load(folder / "x.npz")
+    assert np.allclose(table.settings["inner"], [*centre, half])
+    fields = [files.field_of(table, ad, form) for form in ("", "float32")]
+    assert all(f.unbounded and np.allclose([f.lower, f.upper], [centre - half, centre + half]) for f in fields)
+    *_, o, d = rays(ad, rng, 100)
+    a, b = (march.march(f, o, d, 0, np.inf) for f in fields)
+    assert np.allclose(a.transmittance.numpy(), b.transmittance.numpy(), atol=2e-3)
+    assert (a.transmittance.numpy() < 0.9).any()
+
+
+def test_damaged_cubes_are_refused(folder, tmp_path):
+    table = load_table(folder / "x.npz")
+    for inner in ([0, 0, 0], [0, 0, 0, -1.0], "cube"):
+        table.settings["inner"] = inner
+        save_table(tmp_path / "x.npz", table)
+        with pytest.raises(TableError, match="inner"):
+            files.load(tmp_path / "x.npz")
+
+
+def test_the_paper_preset_has_no_surroundings(folder, tmp_path, capsys):
+    for option, message in ((["--background", "surroundings"], "found surroundings with the preset paper"),
+                            (["--exposures"], "--exposures is an option of the preset sparse")):  # fmt: skip
+        output = ["-o", str(tmp_path / "x.npz"), "--variant", "llvm_ad_rgb", "--preset", "paper"]
+        assert main(["fit", "field", str(folder), *output, *option]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_exposures(folder, ad):
+    """They are recorded with a mean of 0, and the derivative of the loss is that of finite differences."""
+    tables = [load_table(folder / name) for name in ("grid.npz", "x.npz")]
+    stops = [np.array(t.settings["exposures"]) for t in tables]
+    assert all(s.shape == (4,) and abs(s.mean()) < 1e-3 and s.std() > 1e-3 for s in stops)
+    session = FieldSession.load(ad, folder, background="surroundings", exposures=True)
+    problem = grids.GridProblem(field_fit.grid_of(files.load(folder / "grid.npz"), ad), session)
+    direction = np.float32([0.5, -1.0, 0.2, 0.9])
+
+    def loss(step, net=None):
+        net = net or {**problem.net, "exposures": ad.TensorXf(step * direction)}
+        return dr.sum(ImagesProblem.loss(problem, net, dr.rng(3), 2048))
+
+    net = {**problem.net, "exposures": ad.TensorXf(0 * direction)}
+    dr.enable_grad(net["exposures"])
+    dr.backward(loss(0, net))
+    gradient = float((dr.grad(net["exposures"]).numpy() * direction).sum())
+    assert gradient == pytest.approx((loss(0.05)[0] - loss(-0.05)[0]) / 0.1, rel=0.01)
+    assert loss(0, {**problem.net, "exposures": ad.TensorXf([1.0] * 4)})[0] == pytest.approx(loss(0)[0], rel=1e-5)
+
+
+def test_surroundings_in_a_scene(field, tmp_path, mi_rgb):
+    """They fill the picture, or are left out; sentences for what does not go together."""
+    mi = mi_rgb
+    density, colour = (values.numpy() for values in field.arrays.values())
+    save_table(tmp_path / "x.npz", files.grid_table(field.nodes, density + 4, colour))
+
+    def integrator(**more):
+        return {"type": "neural_field", "filename": str(tmp_path / "x.npz"), **more}
+
+    def rendered(**more):
+        film = {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+        away = mi.ScalarTransform4f().look_at([3, 0, 0], [6, 0, 0], [0, 1, 0])
+        camera = {"type": "perspective", "to_world": away, "film": film}
+        return mi.load_dict({"type": "scene", "integrator": integrator(**more), "camera": camera})
+
+    assert mi.render(rendered(), spp=1).numpy()[..., 3].min() > 0.9
+    assert mi.render(rendered(surroundings=False), spp=1).numpy()[..., 3].max() == 0
+    with pytest.raises(RuntimeError, match='parameter "surroundings": true for a field among nested ones'):
+        rendered(inner=integrator(surroundings=False))
+    rendered(surroundings=False, inner=integrator(surroundings=False))
+    scene = rendered()
+    params = mi.traverse(scene)
+    dr.enable_grad(params["integrator.to_world"])
+    params.update()
+    with pytest.raises(RuntimeError) as raised:
+        dr.backward(dr.sum(mi.render(scene, params, spp=1), axis=None))
+    assert "has no derivatives for a field with surroundings" in compat.one_sentence(raised.value)
