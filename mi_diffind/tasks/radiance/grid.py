@@ -100,7 +100,10 @@ def neighbours(nodes: Nodes) -> np.ndarray:
 
 
 def resolution_of(views: CapturedViews) -> int:
-    """Return the resolution at which a voxel is as wide as a pixel is at the middle of the box, for :func:`begin`."""
+    """Return the resolution at which a pixel, seen at the middle of the box, is :data:`VOXELS_PER_PIXEL` voxels wide.
+
+    It is that of :func:`begin`.
+    """
     if views.surroundings:
         nodes = surroundings.resolution_of(views)
     else:
