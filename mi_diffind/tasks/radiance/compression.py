@@ -6,6 +6,7 @@ that all nodes share.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import drjit as dr
@@ -38,6 +39,19 @@ MOST_BITS, INDEX_BITS, DEFAULT_BITS = 14, (6, 8, 10, 12, 14), 12
 #: levels counts less, since errors of neighbouring densities add up.
 SLOPE, LEVEL_SLOPE = 0.007, 0.1
 
+#: Least and largest slope for a size of the file, trials between them, and nodes of a trial.
+SLOPES, TRIALS, TRIAL_NODES = (1e-3, 0.2), 6, 60_000
+
+#: Planes of nodes that stay together in a trial.
+PLANES = 8
+
+#: Share of the bytes of a file that its palette may have, that of a file before its training, which adds to it, and
+#: bytes of a file beside its nodes and its palette.
+PALETTE_SHARE, BEFORE_TRAINING, OTHER_BYTES = 0.12, 0.92, 2500
+
+#: Factor of the rate of levels, and how often it is applied, until a trained field has the bytes of its file.
+STEEPER, MOST_STEEPER = 1.5, 12
+
 #: Training steps between updates of the range of the palette's bytes.
 RANGE_INTERVAL = 50
 
@@ -54,7 +68,7 @@ class PaletteCoding:
 
     ``levels`` ``(n,)`` are densities in [0, 1] between :data:`EMPTIEST` and :data:`DENSEST`; ``index`` ``(n,)``
     (uint32) names a row of ``palette`` ``(P, columns)``. The first entry of both stands for no node. ``weight`` and
-    ``rate`` are those of a squared step of a level and of a bit.
+    ``rate`` are those of a squared step of a level and of a bit. ``file_bytes`` is the most that the file may have.
     """
 
     nodes: Nodes
@@ -64,11 +78,23 @@ class PaletteCoding:
     passes: list[node_codes.Pass]
     weight: np.ndarray
     rate: float
+    file_bytes: float | None = None
 
     def chosen(self, levels: np.ndarray) -> np.ndarray:
-        """Return whole levels for levels ``(n,)`` in [0, 1]."""
-        exact = levels[1:].astype(np.float64) * LAST_LEVEL
-        return np.concatenate([[0], chosen_levels(self.passes, exact, self.weight, self.rate, LAST_LEVEL + 1)])
+        """Return whole levels for levels ``(n,)`` in [0, 1], of fewer bits until the file is small enough."""
+        exact, rate = levels[1:].astype(np.float64) * LAST_LEVEL, self.rate
+        for _ in range(MOST_STEEPER):
+            whole = chosen_levels(self.passes, exact, self.weight, rate, LAST_LEVEL + 1)
+            if self.file_bytes is None or self.estimated_bytes(whole) <= self.file_bytes:
+                break
+            rate *= STEEPER
+        return np.concatenate([[0], whole])
+
+    def estimated_bytes(self, levels: np.ndarray, share: float = 1.0) -> float:
+        """Return about the bytes of a file with these whole levels of stored nodes, which are a ``share`` of all."""
+        colours = len(self.palette)
+        probabilities, data = node_codes.encoded(self.nodes.stored, levels, self.index[1:], LAST_LEVEL + 1, colours)
+        return len(data) / share + len(zlib.compress(probabilities, 9)) + self.palette.size + OTHER_BYTES
 
 
 def palette_coding(
@@ -83,12 +109,24 @@ def palette_coding(
 
     A bit for each node is worth the share ``slope`` of the error of the grid's images.
     """
-    metric = np.sqrt(importance.metric)
-    points, rate = grid.colour[1:] * metric, slope * importance.loss / grid.nodes.count
-    palette = clusters(points, importance.colour, 2**index_bits, seed, deadline)
+    palette = sorted_clusters(grid, importance, index_bits, seed, deadline)
+    return coded_by(grid, importance, palette, slope * importance.loss / grid.nodes.count)
+
+
+def sorted_clusters(
+    grid: NodeGrid, importance: Importance, index_bits: int, seed: int, deadline: Deadline | None = None
+) -> np.ndarray:
+    """Return ``2**index_bits`` weighted clusters of the colours of a grid, in units of its metric, along a line."""
+    palette = clusters(grid.colour[1:] * np.sqrt(importance.metric), importance.colour, 2**index_bits, seed, deadline)
     # Neighbours in the palette look alike: the part of the palette predicts that of the next node
     centred = palette - palette.mean(axis=0)
-    palette = palette[np.argsort(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1], kind="stable")]
+    return palette[np.argsort(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1], kind="stable")]
+
+
+def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: float) -> PaletteCoding:
+    """Return the coding of a grid by a palette of :func:`sorted_clusters`; a bit of the file counts ``rate``."""
+    metric = np.sqrt(importance.metric)
+    points = grid.colour[1:] * metric
     passes = node_codes.passes_of(grid.nodes.stored)
     palette, index = chosen_index(passes, points, importance.colour, palette, rate)
     used, index = np.unique(index, return_inverse=True)
@@ -104,6 +142,47 @@ def palette_coding(
     )
     coding.levels = (coding.chosen(levels) / LAST_LEVEL).astype(np.float32)
     return coding
+
+
+def coding_in(
+    grid: NodeGrid, importance: Importance, nbytes: float, seed: int, deadline: Deadline | None = None
+) -> PaletteCoding | None:
+    """Return a coding of a grid whose file has at most ``nbytes`` once it is trained, or ``None`` if there is none.
+
+    The number of colours follows from ``nbytes``, the slope from trials with a part of the nodes.
+    """
+    bits = int(np.clip(np.log2(max(PALETTE_SHARE * nbytes / grid.colour.shape[1], 1)), INDEX_BITS[0], DEFAULT_BITS))
+    palette = sorted_clusters(grid, importance, bits, seed, deadline)
+    per_node = importance.loss / grid.nodes.count
+    part, weights = trial_part(grid, importance)
+    share = part.nodes.count / grid.nodes.count
+
+    def size(slope: float) -> float:
+        coding = coded_by(part, weights, palette, slope * per_node)
+        return coding.estimated_bytes(np.rint(coding.levels[1:] * LAST_LEVEL).astype(int), share)
+
+    low, high = np.log(SLOPES)
+    if size(np.exp(high)) > BEFORE_TRAINING * nbytes:
+        return None
+    for _ in range(TRIALS):
+        middle = (low + high) / 2
+        fits = size(np.exp(middle)) <= BEFORE_TRAINING * nbytes
+        low, high = (low, middle) if fits else (middle, high)
+    coding = coded_by(grid, importance, palette, np.exp(high) * per_node)
+    coding.file_bytes = nbytes
+    return coding
+
+
+def trial_part(grid: NodeGrid, importance: Importance) -> tuple[NodeGrid, Importance]:
+    """Return planes of a grid with about :data:`TRIAL_NODES` nodes, and their importance."""
+    every = max(1, grid.nodes.count // TRIAL_NODES)
+    planes = np.arange(grid.nodes.shape[0]) // PLANES % every == 0
+    here = planes[np.nonzero(grid.nodes.stored)[0]]
+    nodes = grid.nodes
+    part = nodes.like(nodes.spacing, nodes.shape, nodes.stored & planes[:, None, None])
+    entries = np.concatenate([[True], here])
+    weights = Importance(importance.density[here], importance.colour[here], importance.metric, importance.loss)
+    return NodeGrid(part, grid.density[entries], grid.colour[entries]), weights
 
 
 def clusters(

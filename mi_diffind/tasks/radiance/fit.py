@@ -7,6 +7,7 @@ import functools
 import os
 import sys
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,13 +24,19 @@ from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
 from .presets import COMPRESSION, PRESETS, RESOLUTIONS, STAGES, dense_bytes, ratio_for
-from .rate_distortion import importance
+from .rate_distortion import Importance, importance
 from .session import FieldSession
 from .training import ImagesProblem
 from .volume_field import VolumeField
 
-#: Sizes that ``--psnr`` tries in turn: share of the resolution, and bits of an index.
-LADDER = ((0.5, 8), (0.7, 10), (1.0, 8), (1.0, 10), (1.0, 12), (1.0, 14))
+#: Sizes among which ``--psnr`` searches: share of the resolution, bits of an index, and slope of rate and distortion.
+LADDER = (
+    (0.5, 9, 0.05), (0.7, 10, 0.05), (0.85, 10, 0.05), (1.0, 10, 0.1), (1.0, 11, 0.05), (1.0, 12, 0.02),
+    (1.0, 12, compression.SLOPE), (1.0, 13, 0.002),
+)  # fmt: skip
+
+#: Shares of the resolution that ``--disk`` tries in turn.
+SHARES = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)
 
 #: Training of pairs on the numbers of the grid, before the images: steps, samples of a step, and learning rate.
 VALUE_STEPS, VALUE_BATCH, VALUE_RATE = 300, 2**15, 1e-2
@@ -59,23 +66,24 @@ def check(request: FitRequest) -> None:
         raise UsageError("source: not given, a folder of views is needed")
     if options["box"] is not None and Path(options["source"]).suffix.lower() != ".ply":
         raise UsageError(f"--box: given with {options['source']}, allowed are PLY files of 3D Gaussians")
-    sized = [name for name in ("bytes", "compression", "psnr") if options[name] is not None]
+    sized = [name for name in ("bytes", "compression", "psnr", "disk") if options.get(name) is not None]
     if request.preset == "grid" and sized:
         raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
     if request.preset == "paper":
-        for name in ("psnr", "exposures"):
+        for name in ("psnr", "disk", "exposures"):
             if options.get(name):
                 raise UsageError(f"--{name} is an option of the preset sparse, found the preset paper")
         if options.get("background") == "surroundings":
             raise UsageError("--background: found surroundings with the preset paper, whose box is not contracted")
-    for name, parse in (("bytes", units.parse_bytes), ("compression", units.parse_compression)):
-        if options[name] is not None:
+    sizes = (("bytes", units.parse_bytes), ("disk", units.parse_bytes), ("compression", units.parse_compression))
+    for name, parse in sizes:
+        if options.get(name) is not None:
             try:
                 value = parse(options[name])
             except ValueError as e:
                 raise UsageError(f"--{name}: {e}") from None
-            if name == "bytes":
-                units.check_size("--bytes", value, MAX_BYTES)
+            if name != "compression":
+                units.check_size(f"--{name}", value, MAX_BYTES)
     nodes = options["resolution"] or RESOLUTIONS[0]
     units.check_memory("--resolution", nodes, VOXEL * nodes**3)
 
@@ -213,7 +221,9 @@ class FieldFit:
                     grid = grids.begin(request.types, self.session.seeing_images.views, max(8, round(nodes * share)))
                 else:
                     visible = grids.visible(grid, self.session.seeing_images)
-                    grid = grids.divided(grid, visible, share / STAGES[number - 1][0], wide=1)
+                    # Around the half resolution's, no further cells are needed, and memory would be
+                    wide = 0 if (STAGES[number - 1][0], share) == (0.5, 1.0) else 1
+                    grid = grids.divided(grid, visible, share / STAGES[number - 1][0], wide)
             if stop.is_set() and result is not None:
                 return grid, dataclasses.replace(result, interrupted=True)
             if grid.nodes.count == 0:
@@ -300,6 +310,8 @@ class FieldFit:
         options = self.request.options
         if options["psnr"] is not None:
             return self.smallest(grid, float(options["psnr"]), stopped)
+        if options.get("disk") is not None:
+            return self.in_file(grid, units.parse_bytes(options["disk"]), stopped)
         try:
             smaller, bits = compression.sized(grid, self.session.seeing_images, self.wanted_bytes(grid))
         except ValueError as e:
@@ -307,16 +319,25 @@ class FieldFit:
             raise UsageError(f"--{given}: {e}") from None
         return self.compressed(smaller, bits, stopped)
 
-    def compressed(self, grid: NodeGrid, bits: int, stopped: bool, suffix: str = ""):
+    def compressed(self, grid: NodeGrid, bits: int, stopped: bool, suffix: str = "", slope: float = compression.SLOPE):
         """Train a palette of at most ``2**bits`` colours on a grid; return the table, the result and the field."""
-        limit, settings = self.request.part(CLUSTER_TIME).deadline, self.request.settings
+        limit = self.request.part(CLUSTER_TIME).deadline
+        weights = self.importance(grid)
+        coding = compression.palette_coding(grid, weights, bits, self.request.settings.seed, slope, limit)
+        return self.coded(coding, stopped, suffix)
+
+    def importance(self, grid: NodeGrid) -> Importance:
+        """Return the importance of the nodes of a grid."""
+        settings = self.request.settings
         with cores(settings.deterministic):
-            weights = importance(grid, self.session, settings.seed, limit)
-        coding = compression.palette_coding(grid, weights, bits, settings.seed, deadline=limit)
+            return importance(grid, self.session, settings.seed, self.request.part(CLUSTER_TIME).deadline)
+
+    def coded(self, coding: compression.PaletteCoding, stopped: bool, suffix: str = ""):
+        """Train a coding; return the table, the result and the field."""
         problem = compression.PaletteProblem(coding, self.session)
 
         def stored() -> tuple[Table, VolumeField]:
-            table = files.palette_table(grid.nodes, problem.stored())
+            table = files.palette_table(coding.nodes, problem.stored())
             return table, files.field_of(table, self.request.types)
 
         result = self.train(problem, stopped, lambda: self.session.watched_images.evaluate(stored()[1]), suffix)
@@ -324,28 +345,52 @@ class FieldFit:
         table, field = stored()
         return table, result, field
 
-    def smallest(self, grid: NodeGrid, psnr: float, stopped: bool):
-        """Return the first size of :data:`LADDER` that reaches a PSNR in decibels over white, else the last one.
+    def in_file(self, grid: NodeGrid, nbytes: int, stopped: bool):
+        """Compress a grid to a file of at most ``nbytes``, at the highest resolution that allows it."""
+        if nbytes < 2 * compression.OTHER_BYTES:
+            raise UsageError(f"--disk: {nbytes:,} bytes are fewer than a file needs")
+        cells = grids.visible(grid, self.session.seeing_images)
+        for share in SHARES:
+            smaller = grids.divided(grid, cells, share)
+            limit = self.request.part(CLUSTER_TIME).deadline
+            coding = compression.coding_in(smaller, self.importance(smaller), nbytes, self.request.settings.seed, limit)
+            if coding is not None:
+                return self.coded(coding, stopped)
+        raise UsageError(f"--disk: {nbytes:,} bytes are fewer than the smallest file of this capture needs")
 
-        With a limit of time, a size that would take longer than what is left is not tried.
+    def smallest(self, grid: NodeGrid, psnr: float, stopped: bool):
+        """Return the first size of :data:`LADDER` that reaches a PSNR in decibels over white, else the largest tried.
+
+        It is found by bisection. With a limit of time, a size that would take longer than what is left is not tried.
         """
         cells = grids.visible(grid, self.session.seeing_images)
         limit, duration = self.request.deadline, 0.0
-        for number, (share, bits) in enumerate(LADDER):
+        low, high, best, largest = 0, len(LADDER), None, None
+        while low < high:
             if limit is not None and limit.left() < duration:
-                print(f"warning: the time allowed {number} of {len(LADDER)} sizes", file=sys.stderr)
+                print(f"warning: the time did not allow the last {high - low} of {len(LADDER)} sizes", file=sys.stderr)
                 break
             start = time.perf_counter()
+            number = (low + high) // 2
+            share, bits, slope = LADDER[number]
             smaller = grids.divided(grid, cells, share)
-            size = dataclasses.replace(self, request=self.request.part(1 / (len(LADDER) - number)))
-            fitted = size.compressed(smaller, bits, stopped, f".size{number}")
+            trainings = (high - low).bit_length()
+            size = dataclasses.replace(self, request=self.request.part(1 / trainings))
+            fitted = size.compressed(smaller, bits, stopped, f".size{number}", slope)
             reached = self.session.held_out_images.evaluate(fitted[2])["psnr_white_db"]
             duration = time.perf_counter() - start
-            print(f"{fitted[2].nbytes:,} bytes: {reached:.2f} dB over white", file=sys.stderr)
-            if reached >= psnr or fitted[1].interrupted:
+            on_disk = sum(len(zlib.compress(array.entries, 9)) for array in fitted[0].arrays.values())
+            print(f"{on_disk:,} bytes on disk: {reached:.2f} dB over white", file=sys.stderr)
+            if fitted[1].interrupted:
                 return fitted
-        print(f"warning: {psnr:g} dB were not reached, the largest size has {reached:.2f} dB", file=sys.stderr)
-        return fitted
+            if reached >= psnr:
+                best, high = fitted, number
+            else:
+                low, largest = number + 1, (fitted, reached)
+        if best is None:
+            fitted, reached = largest
+            print(f"warning: {psnr:g} dB were not reached, the largest size has {reached:.2f} dB", file=sys.stderr)
+        return best or fitted
 
     def pairs(self, grid: NodeGrid, stopped: bool) -> tuple[Table, FitResult, VolumeField]:
         """Compress a grid to the pairs of dense arrays of the supplement."""

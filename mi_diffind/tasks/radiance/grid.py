@@ -30,7 +30,7 @@ DENSITY_SCALE = 10.0
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 
 #: Total variation of raw densities: its weight, the square that rounds its kink at 0, and nodes a step.
-SMOOTH, ROUND, VARIED = 7e-5, 1e-2, 2**13
+SMOOTH, ROUND, VARIED = 5e-5, 1e-2, 2**13
 
 #: Largest weight in a ray below which a cell is removed.
 VISIBLE = 0.02
@@ -100,7 +100,10 @@ def neighbours(nodes: Nodes) -> np.ndarray:
 
 
 def resolution_of(views: CapturedViews) -> int:
-    """Return the resolution at which a voxel is as wide as a pixel is at the middle of the box, for :func:`begin`."""
+    """Return the resolution at which a pixel, seen at the middle of the box, is :data:`VOXELS_PER_PIXEL` voxels wide.
+
+    It is that of :func:`begin`.
+    """
     if views.surroundings:
         nodes = surroundings.resolution_of(views)
     else:

@@ -24,7 +24,7 @@ from .session import FieldSession
 from .volume_field import NodeField
 
 #: Rays of an estimate for each pixel of the training views, rays at a time, and the least estimates.
-RAYS_PER_PIXEL, RAYS, LEAST = 0.3, 2**16, 8
+RAYS_PER_PIXEL, RAYS, LEAST = 0.2, 2**16, 8
 
 #: Nearest colours that are tried for a node, and the error allowed in finding them.
 NEAREST, SLACK = 8, 0.3

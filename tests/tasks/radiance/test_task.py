@@ -5,6 +5,7 @@ import gc
 import json
 import resource
 from pathlib import Path
+from types import SimpleNamespace
 
 import captures
 import drjit as dr
@@ -19,7 +20,7 @@ from mi_diffind.fitting import FitSettings
 from mi_diffind.fitting import fit as train
 from mi_diffind.runtime import array_module
 from mi_diffind.tables import StoredArray, TableError, load_table, save_table
-from mi_diffind.task import fit, tasks
+from mi_diffind.task import FitRequest, fit, tasks
 from mi_diffind.tasks.radiance import compression, files, nodes, rate_distortion, visual_hull
 from mi_diffind.tasks.radiance import fit as field_fit
 from mi_diffind.tasks.radiance import grid as grids
@@ -139,6 +140,36 @@ def test_bytes_are_kept(folder, tmp_path):
         assert json.loads((tmp_path / "f.json").read_text())["memory_bytes"] <= nbytes
 
 
+def test_bytes_of_the_file_are_kept(folder, tmp_path):
+    sizes = []
+    for nbytes in (5_000, 9_000):
+        out = tmp_path / f"{nbytes}.npz"
+        assert main(["fit", "field", str(folder), "-o", str(out), "--grid", str(folder / "grid.npz"), "--disk",
+                     str(nbytes), "--steps", "4", *SHORT]) == 0  # fmt: skip
+        sizes.append(out.stat().st_size)
+        assert sizes[-1] <= nbytes
+    assert sizes[1] > 1.2 * sizes[0]
+
+
+@pytest.mark.parametrize(("psnr", "trained", "kept"), [(30, [2, 1], 2), (20, [2, 1, 0], 0), (50, [2, 3], 3)])
+def test_the_smallest_size_of_a_psnr(folder, ad, monkeypatch, capsys, psnr, trained, kept):
+    """Bisection among four sizes, whose field is their number here."""
+    tried = []
+
+    def compressed(self, grid, bits, stopped, suffix, slope):
+        tried.append(int(suffix[-1]))
+        return SimpleNamespace(arrays={}), SimpleNamespace(interrupted=False), tried[-1]
+
+    monkeypatch.setattr(field_fit, "LADDER", ((0.5, 6, 0.1), (0.7, 6, 0.1), (1.0, 7, 0.02), (1.0, 9, 0.001)))
+    monkeypatch.setattr(field_fit.FieldFit, "compressed", compressed)
+    monkeypatch.setattr(ViewImages, "evaluate", lambda self, field, ssim=False: {"psnr_white_db": 25.0 + 4 * field})
+    request = FitRequest("sparse", FitSettings(), ad, progress=False)
+    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    assert field_fit.FieldFit(request, FieldSession.load(ad, folder)).smallest(grid, psnr, False)[2] == kept
+    assert tried == trained
+    assert ("were not reached" in capsys.readouterr().err) == (psnr == 50)
+
+
 def test_paper_preset(folder, tmp_path, ad):
     out = tmp_path / "paper.npz"
     assert main(["fit", "field", str(folder), "-o", str(out), "--preset", "paper", "--grid",
@@ -229,6 +260,8 @@ def test_ctrl_c_keeps_what_there_is(folder, tmp_path, monkeypatch, late):
         ),
         (["--preset", "paper", "--psnr", "30"], "--psnr is an option of the preset sparse, found the preset paper"),
         (["--bytes", "100"], "--bytes: 100 bytes are fewer than the smallest field needs"),
+        (["--disk", "100"], "--disk: 100 bytes are fewer than a file needs"),
+        (["--disk", "9k", "--bytes", "9k"], "not allowed with argument"),
         (["--compression", "1e5"], "--compression: "),
         (["--bytes", "many"], "many"),
     ],
@@ -342,20 +375,22 @@ def test_clusters(rng):
     assert np.abs(entries[:, None] - points).max(axis=2).min(axis=1).max() < 1e-6
 
 
-def test_importance_is_what_a_change_costs(folder, ad):
-    """Against differences: a changed node changes the images by as much as its importance says."""
+def test_importance_is_what_a_change_costs(folder, ad, rng):
+    """Against differences: changes of important and of other nodes change the images as their importance says."""
     grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
-    weights = rate_distortion.importance(grid, session, 0)
-    node = int(np.argsort(weights.colour)[-20])
-    changed = grids.NodeGrid(grid.nodes, grid.density, grid.colour.copy())
-    changed.colour[node + 1, ::4] += 0.05
-    images = session.images
-    pairs = [[displayed(images.render(g.field(), v)) for v in range(len(images.views))] for g in (grid, changed)]
-    error = np.mean(np.square(np.subtract(*pairs)))
-    # The three channels' mean colours, each with its column's weight
-    expected = weights.colour[node] * weights.metric[::4].sum() * 0.05**2
-    assert expected == pytest.approx(error, rel=0.6)
+    weights, images = rate_distortion.importance(grid, session, 0), session.images
+    order, ratios = np.argsort(weights.colour), []
+    before = [displayed(images.render(grid.field(), v)) for v in range(len(images.views))]
+    for nodes_of in (order[-40:], order[len(order) // 2 :][:40]):
+        changed = grids.NodeGrid(grid.nodes, grid.density, grid.colour.copy())
+        changed.colour[nodes_of + 1, ::4] += 0.05 * rng.choice([-1, 1], (40, 1))
+        after = [displayed(images.render(changed.field(), v)) for v in range(len(images.views))]
+        error = np.mean(np.square(np.subtract(after, before)))
+        # The three channels' mean colours, each with its column's weight
+        ratios.append(weights.colour[nodes_of].sum() * weights.metric[::4].sum() * 0.05**2 / error)
+    # Training pixels lie where something is seen, which raises both
+    assert 0.5 < ratios[0] < 4 and ratios[0] == pytest.approx(ratios[1], rel=0.5)
 
 
 def test_scores_of_a_known_error(folder):
