@@ -20,12 +20,14 @@ import numpy as np
 from PIL import Image
 
 from mi_diffind import srgb
-from mi_diffind.poses import pose
 
 ASSETS = Path(__file__).resolve().parent / "assets"
 
 #: Horizontal angle of view in degrees.
 FOV = 58.0
+
+#: Cameras of captures look along −z with x to the right, those of Mitsuba along z with x to the left.
+OPTICAL = np.diag([-1.0, 1.0, -1.0, 1.0])
 
 #: Largest exposure in stops, and standard deviations: of directions in pixels, and of positions in units of the scene.
 STOPS, TURN, MOVE = 0.3, 0.3, 0.002
@@ -111,14 +113,15 @@ def cameras(count: int, turn: float, rng) -> np.ndarray:
         angle = 2 * np.pi * (i + turn) / count + rng.normal(0, 0.05)
         radius, height = rng.uniform(2.0, 2.6), (0.75, 1.55)[i % 2] + rng.normal(0, 0.1)
         origin = np.array([radius * np.cos(angle), height, radius * np.sin(angle)])
-        result.append(pose(origin, np.array([0, 0.25, 0]) + rng.normal(0, 0.08, 3), (0, 1, 0)))
+        to = np.array([0, 0.25, 0]) + rng.normal(0, 0.08, 3)
+        result.append(np.array(mi.ScalarTransform4f().look_at(origin, to, [0, 1, 0]).matrix) @ OPTICAL)
     return np.stack(result)
 
 
 def photographed(scene: mi.Scene, camera: np.ndarray, side: int, spp: int, seed: int) -> np.ndarray:
     """Return the linear image ``(side, side, 3)`` from a pose."""
     sensor = mi.load_dict({
-        "type": "perspective", "fov": FOV, "to_world": mi.ScalarTransform4f(camera @ np.diag([-1, 1, -1, 1])),
+        "type": "perspective", "fov": FOV, "to_world": mi.ScalarTransform4f(camera @ OPTICAL),
         "film": {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
         "sampler": {"type": "multijitter", "sample_count": spp},
     })  # fmt: skip

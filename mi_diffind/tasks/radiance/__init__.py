@@ -61,8 +61,8 @@ class RadianceField(Task):
         ),
         Argument(
             "--resolution", type=resolution, metavar="N",
-            help="resolution of the grid: nodes along the side of a cube of the same volume, or auto: a voxel is as "
-            "wide as a pixel (default: auto)",
+            help="resolution of the grid: nodes along the side of a cube of the same volume, or auto: a voxel has "
+            "0.8 of the width of a pixel (default: auto)",
         ),
         Argument(
             "--background", choices=BACKGROUNDS,

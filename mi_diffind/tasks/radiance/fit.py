@@ -221,7 +221,9 @@ class FieldFit:
                     grid = grids.begin(request.types, self.session.seeing_images.views, max(8, round(nodes * share)))
                 else:
                     visible = grids.visible(grid, self.session.seeing_images)
-                    grid = grids.divided(grid, visible, share / STAGES[number - 1][0], wide=1)
+                    # Around the half resolution's, no further cells are needed, and memory would be
+                    wide = 0 if (STAGES[number - 1][0], share) == (0.5, 1.0) else 1
+                    grid = grids.divided(grid, visible, share / STAGES[number - 1][0], wide)
             if stop.is_set() and result is not None:
                 return grid, dataclasses.replace(result, interrupted=True)
             if grid.nodes.count == 0:

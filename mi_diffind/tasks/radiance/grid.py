@@ -30,7 +30,7 @@ DENSITY_SCALE = 10.0
 BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 
 #: Total variation of raw densities: its weight, the square that rounds its kink at 0, and nodes a step.
-SMOOTH, ROUND, VARIED = 7e-5, 1e-2, 2**13
+SMOOTH, ROUND, VARIED = 5e-5, 1e-2, 2**13
 
 #: Largest weight in a ray below which a cell is removed.
 VISIBLE = 0.02
@@ -100,7 +100,10 @@ def neighbours(nodes: Nodes) -> np.ndarray:
 
 
 def resolution_of(views: CapturedViews) -> int:
-    """Return the resolution at which a voxel is as wide as a pixel is at the middle of the box, for :func:`begin`."""
+    """Return the resolution at which a pixel, seen at the middle of the box, is :data:`VOXELS_PER_PIXEL` voxels wide.
+
+    It is that of :func:`begin`.
+    """
     if views.surroundings:
         nodes = surroundings.resolution_of(views)
     else:
@@ -134,9 +137,9 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
     """Return the largest weight (transmittance × opacity) of each cell in a ray: ``(X − 1, Y − 1, Z − 1)``."""
     nodes, types, views = field.nodes, field.types, images.views
     largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
-    # One ray for each voxel, where that is wider than a pixel
+    # One ray for each voxel, where that is wider than a pixel; voxels of surroundings are narrower from afar
     middle = (np.array(nodes.lower) + nodes.upper) / 2
-    every = max(1, int(nodes.spacing / pixel_width(views, middle)))
+    every = max(1, int(nodes.spacing / pixel_width(views, middle))) if nodes.contraction is None else 1
     for view, (height, width) in enumerate((views.sizes // every).tolist()):
         lane, width = dr.arange(types.UInt32, height * width), dr.opaque(types.UInt32, width)
         column, row = (n * dr.opaque(types.UInt32, every) for n in (lane % width, lane // width))
@@ -152,7 +155,8 @@ def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
     In a field that is nearly empty, since its training has just begun, they are those that are seen best.
     """
     largest = weights(grid.field(), images)
-    return (largest > 0) & (largest >= min(VISIBLE, 0.5 * float(largest.max())))
+    least = VISIBLE if grid.nodes.contraction is None else surroundings.VISIBLE
+    return (largest > 0) & (largest >= min(least, 0.5 * float(largest.max())))
 
 
 def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 0) -> NodeGrid:
