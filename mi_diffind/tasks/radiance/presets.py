@@ -62,8 +62,8 @@ class RadianceRecipe:
 
 #: Preset name → recipe; the first is the default.
 PRESETS = {
-    "sparse": RadianceRecipe("sparse", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 5.0),
-    "paper": RadianceRecipe("pairs", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 5.0),
+    "sparse": RadianceRecipe("sparse", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 2.0),
+    "paper": RadianceRecipe("pairs", FitSettings(steps=1000, batch=16384, lr=5e-3, loss="mse", check_every=50), 2.0),
     "grid": RadianceRecipe("grid", FitSettings(steps=2000, batch=16384, lr=4e-2, loss="mse", check_every=50), 20.0),
 }
 
