@@ -216,6 +216,7 @@ class FieldFit:
         for number, (share, part) in enumerate(STAGES):
             if number < finished:
                 continue
+            dr.flush_malloc_cache()  # of the stage before
             with interruptible() as stop:
                 if grid is None:
                     grid = grids.begin(request.types, self.session.seeing_images.views, max(8, round(nodes * share)))
@@ -234,7 +235,6 @@ class FieldFit:
                 settings, steps=steps, schedule="cosine" if last else "constant", measure_every=max(1, steps // 2)
             )
             problem, grid = grids.GridProblem(grid, self.session), None
-            dr.flush_malloc_cache()  # of the coarser grid
             checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
             stage_request = dataclasses.replace(
                 limited.part(part / sum(later for _, later in STAGES[number:])),
@@ -249,6 +249,7 @@ class FieldFit:
             )
             grid = problem.trained()
             problem.keep_exposures()
+            del problem, finish
             if result.interrupted or (result.asked_to_stop and not last):
                 return grid, dataclasses.replace(result, interrupted=True)
             if stages_file is not None:
