@@ -25,7 +25,7 @@ from . import grid as grids
 from .grid import NodeGrid
 from .presets import COMPRESSION, PRESETS, RESOLUTIONS, STAGES, dense_bytes, ratio_for
 from .rate_distortion import Importance, importance
-from .session import FieldSession
+from .session import SIDE, FieldSession
 from .training import ImagesProblem
 from .volume_field import VolumeField
 
@@ -234,7 +234,7 @@ class FieldFit:
             stage = dataclasses.replace(
                 settings, steps=steps, schedule="cosine" if last else "constant", measure_every=max(1, steps // 2)
             )
-            problem, grid = grids.GridProblem(grid, self.session), None
+            problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
             checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
             stage_request = dataclasses.replace(
                 limited.part(part / sum(later for _, later in STAGES[number:])),

@@ -1,7 +1,8 @@
 """Sparse grid of plain numbers, trained from coarse to fine: the field that is compressed.
 
 Training begins in the visual hull at a quarter of the nodes along each side, continues at half of them and ends with
-all of them. Between these stages, cells that no ray sees (:func:`weights`) are removed and the others are divided.
+all of them. Only the last stage has several rays a pixel. Between these stages, cells that no ray sees
+(:func:`weights`) are removed and the others are divided.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from . import surroundings
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
 from .presets import RESOLUTIONS, VOXELS_PER_PIXEL
-from .session import FieldSession, ViewImages
+from .session import SIDE, FieldSession, ViewImages
 from .training import ImagesProblem
 from .views import CapturedViews
 from .visual_hull import box_of, hull, pixel_width
@@ -59,7 +60,8 @@ class GridProblem(ImagesProblem):
     sparse = True
     beta_2 = 0.99
 
-    def __init__(self, grid: NodeGrid, session: FieldSession):
+    def __init__(self, grid: NodeGrid, session: FieldSession, side: int = SIDE):
+        self.side = side
         self.nodes, types = grid.nodes, grid.nodes.types
         tensor = types.TensorXf
         net = {"density": grid.density / DENSITY_SCALE, "colour": grid.colour}

@@ -9,7 +9,7 @@ from ...settings import FitSettings
 
 #: Voxels per pixel of the views at the distance of the box, and the range of the resolution that follows from them:
 #: nodes along each side of a cube with the volume of the box.
-VOXELS_PER_PIXEL, RESOLUTIONS = 1.25, (32, 400)
+VOXELS_PER_PIXEL, RESOLUTIONS = 1.25, (32, 352)
 
 #: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
 #: that no ray sees are removed.

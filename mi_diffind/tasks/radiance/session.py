@@ -94,14 +94,15 @@ class ViewImages:
             places.append(np.stack([np.full(len(x), view), TILE * x, TILE * y]))
         return self.types.Array3u(*(device_array(self.types.UInt32, row) for row in np.concatenate(places, axis=1)))
 
-    def pixel_rays(self, view, x, y) -> tuple:
-        """Return origins and unit directions of the rays of pixels; those of a pixel are next to each other."""
+    def pixel_rays(self, view, x, y, side: int = SIDE) -> tuple:
+        """Return origins and unit directions of the ``side``² rays of pixels, those of a pixel next to each other."""
         Float, UInt32 = self.types.Float, self.types.UInt32
         count = max(dr.width(view), dr.width(x), dr.width(y))
-        lane = dr.arange(UInt32, count * RAYS)
-        pixel, ray = lane // RAYS, lane % RAYS
+        rays = side**2
+        lane = dr.arange(UInt32, count * rays)
+        pixel, ray = lane // rays, lane % rays
         view, x, y = (dr.gather(UInt32, value, pixel) if dr.width(value) > 1 else value for value in (view, x, y))
-        within = ((Float(place) + 0.5) / SIDE for place in (ray % SIDE, ray // SIDE))
+        within = ((Float(place) + 0.5) / side for place in (ray % side, ray // side))
         return self.rays(view, x, y, tuple(within))
 
     def rays(self, view, x, y, within=(0.5, 0.5)) -> tuple:
@@ -145,14 +146,14 @@ class ViewImages:
             return [grey] * 3
         return [types.Float(float(LINEAR[byte])) for byte in self.views.background]
 
-    def random_pixels(self, rng, size: int) -> tuple:
-        """Return view, column and row of ``size`` random pixels, in patches.
+    def random_pixels(self, rng, size: int, side: int = PATCH) -> tuple:
+        """Return view, column and row of ``size`` random pixels, in patches of ``side``².
 
         The share :data:`ANYWHERE` of the patches is drawn from all pixels of a view, and each view is as likely as the
         others; the rest is drawn from the tiles in which something is seen.
         """
         types, views = self.types, self.views
-        patches = max(1, size // PATCH**2)
+        patches = max(1, size // side**2)
 
         def number():
             return types.Float(rng.random(types.TensorXf, (patches,)).array)
@@ -162,17 +163,17 @@ class ViewImages:
 
         view = whole(types.UInt32(len(views)))
         height, width = self._place(view)[1:]
-        x, y = (whole(dr.maximum(limit, PATCH) - (PATCH - 1)) for limit in (width, height))
+        x, y = (whole(dr.maximum(limit, side) - (side - 1)) for limit in (width, height))
         if tiles := dr.width(self.tiles):
             chosen, of_tile = whole(dr.opaque(types.UInt32, tiles)), number() >= ANYWHERE
             place = [dr.gather(types.UInt32, values, chosen) for values in self.tiles]
             place[1:] = (value + whole(types.UInt32(TILE)) for value in place[1:])
             view, x, y = (dr.select(of_tile, a, b) for a, b in zip(place, (view, x, y), strict=True))
             height, width = self._place(view)[1:]
-        lane = dr.arange(types.UInt32, patches * PATCH**2)
-        patch, pixel = lane // PATCH**2, lane % PATCH**2
+        lane = dr.arange(types.UInt32, patches * side**2)
+        patch, pixel = lane // side**2, lane % side**2
         view, x, y, width, height = (dr.gather(types.UInt32, value, patch) for value in (view, x, y, width, height))
-        x, y = x + pixel % PATCH, y + pixel // PATCH
+        x, y = x + pixel % side, y + pixel // side
         return view, dr.minimum(x, width - 1), dr.minimum(y, height - 1)
 
     def render(self, field: VolumeField, view: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from ... import srgb
 from ...fitting import Problem
 from ...indirection import device_tensor
 from .march import differentiable
-from .session import RAYS, FieldSession
+from .session import PATCH, SIDE, FieldSession
 from .volume_field import VolumeField
 
 #: Largest difference of the exposure of a view from the mean, in stops.
@@ -25,8 +25,12 @@ class ImagesProblem(Problem):
     differentiably. The loss is the mean squared difference of sRGB values in front of random greys, which trains the
     opacity, too, or in front of the background of views that have one.
 
+    A pixel is the mean of ``side``² rays; a step has as many rays whatever that is.
+
     If the session has ``exposures`` (in stops), they are trained, too; their mean stays 0.
     """
+
+    side = SIDE
 
     def __init__(self, session: FieldSession, net, field_of: Callable[..., VolumeField]):
         if session.exposures is not None:
@@ -36,15 +40,16 @@ class ImagesProblem(Problem):
 
     def loss(self, net, rng, size: int):
         types, images = self.session.types, self.session.images
-        view, x, y = images.random_pixels(rng, size // RAYS)
+        rays = self.side**2
+        view, x, y = images.random_pixels(rng, size // rays, PATCH * SIDE // self.side)
         count = dr.width(view)
-        o, d = images.pixel_rays(view, x, y)
+        o, d = images.pixel_rays(view, x, y, self.side)
         offset = rng.random(types.TensorXf, (dr.width(o),)).array
         behind = images.behind(rng, count)
         truth = images.colours(view, x, y)
         seen = differentiable(self.field_of(net).for_training(), o, d, images.near, dr.inf, True, offset)
         dr.schedule(seen.colour, seen.transmittance)  # at once: each sum evaluates what it adds up
-        *colour, transmittance = (dr.block_sum(v, RAYS) / RAYS for v in (*seen.colour, seen.transmittance))
+        *colour, transmittance = (dr.block_sum(v, rays) / rays for v in (*seen.colour, seen.transmittance))
         gain, total = self.gain(net, view), types.Float(0)
         for c in range(3):
             reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * behind[c], 0, 1), fused=False)
