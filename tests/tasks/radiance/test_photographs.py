@@ -266,7 +266,7 @@ def test_masked_borders_are_no_background(studio_shots):
 
 def test_a_field_records_its_background(studio_shots, monkeypatch):
     folder, _ = studio_shots
-    options = ["--preset", "grid", "--steps", "12", "--resolution", "12", "--batch", "256"]
+    options = ["--preset", "grid", "--steps", "40", "--resolution", "12", "--batch", "256"]
     monkeypatch.setattr(visual_hull, "SEARCH", 24)
     monkeypatch.setattr(grids, "VISIBLE", 0.0)
     assert main(["fit", "field", str(folder), "-o", str(folder / "x.npz"), *options, "--variant", "llvm_ad_rgb"]) == 0
