@@ -292,21 +292,23 @@ def load_table(path: str | os.PathLike, task: str | None = None, shapes: dict[st
         raise TableError(f"{path}: cannot be read ({reason(e)})") from None
 
 
-def load_layout(path: str | os.PathLike, task: str, layouts: dict[str, dict[str, tuple[int, int]]]) -> Table:
+def load_layout(path: str | os.PathLike, task: str, layouts: dict[str, dict[str, tuple]]) -> Table:
     """Read and check a table file whose setting ``layout`` names one of several sets of arrays.
 
-    ``layouts`` maps a layout to its arrays: name → number of dimensions, and channels. Raises :class:`TableError`.
+    ``layouts`` maps a layout to its arrays: name → number of dimensions, and channels, or a tuple of those that are
+    allowed. Raises :class:`TableError`.
     """
     table = load_table(path, task)
     layout = table.settings.get("layout")
     if not isinstance(layout, str) or layout not in layouts:
         raise TableError(f"{path}: has the layout {layout!r}, allowed are {', '.join(layouts)}")
     for name, (dims, channels) in layouts[layout].items():
-        array = table.arrays.get(name)
-        if array is None or len(array.shape) != dims + 1 or array.shape[-1] != channels:
+        array, allowed = table.arrays.get(name), channels if isinstance(channels, tuple) else (channels,)
+        if array is None or len(array.shape) != dims + 1 or array.shape[-1] not in allowed:
             fault = "is missing" if array is None else f"has the shape {array.shape}"
             raise TableError(
-                f'{path}: the array "{name}" {fault}, expected {dims} dimension(s) and {channels} channel(s)'
+                f'{path}: the array "{name}" {fault}, expected {dims} dimension(s) and '
+                f"{' or '.join(map(str, allowed))} channel(s)"
             )
     return table
 

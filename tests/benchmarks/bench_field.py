@@ -40,7 +40,7 @@ def main() -> None:
     arguments = parser.parse_args()
     types = array_module("llvm")
     session = FieldSession.load(types, arguments.source)
-    grid = fit.grid_of(files.load(arguments.grid), types)
+    grid = files.grid_of(files.load(arguments.grid), types)
     dense = dense_bytes(grid.nodes.shape)
     rows = []
     for name, change in ROWS.items():

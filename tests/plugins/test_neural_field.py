@@ -693,6 +693,7 @@ def file(tmp_path_factory):
 
     from mi_diffind.tables import save_table
     from mi_diffind.tasks.radiance import files, nodes
+    from mi_diffind.tasks.radiance.grid import NodeGrid
 
     side, spacing = 25, 0.1
     place = np.stack(np.meshgrid(*[spacing * np.arange(side) - 1.2] * 3, indexing="ij"), -1)
@@ -701,7 +702,7 @@ def file(tmp_path_factory):
     raw = np.clip(12 * (0.8 - radius), -6, 4)[stored.stored]
     colour = np.zeros((stored.count, 12))
     colour[:, 0], colour[:, 4], colour[:, 8] = -place[stored.stored][:, 0], -1, place[stored.stored][:, 0]
-    table = files.grid_table(stored, np.append(-9, raw), np.concatenate([np.zeros((1, 12)), colour]))
+    table = files.grid_table(NodeGrid(stored, np.append(-9, raw), np.concatenate([np.zeros((1, 12)), colour])))
     path = tmp_path_factory.mktemp("field") / "ball.npz"
     save_table(path, table)
     return path

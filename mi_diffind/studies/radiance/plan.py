@@ -31,8 +31,7 @@ from ...fitting import FitSettings, fit
 from ...measure.store import fingerprint
 from ...measure.study import FLOOR, Candidate, Case, Plan
 from ...tasks.radiance import grid as grids
-from ...tasks.radiance.files import load
-from ...tasks.radiance.fit import grid_of
+from ...tasks.radiance.files import grid_of, load
 from ...tasks.radiance.march import march
 from ...tasks.radiance.presets import dense_bytes
 from ...tasks.radiance.session import FieldSession
@@ -270,7 +269,8 @@ class GridReference(FieldPresetContender):
     def arguments(self) -> dict:
         settings = self.context.settings
         steps = {"steps": settings.grid_steps} if settings.grid_steps else {}
-        return {"source": self.context.source, "resolution": settings.resolution, **steps}
+        # The other methods store numbers of directions
+        return {"source": self.context.source, "resolution": settings.resolution, "colours": "directions", **steps}
 
 
 class TrainedOnReference(GridReference):

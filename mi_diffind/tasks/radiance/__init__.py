@@ -4,6 +4,7 @@
   images with cameras;
 - :mod:`.visual_hull`, :mod:`.surroundings`: the space that captured objects may occupy, and the space around it;
 - :mod:`.volume_field`, :mod:`.nodes`, :mod:`.march`: fields, the nodes that hold their numbers, and ray marching;
+- :mod:`.reflection`: colours by the reflection of an environment that all nodes share;
 - :mod:`.session`, :mod:`.training`, :mod:`.grid`: training through images, and the grid that is compressed;
 - :mod:`.compression`, :mod:`.paper`: our compressed layout, and that of the supplement;
 - :mod:`.presets`, :mod:`.fit`, :mod:`.files`, :mod:`.model`, :mod:`.decode`: the steps of ``fit field`` and its result.
@@ -18,7 +19,7 @@ from pathlib import Path
 from ... import units
 from ...arguments import Argument, checked, decibels, positive
 from ...task import Task
-from .presets import BACKGROUNDS, PRESETS
+from .presets import BACKGROUNDS, COLOURS, PRESETS
 
 
 def resolution(text: str) -> int | None:
@@ -73,6 +74,11 @@ class RadianceField(Task):
         Argument(
             "--exposures", action="store_true",
             help="train an exposure for each view, in stops with the mean 0: photographs of automatic exposure"
+        ),
+        Argument(
+            "--colours", choices=COLOURS,
+            help="how colours change with the direction: reflections of an environment that all nodes share, or a "
+            "degree of directions for red, green and blue (default: what shows views best that a trial leaves out)"
         ),
         Argument(
             "--downscale", type=positive, metavar="N",

@@ -69,6 +69,7 @@ class PaletteCoding:
     ``levels`` ``(n,)`` are densities in [0, 1] between :data:`EMPTIEST` and :data:`DENSEST`; ``index`` ``(n,)``
     (uint32) names a row of ``palette`` ``(P, columns)``. The first entry of both stands for no node. ``weight`` and
     ``rate`` are those of a squared step of a level and of a bit. ``file_bytes`` is the most that the file may have.
+    ``environment`` is that of :class:`.NodeGrid`.
     """
 
     nodes: Nodes
@@ -79,6 +80,7 @@ class PaletteCoding:
     weight: np.ndarray
     rate: float
     file_bytes: float | None = None
+    environment: np.ndarray | None = None
 
     def chosen(self, levels: np.ndarray) -> np.ndarray:
         """Return whole levels for levels ``(n,)`` in [0, 1], of fewer bits until the file is small enough."""
@@ -94,7 +96,8 @@ class PaletteCoding:
         """Return about the bytes of a file with these whole levels of stored nodes, which are a ``share`` of all."""
         colours = len(self.palette)
         probabilities, data = node_codes.encoded(self.nodes.stored, levels, self.index[1:], LAST_LEVEL + 1, colours)
-        return len(data) / share + len(zlib.compress(probabilities, 9)) + self.palette.size + OTHER_BYTES
+        shared = self.palette.size + (0 if self.environment is None else 3 * len(self.environment))
+        return len(data) / share + len(zlib.compress(probabilities, 9)) + shared + OTHER_BYTES
 
 
 def palette_coding(
@@ -139,6 +142,7 @@ def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: 
         passes,
         importance.density * LEVEL_STEP**2,
         LEVEL_SLOPE * rate,
+        environment=grid.environment,
     )
     coding.levels = (coding.chosen(levels) / LAST_LEVEL).astype(np.float32)
     return coding
@@ -182,7 +186,7 @@ def trial_part(grid: NodeGrid, importance: Importance) -> tuple[NodeGrid, Import
     part = nodes.like(nodes.spacing, nodes.shape, nodes.stored & planes[:, None, None])
     entries = np.concatenate([[True], here])
     weights = Importance(importance.density[here], importance.colour[here], importance.metric, importance.loss)
-    return NodeGrid(part, grid.density[entries], grid.colour[entries]), weights
+    return NodeGrid(part, grid.density[entries], grid.colour[entries], grid.environment), weights
 
 
 def clusters(
@@ -223,48 +227,62 @@ class PaletteProblem(ImagesProblem):
         types = coding.nodes.types
         self.coding, self.index = coding, device_array(types.UInt32, coding.index)
         net = {"density": coding.levels, "palette": coding.palette}
+        if coding.environment is not None:
+            net["environment"] = coding.environment
         net = {name: device_tensor(types.TensorXf, values) for name, values in net.items()}
         super().__init__(session, net, self.field_of)
-        self._set_range()
+        self._set_ranges()
 
     def field_of(self, net) -> NodeField:
         """Return the field of the trained parameters, rounded as it is stored."""
-        types, tensor = self.session.types, self.session.types.TensorXf
+        tensor = self.session.types.TensorXf
         level = fold(net["density"].array) * LAST_LEVEL
         level += dr.detach(dr.round(level) - level)
-        palette = net["palette"]
-        lane = dr.arange(types.UInt32, dr.width(palette.array)) % palette.shape[1]
-        scale, offset = (dr.gather(types.Float, v, lane) for v in self.range)
-        exact = dr.detach(palette.array)
-        colour = palette.array + dr.detach(dr.fma(dr.round((exact - offset) / scale), scale, offset) - exact)
+        shared = {name: self.rounded(net[name], *self.ranges[name]) for name in self.ranges}
         density = dr.fma(level, LEVEL_STEP, EMPTIEST)
-        return NodeField(self.coding.nodes, tensor(density), tensor(colour, palette.shape), self.index)
+        palette, environment = shared["palette"], shared.get("environment")
+        return NodeField(self.coding.nodes, tensor(density), palette, self.index, environment)
+
+    def rounded(self, table, scale, offset):
+        """Return a table with the numbers that bytes stand for, and straight-through gradients."""
+        types = self.session.types
+        lane = dr.arange(types.UInt32, dr.width(table.array)) % table.shape[1]
+        scale, offset = (dr.gather(types.Float, v, lane) for v in (scale, offset))
+        exact = dr.detach(table.array)
+        stored = dr.fma(dr.round((exact - offset) / scale), scale, offset)
+        return type(table)(table.array + dr.detach(stored - exact), table.shape)
 
     def begin(self, step, share):
         # Until the next update, numbers beyond the range are rounded to steps outside of it
         if step % RANGE_INTERVAL == 0:
-            self._set_range()
+            self._set_ranges()
         return ""
 
-    def _set_range(self) -> None:
-        self.range = [device_array(self.session.types.Float, v) for v in byte_range(self.net["palette"].numpy())]
+    def _set_ranges(self) -> None:
+        names, Float = [name for name in ("palette", "environment") if name in self.net], self.session.types.Float
+        self.ranges = {n: [device_array(Float, v) for v in byte_range(self.net[n].numpy())] for n in names}
 
     def stored(self) -> dict[str, np.ndarray]:
         """Return what is stored: ``levels``, ``index``, ``palette`` (bytes), its ``scale`` and ``offset``.
 
         ``density_range`` holds the raw density of level 0 and the step from one level to the next, ``density_bits`` the
-        bits of a level.
+        bits of a level. ``environment`` (bytes, ``(e, 3)``) and its ``environment_range``, steps and offsets, are there
+        if the colours have reflections.
         """
-        palette = self.net["palette"].numpy()
-        scale, offset = byte_range(palette)
+        palette, scale, offset = as_bytes(self.net["palette"].numpy())
+        shared = {}
+        if "environment" in self.net:
+            environment, *ranges = as_bytes(self.net["environment"].numpy()[:, :3])
+            shared = {"environment": environment, "environment_range": ranges}
         return {
             "levels": self.coding.chosen(fold(self.net["density"].array).numpy()).astype(np.uint8),
             "density_range": (EMPTIEST, LEVEL_STEP),
             "density_bits": DENSITY_BITS,
             "index": self.coding.index,
-            "palette": np.clip(np.rint((palette - offset) / scale), 0, 255).astype(np.uint8),
+            "palette": palette,
             "scale": scale,
             "offset": offset,
+            **shared,
         }
 
 
@@ -274,11 +292,23 @@ def byte_range(palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum((high - low) / 255, 1e-6), low
 
 
+def as_bytes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the bytes of numbers ``(n, c)``, and the step and the minimum of each column (:func:`byte_range`)."""
+    scale, offset = byte_range(values)
+    return np.clip(np.rint((values - offset) / scale), 0, 255).astype(np.uint8), scale, offset
+
+
 def packed_bytes(grid: NodeGrid, index_bits: int) -> int:
     """Return the bytes in memory of the packed field of a grid."""
     nodes = grid.nodes
     index = nodes.like(nodes.spacing, nodes.shape, nodes.stored, packed=True).nbytes
-    return index + nodes.entries * (DENSITY_BITS + index_bits) // 8 + 8 + 16 * min(2**index_bits, nodes.count)
+    index += 0 if grid.environment is None else 4 * len(grid.environment)
+    return (
+        index
+        + nodes.entries * (DENSITY_BITS + index_bits) // 8
+        + 8
+        + 16 * -(-grid.colour.shape[1] // 16) * min(2**index_bits, nodes.count)
+    )
 
 
 def sized(grid: NodeGrid, images: ViewImages, nbytes: int | None) -> tuple[NodeGrid, int]:

@@ -12,17 +12,23 @@ import numpy as np
 from ...indirection import Indirection, device_array, device_tensor
 from ...tables import StoredArray, Table, TableError, byte_array, check_numbers, load_layout, restored
 from . import node_codes
-from .compression import INDEX_BITS, MOST_BITS, byte_range
+from .compression import INDEX_BITS, MOST_BITS, as_bytes
+from .grid import NodeGrid
 from .nodes import Nodes
 from .paper import PairsField
+from .presets import COLOURS
+from .reflection import COLUMNS, DIRECTIONS, ENTRIES
 from .surroundings import ContractedNodes
 from .volume_field import NodeField, PackedPaletteField, VolumeField
 
+#: Numbers of a colour: without and with reflections.
+NUMBERS = (DIRECTIONS, COLUMNS)
+
 #: Layout → name of an array → number of its dimensions, and channels. "coded" is "sparse" in fewer bytes.
 LAYOUTS = {
-    "coded": {"probabilities": (1, 1), "nodes": (1, 1), "palette": (1, 12)},
-    "sparse": {"cells": (1, 1), "density": (1, 1), "index": (1, 2), "palette": (1, 12)},
-    "grid": {"cells": (1, 1), "density": (1, 1), "colour": (1, 12)},
+    "coded": {"probabilities": (1, 1), "nodes": (1, 1), "palette": (1, NUMBERS)},
+    "sparse": {"cells": (1, 1), "density": (1, 1), "index": (1, 2), "palette": (1, NUMBERS)},
+    "grid": {"cells": (1, 1), "density": (1, 1), "colour": (1, NUMBERS)},
     "pairs": {
         "cells": (1, 1), "density_primary": (3, 3), "density_cascaded": (3, 1), "colour_primary": (3, 3),
         "colour_cascaded": (3, 12),
@@ -51,7 +57,11 @@ def palette_table(nodes: Nodes, stored: dict) -> Table:
     offset, scale = stored["density_range"]
     levels = {"density_bits": stored["density_bits"], "density_offset": offset, "density_scale": scale}
     settings = {"layout": "coded", **levels, **stored_nodes(nodes)[1]}
-    return Table("field", coded(nodes.stored, stored["levels"], stored["index"], palette, settings), settings=settings)
+    arrays = coded(nodes.stored, stored["levels"], stored["index"], palette, settings)
+    if "environment" in stored:
+        arrays["environment"] = StoredArray(stored["environment"], (), *map(tuple, stored["environment_range"]))
+        settings["colours"] = "reflections"
+    return Table("field", arrays, settings=settings)
 
 
 def coded(stored: np.ndarray, levels: np.ndarray, index: np.ndarray, palette: StoredArray, settings: dict) -> dict:
@@ -81,6 +91,8 @@ def sparse(table: Table) -> Table:
         "index": byte_array(np.stack([index & 255, index >> 8], axis=1)),
         "palette": palette,
     }
+    if "environment" in table.arrays:
+        arrays["environment"] = table.arrays["environment"]
     bits = max(1, (len(palette.entries) - 1).bit_length())
     return replace(table, arrays=arrays, settings={**settings, "layout": "sparse", "index_bits": bits})
 
@@ -93,11 +105,14 @@ def decoded(probabilities: bytes, data: bytes, *sizes) -> tuple[np.ndarray, np.n
     return stored, levels.astype(np.uint8), index.astype(np.uint32)
 
 
-def grid_table(nodes: Nodes, density: np.ndarray, colour: np.ndarray, dtype=np.float16) -> Table:
+def grid_table(grid: NodeGrid, dtype=np.float16) -> Table:
     """Return the table of a grid, in half precision by default; the first entry stands for no node."""
-    arrays, settings = stored_nodes(nodes)
-    arrays["density"] = StoredArray(np.clip(density, -1e4, 1e4)[:, None].astype(dtype))
-    arrays["colour"] = StoredArray(np.clip(colour, -1e3, 1e3).astype(dtype))
+    arrays, settings = stored_nodes(grid.nodes)
+    arrays["density"] = StoredArray(np.clip(grid.density, -1e4, 1e4)[:, None].astype(dtype))
+    arrays["colour"] = StoredArray(np.clip(grid.colour, -1e3, 1e3).astype(dtype))
+    if grid.environment is not None:
+        arrays["environment"] = StoredArray(np.clip(grid.environment[:, :3], -1e3, 1e3).astype(dtype))
+        settings["colours"] = "reflections"
     return Table("field", arrays, settings={"layout": "grid", **settings})
 
 
@@ -117,6 +132,7 @@ def load(path) -> Table:
             f"{path}: has a density curve, which this package no longer reads: make the file again with "
             f'"mi-diffind fit field FOLDER -o {Path(path).name}"'
         )
+    check_colours(table)
     check_numbers(table, "lower", 3)
     check_numbers(table, "spacing", 1, positive=True)
     check_numbers(table, "shape", 3, positive=True, whole=True)
@@ -162,6 +178,28 @@ def load(path) -> Table:
     return table
 
 
+def check_colours(table: Table) -> None:
+    """Raise :class:`TableError` unless a table has the environment that its setting ``colours`` speaks of."""
+    colours, environment = table.settings.get("colours", "directions"), table.arrays.get("environment")
+    allowed = COLOURS if table.settings["layout"] != "pairs" else ("directions",)
+    if colours not in allowed:
+        raise TableError(f"{table.path}: is damaged: found the colours {colours!r}, allowed are {', '.join(allowed)}")
+    numbers = table.arrays.get("colour", table.arrays.get("palette"))
+    found = (None if environment is None else environment.shape, None if numbers is None else numbers.shape[-1])
+    expected = ((ENTRIES, 3), COLUMNS) if colours == "reflections" else (None, DIRECTIONS)
+    if table.settings["layout"] != "pairs" and found != expected:
+        raise TableError(
+            f"{table.path}: is damaged: found an environment of the shape {found[0]} and {found[1]} numbers of a "
+            f'colour, the colours "{colours}" have {expected[0]} and {expected[1]}'
+        )
+
+
+def environment_of(table: Table) -> np.ndarray | None:
+    """Return the environment of a table as :class:`.NodeField` takes it, or ``None``."""
+    array = table.arrays.get("environment")
+    return None if array is None else np.pad(array.values, ((0, 0), (0, 1)))
+
+
 def stored(table: Table, entries: dict, storage: str = "") -> Table:
     """Return a table with optimised ``entries``: ``density`` and ``colour`` of its nodes, or of its palette."""
     given, table = table, sparse(table)
@@ -175,6 +213,14 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
         allowed = "float16 and float32" if layout == "grid" else "none: levels and a palette of bytes"
         raise ValueError(f'storage: found "{storage}", allowed of the layout {layout} are {allowed}')
     density, colour = entries["density"].numpy(), entries["colour"].numpy()
+    if "environment" in entries:
+        environment = entries["environment"].numpy()[:, :3]
+        if layout == "grid":
+            form = storage or table.arrays["environment"].storage
+            arrays["environment"] = StoredArray(environment.astype(np.float32)).to(form)
+        else:
+            codes, scale, offset = as_bytes(environment)
+            arrays["environment"] = StoredArray(codes, (), tuple(scale.tolist()), tuple(offset.tolist()))
     if layout == "grid":
         for name, values in (("density", density[:, None]), ("colour", colour)):
             form = storage or table.arrays[name].storage
@@ -184,12 +230,12 @@ def stored(table: Table, entries: dict, storage: str = "") -> Table:
         last = 2 ** table.settings.get("density_bits", SPARSE_BITS) - 1
         codes = np.clip(np.rint((density - levels.offset[0]) / levels.scale[0]), 0, last)
         arrays["density"] = replace(levels, entries=codes.astype(np.uint8)[:, None])
-        scale, offset = byte_range(palette)
-        codes = np.clip(np.rint((palette - offset) / scale), 0, 255).astype(np.uint8)
+        codes, scale, offset = as_bytes(palette)
         arrays["palette"] = StoredArray(codes, (), tuple(scale.tolist()), tuple(offset.tolist()))
         if given is not table:
             codes, palette = arrays["density"].entries[:, 0], arrays["palette"]
-            arrays, table = coded(stored_of(table), codes, index_of(table), palette, given.settings), given
+            nodes = coded(stored_of(table), codes, index_of(table), palette, given.settings)
+            arrays, table = {**given.arrays, **nodes, **{n: a for n, a in arrays.items() if n == "environment"}}, given
     return replace(table, arrays=arrays, settings={**table.settings, "optimised": True}, measured={}, path=None)
 
 
@@ -207,6 +253,13 @@ def nodes_of(table: Table, types, packed: bool = False) -> Nodes:
     return ContractedNodes(*place, inner=settings["inner"]) if "inner" in settings else Nodes(*place)
 
 
+def grid_of(table: Table, types, nodes: Nodes | None = None) -> NodeGrid:
+    """Return the grid of a checked table of the layout "grid", with its ``nodes``, if these are made already."""
+    nodes = nodes_of(table, types) if nodes is None else nodes
+    density, colour = (table.arrays[name].values for name in ("density", "colour"))
+    return NodeGrid(nodes, density[:, 0], colour, environment_of(table))
+
+
 def index_of(table: Table) -> np.ndarray:
     """Return the palette index of each node, uint32 ``(n,)``."""
     low, high = table.arrays["index"].entries.astype(np.uint32).T
@@ -222,11 +275,9 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
     settings, layout, arrays = table.settings, table.settings["layout"], table.arrays
     floats = storage == "float32"
     nodes = nodes_of(table, types, packed=not floats)
-    tensor = types.TensorXf
+    tensor, environment = types.TensorXf, environment_of(table)
     if layout == "grid":
-        return NodeField(
-            nodes, *(device_tensor(tensor, v) for v in (arrays["density"].values[:, 0], arrays["colour"].values))
-        )
+        return grid_of(table, types, nodes).field()
     if layout == "pairs":
         allocated = {name: arrays[name].allocate(tensor, storage) for name in PairsField.NAMES}
         density, colour = (
@@ -235,10 +286,14 @@ def field_of(table: Table, types, storage: str = "") -> VolumeField:
         return PairsField(nodes, density, colour, settings["low"], settings["high"])
     palette, density, index = arrays["palette"], arrays["density"], index_of(table)
     if floats:
+        environment = None if environment is None else device_tensor(tensor, environment)
         return NodeField(nodes, *(device_tensor(tensor, v) for v in (density.values[:, 0], palette.values)),
-                         device_array(types.UInt32, index))  # fmt: skip
+                         device_array(types.UInt32, index), environment)  # fmt: skip
     stored = {
         "levels": density.entries[:, 0], "density_range": (density.offset[0], density.scale[0]), "index": index,
         "palette": palette.entries, "scale": palette.scale, "offset": palette.offset,
     }  # fmt: skip
+    if environment is not None:
+        array = arrays["environment"]
+        stored |= {"environment": array.entries, "environment_range": (array.scale, array.offset)}
     return PackedPaletteField(nodes, stored, settings.get("density_bits", SPARSE_BITS), settings["index_bits"])

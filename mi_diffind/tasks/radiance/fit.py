@@ -23,9 +23,9 @@ from ...task import FitRequest, Fitted
 from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
-from .presets import COMPRESSION, PRESETS, RESOLUTIONS, STAGES, dense_bytes, ratio_for
+from .presets import COLOURS, COMPRESSION, PRESETS, REFLECTING, RESOLUTIONS, STAGES, dense_bytes, ratio_for
 from .rate_distortion import Importance, importance
-from .session import SIDE, FieldSession
+from .session import SIDE, WATCHED, FieldSession
 from .training import ImagesProblem
 from .volume_field import VolumeField
 
@@ -54,6 +54,9 @@ GRID_TIME, VALUE_TIME, CLUSTER_TIME = 0.6, 0.2, 0.25
 #: Least steps of the first stage of the grid if time is limited: a field that nobody sees has no second stage.
 FIRST_STEPS = 100
 
+#: Views that a trial of colours needs, and the gain in decibels at which reflections are chosen.
+LEAST_VIEWS, WORTH = 16, 0.15
+
 #: Pixels of held-out views that are measured, and of training views in which visible cells are sought, for each second
 #: of a limited time.
 PIXELS = 40_000
@@ -75,6 +78,12 @@ def check(request: FitRequest) -> None:
                 raise UsageError(f"--{name} is an option of the preset sparse, found the preset paper")
         if options.get("background") == "surroundings":
             raise UsageError("--background: found surroundings with the preset paper, whose box is not contracted")
+        if options.get("colours") == "reflections":
+            raise UsageError(
+                "--colours: found reflections with the preset paper, whose numbers are those of directions"
+            )
+    if options.get("colours") == "reflections" and options.get("background") == "surroundings":
+        raise UsageError("--colours: found reflections with --background surroundings, allowed is directions")
     sizes = (("bytes", units.parse_bytes), ("disk", units.parse_bytes), ("compression", units.parse_compression))
     for name, parse in sizes:
         if options.get(name) is not None:
@@ -157,6 +166,47 @@ class FieldFit:
         figures = {"grid_seconds": grid_seconds, "dense_bytes": dense, "memory_bytes": size, "warnings": warnings}
         return Fitted(table, result, lines, figures)
 
+    @property
+    def colours(self) -> str:
+        """Colours of :data:`.presets.COLOURS`, or "auto": those that show left-out views best (:meth:`reflecting`)."""
+        views, chosen = self.session.views, self.request.options.get("colours")
+        simple = self.request.preset == "paper" or views.surroundings or self.session.exposures is not None
+        return chosen or ("directions" if simple or len(views) < LEAST_VIEWS else "auto")
+
+    def reflecting(self, grid: NodeGrid, trial: FitRequest) -> tuple[NodeGrid, FitResult | None]:
+        """Return a grid with the colours that the options ask for or, by default, those that show more.
+
+        By default, the stage of the request ``trial`` is trained with both colours, by seven eighths of the views.
+        Reflections are chosen if the other views gain :data:`WORTH` decibels. The grid is the trained one then, and its
+        result is returned, too.
+        """
+        if self.colours == "reflections":
+            return grid.reflecting(), None
+        views, seen = self.session.views, np.arange(len(self.session.views)) % 8 != 4
+        left_out = np.nonzero(~seen)[0]
+        left_out = left_out[np.arange(min(WATCHED, len(left_out))) * len(left_out) // min(WATCHED, len(left_out))]
+        session = dataclasses.replace(
+            self.session, views=views.chosen(np.nonzero(seen)[0]), held_out=views.chosen(left_out)
+        )
+        settings = dataclasses.replace(trial.settings, measure_every=trial.settings.steps)
+        trained, reached = [], []
+        for number, start in enumerate((grid, grid.reflecting())):
+            problem = grids.GridProblem(start, session, 1)
+            request = dataclasses.replace(trial.part(1 / (2 - number)), settings=settings, checkpoint=None)
+            request = dataclasses.replace(request, resume=False, seconds=None)
+            result = request.train(problem, f"trial of colours: {COLOURS[1 - number]}")
+            trained.append((problem.trained(), result))
+            reached.append(session.held_out_images.evaluate(trained[-1][0].field())["psnr_foreground_db"])
+            if result.interrupted:
+                return trained[0]
+        better = reached[1] >= reached[0] + WORTH
+        print(
+            f"colours: {COLOURS[1 - better]} (left-out views have {reached[1]:.2f} dB of the foreground with "
+            f"reflections, {reached[0]:.2f} without)",
+            file=sys.stderr,
+        )
+        return trained[better]
+
     def exposures(self) -> dict[str, list[float]]:
         """Return the setting that records the exposures of the training views in stops, if they were trained."""
         stops = self.session.exposures
@@ -176,8 +226,13 @@ class FieldFit:
                 raise UsageError(f'--grid: {path} has the layout "{table.settings["layout"]}", a grid is needed')
             if table.settings.get("source") != views.digest:
                 raise UsageError(f"--grid: {path} was fitted to other views than those in {views.path}")
+            if request.preset == "paper" and "environment" in table.arrays:
+                raise UsageError(
+                    f"--grid: {path} has colours with reflections, the preset paper needs those of directions: "
+                    f"fit a grid with --colours directions"
+                )
             self.take_exposures(table)
-            return grid_of(table, request.types), None
+            return files.grid_of(table, request.types), None
         grid, result = self.trained_grid()
         if path and not result.interrupted:  # the next run would take an interrupted grid for a finished one
             table = self.grid_table(grid)
@@ -185,7 +240,7 @@ class FieldFit:
             stored = files.field_of(table, request.types)  # without invisible cells, in half precision
             table.measured = rounded_figures(self.session.held_out_images.evaluate(stored, ssim=True))
             save_table(path, table)
-            grid = grid_of(files.load(path), request.types)
+            grid = files.grid_of(files.load(path), request.types)
         return grid, result
 
     def trained_grid(self) -> tuple[NodeGrid, FitResult]:
@@ -209,7 +264,9 @@ class FieldFit:
             table = files.load(stages_file)
             if table.settings.get("source") != views.digest or table.settings.get("nodes") != nodes:
                 raise FittingError(f'the checkpoint "{stages_file}" has other views or another resolution')
-            grid, finished = grid_of(table, request.types), table.settings["stages"]
+            if table.settings.get("asked_for_colours") != self.colours:
+                raise FittingError(f'the checkpoint "{stages_file}" was made with another option --colours')
+            grid, finished = files.grid_of(table, request.types), table.settings["stages"]
             self.take_exposures(table)
             if finished == len(STAGES):
                 return grid, FitResult(table.measured, 0, 0, 0.0, False, 0)
@@ -222,9 +279,8 @@ class FieldFit:
                     grid = grids.begin(request.types, self.session.seeing_images.views, max(8, round(nodes * share)))
                 else:
                     visible = grids.visible(grid, self.session.seeing_images)
-                    # Around the half resolution's, no further cells are needed, and memory would be
-                    wide = 0 if (STAGES[number - 1][0], share) == (0.5, 1.0) else 1
-                    grid = grids.divided(grid, visible, share / STAGES[number - 1][0], wide)
+                    # At full resolution, no further cells are needed, but memory and time would be
+                    grid = grids.divided(grid, visible, share / STAGES[number - 1][0], int(share < 1))
             if stop.is_set() and result is not None:
                 return grid, dataclasses.replace(result, interrupted=True)
             if grid.nodes.count == 0:
@@ -234,6 +290,13 @@ class FieldFit:
             stage = dataclasses.replace(
                 settings, steps=steps, schedule="cosine" if last else "constant", measure_every=max(1, steps // 2)
             )
+            if share == REFLECTING and self.colours != "directions":
+                trial = limited.part(2 * part / (part + sum(later for _, later in STAGES[number:])))
+                grid, result = self.reflecting(grid, dataclasses.replace(trial, settings=stage))
+                if result is not None:
+                    if result.interrupted:
+                        return grid, result
+                    stage = dataclasses.replace(stage, steps=max(1, steps - result.steps))
             problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
             checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
             stage_request = dataclasses.replace(
@@ -253,8 +316,9 @@ class FieldFit:
             if result.interrupted or (result.asked_to_stop and not last):
                 return grid, dataclasses.replace(result, interrupted=True)
             if stages_file is not None:
-                table = files.grid_table(grid.nodes, grid.density, grid.colour, np.float32)
-                table.settings |= {"source": views.digest, "nodes": nodes, "stages": number + 1} | self.exposures()
+                table = files.grid_table(grid, np.float32)
+                state = {"nodes": nodes, "stages": number + 1, "asked_for_colours": self.colours}
+                table.settings |= {"source": views.digest, **state, **self.exposures()}
                 table.measured = result.measured
                 save_table(stages_file, table)
         return grid, result
@@ -276,8 +340,7 @@ class FieldFit:
 
     def grid_table(self, grid: NodeGrid) -> Table:
         """Return the table of the visible part of a grid."""
-        visible = self.visible(grid)
-        return files.grid_table(visible.nodes, visible.density, visible.colour)
+        return files.grid_table(self.visible(grid))
 
     def wanted_bytes(self, grid: NodeGrid) -> int | None:
         """Return the bytes in memory that the options ask for, or ``None``."""
@@ -431,12 +494,6 @@ class FieldFit:
             limited = dataclasses.replace(request.part(VALUE_TIME), settings=settings, checkpoint=None, resume=False)
             dataclasses.replace(limited, seconds=None).train(values, "the numbers of the grid")
         return paper.PairsProblem(net, grid.nodes, low, high, self.session)
-
-
-def grid_of(table: Table, types) -> NodeGrid:
-    """Return the grid of a table of the layout "grid"."""
-    nodes = files.nodes_of(table, types)
-    return NodeGrid(nodes, table.arrays["density"].values[:, 0], table.arrays["colour"].values)
 
 
 def rounded_figures(measured: dict[str, float]) -> dict[str, float]:

@@ -11,10 +11,10 @@ import dataclasses
 
 import drjit as dr
 import numpy as np
-from scipy.ndimage import binary_dilation, map_coordinates
+from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from ...indirection import device_array, device_tensor
-from . import surroundings
+from . import reflection, surroundings
 from .march import visibility
 from .nodes import Nodes, cells_of, corners_of
 from .presets import RESOLUTIONS, VOXELS_PER_PIXEL
@@ -33,22 +33,56 @@ BEGIN_DENSITY, BEGIN_COLOUR = -4.0, -1.5
 #: Total variation of raw densities: its weight, the square that rounds its kink at 0, and nodes a step.
 SMOOTH, ROUND, VARIED = 5e-5, 1e-2, 2**13
 
+#: The same of the slopes of colours by direction.
+SMOOTH_DIRECTIONS, ROUND_DIRECTIONS = 5e-5, 1e-3
+
+#: Raw density of empty space, and the blur in nodes, for the normals before reflections are trained.
+EMPTY, NORMAL_BLUR = -6.0, 1.5
+
 #: Largest weight in a ray below which a cell is removed.
 VISIBLE = 0.02
 
 
+#: Arrays of a grid.
+NAMES = ("density", "colour", "environment")
+
+
 @dataclasses.dataclass
 class NodeGrid:
-    """Raw ``density`` ``(n,)`` and ``colour`` ``(n, 12)`` of the entries of sparse ``nodes``, as NumPy arrays."""
+    """Raw ``density`` ``(n,)`` and ``colour`` of the entries of sparse ``nodes``, as NumPy arrays.
+
+    ``colour`` is ``(n, 12)``, or ``(n, 20)`` with an ``environment`` ``(e, 4)``, as in :class:`.NodeField`.
+    """
 
     nodes: Nodes
     density: np.ndarray
     colour: np.ndarray
+    environment: np.ndarray | None = None
 
     def field(self) -> NodeField:
         """Return the grid as a field."""
+        return NodeField(self.nodes, **self.tensors())
+
+    def tensors(self) -> dict:
+        """Return the arrays of :meth:`field` by name."""
         tensor = self.nodes.types.TensorXf
-        return NodeField(self.nodes, *(device_tensor(tensor, values) for values in (self.density, self.colour)))
+        return {name: device_tensor(tensor, values) for name, values in self.arrays().items()}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return density, colour and environment, if there is one, by name."""
+        return {name: values for name in NAMES if (values := getattr(self, name)) is not None}
+
+    def reflecting(self) -> NodeGrid:
+        """Return a grid whose colours are those of :mod:`.reflection`, to be trained.
+
+        Normals point from dense to empty space.
+        """
+        dense = np.full(self.nodes.shape, EMPTY, np.float32)
+        dense[self.nodes.stored] = np.clip(self.density[1:], EMPTY, -EMPTY)
+        slopes = np.stack(np.gradient(gaussian_filter(dense, NORMAL_BLUR)), axis=-1)[self.nodes.stored]
+        normals = np.concatenate([[[0, 0, 1]], -slopes / (np.linalg.norm(slopes, axis=1, keepdims=True) + 1e-6)])
+        environment = np.zeros((reflection.ENTRIES, 4), np.float32)
+        return dataclasses.replace(self, colour=reflection.begun(self.colour, normals), environment=environment)
 
 
 class GridProblem(ImagesProblem):
@@ -63,9 +97,7 @@ class GridProblem(ImagesProblem):
     def __init__(self, grid: NodeGrid, session: FieldSession, side: int = SIDE):
         self.side = side
         self.nodes, types = grid.nodes, grid.nodes.types
-        tensor = types.TensorXf
-        net = {"density": grid.density / DENSITY_SCALE, "colour": grid.colour}
-        net = {name: device_tensor(tensor, values) for name, values in net.items()}
+        net = dataclasses.replace(grid, density=grid.density / DENSITY_SCALE).tensors()
         self.count = dr.opaque(types.UInt32, grid.nodes.count)
         self.neighbours = device_array(types.UInt32, neighbours(grid.nodes))
         super().__init__(session, net, self.field_of)
@@ -73,24 +105,38 @@ class GridProblem(ImagesProblem):
     def field_of(self, net) -> NodeField:
         """Return the field of the trained parameters."""
         density = net["density"]
-        return NodeField(self.nodes, type(density)(density.array * DENSITY_SCALE), net["colour"])
+        density = type(density)(density.array * DENSITY_SCALE)
+        return NodeField(self.nodes, density, net["colour"], environment=dict(net).get("environment"))
 
     def loss(self, net, rng, size: int):
         types = self.nodes.types
         density = net["density"].array
         node = types.UInt32(rng.random(types.TensorXf, (VARIED,)).array * types.Float(self.count))
         node = dr.minimum(node, self.count - 1)
-        here, variation = dr.gather(types.Float, density, node + 1) * DENSITY_SCALE, types.Float(0)
+        here, colours = dr.gather(types.Float, density, node + 1) * DENSITY_SCALE, self.directional(net, node + 1)
+        smooth = SMOOTH if self.nodes.contraction is None else surroundings.SMOOTH
+        total = types.Float(0)
         for axis in range(3):
             other = dr.gather(types.UInt32, self.neighbours, node * 3 + axis)
             step = here - dr.gather(types.Float, density, other) * DENSITY_SCALE
-            variation += dr.select(other != 0, dr.sqrt(dr.square(step) + ROUND), 0)
-        smooth = SMOOTH if self.nodes.contraction is None else surroundings.SMOOTH
-        return [super().loss(net, rng, size), variation * (smooth / VARIED)]
+            variation = smooth * dr.sqrt(dr.square(step) + ROUND)
+            for a, b in zip(colours, self.directional(net, other), strict=True):
+                variation += SMOOTH_DIRECTIONS * dr.sqrt(dr.square(a - b) + ROUND_DIRECTIONS)
+            total += dr.select(other != 0, variation, 0)
+        return [super().loss(net, rng, size), total * (1 / VARIED)]
+
+    def directional(self, net, number) -> list:
+        """Return the slopes b of :func:`.volume_field.colour_of` at nodes."""
+        colour = net["colour"].array
+        packets = net["colour"].shape[1] // 4
+        fours = (dr.gather(self.nodes.types.Array4f, colour, dr.fma(number, packets, k)) for k in range(3))
+        return [value for four in fours for value in list(four)[1:]]
 
     def trained(self) -> NodeGrid:
         """Return the grid with the trained numbers."""
-        return NodeGrid(self.nodes, self.net["density"].numpy() * DENSITY_SCALE, self.net["colour"].numpy())
+        net = {name: self.net[name].numpy() for name in NAMES if name in self.net}
+        net["density"] *= DENSITY_SCALE
+        return NodeGrid(self.nodes, **net)
 
 
 def neighbours(nodes: Nodes) -> np.ndarray:
@@ -186,5 +232,6 @@ def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 
         interpolated = map_coordinates(dense, at, order=1, mode="nearest", prefilter=False)
         return np.concatenate([[begin], interpolated]).astype(np.float32)
 
-    colour = [sampled(grid.colour[:, c], 0 if c % 4 else BEGIN_COLOUR) for c in range(12)]
-    return NodeGrid(fine, sampled(grid.density, BEGIN_DENSITY), np.stack(colour, axis=1))
+    empty = [BEGIN_COLOUR if c in (0, 4, 8) else 0 for c in range(grid.colour.shape[1])]
+    colour = [sampled(column, begin) for column, begin in zip(grid.colour.T, empty, strict=True)]
+    return NodeGrid(fine, sampled(grid.density, BEGIN_DENSITY), np.stack(colour, axis=1), grid.environment)

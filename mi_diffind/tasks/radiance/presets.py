@@ -27,6 +27,12 @@ RATIOS = {
 #: Default compression of the preset ``paper``.
 COMPRESSION = 50.0
 
+#: Colours of a field that a user may choose: with reflections (:mod:`.reflection`), or twelve numbers of directions.
+COLOURS = ("reflections", "directions")
+
+#: Share of the resolution from which on reflections are trained; before, normals are not known.
+REFLECTING = 0.5
+
 #: Backgrounds of images without alpha that a user may choose (:mod:`.background`).
 BACKGROUNDS = ("white", "black", "scene", "surroundings")
 

@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from ... import srgb
 from ...deadline import Deadline
-from ...indirection import device_tensor
 from . import node_codes
 from .grid import NodeGrid
 from .march import differentiable
@@ -53,7 +52,8 @@ class Importance:
 def importance(grid: NodeGrid, session: FieldSession, seed: int, deadline: Deadline | None = None) -> Importance:
     """Return the importance of the nodes of a grid in the training views; at the deadline, from fewer rays."""
     types, images, views = session.types, session.images, session.views
-    net = {name: device_tensor(types.TensorXf, v) for name, v in (("density", grid.density), ("colour", grid.colour))}
+    net = grid.tensors()
+    environment = net.pop("environment", None)
     squares = [dr.zeros(types.Float, v.size) for v in (grid.density, grid.colour)]
     batches = max(LEAST, round(RAYS_PER_PIXEL * len(views) * views.mean_pixels / RAYS))
     loss, count = 0.0, 0
@@ -66,7 +66,7 @@ def importance(grid: NodeGrid, session: FieldSession, seed: int, deadline: Deadl
         offset, behind = rng.random(types.TensorXf, (rays,)).array, images.behind(rng, rays)
         arrays = {name: type(tensor)(tensor) for name, tensor in net.items()}
         dr.enable_grad(arrays)
-        field = NodeField(grid.nodes, **arrays).for_training()
+        field = NodeField(grid.nodes, **arrays, environment=environment).for_training()
         seen = differentiable(field, *images.rays(view, x, y), 0, dr.inf, True, offset)
         truth, total, error = images.colours(view, x, y), types.Float(0), types.Float(0)
         for c in range(3):

@@ -13,16 +13,15 @@ import numpy as np
 
 from ...bits import as_words, pack_bits
 from ...indirection import device_array, device_tensor
+from . import reflection
 from .nodes import Nodes
+from .reflection import BRIGHTEST
 
 #: Optical depth of a voxel below which its density counts as zero.
 FAINT = 2e-3
 
 #: Weight of a step below which its radiance is not read: in pictures, and in training.
 LEAST_WEIGHT, LEAST_TRAINED_WEIGHT = 2e-7, 1e-3
-
-#: Upper limit of the logarithm of a radiance.
-BRIGHTEST = 12.0
 
 
 class EqualSteps:
@@ -159,7 +158,7 @@ def raw_of(density: np.ndarray, voxel: float) -> np.ndarray:
 def colour_of(coefficients: list, d) -> list:
     """Return the radiance [r, g, b] in direction ``d``: exp(a + b·d), clamped at exp(:data:`BRIGHTEST`).
 
-    ``coefficients`` are twelve numbers, a and b for each of red, green and blue. The exponent is linear in them.
+    ``coefficients`` begin with twelve numbers, a and b for each of red, green and blue. The exponent is linear in them.
     """
     radiance = []
     for c in range(3):
@@ -175,10 +174,14 @@ class NodeField(NodeVolume):
     :func:`colour_of`; both are float tensors. ``palette_index`` ``(n,)``, uint32, names the row of ``colour`` of each
     node; without it, node i has row i. A pointer that is an index cannot be interpolated, so rows are read at the eight
     corners of a cell and blended there.
+
+    With an ``environment`` ``(e, 4)``, of which the last column is unused, ``colour`` ``(m, 20)`` holds the numbers of
+    :mod:`.reflection`.
     """
 
-    def __init__(self, nodes: Nodes, density, colour, palette_index=None):
-        super().__init__(nodes, {"density": density, "colour": colour})
+    def __init__(self, nodes: Nodes, density, colour, palette_index=None, environment=None):
+        shared = {} if environment is None else {"environment": environment}
+        super().__init__(nodes, {"density": density, "colour": colour, **shared})
         self.palette_index = palette_index
 
     def density_at(self, p, active=True):
@@ -186,7 +189,17 @@ class NodeField(NodeVolume):
         return self.interpolated_density(lambda number, seen: dr.gather(Float, density, number, seen), p, active)
 
     def radiance_at(self, point_data, p, d, active=True):
-        return colour_of(self.coefficients(point_data, active), d)
+        numbers = self.coefficients(point_data, active)
+        radiance = colour_of(numbers, d)
+        if "environment" not in self.arrays:
+            return radiance
+        Array4f, environment = self.types.Array4f, self.arrays["environment"].array
+
+        def entry(number, seen):
+            return list(dr.gather(Array4f, environment, number, seen))[:3]
+
+        mirrored = reflection.reflected(self.types, numbers, d, entry, active)
+        return [a + b for a, b in zip(radiance, mirrored, strict=True)]
 
     def coefficients(self, point_data, active) -> list:
         """Return the blended columns of ``colour`` at points."""
@@ -229,7 +242,8 @@ class PackedPaletteField(NodeVolume):
     ``stored`` is that of :meth:`.compression.PaletteProblem.stored`. The low bits of a node are a density level, which
     stands for the raw density ``density_range[0]`` + level · ``density_range[1]``. The high bits are an index into
     ``palette`` ``(P, columns)``, uint8, whose bytes stand for ``offset`` + ``scale`` · byte. ``levels`` and ``index``
-    are NumPy arrays ``(n,)``. Entries of the palette take a multiple of 16 bytes in memory.
+    are NumPy arrays ``(n,)``. Entries of the palette take a multiple of 16 bytes in memory, those of ``environment``,
+    with its ``environment_range`` (steps and offsets), four.
     """
 
     def __init__(self, nodes: Nodes, stored: dict, density_bits: int, index_bits: int):
@@ -243,11 +257,17 @@ class PackedPaletteField(NodeVolume):
         self.packets = entries.shape[1] // 16
         self.palette = device_array(types.UInt32, entries.view("<u4"))
         self.scale, self.offset = ([float(v) for v in stored[name]] for name in ("scale", "offset"))
+        self.environment = None
+        if "environment" in stored:
+            words = np.pad(stored["environment"], ((0, 0), (0, 1))).view("<u4")
+            self.environment = device_array(types.UInt32, words)
+            self.environment_range = [[float(v) for v in values] for values in stored["environment_range"]]
 
     @property
     def nbytes(self) -> int:
         """Bytes in memory, including the index of the nodes."""
-        return 4 * sum(map(dr.width, (self.words, self.palette))) + self.nodes.nbytes
+        words = (self.words, self.palette, *([] if self.environment is None else [self.environment]))
+        return 4 * sum(map(dr.width, words)) + self.nodes.nbytes
 
     def density_at(self, p, active=True):
         UInt32, width, indices = self.types.UInt32, self.density_bits + self.index_bits, []
@@ -277,4 +297,15 @@ class PackedPaletteField(NodeVolume):
                 byte = (words[k // 4] << 15 - 8 * (k % 4)) if k % 4 < 2 else (words[k // 4] >> 8 * (k % 4) - 15)
                 number = dr.reinterpret_array(types.Float, (byte & 0x7F8000) | 0x3F800000)
                 sums[k] = dr.fma(weight, number, sums[k])
-        return colour_of([dr.fma(s - 1, 256 * a, b) for s, a, b in zip(sums, self.scale, self.offset, strict=True)], d)
+        numbers = [dr.fma(s - 1, 256 * a, b) for s, a, b in zip(sums, self.scale, self.offset, strict=True)]
+        radiance = colour_of(numbers, d)
+        if self.environment is None:
+            return radiance
+
+        def entry(number, seen):
+            word = dr.gather(types.UInt32, self.environment, number, seen)
+            scale, offset = self.environment_range
+            return [dr.fma(types.Float((word >> 8 * c) & 255), scale[c], offset[c]) for c in range(3)]
+
+        mirrored = reflection.reflected(types, numbers, d, entry, active)
+        return [a + b for a, b in zip(radiance, mirrored, strict=True)]

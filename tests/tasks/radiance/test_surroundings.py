@@ -196,7 +196,7 @@ def test_exposures(folder, ad):
     stops = [np.array(t.settings["exposures"]) for t in tables]
     assert all(s.shape == (4,) and abs(s.mean()) < 1e-3 and s.std() > 1e-3 for s in stops)
     session = FieldSession.load(ad, folder, background="surroundings", exposures=True)
-    problem = grids.GridProblem(field_fit.grid_of(files.load(folder / "grid.npz"), ad), session)
+    problem = grids.GridProblem(files.grid_of(files.load(folder / "grid.npz"), ad), session)
     direction = np.float32([0.5, -1.0, 0.2, 0.9])
 
     def loss(step, net=None):
@@ -215,7 +215,7 @@ def test_surroundings_in_a_scene(field, tmp_path, mi_rgb):
     """They fill the picture, or are left out; sentences for what does not go together."""
     mi = mi_rgb
     density, colour = (values.numpy() for values in field.arrays.values())
-    save_table(tmp_path / "x.npz", files.grid_table(field.nodes, density + 4, colour))
+    save_table(tmp_path / "x.npz", files.grid_table(grids.NodeGrid(field.nodes, density + 4, colour)))
 
     def integrator(**more):
         return {"type": "neural_field", "filename": str(tmp_path / "x.npz"), **more}
@@ -246,7 +246,7 @@ def test_surroundings_light_a_ball(ad, tmp_path, mi_rgb):
     place = np.abs(np.indices((SIDE,) * 3) - SIDE // 2).max(axis=0) / (SIDE // 4)
     grid = contracted_nodes(ad, np.ones((SIDE,) * 3, bool))
     density = np.append(-9, np.where(place > 1.3, 8.0, -9.0).reshape(-1))
-    save_table(tmp_path / "x.npz", files.grid_table(grid, density, np.zeros((grid.entries, 12))))
+    save_table(tmp_path / "x.npz", files.grid_table(grids.NodeGrid(grid, density, np.zeros((grid.entries, 12)))))
     film = {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgba", "rfilter": {"type": "box"}}
     at, white = mi.ScalarTransform4f().look_at([0.2, -0.1, 0.9], list(CENTRE), [0, 1, 0]), {"type": "diffuse"}
     scene = mi.load_dict({

@@ -164,7 +164,7 @@ def test_the_smallest_size_of_a_psnr(folder, ad, monkeypatch, capsys, psnr, trai
     monkeypatch.setattr(field_fit.FieldFit, "compressed", compressed)
     monkeypatch.setattr(ViewImages, "evaluate", lambda self, field, ssim=False: {"psnr_white_db": 25.0 + 4 * field})
     request = FitRequest("sparse", FitSettings(), ad, progress=False)
-    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     assert field_fit.FieldFit(request, FieldSession.load(ad, folder)).smallest(grid, psnr, False)[2] == kept
     assert tried == trained
     assert ("were not reached" in capsys.readouterr().err) == (psnr == 50)
@@ -204,7 +204,7 @@ def test_same_command_same_file(folder, tmp_path):
 
 
 def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
-    """In the second stage of the grid: the first is not made again, and the result is that of an unbroken run."""
+    """In the trial before the second stage: the first is not made again, and the result is that of an unbroken run."""
     options = {"source": str(folder), "resolution": 24, "batch": 512, "steps": 40, "variant": "llvm_ad_rgb"}
     whole = fit("field", preset="grid", progress=False, **options).table
     stages, ended = [], []
@@ -222,7 +222,7 @@ def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
         fit("field", preset="grid", progress=False, checkpoint=checkpoint, **options)
     stages.clear()
     again = fit("field", preset="grid", progress=False, checkpoint=checkpoint, resume=True, **options).table
-    assert len(stages) == len(field_fit.STAGES) - 1
+    assert len(stages) == 2 + len(field_fit.STAGES) - 1
     assert again.arrays["density"].shape == whole.arrays["density"].shape
     np.testing.assert_array_equal(again.arrays["density"].values, whole.arrays["density"].values)
 
@@ -377,7 +377,7 @@ def test_clusters(rng):
 
 def test_importance_is_what_a_change_costs(folder, ad, rng):
     """Against differences: changes of important and of other nodes change the images as their importance says."""
-    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
     weights, images = rate_distortion.importance(grid, session, 0), session.images
     order, ratios = np.argsort(weights.colour), []
@@ -428,7 +428,7 @@ def test_structural_similarity(rng):
 
 
 def test_divided_grids_are_what_they_were(folder, ad, rng):
-    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     images = ViewImages(ad, load_views(folder, "train"))
     finer = grids.divided(grid, grids.visible(grid, images), 2, wide=1)
     cells = nodes.cells_of(finer.nodes.stored)
@@ -466,7 +466,7 @@ def test_views_without_alpha(tmp_path, capsys):
 
 
 def test_sizes(folder, ad):
-    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     session = FieldSession.load(ad, folder)
     weights = rate_distortion.importance(grid, session, 0)
     for bits in (6, 8):
@@ -497,7 +497,7 @@ def test_ten_thousand_steps_take_no_more_memory(folder, ad):
         gc.collect()
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
 
-    grid = field_fit.grid_of(files.load(folder / "grid.npz"), ad)
+    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     problem = grids.GridProblem(grid, FieldSession.load(ad, folder))
     settings = FitSettings(steps=1000, batch=256, lr=1e-3, measure_every=1000, check_every=100)
     train(problem, settings, progress=False)
