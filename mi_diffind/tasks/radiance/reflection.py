@@ -48,16 +48,26 @@ def environment_at(types, entry, d, sharpness, active=True) -> list:
     """
     place, seen, first = unfolded(d), [types.Float(0)] * 3, 0
     for side, share in zip(SIDES, (sharpness, 1 - sharpness), strict=True):
-        x, y = (dr.clip(dr.fma(0.5 * side, t, 0.5 * side - 0.5), 0, side - 1) for t in place)
-        column, row = (dr.minimum(types.UInt32(dr.detach(t)), side - 2) for t in (x, y))
+        x, y = (dr.clip(dr.fma(0.5 * side, t, 0.5 * side - 0.5), -0.5, side - 0.5) for t in place)
+        column, row = (types.Int32(dr.floor(dr.detach(t))) for t in (x, y))
         x, y = x - types.Float(column), y - types.Float(row)
         for j in (0, 1):
             for i in (0, 1):
-                number = dr.fma(row + j, side, column + (first + i))
+                number = first + _number(column + i, row + j, side)
                 weight = share * (x if i else 1 - x) * (y if j else 1 - y)
                 seen = [dr.fma(weight, value, s) for value, s in zip(entry(number, active), seen, strict=True)]
         first += side**2
     return seen
+
+
+def _number(column, row, side: int):
+    """Return the number of an entry of a square; those beyond a border are the mirrored ones along the same border."""
+    inner = [dr.clip(t, 0, side - 1) for t in (column, row)]
+    column, row = (
+        dr.select(other == kept, t, side - 1 - t)
+        for t, other, kept in ((inner[0], row, inner[1]), (inner[1], column, inner[0]))
+    )
+    return dr.fma(row, side, column)
 
 
 def reflected(types, numbers: list, d, entry, active=True) -> list:
