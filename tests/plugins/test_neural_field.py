@@ -4,6 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from radiance_fields import Bumps, Fog, register
+from scipy.ndimage import gaussian_filter
 
 from mi_diffind import compat, plugins
 
@@ -761,6 +762,29 @@ def test_arrays_of_a_file_can_be_optimised(mi_rgb, fields, file):
     params.update()
     after = render(mi, made, integrator=integrator)
     assert after[..., :3].sum() > 1.3 * before[..., :3].sum() and np.abs(after - before)[..., 3].max() < 1e-6
+
+
+def test_reflections_of_a_file(mi_rgb, fields, file, tmp_path):
+    """They change with the environment, and derivatives reach it, the normals, and the place of the field."""
+    from mi_diffind.tables import save_table
+    from mi_diffind.tasks.radiance import TASK, files, reflection
+
+    mi = mi_rgb
+    rng = np.random.default_rng(8)
+    grid = files.grid_of(files.load(file), compat.module_of(mi.Float)).reflecting()
+    place = grid.nodes.positions() - (np.array(grid.nodes.shape) - 1) / 2
+    grid.colour[1:, reflection.NORMAL] = place / np.maximum(np.linalg.norm(place, axis=1, keepdims=True), 1)
+    grid.colour[:, reflection.TINT] = -0.5
+    for part in np.split(grid.environment, [reflection.SIDES[0] ** 2]):
+        side = int(len(part) ** 0.5)
+        smooth = gaussian_filter(rng.normal(0, 1, (side, side, 4)), (side / 8, side / 8, 0))
+        part += (smooth / smooth.std()).reshape(-1, 4)
+    path = tmp_path / "mirror.npz"
+    save_table(path, files.grid_table(grid, np.float32))
+    register(mi, {"mirror": TASK.open(mi.TensorXf, path, storage="float32").field})
+    found = check(mi, lit(mi, "mirror"), "tables.environment", tolerance=0.02)
+    assert np.abs(found[..., :3]).max() > 0.01
+    check(mi, lit(mi, "mirror"), "tables.colour", step=5e-4, tolerance=0.01)
 
 
 def test_a_damaged_file_is_refused(mi_rgb, file, tmp_path):

@@ -215,7 +215,7 @@ def test_a_mirror_is_fitted_by_reflections(tmp_path, capsys):
 
 @pytest.mark.parametrize(("worth", "chosen"), [(-100, "reflections"), (100, "directions")])
 def test_the_colours_that_show_left_out_views(tmp_path, capsys, monkeypatch, worth, chosen):
-    write_mirror(tmp_path, "train", 16, 0)
+    write_mirror(tmp_path, "train", 24, 0)
     monkeypatch.setattr(fit, "WORTH", worth)
     path = tmp_path / "x.npz"
     options = ["--resolution", "20", "--batch", "512", "--variant", "llvm_ad_rgb", "--steps", "40"]
