@@ -177,8 +177,8 @@ class FieldFit:
         """Return a grid with the colours that the options ask for or, by default, those that show more.
 
         By default, the stage of the request ``trial`` is trained with both colours, by seven eighths of the views.
-        Reflections are chosen if the other views gain :data:`WORTH` decibels. The grid is the trained one then, and its
-        result is returned, too.
+        Reflections are chosen if the other views gain :data:`WORTH` decibels. The grid has finished the stage then, and
+        the result of its training is returned, too.
         """
         if self.colours == "reflections":
             return grid.reflecting(), None
@@ -290,29 +290,29 @@ class FieldFit:
             stage = dataclasses.replace(
                 settings, steps=steps, schedule="cosine" if last else "constant", measure_every=max(1, steps // 2)
             )
+            limited_stage = limited.part(part / sum(later for _, later in STAGES[number:]))
+            chosen = None
             if share == REFLECTING and self.colours != "directions":
-                trial = limited.part(2 * part / (part + sum(later for _, later in STAGES[number:])))
-                grid, result = self.reflecting(grid, dataclasses.replace(trial, settings=stage))
-                if result is not None:
-                    if result.interrupted:
-                        return grid, result
-                    stage = dataclasses.replace(stage, steps=max(1, steps - result.steps))
-            problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
-            checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
-            stage_request = dataclasses.replace(
-                limited.part(part / sum(later for _, later in STAGES[number:])),
-                settings=stage,
-                checkpoint=checkpoint,
-                resume=request.resume and checkpoint is not None and os.path.exists(checkpoint),
-                seconds=None,
-            )
-            finish = functools.partial(self.finish_grid, problem) if last and request.preset == "grid" else None
-            result = stage_request.train(
-                problem, f"grid, {round(nodes * share)}³", finish, self.times, 1 if number else FIRST_STEPS
-            )
-            grid = problem.trained()
-            problem.keep_exposures()
-            del problem, finish
+                grid, chosen = self.reflecting(grid, dataclasses.replace(limited_stage, settings=stage))
+            if chosen is not None:
+                result = chosen
+            else:
+                problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
+                checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
+                stage_request = dataclasses.replace(
+                    limited_stage,
+                    settings=stage,
+                    checkpoint=checkpoint,
+                    resume=request.resume and checkpoint is not None and os.path.exists(checkpoint),
+                    seconds=None,
+                )
+                finish = functools.partial(self.finish_grid, problem) if last and request.preset == "grid" else None
+                result = stage_request.train(
+                    problem, f"grid, {round(nodes * share)}³", finish, self.times, 1 if number else FIRST_STEPS
+                )
+                grid = problem.trained()
+                problem.keep_exposures()
+                del problem, finish
             if result.interrupted or (result.asked_to_stop and not last):
                 return grid, dataclasses.replace(result, interrupted=True)
             if stages_file is not None:
