@@ -4,9 +4,10 @@ Measure grid and field on captures in the format of NeRF's synthetic scenes, whi
     python tests/benchmarks/bench_nerf.py nerf_synthetic/lego nerf_synthetic/chair -o docs/measured/nerf_scenes.json
 
 A scene is called as its folder. Each training is a process of its own: ``mi-diffind fit field FOLDER --preset grid``,
-then ``mi-diffind fit field FOLDER --grid GRID``, with the defaults but for ``--steps`` (of both, for trials) and
-``--bytes`` (one more field for each size). The file grows with each result; rows of the same scene, size of the views
-and method are replaced. Files of fields stay in ``--work``.
+then ``mi-diffind fit field FOLDER --grid GRID``, with the defaults but for ``--steps`` (of both, for trials),
+``--all-cores`` and ``--bytes`` (one more field for each size). The file grows with each result; rows of the same scene,
+size of the views and method are replaced. Files of fields stay in ``--work``; with the same folder, an interrupted run
+goes on behind the last finished training.
 """
 
 import argparse
@@ -41,9 +42,10 @@ def timed(command: list[str]) -> dict:
 
 def training(folder: str, output: Path, options: list[str]) -> dict:
     """Fit a field to a folder, and return its figures."""
-    report = output.with_suffix(".json")
-    cost = timed(["fit", "field", folder, "-o", str(output), "--json", str(report), *options])
-    fitted = json.loads(report.read_text(encoding="utf-8"))
+    report, costs = output.with_suffix(".json"), output.with_suffix(".cost.json")
+    if not costs.is_file():
+        write_json(costs, timed(["fit", "field", folder, "-o", str(output), "--json", str(report), *options]))
+    cost, fitted = (json.loads(file.read_text(encoding="utf-8")) for file in (costs, report))
     return {
         **fitted["measured"], **cost, "file_bytes": output.stat().st_size, "memory_bytes": fitted["memory_bytes"],
         "options": [o for o in options if not o.endswith(".npz")],
@@ -61,6 +63,9 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", metavar="FOLDER")
     parser.add_argument("-o", "--output", required=True, metavar="FILE.json")
     parser.add_argument("--steps", type=int, metavar="N", help="steps of each training, for trials")
+    parser.add_argument(
+        "--all-cores", action="store_true", help="train on all cores: results differ in the last digits"
+    )
     parser.add_argument("--bytes", nargs="*", default=[], metavar="N", help="one more field of so many bytes in memory")
     parser.add_argument(
         "--work", metavar="FOLDER", help="folder for the files of the fields (default: a temporary one)"
@@ -71,6 +76,7 @@ def main() -> None:
     described = machine("llvm_ad_rgb")
     quoted = {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
     steps = [] if arguments.steps is None else ["--steps", str(arguments.steps)]
+    steps += ["--all-cores"] if arguments.all_cores else []
     work = Path(arguments.work or tempfile.mkdtemp())
     work.mkdir(parents=True, exist_ok=True)
     for folder in arguments.folders:
