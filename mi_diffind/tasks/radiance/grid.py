@@ -42,7 +42,6 @@ EMPTY, NORMAL_BLUR = -6.0, 1.5
 #: Largest weight in a ray below which a cell is removed.
 VISIBLE = 0.02
 
-
 #: Arrays of a grid.
 NAMES = ("density", "colour", "environment")
 
