@@ -185,11 +185,11 @@ def check_colours(table: Table) -> None:
     if colours not in allowed:
         raise TableError(f"{table.path}: is damaged: found the colours {colours!r}, allowed are {', '.join(allowed)}")
     numbers = table.arrays.get("colour", table.arrays.get("palette"))
-    found = (None if environment is None else environment.shape, None if numbers is None else numbers.shape[-1])
+    shape, columns = environment and environment.shape, numbers and numbers.shape[-1]
     expected = ((ENTRIES, 3), COLUMNS) if colours == "reflections" else (None, DIRECTIONS)
-    if table.settings["layout"] != "pairs" and found != expected:
+    if table.settings["layout"] != "pairs" and (shape, columns) != expected:
         raise TableError(
-            f"{table.path}: is damaged: found an environment of the shape {found[0]} and {found[1]} numbers of a "
+            f"{table.path}: is damaged: found an environment of the shape {shape} and {columns} numbers of a "
             f'colour, the colours "{colours}" have {expected[0]} and {expected[1]}'
         )
 
