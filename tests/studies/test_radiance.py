@@ -268,7 +268,7 @@ def finished(tmp_path_factory):
 
 def command(folder, *more):
     left_out = [x for kind in plans.KINDS if kind not in MADE for x in ("--without", kind)]
-    sizes = ["--quick", "--compression", "60", "--resolution", "16", "--steps", "10"]
+    sizes = ["--quick", "--compression", "120", "--resolution", "16", "--steps", "10"]
     return ["tradeoff", "field", str(folder / "balls"), *sizes, *left_out, "--out", str(folder / "out"),
             "--variant", "llvm_ad_rgb", *more]  # fmt: skip
 
@@ -276,7 +276,7 @@ def command(folder, *more):
 def test_what_is_written(finished):
     result = json.loads((finished / "r.json").read_text(encoding="utf-8"))
     made = {n: c for n, c in result["candidates"].items() if not c["is_reference"]}
-    assert set(made) == {"sparse grid, 8 bits 60×", "ours 60×"}
+    assert set(made) == {"sparse grid, 8 bits 120×", "ours 120×"}
     assert set(result["candidates"]) - set(made) == {"grid", "grid, trained on"}
     for name, c in result["candidates"].items():
         e = c["errors"]
@@ -285,27 +285,27 @@ def test_what_is_written(finished):
         d = c["details"]
         assert c["bytes"] == d["memory_bytes" if name.startswith("ours") else "file_bytes"]
         assert d.get("coarser", 2) > 1
-        assert 0.1 * d["dense_bytes"] / 60 < c["bytes"] <= 1.02 * d["dense_bytes"] / 60, name
+        assert 0.1 * d["dense_bytes"] / 120 < c["bytes"] <= 1.02 * d["dense_bytes"] / 120, name
     assert set(result["cases"]["reads"]["queries"]) == {"density", "both"}
     assert set(result["cases"]["reads"]["passes"]["render"]) == {"grid", *made}
     out = finished / "out"
     assert (out / "tradeoff_field_views.png").stat().st_size > 20_000
     assert len(list((out / "tradeoff_field_models").glob("*.npz"))) == 4
-    assert result["conclusions"][0].startswith("60×: ours is ")
+    assert result["conclusions"][0].startswith("120×: ours is ")
 
 
 def test_what_was_made_is_known(finished):
     result = json.loads((finished / "r.json").read_text(encoding="utf-8"))
     without = tuple(k for k in plans.KINDS if k not in MADE)
     source = str(finished / "balls")
-    plan = plans.plan(FieldSession.load(T, source), source, plans.RadianceStudySettings((60.0,), without))
+    plan = plans.plan(FieldSession.load(T, source), source, plans.RadianceStudySettings((120.0,), without))
     assert [job.name for job in plan.jobs] == list(result["jobs"])
     models = finished / "out" / "tradeoff_field_models"
     for job in plan.jobs:
         record = result["jobs"][job.name]
         assert job.cached_record(models, None) is None and job.cached_record(None, record) is None
         assert job.cached_record(models, record) == record
-    for name in ("sparse grid, 8 bits 60×", "grid, trained on"):
+    for name in ("sparse grid, 8 bits 120×", "grid, trained on"):
         job = next(job for job in plan.jobs if job.name == name)
         found = job.context.errors(job.model)
         assert found == pytest.approx(result["candidates"][name]["errors"], abs=0.01)

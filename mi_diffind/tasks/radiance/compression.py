@@ -18,7 +18,7 @@ from ...indirection import device_array, device_tensor, fold
 from . import grid as grids
 from . import node_codes
 from .grid import NodeGrid
-from .nodes import Nodes
+from .nodes import Nodes, cells_of, corners_of
 from .rate_distortion import Importance, chosen_index, chosen_levels
 from .session import FieldSession, ViewImages
 from .training import ImagesProblem
@@ -180,10 +180,12 @@ def coding_in(
 def trial_part(grid: NodeGrid, importance: Importance) -> tuple[NodeGrid, Importance]:
     """Return planes of a grid with about :data:`TRIAL_NODES` nodes, and their importance."""
     every = max(1, grid.nodes.count // TRIAL_NODES)
-    planes = np.arange(grid.nodes.shape[0]) // PLANES % every == 0
-    here = planes[np.nonzero(grid.nodes.stored)[0]]
     nodes = grid.nodes
-    part = nodes.like(nodes.spacing, nodes.shape, nodes.stored & planes[:, None, None])
+    planes = np.arange(nodes.shape[0]) // PLANES % every == 0
+    # Nodes of cells that other planes cut are left out: a file holds corners of whole cells
+    stored = corners_of(cells_of(nodes.stored & planes[:, None, None]))
+    here = stored[nodes.stored]
+    part = nodes.like(nodes.spacing, nodes.shape, stored)
     entries = np.concatenate([[True], here])
     weights = Importance(importance.density[here], importance.colour[here], importance.metric, importance.loss)
     return NodeGrid(part, grid.density[entries], grid.colour[entries], grid.environment), weights

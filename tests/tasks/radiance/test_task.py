@@ -151,6 +151,18 @@ def test_bytes_of_the_file_are_kept(folder, tmp_path):
     assert sizes[1] > 1.2 * sizes[0]
 
 
+def test_a_trial_with_a_part_of_the_nodes_can_be_coded(folder, ad, monkeypatch):
+    monkeypatch.setattr(compression, "TRIAL_NODES", 300)
+    monkeypatch.setattr(compression, "PLANES", 3)
+    grid = files.grid_of(files.load(folder / "grid.npz"), ad)
+    rows = np.arange(1.0, grid.nodes.count + 1)
+    part, weights = compression.trial_part(grid, rate_distortion.Importance(rows, rows, np.ones(12), 1.0))
+    assert 0 < part.nodes.count < 0.7 * grid.nodes.count
+    assert len(part.density) == part.nodes.entries == len(weights.density) + 1 == len(weights.colour) + 1
+    np.testing.assert_array_equal(part.density[1:], grid.density[1:][weights.density.astype(int) - 1])
+    assert (nodes.corners_of(nodes.cells_of(part.nodes.stored)) == part.nodes.stored).all()
+
+
 @pytest.mark.parametrize(("psnr", "trained", "kept"), [(30, [2, 1], 2), (20, [2, 1, 0], 0), (50, [2, 3], 3)])
 def test_the_smallest_size_of_a_psnr(folder, ad, monkeypatch, capsys, psnr, trained, kept):
     """Bisection among four sizes, whose field is their number here."""
