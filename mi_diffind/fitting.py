@@ -226,7 +226,7 @@ def fit(
         return clock.share() if trainer.step >= least else min(clock.share(), 0.999)
 
     trainer.share = share()
-    good = trainer.snapshot(all_moments=False)
+    good = trainer.earlier()
     bar = _Bar(settings.steps, seconds, title, progress)
     planned = min(MEASUREMENTS, max(1, settings.steps // settings.measure_every))  # with a limit of time
     bar.show(trainer)
@@ -248,7 +248,7 @@ def fit(
         while trainer.share < 1 and not stop.is_set():
             # A snapshot of tables that are written in place is a copy
             kept = not problem.sparse or (trainer.step + 1) % settings.check_every == 0
-            before, share_before = trainer.snapshot(all_moments=False) if kept else good, trainer.share
+            before, share_before = trainer.earlier() if kept else good, trainer.share
             loss = trainer.take_step(plateau.factor)
             if seconds is not None:
                 dr.eval(loss)
@@ -460,6 +460,14 @@ class _Trainer:
             if all_moments or not self.problem.sparse:
                 moments[key] = tuple(moment)
         return _State(self.step, self.lr_scale, parameters, moments)
+
+    def earlier(self) -> _State:
+        """Return the state to which a training that diverges returns: copies of large tables in half precision."""
+        state = self.snapshot(all_moments=False)
+        if self.problem.sparse:
+            state.parameters = {key: self.module.TensorXf16(value) for key, value in state.parameters.items()}
+            dr.eval(state.parameters)
+        return state
 
     def restore(self, state: _State) -> None:
         self.step, self.lr_scale = state.step, state.lr_scale

@@ -140,7 +140,8 @@ class RadianceStudyContext:
     def visible(self, trained: NodeField, least: float = 1.0) -> fits.WeightedGrid:
         """Return a grid without the cells whose largest weight in a ray is below ``least`` · :data:`.grid.VISIBLE`."""
         grid = fits.WeightedGrid.of(trained, fits.visibility(trained, self.session.images))
-        return grid.kept(grids.weights(trained, self.session.images) >= least * grids.VISIBLE)
+        seen = grids.weights(trained, self.session.images) >= least * grids.VISIBLE
+        return grid.kept(trained.nodes.cells_where(seen))
 
     @functools.cached_property
     def dense_bytes(self) -> int:

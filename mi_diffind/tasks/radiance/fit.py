@@ -57,6 +57,9 @@ FIRST_STEPS = 100
 #: Views that a trial of colours needs, and the gain in decibels at which reflections are chosen.
 LEAST_VIEWS, WORTH = 16, 0.15
 
+#: Most steps of each colour in a trial.
+TRIAL = 600
+
 #: Pixels of held-out views that are measured, and of training views in which visible cells are sought, for each second
 #: of a limited time.
 PIXELS = 40_000
@@ -176,9 +179,9 @@ class FieldFit:
     def reflecting(self, grid: NodeGrid, trial: FitRequest) -> tuple[NodeGrid, FitResult | None]:
         """Return a grid with the colours that the options ask for or, by default, those that show more.
 
-        By default, the stage of the request ``trial`` is trained with both colours, by seven eighths of the views.
-        Reflections are chosen if the other views gain :data:`WORTH` decibels. The grid has finished the stage then, and
-        the result of its training is returned, too.
+        By default, both colours are trained as the request ``trial`` says, by seven eighths of the views. Reflections
+        are chosen if the other views gain :data:`WORTH` decibels. The result of the training of the returned grid is
+        returned, too.
         """
         if self.colours == "reflections":
             return grid.reflecting(), None
@@ -291,17 +294,20 @@ class FieldFit:
                 settings, steps=steps, schedule="cosine" if last else "constant", measure_every=max(1, steps // 2)
             )
             limited_stage = limited.part(part / sum(later for _, later in STAGES[number:]))
-            chosen = None
+            rest = steps
             if share == REFLECTING and self.colours != "directions":
-                grid, chosen = self.reflecting(grid, dataclasses.replace(limited_stage, settings=stage))
-            if chosen is not None:
-                result = chosen
-            else:
+                tried = dataclasses.replace(stage, steps=min(steps, TRIAL))
+                grid, chosen = self.reflecting(grid, dataclasses.replace(limited_stage, settings=tried))
+                if chosen is not None:
+                    result = chosen
+                    over = chosen.interrupted or chosen.asked_to_stop or limited.deadline is not None
+                    rest = 0 if over else steps - chosen.steps
+            if rest:
                 problem, grid = grids.GridProblem(grid, self.session, SIDE if last else 1), None
                 checkpoint = f"{request.checkpoint}.stage{number}" if request.checkpoint else None
                 stage_request = dataclasses.replace(
                     limited_stage,
-                    settings=stage,
+                    settings=dataclasses.replace(stage, steps=rest),
                     checkpoint=checkpoint,
                     resume=request.resume and checkpoint is not None and os.path.exists(checkpoint),
                     seconds=None,

@@ -36,6 +36,9 @@ SMOOTH, ROUND, VARIED = 5e-5, 1e-2, 2**13
 #: The same of the slopes of colours by direction.
 SMOOTH_DIRECTIONS, ROUND_DIRECTIONS = 5e-5, 1e-3
 
+#: Sums of the gradients of few entries: atomic ones, since copies of a whole table would cost more.
+FEW = dr.ReduceMode.Direct
+
 #: Raw density of empty space, and the blur in nodes, for the normals before reflections are trained.
 EMPTY, NORMAL_BLUR = -6.0, 1.5
 
@@ -112,12 +115,13 @@ class GridProblem(ImagesProblem):
         density = net["density"].array
         node = types.UInt32(rng.random(types.TensorXf, (VARIED,)).array * types.Float(self.count))
         node = dr.minimum(node, self.count - 1)
-        here, colours = dr.gather(types.Float, density, node + 1) * DENSITY_SCALE, self.directional(net, node + 1)
+        here = dr.gather(types.Float, density, node + 1, mode=FEW) * DENSITY_SCALE
+        colours = self.directional(net, node + 1)
         smooth = SMOOTH if self.nodes.contraction is None else surroundings.SMOOTH
         total = types.Float(0)
         for axis in range(3):
             other = dr.gather(types.UInt32, self.neighbours, node * 3 + axis)
-            step = here - dr.gather(types.Float, density, other) * DENSITY_SCALE
+            step = here - dr.gather(types.Float, density, other, mode=FEW) * DENSITY_SCALE
             variation = smooth * dr.sqrt(dr.square(step) + ROUND)
             for a, b in zip(colours, self.directional(net, other), strict=True):
                 variation += SMOOTH_DIRECTIONS * dr.sqrt(dr.square(a - b) + ROUND_DIRECTIONS)
@@ -128,7 +132,8 @@ class GridProblem(ImagesProblem):
         """Return the slopes b of :func:`.volume_field.colour_of` at nodes."""
         colour = net["colour"].array
         packets = net["colour"].shape[1] // 4
-        fours = (dr.gather(self.nodes.types.Array4f, colour, dr.fma(number, packets, k)) for k in range(3))
+        Array4f = self.nodes.types.Array4f
+        fours = (dr.gather(Array4f, colour, dr.fma(number, packets, k), mode=FEW) for k in range(3))
         return [value for four in fours for value in list(four)[1:]]
 
     def trained(self) -> NodeGrid:
@@ -181,9 +186,9 @@ def _nearly_empty(nodes: Nodes, density: float = BEGIN_DENSITY) -> NodeGrid:
 
 
 def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
-    """Return the largest weight (transmittance × opacity) of each cell in a ray: ``(X − 1, Y − 1, Z − 1)``."""
+    """Return the largest weight (transmittance × opacity) of each cell in a ray: that of its first corner's entry."""
     nodes, types, views = field.nodes, field.types, images.views
-    largest = dr.zeros(types.Float, int(np.prod(nodes.shape)))
+    largest = dr.zeros(types.Float, nodes.entries)
     # One ray for each voxel, where that is wider than a pixel; voxels of surroundings are narrower from afar
     middle = (np.array(nodes.lower) + nodes.upper) / 2
     every = max(1, int(nodes.spacing / pixel_width(views, middle))) if nodes.contraction is None else 1
@@ -193,7 +198,7 @@ def weights(field: NodeVolume, images: ViewImages) -> np.ndarray:
         place = dr.opaque(types.UInt32, view), column, row
         visibility(field, *images.rays(*place), images.near, dr.inf, images.counted(*place), largest)
         dr.eval(largest)
-    return largest.numpy().reshape(nodes.shape)[:-1, :-1, :-1]
+    return largest.numpy()
 
 
 def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
@@ -203,7 +208,7 @@ def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
     """
     largest = weights(grid.field(), images)
     least = VISIBLE if grid.nodes.contraction is None else surroundings.VISIBLE
-    return (largest > 0) & (largest >= min(least, 0.5 * float(largest.max())))
+    return grid.nodes.cells_where((largest > 0) & (largest >= min(least, 0.5 * float(largest.max()))))
 
 
 def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 0) -> NodeGrid:
@@ -211,6 +216,8 @@ def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 
 
     ``wide`` cells of the given grid around them are kept, too.
     """
+    if factor == 1 and not wide:
+        return kept(grid, cells)
     nodes = grid.nodes
     if wide:
         cells = binary_dilation(cells, np.ones((3, 3, 3), bool), wide)
@@ -225,12 +232,19 @@ def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 
     fine = nodes.like(spacing, shape, corners_of(cells[np.ix_(*middle)]))
     at = fine.positions().T / factor
 
-    def sampled(values, begin: float):
+    empty = [BEGIN_DENSITY, *(BEGIN_COLOUR if c in (0, 4, 8) else 0 for c in range(grid.colour.shape[1]))]
+    numbers = np.empty((fine.entries, len(empty)), np.float32)
+    for values, column, begin in zip(numbers.T, (grid.density, *grid.colour.T), empty, strict=True):
         dense = np.full(nodes.shape, begin, np.float32)
-        dense[nodes.stored] = values[1:]
-        interpolated = map_coordinates(dense, at, order=1, mode="nearest", prefilter=False)
-        return np.concatenate([[begin], interpolated]).astype(np.float32)
+        dense[nodes.stored] = column[1:]
+        values[0] = begin
+        values[1:] = map_coordinates(dense, at, order=1, mode="nearest", prefilter=False)
+    return NodeGrid(fine, numbers[:, 0].copy(), numbers[:, 1:].copy(), grid.environment)
 
-    empty = [BEGIN_COLOUR if c in (0, 4, 8) else 0 for c in range(grid.colour.shape[1])]
-    colour = [sampled(column, begin) for column, begin in zip(grid.colour.T, empty, strict=True)]
-    return NodeGrid(fine, sampled(grid.density, BEGIN_DENSITY), np.stack(colour, axis=1), grid.environment)
+
+def kept(grid: NodeGrid, cells: np.ndarray) -> NodeGrid:
+    """Return the grid reduced to those of its ``cells`` that are marked."""
+    stored = corners_of(cells & cells_of(grid.nodes.stored))
+    entries = np.concatenate([[True], stored[grid.nodes.stored]])
+    nodes = grid.nodes.like(grid.nodes.spacing, grid.nodes.shape, stored)
+    return NodeGrid(nodes, grid.density[entries], grid.colour[entries], grid.environment)

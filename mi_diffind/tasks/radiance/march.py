@@ -254,8 +254,8 @@ def _attached(field, o, d, near, far, active) -> tuple:
 def visibility(field, o, d, near, far, active, target) -> None:
     """Raise ``target`` to the largest weight that each cell of ``field.nodes`` has in one of these rays.
 
-    The weight of a step is its transmittance times its opacity. ``target`` has an entry for each node of the grid; that
-    of a cell is at its first corner.
+    The weight of a step is its transmittance times its opacity. ``target`` has the entries of the nodes; that of a cell
+    is the one of its first corner.
     """
     types = field.types
     with dr.suspend_grad():
@@ -270,7 +270,7 @@ def visibility(field, o, d, near, far, active, target) -> None:
             p = dr.fma(d, steps.of_steps(dr.fma(0.5, end - t, t)), o)
             density, _ = field.density_at(p, here)
             passed = through * dr.exp(-density * (steps.of_steps(end) - steps.of_steps(t)))
-            dr.scatter_reduce(dr.ReduceOp.Max, target, through - passed, field.nodes.cell(p), here)
+            dr.scatter_reduce(dr.ReduceOp.Max, target, through - passed, field.nodes.cell(p, here), here)
             through = dr.select(here, passed, through)
             t += step
             active &= here & (t < far) & (through > OPAQUE)

@@ -97,10 +97,20 @@ class Nodes:
             cell.append(self.types.UInt32(i))
         return cell, fraction
 
-    def cell(self, p):
-        """Return the cell that holds ``p``: the lexicographic index of its first corner in the grid."""
+    def cell(self, p, active=True):
+        """Return the number of the first corner of the cell that holds ``p``; 0 if the cell of a sparse grid is empty."""
         (x, y, z), _ = self._place(p)
-        return dr.fma(dr.fma(x, self._sides.y, y), self._sides.z, z)
+        at = dr.fma(dr.fma(x, self._sides.y, y), self._sides.z, z)
+        return at if self.stored is None else dr.gather(self.types.UInt32, self.index, at, active)
+
+    def cells_where(self, chosen: np.ndarray) -> np.ndarray:
+        """Return the cells ``(X − 1, Y − 1, Z − 1)`` whose first corners are ``chosen``, bool for each entry."""
+        if self.stored is None:
+            cells = chosen.reshape(self.shape)
+        else:
+            cells = np.zeros(self.shape, bool)
+            cells[self.stored] = chosen[1:]
+        return cells[:-1, :-1, :-1]
 
     def corners(self, p, active=True) -> tuple[list, object]:
         """Return eight pairs (weight, node number) of the cell that holds ``p``, and whether that cell is occupied.

@@ -16,7 +16,7 @@ VOXELS_PER_PIXEL, RESOLUTIONS = 1.25, (32, 352)
 STAGES = ((0.25, 0.08), (0.5, 0.12), (1.0, 0.15), (1.0, 0.65))
 
 #: Most steps that follow from the pixels of the views.
-MOST_STEPS = 12_000
+MOST_STEPS = 11_000
 
 #: Ratio ρ of the sides of primary and cascaded array by compression (Table 6 of the supplement).
 RATIOS = {
