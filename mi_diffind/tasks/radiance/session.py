@@ -59,7 +59,10 @@ class ViewImages:
 
         They share the memory of the views on the CPU.
         """
-        pixels, types = self.views.pixels, self.types
+        views, types = self.views, self.types
+        if views.packed is not None:
+            raise ValueError("the pixels of compressed views are not on the device")
+        pixels = views.pixels
         if pixels.shape[1] == 1:
             return types.UInt32(pixels.reshape(-1))
         return types.Float16(pixels.view(np.float16).reshape(-1))
@@ -226,7 +229,9 @@ class FieldSession:
         most = None if pixels is None else max(2, round(pixels / views.mean_pixels))
         reading["background"] = views.background or "scene"
         stops = np.zeros(len(views), np.float32) if exposures else None
-        return FieldSession(types, views, *load_held_out(folder, most, **reading), pixels, stops)
+        held_out, has_test_views = load_held_out(folder, most, **reading)
+        # Of these, one is looked at at a time
+        return FieldSession(types, views, held_out.compressed(), has_test_views, pixels, stops)
 
     @functools.cached_property
     def images(self) -> ViewImages:

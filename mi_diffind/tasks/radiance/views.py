@@ -13,6 +13,7 @@ import functools
 import hashlib
 import json
 import os
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +26,9 @@ from .colmap import colmap_frames, model_folder
 from .image_files import ViewsError, decoded, half_floats, image_file, is_linear, read_image, read_mask, reduced
 from .lenses import DISTORTION, undistorted
 from .transforms import SPLITS, Frame, FrameList, listed_frames
+
+#: Level of zlib for images that are kept compressed: the fastest.
+PACKING = 1
 
 #: Longest side in pixels of images that are not reduced.
 LONGEST = 1600
@@ -74,6 +78,8 @@ class CapturedViews:
     settings: dict = dataclasses.field(default_factory=dict)
     #: Whether fields have surroundings (:mod:`.surroundings`) instead of a box around everything.
     surroundings: bool = False
+    #: Images of :meth:`compressed` views, by zlib; ``pixels`` is empty then.
+    packed: tuple[bytes, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -83,13 +89,22 @@ class CapturedViews:
         return dataclasses.replace(
             self, offsets=self.offsets[numbers], sizes=self.sizes[numbers], poses=self.poses[numbers],
             focal=self.focal[numbers], centre=self.centre[numbers], names=tuple(self.names[i] for i in numbers),
+            packed=None if self.packed is None else tuple(self.packed[i] for i in numbers),
         )  # fmt: skip
 
+    def compressed(self) -> CapturedViews:
+        """Return the same views with compressed images, which are decoded one at a time."""
+        packed = tuple(zlib.compress(self.stored(view), PACKING) for view in range(len(self)))
+        return dataclasses.replace(self, pixels=self.pixels[:0].copy(), packed=packed)
+
     def stored(self, view: int) -> np.ndarray:
-        """Return the image of a view ``(height, width, 4)`` as it is kept: uint8 or float16, not a copy."""
+        """Return the image of a view ``(height, width, 4)``: uint8 or float16, not a copy unless it is compressed."""
         height, width = self.sizes[view]
+        entry = np.uint8 if self.pixels.shape[1] == 1 else np.float16
+        if self.packed is not None:
+            return np.frombuffer(zlib.decompress(self.packed[view]), entry).reshape(height, width, 4)
         words = self.pixels[self.offsets[view] : self.offsets[view] + height * width]
-        return words.view(np.uint8 if words.shape[1] == 1 else np.float16).reshape(height, width, 4)
+        return words.view(entry).reshape(height, width, 4)
 
     def image(self, view: int) -> np.ndarray:
         """Return the image of a view ``(height, width, 4)``, float32: linear, multiplied by alpha, and alpha."""

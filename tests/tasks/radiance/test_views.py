@@ -24,6 +24,26 @@ def test_few_views_of_many_are_evenly_spread(blender):
     assert load_views(blender, most=9).digest == load_views(blender).digest
 
 
+@pytest.mark.parametrize("suffix", ["png", "exr"])
+def test_compressed_views_are_the_same(blender, suffix):
+    """Of all views and of some of them, whatever the pixels are."""
+    if suffix == "exr":
+        image = np.random.default_rng(0).uniform(size=(*SIZE, 4)).astype(np.float32)
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGBA": image}).write(str(blender / "train/r_1.exr"))
+        listed = json.loads((blender / "transforms_train.json").read_text())["frames"]
+        listed[1]["file_path"] = "./train/r_1.exr"
+        change(blender, "transforms_train.json", frames=listed)
+    views = load_views(blender)
+    packed = views.compressed()
+    assert packed.digest == views.digest and packed.pixels.size == 0
+    numbers = np.array([3, 1])
+    for a, b in zip(packed.chosen(numbers).names, numbers, strict=True):
+        assert a == views.names[b]
+    np.testing.assert_array_equal(packed.chosen(numbers).image(1), views.image(1))
+    with pytest.raises(ValueError, match="compressed"):
+        _ = ViewImages(llvm, packed).pixels
+
+
 def test_a_limit_of_pixels_leaves_out_held_out_views(blender):
     """Two views at least; the views that are trained by are complete."""
     height, width = SIZE
