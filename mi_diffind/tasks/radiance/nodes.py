@@ -98,7 +98,7 @@ class Nodes:
         return cell, fraction
 
     def cell(self, p, active=True):
-        """Return the number of the first corner of the cell that holds ``p``; 0 if the cell of a sparse grid is empty."""
+        """Return the number of the first corner of the cell that holds ``p``; 0 if the cell is empty."""
         (x, y, z), _ = self._place(p)
         at = dr.fma(dr.fma(x, self._sides.y, y), self._sides.z, z)
         return at if self.stored is None else dr.gather(self.types.UInt32, self.index, at, active)
