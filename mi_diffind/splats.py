@@ -1,4 +1,4 @@
-"""3D Gaussians of "3D Gaussian Splatting" (Kerbl et al. 2023): their PLY files, and views of them for a field.
+"""3D Gaussians of "3D Gaussian Splatting" (Kerbl et al. 2023), and views of them for a field.
 
 Mitsuba traces the Gaussians: the shape ``ellipsoidsmesh`` orders them along a ray, and the integrator
 ``volprim_rf_basic`` gives the transmittance and the colour of each. Two things are added to that integrator. It has an
@@ -9,7 +9,6 @@ size, which skips Gaussians of a small scene; here all scenes are traced at one 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import os
 from dataclasses import dataclass
@@ -19,19 +18,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .errors import DiffindError, reason
+from .splat_files import SplatsError, read_gaussians
 from .srgb import to_linear
 from .units import check_memory
-
-#: Names of properties that every Gaussian has.
-NAMES = (
-    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *(f"scale_{i}" for i in range(3)),
-    *(f"rot_{i}" for i in range(4)),
-)
-
-#: Numbers of further coefficients ``f_rest_*``: spherical harmonics of degree 0 to 3.
-REST = (0, 9, 24, 45)
 
 #: Opacity below which a Gaussian is left out: it changes no 8-bit value.
 FAINT = 1 / 255
@@ -54,15 +43,6 @@ PASS, GAUSSIAN = 1 << 21, 4096
 
 #: Default number of samples a pixel.
 SPP = 4
-
-
-class SplatsError(DiffindError, ValueError):
-    """Error for a file that holds no usable Gaussians; the message is one sentence that names the file."""
-
-
-def is_splats(source) -> bool:
-    """Return whether a source is the name of a PLY file."""
-    return isinstance(source, (str, os.PathLike)) and Path(source).suffix.lower() == ".ply"
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,55 +68,9 @@ class Splats:
 
     @staticmethod
     def read(path: str | os.PathLike) -> Splats:
-        """Read a PLY file as the reference implementation writes it, text or binary. Raises :class:`SplatsError`."""
-        from trimesh.exchange.ply import load_ply
-
-        path = Path(path)
-        try:
-            content = path.read_bytes()
-            with path.open("rb") as file:
-                vertices = load_ply(file)["metadata"]["_ply_raw"]["vertex"]["data"]
-            names = vertices.dtype.names if isinstance(vertices, np.ndarray) else tuple(vertices)
-        except OSError as e:
-            raise SplatsError(f"{path}: cannot be read ({e.strerror or reason(e)})") from None
-        except Exception as e:  # the reader has no errors of its own
-            raise SplatsError(f"{path}: is not a PLY file with vertices, or is damaged ({reason(e)})") from None
-        if "packed_position" in names:
-            raise SplatsError(f"{path}: holds compressed Gaussians, an uncompressed PLY file is needed")
-        missing = [name for name in NAMES if name not in names]
-        if missing:
-            raise SplatsError(f"{path}: holds no 3D Gaussians, its vertices lack {', '.join(missing)}")
-        rest = sum(name.startswith("f_rest_") for name in names)
-        if rest not in REST:
-            raise SplatsError(f"{path}: has {rest} properties f_rest_*, allowed are {', '.join(map(str, REST))}")
-
-        def columns(*chosen: str) -> np.ndarray:
-            return np.stack([np.asarray(vertices[name], np.float64).reshape(-1) for name in chosen], axis=-1)
-
-        names = (*NAMES, *(f"f_rest_{i}" for i in range(rest)))
-        for name in names:
-            values = columns(name)
-            wrong = np.isnan(values) if name == "opacity" else ~np.isfinite(values)
-            if wrong.any():
-                raise SplatsError(f"{path}: has {np.count_nonzero(wrong):,} values of {name} that are NaN or infinite")
-        if not len(vertices[names[0]]):
-            raise SplatsError(f"{path}: holds no Gaussians")
-        rotations = columns("rot_1", "rot_2", "rot_3", "rot_0")
-        lengths = np.linalg.norm(rotations, axis=1, keepdims=True)
-        if not lengths.all():
-            raise SplatsError(f"{path}: has {np.count_nonzero(lengths == 0):,} rotations of length 0")
-        colours = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
-        if rest:
-            further = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, rest // 3)
-            colours = np.concatenate([colours, further.swapaxes(1, 2)], axis=1)
-        with np.errstate(over="ignore"):
-            opacities = 1 / (1 + np.exp(-columns("opacity")[:, 0]))
-            scales = np.exp(columns("scale_0", "scale_1", "scale_2"))
-        arrays = (columns("x", "y", "z"), scales, rotations / lengths, opacities, colours)
-        if scales.max() > 1e18 or np.abs(arrays[0]).max() > 1e18:
-            raise SplatsError(f"{path}: has places or scales above 1e18, are the scales logarithms?")
-        arrays = [array.astype(np.float32) for array in arrays]
-        return Splats(path, *arrays, hashlib.sha256(content).hexdigest())
+        """Read a PLY file or SOG (:mod:`.splat_files`). Raises :class:`SplatsError`."""
+        arrays, digest = read_gaussians(path)
+        return Splats(Path(path), digest=digest, **arrays)
 
     def chosen(self, which: np.ndarray) -> Splats:
         """Return some of the Gaussians, by a mask ``(N,)`` or numbers."""

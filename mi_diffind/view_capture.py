@@ -36,6 +36,7 @@ from .plugins.support import footprint
 from .poses import frame_of, pose
 from .progress import progress_bar
 from .runtime import use_variant
+from .splat_files import is_splats
 from .task import FitRequest
 
 #: Samples of the whole image in one pass.
@@ -153,7 +154,7 @@ def capture(
     """Render the views of a ``scene`` into ``folder``, in the variant that is set.
 
     The scene is a file or a dictionary as of ``mi.load_dict``; of a loaded scene, lights could not be hidden. It may
-    also be a PLY file of 3D Gaussians (:mod:`.splats`), of which ``box`` crops a part.
+    also be a file of 3D Gaussians (:mod:`.splat_files`), of which ``box`` crops a part.
     ``given`` are fields of :class:`CaptureSettings`, the options of ``mi-diffind capture`` as keywords: ``views=60``,
     ``resolution=160``, ``path="orbit"``, …; ``defines`` replace the file's ``<default>`` parameters; ``workers``
     processes share the views, or those of the Dask cluster ``scheduler``. The folder is created if its parent exists.
@@ -206,7 +207,7 @@ def capture(
 
 
 def views_of_splats(request: FitRequest) -> Path:
-    """Capture the PLY file of 3D Gaussians that a field is to be fitted to, and return the folder of its views.
+    """Capture the file of 3D Gaussians that a field is to be fitted to, and return the folder of its views.
 
     The folder ``NAME_views`` stands beside the output ``NAME.npz``; views that it holds already are kept. Raises as
     :func:`capture` does.
@@ -254,9 +255,9 @@ def _camera_of(content: bytes) -> tuple[CaptureCamera, dict]:
 
 def _subject(scene, defines: Mapping | None, settings: CaptureSettings) -> SceneSubject | splats.SplatSubject:
     """Return the subject of a capture. Raises :class:`~mi_diffind.errors.UsageError`."""
-    if not splats.is_splats(scene):
+    if not is_splats(scene):
         if settings.box is not None:
-            raise UsageError("box: given with a scene, allowed are PLY files of 3D Gaussians; objects names shapes")
+            raise UsageError("box: given with a scene, allowed are files of 3D Gaussians; objects names shapes")
         return SceneSubject(scene, defines, settings.objects)
     for name, value in (("defines", defines), ("objects", settings.objects)):
         if value:
@@ -309,7 +310,7 @@ def _settings(scene, given: dict) -> CaptureSettings:
     names = ("centre", "elevation", "up", "objects", "box")
     tuples = {name: tuple(given[name]) for name in names if given.get(name) is not None}
     if given.get("spp") is None:
-        tuples["spp"] = splats.SPP if splats.is_splats(scene) else CaptureSettings.spp
+        tuples["spp"] = splats.SPP if is_splats(scene) else CaptureSettings.spp
     settings = CaptureSettings(**{**given, **tuples})
     try:
         settings.check()

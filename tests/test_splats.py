@@ -149,6 +149,120 @@ def test_strays_and_faint_gaussians_are_left_out(tmp_path, rng):
         splats.cropped((50, 0, 0, 60, 1, 1))
 
 
+def sog(folder, g, change=lambda meta, images: None, archive=None):
+    """Write Gaussians as SOG with exact codebooks where the numbers allow it, in a folder or an archive."""
+    import io
+    import zipfile
+
+    from PIL import Image
+
+    def image(values, width):
+        pixels = np.zeros((-(-len(values) // width) * width, 4), np.uint8)
+        pixels[:, 3] = 255
+        pixels[: len(values), : values.shape[1]] = values
+        return pixels.reshape(-1, width, 4)
+
+    logarithms = np.sign(g["centres"]) * np.log1p(np.abs(g["centres"]))
+    low, high = logarithms.min(axis=0), logarithms.max(axis=0)
+    code = np.rint((logarithms - low) / (high - low) * 65535).astype(int)
+    books = {
+        "scales": np.sort(np.log(g["scales"]).ravel()), "sh0": np.sort(g["colours"][:, 0].ravel()),
+        "shN": np.linspace(-2, 2, 256),
+    }  # fmt: skip
+    q = g["quaternions"] / np.linalg.norm(g["quaternions"], axis=1, keepdims=True)
+    largest = np.abs(q).argmax(axis=1)
+    q *= np.sign(q[np.arange(COUNT), largest])[:, None]
+    others = np.stack([np.delete(row, k) for row, k in zip(q, largest, strict=True)])
+    quats = np.column_stack([np.rint(255 * (others * np.sqrt(2) / 2 + 0.5)), 252 + largest])
+    palette = np.rint((g["colours"][:, 1:] + 2) / 4 * 255).clip(0, 255)  # an entry for each Gaussian, in reverse order
+    centroids = np.zeros((1, 64 * 15, 4), np.uint8)
+    centroids[0, : 15 * COUNT, :3] = palette[::-1].reshape(-1, 3)
+    order = np.arange(COUNT)[::-1]
+    images = {
+        "means_l.webp": image(code & 255, 4), "means_u.webp": image(code >> 8, 4), "quats.webp": image(quats, 4),
+        "scales.webp": image(np.searchsorted(books["scales"], np.log(g["scales"])), 4),
+        "sh0.webp": image(
+            np.column_stack([np.searchsorted(books["sh0"], g["colours"][:, 0]), np.rint(255 * g["opacities"])]), 4
+        ),
+        "shN_centroids.webp": centroids, "shN_labels.webp": image(np.column_stack([order, 0 * order]), 4),
+    }  # fmt: skip
+    full = {name: np.pad(book, (0, 256 - len(book))).tolist() for name, book in books.items()}
+    meta = {
+        "version": 2, "count": COUNT, "quats": {"files": ["quats.webp"]},
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": full["scales"], "files": ["scales.webp"]},
+        "sh0": {"codebook": full["sh0"], "files": ["sh0.webp"]},
+        "shN": {
+            "count": COUNT, "bands": 3, "codebook": full["shN"], "files": ["shN_centroids.webp", "shN_labels.webp"]
+        },
+    }  # fmt: skip
+    change(meta, images)
+    files = {"meta.json": json.dumps(meta).encode()}
+    for name, pixels in images.items():
+        stream = io.BytesIO()
+        Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True)
+        files[name] = stream.getvalue()
+    if archive is not None:
+        with zipfile.ZipFile(archive, "w") as zipped:
+            for name, content in files.items():
+                zipped.writestr(name, content)
+        return archive
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return folder / "meta.json"
+
+
+@pytest.mark.parametrize("bundled", [True, False])
+def test_sog_is_read(tmp_path, rng, bundled):
+    """Within its quantisation: places of 16 bits, rotations and opacities of 8."""
+    from mi_diffind.splats import Splats
+
+    g = gaussians(rng)
+    splats = Splats.read(sog(tmp_path, g, archive=tmp_path / "s.sog" if bundled else None))
+    np.testing.assert_allclose(splats.centres, g["centres"], atol=2e-4)
+    np.testing.assert_allclose(splats.scales, g["scales"], rtol=1e-5)
+    np.testing.assert_allclose(splats.opacities, g["opacities"], atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(splats.colours[:, 0], g["colours"][:, 0], rtol=1e-5)
+    np.testing.assert_allclose(splats.colours[:, 1:], g["colours"][:, 1:].clip(-2, 2), atol=2 / 255 + 1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(splats.quaternions).as_matrix(), g["axes"], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m, i: m.update(version=1), "has the SOG version 1, only 2 is read"),
+        (lambda m, i: m.update(count=40), 'image 0 of "means" has 8 pixels for 40 Gaussians'),
+        (lambda m, i: m.update(count=10**9), r'"count" in meta.json is 1000000000, allowed is 0 to 33,554,432'),
+        (lambda m, i: m.update(count=0), "holds no Gaussians"),
+        (lambda m, i: m["means"].update(mins=[0, 1e999, 0]), '"mins" of "means" in meta.json is no list of 3 finite'),
+        (lambda m, i: m["means"].update(files=["../x.webp", "y"]), '"means" in meta.json names no file 0 beside it'),
+        (lambda m, i: m["scales"].update(codebook=[1, "a"]), '"codebook" of "scales" in meta.json is no list of 256'),
+        (lambda m, i: m.pop("sh0"), 'meta.json has no object "sh0"'),
+        (lambda m, i: i.pop("quats.webp"), "holds no file quats.webp"),
+        (lambda m, i: i["quats.webp"].__setitem__((0, 0, 3), 9), "has 1 rotations without a largest component"),
+        (lambda m, i: i["shN_labels.webp"].__setitem__((0, 0, 1), 1), "has the label 261, the palette has 6 colours"),
+        (lambda m, i: m["shN"].update(bands=2), 'the palette of "shN" has 960 x 1 pixels, 6 colours of degree 2'),
+        (lambda m, i: i.update({"sh0.webp": np.zeros((600, 600, 4), np.uint8)}), "has 600 x 600 pixels for 6 items"),
+    ],
+)
+def test_other_sog_files_are_refused(tmp_path, rng, change, message):
+    from mi_diffind.splats import Splats, SplatsError
+
+    with pytest.raises(SplatsError, match=message):
+        Splats.read(sog(tmp_path, gaussians(rng), change, tmp_path / "s.sog"))
+
+
+def test_damaged_archives_are_refused(tmp_path, rng):
+    from mi_diffind.splats import Splats, SplatsError
+
+    path = sog(tmp_path, gaussians(rng), archive=tmp_path / "s.sog")
+    content = path.read_bytes()
+    for damaged in (content[:-40], b"", content[:200], b"PK" + content[9:]):
+        path.write_bytes(damaged)
+        with pytest.raises(SplatsError, match=r"s\.sog: (is not a ZIP archive, or|meta.json) is damaged \("):
+            Splats.read(path)
+
+
 def without(table, *names):
     return {name: values for name, values in table.items() if name not in names}
 

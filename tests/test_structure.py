@@ -22,7 +22,7 @@ FLOORS = (
         "progress",
         "jobs",
     ),
-    ("bits", "bounds", "metrics", "rays", "srgb", "units"),
+    ("bits", "bounds", "metrics", "rays", "splat_files", "srgb", "units"),
     ("lookup",),
     ("indirection", "pages"),
     ("tables",),

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from pathlib import Path
 
 from ... import units
 from ...arguments import Argument, checked, decibels, positive
+from ...splat_files import is_splats
 from ...task import Task
 from .presets import BACKGROUNDS, COLOURS, PRESETS
 
@@ -98,7 +98,7 @@ class RadianceField(Task):
 
     def fit(self, request):
         source = request.options["source"]
-        if Path(source).suffix.lower() == ".ply":
+        if is_splats(source):
             # Captures stand above tasks: asked for by name, as plugins are
             views = importlib.import_module("mi_diffind.view_capture").views_of_splats(request)
             request = dataclasses.replace(request, options={**request.options, "source": views})

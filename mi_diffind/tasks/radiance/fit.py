@@ -18,6 +18,7 @@ from ... import units
 from ...errors import UsageError
 from ...fitting import FitResult, FittingError, cores
 from ...interrupt import interruptible
+from ...splat_files import is_splats
 from ...tables import MAX_BYTES, StoredArray, Table, save_table
 from ...task import FitRequest, Fitted
 from . import compression, files, paper
@@ -70,8 +71,8 @@ def check(request: FitRequest) -> None:
     options = request.options
     if options["source"] is None:
         raise UsageError("source: not given, a folder of views is needed")
-    if options["box"] is not None and Path(options["source"]).suffix.lower() != ".ply":
-        raise UsageError(f"--box: given with {options['source']}, allowed are PLY files of 3D Gaussians")
+    if options["box"] is not None and not is_splats(options["source"]):
+        raise UsageError(f"--box: given with {options['source']}, allowed are files of 3D Gaussians")
     sized = [name for name in ("bytes", "compression", "psnr", "disk") if options.get(name) is not None]
     if request.preset == "grid" and sized:
         raise UsageError(f"--{sized[0]} is an option of the presets sparse and paper, found the preset grid")
