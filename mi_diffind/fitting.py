@@ -7,7 +7,6 @@ step and the number of restarts, so that a run is repeatable and an interrupted 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import math
 import os
@@ -144,13 +143,6 @@ class FitResult:
     history: list[dict] = field(default_factory=list)
     asked_to_stop: bool = False  # by Ctrl-C, which may have come too late to interrupt it
     unfinished: bool = False  # the time was too short
-
-    def after(self, before: FitResult) -> FitResult:
-        """Return the record of a training that continued another one."""
-        history = before.history + [{**figures, "step": before.steps + figures["step"]} for figures in self.history]
-        counts = {name: getattr(before, name) + getattr(self, name) for name in ("steps", "seconds", "restarts")}
-        step = before.steps + self.step
-        return dataclasses.replace(self, history=history, step=step, **counts)
 
     @property
     def outcome(self) -> str:

@@ -6,7 +6,6 @@ that all nodes share.
 
 from __future__ import annotations
 
-import dataclasses
 import zlib
 from dataclasses import dataclass
 
@@ -20,7 +19,7 @@ from . import grid as grids
 from . import node_codes
 from .grid import NodeGrid
 from .nodes import Nodes, cells_of, corners_of
-from .rate_distortion import Importance, chosen_index, chosen_levels, colour_slopes
+from .rate_distortion import Importance, chosen_index, chosen_levels
 from .session import FieldSession, ViewImages
 from .training import ImagesProblem
 from .volume_field import NodeField
@@ -59,10 +58,6 @@ RANGE_INTERVAL = 50
 #: Resolution of the smallest grid, as a share of the full resolution.
 SMALLEST = 0.2
 
-#: Part of a step of Newton's method, node by node, to the colours for which indices are chosen again, since errors of
-#: neighbours add up; and the least importance of a node, as a share of the mean, that the step divides by.
-DAMPING, LEAST_IMPORTANCE = 0.25, 0.1
-
 #: Nodes per cluster that clusters are computed from, and rounds of Lloyd's algorithm.
 SAMPLES, ROUNDS = 60, 8
 
@@ -73,9 +68,8 @@ class PaletteCoding:
 
     ``levels`` ``(n,)`` are densities in [0, 1] between :data:`EMPTIEST` and :data:`DENSEST`; ``index`` ``(n,)``
     (uint32) names a row of ``palette`` ``(P, columns)``. The first entry of both stands for no node. ``weight`` and
-    ``rate`` are those of a squared step of a level and of a bit. ``importance`` and ``index_rate`` are those by which
-    indices are chosen. ``file_bytes`` is the most that the file may have. ``environment`` is that of
-    :class:`.NodeGrid`.
+    ``rate`` are those of a squared step of a level and of a bit. ``file_bytes`` is the most that the file may have.
+    ``environment`` is that of :class:`.NodeGrid`.
     """
 
     nodes: Nodes
@@ -85,8 +79,6 @@ class PaletteCoding:
     passes: list[node_codes.Pass]
     weight: np.ndarray
     rate: float
-    importance: Importance
-    index_rate: float
     file_bytes: float | None = None
     environment: np.ndarray | None = None
 
@@ -150,8 +142,6 @@ def coded_by(grid: NodeGrid, importance: Importance, palette: np.ndarray, rate: 
         passes,
         importance.density * LEVEL_STEP**2,
         LEVEL_SLOPE * rate,
-        importance,
-        rate,
         environment=grid.environment,
     )
     coding.levels = (coding.chosen(levels) / LAST_LEVEL).astype(np.float32)
@@ -269,35 +259,6 @@ class PaletteProblem(ImagesProblem):
         if step % RANGE_INTERVAL == 0:
             self._set_ranges()
         return ""
-
-    def reassigned(self, seed: int, deadline: Deadline | None = None) -> PaletteCoding:
-        """Return the coding with the trained numbers and indices that are chosen again.
-
-        They are chosen for the colours to which the error of the training views falls (:func:`.colour_slopes`).
-        """
-        coding, weights = self.coding, self.coding.importance
-        palette, density = self.net["palette"].numpy(), fold(self.net["density"].array).numpy()
-        metric = np.sqrt(weights.metric)
-        slopes = colour_slopes(self.field_of(self.net), self.session, seed, deadline)
-        curvature = 2 * np.maximum(weights.colour, LEAST_IMPORTANCE * weights.colour.mean())[:, None]
-        points = palette[coding.index[1:]] * metric - DAMPING * slopes / metric / curvature
-        centres, index = chosen_index(
-            coding.passes,
-            points,
-            weights.colour,
-            palette * metric,
-            coding.index_rate,
-            coding.index[1:].astype(np.int64),
-        )
-        used, index = np.unique(index, return_inverse=True)
-        environment = self.net["environment"].numpy() if "environment" in self.net else None
-        return dataclasses.replace(
-            coding,
-            levels=density,
-            index=np.concatenate([[0], index]).astype(np.uint32),
-            palette=(centres[used] / metric).astype(np.float32),
-            environment=environment,
-        )
 
     def _set_ranges(self) -> None:
         names, Float = [name for name in ("palette", "environment") if name in self.net], self.session.types.Float

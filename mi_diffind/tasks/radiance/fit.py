@@ -61,9 +61,6 @@ LEAST_VIEWS, WORTH = 16, 0.15
 #: Most steps of each colour in a trial.
 TRIAL = 600
 
-#: Share of the steps of a compressed field after which indices are chosen again, and the least steps for that.
-REASSIGNED, LEAST_REASSIGNED = 0.4, 500
-
 #: Pixels of held-out views that are measured, and of training views in which visible cells are sought, for each second
 #: of a limited time.
 PIXELS = 40_000
@@ -374,7 +371,7 @@ class FieldFit:
             path, resume = f"{request.checkpoint}{suffix}", request.resume
             if resume and not os.path.exists(path):
                 # The interrupted part may have been the grid, or a smaller size
-                before = [f"{request.checkpoint}.{name}" for name in ("stage0", "grid.npz", "begin")]
+                before = [f"{request.checkpoint}.{name}" for name in ("stage0", "grid.npz")]
                 resume = not suffix and not any(map(os.path.exists, before))
             request = dataclasses.replace(request, checkpoint=path, resume=resume)
         return request.train(problem, "through the images", finish, self.times)
@@ -408,37 +405,16 @@ class FieldFit:
 
     def coded(self, coding: compression.PaletteCoding, stopped: bool, suffix: str = ""):
         """Train a coding; return the table, the result and the field."""
-        problem, before, last = compression.PaletteProblem(coding, self.session), None, self
-        if not stopped and self.request.settings.steps >= LEAST_REASSIGNED:
-            first, last = self.stages(REASSIGNED)
-            before = first.train(problem, False, None, f"{suffix}.begin")
-            problem.keep_exposures()
-            stopped = before.interrupted
-            if not stopped:
-                limit = last.request.part(CLUSTER_TIME).deadline
-                problem = compression.PaletteProblem(
-                    problem.reassigned(first.request.settings.seed, limit), self.session
-                )
+        problem = compression.PaletteProblem(coding, self.session)
 
         def stored() -> tuple[Table, VolumeField]:
             table = files.palette_table(coding.nodes, problem.stored())
             return table, files.field_of(table, self.request.types)
 
-        result = last.train(problem, stopped, lambda: self.session.watched_images.evaluate(stored()[1]), suffix)
-        if before is not None:
-            result = result.after(before)
+        result = self.train(problem, stopped, lambda: self.session.watched_images.evaluate(stored()[1]), suffix)
         problem.keep_exposures()
         table, field = stored()
         return table, result, field
-
-    def stages(self, share: float) -> tuple[FieldFit, FieldFit]:
-        """Return two runs that take a ``share`` of the steps, at a constant rate, and the rest of them."""
-        request = self.request
-        steps = round(share * request.settings.steps)
-        begin = dataclasses.replace(request.settings, steps=steps, schedule="constant", measure_every=steps)
-        rest = dataclasses.replace(request.settings, steps=request.settings.steps - steps)
-        parts = (dataclasses.replace(request.part(share), settings=begin), dataclasses.replace(request, settings=rest))
-        return tuple(dataclasses.replace(self, request=part) for part in parts)
 
     def in_file(self, grid: NodeGrid, nbytes: int, stopped: bool):
         """Compress a grid to a file of at most ``nbytes``, at the highest resolution that allows it."""

@@ -51,12 +51,13 @@ class Importance:
 
 def importance(grid: NodeGrid, session: FieldSession, seed: int, deadline: Deadline | None = None) -> Importance:
     """Return the importance of the nodes of a grid in the training views; at the deadline, from fewer rays."""
-    types, images = session.types, session.images
+    types, images, views = session.types, session.images, session.views
     net = grid.tensors()
     environment = net.pop("environment", None)
     squares = [dr.zeros(types.Float, v.size) for v in (grid.density, grid.colour)]
+    batches = max(LEAST, round(RAYS_PER_PIXEL * len(views) * views.mean_pixels / RAYS))
     loss, count = 0.0, 0
-    for batch in range(batches_of(session)):
+    for batch in range(batches):
         if deadline is not None and deadline.passed and count:
             break
         rng = dr.rng((seed << 32) + batch)
@@ -83,48 +84,6 @@ def importance(grid: NodeGrid, session: FieldSession, seed: int, deadline: Deadl
     colour = colour.reshape(grid.colour.shape)[1:]
     metric = np.maximum(colour.mean(axis=0), 1e-30)
     return Importance(density[1:], (colour / metric).mean(axis=1), metric, loss / (3 * count))
-
-
-def colour_slopes(field: NodeField, session: FieldSession, seed: int, deadline: Deadline | None = None) -> np.ndarray:
-    """Return the derivative of the mean squared error of the training views by the colour of each stored node.
-
-    ``field`` has a palette. The result, ``(n, columns)``, tells which other colour would suit a node. It is
-    estimated from as many rays as :func:`importance`.
-    """
-    types, images = session.types, session.images
-    arrays = dict(field.arrays)
-    rows = dr.gather(types.UInt32, field.palette_index, dr.arange(types.UInt32, field.nodes.entries))
-    columns = arrays["colour"].shape[1]
-    lane = dr.arange(types.UInt32, field.nodes.entries * columns)
-    row = dr.gather(types.UInt32, rows, lane // columns)
-    colours = dr.gather(types.Float, dr.detach(arrays["colour"].array), dr.fma(row, columns, lane % columns))
-    total, count = dr.zeros(types.Float, dr.width(colours)), 0
-    for batch in range(batches_of(session)):
-        if deadline is not None and deadline.passed and count:
-            break
-        rng = dr.rng((seed << 32) + batch)
-        view, x, y = images.random_pixels(rng, RAYS)
-        rays = dr.width(view)
-        offset, behind = rng.random(types.TensorXf, (rays,)).array, images.behind(rng, rays)
-        colour = types.TensorXf(colours, (field.nodes.entries, columns))
-        dr.enable_grad(colour)
-        whole = NodeField(field.nodes, dr.detach(arrays["density"]), colour, environment=arrays.get("environment"))
-        seen = differentiable(whole.for_training(), *images.rays(view, x, y), 0, dr.inf, True, offset)
-        truth, error = images.colours(view, x, y), types.Float(0)
-        for c in range(3):
-            shown = srgb.from_linear(seen.colour[c] + seen.transmittance * behind[c], fused=False)
-            reference = srgb.from_linear(dr.clip(truth[c] + (1 - truth[3]) * behind[c], 0, 1), fused=False)
-            error += dr.square(shown - reference)
-        dr.backward(dr.select(images.counted(view, x, y), error, 0))
-        total += dr.grad(colour).array
-        dr.eval(total)
-        count += rays
-    return total.numpy().reshape(-1, columns)[1:].astype(np.float64) / (3 * count)
-
-
-def batches_of(session: FieldSession) -> int:
-    """Return the number of estimates from :data:`RAYS` rays each."""
-    return max(LEAST, round(RAYS_PER_PIXEL * len(session.views) * session.views.mean_pixels / RAYS))
 
 
 def costs(counts: np.ndarray) -> np.ndarray:
