@@ -42,7 +42,8 @@ def child(arguments) -> dict:
         session.ANYWHERE = 1.0
     types = array_module("llvm")
     views = session.FieldSession.load(types, arguments.source)
-    begin = files.grid_of(files.load(arguments.grid), types)
+    reader = files if hasattr(files, "grid_of") else importlib.import_module("mi_diffind.tasks.radiance.fit")
+    begin = reader.grid_of(files.load(arguments.grid), types)
     with fitting.cores(True):
         side = () if arguments.old else (1,)
         problem = grid.GridProblem(begin, views, *side)

@@ -3,11 +3,10 @@ Measure grid and field on captures in the format of NeRF's synthetic scenes, whi
 
     python tests/benchmarks/bench_nerf.py nerf_synthetic/lego nerf_synthetic/chair -o docs/measured/nerf_scenes.json
 
-A scene is called as its folder. Each training is a process of its own: ``mi-diffind fit field FOLDER --preset grid``,
-then ``mi-diffind fit field FOLDER --grid GRID``, with the defaults but for ``--steps`` (of both, for trials),
-``--all-cores`` and ``--bytes`` (one more field for each size). The file grows with each result; rows of the same scene,
-size of the views and method are replaced. Files of fields stay in ``--work``; with the same folder, an interrupted run
-goes on behind the last finished training.
+A scene is called as its folder. ``mi-diffind fit field FOLDER --grid GRID`` trains grid and field in a process of its
+own, with the defaults but for ``--steps`` (for trials) and ``--all-cores``. ``--disk`` fits one more field to the grid
+for each size. The file grows with each result; rows of the same scene, size of the views and method are replaced. Files
+of fields stay in ``--work``; with the same folder, an interrupted run goes on behind the last finished training.
 """
 
 import argparse
@@ -21,6 +20,7 @@ from pathlib import Path
 
 from mi_diffind.files import write_json
 from mi_diffind.measure.clock import machine
+from mi_diffind.tables import load_table
 from mi_diffind.tasks.radiance.views import load_views
 
 
@@ -41,21 +41,32 @@ def timed(command: list[str]) -> dict:
 
 
 def training(folder: str, output: Path, options: list[str]) -> dict:
-    """Fit a field to a folder, and return its figures."""
+    """Fit a field to a folder, and return its report and its cost."""
     report, costs = output.with_suffix(".json"), output.with_suffix(".cost.json")
     if not costs.is_file():
         write_json(costs, timed(["fit", "field", folder, "-o", str(output), "--json", str(report), *options]))
     cost, fitted = (json.loads(file.read_text(encoding="utf-8")) for file in (costs, report))
+    return fitted | cost
+
+
+def row(fitted: dict, output: Path, options: list[str], before: dict | None = None) -> dict:
+    """Return the row of a field: its cost and, if it began with the grid of another training, that of the grid."""
+    minutes, peak = fitted["minutes"], fitted["peak_bytes"]
+    if before is not None:
+        minutes, peak = minutes + before["grid_seconds"] / 60, max(peak, before["peak_bytes"])
     return {
-        **fitted["measured"], **cost, "file_bytes": output.stat().st_size, "memory_bytes": fitted["memory_bytes"],
-        "options": [o for o in options if not o.endswith(".npz")],
+        **fitted["measured"], "minutes": minutes, "peak_bytes": peak, "file_bytes": output.stat().st_size,
+        "memory_bytes": fitted["memory_bytes"], "options": options,
     }  # fmt: skip
 
 
-def after(grid: dict, row: dict) -> dict:
-    """Return the row of a field with the cost of the grid that it was made of."""
-    costs = {name: grid[name] + row[name] for name in ("minutes", "cpu_minutes")}
-    return row | costs | {"peak_bytes": max(grid["peak_bytes"], row["peak_bytes"])}
+def grid_row(fitted: dict, grid_file: Path, options: list[str]) -> dict:
+    """Return the row of the grid of a training."""
+    return {
+        **load_table(grid_file, "field").measured, "minutes": fitted["grid_seconds"] / 60,
+        "peak_bytes": fitted["peak_bytes"], "file_bytes": grid_file.stat().st_size, "memory_bytes": None,
+        "options": options,
+    }  # fmt: skip
 
 
 def main() -> None:
@@ -66,17 +77,17 @@ def main() -> None:
     parser.add_argument(
         "--all-cores", action="store_true", help="train on all cores: results differ in the last digits"
     )
-    parser.add_argument("--bytes", nargs="*", default=[], metavar="N", help="one more field of so many bytes in memory")
+    parser.add_argument("--disk", nargs="*", default=[], metavar="N", help="one more field of so many bytes on disk")
     parser.add_argument(
         "--work", metavar="FOLDER", help="folder for the files of the fields (default: a temporary one)"
     )
     arguments = parser.parse_args()
-    output = Path(arguments.output)
-    result = json.loads(output.read_text(encoding="utf-8")) if output.is_file() else {"rows": []}
+    result_file = Path(arguments.output)
+    result = json.loads(result_file.read_text(encoding="utf-8")) if result_file.is_file() else {"rows": []}
     described = machine("llvm_ad_rgb")
     quoted = {name: described[name] for name in ("cpu", "cores", "system", "mi-diffind")}
-    steps = [] if arguments.steps is None else ["--steps", str(arguments.steps)]
-    steps += ["--all-cores"] if arguments.all_cores else []
+    options = [] if arguments.steps is None else ["--steps", str(arguments.steps)]
+    options += ["--all-cores"] if arguments.all_cores else []
     work = Path(arguments.work or tempfile.mkdtemp())
     work.mkdir(parents=True, exist_ok=True)
     for folder in arguments.folders:
@@ -84,18 +95,20 @@ def main() -> None:
         side = int(load_views(folder, "test", 1).sizes[0].max())
         grid_file = work / f"{scene}{side}.grid.npz"
 
-        def add(row: dict, scene=scene, side=side) -> None:
-            place = {"scene": scene, "side": side, "method": row["method"]}
+        def add(values: dict, scene=scene, side=side) -> None:
+            place = {"scene": scene, "side": side, "method": values["method"]}
             result["rows"] = [r for r in result["rows"] if any(r[k] != v for k, v in place.items())]
-            result["rows"].append(place | row | {"machine": quoted})
-            write_json(output, result)
+            result["rows"].append(place | values | {"machine": quoted})
+            write_json(result_file, result)
 
-        grid = training(folder, grid_file, ["--preset", "grid", *steps])
-        add({"method": "grid", **grid})
-        for size in ("", *arguments.bytes):
-            sized = ["--bytes", size] if size else []
-            field = training(folder, work / f"{scene}{side}{size}.npz", ["--grid", str(grid_file), *sized, *steps])
-            add({"method": f"field, {size} in memory" if size else "field", **after(grid, field)})
+        output = work / f"{scene}{side}.npz"
+        fitted = training(folder, output, ["--grid", str(grid_file), *options])
+        add({"method": "grid", **grid_row(fitted, grid_file, options)})
+        add({"method": "field", **row(fitted, output, options)})
+        for size in arguments.disk:
+            output, sized = work / f"{scene}{side}.{size}.npz", [*options, "--disk", size]
+            smaller = training(folder, output, ["--grid", str(grid_file), *sized])
+            add({"method": f"field, --disk {size}", **row(smaller, output, sized, fitted)})
 
 
 if __name__ == "__main__":
