@@ -29,7 +29,7 @@ def child(arguments) -> dict:
 
     import drjit as dr
 
-    from mi_diffind import fitting
+    from mi_diffind import compat, fitting
     from mi_diffind.runtime import array_module
     from mi_diffind.tasks.radiance import files, grid
     from mi_diffind.tasks.radiance.presets import PRESETS
@@ -44,7 +44,7 @@ def child(arguments) -> dict:
     views = session.FieldSession.load(types, arguments.source)
     reader = files if hasattr(files, "grid_of") else importlib.import_module("mi_diffind.tasks.radiance.fit")
     begin = reader.grid_of(files.load(arguments.grid), types)
-    with fitting.cores(True):
+    with fitting.cores(True), compat.room_for_sums(fitting.LARGEST_SUMS):
         side = () if arguments.old else (1,)
         problem = grid.GridProblem(begin, views, *side)
         settings = dataclasses.replace(PRESETS["grid"].settings, batch=arguments.rays, steps=100000)

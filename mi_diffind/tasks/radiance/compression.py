@@ -49,8 +49,9 @@ PLANES = 8
 #: bytes of a file beside its nodes and its palette.
 PALETTE_SHARE, BEFORE_TRAINING, OTHER_BYTES = 0.12, 0.92, 2500
 
-#: Factor of the rate of levels, and how often it is applied, until a trained field has the bytes of its file.
-STEEPER, MOST_STEEPER = 1.5, 12
+#: Factor of the rate of levels, and how often it is applied, until a trained field has the bytes of its file; then the
+#: last interval is halved so often.
+STEEPER, MOST_STEEPER, HALVINGS = 1.5, 12, 3
 
 #: Training steps between updates of the range of the palette's bytes.
 RANGE_INTERVAL = 50
@@ -84,12 +85,23 @@ class PaletteCoding:
 
     def chosen(self, levels: np.ndarray) -> np.ndarray:
         """Return whole levels for levels ``(n,)`` in [0, 1], of fewer bits until the file is small enough."""
-        exact, rate = levels[1:].astype(np.float64) * LAST_LEVEL, self.rate
-        for _ in range(MOST_STEEPER):
+        exact = levels[1:].astype(np.float64) * LAST_LEVEL
+
+        def at(rate: float) -> tuple[np.ndarray, bool]:
             whole = chosen_levels(self.passes, exact, self.weight, rate, LAST_LEVEL + 1)
-            if self.file_bytes is None or self.estimated_bytes(whole) <= self.file_bytes:
+            return whole, self.file_bytes is None or self.estimated_bytes(whole) <= self.file_bytes
+
+        low = high = self.rate
+        whole, fits = at(low)
+        for _ in range(MOST_STEEPER):
+            if fits:
                 break
-            rate *= STEEPER
+            low, high = high, STEEPER * high
+            whole, fits = at(high)
+        for _ in range(HALVINGS if low < high else 0):
+            middle = np.sqrt(low * high)
+            smaller, fits = at(middle)
+            whole, low, high = (smaller, low, middle) if fits else (whole, middle, high)
         return np.concatenate([[0], whole])
 
     def estimated_bytes(self, levels: np.ndarray, share: float = 1.0) -> float:

@@ -24,7 +24,17 @@ from ...task import FitRequest, Fitted
 from . import compression, files, paper
 from . import grid as grids
 from .grid import NodeGrid
-from .presets import COLOURS, COMPRESSION, PRESETS, REFLECTING, RESOLUTIONS, STAGES, dense_bytes, ratio_for
+from .presets import (
+    COLOURS,
+    COMPRESSION,
+    MOST_NUMBERS,
+    PRESETS,
+    REFLECTING,
+    RESOLUTIONS,
+    STAGES,
+    dense_bytes,
+    ratio_for,
+)
 from .rate_distortion import Importance, importance
 from .session import SIDE, WATCHED, FieldSession
 from .training import ImagesProblem
@@ -263,7 +273,8 @@ class FieldFit:
         nodes = request.options["resolution"] or grids.resolution_of(views)
         stages_file = Path(f"{request.checkpoint}.grid.npz") if request.checkpoint else None
         limited = request.part(GRID_TIME if request.preset != "grid" else 1.0)
-        grid, finished, result = None, 0, None
+        grid, finished, result, reached = None, 0, None, STAGES[0][0]
+        numbers = np.inf if request.options["resolution"] else MOST_NUMBERS
         if stages_file is not None and request.resume and stages_file.exists():
             table = files.load(stages_file)
             if table.settings.get("source") != views.digest or table.settings.get("nodes") != nodes:
@@ -271,6 +282,7 @@ class FieldFit:
             if table.settings.get("asked_for_colours") != self.colours:
                 raise FittingError(f'the checkpoint "{stages_file}" was made with another option --colours')
             grid, finished = files.grid_of(table, request.types), table.settings["stages"]
+            reached = table.settings["share"]
             self.take_exposures(table)
             if finished == len(STAGES):
                 return grid, FitResult(table.measured, 0, 0, 0.0, False, 0)
@@ -284,7 +296,16 @@ class FieldFit:
                 else:
                     visible = grids.visible(grid, self.session.seeing_images)
                     # At full resolution, no further cells are needed, but memory and time would be
-                    grid = grids.divided(grid, visible, share / STAGES[number - 1][0], int(share < 1))
+                    visible = grids.widened(visible) if share < 1 else visible
+                    last = number + 1 == len(STAGES)
+                    factor = 1.0 if last else grids.largest_factor(grid, visible, share / reached, numbers)
+                    grid, reached = grids.divided(grid, visible, factor), reached * factor
+            if number + 2 == len(STAGES) and reached < 0.99:
+                print(
+                    f"resolution: {round(nodes * reached)}³, since {nodes}³, as fine as the pixels, is more than "
+                    f"{MOST_NUMBERS:,} numbers; --resolution decides",
+                    file=sys.stderr,
+                )
             if stop.is_set() and result is not None:
                 return grid, dataclasses.replace(result, interrupted=True)
             if grid.nodes.count == 0:
@@ -315,7 +336,7 @@ class FieldFit:
                 )
                 finish = functools.partial(self.finish_grid, problem) if last and request.preset == "grid" else None
                 result = stage_request.train(
-                    problem, f"grid, {round(nodes * share)}³", finish, self.times, 1 if number else FIRST_STEPS
+                    problem, f"grid, {round(nodes * reached)}³", finish, self.times, 1 if number else FIRST_STEPS
                 )
                 grid = problem.trained()
                 problem.keep_exposures()
@@ -324,7 +345,7 @@ class FieldFit:
                 return grid, dataclasses.replace(result, interrupted=True)
             if stages_file is not None:
                 table = files.grid_table(grid, np.float32)
-                state = {"nodes": nodes, "stages": number + 1, "asked_for_colours": self.colours}
+                state = {"nodes": nodes, "stages": number + 1, "share": reached, "asked_for_colours": self.colours}
                 table.settings |= {"source": views.digest, **state, **self.exposures()}
                 table.measured = result.measured
                 save_table(stages_file, table)

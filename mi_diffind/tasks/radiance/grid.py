@@ -1,8 +1,8 @@
 """Sparse grid of plain numbers, trained from coarse to fine: the field that is compressed.
 
-Training begins in the visual hull at a quarter of the nodes along each side, continues at half of them and ends with
-all of them. Only the last stage has several rays a pixel. Between these stages, cells that no ray sees
-(:func:`weights`) are removed and the others are divided.
+Training begins in the visual hull at a quarter of the nodes along each side, continues at half and three quarters of
+them and ends with all of them. Only the last stage has several rays a pixel. Between these stages, cells that no ray
+sees (:func:`weights`) are removed and the others are divided, as far as the limit of numbers allows.
 """
 
 from __future__ import annotations
@@ -44,6 +44,9 @@ EMPTY, NORMAL_BLUR = -6.0, 1.5
 
 #: Largest weight in a ray below which a cell is removed.
 VISIBLE = 0.02
+
+#: Least factor by which a grid is divided, unless it asks for less, and factors that are tried.
+LEAST_FACTOR, FACTORS = 1.1, 65
 
 #: Arrays of a grid.
 NAMES = ("density", "colour", "environment")
@@ -211,16 +214,16 @@ def visible(grid: NodeGrid, images: ViewImages) -> np.ndarray:
     return grid.nodes.cells_where((largest > 0) & (largest >= min(least, 0.5 * float(largest.max()))))
 
 
-def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 0) -> NodeGrid:
-    """Return the grid reduced to ``cells`` (:func:`visible`), at ``factor`` times as many nodes along each side.
+def widened(cells: np.ndarray) -> np.ndarray:
+    """Return ``cells`` and those beside them."""
+    return binary_dilation(cells, np.ones((3, 3, 3), bool))
 
-    ``wide`` cells of the given grid around them are kept, too.
-    """
-    if factor == 1 and not wide:
+
+def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0) -> NodeGrid:
+    """Return the grid reduced to ``cells`` (:func:`visible`), at ``factor`` times as many nodes along each side."""
+    if factor == 1:
         return kept(grid, cells)
     nodes = grid.nodes
-    if wide:
-        cells = binary_dilation(cells, np.ones((3, 3, 3), bool), wide)
     cells = cells & cells_of(nodes.stored)
     spacing = nodes.spacing / factor
     shape = np.maximum(2, np.ceil((np.asarray(nodes.shape) - 1) * factor - 1e-6).astype(int) + 1)
@@ -232,14 +235,30 @@ def divided(grid: NodeGrid, cells: np.ndarray, factor: float = 1.0, wide: int = 
     fine = nodes.like(spacing, shape, corners_of(cells[np.ix_(*middle)]))
     at = fine.positions().T / factor
 
-    empty = [BEGIN_DENSITY, *(BEGIN_COLOUR if c in (0, 4, 8) else 0 for c in range(grid.colour.shape[1]))]
-    numbers = np.empty((fine.entries, len(empty)), np.float32)
-    for values, column, begin in zip(numbers.T, (grid.density, *grid.colour.T), empty, strict=True):
-        dense = np.full(nodes.shape, begin, np.float32)
+    begin = np.float32([BEGIN_COLOUR if c in (0, 4, 8) else 0 for c in range(grid.colour.shape[1])])
+    colour, density = np.empty((fine.entries, len(begin)), np.float32), np.empty(fine.entries, np.float32)
+    for values, column, empty in zip(
+        (density, *colour.T), (grid.density, *grid.colour.T), (BEGIN_DENSITY, *begin), strict=True
+    ):
+        dense = np.full(nodes.shape, empty, np.float32)
         dense[nodes.stored] = column[1:]
-        values[0] = begin
+        values[0] = empty
         values[1:] = map_coordinates(dense, at, order=1, mode="nearest", prefilter=False)
-    return NodeGrid(fine, numbers[:, 0].copy(), numbers[:, 1:].copy(), grid.environment)
+    return NodeGrid(fine, density, colour, grid.environment)
+
+
+def largest_factor(grid: NodeGrid, cells: np.ndarray, factor: float, numbers: float) -> float:
+    """Return the largest factor up to ``factor`` by which :func:`divided` ``cells`` have at most so many ``numbers``.
+
+    A factor near 1 is 1.
+    """
+    cells = cells & cells_of(grid.nodes.stored)
+    inside = np.count_nonzero(cells)
+    beside = np.count_nonzero(corners_of(cells)) - inside  # nodes at the border grow as a surface does
+    tried = np.linspace(factor, 1, FACTORS)
+    counts = (inside * tried**3 + beside * tried**2) * (1 + grid.colour.shape[1])
+    fits = tried[counts <= numbers]
+    return float(fits[0]) if len(fits) and fits[0] >= min(factor, LEAST_FACTOR) else 1.0
 
 
 def kept(grid: NodeGrid, cells: np.ndarray) -> NodeGrid:

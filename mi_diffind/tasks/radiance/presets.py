@@ -13,7 +13,11 @@ VOXELS_PER_PIXEL, RESOLUTIONS = 1.25, (32, 352)
 
 #: Stages of the grid from coarse to fine: share of the resolution, and share of the training steps. Between them, cells
 #: that no ray sees are removed.
-STAGES = ((0.25, 0.08), (0.5, 0.12), (1.0, 0.15), (1.0, 0.65))
+STAGES = ((0.25, 0.08), (0.5, 0.12), (0.75, 0.12), (1.0, 0.1), (1.0, 0.58))
+
+#: Most numbers of the nodes of a grid while it is trained, which bounds memory and time: grids with more stay coarser,
+#: unless the resolution is given. In the last stage, a third of them has been removed.
+MOST_NUMBERS = 36_000_000
 
 #: Most steps that follow from the pixels of the views.
 MOST_STEPS = 11_000

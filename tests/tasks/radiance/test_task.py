@@ -215,6 +215,25 @@ def test_same_command_same_file(folder, tmp_path):
         np.testing.assert_array_equal(array.entries, b.arrays[name].entries)
 
 
+def test_numbers_limit_the_resolution(folder, monkeypatch, capsys):
+    """All stages stay below the limit; a resolution that is given is kept."""
+    trained = []
+    train_all = fitting.fit
+    monkeypatch.setattr(fitting, "fit", lambda p, *a, **k: trained.append(p.nodes) or train_all(p, *a, **k))
+    options = {"source": str(folder), "batch": 256, "steps": 40, "variant": "llvm_ad_rgb", "colours": "directions"}
+    sizes = {}
+    for limit in (10**9, 100_000):
+        monkeypatch.setattr(field_fit, "MOST_NUMBERS", limit)
+        trained.clear()
+        fit("field", preset="grid", progress=False, **options)
+        sizes[limit] = trained[-1].shape[0]
+        assert max(13 * nodes.count for nodes in trained[1:]) < 1.1 * limit
+        assert ("more than 100,000 numbers" in capsys.readouterr().err) == (limit == 100_000)
+    assert 16 < sizes[100_000] < 0.8 * sizes[10**9]
+    fit("field", preset="grid", progress=False, **options, resolution=40)
+    assert 36 <= trained[-1].shape[0] <= 44
+
+
 def test_a_stopped_training_goes_on(folder, tmp_path, monkeypatch):
     """In the trial before the second stage: the first is not made again, and the result is that of an unbroken run."""
     options = {"source": str(folder), "resolution": 24, "batch": 512, "steps": 40, "variant": "llvm_ad_rgb"}
@@ -442,7 +461,7 @@ def test_structural_similarity(rng):
 def test_divided_grids_are_what_they_were(folder, ad, rng):
     grid = files.grid_of(files.load(folder / "grid.npz"), ad)
     images = ViewImages(ad, load_views(folder, "train"))
-    finer = grids.divided(grid, grids.visible(grid, images), 2, wide=1)
+    finer = grids.divided(grid, grids.widened(grids.visible(grid, images)), 2)
     cells = nodes.cells_of(finer.nodes.stored)
     places = np.argwhere(cells)[rng.choice(cells.sum(), 500)] + 0.5
     p = ad.Array3f((np.array(finer.nodes.lower) + finer.nodes.spacing * places).T.astype(np.float32))
