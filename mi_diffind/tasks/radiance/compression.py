@@ -124,15 +124,15 @@ def palette_coding(
 
     A bit for each node is worth the share ``slope`` of the error of the grid's images.
     """
-    palette = sorted_clusters(grid, importance, index_bits, seed, deadline)
+    palette = sorted_clusters(grid, importance, 2**index_bits, seed, deadline)
     return coded_by(grid, importance, palette, slope * importance.loss / grid.nodes.count)
 
 
 def sorted_clusters(
-    grid: NodeGrid, importance: Importance, index_bits: int, seed: int, deadline: Deadline | None = None
+    grid: NodeGrid, importance: Importance, count: int, seed: int, deadline: Deadline | None = None
 ) -> np.ndarray:
-    """Return ``2**index_bits`` weighted clusters of the colours of a grid, in units of its metric, along a line."""
-    palette = clusters(grid.colour[1:] * np.sqrt(importance.metric), importance.colour, 2**index_bits, seed, deadline)
+    """Return ``count`` weighted clusters of the colours of a grid, in units of its metric, along a line."""
+    palette = clusters(grid.colour[1:] * np.sqrt(importance.metric), importance.colour, count, seed, deadline)
     # Neighbours in the palette look alike: the part of the palette predicts that of the next node
     centred = palette - palette.mean(axis=0)
     return palette[np.argsort(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1], kind="stable")]
@@ -167,8 +167,8 @@ def coding_in(
 
     The number of colours follows from ``nbytes``, the slope from trials with a part of the nodes.
     """
-    bits = int(np.clip(np.log2(max(PALETTE_SHARE * nbytes / grid.colour.shape[1], 1)), INDEX_BITS[0], DEFAULT_BITS))
-    palette = sorted_clusters(grid, importance, bits, seed, deadline)
+    colours = int(np.clip(PALETTE_SHARE * nbytes / grid.colour.shape[1], 2 ** INDEX_BITS[0], 2**DEFAULT_BITS))
+    palette = sorted_clusters(grid, importance, colours, seed, deadline)
     per_node = importance.loss / grid.nodes.count
     part, weights = trial_part(grid, importance)
     share = part.nodes.count / grid.nodes.count
