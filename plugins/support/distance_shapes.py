@@ -25,6 +25,7 @@ from mi_diffind.tasks.sdf import tracing
 
 from . import omissions
 from .placement import Placement, PlacementParameter
+from .tables import arrays_of
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
 OFFSET = 3 * tracing.EPSILON
@@ -63,6 +64,7 @@ def distance_shape(mesh: type) -> type:
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
             if self.is_medium_transition():
                 raise RuntimeError("medium: found one, signed distance fields hold none")
+            self._hold()
             self._place()
             self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
             omissions.watch(self)
@@ -84,6 +86,11 @@ def distance_shape(mesh: type) -> type:
             buffers["faces"] = np.repeat(np.arange(CORNERS, dtype=np.uint32), 3)
             buffers.update()
             self.ready = True
+
+        def _hold(self) -> None:
+            """Keep all arrays that rays read as an attribute, for frozen functions; build the index of the field."""
+            tracing.index_bytes(self.field)
+            self.held = arrays_of(self.field)
 
         def traverse(self, cb: mi.TraversalCallback) -> None:
             if not self.ready:
