@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned
-from sdf_fields import sparse_table, torus
+from sdf_fields import dense_table, sparse_table, torus
 
 from mi_diffind import compat, plugins, scenes
 from mi_diffind.scenes import SceneError
@@ -38,23 +38,8 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def dense(tmp_path_factory):
     """The torus in two dense arrays."""
-    from mi_diffind.runtime import array_module
-    from mi_diffind.tables import StoredArray, Table
-    from mi_diffind.tasks.sdf import paper
-
-    lower, upper, band = np.float64([-0.6, -0.6, -0.25]), np.float64([0.6, 0.6, 0.25]), 0.1
-
-    def distance(resolution):
-        axes = [np.linspace(a, b, n) for a, b, n in zip(lower, upper, resolution, strict=True)]
-        return torus(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))[0].reshape(resolution)
-
-    net = paper.initial("distance", (48, 48, 20), (4, 4, 4), distance, None, None, band)
-    net = paper.stored_form(net.alloc(array_module("llvm").TensorXf))
-    arrays = {"primary": StoredArray.of(net.primary[0]), "cascaded": StoredArray.of(net.cascaded)}
-    settings = {"layout": "pair", "lower": lower.tolist(), "upper": upper.tolist(), "band": band, "scale": SCALE}
-    settings |= {"slope": paper.slope_of(net, lower, upper, band), "centre": list(CENTRE)}
     path = tmp_path_factory.mktemp("dense") / "dense.npz"
-    save_table(path, Table("sdf", arrays, "dense", settings))
+    save_table(path, dense_table(scale=SCALE, centre=CENTRE))
     return path
 
 
