@@ -143,11 +143,12 @@ def _follow(scene, shapes, sampler, ray, β, light, path, paths, deepest, limit)
     depth, η, active = mi.UInt32(0), mi.Float(1), mi.Bool(True)
     si_prev = dr.zeros(mi.SurfaceInteraction3f)
     pdf_prev, delta_prev = mi.Float(1), mi.Bool(True)
+    rest = mi.Vector3f(0)
 
     while active:
         pi = scene.ray_intersect_preliminary(ray, active=active)
         if dr.hint(bool(shapes), mode="scalar"):
-            hit = sdf.intersect(shapes, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active)
+            hit = sdf.intersect(shapes, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active, rest)
             pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         if dr.hint(bool(shapes), mode="scalar"):
@@ -166,11 +167,7 @@ def _follow(scene, shapes, sampler, ray, β, light, path, paths, deepest, limit)
         ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
         lit &= ds.pdf != 0
         if dr.hint(bool(shapes), mode="scalar"):
-            start = sdf.spawn(shapes, hit, si, ds.d)
-            distance = dr.norm(ds.p - start)
-            lit &= ~sdf.occluded(
-                shapes, start, (ds.p - start) / distance, distance * (1 - mi.math.ShadowEpsilon), lit
-            )  # fmt: skip
+            lit &= ~sdf.occluded_from(shapes, hit, si, ds, lit)
         value, pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), lit)
         mis = dr.select(ds.delta, 1, _mis(ds.pdf, pdf))
         Lr = β * mis * mi.unpolarized_spectrum(value) * mi.unpolarized_spectrum(weight)
@@ -182,7 +179,7 @@ def _follow(scene, shapes, sampler, ray, β, light, path, paths, deepest, limit)
         η *= bs.eta
         ray = si.spawn_ray(si.to_world(bs.wo))
         if dr.hint(bool(shapes), mode="scalar"):
-            ray.o = sdf.spawn(shapes, hit, si, ray.d)
+            ray.o, rest = sdf.spawn(shapes, hit, si, ray.d)
         si_prev, pdf_prev, delta_prev = si, bs.pdf, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         survival = dr.minimum(dr.max(β) * η * η, 0.95)
         survival = dr.select(depth >= ROULETTE, survival, 1)

@@ -4,6 +4,18 @@ from __future__ import annotations
 
 import drjit as dr
 
+#: Magnitude below which a component of a direction counts as zero: its reciprocal fits single precision.
+PARALLEL = 1e-30
+
+
+def is_direction(d):
+    """Return whether a Dr.Jit vector has a length between ½ and 2; false for NaN.
+
+    Along any other vector, the steps of a ray may be too short to end.
+    """
+    squared = dr.squared_norm(d)
+    return (squared > 0.25) & (squared < 4)
+
 
 def box_interval(o, d, lower, upper, near, far, active) -> tuple:
     """Cut the parts ``near`` ≤ t ≤ ``far`` of rays ``o + t·d`` down to those in the box: ``(near, far, active)``.
@@ -13,7 +25,7 @@ def box_interval(o, d, lower, upper, near, far, active) -> tuple:
     if it lies between the two planes. The caller drops empty parts (``near`` > ``far``) and NaN by a comparison.
     """
     for x, v, low, high in zip(o, d, lower, upper, strict=True):
-        parallel = v == 0  # 0 · inf along a face would be NaN
+        parallel = dr.abs(v) < PARALLEL  # 0 · inf along a face would be NaN
         inverse = dr.rcp(dr.select(parallel, 1, v))
         first, second = (low - x) * inverse, (high - x) * inverse
         active &= ~parallel | ((x >= low) & (x <= high))

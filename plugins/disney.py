@@ -21,6 +21,9 @@ _DISCONTINUOUS = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
 #: Largest index of refraction whose reflectance the model is asked to express (``specular`` = 3.1).
 ETA_MAX = 3.0
 
+#: Largest sampling rate of a lobe; sums of rates fit single precision.
+LARGEST_RATE = 1e30
+
 #: Samples of a smaller density count as failed. They are next to none, 10⁻¹¹ of all, at the very horizon, and the
 #: derivative of a value, multiplied by the density's inverse, would leave the range of floats.
 _SMALLEST_DENSITY = 1e-12
@@ -228,8 +231,8 @@ class Disney(mi.BSDF):
         self.rates = {}
         for lobe, name in self.RATES.items():
             rate = float(props.get(name, 1.0))
-            if not 0 <= rate < float("inf"):
-                raise RuntimeError(f'parameter "{name}": found {rate:g}, a number ≥ 0 is needed')
+            if not 0 <= rate <= LARGEST_RATE:  # NaN, too
+                raise RuntimeError(f'parameter "{name}": found {rate:g}, allowed is [0, {LARGEST_RATE:g}]')
             self.rates[lobe] = mi.Float(rate)
             dr.make_opaque(self.rates[lobe])
 

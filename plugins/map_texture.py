@@ -20,6 +20,10 @@ from .support.textures import WRAP_MODES, PositionDistribution, luminance
 #: Most texels that are decoded for the mean, the maximum and the sampling of positions; larger images are reduced.
 DECODED = 2**22
 
+#: Largest magnitude of the values of a map in a scene, about the radiance of the sun in candelas per square metre: four
+#: bounces on such a surface fit single precision.
+BRIGHTEST = 1e9
+
 
 class MapTexture(mi.Texture):
     """Texture of one map of a :class:`~mi_diffind.maps.compressed.CompressedMaps`.
@@ -40,6 +44,8 @@ class MapTexture(mi.Texture):
         #: The arrays, where frozen functions (``dr.freeze``) look for them.
         self.net = getattr(self.image, "net", None)
         self.map, self.raw = self._choose(props)
+        for m in self._shown():
+            self._check_values(m, next(name for name in ("filename", "bitmap", "pyramid") if name in props))
         self.to_uv = textures.transformation(props)
         self._update_transformation()
         self._clear_cache()
@@ -55,6 +61,26 @@ class MapTexture(mi.Texture):
         if not isinstance(raw, bool):
             raise RuntimeError(f'parameter "raw": found {raw}, allowed are true and false')
         return chosen, raw
+
+    def _shown(self) -> list[MapLayout]:
+        """Return the maps that are read."""
+        return [self.map]
+
+    def _check_values(self, m: MapLayout, name: str) -> None:
+        """Refuse a map of the property ``name`` with values beyond :data:`BRIGHTEST`. Raises ``RuntimeError``."""
+        ends = [w[1] for w in m.where if isinstance(w, tuple)]
+        if len(ends) < m.channels:
+            ends += [m.low, m.high]
+        values = np.array(ends, np.float64)
+        with np.errstate(over="ignore"):
+            values = srgb.to_linear(values) if self._is_encoded(m) else values
+        furthest = values[np.argmax(np.abs(values))]
+        if not abs(furthest) <= BRIGHTEST:
+            where = f"{self._path}: " if self._path else ""
+            raise RuntimeError(
+                f'parameter "{name}": {where}found values up to {furthest:.3g} in the map "{m.name}", allowed in a '
+                f"scene are {-BRIGHTEST:g} to {BRIGHTEST:g}"
+            )
 
     def traverse(self, cb: mi.TraversalCallback):
         tables.traverse(cb, self._shared.tables)
@@ -122,6 +148,7 @@ class MapTexture(mi.Texture):
         if not self._is_encoded(m):
             return values
         bounded = m.low >= 0 and m.high <= 1 and m.knee == 0
+        bounded &= all(0 <= w[1] <= 1 for w in m.where if isinstance(w, tuple))
         decode = srgb.to_linear_bounded if bounded else srgb.to_linear
         return [decode(v) for v in values]
 

@@ -97,6 +97,9 @@ class MaterialMaps(FilteredTexture):
         self.maps, self.left_out = material_maps(self.image.layout, ignored(props))
         return next(iter(self.maps.values())), False
 
+    def _shown(self):
+        return list(self.maps.values())
+
     def read(self, si: mi.SurfaceInteraction3f) -> dict[str, list[mi.Float]]:
         """Return the channels of each map at a hit, linear, by parameter."""
         return self._by_parameter(iter(self._values(si)))

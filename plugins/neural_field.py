@@ -90,8 +90,8 @@ Radiance field among surfaces (:monosp:`neural_field`)
 
  * - tables.*
    - |tensor|
-   - Arrays of the field, with ``storage`` ``float32``: ``density``, ``colour`` and, with reflections, ``environment``
-     (paper: ``density_primary``, …).
+   - Arrays of the field, with ``storage`` ``float32``, and those of a grid with any: ``density``, ``colour`` and, with
+     reflections, ``environment`` (paper: ``density_primary``, …). Bytes have no derivatives.
    - |exposed|, |differentiable|
 
 A captured radiance field (Datta et al., *Efficient Graphics Representation with Differentiable Indirection*, SIGGRAPH

@@ -41,7 +41,8 @@ class NeuralMaterial(Disney):
 
      * - filename
        - |string|
-       - The maps of a material, written by ``mi-diffind fit texture`` or ``mi-diffind fit shading``.
+       - The maps of a material, written by ``mi-diffind fit texture`` or ``mi-diffind fit shading``. A map with linear
+         values beyond :math:`\pm 10^9` is refused.
        - --
 
      * - ignore

@@ -244,6 +244,7 @@ class NeuralSDF(distance_shape(mi.Mesh)):
         tables.check_shapes(tables.exposed(self.model.arrays))
         if not keys or any(key.startswith("tables.") for key in keys):
             self.model.field.changed()
+            self._hold()
 
     def report(self) -> dict:
         return {

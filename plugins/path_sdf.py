@@ -35,8 +35,15 @@ read only cells that the surface crosses. Fields of the other layouts are sphere
 Visual Computer 1996): a step is the distance divided by a bound of the field's slope, at least :math:`10^{-4}` of the
 longest side. A hit is where the sign differs from that at the start, so cameras may be within a solid; the place
 between the last sign and the next is found by false position. Secondary rays start :math:`3 \cdot 10^{-4}` of the
-longest side off the surface: walls thinner than that are not reliable. Seen from :math:`10^3` times its size away, a
-solid's hits are precise to :math:`10^{-4}` of the size, which is single precision.
+longest side off the surface: walls thinner than that are not reliable. They start from the hit in the frame of the
+field, with the digits that single precision rounds off in the world: a solid that is moved :math:`10^4` times its size
+from the origin looks the same. Seen from :math:`10^3` times its size away, a solid's hits are precise to
+:math:`10^{-4}` of the size, which is single precision.
+
+**Glass** needs a large ``max_depth``. The normals of a field are a fraction of a degree off, as those of flat triangles
+are: light that enters a round solid at grazing incidence is then totally reflected within it, often hundreds of times.
+Of a glass ball under a white sky, a field of 1 MB has 102 of 2304 pixels more than 1% too dark with a ``max_depth`` of
+16, a mesh of 20,480 flat triangles 110. With 1000, the field has none, and every path has the weight 1.
 
 **Derivatives** are computed by path replay with respect to materials, textures, emitters, the ``to_world`` of fields
 and, with ``storage`` ``float32``, their arrays: hits move along their rays by the implicit function theorem, and
@@ -88,13 +95,13 @@ def integrator() -> type:
                 return super().sample(mode, scene, *args, **kwargs)
             return self.sample_shapes(mode, scene, shapes, *args, **kwargs)
 
-        def intersect(self, scene, shapes, ray, coherent, active):
+        def intersect(self, scene, shapes, ray, coherent, active, rest):
             """Return the nearest hit, of an ordinary shape or of a distance shape; the other one is not valid."""
             pi = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-            return self.nearer(shapes, ray, pi, active)
+            return self.nearer(shapes, ray, pi, active, rest)
 
-        def nearer(self, shapes, ray, pi, active):
-            hit = sdf.intersect(shapes, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active)
+        def nearer(self, shapes, ray, pi, active, rest=0):
+            hit = sdf.intersect(shapes, ray.o, ray.d, dr.minimum(pi.t, ray.maxt), active, rest)
             pi.t = dr.select(hit.number > 0, dr.inf, pi.t)
             return pi, hit
 
@@ -159,10 +166,7 @@ def integrator() -> type:
                 lit = going & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
                 ds, emitter_weight = scene.sample_emitter_direction(fixed, sampler.next_2d(), True, lit)
                 lit &= ds.pdf != 0
-                start = sdf.spawn(shapes, hit, fixed, ds.d)
-                to = ds.p - start
-                distance = dr.norm(to)
-                lit &= ~sdf.occluded(shapes, start, to / distance, distance * (1 - mi.math.ShadowEpsilon), lit)
+                lit &= ~sdf.occluded_from(shapes, hit, fixed, ds, lit)
                 with dr.resume_grad(when=not primal):
                     factor = mi.Float(1)
                     if dr.hint(moving, mode="scalar"):
@@ -189,7 +193,7 @@ def integrator() -> type:
                 L = L + emitted + direct if primal else L - dr.detach(emitted + direct)
                 out = fixed.to_world(bs.wo)
                 following = fixed.spawn_ray(out)
-                following.o = sdf.spawn(shapes, hit, fixed, out)
+                following.o, rest = sdf.spawn(shapes, hit, fixed, out)
                 valid |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
                 # Russian roulette: undo the change of radiance by η² at a boundary
@@ -201,7 +205,7 @@ def integrator() -> type:
                 survives = sampler.next_1d() < survival
                 passed[roulette] *= dr.rcp(survival)
                 further = going & (largest != 0) & (~roulette | survives)
-                pi_next, hit_next = self.intersect(scene, shapes, following, False, further)
+                pi_next, hit_next = self.intersect(scene, shapes, following, False, further, rest)
 
                 if dr.hint(not primal, mode="scalar"):
                     factor, wo = mi.Float(1), bs.wo

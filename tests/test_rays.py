@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 
-from mi_diffind.rays import box_interval
+from mi_diffind.rays import box_interval, is_direction
 from mi_diffind.runtime import array_module
 
 
@@ -40,3 +40,26 @@ def test_nan_is_in_no_box():
     for o, d in ((p, ad.Array3f(1, 0, 0)), (ad.Array3f(0.5), ad.Array3f(dr.nan, 0, 0))):
         near, far, active = box_interval(o, d, (0, 0, 0), (1, 1, 1), ad.Float(0), ad.Float(dr.inf), ad.Bool(True))
         assert not (active & (near <= far) & dr.isfinite(near) & dr.isfinite(far))[0]
+
+
+def test_only_vectors_of_about_unit_length_are_directions():
+    ad = array_module("llvm")
+    lengths = [0, 1e-45, 1e-30, 0.4, 0.6, 1, 1.9, 2.1, 1e19, 1e30, np.inf, np.nan]
+    d = ad.Array3f(np.float32([lengths, [0] * 12, [0] * 12]))
+    assert is_direction(d).numpy().tolist() == [False] * 4 + [True] * 3 + [False] * 5
+
+
+def test_denormal_components_count_as_zero():
+    """Also along a side of the box, where the product with the reciprocal would be NaN."""
+    ad = array_module("llvm")
+    for tiny in (1e-45, -1e-45, 1e-31):
+        near, far, active = box_interval(
+            ad.Array3f(0, 0.5, -1),
+            ad.Array3f(tiny, 0, 1),
+            (0, 0, 0),
+            (1, 1, 1),
+            ad.Float(0),
+            ad.Float(9),
+            ad.Bool(True),
+        )
+        assert active[0] and near[0] == 1 and far[0] == 2

@@ -234,8 +234,13 @@ def _where(w, stored: int):
         return w
     if w == FROM_NORMAL:
         return w
-    if isinstance(w, (list, tuple)) and len(w) == 2 and w[0] == "constant" and math.isfinite(w[1]):
-        return ("constant", float(w[1]))
+    if isinstance(w, (list, tuple)) and len(w) == 2 and w[0] == "constant":
+        value = float(w[1])
+        if not abs(value) <= LARGEST:  # NaN, too
+            raise ValueError(
+                f"a channel has the constant {value:g}, allowed are numbers from -{LARGEST:g} to {LARGEST:g}"
+            )
+        return ("constant", value)
     raise ValueError(f"a channel has the origin {w!r:.40}, allowed are stored channels, z and constants")
 
 

@@ -25,6 +25,7 @@ from mi_diffind.tasks.sdf import tracing
 
 from . import omissions
 from .placement import Placement, PlacementParameter
+from .tables import arrays_of
 
 #: Distance of secondary rays' origins from the surface: three shortest steps of a ray.
 OFFSET = 3 * tracing.EPSILON
@@ -63,6 +64,7 @@ def distance_shape(mesh: type) -> type:
                 raise RuntimeError("emitter: found one, signed distance fields emit no light")
             if self.is_medium_transition():
                 raise RuntimeError("medium: found one, signed distance fields hold none")
+            self._hold()
             self._place()
             self.add_attribute(UNMERGED, 1, [0.0] * CORNERS)
             omissions.watch(self)
@@ -84,6 +86,11 @@ def distance_shape(mesh: type) -> type:
             buffers["faces"] = np.repeat(np.arange(CORNERS, dtype=np.uint32), 3)
             buffers.update()
             self.ready = True
+
+        def _hold(self) -> None:
+            """Keep all arrays that rays read as an attribute, for frozen functions; build the index of the field."""
+            tracing.index_bytes(self.field)
+            self.held = arrays_of(self.field)
 
         def traverse(self, cb: mi.TraversalCallback) -> None:
             if not self.ready:
@@ -128,17 +135,29 @@ def distance_shape(mesh: type) -> type:
             """Bytes of the field's ray-marching index."""
             return tracing.index_bytes(self.field)
 
-        def local_ray(self, o, d):
+        def local_ray(self, o, d, rest=0):
             """Return a ray's origin and direction in the unit frame: lengths are those of the world by ``size``."""
-            return self.local_point(o), self.axes.to_local(d)
+            return self.local_point(o, rest), self.axes.to_local(d)
 
-        def local_point(self, p):
-            """Return a point of the world in the unit frame."""
-            return self.axes.to_local(mi.Vector3f(p - self.origin)) / self.size
+        def local_point(self, p, rest=0):
+            """Return the point ``p`` + ``rest`` of the world in the unit frame; see :meth:`split_world`."""
+            return self.axes.to_local(mi.Vector3f(p - self.origin) + rest) / self.size
 
         def to_world(self, p):
             """Return a point of the unit frame in the world."""
             return mi.Point3f(dr.fma(self.axes.to_world(mi.Vector3f(p)), self.size, self.origin))
+
+        def split_world(self, p) -> tuple:
+            """Return a point of the unit frame in the world, and the rest that single precision rounds off.
+
+            Far from the world's origin the rest is larger than :data:`OFFSET`: rays that start without it begin on the
+            wrong side of the surface. The sum of two numbers and its error: Knuth, *The Art of Computer Programming*,
+            section 4.2.2, theorem B.
+            """
+            a, b = self.axes.to_world(mi.Vector3f(p)) * self.size, mi.Vector3f(self.origin)
+            total = a + b
+            part = total - a
+            return mi.Point3f(total), (a - (total - part)) + (b - part)
 
         def moved(self, p, d, active=True) -> tuple:
             """Return the hit ``p`` (unit frame) of a ray with the direction ``d`` (world), and its place in the world.
@@ -261,11 +280,14 @@ class ShapeHit:
     p: mi.Point3f
 
 
-def intersect(shapes: list, o, d, maxt, active=True) -> ShapeHit:
-    """Return the first hit of rays before ``maxt``; without a hit, ``t`` is ``maxt``."""
+def intersect(shapes: list, o, d, maxt, active=True, rest=0) -> ShapeHit:
+    """Return the first hit of rays before ``maxt``; without a hit, ``t`` is ``maxt``.
+
+    Rays start at ``o`` + ``rest``, as :func:`spawn` returns them.
+    """
     nearest = ShapeHit(mi.UInt32(0), mi.Float(maxt), mi.Point3f(0))
     for i, shape in enumerate(shapes):
-        start, direction = shape.local_ray(o, d)
+        start, direction = shape.local_ray(o, d, rest)
         result = tracing.intersect(shape.field, start, direction, nearest.t / shape.size, active)
         nearest.number = dr.select(result.hit, i + 1, nearest.number)
         nearest.t = dr.select(result.hit, result.t * shape.size, nearest.t)
@@ -273,11 +295,11 @@ def intersect(shapes: list, o, d, maxt, active=True) -> ShapeHit:
     return nearest
 
 
-def occluded(shapes: list, o, d, maxt, active=True):
-    """Return whether rays hit any distance shape before ``maxt``."""
+def occluded(shapes: list, o, d, maxt, active=True, rest=0):
+    """Return whether rays from ``o`` + ``rest`` hit any distance shape before ``maxt``."""
     blocked = mi.Bool(False)
     for shape in shapes:
-        start, direction = shape.local_ray(o, d)
+        start, direction = shape.local_ray(o, d, rest)
         blocked |= tracing.occluded(shape.field, start, direction, maxt / shape.size, active & ~blocked)
     return blocked
 
@@ -309,10 +331,28 @@ def shift(shapes: list, hit: ShapeHit, d, active=True):
     return change
 
 
-def spawn(shapes: list, hit: ShapeHit, si, d):
-    """Return the origin of a ray from ``si`` in the direction ``d``, off the surface by :data:`OFFSET`."""
-    o = si.spawn_ray(d).o
-    for i, shape in enumerate(shapes):
-        away = dr.copysign(OFFSET * shape.size, dr.dot(si.n, d))
-        o = dr.select(hit.number == i + 1, dr.fma(si.n, away, si.p), o)
-    return mi.Point3f(o)
+def spawn(shapes: list, hit: ShapeHit, si, d) -> tuple:
+    """Return the origin of a ray from ``si`` in the direction ``d``, and the rest that single precision rounds off.
+
+    The origin of a ray from a distance shape is off the surface by :data:`OFFSET`, in the unit frame; that from any
+    other shape has no rest.
+    """
+    with dr.suspend_grad():
+        o, rest = mi.Point3f(si.spawn_ray(d).o), mi.Vector3f(0)
+        for i, shape in enumerate(shapes):
+            away = dr.copysign(mi.Float(OFFSET), dr.dot(si.n, d))
+            place, low = shape.split_world(dr.fma(shape.axes.to_local(mi.Vector3f(si.n)), away, hit.p))
+            here = hit.number == i + 1
+            o, rest = dr.select(here, place, o), dr.select(here, low, rest)
+        return dr.detach(o), dr.detach(rest)
+
+
+def occluded_from(shapes: list, hit: ShapeHit, si, ds, active=True):
+    """Return whether a distance shape lies between ``si`` and a sample of an emitter (``mi.DirectionSample3f``)."""
+    start, rest = spawn(shapes, hit, si, ds.d)
+    to = mi.Vector3f(ds.p - start) - rest
+    distance = dr.norm(to)
+    # Places on infinite emitters are as far as the scene is large, and rounded far from the world's origin
+    infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+    d, distance = dr.select(infinite, ds.d, to / distance), dr.select(infinite, ds.dist, distance)
+    return occluded(shapes, start, d, distance * (1 - mi.math.ShadowEpsilon), active, rest)

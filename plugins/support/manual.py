@@ -10,8 +10,8 @@ PARTS = {
     "channels": """\
         * - channels
           - |string|
-          - Name of the map to show, such as ``albedo``; it has 1 or 3 channels. (Default: the only map, or the only
-            albedo)
+          - Name of the map to show, such as ``albedo``; it has 1 or 3 channels. A map with linear values beyond
+            :math:`\\pm 10^9` is refused. (Default: the only map, or the only albedo)
           - --""",
     "raw": """\
         * - raw

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import product
 from pathlib import Path
-from types import ModuleType
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +16,7 @@ from mi_diffind.tasks.radiance.files import load
 
 from . import properties, upsampling
 from .placement import Placement, PlacementParameter
+from .tables import arrays_of
 
 #: Luminance of linear sRGB, the same as in Mitsuba.
 LUMINANCE = (0.212671, 0.715160, 0.072169)
@@ -53,7 +53,7 @@ class PlacedField:
         A plugin keeps them as an attribute of its instance, since a frozen function (``dr.freeze``) does not traverse
         other objects.
         """
-        return [self.axes, self.origin, self.size, *_arrays_of(self.field, set())]
+        return [self.axes, self.origin, self.size, *arrays_of(self.field)]
 
     @property
     def exposed(self) -> dict:
@@ -155,24 +155,6 @@ def corners(placed: PlacedField) -> np.ndarray:
     """Return the corners ``(8, 3)`` of a field's box in the world."""
     field = placed.field
     return placed.placement.world(np.array(list(product(*zip(field.lower, field.upper, strict=True)))))
-
-
-def _arrays_of(value, visited: set) -> list:
-    """Return the Dr.Jit arrays of an object and of all objects that it refers to."""
-    if id(value) in visited:
-        return []
-    visited.add(id(value))
-    if isinstance(value, dr.ArrayBase):
-        return [value] if dr.is_jit_v(value) else []
-    if isinstance(value, dict):
-        inside = value.values()
-    elif isinstance(value, (list, tuple)):
-        inside = value
-    else:
-        inside = (
-            vars(value).values() if hasattr(value, "__dict__") and not isinstance(value, (type, ModuleType)) else ()
-        )
-    return [array for one in inside for array in _arrays_of(one, visited)]
 
 
 class VariantLight:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
+import drjit as dr
 import mitsuba as mi
 
 from mi_diffind import compat
@@ -44,6 +47,29 @@ def check_shapes(arrays: dict) -> None:
             array.check_shape()
         except ValueError as e:
             raise RuntimeError(f'parameter "tables.{name}": {e}') from None
+
+
+def arrays_of(value, visited: set | None = None) -> list:
+    """Return the Dr.Jit arrays of an object and of all objects that it refers to.
+
+    A plugin keeps them as an attribute of its instance, since a frozen function (``dr.freeze``) does not traverse other
+    objects.
+    """
+    visited = set() if visited is None else visited
+    if id(value) in visited:
+        return []
+    visited.add(id(value))
+    if isinstance(value, dr.ArrayBase):
+        return [value] if dr.is_jit_v(value) else []
+    if isinstance(value, dict):
+        inside = value.values()
+    elif isinstance(value, (list, tuple)):
+        inside = value
+    else:
+        inside = (
+            vars(value).values() if hasattr(value, "__dict__") and not isinstance(value, (type, ModuleType)) else ()
+        )
+    return [array for one in inside for array in arrays_of(one, visited)]
 
 
 def optimised(arrays: dict) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -14,6 +15,9 @@ from mi_diffind.lookup import clamp
 from . import upsampling
 
 WRAP_MODES = ("repeat", "mirror", "clamp")
+
+#: Largest entry of a transformation of texture coordinates; products of two of them fit single precision.
+STRETCH = 1e18
 
 #: Density of black positions, relative to the mean.
 FLOOR = 0.01
@@ -51,7 +55,11 @@ def transformation(props: mi.Properties):
     if not hasattr(given, "extract"):
         raise RuntimeError(f'parameter "to_uv": found {given}, a transformation is needed')
     m = given.extract().matrix
-    return mi.ScalarAffineTransform3f([[float(m[i, j]) for j in range(3)] for i in range(3)])
+    matrix = [[float(m[i, j]) for j in range(3)] for i in range(3)]
+    largest = max((abs(v) for row in matrix for v in row), key=lambda v: v if v == v else math.inf)
+    if not largest <= STRETCH:  # NaN, too
+        raise RuntimeError(f'parameter "to_uv": found an entry of {largest:g}, allowed are up to {STRETCH:g}')
+    return mi.ScalarAffineTransform3f(matrix)
 
 
 def permutes_corners(matrix: list) -> bool:

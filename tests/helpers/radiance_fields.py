@@ -68,6 +68,31 @@ class Bumps(VolumeField):
         return dr.select((p.x > 0) & active, away, 0)
 
 
+def ball_table(inner=None):
+    """The table of a ball that is red to the left and blue to the right, in half precision.
+
+    With ``inner`` (centre and half side of a cube), a thin haze fills all space in place of the ball.
+    """
+    import drjit.llvm as types
+
+    from mi_diffind.tasks.radiance import files, nodes, surroundings
+    from mi_diffind.tasks.radiance.grid import NodeGrid
+
+    side, spacing = 25, 0.1
+    place = np.stack(np.meshgrid(*[spacing * np.arange(side) - 1.2] * 3, indexing="ij"), -1)
+    radius = np.linalg.norm(place, axis=-1)
+    grid = types, (-1.2,) * 3, spacing, (side,) * 3
+    if inner is None:
+        stored = nodes.Nodes(*grid, radius < 1)
+        raw = np.clip(12 * (0.8 - radius), -6, 4)[stored.stored]
+    else:
+        stored = surroundings.ContractedNodes(*grid, np.ones((side,) * 3, bool), inner=inner)
+        raw = np.full(side**3, -5.0)
+    colour = np.zeros((stored.count, 12))
+    colour[:, 0], colour[:, 4], colour[:, 8] = -place[stored.stored][:, 0], -1, place[stored.stored][:, 0]
+    return files.grid_table(NodeGrid(stored, np.append(-9, raw), np.concatenate([np.zeros((1, 12)), colour])))
+
+
 def register(mi, fields: dict, name: str = "test_field") -> None:
     """An integrator ``name``: ``neural_field``, of which ``field`` is the key of one in ``fields``."""
     # The module is another one in each variant

@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
-from radiance_fields import Bumps, Fog, register
+from radiance_fields import Bumps, Fog, ball_table, register
 from scipy.ndimage import gaussian_filter
 
 from mi_diffind import compat, plugins
@@ -690,22 +690,10 @@ def test_what_is_refused(mi_rgb, fields, more, message):
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
     """A small field: a ball that is red to the left and blue to the right, in half precision."""
-    import drjit.llvm as types
-
     from mi_diffind.tables import save_table
-    from mi_diffind.tasks.radiance import files, nodes
-    from mi_diffind.tasks.radiance.grid import NodeGrid
 
-    side, spacing = 25, 0.1
-    place = np.stack(np.meshgrid(*[spacing * np.arange(side) - 1.2] * 3, indexing="ij"), -1)
-    radius = np.linalg.norm(place, axis=-1)
-    stored = nodes.Nodes(types, (-1.2,) * 3, spacing, (side,) * 3, radius < 1)
-    raw = np.clip(12 * (0.8 - radius), -6, 4)[stored.stored]
-    colour = np.zeros((stored.count, 12))
-    colour[:, 0], colour[:, 4], colour[:, 8] = -place[stored.stored][:, 0], -1, place[stored.stored][:, 0]
-    table = files.grid_table(NodeGrid(stored, np.append(-9, raw), np.concatenate([np.zeros((1, 12)), colour])))
     path = tmp_path_factory.mktemp("field") / "ball.npz"
-    save_table(path, table)
+    save_table(path, ball_table())
     return path
 
 

@@ -3,13 +3,14 @@
 import json
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from weakref import WeakValueDictionary
 
 import drjit as dr
 import numpy as np
 import pytest
 from arrays import aligned
-from sdf_fields import sparse_table, torus
+from sdf_fields import dense_table, sparse_table, torus
 
 from mi_diffind import compat, plugins, scenes
 from mi_diffind.scenes import SceneError
@@ -31,6 +32,14 @@ def folder(tmp_path_factory):
     mesh.export(path / "torus.ply")
     table.settings["mesh_path"] = "torus.ply"
     save_table(path / "torus.npz", table)
+    return path
+
+
+@pytest.fixture(scope="module")
+def dense(tmp_path_factory):
+    """The torus in two dense arrays."""
+    path = tmp_path_factory.mktemp("dense") / "dense.npz"
+    save_table(path, dense_table(scale=SCALE, centre=CENTRE))
     return path
 
 
@@ -256,6 +265,37 @@ def test_a_moved_shape_is_that_of_a_new_scene(mi_rgb, folder):
     params["a.to_world"] = at()
     params.update()
     np.testing.assert_array_equal(np.array(mi.render(loaded, spp=4)), before)
+
+
+@pytest.mark.parametrize("file, storage", [("torus", "uint8"), ("torus", "float32"), ("dense", "uint8")])
+def test_frozen(mi_rgb, folder, dense, no_garbage_collection, file, storage):
+    """A recorded render is the other one to the last bit, with other seeds, places, materials and nodes, too."""
+    mi, at = mi_rgb, mi_rgb.AffineTransform4f
+    filename = str(dense if file == "dense" else folder / "torus.npz")
+    red = {"type": "rgb", "value": [0.8, 0.2, 0.1]}
+    more = {"storage": storage, "bsdf": {"type": "diffuse", "reflectance": red}}
+    loaded = scene(mi, {"a": {"type": "neural_sdf", "filename": filename, **more}})
+    params = mi.traverse(loaded)
+    frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=2, seed=seed))
+    changes = {
+        0: {},
+        1: {},
+        2: {"a.to_world": at().translate([0.2, 0.1, 0]).rotate([0, 0, 1], 30)},
+        3: {"a.bsdf.reflectance.value": mi.Color3f(0.1, 0.9, 0.3)},
+    }
+    if storage == "float32":
+        nodes = params["a.tables.nodes"].numpy()
+        changes[4] = {"a.tables.nodes": mi.TensorXf(aligned(nodes - np.float32([0.2, 0, 0, 0])))}
+    images = []
+    for number, changed in changes.items():
+        for key, value in changed.items():
+            params[key] = value
+        params.update()
+        seed = dr.opaque(mi.UInt32, min(number, 1))
+        images.append(np.array(frozen(loaded, seed)))
+        np.testing.assert_array_equal(images[-1], np.array(mi.render(loaded, spp=2, seed=seed)))
+    assert frozen.n_recordings < len(changes)
+    assert all(np.abs(a - b).mean() > 1e-3 for a, b in pairwise(images[1:]))
 
 
 # -- how fine a grid is ------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 
 import drjit as dr
 
-from ...rays import box_interval
+from ...rays import box_interval, is_direction
 from .volume_field import VolumeField
 
 #: Transmittance at which a ray ends.
@@ -46,14 +46,20 @@ class Marched:
 def box(field, o, d, near, far, active):
     """Return the part of each ray in the field's box: origin, distance, length, and whether it exists.
 
-    A ray with NaN has no part in the box.
+    A ray with NaN, or without a direction (:func:`.rays.is_direction`), has no part in the box.
     """
     types = field.types
     near, far = types.Float(near), types.Float(far)
     near, far, active = box_interval(o, d, *field.box, near, far, types.Bool(active))
     # Comparisons with NaN are false
-    active &= (near < far) & dr.isfinite(near) & dr.isfinite(far)
-    return types.Array3f(dr.fma(d, near, o)), near, far - near, active
+    active &= (near < far) & dr.isfinite(near) & dr.isfinite(far) & is_direction(dr.detach(d))
+    # The difference of two large distances may be longer than the box, whose diagonal a direction of ½ makes 2 long
+    lower, upper = field.box
+    longest = 2 * dr.norm(types.Array3f(upper) - types.Array3f(lower))
+    entry = types.Array3f(dr.fma(d, near, o))
+    # From too far away, single precision loses the box
+    active &= dr.norm(dr.detach(entry) - types.Array3f(lower)) < longest
+    return entry, near, dr.minimum(far - near, longest), active
 
 
 @dr.syntax

@@ -13,6 +13,8 @@ as in the structure.
 
 from __future__ import annotations
 
+import threading
+
 import drjit as dr
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
@@ -42,6 +44,8 @@ EMPTY, INSIDE = 1 << 31, 1 << 30
 
 #: Largest height of a slab's bounds above or below a block's plane, number of steps in 16 bits, and safety margin.
 SLAB, STEPS, MARGIN = 10.0, 65535, 1e-3
+
+_lock = threading.RLock()  # a thread that waits for the copy of an array may load another shape
 
 
 class GridCells:
@@ -155,7 +159,7 @@ def empty_space_words(structure, cells: GridCells) -> tuple[np.ndarray, np.ndarr
 
 
 class Marcher:
-    """Ray-marching index: empty-space distances and per-block slabs, built on the first trace.
+    """Ray-marching index: empty-space distances and per-block slabs, built once for a field.
 
     In memory, for each region, and each block of those with nodes, a word with its number or the distance to the next
     crossed block (:func:`empty_space_words`); for each block with nodes, its :class:`GridCells`, plane and slab.
@@ -271,10 +275,11 @@ class Marcher:
 
 
 def marcher_of(field) -> Marcher:
-    """Return the field's cached marcher."""
-    if "_marcher" not in vars(field):
-        field._marcher = Marcher(field)
-    return field._marcher
+    """Return the field's cached marcher, the same one to all threads."""
+    with _lock:
+        if "_marcher" not in vars(field):
+            vars(field).setdefault("_marcher", Marcher(field))
+        return field._marcher
 
 
 def along(corners, start, d):

@@ -16,7 +16,7 @@ from typing import Any
 
 import drjit as dr
 
-from ...rays import box_interval
+from ...rays import box_interval, is_direction
 from . import marching
 
 #: Shortest step, relative to the longest side; a ray may miss a solid that it crosses in less.
@@ -50,20 +50,20 @@ def enter(field, o, d, maxt, active=True):
     """Return the distances at which rays enter and leave the field's box: ``(near, far, active)``.
 
     A ray that starts in the box enters at 0. Components of ``d`` may be zero. A ray is not active if it misses the
-    box, or if anything is NaN.
+    box, if it has no direction (:func:`.rays.is_direction`), or if anything is NaN.
     """
     Float = field.types.Float
-    active = field.types.Bool(active)
+    active = field.types.Bool(active) & is_direction(d)
     near, far, active = box_interval(o, d, *field.box, Float(0), Float(maxt), active)
-    active &= near <= far  # false for NaN
+    active &= (near <= far) & (far < dr.inf)  # false for NaN
     return near, far, active
 
 
 def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
     """Intersect rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, with the surface, from either side.
 
-    A ray that starts in the box starts with the field's sign, any other one outside of the solid. If not ``exact``,
-    only ``hit`` and ``leaving`` are valid, which is faster.
+    A ray that starts in the box starts with the field's sign, any other one outside of the solid. A direction shorter
+    than ½ or longer than 2 hits nothing. If not ``exact``, only ``hit`` and ``leaving`` are valid, which is faster.
     """
     Float, Point = field.types.Float, field.types.Array3f
     with dr.suspend_grad():
@@ -71,7 +71,8 @@ def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
         near, far, active = enter(field, o, d, maxt, active)
         # From here on, numbers are small. Rounding must not leave a ray outside of the box
         start = Point(dr.clip(dr.fma(d, near, o), *field.box))
-        length = far - near
+        # The difference of two large distances may be longer than the box: steps beyond it might never end
+        _, length, _ = box_interval(start, d, *field.box, Float(0), far - near, active)
         if field.marched:
             scale = field.cells_per_unit
             origin = [(x - a) * scale for x, a in zip(start, field.box[0], strict=True)]

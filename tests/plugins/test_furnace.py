@@ -1,0 +1,143 @@
+"""
+White furnace: a ball that absorbs nothing, under a sky of radiance 1, is invisible. The ball is a ``neural_sdf`` and,
+beside it, a mesh; here, and moved by 10⁴ times its size.
+"""
+
+import drjit as dr
+import numpy as np
+import pytest
+from sdf_fields import sparse_table
+
+from mi_diffind.tables import save_table
+
+SIZE, FAR = 48, 1e4
+
+BSDFS = {
+    "glass": {"type": "dielectric"},
+    "mirror": {"type": "conductor", "material": "none", "specular_reflectance": 1.0},
+    "diffuse": {"type": "diffuse", "reflectance": 1.0},
+}
+
+
+def ball(p):
+    """Distance to a ball that fills the unit frame, and its gradient."""
+    r = np.linalg.norm(p, axis=1)
+    return r - 0.5, p / np.maximum(r, 1e-12)[:, None]
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory):
+    import trimesh
+
+    path = tmp_path_factory.mktemp("furnace")
+    save_table(path / "ball.npz", sparse_table(ball, scale=2.0, centre=(0, 0, 0)))
+    trimesh.creation.icosphere(5, 1.0).export(path / "ball.ply")
+    return {
+        "field": {"type": "neural_sdf", "filename": str(path / "ball.npz")},
+        "mesh": {"type": "ply", "filename": str(path / "ball.ply")},
+    }
+
+
+def scene(mi, shape, bsdf, far=0.0, max_depth=1000, view=(0.3, -5, 0.7), fov=30, size=SIZE):
+    """A shape moved by ``far``, under a white sky. No path ends by roulette."""
+    at = mi.ScalarTransform4f
+    move = at().translate([far, -far, 0.5 * far])
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = move @ at().look_at(view, [0, 0, 0], [0, 0, 1])
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": "path_sdf", "max_depth": max_depth, "rr_depth": 10**6},
+        "sky": {"type": "constant"},
+        "sensor": {"type": "perspective", "fov": fov, "near_clip": 1e-3, "to_world": view, "film": film},
+        "ball": {**shape, "to_world": move, "bsdf": BSDFS[bsdf]},
+    })  # fmt: skip
+
+
+def render(mi, loaded, spp, seed=0):
+    return np.array(mi.render(loaded, spp=spp, seed=dr.opaque(mi.UInt32, seed))).mean(-1)
+
+
+def furnace(mi, shape, bsdf, far=0.0, spp=16, **options):
+    return render(mi, scene(mi, shape, bsdf, far, **options), spp)
+
+
+@pytest.mark.parametrize("far", [0.0, FAR])
+@pytest.mark.parametrize("bsdf", ["glass", "mirror"])
+def test_smooth_balls_are_invisible_in_every_sample(mi_rgb, shapes, bsdf, far):
+    """The mesh, which is not moved, has a few pixels that are not 1: its smooth normals are not those of triangles."""
+    image, mesh = furnace(mi_rgb, shapes["field"], bsdf, far), furnace(mi_rgb, shapes["mesh"], bsdf)
+    assert np.abs(image - 1).max() < 1e-5
+    assert (np.abs(image - mesh) > 0.01).sum() <= 16
+
+
+@pytest.mark.parametrize("far", [0.0, FAR])
+def test_a_diffuse_ball_is_invisible_within_noise(mi_rgb, shapes, far):
+    """Pixel by pixel, also against the mesh; noise is that of weighting two ways to sample the sky."""
+    loaded = {name: scene(mi_rgb, shapes[name], "diffuse", far, max_depth=4, size=24) for name in ("field", "mesh")}
+    passes = {name: np.stack([render(mi_rgb, v, 16, seed) for seed in range(24)]) for name, v in loaded.items()}
+    error = {name: images.std(0, ddof=1) / np.sqrt(len(images)) for name, images in passes.items()}
+    mean = {name: images.mean(0) for name, images in passes.items()}
+    outside = error["field"] == 0
+    assert 0.3 < outside.mean() < 0.8 and np.abs(mean["field"][outside] - 1).max() < 1e-5
+    seen = ~outside & (error["mesh"] > 0)
+    for difference, deviation in (
+        (mean["field"] - 1, error["field"]),
+        (mean["field"] - mean["mesh"], np.hypot(error["field"], error["mesh"])),
+    ):
+        z = difference[seen] / deviation[seen]
+        assert np.abs(z).max() < 6.5 and abs(z.mean()) < 0.2 and z.std() < 1.4
+    assert abs(mean["field"].mean() - 1) < 1e-3
+
+
+def test_glass_seen_from_within(mi_rgb, shapes):
+    """A path that starts in the ball leaves it once more than it enters: radiance grows by η²."""
+    for far in (0.0, FAR):
+        image = furnace(mi_rgb, shapes["field"], "glass", far, 32, view=(0.25, 0.5, 0.125), fov=90, size=16)
+        assert np.abs(image / (1.5046 / 1.000277) ** 2 - 1).max() < 1e-4  # bk7 in air
+
+
+def test_limited_depth_loses_light_as_flat_triangles_do(mi_rgb, shapes):
+    """Light that is totally reflected within a ball that is not quite round stays for long, in a mesh as in a field."""
+    mi = mi_rgb
+    flat = {**shapes["mesh"], "face_normals": True}
+    lost = {
+        name: 1 - furnace(mi, shape, "glass", spp=32, max_depth=16).mean()
+        for name, shape in {"field": shapes["field"], "flat": flat}.items()
+    }
+    assert 0 < lost["field"] < lost["flat"] < 5e-3
+
+
+def test_origins_of_rays_keep_what_single_precision_rounds_off(mi_rgb, shapes, rng):
+    from mi_diffind.plugins.support import distance_shapes
+
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    move = at().translate([FAR, -3 * FAR, 7.7]).rotate([0.6, 0, 0.8], 50).scale(1.7)
+    shape = mi.load_dict({**shapes["field"], "to_world": move})
+    p = rng.uniform(-0.5, 0.5, (3, 1000)).astype(np.float32)
+    place, rest = shape.split_world(mi.Point3f(p))
+    exact = np.array(shape.placement.size) * (shape.placement.rotation @ p.astype(np.float64))
+    exact += np.array(shape.origin, np.float64).reshape(3, 1)
+    assert np.abs(np.array(place) - exact).max() > 1e-4  # what a point in the world alone is worth
+    assert np.abs(np.array(place, np.float64) + np.array(rest, np.float64) - exact).max() < 2e-6
+    assert np.abs(np.array(shape.local_point(place, rest)) - p).max() < 5e-7
+    assert distance_shapes.OFFSET > 100 * 5e-7
+
+
+def test_hits_far_from_the_origin_are_those_near_it(mi_rgb, shapes, rng):
+    """Distances and places of camera rays: as exact as those of a mesh."""
+    from mi_diffind.plugins.support import distance_shapes
+
+    mi, at = mi_rgb, mi_rgb.ScalarTransform4f
+    o = np.round(rng.normal(size=(3, 4000)) * 2**8) / 2**8  # exact after the move
+    o += np.sign(o) * 2
+    d = rng.uniform(-0.6, 0.6, o.shape) - o
+    d = (d / np.linalg.norm(d, axis=0)).astype(np.float32)
+    results = []
+    for far in (0.0, 2.0**13):
+        shape = mi.load_dict({**shapes["field"], "to_world": at().translate([far, -far, far])})
+        start = o + far * np.array([[1], [-1], [1]])
+        hit = distance_shapes.intersect([shape], mi.Point3f(start), mi.Vector3f(d), mi.Float(dr.inf))
+        results.append([np.array(v) for v in (hit.number, hit.t, hit.p)])
+    (near, t, p), (moved, far_t, far_p) = results
+    assert (near == moved).all() and near.mean() > 0.5
+    assert np.abs(t - far_t)[near > 0].max() < 2e-6 and np.abs(p - far_p)[:, near > 0].max() < 2e-6
