@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping
 
 from .errors import UsageError
+from .files import check_distinct
 
 
 class Argument:
     """Argument of ``fit`` or ``decode`` that a task adds.
 
     Flags and options are those of ``argparse.ArgumentParser.add_argument``; of the arguments of one ``group``, at most
-    one may be given.
+    one may be given. ``file`` is "read" or "written" for the path of a file (which a command may read, too), lest two
+    arguments name the same file.
     """
 
-    def __init__(self, *flags: str, group: str = "", **options):
-        self.flags, self.group, self.options = flags, group, options
+    def __init__(self, *flags: str, group: str = "", file: str = "", **options):
+        self.flags, self.group, self.file, self.options = flags, group, file, options
 
     @property
     def name(self) -> str:
@@ -51,6 +54,15 @@ def add_arguments(parser: argparse.ArgumentParser, arguments: tuple[Argument, ..
     groups = {name: parser.add_mutually_exclusive_group() for name in dict.fromkeys(a.group for a in arguments) if name}
     for argument in arguments:
         groups.get(argument.group, parser).add_argument(*argument.flags, **argument.options)
+
+
+def check_files(arguments: tuple[Argument, ...], options: Mapping, outputs: Mapping) -> None:
+    """Refuse ``outputs`` or files of ``arguments`` to write that are another one of them, or a file to read.
+
+    ``options`` are the values of the arguments by name. Raises :class:`~mi_diffind.errors.UsageError`.
+    """
+    files = {use: {a.flags[0]: options[a.name] for a in arguments if a.file == use} for use in ("read", "written")}
+    check_distinct({**outputs, **files["written"]}, files["read"])
 
 
 def positive(text: str) -> int:

@@ -11,6 +11,7 @@ import os
 import sys
 
 from . import __version__
+from .commands.common import check_files
 from .errors import DiffindError
 from .files import writable_file, write_json
 
@@ -23,6 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     arguments = _parser(argv).parse_args(argv)
     try:
+        check_files(arguments)
         if arguments.json is not None:
             writable_file(arguments.json)
         result = arguments.run(arguments)

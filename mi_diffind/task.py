@@ -31,7 +31,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from . import discovery
-from .arguments import Argument
+from .arguments import Argument, check_files
 from .compat import module_of
 from .deadline import Deadline
 from .errors import UsageError
@@ -587,10 +587,10 @@ def fit(
     request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options)
     request.deadline, request.seconds = deadline, None if deadline is None else deadline.seconds
     request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
-    request.output = None if output is None else chosen.output_path(output)
+    request.output, request.task = None if output is None else chosen.output_path(output), task
+    check_files(chosen.arguments, options, {"-o": request.output, "--checkpoint": checkpoint})
     if resume and seconds is not None:
         raise UsageError("--resume needs the --steps of the run that it goes on with: leave out --seconds")
-    request.task = task
     chosen.check(request)
     request.types = array_module(variant)
     fitted = chosen.fit(request)
