@@ -28,6 +28,9 @@ TOLERANCE, ZERO = 1e-5, 1e-6
 #: Distance, in cells, by which a ray may exceed the safe step where the surface is expected.
 RELAXATION = 1.0
 
+#: Squares of the lengths between which a direction counts as one of length 1.
+UNIT = 0.5, 2.0
+
 #: Steps by false position before bisection takes over.
 FALSE_POSITIONS = 5
 
@@ -50,10 +53,12 @@ def enter(field, o, d, maxt, active=True):
     """Return the distances at which rays enter and leave the field's box: ``(near, far, active)``.
 
     A ray that starts in the box enters at 0. Components of ``d`` may be zero. A ray is not active if it misses the
-    box, or if anything is NaN.
+    box, if anything is NaN, or if the square of the length of ``d`` is not within :data:`UNIT`.
     """
     Float = field.types.Float
-    active = field.types.Bool(active)
+    squared = dr.squared_norm(d)
+    # A step along a direction of the length 0 would not advance
+    active = field.types.Bool(active) & (squared > UNIT[0]) & (squared < UNIT[1])
     near, far, active = box_interval(o, d, *field.box, Float(0), Float(maxt), active)
     active &= near <= far  # false for NaN
     return near, far, active
@@ -62,7 +67,7 @@ def enter(field, o, d, maxt, active=True):
 def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
     """Intersect rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, with the surface, from either side.
 
-    A ray that starts in the box starts with the field's sign, any other one outside of the solid. If not ``exact``,
+    A direction that is zero, NaN, infinite or far from length 1 hits nothing. A ray that starts in the box starts with the field's sign, any other one outside of the solid. If not ``exact``,
     only ``hit`` and ``leaving`` are valid, which is faster.
     """
     Float, Point = field.types.Float, field.types.Array3f
