@@ -9,6 +9,9 @@ from collections.abc import Mapping
 from .errors import UsageError
 from .files import check_distinct
 
+#: Largest size or count, and largest seed: Dr.Jit and Mitsuba hold them in 32 bits.
+MOST, MOST_NATURAL = 2**31 - 1, 2**32 - 1
+
 
 class Argument:
     """Argument of ``fit`` or ``decode`` that a task adds.
@@ -66,21 +69,25 @@ def check_files(arguments: tuple[Argument, ...], options: Mapping, outputs: Mapp
 
 
 def positive(text: str) -> int:
-    """Return a whole number ≥ 1. Raises ``ArgumentTypeError``."""
+    """Return a whole number from 1 to :data:`MOST`. Raises ``ArgumentTypeError``."""
     value = natural(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    if value > MOST:
+        raise argparse.ArgumentTypeError(f"found {text:.40}, allowed are whole numbers up to {MOST:,}")
     return value
 
 
 def natural(text: str) -> int:
-    """Return a whole number ≥ 0. Raises ``ArgumentTypeError``."""
+    """Return a whole number from 0 to :data:`MOST_NATURAL`. Raises ``ArgumentTypeError``."""
     try:
         value = int(text)
     except ValueError:
         value = -1
     if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number ≥ 0")
+        raise argparse.ArgumentTypeError(f"{text:.40} is not a whole number ≥ 0")
+    if value > MOST_NATURAL:
+        raise argparse.ArgumentTypeError(f"found {text:.40}, allowed are whole numbers up to {MOST_NATURAL:,}")
     return value
 
 

@@ -35,7 +35,7 @@ from .arguments import Argument, check_files
 from .compat import module_of
 from .deadline import Deadline
 from .errors import UsageError
-from .settings import FitSettings
+from .settings import FitSettings, within_memory
 from .units import labelled
 
 if TYPE_CHECKING:
@@ -583,7 +583,7 @@ def fit(
             raise UsageError(f'{task}: found the argument "{key}", allowed are {allowed}')
         if key in options:
             options[key] = arguments[key].parsed(value)
-    settings = chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options)
+    settings = within_memory(chosen.settings(preset, {k: v for k, v in given.items() if k in fields}, options))
     request = FitRequest(preset, settings, None, storage or next(iter(chosen.storages), ""), options)
     request.deadline, request.seconds = deadline, None if deadline is None else deadline.seconds
     request.checkpoint, request.resume, request.progress = checkpoint, resume, progress
