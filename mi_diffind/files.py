@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from .errors import DiffindError, UsageError, reason
+from .errors import DiffindError, UsageError, reason, shortened
 
 try:
     import fcntl
@@ -47,8 +47,7 @@ class OutputError(DiffindError, OSError):
 
 def shown(path: str | os.PathLike) -> str:
     """Return a path as a sentence names it: of a long one, the beginning and the end."""
-    text = os.fspath(path)
-    return text if len(text) <= SHOWN else f"{text[: SHOWN // 2]}…{text[-SHOWN // 2 :]}"
+    return shortened(os.fspath(path), SHOWN)
 
 
 def irregular(path: str | os.PathLike, most: int | None = None) -> str:

@@ -107,7 +107,7 @@ def test_names_that_are_too_long(tmp_path):
     with pytest.raises(OutputError, match="File name too long") as error:
         writable_file(tmp_path / ("a/" * 4000) / "b")
     assert len(str(error.value)) < 250
-    assert shown("a" * 500).count("a") == 120 and shown("a" * 120) == "a" * 120
+    assert len(shown("a" * 500)) == 120 and shown("a" * 120) == "a" * 120
 
 
 def test_files_that_must_not_be_opened(tmp_path):

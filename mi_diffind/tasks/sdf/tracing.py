@@ -67,8 +67,9 @@ def enter(field, o, d, maxt, active=True):
 def intersect(field, o, d, maxt, active=True, exact: bool = True) -> Hit:
     """Intersect rays ``o + t·d``, 0 ≤ t ≤ ``maxt``, ``d`` of length 1, with the surface, from either side.
 
-    A direction that is zero, NaN, infinite or far from length 1 hits nothing. A ray that starts in the box starts with the field's sign, any other one outside of the solid. If not ``exact``,
-    only ``hit`` and ``leaving`` are valid, which is faster.
+    A direction that is zero, NaN, infinite or far from length 1 hits nothing. A ray that starts in the box starts with
+    the field's sign, any other one outside of the solid. If not ``exact``, only ``hit`` and ``leaving`` are valid,
+    which is faster.
     """
     Float, Point = field.types.Float, field.types.Array3f
     with dr.suspend_grad():
